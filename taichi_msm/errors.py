@@ -1,0 +1,53 @@
+"""What can go wrong, as the user is told it. Only the command line prints these or turns them into exit codes."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+Path = tuple[str | int, ...]
+
+
+@dataclass(frozen=True)
+class Problem:
+    """One fault of a scene.
+
+    Attributes:
+        path: the key at fault, e.g. ("probes", 0, "load").
+        message: the value, what is wrong with it and the remedy, without the key.
+    """
+
+    path: Path
+    message: str
+
+    @property
+    def key(self) -> str:
+        """The key as the user writes it: probes.0.load."""
+        return ".".join(str(part) for part in self.path)
+
+    def __str__(self) -> str:
+        return f"{self.key}: {self.message}" if self.path else self.message
+
+
+class MsmError(Exception):
+    """Any error of this package that is meant for the user."""
+
+
+class SceneError(MsmError):
+    """A scene that cannot be run; `lines` holds one line for each fault."""
+
+    def __init__(self, lines: Sequence[str]) -> None:
+        super().__init__("\n".join(lines))
+        self.lines = tuple(lines)
+
+
+class DeviceError(MsmError):
+    """The arch or thread count asked for cannot be had."""
+
+
+class DivergedError(MsmError):
+    """The simulation left every bound; the message names the time, the point and the remedy."""
+
+
+class FilesError(MsmError):
+    """Reading or writing failed; the message names the path and the remedy."""

@@ -1,0 +1,240 @@
+"""The scene: one frozen model per section of the YAML file, with every default and limit, and nothing else."""
+
+from __future__ import annotations
+
+from typing import Annotated, Any, Literal
+
+from pydantic import BaseModel, ConfigDict, Field, StrictBool, field_validator, model_validator
+from pydantic_core import PydanticCustomError
+
+MAX_POINTS = 4096
+MAX_PROBES = 16
+MAX_PIXELS = 8192
+MAX_REFINE = 64
+
+# Times that differ by less than this fraction of a frame are one instant: 0.1 s x 30 /s is 3 frames.
+WHOLE = 1e-6
+
+Number = Annotated[float, Field(strict=True, allow_inf_nan=False)]
+Positive = Annotated[Number, Field(gt=0)]
+NotNegative = Annotated[Number, Field(ge=0)]
+Whole = Annotated[int, Field(strict=True)]
+Count = Annotated[Whole, Field(ge=2, le=MAX_POINTS)]
+Pixels = Annotated[Whole, Field(ge=1, le=MAX_PIXELS)]
+Byte = Annotated[Whole, Field(ge=0, le=255)]
+Text = Annotated[str, Field(strict=True, min_length=1)]
+Side = Literal["top", "bottom", "left", "right"]
+Vector = tuple[Number, Number, Number]
+
+
+def key(default: Any = ..., *, means: str, expects: str) -> Any:
+    """Describe one key: what it means (with its unit) and, for errors, what it may hold."""
+    return Field(default, description=means, json_schema_extra={"expects": expects})
+
+
+class Section(BaseModel):
+    """A section of the scene: immutable, and strict about its keys."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid", validate_default=True)
+
+
+class Sheet(Section):
+    """The sheet of mass points."""
+
+    points: tuple[Count, Count] = key(
+        means="rows, columns of mass points", expects=f"two whole numbers, 2 to {MAX_POINTS}: [rows, cols]"
+    )
+    size: tuple[Positive, Positive] = key(
+        means="height, width of the sheet at rest [m]", expects="two numbers above 0: [height, width] in metres"
+    )
+    mass: Positive = key(means="mass of one point [kg]", expects="a number above 0, in kg")
+    fixed: Literal["border", "corners", "none"] | tuple[Side, ...] = key(
+        "border",
+        means="the points that never move",
+        expects="border, corners, none, or a list of top, bottom, left, right",
+    )
+
+
+class Springs(Section):
+    """The stiffness of each family of springs; 0 leaves a family out."""
+
+    structural: NotNegative = key(
+        0.0, means="springs to the 4 nearest neighbours [N/m]", expects="a number, 0 or more, in N/m"
+    )
+    shear: NotNegative = key(
+        0.0, means="springs to the 4 diagonal neighbours [N/m]", expects="a number, 0 or more, in N/m"
+    )
+    virtual: NotNegative = key(
+        0.0, means="springs from each point to its rest position [N/m]", expects="a number, 0 or more, in N/m"
+    )
+    virtual_active: Literal["loaded", "always"] = key(
+        "loaded",
+        means="when the virtual springs exist: while any probe's percent is not 0, or always",
+        expects="loaded or always",
+    )
+
+
+class Probe(Section):
+    """A tool: where it acts, how hard, and when (eq. 5)."""
+
+    at: tuple[Number, Number] | Annotated[tuple[Vector, ...], Field(min_length=1)] = key(
+        (0.5, 0.5),
+        means="control point: fraction of the width from the left, of the height from the top; "
+        "or keys [[t, across, down], ...], linear between, held outside",
+        expects="[across, down], or keys [[t, across, down], ...]",
+    )
+    force: Vector = key(means="force at 100 % [N]", expects="three numbers: [x, y, z] in newtons")
+    load: Annotated[tuple[tuple[Number, Number], ...], Field(min_length=1)] = key(
+        ((0.0, 100.0),),
+        means="keys [t, percent], linear between; 0 before the first, the last value after the last; "
+        "two keys at one time are a jump",
+        expects="keys [[t, percent], ...], t in seconds",
+    )
+    falloff: NotNegative = key(
+        150.0, means="decay of the force with the distance from the control point [1/m]",
+        expects="a number, 0 or more, in 1/m",
+    )
+    offset: Annotated[Number, Field(ge=-50, le=1000)] = key(
+        10.0, means="exponent subtracted at the control point itself", expects="a number, -50 to 1000"
+    )
+
+    @field_validator("at", "load", mode="after")
+    @classmethod
+    def _in_order(cls, keys: tuple[Any, ...]) -> tuple[Any, ...]:
+        if not isinstance(keys[0], tuple):
+            return keys
+        times = [entry[0] for entry in keys]
+        for n in range(1, len(times)):
+            if times[n] < times[n - 1]:
+                raise PydanticCustomError(
+                    "order", "key {n} goes back in time, from {before} s to {now} s; sort the keys by time",
+                    {"n": n, "before": times[n - 1], "now": times[n]},
+                )
+            if n > 1 and times[n] == times[n - 2]:
+                raise PydanticCustomError(
+                    "order", "three keys at {now} s; a jump is two keys at one time, so remove the middle one",
+                    {"now": times[n]},
+                )
+        return keys
+
+
+class Time(Section):
+    """The time span, the frames and the steps."""
+
+    duration: Positive = key(
+        means="simulated time [s]; duration x frames_per_second is a whole number",
+        expects="a number above 0, in seconds",
+    )
+    frames_per_second: Positive = key(25.0, means="frames per simulated second", expects="a number above 0")
+    step: Literal["auto"] | Positive = key(
+        "auto",
+        means="time step [s], a whole fraction of a frame; auto: half the stability limit or less",
+        expects="auto, or a number above 0, in seconds",
+    )
+    damping_difference: Literal["central", "backward"] = key(
+        "central",
+        means="difference that stands for the velocity in the damping: central is of order 2, backward "
+        "(the paper's eq. 3) of order 1",
+        expects="central or backward",
+    )
+    precision: Literal["f32", "f64"] = key("f32", means="floating-point precision", expects="f32 or f64")
+
+    @property
+    def frames(self) -> int:
+        """F, the number of frame intervals; F + 1 frames are drawn."""
+        return round(self.duration * self.frames_per_second)
+
+    @model_validator(mode="after")
+    def _whole_frames(self) -> Time:
+        frames = self.duration * self.frames_per_second
+        if not 0.5 < frames < 1e9 or abs(frames - round(frames)) > WHOLE:
+            nearest = max(1, round(min(frames, 1e9))) / self.frames_per_second
+            raise PydanticCustomError(
+                "frames",
+                "{duration} s x {rate} frames per second = {frames} frames, not a whole number; try {nearest}",
+                {"key": "duration", "duration": self.duration, "rate": self.frames_per_second,
+                 "frames": f"{frames:.6g}", "nearest": f"{nearest:.9g}"},
+            )
+        return self
+
+
+class Camera(Section):
+    """A pinhole camera."""
+
+    eye: Vector = key(means="where the camera is [m]", expects="three numbers: [x, y, z] in metres")
+    target: Vector = key(
+        (0.0, 0.0, 0.0), means="the point it looks at [m]", expects="three numbers: [x, y, z] in metres"
+    )
+    up: Vector = key(
+        (0.0, 1.0, 0.0), means="the direction that is up in the picture", expects="three numbers: [x, y, z]"
+    )
+    fov: Annotated[Number, Field(gt=0, lt=180)] = key(
+        40.0, means="angle from the picture's bottom to its top [degrees]",
+        expects="a number between 0 and 180, in degrees",
+    )
+
+
+class Render(Section):
+    """How a frame is drawn."""
+
+    size: tuple[Pixels, Pixels] = key(
+        (512, 512), means="width, height of a frame [px]",
+        expects=f"two whole numbers, 1 to {MAX_PIXELS}: [width, height] in pixels",
+    )
+    refine: Annotated[Whole, Field(ge=0, le=MAX_REFINE)] = key(
+        10, means="points inserted between two neighbours when drawing", expects=f"a whole number, 0 to {MAX_REFINE}"
+    )
+    camera: Literal["top", "oblique"] | Camera = key(
+        "top", means="top: straight down, to scale; oblique: tilted, shows depth; or a pinhole camera",
+        expects="top, oblique, or {eye: [x, y, z], target: [x, y, z], up: [x, y, z], fov: degrees}",
+    )
+    shading: Literal["none", "headlight"] = key(
+        "headlight", means="none: the picture's own colours; headlight: lit from the camera",
+        expects="none or headlight",
+    )
+    wireframe: StrictBool = key(False, means="draw the mass-point mesh over the surface", expects="true or false")
+    supersample: Annotated[Whole, Field(ge=1, le=4)] = key(
+        1, means="samples per pixel along each axis", expects="a whole number, 1 to 4"
+    )
+    background: tuple[Byte, Byte, Byte] = key(
+        (0, 0, 0), means="colour where no surface is", expects="three whole numbers, 0 to 255: [red, green, blue]"
+    )
+
+
+class Scene(Section):
+    """Everything a run needs; what the YAML file says, checked and with its defaults filled in."""
+
+    image: Text | None = key(
+        None, means="the picture on the sheet: PNG, JPEG, WebP, BMP or TIFF; relative to the scene file",
+        expects="the path of a picture",
+    )
+    region: tuple[Whole, Whole, Whole, Whole] | None = key(
+        None, means="x, y, width, height [px] of the part of the image that the sheet carries; default: all of it",
+        expects="four whole numbers: [x, y, width, height] in pixels",
+    )
+    sheet: Sheet = key(means="the sheet of mass points", expects="a mapping with points, size and mass")
+    springs: Springs = key(means="the springs", expects="a mapping with structural, shear, virtual")
+    damping: NotNegative = key(0.0, means="C, force per velocity [N s/m]", expects="a number, 0 or more, in N s/m")
+    probes: Annotated[tuple[Probe, ...], Field(max_length=MAX_PROBES)] = key(
+        (), means="the tools", expects=f"a list of at most {MAX_PROBES} mappings with at, force, load"
+    )
+    time: Time = key(means="time span, frames and steps", expects="a mapping with at least duration")
+    render: Render = key(Render(), means="how a frame is drawn", expects="a mapping")
+    output: tuple[Literal["png", "gif", "trajectory"], ...] = key(
+        ("png", "gif", "trajectory"), means="what is written besides run.json; [] simulates only",
+        expects="a list of png, gif, trajectory",
+    )
+
+    @property
+    def draws(self) -> bool:
+        """Whether any output is a picture."""
+        return "png" in self.output or "gif" in self.output
+
+    @model_validator(mode="after")
+    def _picture_given(self) -> Scene:
+        if self.draws and self.image is None:
+            raise PydanticCustomError(
+                "image", "a picture is needed to draw png or gif; name one, or set output to [trajectory] or []",
+                {"key": "image"},
+            )
+        return self
