@@ -56,9 +56,10 @@ def problems(scene: Scene) -> Iterator[Problem]:
     frame = 1 / scene.time.frames_per_second
     limit = stable_step(scene)
     if given > limit * (1 + 1e-12):
+        below = frame / math.ceil(frame / limit)
         yield Problem(
             ("time", "step"),
-            f"{given:g} s is above the stability limit {limit:.6g} s; take at most {limit:.3g}, or auto",
+            f"{given:g} s is above the stability limit {limit:.6g} s; try {below:.9g}, or auto",
         )
     elif abs(frame / given - round(frame / given)) > WHOLE * max(1.0, frame / given):
         yield Problem(

@@ -1,0 +1,105 @@
+"""The scene's camera -> one matrix from the sheet to the picture."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from taichi_msm.errors import Problem
+from taichi_msm.scene import Camera, Scene
+
+Array = NDArray[np.float64]
+
+# The oblique preset looks from the near side, 50 degrees above the sheet, through a moderate lens.
+OBLIQUE_DIRECTION = np.array([0.0, -0.64, 0.77])
+OBLIQUE_FOV = 32.0
+OBLIQUE_MARGIN = 1.04
+
+# Nothing nearer to the eye than this fraction of the distance to the target is drawn.
+NEAR = 1e-3
+
+
+class View(NamedTuple):
+    """How points become pixels.
+
+    Attributes:
+        matrix: takes (x, y, z, 1) [m] to (X, Y, w, depth), shape (4, 4): the point is at X / w, Y / w [px], x right
+            and y down from the picture's top-left corner; of two points the one of smaller depth [m] is nearer.
+        toward: unit vector toward the camera, shape (3,); also the direction of the headlight.
+        near: nothing with a w of this or less is drawn [m].
+    """
+
+    matrix: Array
+    toward: Array
+    near: float
+
+
+def view(scene: Scene) -> View:
+    """Set up the scene's camera."""
+    camera = scene.render.camera
+    if camera == "top":
+        return _top(scene)
+    if isinstance(camera, Camera):
+        return _pinhole(camera, scene.render.size)
+    return _pinhole(_oblique(scene), scene.render.size)
+
+
+def problems(scene: Scene) -> Iterator[Problem]:
+    """Say why a pinhole camera sees nothing, if it does."""
+    camera = scene.render.camera
+    if not isinstance(camera, Camera):
+        return
+    sight = np.subtract(camera.eye, camera.target)
+    if not np.linalg.norm(sight) > 0:
+        yield Problem(("render", "camera", "eye"), f"{list(camera.eye)} is also the target; move one of them")
+    elif not np.linalg.norm(np.cross(sight, camera.up)) > 1e-9 * np.linalg.norm(sight) * np.linalg.norm(camera.up):
+        yield Problem(
+            ("render", "camera", "up"),
+            f"{list(camera.up)} is zero or along the line of sight; take a direction across it",
+        )
+
+
+def _top(scene: Scene) -> View:
+    """Look straight down, the rest rectangle fitted into the picture at one scale and centred."""
+    (height, width), (columns, lines) = scene.sheet.size, scene.render.size
+    scale = min(columns / width, lines / height)
+    matrix = np.array(
+        [[scale, 0, 0, columns / 2], [0, -scale, 0, lines / 2], [0, 0, 0, 1], [0, 0, -1, 0]], dtype=float
+    )
+    return View(matrix, np.array([0.0, 0.0, 1.0]), 0.0)
+
+
+def _axes(camera: Camera) -> Array:
+    """Give the camera's unit vectors right, up and toward the eye, as rows, shape (3, 3)."""
+    toward = np.subtract(camera.eye, camera.target)
+    toward = toward / np.linalg.norm(toward)
+    right = np.cross(camera.up, toward)
+    right = right / np.linalg.norm(right)
+    return np.stack([right, np.cross(toward, right), toward])
+
+
+def _pinhole(camera: Camera, size: tuple[int, int]) -> View:
+    """Look from the eye to the target; fov is the angle from the picture's bottom to its top."""
+    columns, lines = size
+    axes = _axes(camera)
+    right, up, depth = axes * np.array([[1.0], [1.0], [-1.0]])
+    eye = np.array(camera.eye)
+    focal = lines / 2 / np.tan(np.radians(camera.fov) / 2)
+    rows = [focal * right + columns / 2 * depth, -focal * up + lines / 2 * depth, depth, depth]
+    matrix = np.array([[*row, -row @ eye] for row in rows])
+    return View(matrix, axes[2], NEAR * float(np.linalg.norm(np.subtract(camera.eye, camera.target))))
+
+
+def _oblique(scene: Scene) -> Camera:
+    """Tilt the camera and move it as near as the whole rest rectangle allows."""
+    (height, width), (columns, lines) = scene.sheet.size, scene.render.size
+    toward = OBLIQUE_DIRECTION / np.linalg.norm(OBLIQUE_DIRECTION)
+    axes = _axes(Camera(eye=tuple(toward), fov=OBLIQUE_FOV))
+    corners = np.array([[x, y, 0.0] for x in (-width / 2, width / 2) for y in (-height / 2, height / 2)]) @ axes.T
+    half_height = np.tan(np.radians(OBLIQUE_FOV) / 2)
+    half = np.array([half_height * columns / lines, half_height])
+    distance = float((corners[:, 2:] + np.abs(corners[:, :2]) / half).max()) * OBLIQUE_MARGIN
+    return Camera(eye=tuple(distance * toward), fov=OBLIQUE_FOV)

@@ -1,0 +1,85 @@
+"""The sheet at rest: where its points are, which of them are fixed, which springs join them."""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from taichi_msm.scene import Scene, Sheet
+
+SIDES = ("top", "bottom", "left", "right")
+
+
+class Spring(NamedTuple):
+    """One of the springs that leave a point.
+
+    Attributes:
+        down: rows from the point to its neighbour, i counted down.
+        right: columns from the point to its neighbour.
+        offset: rest vector from the point to its neighbour [m], x right, y up.
+        length: rest length L0 [m].
+        stiffness: k [N/m].
+    """
+
+    down: int
+    right: int
+    offset: tuple[float, float]
+    length: float
+    stiffness: float
+
+
+def spacing(sheet: Sheet) -> tuple[float, float]:
+    """Give the distance between neighbouring columns and between neighbouring rows [m]."""
+    (rows, cols), (height, width) = sheet.points, sheet.size
+    return width / (cols - 1), height / (rows - 1)
+
+
+def rest_positions(sheet: Sheet) -> NDArray[np.float64]:
+    """Place the points: X_ij = ((j/(cols-1) - 1/2) width, (1/2 - i/(rows-1)) height, 0).
+
+    Returns:
+        Rest positions [m], shape (rows, cols, 3).
+    """
+    (rows, cols), (height, width) = sheet.points, sheet.size
+    position = np.zeros((rows, cols, 3))
+    position[..., 0] = (np.arange(cols) / (cols - 1) - 0.5) * width
+    position[..., 1] = ((0.5 - np.arange(rows) / (rows - 1)) * height)[:, None]
+    return position
+
+
+def fixed_points(sheet: Sheet) -> NDArray[np.bool_]:
+    """Mark the points that never move.
+
+    Returns:
+        True where fixed, shape (rows, cols).
+    """
+    fixed = np.zeros(sheet.points, dtype=bool)
+    if sheet.fixed == "corners":
+        fixed[np.ix_((0, -1), (0, -1))] = True
+        return fixed
+    sides = {"border": SIDES, "none": ()}.get(sheet.fixed, sheet.fixed) if isinstance(sheet.fixed, str) else sheet.fixed
+    fixed[0] |= "top" in sides
+    fixed[-1] |= "bottom" in sides
+    fixed[:, 0] |= "left" in sides
+    fixed[:, -1] |= "right" in sides
+    return fixed
+
+
+def springs(scene: Scene) -> tuple[Spring, ...]:
+    """List the springs from a point to its up to 8 neighbours, without the families of stiffness 0."""
+    dx, dy = spacing(scene.sheet)
+    around = [(down, right) for down in (-1, 0, 1) for right in (-1, 0, 1) if (down, right) != (0, 0)]
+    stencil = (
+        Spring(
+            down,
+            right,
+            (right * dx, -down * dy),
+            math.hypot(right * dx, down * dy),
+            scene.springs.shear if down and right else scene.springs.structural,
+        )
+        for down, right in around
+    )
+    return tuple(spring for spring in stencil if spring.stiffness > 0)

@@ -1,0 +1,167 @@
+"""The probes in time: how hard each presses, where, and whether the virtual springs exist, step by step.
+
+At a jump the value is the mean of its left and right limits, and at t = 0 the right limit; so a Verlet step that
+falls on a release stays of order 2.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from taichi_msm.scene import Probe, Scene, Sheet
+from taichi_msm.stability import steps_per_frame
+
+# A key closer to a step than this fraction of the step is on it: decimal key times meet binary step times.
+SNAP = 1e-6
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Grip:
+    """One probe between two jumps of its control point; a probe that never jumps is one grip.
+
+    Attributes:
+        probe: index of the probe in the scene.
+        times: keys of the control point [s], shape (n,); one key stands still.
+        points: control point at those keys, x and y at rest [m], shape (n, 2).
+        start: the grip holds from here [s] ...
+        end: ... to here [s].
+    """
+
+    probe: int
+    times: Array
+    points: Array
+    start: float = -math.inf
+    end: float = math.inf
+
+    @property
+    def moves(self) -> bool:
+        """Whether the control point moves while the grip holds."""
+        return len(self.times) > 1
+
+
+class Schedule(NamedTuple):
+    """The loads at consecutive steps.
+
+    Attributes:
+        strength: force at the control point before its decay [N], shape (steps, grips, 3).
+        point: control point, x and y at rest [m], shape (steps, grips, 2).
+        active: share of the virtual springs' stiffness, 0, 1 or, where it jumps, 1/2; shape (steps,).
+    """
+
+    strength: Array
+    point: Array
+    active: Array
+
+
+def control_points(probe: Probe, sheet: Sheet) -> tuple[Array, Array]:
+    """Give the keys of a probe's control point: times [s], shape (n,), and points [m], shape (n, 2)."""
+    first = probe.at[0]
+    keys = probe.at if isinstance(first, tuple) else ((0.0, *probe.at),)
+    time, across, down = np.array(keys, dtype=float).T
+    height, width = sheet.size
+    return time, np.stack([(across - 0.5) * width, (0.5 - down) * height], axis=1)
+
+
+def grips(scene: Scene) -> tuple[Grip, ...]:
+    """Cut every probe at the jumps of its control point.
+
+    The force at a jump is the mean of its limits, not the force at the mean of two places; two grips of which one
+    ends where the other begins give just that.
+    """
+    parts = []
+    for index, probe in enumerate(scene.probes):
+        times, points = control_points(probe, scene.sheet)
+        cuts = [n for n in range(1, len(times)) if times[n] == times[n - 1]]
+        for first, last in zip([0, *cuts], [*cuts, len(times)], strict=True):
+            part = Grip(index, times[first:last], points[first:last])
+            if first > 0:
+                part = replace(part, start=float(times[first]))
+            if last < len(times):
+                part = replace(part, end=float(times[last]))
+            parts.append(part)
+    return tuple(parts)
+
+
+def decay(grip: Grip, scene: Scene, rest: Array) -> Array:
+    """Evaluate exp(-falloff d - offset) of a standing grip (eq. 5).
+
+    Args:
+        grip: a grip that does not move.
+        scene: its scene.
+        rest: rest positions [m], shape (rows, cols, 3).
+
+    Returns:
+        Share of the force that each point feels, shape (rows, cols).
+    """
+    probe = scene.probes[grip.probe]
+    distance = np.hypot(rest[..., 0] - grip.points[0, 0], rest[..., 1] - grip.points[0, 1])
+    return np.exp(-probe.falloff * distance - probe.offset)
+
+
+def _between(times: Array, values: Array, t: Array, after: NDArray[np.intp], before: float | Array) -> Array:
+    """Interpolate between the keys after[n] - 1 and after[n]; `before` the first key, the last value after the last."""
+    low = np.clip(after - 1, 0, len(times) - 1)
+    high = np.clip(after, 0, len(times) - 1)
+    span = times[high] - times[low]
+    share = np.divide(t - times[low], span, out=np.zeros_like(t), where=span > 0)
+    shape = (-1,) + (1,) * (values.ndim - 1)
+    value = values[low] + share.reshape(shape) * (values[high] - values[low])
+    return np.where((after == 0).reshape(shape), before, value)
+
+
+def schedule(scene: Scene, first: int, count: int) -> Schedule:
+    """Evaluate the loads at the steps first, ..., first + count - 1.
+
+    The time of step n is n / (frames per second x steps per frame), never a sum of steps.
+    """
+    rate = scene.time.frames_per_second * steps_per_frame(scene)
+    t = np.arange(first, first + count) / rate
+    percent = np.zeros((len(scene.probes), 2, count))
+    pressing = np.zeros((2, count), dtype=bool)
+    for index, probe in enumerate(scene.probes):
+        times, values = np.array(probe.load).T
+        t = _snap(t, times, SNAP / rate)
+        # Not zero between two keys when it is not zero at one of them; afterwards when the last value is not.
+        nonzero = np.concatenate([[False], (values[:-1] != 0) | (values[1:] != 0), [values[-1] != 0]])
+        for side, after in enumerate(_limits(times, t)):
+            percent[index, side] = _between(times, values, t, after, 0.0)
+            pressing[side] |= nonzero[after]
+
+    parts = grips(scene)
+    strength = np.zeros((count, len(parts), 3))
+    point = np.zeros((count, len(parts), 2))
+    for n, part in enumerate(parts):
+        t = _snap(t, np.array([part.start, part.end]), SNAP / rate)
+        left = percent[part.probe, 0] * ((part.start < t) & (t <= part.end))
+        right = percent[part.probe, 1] * ((part.start <= t) & (t < part.end))
+        strength[:, n] = np.multiply.outer(_mean(left, right, t) / 100, scene.probes[part.probe].force)
+        point[:, n] = _between(part.times, part.points, t, _limits(part.times, t)[1], part.points[0])
+    if scene.springs.virtual_active == "always":
+        active = np.ones(count)
+    else:
+        active = _mean(*pressing.astype(float), t)
+    return Schedule(strength, point, active)
+
+
+def _snap(t: Array, keys: Array, tolerance: float) -> Array:
+    """Move every time that is within the tolerance of a key onto the key."""
+    for key in keys[np.isfinite(keys)]:
+        t = np.where(np.abs(t - key) <= tolerance, key, t)
+    return t
+
+
+def _limits(times: Array, t: Array) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+    """Number the first key at or after t (for the left limit) and the first key after t (for the right one)."""
+    return np.searchsorted(times, t, "left"), np.searchsorted(times, t, "right")
+
+
+def _mean(left: Array, right: Array, t: Array) -> Array:
+    """Take the mean of both limits; at t = 0, before which nothing is, the right one."""
+    return np.where(t <= 0, right, (left + right) / 2)

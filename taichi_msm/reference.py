@@ -1,0 +1,275 @@
+"""The model and the picture once more in plain float64 NumPy, slow and obvious: what the kernels are tested against.
+
+Not to be confused with an independent check: it is itself tested against closed forms and SciPy's integrators.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import numpy as np
+from numpy.typing import NDArray
+
+from taichi_msm import look
+from taichi_msm.camera import view
+from taichi_msm.lattice import fixed_points, rest_positions, spacing, springs
+from taichi_msm.loads import Schedule, control_points, decay, grips, schedule
+from taichi_msm.scene import Scene
+from taichi_msm.stability import step, steps_per_frame
+
+Array = NDArray[np.float64]
+
+
+def elastic_force(scene: Scene, displacement: Array) -> Array:
+    """Sum k (L - L0) (Q - P) / L over the neighbours Q of every point P (eq. 2).
+
+    Args:
+        scene: the scene.
+        displacement: x - X [m], shape (rows, cols, 3).
+
+    Returns:
+        Force [N], shape (rows, cols, 3).
+    """
+    rows, cols = scene.sheet.points
+    force = np.zeros_like(displacement)
+    for spring in springs(scene):
+        i = slice(max(0, -spring.down), rows - max(0, spring.down))
+        j = slice(max(0, -spring.right), cols - max(0, spring.right))
+        i_q = slice(max(0, spring.down), rows - max(0, -spring.down))
+        j_q = slice(max(0, spring.right), cols - max(0, -spring.right))
+        between = displacement[i_q, j_q] - displacement[i, j] + np.array([*spring.offset, 0.0])
+        length = np.linalg.norm(between, axis=-1, keepdims=True)
+        pull = np.divide(length - spring.length, length, out=np.zeros_like(length), where=length > 0)
+        force[i, j] += spring.stiffness * pull * between
+    return force
+
+
+def surgical_force(scene: Scene, loads: Schedule, n: int) -> Array:
+    """Sum (percent / 100) force exp(-falloff d - offset) over the probes (eq. 5).
+
+    Args:
+        scene: the scene.
+        loads: its schedule.
+        n: row of the schedule.
+
+    Returns:
+        Force [N], shape (rows, cols, 3).
+    """
+    rest = rest_positions(scene.sheet)
+    force = np.zeros_like(rest)
+    for index, grip in enumerate(grips(scene)):
+        probe = scene.probes[grip.probe]
+        distance = np.linalg.norm(rest[..., :2] - loads.point[n, index], axis=-1)
+        force += np.exp(-probe.falloff * distance - probe.offset)[..., None] * loads.strength[n, index]
+    return force
+
+
+def force(scene: Scene, displacement: Array, loads: Schedule, n: int) -> Array:
+    """Add up all forces but the damping at one step (eq. 1).
+
+    Args:
+        scene: the scene.
+        displacement: x - X [m], shape (rows, cols, 3).
+        loads: its schedule.
+        n: row of the schedule.
+
+    Returns:
+        Force [N], shape (rows, cols, 3).
+    """
+    return (
+        elastic_force(scene, displacement)
+        + surgical_force(scene, loads, n)
+        - loads.active[n] * scene.springs.virtual * displacement
+    )
+
+
+def displacements(scene: Scene) -> Iterator[Array]:
+    """Step the scene by Stoermer-Verlet (eq. 6 to 9) and yield u_0, u_1, ... [m], each of shape (rows, cols, 3)."""
+    h, m, damping = step(scene), scene.sheet.mass, scene.damping
+    moves = ~fixed_points(scene.sheet)[..., None]
+    g = damping / m
+    loads = schedule(scene, 0, scene.time.frames * steps_per_frame(scene))
+
+    previous = np.zeros((*scene.sheet.points, 3))
+    yield previous
+    current = h**2 / 2 * force(scene, previous, loads, 0) / m * moves
+    yield current
+    for n in range(1, len(loads.active)):
+        a = force(scene, current, loads, n) / m
+        if scene.time.damping_difference == "central":
+            following = (2 * current - (1 - g * h / 2) * previous + h**2 * a) / (1 + g * h / 2)
+        else:
+            following = 2 * current - previous + h**2 * a - g * h * (current - previous)
+        previous, current = current, following * moves
+        yield current
+
+
+def simulate(scene: Scene) -> Array:
+    """Run the whole scene.
+
+    Returns:
+        Positions of every frame [m], shape (F + 1, rows, cols, 3).
+    """
+    every = steps_per_frame(scene)
+    frames = [u for n, u in enumerate(displacements(scene)) if n % every == 0]
+    return rest_positions(scene.sheet) + np.array(frames)
+
+
+def refine(values: Array, n: int) -> Array:
+    """Insert n values between neighbours by bilinear interpolation.
+
+    Args:
+        values: values at the mass points, shape (rows, cols, k).
+        n: number of new ones between two.
+
+    Returns:
+        Values at the vertices, shape ((rows - 1)(n + 1) + 1, (cols - 1)(n + 1) + 1, k).
+    """
+    for axis in (0, 1):
+        count = values.shape[axis]
+        place = np.arange((count - 1) * (n + 1) + 1) / (n + 1)
+        low = np.minimum(place.astype(int), count - 2)
+        share = (place - low).reshape((-1, 1, 1) if axis == 0 else (1, -1, 1))
+        values = np.take(values, low, axis) * (1 - share) + np.take(values, low + 1, axis) * share
+    return values
+
+
+def normals(position: Array) -> Array:
+    """Give unit normals from central differences, one-sided ones at the edges.
+
+    Args:
+        position: positions [m], shape (rows, cols, 3).
+
+    Returns:
+        Unit normals, toward the viewer at rest, shape (rows, cols, 3).
+    """
+    right = np.gradient(position, axis=1)
+    up = -np.gradient(position, axis=0)
+    normal = np.cross(right, up)
+    length = np.linalg.norm(normal, axis=-1, keepdims=True)
+    return np.divide(normal, length, out=np.zeros_like(normal), where=length > 0)
+
+
+def sample(texture: NDArray[np.uint8], u: Array, v: Array) -> Array:
+    """Filter the texture bilinearly, clamped at its edge; texel (a, b) has its centre at ((a + 1/2)/w, (b + 1/2)/h).
+
+    Args:
+        texture: colours, shape (height, width, 3).
+        u: 0 at the left edge to 1 at the right one, any shape.
+        v: 0 at the top edge to 1 at the bottom one, the same shape.
+
+    Returns:
+        Colours 0 to 255, shape (*u.shape, 3).
+    """
+    height, width, _ = texture.shape
+    x, y = u * width - 0.5, v * height - 0.5
+    a, b = np.floor(x).astype(int), np.floor(y).astype(int)
+
+    def texel(a: NDArray[np.int_], b: NDArray[np.int_]) -> Array:
+        return texture[np.clip(b, 0, height - 1), np.clip(a, 0, width - 1)].astype(float)
+
+    across, down = (x - a)[..., None], (y - b)[..., None]
+    upper = texel(a, b) * (1 - across) + texel(a + 1, b) * across
+    lower = texel(a, b + 1) * (1 - across) + texel(a + 1, b + 1) * across
+    return upper * (1 - down) + lower * down
+
+
+def weights(triangle: Array, x: Array, y: Array) -> Array:
+    """Give the share of each corner in the point of a triangle that is seen at a pixel; perspective-correct.
+
+    With p the pixel and (X, Y, w) the corners, the point sum b_i (X, Y, w)_i is at p where
+    sum b_i ((X, Y)_i - p w_i) = 0, so b_i is the cross product of the other two such differences.
+
+    Args:
+        triangle: corners (X, Y, w, ...), shape (3, k).
+        x: pixel, right [px], any shape.
+        y: pixel, down [px], the same shape.
+
+    Returns:
+        Weights of sum 1, shape (3, *x.shape); all are 0 or more inside, NaN where the triangle is seen edge-on.
+    """
+    dx = [corner[0] - x * corner[2] for corner in triangle]
+    dy = [corner[1] - y * corner[2] for corner in triangle]
+    cross = np.array([dx[i - 2] * dy[i - 1] - dx[i - 1] * dy[i - 2] for i in range(3)])
+    with np.errstate(divide="ignore", invalid="ignore"):
+        return np.asarray(cross / cross.sum(axis=0))
+
+
+def wire_share(scene: Scene, triangle: Array, x: Array, y: Array) -> Array:
+    """Give the share of the mesh lines in the colour of the pixels of a triangle.
+
+    Args:
+        scene: the scene.
+        triangle: corners (X, Y, w, depth, u, v, ...), shape (3, k).
+        x: pixel, right [px of the supersampled picture], any shape.
+        y: pixel, down, the same shape.
+
+    Returns:
+        Share 0 to 1, the shape of x.
+    """
+    rows, cols = scene.sheet.points
+
+    def mesh(x: Array, y: Array) -> Array:
+        u, v = np.tensordot(triangle[:, 4:6].T, weights(triangle, x, y), 1)
+        return np.array([u * (cols - 1), v * (rows - 1)])
+
+    here = mesh(x, y)
+    slope = np.hypot(mesh(x + 1, y) - here, mesh(x, y + 1) - here)
+    distance = np.abs(here - np.round(here)) / np.maximum(slope, 1e-12)
+    half = look.WIRE_WIDTH / 2 * scene.render.supersample
+    return np.asarray(look.WIRE_OPACITY * np.clip(half + 0.5 - distance.min(axis=0), 0, 1))
+
+
+def draw(scene: Scene, position: Array, texture: NDArray[np.uint8]) -> NDArray[np.uint8]:
+    """Draw one frame: refine, project, and of every pixel keep the nearest triangle.
+
+    Args:
+        scene: the scene.
+        position: positions of the mass points [m], shape (rows, cols, 3).
+        texture: the picture on the sheet, shape (height, width, 3).
+
+    Returns:
+        Colours, shape (height, width, 3).
+    """
+    rows, cols = scene.sheet.points
+    factor = scene.render.supersample
+    width, height = (size * factor for size in scene.render.size)
+    camera = view(scene)
+    matrix = camera.matrix * np.array([[factor], [factor], [1], [1]])
+
+    projected = np.concatenate([position, np.ones((rows, cols, 1))], axis=-1) @ matrix.T
+    u, v = np.meshgrid(np.arange(cols) / (cols - 1), np.arange(rows) / (rows - 1))
+    surface = refine(np.concatenate([projected, u[..., None], v[..., None]], axis=-1), scene.render.refine)
+    normal = refine(normals(position), scene.render.refine)
+    light = np.ones(normal.shape[:2])
+    if scene.render.shading == "headlight":
+        light = np.abs(normal @ camera.toward) / np.maximum(np.linalg.norm(normal, axis=-1), 1e-30)
+    vertex = np.concatenate([surface, light[..., None]], axis=-1)
+
+    colour = np.empty((height, width, 3))
+    colour[:] = scene.render.background
+    nearest = np.full((height, width), np.inf)
+    for r, c in np.ndindex(vertex.shape[0] - 1, vertex.shape[1] - 1):
+        corners = vertex[r, c], vertex[r + 1, c], vertex[r + 1, c + 1], vertex[r, c + 1]
+        for triangle in (np.array(corners[:3]), np.array([corners[0], *corners[2:]])):
+            if (triangle[:, 2] > camera.near).all():
+                corner = triangle[:, :2] / triangle[:, 2:3] - 0.5
+                left, top = np.maximum(np.floor(corner.min(axis=0)), 0).astype(int)
+                right, bottom = np.minimum(np.ceil(corner.max(axis=0)), [width - 1, height - 1]).astype(int)
+            else:
+                left, top, right, bottom = 0, 0, width - 1, height - 1
+            if right < left or bottom < top:
+                continue
+            box = np.s_[top : bottom + 1, left : right + 1]
+            y, x = np.mgrid[box].astype(float) + 0.5
+            share = weights(triangle, x, y)
+            w, depth, u, v, light = np.tensordot(triangle[:, 2:].T, share, 1)
+            seen = (share >= -1e-12).all(axis=0) & (w > camera.near) & (depth < nearest[box])
+            nearest[box][seen] = depth[seen]
+            lit = sample(texture, np.where(seen, u, 0), np.where(seen, v, 0)) * light[..., None]
+            if scene.render.wireframe:
+                wire = wire_share(scene, triangle, x, y)[..., None]
+                lit = lit * (1 - wire) + np.array(look.WIRE_COLOUR) * wire
+            colour[box][seen] = lit[seen]
+    colour = colour.reshape(height // factor, factor, width // factor, factor, 3).mean(axis=(1, 3))
+    return np.floor(colour + 0.5).astype(np.uint8)

@@ -1,0 +1,83 @@
+"""The only place that imports and starts Taichi."""
+
+from __future__ import annotations
+
+import contextlib
+import io
+import os
+from dataclasses import dataclass
+from pathlib import Path
+
+from taichi_msm.errors import DeviceError
+
+# No banner on stdout, which may be JSON, and no call home.
+os.environ.setdefault("ENABLE_TAICHI_HEADER_PRINT", "0")
+os.environ.setdefault("TI_SKIP_VERSION_CHECK", "ON")
+
+import taichi as ti
+
+ARCHS = ("cpu", "cuda")
+
+
+@dataclass(frozen=True)
+class Device:
+    """Where kernels run.
+
+    Attributes:
+        arch: cpu or cuda.
+        threads: number of CPU threads.
+    """
+
+    arch: str
+    threads: int
+
+
+_device: Device | None = None
+
+
+def available_threads() -> int:
+    """Count the cores this process may use: its affinity, and the quota of its control group."""
+    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    with contextlib.suppress(OSError, ValueError):
+        quota, period = Path("/sys/fs/cgroup/cpu.max").read_text().split()
+        cores = min(cores, max(1, int(quota) // int(period)))
+    return cores
+
+
+def start(arch: str = "cpu", threads: int | None = None) -> Device:
+    """Start Taichi, once in a process.
+
+    Args:
+        arch: cpu or cuda.
+        threads: number of CPU threads; None takes every core.
+
+    Raises:
+        DeviceError: when the arch is not supported or not there, or Taichi already runs otherwise.
+    """
+    global _device
+    if arch not in ARCHS:
+        raise DeviceError(f"--arch {arch}: not supported; take one of: {', '.join(ARCHS)}")
+    wanted = Device(arch, available_threads() if threads is None else threads)
+    if _device is None:
+        _initialise(wanted)
+        _device = wanted
+    elif wanted != _device:
+        raise DeviceError(
+            f"Taichi already runs on {_device.arch} with {_device.threads} threads in this process; "
+            f"start another process for {wanted.arch} with {wanted.threads}"
+        )
+    return _device
+
+
+def _initialise(device: Device) -> None:
+    try:
+        # Taichi prints the arch and, where a driver is missing, its search for it.
+        with contextlib.redirect_stdout(io.StringIO()):
+            ti.init(
+                arch=getattr(ti, device.arch),
+                cpu_max_num_threads=device.threads,
+                enable_fallback=False,
+                log_level=ti.ERROR,
+            )
+    except Exception as error:
+        raise DeviceError(f"--arch {device.arch}: not available on this machine; take --arch cpu") from error
