@@ -141,6 +141,11 @@ class Dynamics:
             self.steps_done += count
             self.launches += 1
 
+    def compile(self) -> None:
+        """Compile the step and the read-out without moving anything."""
+        self._advance(0, 0, *self._arguments, self._table(1))
+        self.displacement()
+
     def displacement(self) -> NDArray[Any]:
         """Read the displacements.
 

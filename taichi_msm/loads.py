@@ -16,8 +16,9 @@ from numpy.typing import NDArray
 from taichi_msm.scene import Probe, Scene, Sheet
 from taichi_msm.stability import steps_per_frame
 
-# A key closer to a step than this fraction of the step is on it: decimal key times meet binary step times.
-SNAP = 1e-6
+# A key is on a step when their times differ by no more than rounding, as a fraction of the time: decimal key times
+# meet binary step times.
+SNAP = 1e-13
 
 Array = NDArray[np.float64]
 
@@ -127,7 +128,7 @@ def schedule(scene: Scene, first: int, count: int) -> Schedule:
     pressing = np.zeros((2, count), dtype=bool)
     for index, probe in enumerate(scene.probes):
         times, values = np.array(probe.load).T
-        t = _snap(t, times, SNAP / rate)
+        t = _snap(t, times)
         # Not zero between two keys when it is not zero at one of them; afterwards when the last value is not.
         nonzero = np.concatenate([[False], (values[:-1] != 0) | (values[1:] != 0), [values[-1] != 0]])
         for side, after in enumerate(_limits(times, t)):
@@ -138,7 +139,7 @@ def schedule(scene: Scene, first: int, count: int) -> Schedule:
     strength = np.zeros((count, len(parts), 3))
     point = np.zeros((count, len(parts), 2))
     for n, part in enumerate(parts):
-        t = _snap(t, np.array([part.start, part.end]), SNAP / rate)
+        t = _snap(t, np.array([part.start, part.end]))
         left = percent[part.probe, 0] * ((part.start < t) & (t <= part.end))
         right = percent[part.probe, 1] * ((part.start <= t) & (t < part.end))
         strength[:, n] = np.multiply.outer(_mean(left, right, t) / 100, scene.probes[part.probe].force)
@@ -150,10 +151,10 @@ def schedule(scene: Scene, first: int, count: int) -> Schedule:
     return Schedule(strength, point, active)
 
 
-def _snap(t: Array, keys: Array, tolerance: float) -> Array:
-    """Move every time that is within the tolerance of a key onto the key."""
+def _snap(t: Array, keys: Array) -> Array:
+    """Move every time that is on a key but for rounding onto the key."""
     for key in keys[np.isfinite(keys)]:
-        t = np.where(np.abs(t - key) <= tolerance, key, t)
+        t = np.where(np.abs(t - key) <= SNAP * abs(key), key, t)
     return t
 
 

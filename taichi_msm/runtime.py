@@ -71,12 +71,14 @@ def start(arch: str = "cpu", threads: int | None = None) -> Device:
 
 def _initialise(device: Device) -> None:
     try:
-        # Taichi prints the arch and, where a driver is missing, its search for it.
+        # Taichi prints the arch and, where a driver is missing, its search for it. Without fast_math every operation
+        # rounds as IEEE 754 says, so that the bits of a result do not depend on threads, lanes or the compiler's mood.
         with contextlib.redirect_stdout(io.StringIO()):
             ti.init(
                 arch=getattr(ti, device.arch),
                 cpu_max_num_threads=device.threads,
                 enable_fallback=False,
+                fast_math=False,
                 log_level=ti.ERROR,
             )
     except Exception as error:

@@ -1,0 +1,79 @@
+"""Scenes for tests."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from taichi_msm.scene import Scene
+
+SHEET = {"points": [9, 11], "size": [0.3, 0.4], "mass": 1e-3}
+SPRINGS = {"structural": 20, "shear": 10, "virtual": 0.5}
+PRESS = {"force": [0, 3000, -10000], "load": [[0, 0], [0.1, 100], [0.2, 100], [0.2, 0]], "falloff": 20}
+
+
+def scene(**sections: Any) -> Scene:
+    """A small scene in f64 that simulates only; sections given replace its own, keys of time are added."""
+    return Scene.model_validate(
+        {
+            "sheet": SHEET,
+            "springs": SPRINGS,
+            "damping": 0.01,
+            "probes": [PRESS],
+            "output": [],
+            **sections,
+            "time": {"duration": 0.4, "precision": "f64", **sections.get("time", {})},
+        }
+    )
+
+
+def random_scene(seed: int, precision: str = "f64") -> Scene:
+    """A random scene of few points that uses every term of the model in some seed."""
+    rng = np.random.default_rng(seed)
+
+    def some(low: float, high: float) -> float:
+        return float(rng.uniform(low, high))
+
+    def keys(count: int, *ranges: tuple[float, float]) -> list[list[float]]:
+        times = np.sort(rng.choice(40, count, replace=False)) / 100
+        return [[float(t), *(some(*limits) for limits in ranges)] for t in times]
+
+    def probe() -> dict[str, Any]:
+        load = keys(4, (-100, 100))
+        load[2][0] = load[1][0]
+        across = keys(3, (0, 1), (0, 1)) if rng.random() < 0.5 else [some(0, 1), some(0, 1)]
+        if rng.random() < 0.3 and isinstance(across[0], list):
+            across[2][0] = across[1][0]
+        force = [some(-3, 3) for _ in range(3)]
+        return {"at": across, "force": force, "load": load, "falloff": some(0, 30), "offset": 2}
+
+    sides = ["top", "bottom", "left", "right"]
+    fixed = [side for side in sides if rng.random() < 0.4]
+    return scene(
+        sheet={
+            "points": [int(rng.integers(2, 14)), int(rng.integers(2, 23))],
+            "size": [some(0.2, 0.5), some(0.2, 0.5)],
+            "mass": some(1e-3, 3e-3),
+            "fixed": ["border", "corners", "none", fixed][rng.integers(4)],
+        },
+        springs={
+            "structural": some(20, 40) if rng.random() < 0.9 else 0,
+            "shear": some(10, 30) if rng.random() < 0.8 else 0,
+            "virtual": some(1, 30) if rng.random() < 0.7 else 0,
+            "virtual_active": ["loaded", "always"][rng.integers(2)],
+        },
+        damping=some(0.01, 0.1) if rng.random() < 0.8 else 0,
+        probes=[probe() for _ in range(rng.integers(0, 4))],
+        time={
+            "duration": 0.4,
+            "precision": precision,
+            "damping_difference": ["central", "backward"][rng.integers(2)],
+        },
+    )
+
+
+def speckle(height: int, width: int, seed: int = 0) -> NDArray[np.uint8]:
+    """A picture of random texels, the hardest to draw right."""
+    return np.random.default_rng(seed).integers(0, 256, (height, width, 3), dtype=np.uint8)

@@ -1,0 +1,202 @@
+"""Kernel 1 against its twin, and against what must hold of any integrator of this sheet."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from taichi_msm import reference
+from taichi_msm.dynamics import GPU_STEPS_PER_LAUNCH, LANES, POINTS_PER_WORKER, Dynamics, Structure, structure
+from taichi_msm.lattice import rest_positions
+from taichi_msm.runtime import Device
+from taichi_msm.scene import Scene
+from taichi_msm.stability import stable_step, step, steps_per_frame
+from tests.scenes import PRESS, SHEET, SPRINGS, random_scene, scene
+
+ROUNDING = {"f32": 2.0**-24, "f64": 2.0**-53}
+
+
+def simulate(made: Scene, device: Device, layout: Structure | None = None) -> NDArray[Any]:
+    """Displacements of every frame, shape (F + 1, rows, cols, 3)."""
+    dynamics = Dynamics(made, device, layout)
+    frames = [dynamics.displacement()]
+    for _ in range(made.time.frames):
+        dynamics.advance(steps_per_frame(made))
+        frames.append(dynamics.displacement())
+    dynamics.close()
+    return np.array(frames)
+
+
+def assert_like_twin(made: Scene, device: Device, layout: Structure | None = None) -> None:
+    twin = reference.simulate(made) - rest_positions(made.sheet)
+    # A rounding of a step, of the size of a rest length, is amplified by at most the number of steps squared;
+    # in practice by far less. Chaos is kept away by small displacements and few steps.
+    largest = max(np.abs(twin).max(), 1e-3 * max(made.sheet.size))
+    steps = made.time.frames * steps_per_frame(made)
+    tolerance = ROUNDING[made.time.precision] * steps**1.5 * largest
+    np.testing.assert_allclose(simulate(made, device, layout), twin, rtol=0, atol=tolerance)
+
+
+@pytest.mark.parametrize("precision", ["f32", "f64"])
+@pytest.mark.parametrize("seed", range(8))
+def test_random_scene_is_like_the_twin(seed: int, precision: str, device: Device) -> None:
+    assert_like_twin(random_scene(seed, precision), device)
+
+
+@pytest.mark.parametrize("points", [[2, 2], [2, 9], [9, 2], [3, 8], [4, 17]])
+@pytest.mark.parametrize("fixed", ["border", "corners", "none", ["top"], ["left", "bottom"]])
+def test_small_sheets_and_fixed_sides(points: list[int], fixed: Any, device: Device) -> None:
+    sheet = {**SHEET, "points": points, "fixed": fixed}
+    assert_like_twin(scene(sheet=sheet, probes=[{"force": [1, 2, 30], "falloff": 3, "offset": 6}]), device)
+
+
+def test_the_plain_layout_of_a_gpu_gives_the_same(device: Device) -> None:
+    made = scene(probes=[PRESS], time={"duration": 0.08})
+    layout = replace(structure(made, device), lanes=1, workers=0)
+    assert steps_per_frame(made) % GPU_STEPS_PER_LAUNCH != 0, "a launch that is not full is part of the test"
+    assert_like_twin(made, device, layout)
+
+
+def test_bands_of_rows_give_the_same_bits(device: Device) -> None:
+    made = scene(sheet={**SHEET, "points": [21, 19], "fixed": ["top"]}, time={"precision": "f32"})
+    whole = structure(made, device)
+    assert whole.workers == 1
+    one, two = (simulate(made, device, replace(whole, workers=workers)) for workers in (1, 2))
+    assert one.tobytes() == two.tobytes()
+
+
+def test_lanes_do_not_change_the_bits(device: Device) -> None:
+    made = scene(sheet={**SHEET, "points": [7, 13]}, time={"precision": "f32"})
+    whole = structure(made, device)
+    eight, two = (simulate(made, device, replace(whole, lanes=lanes)) for lanes in (8, 2))
+    assert eight.tobytes() == two.tobytes()
+
+
+def test_large_sheets_are_cut_into_bands(device: Device) -> None:
+    side = int(np.sqrt(2 * POINTS_PER_WORKER)) + 1
+    for count, workers in ((side, 2), (side // 2, 1)):
+        made = scene(sheet={**SHEET, "points": [count, count]}, time={"duration": 0.04})
+        assert structure(made, device).workers == workers
+        assert_like_twin(made, device)
+
+
+def test_a_frame_of_a_small_sheet_is_one_launch(device: Device) -> None:
+    made = scene(sheet={**SHEET, "points": [31, 31]})
+    dynamics = Dynamics(made, device)
+    dynamics.advance(steps_per_frame(made))
+    assert steps_per_frame(made) > 1
+    assert dynamics.launches == 1
+    dynamics.close()
+
+
+def test_absent_terms_are_left_out(device: Device) -> None:
+    bare = structure(scene(springs={"structural": 1}, probes=[]), device)
+    assert bare.neighbours == ((-1, 0), (0, -1), (0, 1), (1, 0))
+    assert (bare.virtual, bare.open_edges, bare.grips) == (False, False, ())
+    assert not structure(scene(probes=[]), device).virtual, "loaded, but nothing ever loads"
+    assert structure(scene(), device).virtual
+    assert structure(scene(), device).lanes == LANES["f64"]
+
+
+def test_nothing_moves_without_a_load(device: Device) -> None:
+    assert not simulate(scene(probes=[], sheet={**SHEET, "fixed": "none"}), device).any()
+
+
+def test_fixed_points_stay_exactly(device: Device) -> None:
+    u = simulate(scene(time={"precision": "f32"}), device)
+    assert not u[:, [0, -1]].any()
+    assert not u[:, :, [0, -1]].any()
+    assert u[:, 1:-1, 1:-1].any()
+
+
+def test_energy_does_not_drift(device: Device) -> None:
+    # Undamped, unloaded after a release: the energy of the scheme oscillates with (w h)^2 and has no trend.
+    made = scene(
+        damping=0,
+        springs={**SPRINGS, "virtual_active": "always"},
+        probes=[{"force": [0, 0, -300], "load": [[0, 0], [0.04, 100], [0.04, 0]], "falloff": 20}],
+        time={"duration": 24.0},
+    )
+    h, steps = step(made), steps_per_frame(made)
+    assert made.time.frames * steps > 1e4
+    dynamics = Dynamics(made, device)
+    energies = []
+    for _ in range(made.time.frames):
+        dynamics.advance(steps - 1)
+        before = dynamics.displacement()
+        dynamics.advance(1)
+        after = dynamics.displacement()
+        energies.append(energy(made, (before + after) / 2, (after - before) / h))
+    dynamics.close()
+    late = np.array(energies[10:])
+    trend = np.polyfit(np.linspace(-0.5, 0.5, len(late)), late, 1)[0]
+    # (w h)^2 / 8 = 1/8 of the energy of the highest mode is in the oscillation; the press excites low modes.
+    assert late.std() < 0.02 * late.mean()
+    assert abs(trend) < 1e-3 * late.mean()
+
+
+def energy(made: Scene, u: NDArray[Any], v: NDArray[Any]) -> float:
+    """Kinetic and potential energy [J] at the middle of a step."""
+    from taichi_msm.lattice import springs
+
+    rows, cols = made.sheet.points
+    total = 0.5 * made.sheet.mass * (v**2).sum() + 0.5 * made.springs.virtual * (u**2).sum()
+    x = u + rest_positions(made.sheet)
+    for spring in springs(made):
+        if (spring.down, spring.right) > (0, 0):
+            left = max(0, -spring.right)
+            p = x[: rows - spring.down, left : cols - max(0, spring.right)]
+            q = x[spring.down :, left + spring.right : cols - max(0, spring.right) + spring.right]
+            stretch = np.linalg.norm(q - p, axis=-1) - spring.length
+            total += 0.5 * spring.stiffness * (stretch**2).sum()
+    return float(total)
+
+
+@pytest.mark.parametrize("difference", ["central", "backward"])
+def test_just_under_the_limit_stays_bounded(difference: str, device: Device) -> None:
+    coarse = scene(time={"duration": 1, "damping_difference": difference})
+    # The largest step below the limit that cuts a frame of its own rate into one.
+    rate = 1 / (0.99 * stable_step(coarse))
+    frames = 100
+    made = scene(
+        probes=[{"force": [0, 0, -1000], "falloff": 20}],
+        time={
+            "duration": frames / rate * 1000,
+            "frames_per_second": rate / 1000,
+            "step": 1 / rate,
+            "damping_difference": difference,
+        },
+    )
+    dynamics = Dynamics(made, device)
+    for _ in range(frames):
+        dynamics.advance(1000)
+        largest = np.abs(dynamics.displacement()).max()
+        assert largest < max(made.sheet.size), "bounded by the sheet, over 10^5 steps"
+    dynamics.close()
+
+
+def mirrored(at: list[float], force: list[float]) -> dict[str, Any]:
+    return {"at": at, "force": force, "load": [[0, 100]], "falloff": 10, "offset": 5}
+
+
+def test_symmetries(device: Device) -> None:
+    def motion(size: list[float], at: list[float], force: list[float], points: list[int]) -> NDArray[Any]:
+        return simulate(
+            scene(sheet={**SHEET, "points": points, "size": size, "fixed": "none"}, probes=[mirrored(at, force)]), device
+        )
+
+    plain = motion([0.3, 0.4], [0.3, 0.2], [1, 2, -3], [9, 11])
+    scale = 1e-9 * np.abs(plain).max()
+    # Mirror left and right: x changes sign.
+    mirror = motion([0.3, 0.4], [0.7, 0.2], [-1, 2, -3], [9, 11])
+    np.testing.assert_allclose(mirror[:, :, ::-1] * [-1, 1, 1], plain, atol=scale)
+    # Transpose: rows become columns; right becomes down, that is x becomes -y and y becomes -x.
+    transpose = motion([0.4, 0.3], [0.2, 0.3], [-2, -1, -3], [11, 9])
+    np.testing.assert_allclose(-transpose.swapaxes(1, 2)[..., [1, 0, 2]] * [1, 1, -1], plain, atol=scale)
+    # A quarter turn counter-clockwise: the top right corner goes to the top left one; (x, y) becomes (-y, x).
+    turned = motion([0.4, 0.3], [0.2, 0.7], [-2, 1, -3], [11, 9])
+    np.testing.assert_allclose(np.rot90(turned, -1, (1, 2))[..., [1, 0, 2]] * [1, -1, 1], plain, atol=scale)

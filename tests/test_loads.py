@@ -1,0 +1,95 @@
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+
+from taichi_msm.loads import grips, schedule
+from tests.scenes import SHEET, SPRINGS, scene
+
+# 25 frames a second in 4 steps of 0.01 s.
+STEPS = {"duration": 1.0, "step": 0.01}
+SOFT = {**SPRINGS, "structural": 0.1, "shear": 0.1, "virtual": 0.1}
+
+
+def percent(load: list[list[float]], **changes: Any) -> list[float]:
+    """Percent at the steps 0 to 5, that is at 0 s to 0.05 s."""
+    made = scene(springs=SOFT, probes=[{"force": [100, 0, 0], "load": load}], time=STEPS, **changes)
+    return [round(float(value), 9) for value in schedule(made, 0, 6).strength[:, 0, 0]]
+
+
+@pytest.mark.parametrize(
+    ("load", "expected"),
+    [
+        ([[0, 0], [0.04, 100]], [0, 25, 50, 75, 100, 100]),
+        ([[0, 100]], [100, 100, 100, 100, 100, 100]),
+        ([[0.02, 100]], [0, 0, 50, 100, 100, 100]),
+        ([[0, 0], [0.02, 100], [0.02, 0]], [0, 50, 50, 0, 0, 0]),
+        ([[0, 0], [0, 100]], [100, 100, 100, 100, 100, 100]),
+        ([[0, -80], [0.04, 80]], [-80, -40, 0, 40, 80, 80]),
+        # 0.03 is no binary fraction: the step that meets it is the one a person means.
+        ([[0, 0], [0.03, 0], [0.03, 100]], [0, 0, 0, 50, 100, 100]),
+        # Keys 1 ns apart are a ramp, not a jump: at the first of them its own value counts.
+        ([[0, 0], [0.02, 0], [0.020000001, 100]], [0, 0, 0, 100, 100, 100]),
+    ],
+)
+def test_percent(load: list[list[float]], expected: list[float]) -> None:
+    assert percent(load) == expected
+
+
+@pytest.mark.parametrize(
+    ("loads", "expected"),
+    [
+        # A jump of the activity, though the percent has none.
+        ([[[0.01, 0], [0.03, 100], [0.04, 0]]], [0, 0.5, 1, 1, 0.5, 0]),
+        # A percent that only crosses 0 keeps the springs.
+        ([[[0, -50], [0.04, 50]]], [1, 1, 1, 1, 1, 1]),
+        ([[[0, 0], [0.02, 0], [0.02, 100]]], [0, 0, 0.5, 1, 1, 1]),
+        # Any probe is enough, and one that takes over from another leaves no gap.
+        ([[[0, 100], [0.02, 100], [0.02, 0]], [[0.02, 0], [0.02, 100]]], [1, 1, 1, 1, 1, 1]),
+        ([[[0, 0]]], [0, 0, 0, 0, 0, 0]),
+    ],
+)
+def test_virtual_springs_while_loaded(loads: list[list[list[float]]], expected: list[float]) -> None:
+    probes = [{"force": [0, 0, 1], "load": load} for load in loads]
+    made = scene(springs=SOFT, probes=probes, time=STEPS)
+    assert schedule(made, 0, 6).active.tolist() == expected
+
+
+def test_virtual_springs_always() -> None:
+    made = scene(springs={**SOFT, "virtual_active": "always"}, probes=[], time=STEPS)
+    assert schedule(made, 0, 3).active.tolist() == [1, 1, 1]
+
+
+def test_a_schedule_does_not_depend_on_where_it_is_cut() -> None:
+    made = scene(springs=SOFT, time=STEPS)
+    whole = schedule(made, 0, 40)
+    for cut in (1, 17, 20, 21):
+        halves = schedule(made, 0, cut), schedule(made, cut, 40 - cut)
+        for n in range(3):
+            np.testing.assert_array_equal(np.concatenate([half[n] for half in halves]), whole[n])
+
+
+def test_a_control_point_moves_between_its_keys_and_is_held_outside() -> None:
+    keys = [[0.01, 0, 0], [0.03, 1, 0.5]]
+    made = scene(springs=SOFT, probes=[{"force": [0, 0, 1], "at": keys}], time=STEPS)
+    point = schedule(made, 0, 6).point[:, 0]
+    # The sheet is 0.4 m wide and 0.3 m high, its centre the origin, y up.
+    expected = [[-0.2, 0.15], [-0.2, 0.15], [0, 0.075], [0.2, 0], [0.2, 0], [0.2, 0]]
+    np.testing.assert_allclose(point, expected, atol=1e-15)
+
+
+def test_a_jump_of_the_control_point_shares_the_force_between_both_places() -> None:
+    keys = [[0, 0, 0], [0.02, 0, 0], [0.02, 1, 1]]
+    probe = {"force": [0, 0, 8], "at": keys, "load": [[0, 100], [0.02, 100], [0.02, 50]]}
+    made = scene(springs=SOFT, probes=[probe], time=STEPS)
+    assert [grip.moves for grip in grips(made)] == [True, False]
+    strength = schedule(made, 0, 5).strength[..., 2]
+    np.testing.assert_allclose(strength.T, [[8, 8, 4, 0, 0], [0, 0, 2, 4, 4]])
+    point = schedule(made, 0, 5).point
+    np.testing.assert_allclose(point[2], [[-0.2, 0.15], [0.2, -0.15]])
+
+
+def test_the_sheet_of_these_tests() -> None:
+    assert SHEET["size"] == [0.3, 0.4]

@@ -1,0 +1,110 @@
+"""The twin against closed forms and against SciPy."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+from scipy.integrate import solve_ivp
+
+from taichi_msm import reference
+from taichi_msm.lattice import fixed_points, rest_positions
+from taichi_msm.loads import schedule
+from taichi_msm.stability import step, steps_per_frame
+from tests.scenes import scene
+
+# A 2 x 2 sheet without springs but virtual ones: four independent oscillators.
+ALONE = {
+    "sheet": {"points": [2, 2], "size": [1, 1], "mass": 2.0, "fixed": "none"},
+    "springs": {"virtual": 50.0, "virtual_active": "always"},
+    "probes": [{"force": [0, 0, 3.0], "falloff": 0, "offset": 0}],
+}
+
+
+def discrete(n: NDArray[np.int_], h: float, w: float, g: float, rest: float) -> NDArray[np.float64]:
+    """Solve (1 + gh/2) u_{n+1} = (2 - w^2 h^2) u_n - (1 - gh/2) u_{n-1} + w^2 h^2 rest by its two roots."""
+    a, b, c = 1 + g * h / 2, -(2 - (w * h) ** 2), 1 - g * h / 2
+    root = np.roots([a, b, c]).astype(complex)
+    # u_n - rest = p r_0^n + q r_1^n from u_0 = 0 and u_1 = h^2 a_0 / 2 = (w h)^2 rest / 2.
+    p, q = np.linalg.solve(np.array([[1, 1], root]), np.array([-rest, (w * h) ** 2 * rest / 2 - rest]))
+    return np.asarray((rest + p * root[0] ** n + q * root[1] ** n).real)
+
+
+@pytest.mark.parametrize("damping", [0.0, 4.0])
+def test_one_oscillator_follows_the_discrete_solution(damping: float) -> None:
+    made = scene(**ALONE, damping=damping, time={"duration": 4.0, "step": 0.02})
+    z = np.array([u[0, 0, 2] for u in reference.displacements(made)])
+    exact = discrete(np.arange(len(z)), 0.02, 5.0, damping / 2.0, 3.0 / 50.0)
+    # 200 steps, each of which rounds numbers of at most 0.12.
+    np.testing.assert_allclose(z, exact, rtol=0, atol=200**2 * 1.2e-17)
+
+
+def test_undamped_oscillator_has_the_frequency_of_the_scheme() -> None:
+    made = scene(**ALONE, damping=0, time={"duration": 4.0, "step": 0.04})
+    z = np.array([u[0, 0, 2] for u in reference.displacements(made)]) - 3.0 / 50.0
+    # sin(theta / 2) = w h / 2; and u_0 is an extremum, so the motion is a cosine.
+    theta = 2 * np.arcsin(5.0 * 0.04 / 2)
+    np.testing.assert_allclose(z, -3.0 / 50.0 * np.cos(theta * np.arange(len(z))), atol=1e-14)
+
+
+def test_backward_damping_is_the_literal_recurrence() -> None:
+    made = scene(**ALONE, damping=4.0, time={"duration": 0.4, "step": 0.02, "damping_difference": "backward"})
+    u = [0.0, 0.02**2 * 3.0 / 2.0 / 2]
+    for _ in range(19):
+        u.append(2 * u[-1] - u[-2] + 0.02**2 * (3.0 - 50.0 * u[-1]) / 2.0 - 2.0 * 0.02 * (u[-1] - u[-2]))
+    z = [v[0, 0, 2] for v in reference.displacements(made)]
+    np.testing.assert_allclose(z, u, atol=1e-16)
+
+
+def test_static_balance_of_virtual_springs_and_force() -> None:
+    # Overdamped (g = 20 > 2 w = 10): the slow mode decays as exp(-1.34 t), to 1e-11 of itself after 20 s.
+    made = scene(**ALONE, damping=40.0, time={"duration": 20.0})
+    *_, last = reference.displacements(made)
+    np.testing.assert_allclose(last[..., 2], 3.0 / 50.0, rtol=1e-10)
+    assert np.abs(last[..., :2]).max() == 0
+
+
+def test_a_single_stretched_spring_pulls_with_hookes_force() -> None:
+    made = scene(sheet={"points": [2, 2], "size": [1, 2], "mass": 1}, springs={"structural": 7.0}, probes=[])
+    u = np.zeros((2, 2, 3))
+    u[0, 1] = [0.5, 0, 0]
+    force = reference.elastic_force(made, u)
+    # Along the top edge the spring of length 2 is 0.5 longer; the right edge of length 1 is now sqrt(1.25) long.
+    pull = 7.0 * (np.sqrt(1.25) - 1) / np.sqrt(1.25)
+    np.testing.assert_allclose(force[0, 0], [3.5, 0, 0], atol=1e-15)
+    np.testing.assert_allclose(force[1, 1], pull * np.array([0.5, 1, 0]), atol=1e-15)
+    np.testing.assert_allclose(force[0, 1], [-3.5 - pull * 0.5, -pull, 0], atol=1e-15)
+    np.testing.assert_allclose(force.sum(axis=(0, 1)), 0, atol=1e-15)
+
+
+def test_a_spring_without_length_has_no_force() -> None:
+    made = scene(sheet={"points": [2, 2], "size": [1, 1], "mass": 1}, springs={"structural": 7.0}, probes=[])
+    u = np.zeros((2, 2, 3))
+    u[:, 1, 0] = -1.0
+    force = reference.elastic_force(made, u)
+    assert np.isfinite(force).all()
+    np.testing.assert_allclose(force, 0, atol=1e-15)
+
+
+def test_agrees_with_dop853() -> None:
+    made = scene(probes=[{"force": [0, 300, -1000], "load": [[0, 0], [0.4, 100]], "falloff": 20}])
+    rest, moves = rest_positions(made.sheet), ~fixed_points(made.sheet)[..., None]
+    full = schedule(made, made.time.frames * steps_per_frame(made), 1)
+
+    def motion(t: float, y: NDArray[np.float64]) -> NDArray[np.float64]:
+        u, v = y.reshape(2, *rest.shape)
+        surgical = reference.surgical_force(made, full, 0) * t / 0.4
+        force = reference.elastic_force(made, u) + surgical - 0.5 * u - made.damping * v
+        return np.stack([v, force / made.sheet.mass * moves]).ravel()
+
+    solved = solve_ivp(motion, (0, 0.4), np.zeros(2 * rest.size), "DOP853", rtol=1e-9, atol=1e-12)
+    exact = solved.y[:, -1].reshape(2, *rest.shape)[0]
+    errors = []
+    for halvings in (3, 4):
+        fine = made.model_copy(update={"time": made.time.model_copy(update={"step": step(made) / 2**halvings})})
+        *_, last = reference.displacements(fine)
+        errors.append(np.abs(last - exact).max())
+    # Of order 2, so the finer one is wrong by a third of the difference of both; the integrator by far less.
+    assert 3.8 < errors[0] / errors[1] < 4.2
+    assert errors[1] < 1e-3 * np.abs(exact).max()
+    assert np.abs(exact).max() > 0.01
