@@ -15,8 +15,16 @@ MAX_REFINE = 64
 # Times that differ by less than this fraction of a frame are one instant: 0.1 s x 30 /s is 3 frames.
 WHOLE = 1e-6
 
-Number = Annotated[float, Field(strict=True, allow_inf_nan=False)]
-Positive = Annotated[Number, Field(gt=0)]
+# Beyond these sizes squares and quotients of two numbers leave floating point.
+LARGEST = 1e30
+SMALLEST = 1e-30
+
+# The type of the errors raised here: their message is for the user as it is, and their context may name the
+# `key` (or item) below the validated value that is at fault.
+REFUSED = "refused"
+
+Number = Annotated[float, Field(strict=True, allow_inf_nan=False, ge=-LARGEST, le=LARGEST)]
+Positive = Annotated[float, Field(strict=True, allow_inf_nan=False, ge=SMALLEST, le=LARGEST)]
 NotNegative = Annotated[Number, Field(ge=0)]
 Whole = Annotated[int, Field(strict=True)]
 Count = Annotated[Whole, Field(ge=2, le=MAX_POINTS)]
@@ -107,13 +115,13 @@ class Probe(Section):
         for n in range(1, len(times)):
             if times[n] < times[n - 1]:
                 raise PydanticCustomError(
-                    "order", "key {n} goes back in time, from {before} s to {now} s; sort the keys by time",
-                    {"n": n, "before": times[n - 1], "now": times[n]},
+                    REFUSED, "goes back in time, from {before} s to {now} s; sort the keys by time",
+                    {"key": n, "before": f"{times[n - 1]:g}", "now": f"{times[n]:g}"},
                 )
             if n > 1 and times[n] == times[n - 2]:
                 raise PydanticCustomError(
-                    "order", "three keys at {now} s; a jump is two keys at one time, so remove the middle one",
-                    {"now": times[n]},
+                    REFUSED, "third key at {now} s; a jump is two keys at one time, so remove the middle one",
+                    {"key": n, "now": f"{times[n]:g}"},
                 )
         return keys
 
@@ -147,13 +155,17 @@ class Time(Section):
     @model_validator(mode="after")
     def _whole_frames(self) -> Time:
         frames = self.duration * self.frames_per_second
-        if not 0.5 < frames < 1e9 or abs(frames - round(frames)) > WHOLE:
+        if not 0.5 < frames <= 1e9 or abs(frames - round(frames)) > WHOLE:
             nearest = max(1, round(min(frames, 1e9))) / self.frames_per_second
             raise PydanticCustomError(
-                "frames",
-                "{duration} s x {rate} frames per second = {frames} frames, not a whole number; try {nearest}",
-                {"key": "duration", "duration": self.duration, "rate": self.frames_per_second,
-                 "frames": f"{frames:.6g}", "nearest": f"{nearest:.9g}"},
+                REFUSED,
+                "{duration} s x {rate} frames per second = {frames} frames, not a whole number up to 1e9; "
+                "try {nearest}",
+                {
+                    "key": "duration", "duration": f"{self.duration:.12g}",
+                    "rate": f"{self.frames_per_second:.12g}",
+                    "frames": f"{frames:.12g}", "nearest": f"{nearest:.12g}",
+                },
             )
         return self
 
@@ -234,7 +246,7 @@ class Scene(Section):
     def _picture_given(self) -> Scene:
         if self.draws and self.image is None:
             raise PydanticCustomError(
-                "image", "a picture is needed to draw png or gif; name one, or set output to [trajectory] or []",
+                REFUSED, "a picture is needed to draw png or gif; name one, or set output to [trajectory] or []",
                 {"key": "image"},
             )
         return self

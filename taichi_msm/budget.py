@@ -1,0 +1,212 @@
+"""What a scene will need, before anything is computed."""
+
+from __future__ import annotations
+
+import os
+import sys
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+from taichi_msm import stability, texture
+from taichi_msm.errors import Path as Key
+from taichi_msm.errors import Problem
+from taichi_msm.scene import Scene
+
+MAX_STEPS = 10**12
+
+# A triangle's number shares 64 bits with its depth, and the highest number means none.
+MAX_TRIANGLES = 2**32 - 2
+
+# Bytes of the parts of a drawing.
+VERTEX_BYTES = 28  # position and shade of one vertex of the refined surface
+POINT_BYTES = 40  # a mass point on its way to the surface
+SAMPLE_BYTES = 8  # depth and triangle of one sample of the picture
+PIXEL_BYTES = 3 * 12  # colours of one pixel, from sums to bytes
+TEXEL_BYTES = 4
+
+# Numbers for each mass point: displacement, difference and sums of forces; and the copies made for output.
+STATE_NUMBERS = 9
+OUTPUT_NUMBERS = 12
+
+
+@dataclass(frozen=True)
+class Budget:
+    """What a scene will need.
+
+    Attributes:
+        points: mass points.
+        steps: time steps in all.
+        frames: frames in all, the one at rest included.
+        simulation_bytes: memory for the state of the sheet and its output.
+        surface_bytes: memory for the refined surface; 0 where nothing is drawn.
+        picture_bytes: memory for a frame and the texture; 0 where nothing is drawn.
+        disk_bytes: size of the files, about.
+    """
+
+    points: int
+    steps: int
+    frames: int
+    simulation_bytes: int
+    surface_bytes: int
+    picture_bytes: int
+    disk_bytes: int
+
+    @property
+    def drawing_bytes(self) -> int:
+        """Memory for drawing."""
+        return self.surface_bytes + self.picture_bytes
+
+    @property
+    def memory_bytes(self) -> int:
+        """Memory in use at one time. Trajectories do not count: they are streamed to disk."""
+        return self.simulation_bytes + self.drawing_bytes
+
+
+def estimate(scene: Scene) -> Budget:
+    """Estimate what the scene will need."""
+    rows, cols = scene.sheet.points
+    points = rows * cols
+    number = _number_bytes(scene)
+    return Budget(
+        points=points,
+        steps=scene.time.frames * stability.steps_per_frame(scene),
+        frames=scene.time.frames + 1,
+        simulation_bytes=points * number * (STATE_NUMBERS + OUTPUT_NUMBERS + len(scene.probes)),
+        surface_bytes=_surface_bytes(scene) if scene.draws else 0,
+        picture_bytes=_picture_bytes(scene) if scene.draws else 0,
+        disk_bytes=_disk_bytes(scene),
+    )
+
+
+def available_memory() -> int:
+    """Tell how much memory a run may take [bytes]: what is free and what the control group still allows.
+
+    Without /proc it is all the memory there is, and sys.maxsize where the system does not tell.
+    """
+    try:
+        free = _free_memory(Path("/proc/meminfo"))
+        return min(free, _control_group_rest(Path("/proc/self/cgroup"), Path("/sys/fs/cgroup")))
+    except (OSError, KeyError, ValueError, IndexError):
+        return _physical_memory()
+
+
+def problems(scene: Scene) -> Iterator[Problem]:
+    """Say what makes the scene too large, with the numbers and the key to change."""
+    yield from _step_problems(scene)
+    too_fine = list(_triangle_problems(scene))
+    yield from too_fine or _memory_problems(scene)
+
+
+def _number_bytes(scene: Scene) -> int:
+    return 4 if scene.time.precision == "f32" else 8
+
+
+def _refined(scene: Scene) -> tuple[int, int]:
+    """Count the cells of the refined surface, down and across."""
+    rows, cols = scene.sheet.points
+    n = scene.render.refine
+    return (rows - 1) * (n + 1), (cols - 1) * (n + 1)
+
+
+def _surface_bytes(scene: Scene) -> int:
+    rows, cols = scene.sheet.points
+    down, across = _refined(scene)
+    return (down + 1) * (across + 1) * VERTEX_BYTES + rows * cols * POINT_BYTES
+
+
+def _picture_bytes(scene: Scene) -> int:
+    width, height = scene.render.size
+    texture_width, texture_height = texture.texture_size(scene) or (0, 0)
+    frame = width * height * (scene.render.supersample**2 * SAMPLE_BYTES + PIXEL_BYTES)
+    return frame + texture_width * texture_height * TEXEL_BYTES
+
+
+def _disk_bytes(scene: Scene) -> int:
+    """Estimate the size of the files: for a pixel 2 bytes in a png, 1 in a gif."""
+    rows, cols = scene.sheet.points
+    width, height = scene.render.size
+    frame_bytes = {
+        "trajectory": rows * cols * 3 * _number_bytes(scene),
+        "png": width * height * 2,
+        "gif": width * height,
+    }
+    return (scene.time.frames + 1) * sum(frame_bytes[kind] for kind in set(scene.output))
+
+
+def _step_problems(scene: Scene) -> Iterator[Problem]:
+    steps = scene.time.frames * stability.steps_per_frame(scene)
+    if steps <= MAX_STEPS:
+        return
+    count = f"{scene.time.duration:g} s in steps of {stability.step(scene):.6g} s is {steps:.3g} steps"
+    limit = f"more than the {MAX_STEPS:.0e} that can be taken"
+    if scene.time.step == "auto":
+        remedy = "take a shorter time, softer springs or more mass"
+        yield Problem(("time", "duration"), f"{count}, {limit}; {remedy}")
+    else:
+        yield Problem(("time", "step"), f"{count}, {limit}; take a longer step or a shorter time")
+
+
+def _triangle_problems(scene: Scene) -> Iterator[Problem]:
+    down, across = _refined(scene)
+    if scene.draws and 2 * down * across > MAX_TRIANGLES:
+        yield Problem(
+            ("render", "refine"),
+            f"{scene.render.refine} makes {2 * down * across:.3g} triangles, "
+            f"more than the {MAX_TRIANGLES:.3g} that can be drawn; refine less",
+        )
+
+
+def _memory_problems(scene: Scene) -> Iterator[Problem]:
+    budget, available = estimate(scene), available_memory()
+    if budget.memory_bytes <= available:
+        return
+    rows, cols = scene.sheet.points
+    width, height = scene.render.size
+    parts: list[tuple[int, Key, str]] = [
+        (budget.simulation_bytes, ("sheet", "points"), f"{rows} x {cols} points"),
+        (budget.surface_bytes, ("render", "refine"), f"a surface refined by {scene.render.refine}"),
+        (budget.picture_bytes, ("render", "size"), f"frames of {width} x {height} pixels and their texture"),
+    ]
+    size, key, name = max(parts)
+    yield Problem(
+        key,
+        f"the scene needs {_gib(budget.memory_bytes)} of memory, {_gib(size)} of it for {name}, "
+        f"but {_gib(available)} is free; take less",
+    )
+
+
+def _gib(size: int) -> str:
+    return f"{size / 2**30:.3g} GiB"
+
+
+def _free_memory(meminfo: Path) -> int:
+    """Read Linux's estimate of what can be taken without swapping [bytes]."""
+    fields = dict(line.split(":", 1) for line in meminfo.read_text().splitlines())
+    return int(fields["MemAvailable"].split()[0]) * 1024
+
+
+def _control_group_rest(membership: Path, root: Path) -> int:
+    """Find what the control groups (version 2) of this process still allow [bytes]; sys.maxsize: no limit."""
+    lines = membership.read_text().splitlines()
+    own = next((line[len("0::/") :] for line in lines if line.startswith("0::/")), "")
+    group = root / own
+    return min(_group_rest(each) for each in (group, *group.parents) if each.is_relative_to(root))
+
+
+def _group_rest(group: Path) -> int:
+    try:
+        limit = (group / "memory.max").read_text().strip()
+        used = int((group / "memory.current").read_text())
+        cached = dict(line.split() for line in (group / "memory.stat").read_text().splitlines())
+    except OSError:
+        return sys.maxsize
+    # Cached files count as used, but make room when memory is asked for.
+    return sys.maxsize if limit == "max" else max(0, int(limit) - used + int(cached.get("inactive_file", 0)))
+
+
+def _physical_memory() -> int:
+    try:
+        return os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
+    except (AttributeError, OSError, ValueError):
+        return sys.maxsize

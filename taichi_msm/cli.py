@@ -1,0 +1,190 @@
+"""The command line: arguments, exit codes, printing. Nothing else prints or exits."""
+
+from __future__ import annotations
+
+import time
+
+STARTED = time.perf_counter()
+
+import json
+import os
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import click
+
+from taichi_msm import __version__
+from taichi_msm.errors import DeviceError, FilesError, SceneError
+
+DONE, BUG, WRONG_INPUT, DIVERGED, FILES, INTERRUPTED = 0, 1, 2, 3, 4, 130
+EXIT_CODES = {"complete": DONE, "diverged": DIVERGED, "interrupted": INTERRUPTED}
+
+scene_argument = click.argument("scene", metavar="SCENE")
+set_option = click.option(
+    "--set",
+    "overrides",
+    metavar="KEY=VALUE",
+    multiple=True,
+    help="Override a key of the scene by its dotted path, e.g. sheet.points=[61,61]; list items by index.",
+)
+json_option = click.option("--json", "as_json", is_flag=True, help="Print one JSON object on stdout and nothing else.")
+
+
+@click.group(context_settings={"help_option_names": ["-h", "--help"]})
+@click.version_option(__version__, prog_name="taichi-msm")
+def program() -> None:
+    """Deform an image as tissue deforms."""
+
+
+@program.command()
+@scene_argument
+@click.option("--out", metavar="DIR", help="Where the results go.  [default: output/<name of the scene file>]")
+@click.option("--image", metavar="FILE", help="Another picture on the scene's sheet.")
+@set_option
+@click.option("--arch", metavar="cpu|cuda", default="cpu", show_default=True, help="Where to compute.")
+@click.option("--threads", type=click.IntRange(min=1), metavar="N", help="CPU threads.  [default: every core]")
+@click.option("--quiet", is_flag=True, help="No progress and no summary.")
+@json_option
+def run(
+    scene: str,
+    out: str | None,
+    image: str | None,
+    overrides: tuple[str, ...],
+    arch: str,
+    threads: int | None,
+    quiet: bool,
+    as_json: bool,
+) -> int:
+    """Simulate SCENE, draw its frames and write them."""
+    from taichi_msm.scene_file import load_scene
+
+    loaded = load_scene(scene, overrides, image)
+    directory = Path(out) if out is not None else Path("output") / Path(scene).stem
+
+    from taichi_msm import run as runner
+    from taichi_msm.console import Progress, summary
+
+    recorded = [*overrides, *([f"image={image}"] if image is not None else [])]
+    with Progress(quiet=quiet or as_json) as progress:
+        record = runner.run(
+            loaded,
+            directory,
+            arch=arch,
+            threads=threads,
+            overrides=recorded,
+            started=STARTED,
+            progress=progress.update,
+        )
+    if as_json:
+        print_json({"directory": str(directory), **record})
+    elif not quiet:
+        click.echo(summary(record, directory))
+    if record["status"] != "complete":
+        reason = record.get("error", "interrupted")
+        complain([f"{scene}: {reason}; {directory} holds the {record['frames']} frames before"])
+    return EXIT_CODES[record["status"]]
+
+
+@program.command()
+@scene_argument
+@set_option
+@json_option
+def check(scene: str, overrides: tuple[str, ...], as_json: bool) -> int:
+    """Validate SCENE and say what it would take; compute nothing."""
+    from taichi_msm import budget, stability
+    from taichi_msm.scene_file import load_scene
+
+    loaded = load_scene(scene, overrides)
+    need = budget.estimate(loaded)
+    limit = stability.stable_step(loaded)
+    facts = {
+        "scene": loaded.model_dump(mode="json"),
+        "step": stability.step(loaded),
+        "stable_step": limit if limit < float("inf") else None,
+        "steps_per_frame": stability.steps_per_frame(loaded),
+        "steps": need.steps,
+        "frames": need.frames,
+        "memory": need.memory_bytes,
+        "disk": need.disk_bytes,
+    }
+    if as_json:
+        print_json(facts)
+        return DONE
+    import yaml
+
+    click.echo(yaml.safe_dump(facts["scene"], sort_keys=False, default_flow_style=None), nl=False)
+    click.echo(
+        f"\n{need.points} points, {need.frames} frames, {need.steps} steps of {facts['step']:.6g} s "
+        f"(limit {limit:.6g} s), {facts['steps_per_frame']} a frame\n"
+        f"about {need.memory_bytes / 2**20:.0f} MiB of memory, {need.disk_bytes / 2**20:.1f} MiB on disk"
+    )
+    return DONE
+
+
+@program.command()
+def schema() -> int:
+    """Print the JSON Schema of a scene, for editors."""
+    from taichi_msm.scene_file import schema
+
+    print_json(schema())
+    return DONE
+
+
+def print_json(value: Any) -> None:
+    """Print one JSON object."""
+    click.echo(json.dumps(value, indent=2, allow_nan=False))
+
+
+def complain(lines: Sequence[str]) -> None:
+    """Print errors on stderr, one a line."""
+    for line in lines:
+        click.echo(line, err=True)
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run the command line.
+
+    Args:
+        arguments: what follows the program's name; None takes the process's.
+
+    Returns:
+        The exit code: 0 done, 1 a bug, 2 wrong scene or arguments, 3 diverged, 4 files, 130 interrupted.
+    """
+    words = list(sys.argv[1:] if arguments is None else arguments)
+
+    def fail(code: int, lines: Sequence[str]) -> int:
+        complain(lines)
+        if "--json" in words:
+            print_json({"status": "error", "errors": list(lines)})
+        return code
+
+    try:
+        return int(program.main(words, prog_name="taichi-msm", standalone_mode=False) or DONE)
+    except SceneError as error:
+        return fail(WRONG_INPUT, error.lines)
+    except DeviceError as error:
+        return fail(WRONG_INPUT, [str(error)])
+    except FilesError as error:
+        return fail(FILES, [str(error)])
+    except click.exceptions.NoArgsIsHelpError as error:
+        click.echo(error.format_message())
+        return WRONG_INPUT
+    except click.ClickException as error:
+        return fail(WRONG_INPUT, [f"taichi-msm: {error.format_message().rstrip('.')}; see taichi-msm --help"])
+    except (KeyboardInterrupt, click.Abort):
+        return fail(INTERRUPTED, ["interrupted; nothing was written"])
+    except BrokenPipeError:
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return FILES
+    except Exception as error:
+        if os.environ.get("TAICHI_MSM_TRACEBACK"):
+            raise
+        return fail(
+            BUG,
+            [
+                f"taichi-msm: a bug: {type(error).__name__}: {' '.join(str(error).split())}; "
+                "please report it with what TAICHI_MSM_TRACEBACK=1 prints"
+            ],
+        )

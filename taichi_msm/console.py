@@ -1,0 +1,60 @@
+"""What a person sees of a run: progress while it works, a summary at its end."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from types import TracebackType
+from typing import Any
+
+STAGES = {
+    "start": "starting Taichi",
+    "compile": "compiling the kernels",
+    "frames": "simulating and drawing",
+    "write": "writing",
+}
+
+
+class Progress:
+    """A progress bar on stderr; silent where quiet or where stderr is not a terminal."""
+
+    def __init__(self, quiet: bool) -> None:
+        from rich.console import Console
+        from rich.progress import BarColumn, MofNCompleteColumn, TextColumn, TimeElapsedColumn
+        from rich.progress import Progress as Bar
+
+        console = Console(stderr=True)
+        self._bar = Bar(
+            TextColumn("{task.description:24}"),
+            BarColumn(),
+            MofNCompleteColumn(),
+            TimeElapsedColumn(),
+            console=console,
+            transient=True,
+            disable=quiet or not console.is_terminal,
+        )
+        self._task = self._bar.add_task(STAGES["start"])
+
+    def update(self, stage: str, done: int, total: int) -> None:
+        """Show the stage and the frames done."""
+        self._bar.update(self._task, description=STAGES[stage], completed=done, total=total)
+
+    def __enter__(self) -> Progress:
+        self._bar.start()
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self._bar.stop()
+
+
+def summary(record: Mapping[str, Any], directory: Path) -> str:
+    """Say in two lines what a run did and how long it took."""
+    times = record["timings"]
+    stages = ", ".join(f"{stage} {seconds:.2f}" for stage, seconds in times.items() if stage != "total")
+    return (
+        f"{directory}: {record['frames']} frames, {record['steps']} steps of {record['step']:.4g} s, "
+        f"largest displacement {record['max_displacement']:.4g} m\n"
+        f"{times['total']:.2f} s: {stages} (encode overlaps)"
+    )

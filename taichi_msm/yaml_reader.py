@@ -1,0 +1,209 @@
+"""YAML text -> plain data and where each key stands; a safe and small part of YAML 1.2.
+
+The data is built straight from the parser's events: what a scene has no use for (anchors, aliases, tags,
+several documents, deep nesting) is met as an event and refused there, so that no text can make the reader
+recurse, expand or load anything. Scalars follow the core schema of YAML 1.2: 1e4 is a number, 010 is ten,
+`yes` is text.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable, Iterator
+from typing import Any, NamedTuple
+
+import yaml
+
+from taichi_msm.errors import Path
+
+MAX_DEPTH = 20
+MAX_NODES = 100_000
+
+# Longer plain scalars are text, whatever they look like: no number of a scene needs more, and Python refuses
+# to read integers of several thousand digits.
+MAX_NUMBER_LENGTH = 100
+
+# The C parser is twenty times faster; a PyYAML that was built without it gives the same data.
+_LOADER: Any = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
+
+# What YAML excludes, and the line breaks that it knows and editors do not, which would put line numbers off.
+_NOT_ALLOWED = re.compile("[^\t\n\r\x20-\x7e\xa0-\u2027\u202a-\ud7ff\ue000-\ufffd\U00010000-\U0010ffff]")
+
+_NUMBERS: tuple[tuple[re.Pattern[str], Callable[[str], float]], ...] = (
+    (re.compile(r"[-+]?[0-9]+"), int),
+    (re.compile(r"0o[0-7]+"), lambda text: int(text, 8)),
+    (re.compile(r"0x[0-9a-fA-F]+"), lambda text: int(text, 16)),
+    (re.compile(r"[-+]?(\.[0-9]+|[0-9]+(\.[0-9]*)?)([eE][-+]?[0-9]+)?"), float),
+    (re.compile(r"[-+]?\.(inf|Inf|INF)|\.(nan|NaN|NAN)"), lambda text: float(text.replace(".", ""))),
+)
+_WORDS: dict[str, bool | None] = {
+    **dict.fromkeys(("", "~", "null", "Null", "NULL")),
+    **dict.fromkeys(("true", "True", "TRUE"), True),
+    **dict.fromkeys(("false", "False", "FALSE"), False),
+}
+
+
+class Mark(NamedTuple):
+    """A place in the text, counted from 1."""
+
+    line: int
+    column: int
+
+
+class Fault(NamedTuple):
+    """What is wrong with one node of the text that can be read all the same."""
+
+    mark: Mark
+    path: Path
+    message: str
+
+
+class Document(NamedTuple):
+    """What a text says.
+
+    Attributes:
+        data: None, bool, int, float, str, and lists and dicts of them; None for an empty text.
+        marks: where each key, and each item of a list, stands.
+        faults: what is wrong but did not stop the reading.
+    """
+
+    data: Any
+    marks: dict[Path, Mark]
+    faults: list[Fault]
+
+
+class UnreadableError(Exception):
+    """The text is not YAML, or more of it than a scene can be."""
+
+    def __init__(self, mark: Mark, message: str) -> None:
+        super().__init__(message)
+        self.mark = mark
+
+
+def read(text: str) -> Document:
+    """Read one YAML document.
+
+    Raises:
+        UnreadableError: when the text is not YAML, nests too deeply or is too long; the rest is not read.
+    """
+    if bad := _NOT_ALLOWED.search(text):
+        said = f"character U+{ord(bad[0]):04X} is not allowed; remove it"
+        raise UnreadableError(mark_at(text, bad.start()), said)
+    reader = _Reader(yaml.parse(text, Loader=_LOADER))
+    try:
+        return Document(reader.document(), reader.marks, reader.faults)
+    except yaml.MarkedYAMLError as error:
+        raise _syntax_error(text, error) from None
+    except (yaml.YAMLError, ValueError) as error:
+        # PyYAML's own parser passes some bad escapes of a quoted text on to chr().
+        raise UnreadableError(Mark(1, 1), f"not valid YAML: {error}") from None
+
+
+def mark_at(text: str, index: int) -> Mark:
+    """Find line and column of a character."""
+    before = text[:index]
+    return Mark(before.count("\n") + 1, index - before.rfind("\n"))
+
+
+def _syntax_error(text: str, error: yaml.MarkedYAMLError) -> UnreadableError:
+    mark = error.problem_mark or error.context_mark
+    at = mark.index if mark else 0
+    hint = "; indent with spaces, not tabs" if text[at : at + 1] == "\t" else ""
+    said = " ".join(part for part in (error.problem, error.context) if part)
+    return UnreadableError(_mark(mark) if mark else Mark(1, 1), f"not valid YAML: {said}{hint}")
+
+
+def _mark(mark: Any) -> Mark:
+    return Mark(mark.line + 1, mark.column + 1)
+
+
+def _resolve(text: str) -> Any:
+    """Give a plain scalar its value."""
+    if text in _WORDS:
+        return _WORDS[text]
+    if text[0] in "+-.0123456789" and len(text) <= MAX_NUMBER_LENGTH:
+        for pattern, number in _NUMBERS:
+            if pattern.fullmatch(text):
+                return number(text)
+    return text
+
+
+class _Reader:
+    """Builds the data of a stream of events."""
+
+    def __init__(self, events: Iterator[Any]) -> None:
+        self.marks: dict[Path, Mark] = {(): Mark(1, 1)}
+        self.faults: list[Fault] = []
+        self._events = events
+        self._nodes = 0
+
+    def document(self) -> Any:
+        """Build the first document, and refuse a second."""
+        next(self._events)
+        if isinstance(next(self._events), yaml.StreamEndEvent):
+            return None
+        data = self._node(next(self._events), ())
+        next(self._events)
+        after = next(self._events)
+        if not isinstance(after, yaml.StreamEndEvent):
+            self._refuse(after, (), "a second document begins here; keep one")
+        return data
+
+    def _node(self, event: Any, path: Path) -> Any:
+        self._admit(event, path)
+        if isinstance(event, yaml.AliasEvent):
+            return None
+        if isinstance(event, yaml.ScalarEvent):
+            return _resolve(event.value) if event.implicit[0] else event.value
+        if isinstance(event, yaml.SequenceStartEvent):
+            return self._items(path)
+        return self._mapping(path)
+
+    def _admit(self, event: Any, path: Path) -> None:
+        """Refuse what a scene has no use for."""
+        self._nodes += 1
+        if self._nodes > MAX_NODES:
+            raise UnreadableError(
+                _mark(event.start_mark), f"more than {MAX_NODES} values; a scene is smaller"
+            )
+        if len(path) > MAX_DEPTH:
+            raise UnreadableError(
+                _mark(event.start_mark), f"nested more than {MAX_DEPTH} deep; a scene is flatter"
+            )
+        if isinstance(event, yaml.AliasEvent):
+            self._refuse(event, path, f"alias *{event.anchor} is not allowed; write the value out")
+            return
+        if event.anchor is not None:
+            self._refuse(event, path, f"anchor &{event.anchor} is not allowed; remove it")
+        if event.tag is not None:
+            tag = event.tag.replace("tag:yaml.org,2002:", "!!")
+            self._refuse(event, path, f"tag {tag} is not allowed; remove it")
+
+    def _refuse(self, event: Any, path: Path, message: str) -> None:
+        self.faults.append(Fault(_mark(event.start_mark), path, message))
+
+    def _items(self, path: Path) -> list[Any]:
+        items: list[Any] = []
+        while not isinstance(event := next(self._events), yaml.SequenceEndEvent):
+            here = (*path, len(items))
+            self.marks.setdefault(here, _mark(event.start_mark))
+            items.append(self._node(event, here))
+        return items
+
+    def _mapping(self, path: Path) -> dict[str, Any]:
+        mapping: dict[str, Any] = {}
+        while not isinstance(event := next(self._events), yaml.MappingEndEvent):
+            if not isinstance(event, yaml.ScalarEvent):
+                raise UnreadableError(_mark(event.start_mark), "a key must be text; put it in quotes")
+            here = (*path, event.value)
+            self.marks.setdefault(here, _mark(event.start_mark))
+            key = self._node(event, here)
+            value = self._node(next(self._events), here)
+            if not isinstance(key, str):
+                self._refuse(event, here, "a key must be text; put it in quotes")
+            elif key in mapping:
+                first = self.marks[here].line
+                self._refuse(event, here, f"given twice, first in line {first}; keep one")
+            else:
+                mapping[key] = value
+        return mapping
