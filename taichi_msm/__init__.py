@@ -1,3 +1,45 @@
-"""Deform an image as tissue deforms."""
+"""Deform an image as tissue deforms.
+
+The names of the API are imported when they are first used, so that `import taichi_msm` does not start Taichi.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from taichi_msm.errors import DeviceError, DivergedError, FilesError, MsmError, SceneError
+    from taichi_msm.runner import run
+    from taichi_msm.scene import Scene
+    from taichi_msm.scene_file import load_scene
+    from taichi_msm.simulation import Simulation
 
 __version__ = "0.1.0"
+
+__all__ = [
+    "DeviceError",
+    "DivergedError",
+    "FilesError",
+    "MsmError",
+    "Scene",
+    "SceneError",
+    "Simulation",
+    "load_scene",
+    "run",
+]
+
+_HOMES = {
+    **dict.fromkeys(("DeviceError", "DivergedError", "FilesError", "MsmError", "SceneError"), "errors"),
+    "Scene": "scene",
+    "Simulation": "simulation",
+    "load_scene": "scene_file",
+    "run": "runner",
+}
+
+
+def __getattr__(name: str) -> Any:
+    if name not in _HOMES:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    from importlib import import_module
+
+    return getattr(import_module(f"{__name__}.{_HOMES[name]}"), name)

@@ -63,7 +63,7 @@ def run(
     loaded = load_scene(scene, overrides, image)
     directory = Path(out) if out is not None else Path("output") / Path(scene).stem
 
-    from taichi_msm import run as runner
+    from taichi_msm import runner
     from taichi_msm.console import Progress, summary
 
     recorded = [*overrides, *([f"image={image}"] if image is not None else [])]
@@ -83,7 +83,7 @@ def run(
         click.echo(summary(record, directory))
     if record["status"] != "complete":
         reason = record.get("error", "interrupted")
-        complain([f"{scene}: {reason}; {directory} holds the {record['frames']} frames before"])
+        complain([f"{scene}: {reason}; frames in {directory}: {record['frames']}"])
     return EXIT_CODES[record["status"]]
 
 
@@ -172,7 +172,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         click.echo(error.format_message())
         return WRONG_INPUT
     except click.ClickException as error:
-        return fail(WRONG_INPUT, [f"taichi-msm: {error.format_message().rstrip('.')}; see taichi-msm --help"])
+        return fail(WRONG_INPUT, [f"taichi-msm: {error.format_message()} (see taichi-msm --help)"])
     except (KeyboardInterrupt, click.Abort):
         return fail(INTERRUPTED, ["interrupted; nothing was written"])
     except BrokenPipeError:

@@ -97,7 +97,9 @@ class Encoder:
             stdin=subprocess.PIPE,
             stdout=subprocess.PIPE,
             pass_fds=inherit,
-            start_new_session=True,  # Ctrl-C is for us to handle: the pictures so far are finished
+            # Ctrl-C is for us alone: the pictures so far are still to be finished.
+            start_new_session=True,
+            creationflags=getattr(subprocess, "CREATE_NEW_PROCESS_GROUP", 0),
         )
         assert self._process.stdin
         assert self._process.stdout
@@ -141,10 +143,9 @@ class Encoder:
 
 def main(path: str) -> None:
     """Be the process: read a job from a file and its pictures from stdin, report on stdout."""
-    job = pickle.loads(Path(path).read_bytes())
     answer: Report | OSError
     try:
-        answer = encode(job, sys.stdin.buffer)
+        answer = encode(pickle.loads(Path(path).read_bytes()), sys.stdin.buffer)
     except OSError as error:
         answer = error
     pickle.dump(answer, sys.stdout.buffer)

@@ -13,7 +13,7 @@ import os
 import re
 import shutil
 from collections.abc import Iterator
-from contextlib import suppress
+from contextlib import ExitStack, suppress
 from pathlib import Path
 from types import TracebackType
 from typing import BinaryIO
@@ -141,20 +141,24 @@ class Publication:
             self._staging.mkdir(parents=True, exist_ok=True)
             if fcntl is None:
                 return
-            with suppress(FileNotFoundError):  # when a run that ends just now removes what we open
-                lock = self._lock_path.open("ab")
-                try:
-                    fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
-                except BlockingIOError:
-                    lock.close()
-                    raise FilesError(
-                        f"{self._directory}: another run is writing there; choose another --out"
-                    ) from None
-                except OSError:  # a file system without locks
-                    pass
+            # A run that ends just now may remove what we open, or have removed it when we have its lock.
+            with suppress(FileNotFoundError), ExitStack() as opened:
+                lock = opened.enter_context(self._lock_path.open("ab"))
+                self._seize(lock)
                 if os.path.samestat(os.fstat(lock.fileno()), self._lock_path.stat()):
+                    opened.pop_all()
                     self._lock = lock
                     return
+
+    def _seize(self, lock: BinaryIO) -> None:
+        try:
+            fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            message = f"{self._directory}: another run is writing there; choose another --out"
+            raise FilesError(message) from None
+        except OSError:
+            pass  # a file system without locks
+
     def _release(self) -> None:
         """Unlock, and remove the directories that are empty and ours."""
         if self._lock is not None:

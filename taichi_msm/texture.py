@@ -99,8 +99,8 @@ def _size(path: str) -> tuple[int, int]:
     from PIL import Image
 
     with _open(path) as image:
-        # Pillow's size of a TIFF is that of the upright picture already. The base class's getexif() keeps to the
-        # header, where that of PNG would decode the picture to look behind it.
+        # Pillow's size of a TIFF is that of the upright picture already. The base class's getexif() keeps to
+        # the header, where that of PNG would decode the picture to look behind it.
         if image.format != "TIFF" and Image.Image.getexif(image).get(_ORIENTATION) in _LYING:
             return image.height, image.width
         return image.size

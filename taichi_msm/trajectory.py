@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import shutil
 import zipfile
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -60,6 +61,6 @@ class TrajectoryWriter:
 
     def close(self) -> None:
         """Remove the positions that wait."""
-        if not self._positions.closed:
-            Path(self._positions.name).unlink()
+        with suppress(OSError):  # a full disk may hold back the rest, which nobody wants any more
             self._positions.close()
+        Path(self._positions.name).unlink(missing_ok=True)

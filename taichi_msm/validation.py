@@ -48,13 +48,15 @@ def validate(data: dict[str, Any]) -> tuple[Scene | None, list[Problem]]:
     Returns:
         The scene, None if there is any problem; and the problems.
     """
-    scene, problems = _parse(data)
-    checked = scene
-    if checked is None:
-        checked, more = _parse(_spare(data, problems))
-        problems += more
-    if checked is not None:
-        problems += [problem for check in CHECKS for problem in check(checked)]
+    problems: list[Problem] = []
+    # Pydantic asks for the picture once the sections are faultless, and CHECKS run once it has that too.
+    for _ in range(3):
+        scene, found = _parse(data)
+        problems += found
+        if scene is not None:
+            problems += [problem for check in CHECKS for problem in check(scene)]
+            break
+        data = _spare(data, found)
     return (None if problems else scene), problems
 
 

@@ -9,10 +9,14 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
-from taichi_msm import __version__
+import numpy
+import PIL
+
+from taichi_msm import __version__, runtime
 from taichi_msm.errors import DivergedError
 from taichi_msm.files import ResultWriter
 from taichi_msm.scene import Scene
+from taichi_msm.simulation import Simulation
 from taichi_msm.stability import stable_step, step, steps_per_frame
 from taichi_msm.texture import load_texture
 
@@ -62,13 +66,11 @@ def run(
         FilesError: when the results cannot be written.
     """
     started = time.perf_counter() if started is None else started
+    device = runtime.start(arch, threads)
     texture = load_texture(scene) if scene.draws else None
     frames = scene.time.frames + 1
     record: dict[str, Any] = {"status": "complete"}
     with ResultWriter(Path(directory), scene, texture) as writer:
-        progress("start", 0, frames)
-        from taichi_msm.simulation import Simulation
-
         with Simulation(scene, arch, threads, texture) as simulation:
             watch = Stopwatch()
             startup = time.perf_counter() - started
@@ -102,8 +104,8 @@ def run(
                 "steps": simulation.steps,
                 "frames": written,
                 "max_displacement": simulation.max_displacement,
-                "arch": simulation.device.arch,
-                "threads": simulation.device.threads,
+                "arch": device.arch,
+                "threads": device.threads,
                 "versions": versions(),
             }
         writer.finish()
@@ -122,15 +124,10 @@ def run(
 
 def versions() -> dict[str, str]:
     """Name the versions that the results depend on."""
-    import numpy
-    import PIL
-
-    from taichi_msm.runtime import ti
-
     return {
         "taichi-msm": __version__,
         "python": platform.python_version(),
-        "taichi": ".".join(str(part) for part in ti.__version__),
+        "taichi": ".".join(str(part) for part in runtime.ti.__version__),
         "numpy": numpy.__version__,
         "pillow": PIL.__version__,
         "platform": f"{sys.platform} {platform.machine()}",

@@ -1,0 +1,76 @@
+"""Make the pictures of the README: run the shipped scenes and keep what the page shows.
+
+    python docs/make_figures.py
+
+Needs the extra `test`, for the photograph. Takes about a minute.
+"""
+
+from __future__ import annotations
+
+import shutil
+import tempfile
+from pathlib import Path
+
+import numpy as np
+import skimage
+from PIL import Image
+
+from taichi_msm import Simulation, load_scene, run
+
+ROOT = Path(__file__).parent.parent
+SCENES = ROOT / "scenes"
+IMAGES = ROOT / "docs" / "images"
+
+# For every scene the moment that shows it best [s].
+MOMENTS = {"drag": 0.92, "grasp": 0.76, "two-tools": 0.84}
+
+# The stages of the paper's figure 3: at rest, pressed more and more, and let go.
+STAGES = (0.0, 0.16, 0.4, 0.64, 1.2)
+
+# A fundus photograph, CC0, NHS Foundation Trust; it comes with scikit-image.
+RETINA = Path(skimage.__file__).parent / "data" / "retina.jpg"
+
+
+def frames(scene_file: Path, moments: tuple[float, ...], size: tuple[int, int]) -> list[Image.Image]:
+    """Draw a scene at some moments [s]."""
+    scene = load_scene(scene_file, [f"render.size={list(size)}", "render.supersample=2", "output=[png]"])
+    pictures = []
+    with Simulation(scene) as simulation:
+        for moment in moments:
+            simulation.advance(round(moment * scene.time.frames_per_second) - simulation.frame)
+            pictures.append(Image.fromarray(simulation.draw()))
+    return pictures
+
+
+def animation(name: str, size: int, *overrides: str, image: Path | None = None) -> None:
+    """Keep the GIF of the scene press, in another size or on another picture."""
+    settings = [f"render.size=[{size},{size}]", "render.supersample=2", "output=[gif]", *overrides]
+    scene = load_scene(SCENES / "press.yaml", settings, image)
+    with tempfile.TemporaryDirectory() as directory:
+        run(scene, directory, overrides=settings)
+        shutil.copy(Path(directory) / "animation.gif", IMAGES / f"{name}.gif")
+
+
+def strip(pictures: list[Image.Image], gap: int = 6) -> Image.Image:
+    """Put pictures side by side on white."""
+    width, height = pictures[0].size
+    page = Image.new("RGB", (len(pictures) * (width + gap) - gap, height), "white")
+    for n, picture in enumerate(pictures):
+        page.paste(picture, (n * (width + gap), 0))
+    return page
+
+
+def main() -> None:
+    """Write every picture."""
+    IMAGES.mkdir(exist_ok=True)
+    animation("press", 384)
+    animation("retina", 320, "render.camera={eye: [0, -0.3, 0.36], target: [0, -0.012, 0], fov: 44}", image=RETINA)
+    strip(frames(SCENES / "figure-3.yaml", STAGES, (400, 250))).save(IMAGES / "figure-3.png", optimize=True)
+    stills = [frames(SCENES / f"{name}.yaml", (moment,), (400, 400))[0] for name, moment in MOMENTS.items()]
+    strip(stills).save(IMAGES / "scenes.jpg", quality=90)
+    for path in sorted(IMAGES.iterdir()):
+        print(f"{path.relative_to(ROOT)}  {path.stat().st_size / 1024:.0f} KiB  {np.array(Image.open(path)).shape}")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,201 @@
+from __future__ import annotations
+
+import os
+import sys
+from pathlib import Path
+from typing import Any
+
+import pytest
+from PIL import Image
+
+from taichi_msm import budget
+from taichi_msm.budget import available_memory, estimate, problems
+from taichi_msm.scene import Scene
+
+PROBE = {"force": [0, 0, 1]}
+
+
+def scene(**keys: Any) -> Scene:
+    """20 frames of 4 steps of a small sheet that draws nothing, unless the keys say otherwise."""
+    return Scene.model_validate(
+        {
+            "image": "none.png",
+            "sheet": {"points": [30, 40], "size": [1, 1], "mass": 1},
+            "springs": {},
+            "time": {"duration": 2, "frames_per_second": 10, "step": 0.025},
+            "output": [],
+            **keys,
+        }
+    )
+
+
+def faults(scene: Scene) -> list[str]:
+    return [str(problem) for problem in problems(scene)]
+
+
+def test_counts() -> None:
+    need = estimate(scene())
+    assert (need.points, need.steps, need.frames) == (1200, 80, 21)
+
+
+def test_simulation() -> None:
+    assert estimate(scene()).simulation_bytes == 1200 * 4 * 21
+    assert estimate(scene(probes=[PROBE, PROBE])).simulation_bytes == 1200 * 4 * 23
+    precise = scene(time={"duration": 2, "precision": "f64"})
+    assert estimate(precise).simulation_bytes == 1200 * 8 * 21
+
+
+def test_drawing(tmp_path: Path) -> None:
+    render = {"size": [50, 60], "refine": 2, "supersample": 3}
+    need = estimate(scene(render=render, output=["gif"]))
+    assert need.surface_bytes == (29 * 3 + 1) * (39 * 3 + 1) * 28 + 1200 * 40
+    assert need.picture_bytes == 50 * 60 * (9 * 8 + 36)
+    assert need.drawing_bytes == need.surface_bytes + need.picture_bytes
+    assert need.memory_bytes == need.simulation_bytes + need.drawing_bytes
+
+    Image.new("RGB", (70, 80)).save(tmp_path / "a.png")
+    pictured = scene(image=str(tmp_path / "a.png"), render=render, output=["gif"])
+    assert estimate(pictured).picture_bytes == need.picture_bytes + 70 * 80 * 4
+    cut = scene(image=str(tmp_path / "a.png"), region=[1, 2, 3, 4], render=render, output=["gif"])
+    assert estimate(cut).picture_bytes == need.picture_bytes + 3 * 4 * 4
+
+
+@pytest.mark.parametrize("output", [[], ["trajectory"]])
+def test_nothing_drawn_takes_no_memory(output: list[str]) -> None:
+    need = estimate(scene(output=output))
+    assert need.drawing_bytes == 0
+    assert need.memory_bytes == need.simulation_bytes
+
+
+@pytest.mark.parametrize(
+    ("output", "of_a_frame"),
+    [
+        ([], 0),
+        (["trajectory"], 1200 * 3 * 4),
+        (["png"], 50 * 60 * 2),
+        (["gif"], 50 * 60),
+        (["png", "gif", "trajectory", "gif"], 1200 * 3 * 4 + 50 * 60 * 3),
+    ],
+)
+def test_disk(output: list[str], of_a_frame: int) -> None:
+    assert estimate(scene(render={"size": [50, 60]}, output=output)).disk_bytes == 21 * of_a_frame
+
+
+def test_an_ordinary_scene_has_no_problems() -> None:
+    assert faults(scene(output=["png", "gif", "trajectory"])) == []
+
+
+@pytest.mark.parametrize(
+    ("keys", "fault"),
+    [
+        (
+            {"sheet": {"points": [4096, 4096], "size": [1, 1], "mass": 1}},
+            "sheet.points: the scene needs 1.31 GiB of memory, 1.31 GiB of it for 4096 x 4096 points, "
+            "but 0.5 GiB is free; take less",
+        ),
+        (
+            {
+                "render": {"refine": 64, "size": [8, 8]},
+                "sheet": {"points": [100, 100], "size": [1, 1], "mass": 1},
+            },
+            "render.refine: the scene needs 1.08 GiB of memory, 1.08 GiB of it for a surface refined by 64, "
+            "but 0.5 GiB is free; take less",
+        ),
+        (
+            {"render": {"refine": 0, "size": [8192, 4096]}},
+            "render.size: the scene needs 1.38 GiB of memory, 1.38 GiB of it for frames of 8192 x 4096 pixels "
+            "and their texture, but 0.5 GiB is free; take less",
+        ),
+    ],
+    ids=["points", "surface", "picture"],
+)
+def test_what_takes_most_of_the_memory_is_named(
+    monkeypatch: pytest.MonkeyPatch, keys: dict[str, Any], fault: str
+) -> None:
+    output = ["gif"] if "render" in keys else []
+    monkeypatch.setattr(budget, "available_memory", lambda: 2**29)
+    assert faults(scene(output=output, **keys)) == [fault]
+
+
+def test_memory_that_just_fits(monkeypatch: pytest.MonkeyPatch) -> None:
+    need = estimate(scene()).memory_bytes
+    monkeypatch.setattr(budget, "available_memory", lambda: need)
+    assert faults(scene()) == []
+    monkeypatch.setattr(budget, "available_memory", lambda: need - 1)
+    assert len(faults(scene())) == 1
+
+
+def test_too_many_steps() -> None:
+    time = {"duration": 1e6, "frames_per_second": 10}
+    assert faults(scene(time=time | {"step": 1e-6})) == []
+    assert faults(scene(time=time | {"step": 1e-7})) == [
+        "time.step: 1e+06 s in steps of 1e-07 s is 1e+13 steps, more than the 1e+12 that can be taken; "
+        "take a longer step or a shorter time"
+    ]
+    # The step limit is 2 / sqrt(8 * 1e14 / 1) s, half of it the step of `auto`: 1 / 28284271.2 s.
+    assert faults(scene(springs={"structural": 1e14}, time=time)) == [
+        "time.duration: 1e+06 s in steps of 3.53553e-08 s is 2.83e+13 steps, more than the 1e+12 that can be "
+        "taken; take a shorter time, softer springs or more mass"
+    ]
+
+
+def test_more_triangles_than_can_be_told_apart(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(budget, "available_memory", lambda: sys.maxsize)
+    sheet = {"points": [4096, 4096], "size": [1, 1], "mass": 1}
+    # 2 (4095 (n + 1))^2 is 4.06e9 for n = 10 and 4.83e9 for n = 11, on either side of 2^32.
+    assert faults(scene(sheet=sheet, render={"refine": 10}, output=["png"])) == []
+    assert faults(scene(sheet=sheet, render={"refine": 11}, output=["png"])) == [
+        "render.refine: 11 makes 4.83e+09 triangles, more than the 4.29e+09 that can be drawn; refine less"
+    ]
+    assert faults(scene(sheet=sheet, render={"refine": 11}, output=[])) == []
+
+
+def test_available_memory() -> None:
+    assert 2**20 < available_memory() <= sys.maxsize
+
+
+def test_free_memory(tmp_path: Path) -> None:
+    (tmp_path / "meminfo").write_text("MemTotal:  900 kB\nMemFree:  1 kB\nMemAvailable:  300 kB\n")
+    assert budget._free_memory(tmp_path / "meminfo") == 300 * 1024
+
+
+def control_group(folder: Path, limit: str, used: int, cached: int) -> None:
+    folder.mkdir(parents=True, exist_ok=True)
+    (folder / "memory.max").write_text(f"{limit}\n")
+    (folder / "memory.current").write_text(f"{used}\n")
+    (folder / "memory.stat").write_text(f"anon 7\ninactive_file {cached}\n")
+
+
+def test_the_narrowest_control_group_counts(tmp_path: Path) -> None:
+    root, membership = tmp_path / "cgroup", tmp_path / "membership"
+    root.mkdir()
+    membership.write_text("4:memory:/elsewhere\n0::/outer/inner\n")
+    assert budget._control_group_rest(membership, root) == sys.maxsize
+    control_group(root / "outer" / "inner", "max", 10, 0)
+    assert budget._control_group_rest(membership, root) == sys.maxsize
+    control_group(root / "outer", "1000", 300, 100)
+    assert budget._control_group_rest(membership, root) == 800
+    control_group(root / "outer" / "inner", "400", 500, 50)
+    assert budget._control_group_rest(membership, root) == 0
+    control_group(root / "elsewhere", "1", 0, 0)
+    membership.write_text("0::/\n")
+    control_group(root, "90", 20, 0)
+    assert budget._control_group_rest(membership, root) == 70
+
+
+def test_a_limit_below_the_free_memory_counts(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(budget, "_free_memory", lambda _: 500)
+    monkeypatch.setattr(budget, "_control_group_rest", lambda *_: 400)
+    assert available_memory() == 400
+    monkeypatch.setattr(budget, "_control_group_rest", lambda *_: 600)
+    assert available_memory() == 500
+
+
+def test_systems_without_proc(monkeypatch: pytest.MonkeyPatch) -> None:
+    def missing(_: Path) -> int:
+        raise FileNotFoundError
+
+    monkeypatch.setattr(budget, "_free_memory", missing)
+    assert 2**20 < available_memory() < sys.maxsize
+    monkeypatch.delattr(os, "sysconf")
+    assert available_memory() == sys.maxsize

@@ -1,0 +1,265 @@
+"""The command line as a person meets it: files, texts, exit codes."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from taichi_msm import reference
+from taichi_msm.cli import main
+from taichi_msm.scene_file import load_scene
+from tests.scenes import speckle
+
+SMALL = """\
+image: speckle.png
+sheet: {points: [9, 11], size: [0.3, 0.4], mass: 1.0e-3}
+springs: {structural: 20, shear: 10, virtual: 0.5}
+damping: 0.01
+probes:
+  - force: [0, 300, -1000]
+    load: [[0, 0], [0.1, 100], [0.2, 100], [0.2, 0]]
+    falloff: 20
+time: {duration: 0.4, frames_per_second: 10}
+render: {size: [40, 30], refine: 1}
+"""
+
+
+@pytest.fixture()
+def small(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """A directory to work in, with small.yaml and its picture."""
+    Image.fromarray(speckle(30, 40)).save(tmp_path / "speckle.png")
+    (tmp_path / "small.yaml").write_text(SMALL)
+    monkeypatch.chdir(tmp_path)
+    return tmp_path
+
+
+def program(*arguments: str, **options: Any) -> subprocess.CompletedProcess[str]:
+    """Run the program in a process of its own, as the device of a process cannot be changed."""
+    return subprocess.run(
+        [sys.executable, "-m", "taichi_msm", *arguments], capture_output=True, text=True, check=False, **options
+    )
+
+
+def test_run_writes_everything(small: Path) -> None:
+    done = program("run", "small.yaml", "--threads", "2")
+    assert (done.returncode, done.stderr) == (0, "")
+    assert done.stdout.startswith("output/small: 5 frames, 164 steps of 0.002439 s, largest displacement 0.0")
+
+    out = small / "output" / "small"
+    assert sorted(path.name for path in out.iterdir()) == ["animation.gif", "frames", "run.json", "trajectory.npz"]
+    assert sorted(path.name for path in (out / "frames").iterdir()) == [f"000{n}.png" for n in range(5)]
+    scene = load_scene("small.yaml")
+    twin = reference.simulate(scene)
+    trajectory = np.load(out / "trajectory.npz")
+    assert trajectory["position"].dtype == np.float32
+    np.testing.assert_allclose(trajectory["position"], twin, atol=1e-6)
+    np.testing.assert_allclose(trajectory["time"], [0, 0.1, 0.2, 0.3, 0.4])
+    for frame in (0, 2):
+        expected = reference.draw(scene, trajectory["position"][frame].astype(float), speckle(30, 40))
+        apart = np.abs(np.array(Image.open(out / "frames" / f"000{frame}.png")).astype(int) - expected)
+        assert (apart > 1).mean() < 0.01
+    record = json.loads((out / "run.json").read_text())
+    assert record["status"] == "complete"
+    assert record["scene"]["render"]["camera"] == "top"
+    assert record["steps"] == record["steps_per_frame"] * 4 == 164
+    assert record["max_displacement"] == pytest.approx(np.linalg.norm(twin - twin[0], axis=-1).max(), rel=1e-4)
+    assert set(record["timings"]) == {"startup", "compile", "simulate", "render", "encode", "total"}
+    assert record["outputs"] == ["frames", "animation.gif", "trajectory.npz", "run.json"]
+    assert (record["arch"], record["threads"], record["overrides"]) == ("cpu", 2, [])
+
+
+def test_one_hash_with_one_and_two_threads(small: Path) -> None:
+    # Large enough for two workers to step it.
+    hashes = set()
+    for threads in ("1", "2"):
+        settings = ["--set", "sheet.points=[95,95]", "--set", "time.duration=0.2", "--set", "render.refine=0"]
+        done = program("run", "small.yaml", *settings, "--threads", threads, "--out", threads)
+        assert done.returncode == 0, done.stderr
+        digest = hashlib.sha256()
+        for path in ["trajectory.npz", "animation.gif", "frames/0000.png", "frames/0001.png", "frames/0002.png"]:
+            digest.update((small / threads / path).read_bytes())
+        hashes.add(digest.hexdigest())
+    assert len(hashes) == 1
+
+
+def test_json_is_all_there_is_on_stdout(small: Path) -> None:
+    done = program("run", "small.yaml", "--json", "--set", "output=[]", "--out", "here")
+    record = json.loads(done.stdout)
+    assert done.stderr == ""
+    assert record["directory"] == "here"
+    assert record["overrides"] == ["output=[]"]
+    assert record["outputs"] == ["run.json"]
+    assert sorted(path.name for path in (small / "here").iterdir()) == ["run.json"]
+
+
+def test_another_picture_on_the_same_sheet(small: Path) -> None:
+    (small / "elsewhere").mkdir()
+    Image.new("RGB", (8, 6), (10, 200, 30)).save(small / "elsewhere" / "green.png")
+    settings = ["--set", "output=[png]", "--set", "render.shading=none", "--set", "render.background=[10,200,30]"]
+    done = program("run", "small.yaml", "--image", "elsewhere/green.png", *settings, "--out", "green")
+    assert done.returncode == 0, done.stderr
+    assert (np.array(Image.open(small / "green" / "frames" / "0002.png")) == [10, 200, 30]).all()
+    record = json.loads((small / "green" / "run.json").read_text())
+    assert record["overrides"][-1] == "image=elsewhere/green.png"
+
+
+def test_a_simulation_that_runs_away_stops_with_3(small: Path) -> None:
+    # Within the step's limit, but pressed with a force that folds the springs over.
+    done = program("run", "small.yaml", "--set", "probes.0.force=[0,0,-1e12]", "--out", "wild")
+    assert done.returncode == 3
+    assert done.stderr.startswith("small.yaml: diverged before 0.1 s, step 41: point (4, 5) is ")
+    assert done.stderr.count("\n") == 1
+    record = json.loads((small / "wild" / "run.json").read_text())
+    assert (record["status"], record["frames"]) == ("diverged", 1)
+    assert [path.name for path in (small / "wild" / "frames").iterdir()] == ["0000.png"]
+    assert np.isfinite(np.load(small / "wild" / "trajectory.npz")["position"]).all()
+
+
+def test_ctrl_c_keeps_the_frames_so_far(small: Path) -> None:
+    settings = ["--set", "time.duration=2000", "--set", "render.size=[400,300]", "--set", "output=[png, trajectory]"]
+    process = subprocess.Popen(
+        [sys.executable, "-m", "taichi_msm", "run", "small.yaml", "--out", "long", *settings],
+        stderr=subprocess.PIPE,
+        text=True,
+    )
+    staged = small / "long" / ".partial" / "new" / "frames"
+    for _ in range(600):
+        if staged.exists() and len(list(staged.iterdir())) > 3:
+            break
+        time.sleep(0.05)
+    process.send_signal(signal.SIGINT)
+    _, error = process.communicate(timeout=30)
+    assert process.returncode == 130
+    record = json.loads((small / "long" / "run.json").read_text())
+    assert record["status"] == "interrupted"
+    frames = record["frames"]
+    assert 3 < frames < 20000
+    assert error == f"small.yaml: interrupted; frames in long: {frames}\n"
+    assert len(list((small / "long" / "frames").iterdir())) == frames
+    assert np.load(small / "long" / "trajectory.npz")["position"].shape == (frames, 9, 11, 3)
+
+
+def test_a_killed_run_leaves_the_results_before_it(small: Path) -> None:
+    assert program("run", "small.yaml", "--out", "kept").returncode == 0
+    before = {path: path.read_bytes() for path in (small / "kept").rglob("*") if path.is_file()}
+    process = subprocess.Popen(
+        [sys.executable, "-m", "taichi_msm", "run", "small.yaml", "--out", "kept", "--set", "time.duration=2000"]
+    )
+    while not (small / "kept" / ".partial" / "new" / "frames").exists():
+        time.sleep(0.02)
+    process.kill()
+    process.wait()
+    assert {path: path.read_bytes() for path in before} == before
+    assert program("run", "small.yaml", "--out", "kept").returncode == 0
+    assert not (small / "kept" / ".partial").exists()
+
+
+def call(capsys: pytest.CaptureFixture[str], *arguments: str) -> tuple[int, str, str]:
+    """Exit code, stdout and stderr of a command that needs no device."""
+    code = main(arguments)
+    captured = capsys.readouterr()
+    return code, captured.out, captured.err
+
+
+@pytest.mark.parametrize(
+    ("arguments", "error"),
+    [
+        (["run", "nowhere.yaml"], "nowhere.yaml: no such file or directory\n"),
+        (
+            ["check", "small.yaml", "--set", "springs.shaer=3", "--set", "sheet.mass=0"],
+            "--set springs.shaer=3: springs.shaer: unknown key; did you mean 'shear'?\n"
+            "--set sheet.mass=0: sheet.mass: 0 is not allowed; expected a number above 0, in kg\n",
+        ),
+        (
+            ["check", "small.yaml", "--set", "time.step=0.1"],
+            "--set time.step=0.1: time.step: 0.1 s is above the stability limit 0.00499221 s; try 0.00476190476, or auto\n",
+        ),
+        (["run"], "taichi-msm: Missing argument 'SCENE'. (see taichi-msm --help)\n"),
+        (["jump"], "taichi-msm: No such command 'jump'. (see taichi-msm --help)\n"),
+        (
+            ["check", "small.yaml", "--sett=1"],
+            "taichi-msm: No such option '--sett'. Did you mean '--set'? (see taichi-msm --help)\n",
+        ),
+        (
+            ["run", "small.yaml", "--threads", "0"],
+            "taichi-msm: Invalid value for '--threads': 0 is not in the range x>=1. (see taichi-msm --help)\n",
+        ),
+        (
+            ["run", "small.yaml", "--arch", "vulkan"],
+            "--arch vulkan: not supported; take one of: cpu, cuda\n",
+        ),
+    ],
+)
+def test_wrong_input_is_one_clear_text(
+    arguments: list[str], error: str, small: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert call(capsys, *arguments) == (2, "", error)
+    assert sorted(path.name for path in small.iterdir()) == ["small.yaml", "speckle.png"], "nothing is left behind"
+
+
+def test_errors_as_json(small: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    code, out, err = call(capsys, "check", "small.yaml", "--json", "--set", "damping=-1")
+    line = "--set damping=-1: damping: -1 is not allowed; expected a number, 0 or more, in N s/m"
+    assert (code, err) == (2, line + "\n")
+    assert json.loads(out) == {"status": "error", "errors": [line]}
+
+
+def test_check_prints_the_resolved_scene_and_what_it_takes(small: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    code, out, err = call(capsys, "check", "small.yaml")
+    assert (code, err) == (0, "")
+    assert "falloff: 20.0" in out
+    assert "\n99 points, 5 frames, 164 steps of 0.00243902 s (limit 0.00499221 s), 41 a frame\n" in out
+    assert not (small / "output").exists()
+    facts = json.loads(call(capsys, "check", "small.yaml", "--json")[1])
+    assert facts["scene"]["time"]["damping_difference"] == "central"
+    assert (facts["steps"], facts["frames"], facts["steps_per_frame"]) == (164, 5, 41)
+
+
+def test_check_without_springs_has_no_limit(small: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    code, out, _ = call(capsys, "check", "small.yaml", "--json", "--set", "springs={}")
+    assert (code, json.loads(out)["stable_step"]) == (0, None)
+
+
+def test_schema_is_a_json_schema(capsys: pytest.CaptureFixture[str]) -> None:
+    code, out, _ = call(capsys, "schema")
+    assert code == 0
+    assert json.loads(out)["$schema"] == "https://json-schema.org/draft/2020-12/schema"
+
+
+def test_a_file_in_the_way_is_4(small: Path) -> None:
+    (small / "taken").write_text("mine")
+    done = program("run", "small.yaml", "--out", "taken")
+    assert (done.returncode, done.stdout) == (4, "")
+    assert done.stderr.startswith("taken: cannot write: ")
+    assert done.stderr.count("\n") == 1
+    assert (small / "taken").read_text() == "mine"
+
+
+def test_a_bug_is_one_line(small: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> None:
+    def broken(*arguments: object) -> None:
+        raise ZeroDivisionError("by zero\nin two lines")
+
+    monkeypatch.setattr("taichi_msm.budget.estimate", broken)
+    monkeypatch.delenv("TAICHI_MSM_TRACEBACK", raising=False)
+    monkeypatch.setattr("taichi_msm.scene_file.load_scene", broken)
+    code, _, err = call(capsys, "check", "small.yaml")
+    assert code == 1
+    assert err == (
+        "taichi-msm: a bug: ZeroDivisionError: by zero in two lines; "
+        "please report it with what TAICHI_MSM_TRACEBACK=1 prints\n"
+    )
+
+
+def test_environment_of_this_test_is_not_changed() -> None:
+    assert "TAICHI_MSM_TRACEBACK" not in os.environ

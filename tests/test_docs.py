@@ -1,0 +1,57 @@
+"""What the README says is what the program does."""
+
+from __future__ import annotations
+
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from taichi_msm.scene_file import load_scene
+
+SCENES = ["press", "figure-3", "drag", "grasp", "two-tools"]
+
+
+def blocks(root: Path, language: str) -> list[str]:
+    text = (root / "README.md").read_text(encoding="utf-8")
+    return re.findall(rf"```{language}\n(.*?)```", text, flags=re.DOTALL)
+
+
+def test_the_scene_shown_is_the_scene_shipped(root: Path) -> None:
+    assert blocks(root, "yaml") == [(root / "scenes" / "press.yaml").read_text(encoding="utf-8")]
+
+
+def test_the_table_of_keys_is_made_from_the_schema(root: Path) -> None:
+    sys.path.insert(0, str(root / "docs"))
+    try:
+        from make_key_table import table  # type: ignore[import-not-found,unused-ignore]
+    finally:
+        sys.path.pop(0)
+    assert table() in (root / "README.md").read_text(encoding="utf-8"), "run docs/make_key_table.py"
+
+
+def test_the_python_shown_runs(root: Path, tmp_path: Path) -> None:
+    (code,) = blocks(root, "python")
+    (tmp_path / "scenes").symlink_to(root / "scenes")
+    (tmp_path / "example.py").write_text(code + "print(position.shape, picture.shape, record['status'])\n")
+    done = subprocess.run(
+        [sys.executable, "example.py"], cwd=tmp_path, check=True, capture_output=True, text=True
+    )
+    assert done.stdout == "(41, 41, 3) (512, 512, 3) complete\n"
+    assert (tmp_path / "output" / "from-python" / "animation.gif").exists()
+
+
+@pytest.mark.parametrize("name", SCENES)
+def test_shipped_scenes_are_valid(name: str, root: Path) -> None:
+    scene = load_scene(root / "scenes" / f"{name}.yaml")
+    assert scene.time.frames >= 25
+
+
+def test_every_file_the_readme_names_exists(root: Path) -> None:
+    text = (root / "README.md").read_text(encoding="utf-8")
+    links = [link for link in re.findall(r"\]\(([^)]+)\)", text) if "://" not in link]
+    assert links
+    for link in links:
+        assert (root / link).exists(), link

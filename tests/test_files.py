@@ -1,0 +1,356 @@
+from __future__ import annotations
+
+import errno
+import json
+import os
+import shutil
+import signal
+import subprocess
+import sys
+import zipfile
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+from PIL import Image
+
+from taichi_msm import look
+from taichi_msm.encoding import Encoder
+from taichi_msm.errors import FilesError
+from taichi_msm.files import ResultWriter
+from taichi_msm.scene import Scene
+from tests.scenes import scene, speckle
+
+ROWS, COLS = 3, 4
+WIDTH, HEIGHT = 40, 24
+TEXTURE = speckle(8, 8)
+
+# A run of one frame after another that never ends; names its encoder on stdout when the tenth is handed over.
+ENDLESS = """
+import itertools
+import sys
+from pathlib import Path
+from taichi_msm.files import ResultWriter
+from tests.test_files import TEXTURE, picture, position, small_scene
+
+with ResultWriter(Path(sys.argv[1]), small_scene(), TEXTURE) as writer:
+    for frame in itertools.count():
+        writer.add(position(frame), picture(frame))
+        if frame == 10:
+            print(writer._encoder._process.pid, flush=True)
+"""
+
+
+def small_scene(*output: str, precision: str = "f32", **render: Any) -> Scene:
+    return scene(
+        image="texture.png",
+        sheet={"points": [ROWS, COLS], "size": [0.3, 0.4], "mass": 1e-3},
+        time={"precision": precision},
+        render={"size": [WIDTH, HEIGHT], **render},
+        output=list(output or ("png", "gif", "trajectory")),
+    )
+
+
+def position(frame: int) -> NDArray[np.float64]:
+    return np.random.default_rng(frame).normal(size=(ROWS, COLS, 3))
+
+
+def picture(frame: int) -> NDArray[np.uint8]:
+    return speckle(HEIGHT, WIDTH, frame)
+
+
+def write(directory: Path, frames: int, scene: Scene) -> list[str]:
+    with ResultWriter(directory, scene, TEXTURE if scene.draws else None) as writer:
+        for frame in range(frames):
+            writer.add(position(frame), picture(frame) if scene.draws else None)
+        names = writer.publish({"frames": frames})
+        assert writer.frames == frames
+    return names
+
+
+def files(directory: Path) -> dict[str, bytes]:
+    return {str(p.relative_to(directory)): p.read_bytes() for p in directory.rglob("*") if p.is_file()}
+
+
+def test_all_results_of_a_run(tmp_path: Path) -> None:
+    names = write(tmp_path / "a" / "b", 11, small_scene())
+    assert names == ["frames", "animation.gif", "trajectory.npz", "run.json"]
+    found = files(tmp_path / "a" / "b")
+    frames = [f"frames/{frame:04}.png" for frame in range(11)]
+    assert sorted(found) == sorted([*frames, "animation.gif", "trajectory.npz", "run.json"])
+    for frame in range(11):
+        with Image.open(tmp_path / "a" / "b" / frames[frame]) as image:
+            np.testing.assert_array_equal(np.asarray(image), picture(frame))
+    with Image.open(tmp_path / "a" / "b" / "animation.gif") as image:
+        assert image.size == (WIDTH, HEIGHT)
+        assert getattr(image, "n_frames", 1) == 11
+    assert json.loads(found["run.json"]) == {"frames": 11, "outputs": names}
+
+
+def test_equal_runs_write_equal_bytes(tmp_path: Path) -> None:
+    for name in ("first", "second"):
+        write(tmp_path / name, 7, small_scene())
+    assert files(tmp_path / "first") == files(tmp_path / "second")
+
+
+@pytest.mark.parametrize(
+    ("outputs", "names"),
+    [
+        (("png",), ["frames", "run.json"]),
+        (("gif",), ["animation.gif", "run.json"]),
+        (("trajectory",), ["trajectory.npz", "run.json"]),
+    ],
+)
+def test_only_the_outputs_asked_for_are_there(
+    tmp_path: Path, outputs: tuple[str, ...], names: list[str]
+) -> None:
+    """Also those that an earlier run left go, but no file of the user's."""
+    write(tmp_path, 4, small_scene())
+    (tmp_path / "notes.txt").write_text("mine")
+    assert write(tmp_path, 3, small_scene(*outputs)) == names
+    assert sorted(path.name for path in tmp_path.iterdir()) == sorted([*names, "notes.txt"])
+    if "png" in outputs:
+        assert len(list((tmp_path / "frames").iterdir())) == 3
+
+
+def test_a_run_without_outputs_writes_its_record(tmp_path: Path) -> None:
+    assert write(tmp_path, 3, scene(output=[])) == ["run.json"]
+    assert [path.name for path in tmp_path.iterdir()] == ["run.json"]
+
+
+def test_a_run_that_ended_before_its_first_frame(tmp_path: Path) -> None:
+    assert write(tmp_path, 0, small_scene()) == ["trajectory.npz", "run.json"]
+    with np.load(tmp_path / "trajectory.npz") as trajectory:
+        assert trajectory["position"].shape == (0, ROWS, COLS, 3)
+        assert trajectory["time"].shape == (0,)
+
+
+@pytest.mark.parametrize(("precision", "dtype"), [("f32", np.float32), ("f64", np.float64)])
+def test_the_trajectory_comes_back(tmp_path: Path, precision: str, dtype: type[np.floating[Any]]) -> None:
+    write(tmp_path, 6, small_scene("trajectory", precision=precision))
+    with np.load(tmp_path / "trajectory.npz") as trajectory:
+        assert trajectory["position"].dtype == dtype
+        assert trajectory["time"].dtype == np.float64
+        np.testing.assert_array_equal(trajectory["time"], np.arange(6) / 25)
+        np.testing.assert_array_equal(trajectory["position"], [position(f).astype(dtype) for f in range(6)])
+
+
+def test_a_trajectory_may_be_longer_than_4_gib(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """zipfile refuses to write past its limit unless it was told before the first byte."""
+    monkeypatch.setattr(zipfile, "ZIP64_LIMIT", 1000)
+    write(tmp_path, 20, small_scene("trajectory"))
+    with np.load(tmp_path / "trajectory.npz") as trajectory:
+        assert trajectory["position"].shape == (20, ROWS, COLS, 3)
+
+
+@pytest.mark.parametrize("shading", ["none", "headlight"])
+@pytest.mark.parametrize("wireframe", [False, True])
+def test_the_animation_is_like_its_frames(tmp_path: Path, shading: str, wireframe: bool) -> None:
+    """The palette foresees a texture in light and shade, under the wires, and beside the background."""
+    texture = np.empty((16, 16, 3), np.uint8)
+    texture[:, ::2], texture[:, 1::2] = (200, 100, 90), (220, 130, 100)
+    frame = texture.astype(float)
+    if shading == "headlight":
+        frame[:8] *= 0.6
+    if wireframe:
+        frame[:, 5] += (np.array(look.WIRE_COLOUR) - frame[:, 5]) * look.WIRE_OPACITY
+    background = (1, 99, 255)
+    frame[:, 0] = background
+    wanted = small_scene("gif", shading=shading, wireframe=wireframe, background=background, size=[16, 16])
+    with ResultWriter(tmp_path, wanted, texture) as writer:
+        writer.add(position(0), frame.astype(np.uint8))
+        writer.publish({})
+    with Image.open(tmp_path / "animation.gif") as image:
+        shown = np.asarray(image.convert("RGB")).astype(float)
+    assert (shown[:, 0] == background).all()
+    # Levels of light lie up to a fifth apart: half of that, of 220, and the lookup's 2 and the rounding's 1.
+    assert np.abs(shown - frame).max() <= 25
+
+
+def test_leaving_without_publishing_leaves_what_was_there(tmp_path: Path) -> None:
+    write(tmp_path / "out", 3, small_scene())
+    before = files(tmp_path / "out")
+    for directory in (tmp_path / "out", tmp_path / "fresh"):
+        with ResultWriter(directory, small_scene(), TEXTURE) as writer:
+            writer.add(position(9), picture(9))
+    assert files(tmp_path / "out") == before
+    assert not (tmp_path / "fresh").exists()
+
+
+def test_an_interrupted_hand_over_leaves_whole_frames(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Ctrl-C may come when the positions of a frame, but only half of its picture, are handed over."""
+
+    def interrupted(encoder: Encoder, picture: NDArray[np.uint8]) -> None:
+        add(encoder, picture[: HEIGHT // 2])
+        raise KeyboardInterrupt
+
+    add = Encoder.add
+    with ResultWriter(tmp_path, small_scene(), TEXTURE) as writer:
+        writer.add(position(0), picture(0))
+        monkeypatch.setattr(Encoder, "add", interrupted)
+        with pytest.raises(KeyboardInterrupt):
+            writer.add(position(1), picture(1))
+        writer.finish()
+        assert writer.frames == 1
+        writer.publish({})
+    assert [path.name for path in (tmp_path / "frames").iterdir()] == ["0000.png"]
+    with np.load(tmp_path / "trajectory.npz") as trajectory:
+        np.testing.assert_array_equal(trajectory["position"], [position(0).astype(np.float32)])
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="no sessions")
+def test_ctrl_c_does_not_reach_the_encoder(tmp_path: Path) -> None:
+    with ResultWriter(tmp_path, small_scene(), TEXTURE) as writer:
+        assert writer._encoder
+        assert os.getsid(writer._encoder._process.pid) != os.getsid(0)
+
+
+def test_the_time_spent_encoding_is_told(tmp_path: Path) -> None:
+    with ResultWriter(tmp_path, small_scene(), TEXTURE) as writer:
+        writer.add(position(0), picture(0))
+        writer.finish()
+        assert 0 < writer.encode_seconds < 60
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="kills with SIGKILL")
+def test_a_killed_run_leaves_the_results_and_the_next_one_goes_on(tmp_path: Path, root: Path) -> None:
+    write(tmp_path, 3, small_scene())
+    before = files(tmp_path)
+    command = [sys.executable, "-c", ENDLESS, str(tmp_path)]
+    with subprocess.Popen(command, cwd=root, stdout=subprocess.PIPE, stderr=subprocess.PIPE) as run:
+        assert run.stdout
+        encoder = int(run.stdout.readline())
+        with pytest.raises(FilesError, match="another run is writing there"):
+            write(tmp_path, 2, small_scene())
+        os.kill(encoder, signal.SIGSTOP)
+        run.kill()
+        run.wait()
+        with pytest.raises(FilesError, match="another run is writing there"):
+            write(tmp_path, 2, small_scene())
+        os.kill(encoder, signal.SIGCONT)
+        run.communicate()  # until the encoder has ended too
+    assert {name: data for name, data in files(tmp_path).items() if ".partial" not in name} == before
+    write(tmp_path, 2, small_scene())
+    assert len(list((tmp_path / "frames").iterdir())) == 2
+    assert not (tmp_path / ".partial").exists()
+
+
+def full_disk(*_: object, **__: object) -> None:
+    raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+
+@pytest.mark.parametrize("target", ["write_bytes", "write_text", "replace"])
+def test_a_full_disk_is_one_line_and_changes_nothing(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, target: str
+) -> None:
+    """When the job is written, the record, or the marker."""
+    write(tmp_path, 3, small_scene())
+    before = files(tmp_path)
+    monkeypatch.setattr(Path, target, full_disk)
+    with pytest.raises(FilesError) as told:
+        write(tmp_path, 2, small_scene())
+    assert str(told.value) == (
+        f"{tmp_path}: cannot write: No space left on device; free some space or choose another --out"
+    )
+    assert files(tmp_path) == before
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="needs a limit for the size of files")
+@pytest.mark.parametrize(
+    ("points", "limit"),
+    [
+        pytest.param(100, 4096, id="many positions fail at once"),
+        pytest.param(2, 40, id="few wait in a buffer until the end"),
+        pytest.param(100, 100 * 100 * 3 * 8 + 200, id="the positions fit but not their headers"),
+    ],
+)
+def test_positions_that_cannot_be_written(tmp_path: Path, points: int, limit: int) -> None:
+    import resource
+
+    sheet = {"points": [points, points], "size": [0.3, 0.4], "mass": 1e-3}
+    soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
+
+    def run() -> None:
+        with ResultWriter(tmp_path, scene(sheet=sheet, output=["trajectory"]), None) as writer:
+            resource.setrlimit(resource.RLIMIT_FSIZE, (limit, hard))
+            writer.add(np.zeros((points, points, 3)), None)
+            writer.publish({})
+
+    try:
+        with pytest.raises(FilesError, match="cannot write: File too large; choose another --out"):
+            run()
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
+    assert list(tmp_path.iterdir()) == []
+
+
+def refused(directory: Path, meanwhile: Callable[[ResultWriter], None] = lambda _: None) -> str:
+    """The error of a run of many frames in whose course something happens."""
+
+    def run() -> None:
+        with ResultWriter(directory, small_scene(), TEXTURE) as writer:
+            meanwhile(writer)
+            for frame in range(1000):
+                writer.add(position(frame), picture(frame))
+            writer.publish({})
+
+    with pytest.raises(FilesError) as told:
+        run()
+    return str(told.value)
+
+
+def test_a_file_in_the_place_of_the_directory(tmp_path: Path) -> None:
+    (tmp_path / "out").write_text("mine")
+    assert refused(tmp_path / "out") == (
+        f"{tmp_path / 'out'}: cannot write: Not a directory; choose another --out"
+    )
+
+
+@pytest.mark.skipif(not hasattr(os, "geteuid") or os.geteuid() == 0, reason="root may write everywhere")
+def test_a_directory_that_cannot_be_written(tmp_path: Path) -> None:
+    tmp_path.chmod(0o500)
+    assert "Permission denied; choose another --out" in refused(tmp_path / "out")
+
+
+def test_what_stops_the_encoder_is_told(tmp_path: Path) -> None:
+    def block(_: ResultWriter) -> None:
+        (tmp_path / ".partial" / "new" / "frames").write_text("in the way")
+
+    assert refused(tmp_path, block) == f"{tmp_path}: cannot write: File exists; choose another --out"
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_an_encoder_that_is_killed_is_told(tmp_path: Path) -> None:
+    def kill(writer: ResultWriter) -> None:
+        assert writer._encoder
+        writer._encoder._process.kill()
+
+    assert "cannot write: the encoder ended with exit code" in refused(tmp_path, kill)
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="open files stay there")
+def test_a_directory_that_vanishes(tmp_path: Path) -> None:
+    def vanish(_: ResultWriter) -> None:
+        shutil.rmtree(tmp_path / "out")
+
+    assert "No such file or directory; choose another --out" in refused(tmp_path / "out", vanish)
+    assert not (tmp_path / "out").exists()
+
+
+def test_the_record_is_strict_json(tmp_path: Path) -> None:
+    with ResultWriter(tmp_path, scene(), None) as writer:
+        with pytest.raises(ValueError, match="not JSON compliant"):
+            writer.publish({"step": float("nan")})
+        writer.publish({"image": "Schleimhaut-Ä.png", "odd": "\udcff.png"})
+    text = (tmp_path / "run.json").read_bytes().decode()
+    assert text == (
+        '{\n  "image": "Schleimhaut-Ä.png",\n  "odd": "\\udcff.png",\n'
+        '  "outputs": [\n    "run.json"\n  ]\n}\n'
+    )
+    assert json.loads(text)["odd"] == "\udcff.png"

@@ -1,0 +1,72 @@
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numpy as np
+import pytest
+
+from taichi_msm import reference
+from taichi_msm.lattice import rest_positions
+from taichi_msm.stability import highest_frequency, problems, stable_step, step, steps_per_frame
+from tests.scenes import SHEET, scene
+
+
+def test_limit_of_central_differences() -> None:
+    made = scene(sheet={**SHEET, "mass": 0.5}, springs={"structural": 3, "shear": 5, "virtual": 2})
+    w = math.sqrt((4 * 3 + 8 * 5 + 2) / 0.5)
+    assert stable_step(made) == pytest.approx(2 / w, rel=1e-14)
+
+
+def test_limit_of_backward_differences() -> None:
+    made = scene(
+        sheet={**SHEET, "mass": 0.5}, springs={"structural": 6}, damping=3.0, time={"damping_difference": "backward"}
+    )
+    g, w2 = 6.0, 8 * 6 / 0.5
+    assert stable_step(made) == pytest.approx((math.sqrt(g * g + 4 * w2) - g) / w2, rel=1e-14)
+
+
+def test_without_springs_nothing_limits_but_backward_damping() -> None:
+    assert stable_step(scene(springs={})) == math.inf
+    assert steps_per_frame(scene(springs={})) == 1
+    damped = scene(springs={}, sheet={**SHEET, "mass": 2}, damping=8.0, time={"damping_difference": "backward"})
+    assert stable_step(damped) == pytest.approx(2 / (8.0 / 2), rel=1e-14)
+
+
+def test_bound_holds_and_is_tight() -> None:
+    # The largest eigenvalue of the stiffness of a free sheet, by the twin's own forces, nears the bound from below.
+    made = scene(sheet={**SHEET, "points": [7, 7], "fixed": "none"}, springs={"structural": 3, "shear": 5}, probes=[])
+    size = rest_positions(made.sheet).size
+    small = 1e-6
+    stiffness = np.empty((size, size))
+    for n in range(size):
+        u = np.zeros(size)
+        u[n] = small
+        stiffness[n] = -reference.elastic_force(made, u.reshape(7, 7, 3)).ravel() / small
+    largest = np.linalg.eigvalsh((stiffness + stiffness.T) / 2)[-1] / made.sheet.mass
+    assert 0.5 < largest / highest_frequency(made) ** 2 < 1
+
+
+@pytest.mark.parametrize("limit_per_frame", [0.3, 1.0, 7.9, 8.0, 8.1])
+def test_auto_is_the_largest_whole_fraction_within_half_the_limit(limit_per_frame: float) -> None:
+    # m = 8 k h^2 / 4 makes 2 / w = h; a frame is 1/25 s.
+    h = 1 / 25 / limit_per_frame
+    made = scene(sheet={**SHEET, "mass": 2 * 3.0 * h * h}, springs={"structural": 3.0})
+    n = steps_per_frame(made)
+    assert step(made) <= stable_step(made) / 2 * (1 + 1e-9)
+    assert n == 1 or 1 / 25 / (n - 1) > stable_step(made) / 2
+
+
+def refused(given: float, **changes: Any) -> list[str]:
+    return [str(problem) for problem in problems(scene(springs={"structural": 3.0}, time={"step": given}, **changes))]
+
+
+def test_a_step_above_the_limit_is_refused_with_the_limit() -> None:
+    # 2 / sqrt(24 / 1e-3) = 0.0129099 s; 0.04 / 4 = 0.01 s is the largest whole fraction of a frame below.
+    assert refused(0.02) == ["time.step: 0.02 s is above the stability limit 0.0129099 s; try 0.01, or auto"]
+    assert refused(0.01) == []
+
+
+def test_a_step_divides_a_frame() -> None:
+    assert refused(0.011) == ["time.step: 0.011 s does not divide a frame of 0.04 s; try 0.01"]
+    assert refused(0.04 / 7) == []

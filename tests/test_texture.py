@@ -1,0 +1,331 @@
+from __future__ import annotations
+
+import os
+import warnings
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+from PIL import Image
+
+from taichi_msm.errors import SceneError
+from taichi_msm.scene import Scene
+from taichi_msm.texture import load_texture, problems, texture_size
+
+BACKGROUND = (10, 20, 30)
+ORIENTATION = 0x0112
+
+# Chosen so that every wrong turn, mirror or channel order shows: 2 rows of 3 different colours.
+COLOURS = np.array(
+    [[[255, 0, 0], [0, 255, 0], [0, 0, 255]], [[255, 255, 0], [0, 255, 255], [255, 255, 255]]], dtype=np.uint8
+)
+
+
+@pytest.fixture(autouse=True)
+def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    monkeypatch.chdir(tmp_path)
+    return tmp_path
+
+
+def scene(image: str | None, **keys: Any) -> Scene:
+    return Scene.model_validate(
+        {
+            "image": image,
+            "sheet": {"points": [2, 2], "size": [1, 1], "mass": 1},
+            "springs": {},
+            "time": {"duration": 1},
+            "render": {"background": BACKGROUND},
+            "output": [],
+            **keys,
+        }
+    )
+
+
+def faults(image: str | None, **keys: Any) -> list[str]:
+    return [str(problem) for problem in problems(scene(image, **keys))]
+
+
+def refusal(image: str, **keys: Any) -> str:
+    with pytest.raises(SceneError) as caught:
+        load_texture(scene(image, **keys))
+    (line,) = caught.value.lines
+    return line
+
+
+def assert_texture(image: str, expected: Any, **keys: Any) -> None:
+    """The texture is as expected, its size is known beforehand, and no problem is seen in it."""
+    texture = load_texture(scene(image, **keys))
+    assert texture.dtype == np.uint8
+    np.testing.assert_array_equal(texture, np.array(expected, dtype=np.uint8))
+    assert texture_size(scene(image, **keys)) == (texture.shape[1], texture.shape[0])
+    assert faults(image, **keys) == []
+
+
+def grey(*values: int) -> NDArray[np.uint8]:
+    """One row of grey pixels, shape (1, n, 3)."""
+    return np.repeat(np.array(values, dtype=np.uint8)[None, :, None], 3, axis=2)
+
+
+@pytest.mark.parametrize("name", ["a.png", "a.bmp", "a.tif", "a.webp", "a.with.no.known.ending"])
+def test_lossless_formats_keep_every_bit(name: str) -> None:
+    kind = {"bmp": "BMP", "tif": "TIFF", "webp": "WEBP"}.get(name[2:], "PNG")
+    Image.fromarray(COLOURS).save(name, format=kind, lossless=True)
+    assert_texture(name, COLOURS)
+
+
+def test_jpeg() -> None:
+    Image.new("RGB", (16, 8), (200, 100, 50)).save("a.jpg", quality=100, subsampling=0)
+    texture = load_texture(scene("a.jpg"))
+    assert texture.shape == (8, 16, 3)
+    # Rounding to whole Y, Cb, Cr and back is within 2 of each colour.
+    assert np.abs(texture.astype(int) - [200, 100, 50]).max() <= 2
+
+
+def test_one_pixel() -> None:
+    Image.new("RGB", (1, 1), (1, 2, 3)).save("a.png")
+    assert_texture("a.png", [[[1, 2, 3]]])
+
+
+@pytest.mark.parametrize("name", ["a.png", "a.tif"])
+def test_16_bit_grey_is_scaled_to_the_nearest(name: str) -> None:
+    Image.fromarray(np.array([[0, 128, 129, 257, 32768, 65535]], dtype=np.uint16)).save(name)
+    # v / 257: 0, 0.498, 0.502, 1, 127.502, 255
+    assert_texture(name, grey(0, 0, 1, 1, 128, 255))
+
+
+def test_big_endian_16_bit_grey() -> None:
+    Image.frombytes("I;16B", (2, 1), bytes([0x01, 0x01, 0xFF, 0xFF])).save("a.tif")
+    assert_texture("a.tif", grey(1, 255))
+
+
+def test_black_and_white() -> None:
+    image = Image.new("1", (2, 1))
+    image.putpixel((1, 0), 1)
+    image.save("a.png")
+    assert_texture("a.png", grey(0, 255))
+
+
+def test_grey() -> None:
+    Image.fromarray(np.array([[0, 77, 255]], dtype=np.uint8)).save("a.png")
+    assert_texture("a.png", grey(0, 77, 255))
+
+
+def test_grey_with_alpha_lies_on_the_background() -> None:
+    Image.fromarray(np.array([[[200, 255], [200, 0]]], dtype=np.uint8)).save("a.png")
+    assert_texture("a.png", [[[200, 200, 200], BACKGROUND]])
+
+
+def test_colour_with_alpha_lies_on_the_background() -> None:
+    pixels = [[[200, 100, 50, 255], [200, 100, 50, 0], [200, 100, 50, 51]]]
+    Image.fromarray(np.array(pixels, dtype=np.uint8)).save("a.png")
+    # 51 / 255 is a fifth: 10 + 190 / 5, 20 + 80 / 5, 30 + 20 / 5
+    assert_texture("a.png", [[[200, 100, 50], BACKGROUND, [48, 36, 34]]])
+
+
+@pytest.fixture
+def palette() -> Image.Image:
+    image = Image.new("P", (3, 1))
+    image.putpalette([255, 0, 0, 0, 255, 0, 0, 0, 255])
+    image.putdata([2, 0, 1])
+    return image
+
+
+def test_palette(palette: Image.Image) -> None:
+    palette.save("a.png")
+    assert_texture("a.png", [[[0, 0, 255], [255, 0, 0], [0, 255, 0]]])
+
+
+@pytest.mark.parametrize("transparency", [0, bytes([0, 255, 255])], ids=["index", "bytes"])
+def test_palette_with_transparency(palette: Image.Image, transparency: int | bytes) -> None:
+    palette.save("a.png", transparency=transparency)
+    assert_texture("a.png", [[[0, 0, 255], BACKGROUND, [0, 255, 0]]])
+
+
+def test_a_transparent_colour() -> None:
+    Image.fromarray(COLOURS[:1]).save("a.png", transparency=(0, 255, 0))
+    assert_texture("a.png", [[[255, 0, 0], BACKGROUND, [0, 0, 255]]])
+
+
+def test_cmyk() -> None:
+    Image.frombytes("CMYK", (3, 1), bytes([0, 0, 0, 0, 255, 0, 0, 0, 0, 0, 0, 255])).save("a.tif")
+    assert_texture("a.tif", [[[255, 255, 255], [0, 255, 255], [0, 0, 0]]])
+
+
+@pytest.mark.parametrize("name", ["a.png", "a.tif", "a.webp"])
+@pytest.mark.parametrize(
+    ("orientation", "upright"),
+    [
+        (1, COLOURS),
+        (2, COLOURS[:, ::-1]),
+        (3, COLOURS[::-1, ::-1]),
+        (4, COLOURS[::-1]),
+        (5, COLOURS.swapaxes(0, 1)),
+        (6, np.rot90(COLOURS, -1)),
+        (7, COLOURS[::-1, ::-1].swapaxes(0, 1)),
+        (8, np.rot90(COLOURS)),
+    ],
+)
+def test_exif_orientation(name: str, orientation: int, upright: NDArray[np.uint8]) -> None:
+    exif = Image.Exif()
+    exif[ORIENTATION] = orientation
+    Image.fromarray(COLOURS).save(name, exif=exif, lossless=True)
+    assert_texture(name, upright)
+    height, width = upright.shape[:2]
+    assert_texture(name, upright[1:, 1:], region=[1, 1, width - 1, height - 1])
+
+
+def test_exif_orientation_of_a_jpeg_turns_its_size() -> None:
+    exif = Image.Exif()
+    exif[ORIENTATION] = 6
+    Image.new("RGB", (16, 8)).save("a.jpg", exif=exif)
+    assert texture_size(scene("a.jpg")) == (8, 16)
+    assert load_texture(scene("a.jpg")).shape == (16, 8, 3)
+
+
+def test_the_first_of_several_pictures() -> None:
+    first, second = Image.fromarray(COLOURS), Image.fromarray(COLOURS[::-1])
+    for name in ("a.png", "a.tif", "a.webp"):
+        first.save(name, save_all=True, append_images=[second], lossless=True)
+        assert_texture(name, COLOURS)
+
+
+def test_region() -> None:
+    Image.fromarray(COLOURS).save("a.png")
+    assert_texture("a.png", COLOURS[1:2, 0:2], region=[0, 1, 2, 1])
+    assert_texture("a.png", COLOURS[0:2, 2:3], region=[2, 0, 1, 2])
+
+
+@pytest.mark.parametrize(
+    ("region", "fault"),
+    [
+        ([1, 0, 3, 2], "region: [1, 0, 3, 2] ends at 4, 2; the image has 3 x 2 pixels"),
+        ([0, 1, 3, 2], "region: [0, 1, 3, 2] ends at 3, 3; the image has 3 x 2 pixels"),
+        ([-1, 0, 2, 2], "region: [-1, 0, 2, 2] needs x and y of 0 or more, width and height above 0"),
+        ([0, -1, 2, 2], "region: [0, -1, 2, 2] needs x and y of 0 or more, width and height above 0"),
+        ([0, 0, 0, 2], "region: [0, 0, 0, 2] needs x and y of 0 or more, width and height above 0"),
+        ([0, 0, 2, 0], "region: [0, 0, 2, 0] needs x and y of 0 or more, width and height above 0"),
+    ],
+)
+def test_a_region_outside_the_image(region: list[int], fault: str) -> None:
+    Image.fromarray(COLOURS).save("a.png")
+    assert faults("a.png", region=region) == [fault]
+    assert refusal("a.png", region=region) == fault
+
+
+def test_a_region_without_an_image() -> None:
+    assert faults(None, region=[0, 0, 9, 9]) == []
+    assert faults(None, region=[0, 0, 9, 0]) != []
+    assert faults(None) == []
+    assert texture_size(scene(None)) is None
+
+
+def gif_named_png(name: str) -> None:
+    Image.new("P", (3, 3)).save(name, format="GIF", save_all=True, append_images=[Image.new("P", (3, 3), 1)])
+
+
+@pytest.mark.parametrize(
+    ("make", "fault"),
+    [
+        (lambda _: None, "no such file or directory; name a picture that can be read"),
+        (lambda name: Path(name).mkdir(), "is a directory; name a picture"),
+        (os.mkfifo, "is not a regular file; name a picture"),
+        (
+            lambda name: Path(name).write_text("text"),
+            "is not a PNG, JPEG, WebP, BMP or TIFF picture; convert it",
+        ),
+        (lambda name: Path(name).touch(), "is not a PNG, JPEG, WebP, BMP or TIFF picture; convert it"),
+        (gif_named_png, "is not a PNG, JPEG, WebP, BMP or TIFF picture; convert it"),
+        (
+            lambda name: Image.new("F", (3, 3)).save(name, format="TIFF"),
+            "has pixels of kind F; save it as 8-bit RGB",
+        ),
+        (
+            lambda name: Image.new("I", (3, 3)).save(name, format="TIFF"),
+            "has pixels of kind I; save it as 8-bit RGB",
+        ),
+    ],
+    ids=["missing", "directory", "pipe", "text", "empty", "gif", "float", "32 bits"],
+)
+def test_files_that_are_no_pictures(make: Any, fault: str) -> None:
+    make("a.png")
+    colon = ":" if fault.startswith("no such") else ""
+    expected = f"image: a.png{colon} {fault}"
+    assert faults("a.png") == [expected]
+    assert refusal("a.png") == expected
+    assert texture_size(scene("a.png")) is None
+
+
+def test_a_link_is_followed() -> None:
+    Image.fromarray(COLOURS).save("b.png")
+    Path("a.png").symlink_to("b.png")
+    assert_texture("a.png", COLOURS)
+
+
+@pytest.mark.parametrize("name", ["a.png", "a.jpg", "a.bmp", "a.tif", "a.webp"])
+def test_truncated_pictures(name: str) -> None:
+    rng = np.random.default_rng(1)
+    Image.fromarray(rng.integers(0, 256, (64, 64, 3), dtype=np.uint8)).save(name)
+    whole = Path(name).read_bytes()
+    Path(name).write_bytes(whole[: len(whole) // 2])
+    line = refusal(name)
+    assert line.startswith(f"image: {name} ")
+    assert line.endswith(("; save it anew", "; convert it"))
+
+
+def test_broken_pictures_bring_up_no_other_error() -> None:
+    rng = np.random.default_rng(1)
+    picture = Image.fromarray(rng.integers(0, 256, (8, 8, 3), dtype=np.uint8))
+    refused = 0
+    for name in ("a.png", "a.jpg", "a.bmp", "a.tif", "a.webp"):
+        picture.save(name)
+        whole = bytearray(Path(name).read_bytes())
+        for _ in range(60):
+            broken = whole.copy()
+            for at in rng.integers(0, len(whole), 3):
+                broken[at] = rng.integers(0, 256)
+            Path(name).write_bytes(broken)
+            list(problems(scene(name)))
+            try:
+                load_texture(scene(name))
+            except SceneError:
+                refused += 1
+    assert refused > 50
+
+
+def test_a_picture_of_too_many_pixels(monkeypatch: pytest.MonkeyPatch) -> None:
+    Image.new("1", (2000, 1500)).save("a.png")
+    # Pillow warns of more pixels than this and refuses twice as many: 3 million are refused both ways.
+    for limit in (2_000_000, 1_000_000):
+        monkeypatch.setattr(Image, "MAX_IMAGE_PIXELS", limit)
+        expected = f"image: a.png has more than {limit // 10**6} million pixels; scale it down"
+        assert faults("a.png") == [expected]
+        assert refusal("a.png") == expected
+
+
+def test_the_size_is_read_from_the_header_alone(monkeypatch: pytest.MonkeyPatch) -> None:
+    for name in ("a.png", "a.jpg", "a.bmp", "a.tif", "a.webp"):
+        Image.fromarray(COLOURS).save(name)
+        with monkeypatch.context() as patch:
+            patch.setattr(Image.Image, "load", pytest.fail)
+            assert texture_size(scene(name)) == (3, 2)
+            assert faults(name) == []
+
+
+def test_no_warning_is_left_behind() -> None:
+    exif = Image.Exif()
+    exif[ORIENTATION] = 6
+    Image.fromarray(COLOURS).save("a.jpg", exif=exif)
+    broken = (
+        Path("a.jpg").read_bytes().replace(exif.tobytes()[:14], exif.tobytes()[:10] + b"\xff\xff\xff\xff")
+    )
+    Path("a.jpg").write_bytes(broken)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        load_texture(scene("a.jpg"))
+
+
+def test_a_scene_without_a_picture() -> None:
+    with pytest.raises(SceneError, match="image: no picture is named"):
+        load_texture(scene(None))
