@@ -21,7 +21,7 @@ def rows(section: dict[str, Any], definitions: dict[str, Any], prefix: str = "")
     """Give a line for every key of a section and of the sections below it."""
     for name, key in section["properties"].items():
         default = json.dumps(key["default"]) if "default" in key else ""
-        below = [part for part in _references(key)]
+        below = list(_references(key))
         if below and name != "camera":
             default = ""
         shown = f"`{default}`" if default not in ("", "null") else ""

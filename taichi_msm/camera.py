@@ -66,9 +66,7 @@ def _top(scene: Scene) -> View:
     """Look straight down, the rest rectangle fitted into the picture at one scale and centred."""
     (height, width), (columns, lines) = scene.sheet.size, scene.render.size
     scale = min(columns / width, lines / height)
-    matrix = np.array(
-        [[scale, 0, 0, columns / 2], [0, -scale, 0, lines / 2], [0, 0, 0, 1], [0, 0, -1, 0]], dtype=float
-    )
+    matrix = np.array([[scale, 0, 0, columns / 2], [0, -scale, 0, lines / 2], [0, 0, 0, 1], [0, 0, -1, 0]], dtype=float)
     return View(matrix, np.array([0.0, 0.0, 1.0]), 0.0)
 
 

@@ -143,10 +143,10 @@ class _Fields:
 
         samples = s.height * s.supersample, s.width * s.supersample
         self.point = field(vec4, s.rows, s.cols)
-        self.normal = field(vec3, s.rows, s.cols) if s.lit else None
+        self.normal: Any = field(vec3, s.rows, s.cols) if s.lit else None
         self.vertex = field(vec4, *s.vertices)
         self.snapped = field(vec2i, *s.vertices)
-        self.light = field(ti.f32, *s.vertices) if s.lit else None
+        self.light: Any = field(ti.f32, *s.vertices) if s.lit else None
         # The nearest triangle of every sample: its depth above, its number below.
         self.nearest = field(ti.u64, *samples)
         self.picture = field(ti.types.vector(3, ti.u8), s.height, s.width)
@@ -187,9 +187,12 @@ def rasteriser(fields: _Fields, width: int, height: int, visit: Callable[..., No
         half = SUBPIXEL // 2
         low = ti.min(p, ti.min(q, r))
         high = ti.max(p, ti.max(q, r))
-        for y in range(ti.max((low[1] + half - 1) >> SUBPIXEL_BITS, 0), ti.min((high[1] - half) >> SUBPIXEL_BITS, height - 1) + 1):
+        for y in range(
+            ti.max((low[1] + half - 1) >> SUBPIXEL_BITS, 0), ti.min((high[1] - half) >> SUBPIXEL_BITS, height - 1) + 1
+        ):
             for x in range(
-                ti.max((low[0] + half - 1) >> SUBPIXEL_BITS, 0), ti.min((high[0] - half) >> SUBPIXEL_BITS, width - 1) + 1
+                ti.max((low[0] + half - 1) >> SUBPIXEL_BITS, 0),
+                ti.min((high[0] - half) >> SUBPIXEL_BITS, width - 1) + 1,
             ):
                 at_x = x * SUBPIXEL + half
                 at_y = y * SUBPIXEL + half

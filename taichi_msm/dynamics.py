@@ -18,7 +18,6 @@ and last entry of a row are a halo: the same strips moved by one lane. A GPU tak
 
 # No `from __future__ import annotations` here: Taichi reads the annotations of a kernel.
 
-import math
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
@@ -30,7 +29,7 @@ from taichi_msm.lattice import fixed_points, rest_positions, spacing, springs
 from taichi_msm.loads import decay, grips, schedule
 from taichi_msm.runtime import Device, ti
 from taichi_msm.scene import Scene
-from taichi_msm.stability import step, steps_per_frame
+from taichi_msm.stability import step
 
 # Lanes of a 256-bit vector.
 LANES = {"f32": 8, "f64": 4}
@@ -45,7 +44,7 @@ MAX_STEPS_PER_LAUNCH = 8192
 # On a GPU a launch is a chain of this many kernels, one a step.
 GPU_STEPS_PER_LAUNCH = 16
 
-# Taichi gives a CPU thread at least this many iterations of a parallel loop (its pass make_cpu_multithreaded_range_for).
+# Taichi gives a CPU thread at least this many iterations of a parallel loop: make_cpu_multithreaded_range_for.cpp.
 ITERATIONS_PER_THREAD = 512
 
 # Integers between the progress counters of two workers, so that each has a cache line of its own.

@@ -62,7 +62,7 @@ class ResultWriter:
 
     @property
     def encode_seconds(self) -> float:
-        """Time spent encoding pictures, beside the simulation [s]; known after `finish`."""
+        """Processor time spent encoding pictures, beside the simulation [s]; known after `finish`."""
         return self._encode_seconds
 
     def add(self, position: NDArray[Any], picture: Picture | None) -> None:

@@ -43,7 +43,7 @@ class Palette:
 
     def __init__(self, samples: Picture, background: tuple[int, int, int]) -> None:
         reduced = Image.fromarray(samples).quantize(COLOURS - 1).getpalette() or []
-        colours = np.array([*background, *reduced[: 3 * (COLOURS - 1)]], np.uint8).reshape(-1, 3)
+        colours = np.array([*background, *reduced], np.uint8).reshape(-1, 3)
         self.table: Picture = np.concatenate([colours, np.zeros((COLOURS + 1 - len(colours), 3), np.uint8)])
         self._background = background
         self._lookup = Image.new("P", (1, 1))

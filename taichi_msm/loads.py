@@ -144,11 +144,10 @@ def schedule(scene: Scene, first: int, count: int) -> Schedule:
         right = percent[part.probe, 1] * ((part.start <= t) & (t < part.end))
         strength[:, n] = np.multiply.outer(_mean(left, right, t) / 100, scene.probes[part.probe].force)
         point[:, n] = _between(part.times, part.points, t, _limits(part.times, t)[1], part.points[0])
-    if scene.springs.virtual_active == "always":
-        active = np.ones(count)
-    else:
-        active = _mean(*pressing.astype(float), t)
-    return Schedule(strength, point, active)
+    always = scene.springs.virtual_active == "always"
+    return Schedule(
+        strength, point, np.ones(count) if always else _mean(left=pressing[0] * 1.0, right=pressing[1] * 1.0, t=t)
+    )
 
 
 def _snap(t: Array, keys: Array) -> Array:

@@ -127,8 +127,7 @@ class Publication:
             (self._directory / FRAMES).rmdir()
 
     def _clear(self) -> None:
-        """Empty the staging directory but for the lock; the marker goes first, as it vouches for the rest."""
-        self._marker.unlink(missing_ok=True)
+        """Empty the staging directory but for the lock."""
         for path in self._staging.iterdir():
             if path.is_dir():
                 shutil.rmtree(path)

@@ -12,8 +12,8 @@ from numpy.typing import NDArray
 
 from taichi_msm import look
 from taichi_msm.camera import view
-from taichi_msm.lattice import fixed_points, rest_positions, spacing, springs
-from taichi_msm.loads import Schedule, control_points, decay, grips, schedule
+from taichi_msm.lattice import fixed_points, rest_positions, springs
+from taichi_msm.loads import Schedule, grips, schedule
 from taichi_msm.scene import Scene
 from taichi_msm.stability import step, steps_per_frame
 

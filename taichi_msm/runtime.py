@@ -10,6 +10,8 @@ from pathlib import Path
 
 from taichi_msm.errors import DeviceError
 
+__all__ = ["ARCHS", "Device", "available_threads", "start", "ti"]
+
 # No banner on stdout, which may be JSON, and no call home.
 os.environ.setdefault("ENABLE_TAICHI_HEADER_PRINT", "0")
 os.environ.setdefault("TI_SKIP_VERSION_CHECK", "ON")

@@ -99,7 +99,8 @@ class Probe(Section):
         expects="keys [[t, percent], ...], t in seconds",
     )
     falloff: NotNegative = key(
-        150.0, means="decay of the force with the distance from the control point [1/m]",
+        150.0,
+        means="decay of the force with the distance from the control point [1/m]",
         expects="a number, 0 or more, in 1/m",
     )
     offset: Annotated[Number, Field(ge=-50, le=1000)] = key(
@@ -115,12 +116,14 @@ class Probe(Section):
         for n in range(1, len(times)):
             if times[n] < times[n - 1]:
                 raise PydanticCustomError(
-                    REFUSED, "goes back in time, from {before} s to {now} s; sort the keys by time",
+                    REFUSED,
+                    "goes back in time, from {before} s to {now} s; sort the keys by time",
                     {"key": n, "before": f"{times[n - 1]:g}", "now": f"{times[n]:g}"},
                 )
             if n > 1 and times[n] == times[n - 2]:
                 raise PydanticCustomError(
-                    REFUSED, "third key at {now} s; a jump is two keys at one time, so remove the middle one",
+                    REFUSED,
+                    "third key at {now} s; a jump is two keys at one time, so remove the middle one",
                     {"key": n, "now": f"{times[n]:g}"},
                 )
         return keys
@@ -162,9 +165,11 @@ class Time(Section):
                 "{duration} s x {rate} frames per second = {frames} frames, not a whole number up to 1e9; "
                 "try {nearest}",
                 {
-                    "key": "duration", "duration": f"{self.duration:.12g}",
+                    "key": "duration",
+                    "duration": f"{self.duration:.12g}",
                     "rate": f"{self.frames_per_second:.12g}",
-                    "frames": f"{frames:.12g}", "nearest": f"{nearest:.12g}",
+                    "frames": f"{frames:.12g}",
+                    "nearest": f"{nearest:.12g}",
                 },
             )
         return self
@@ -181,7 +186,8 @@ class Camera(Section):
         (0.0, 1.0, 0.0), means="the direction that is up in the picture", expects="three numbers: [x, y, z]"
     )
     fov: Annotated[Number, Field(gt=0, lt=180)] = key(
-        40.0, means="angle from the picture's bottom to its top [degrees]",
+        40.0,
+        means="angle from the picture's bottom to its top [degrees]",
         expects="a number between 0 and 180, in degrees",
     )
 
@@ -190,18 +196,21 @@ class Render(Section):
     """How a frame is drawn."""
 
     size: tuple[Pixels, Pixels] = key(
-        (512, 512), means="width, height of a frame [px]",
+        (512, 512),
+        means="width, height of a frame [px]",
         expects=f"two whole numbers, 1 to {MAX_PIXELS}: [width, height] in pixels",
     )
     refine: Annotated[Whole, Field(ge=0, le=MAX_REFINE)] = key(
         10, means="points inserted between two neighbours when drawing", expects=f"a whole number, 0 to {MAX_REFINE}"
     )
     camera: Literal["top", "oblique"] | Camera = key(
-        "top", means="top: straight down, to scale; oblique: tilted, shows depth; or a pinhole camera",
+        "top",
+        means="top: straight down, to scale; oblique: tilted, shows depth; or a pinhole camera",
         expects="top, oblique, or {eye: [x, y, z], target: [x, y, z], up: [x, y, z], fov: degrees}",
     )
     shading: Literal["none", "headlight"] = key(
-        "headlight", means="none: the picture's own colours; headlight: lit from the camera",
+        "headlight",
+        means="none: the picture's own colours; headlight: lit from the camera",
         expects="none or headlight",
     )
     wireframe: StrictBool = key(False, means="draw the mass-point mesh over the surface", expects="true or false")
@@ -217,11 +226,13 @@ class Scene(Section):
     """Everything a run needs; what the YAML file says, checked and with its defaults filled in."""
 
     image: Text | None = key(
-        None, means="the picture on the sheet: PNG, JPEG, WebP, BMP or TIFF; relative to the scene file",
+        None,
+        means="the picture on the sheet: PNG, JPEG, WebP, BMP or TIFF; relative to the scene file",
         expects="the path of a picture",
     )
     region: tuple[Whole, Whole, Whole, Whole] | None = key(
-        None, means="x, y, width, height [px] of the part of the image that the sheet carries; default: all of it",
+        None,
+        means="x, y, width, height [px] of the part of the image that the sheet carries; default: all of it",
         expects="four whole numbers: [x, y, width, height] in pixels",
     )
     sheet: Sheet = key(means="the sheet of mass points", expects="a mapping with points, size and mass")
@@ -233,7 +244,8 @@ class Scene(Section):
     time: Time = key(means="time span, frames and steps", expects="a mapping with at least duration")
     render: Render = key(Render(), means="how a frame is drawn", expects="a mapping")
     output: tuple[Literal["png", "gif", "trajectory"], ...] = key(
-        ("png", "gif", "trajectory"), means="what is written besides run.json; [] simulates only",
+        ("png", "gif", "trajectory"),
+        means="what is written besides run.json; [] simulates only",
         expects="a list of png, gif, trajectory",
     )
 
@@ -246,7 +258,8 @@ class Scene(Section):
     def _picture_given(self) -> Scene:
         if self.draws and self.image is None:
             raise PydanticCustomError(
-                REFUSED, "a picture is needed to draw png or gif; name one, or set output to [trajectory] or []",
+                REFUSED,
+                "a picture is needed to draw png or gif; name one, or set output to [trajectory] or []",
                 {"key": "image"},
             )
         return self

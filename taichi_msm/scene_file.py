@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import codecs
 import json
+import re
 import stat
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from itertools import chain
@@ -21,6 +22,9 @@ MAX_BYTES = 2**20
 # Nobody reads further, and a broken file of the greatest size has tens of thousands.
 MAX_LINES = 100
 
+_NO_KEY = Problem((), "expected KEY=VALUE, such as sheet.points=[61,61]")
+_INDEX = re.compile("[0-9]{1,9}")
+
 
 def load_scene(
     path: str | Path, overrides: Sequence[str] | Mapping[str, Any] = (), image: str | Path | None = None
@@ -28,7 +32,7 @@ def load_scene(
     """Read a scene and check all that can be checked before computing.
 
     Args:
-        path: the scene file; the image it names is relative to its folder.
+        path: the scene file; the image that it, or an override, names is relative to its folder.
         overrides: what to put in place of the file's values: "KEY=VALUE" with a dotted key (items of a list
             by number, probes.0.load) and the value in YAML; or a mapping from dotted keys to values.
         image: another picture for the sheet, relative to the current directory.
@@ -92,8 +96,8 @@ def _parse_text(text: str) -> _Override:
     name = f"--set {text}"
     key, equals, value = text.partition("=")
     path = _parse_key(key)
-    if not equals or "" in path:
-        return _Override(name, (), problems=[Problem((), "expected KEY=VALUE, such as sheet.points=[61,61]")])
+    if not equals or not path:
+        return _Override(name, (), problems=[_NO_KEY])
     try:
         document = read(value)
     except UnreadableError as error:
@@ -104,18 +108,22 @@ def _parse_text(text: str) -> _Override:
 
 def _parse_value(key: str, value: Any) -> _Override:
     path = _parse_key(key)
+    if not path:
+        return _Override(f"--set {key}", (), problems=[_NO_KEY])
     try:
         plain = json.loads(json.dumps(value))
     except (TypeError, ValueError, RecursionError):
-        problem = Problem(
-            path, f"a file cannot hold this {type(value).__name__}; use numbers, text, lists, dicts"
-        )
+        problem = Problem(path, f"a file cannot hold this {type(value).__name__}; use numbers, text, lists, dicts")
         return _Override(f"--set {key}", path, problems=[problem])
     return _Override(f"--set {key}={flow(plain)}", path, plain)
 
 
 def _parse_key(key: str) -> Key:
-    return tuple(int(part) if part.isdecimal() and part.isascii() else part for part in key.split("."))
+    """Split a dotted key; into nothing, if it is none."""
+    parts = key.split(".")
+    if not all(part and part.isprintable() for part in parts):
+        return ()
+    return tuple(int(part) if _INDEX.fullmatch(part) else part for part in parts)
 
 
 class _Place(NamedTuple):
@@ -201,9 +209,7 @@ class _Draft:
             here = (*here, part)
             if n == len(path) - 1:
                 holder[part] = value
-                self._overridden = {
-                    key: at for key, at in self._overridden.items() if key[: len(here)] != here
-                }
+                self._overridden = {key: at for key, at in self._overridden.items() if key[: len(here)] != here}
                 self._overridden[here] = place
             elif isinstance(holder, dict) and part not in holder:
                 holder[part] = [] if isinstance(path[n + 1], int) else {}
@@ -222,9 +228,7 @@ def _read_file(name: str) -> Document:
     if document.data is None:
         raise _error(f"{name}:1:1", "no keys; a scene needs at least sheet, springs and time")
     if not isinstance(document.data, dict):
-        raise _error(
-            f"{name}:1:1", f"{flow(document.data)} is not a scene; expected keys such as sheet and time"
-        )
+        raise _error(f"{name}:1:1", f"{flow(document.data)} is not a scene; expected keys such as sheet and time")
     return document
 
 

@@ -84,9 +84,7 @@ def problems(scene: Scene) -> Iterator[Problem]:
 def _region_problems(region: tuple[int, int, int, int], size: tuple[int, int] | None) -> Iterator[Problem]:
     x, y, width, height = region
     if x < 0 or y < 0 or width < 1 or height < 1:
-        yield Problem(
-            ("region",), f"{list(region)} needs x and y of 0 or more, width and height above 0"
-        )
+        yield Problem(("region",), f"{list(region)} needs x and y of 0 or more, width and height above 0")
     elif size is not None and (x + width > size[0] or y + height > size[1]):
         yield Problem(
             ("region",),

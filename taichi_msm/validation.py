@@ -179,14 +179,14 @@ def _choose_kinds(faults: Sequence[_Fault]) -> Iterator[_Fault]:
 
 def _drop_short(faults: Iterable[_Fault]) -> Iterator[_Fault]:
     """Report a list that lacks items as one fault, and not at all where an item of it is at fault."""
-    cut = [
+    merged = [
         fault._replace(path=fault.path[:-1], kind="too_short")
         if fault.kind == "missing" and isinstance(fault.path[-1], int)
         else fault
         for fault in faults
     ]
-    parents = {fault.path[:n] for fault in cut for n in range(len(fault.path))}
-    return (fault for fault in cut if fault.kind != "too_short" or fault.path not in parents)
+    parents = {fault.path[:n] for fault in merged for n in range(len(fault.path))}
+    return (fault for fault in merged if fault.kind != "too_short" or fault.path not in parents)
 
 
 def _message(fault: _Fault, data: Any) -> str:

@@ -29,6 +29,8 @@ _LOADER: Any = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
 # What YAML excludes, and the line breaks that it knows and editors do not, which would put line numbers off.
 _NOT_ALLOWED = re.compile("[^\t\n\r\x20-\x7e\xa0-\u2027\u202a-\ud7ff\ue000-\ufffd\U00010000-\U0010ffff]")
 
+_SURROGATE = re.compile("[\ud800-\udfff]")
+
 _NUMBERS: tuple[tuple[re.Pattern[str], Callable[[str], float]], ...] = (
     (re.compile(r"[-+]?[0-9]+"), int),
     (re.compile(r"0o[0-7]+"), lambda text: int(text, 8)),
@@ -163,16 +165,15 @@ class _Reader:
         """Refuse what a scene has no use for."""
         self._nodes += 1
         if self._nodes > MAX_NODES:
-            raise UnreadableError(
-                _mark(event.start_mark), f"more than {MAX_NODES} values; a scene is smaller"
-            )
+            raise UnreadableError(_mark(event.start_mark), f"more than {MAX_NODES} values; a scene is smaller")
         if len(path) > MAX_DEPTH:
-            raise UnreadableError(
-                _mark(event.start_mark), f"nested more than {MAX_DEPTH} deep; a scene is flatter"
-            )
+            raise UnreadableError(_mark(event.start_mark), f"nested more than {MAX_DEPTH} deep; a scene is flatter")
         if isinstance(event, yaml.AliasEvent):
             self._refuse(event, path, f"alias *{event.anchor} is not allowed; write the value out")
             return
+        if isinstance(event, yaml.ScalarEvent) and event.style == '"' and _SURROGATE.search(event.value):
+            # The C parser says so itself.
+            raise UnreadableError(_mark(event.start_mark), "not valid YAML: invalid Unicode escape")
         if event.anchor is not None:
             self._refuse(event, path, f"anchor &{event.anchor} is not allowed; remove it")
         if event.tag is not None:

@@ -103,8 +103,8 @@ def test_an_ordinary_scene_has_no_problems() -> None:
         ),
         (
             {"render": {"refine": 0, "size": [8192, 4096]}},
-            "render.size: the scene needs 1.38 GiB of memory, 1.38 GiB of it for frames of 8192 x 4096 pixels "
-            "and their texture, but 0.5 GiB is free; take less",
+            "render.size: the scene needs 1.38 GiB of memory, 1.38 GiB of it for frames of 8192 x 4096 "
+            "pixels and their texture, but 0.5 GiB is free; take less",
         ),
     ],
     ids=["points", "surface", "picture"],

@@ -35,7 +35,7 @@ render: {size: [40, 30], refine: 1}
 """
 
 
-@pytest.fixture()
+@pytest.fixture
 def small(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """A directory to work in, with small.yaml and its picture."""
     Image.fromarray(speckle(30, 40)).save(tmp_path / "speckle.png")
@@ -183,7 +183,8 @@ def call(capsys: pytest.CaptureFixture[str], *arguments: str) -> tuple[int, str,
         ),
         (
             ["check", "small.yaml", "--set", "time.step=0.1"],
-            "--set time.step=0.1: time.step: 0.1 s is above the stability limit 0.00499221 s; try 0.00476190476, or auto\n",
+            "--set time.step=0.1: time.step: 0.1 s is above the stability limit 0.00499221 s; "
+            "try 0.00476190476, or auto\n",
         ),
         (["run"], "taichi-msm: Missing argument 'SCENE'. (see taichi-msm --help)\n"),
         (["jump"], "taichi-msm: No such command 'jump'. (see taichi-msm --help)\n"),

@@ -36,9 +36,7 @@ def test_the_python_shown_runs(root: Path, tmp_path: Path) -> None:
     (code,) = blocks(root, "python")
     (tmp_path / "scenes").symlink_to(root / "scenes")
     (tmp_path / "example.py").write_text(code + "print(position.shape, picture.shape, record['status'])\n")
-    done = subprocess.run(
-        [sys.executable, "example.py"], cwd=tmp_path, check=True, capture_output=True, text=True
-    )
+    done = subprocess.run([sys.executable, "example.py"], cwd=tmp_path, check=True, capture_output=True, text=True)
     assert done.stdout == "(41, 41, 3) (512, 512, 3) complete\n"
     assert (tmp_path / "output" / "from-python" / "animation.gif").exists()
 

@@ -186,7 +186,8 @@ def mirrored(at: list[float], force: list[float]) -> dict[str, Any]:
 def test_symmetries(device: Device) -> None:
     def motion(size: list[float], at: list[float], force: list[float], points: list[int]) -> NDArray[Any]:
         return simulate(
-            scene(sheet={**SHEET, "points": points, "size": size, "fixed": "none"}, probes=[mirrored(at, force)]), device
+            scene(sheet={**SHEET, "points": points, "size": size, "fixed": "none"}, probes=[mirrored(at, force)]),
+            device,
         )
 
     plain = motion([0.3, 0.4], [0.3, 0.2], [1, 2, -3], [9, 11])

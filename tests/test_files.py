@@ -104,9 +104,7 @@ def test_equal_runs_write_equal_bytes(tmp_path: Path) -> None:
         (("trajectory",), ["trajectory.npz", "run.json"]),
     ],
 )
-def test_only_the_outputs_asked_for_are_there(
-    tmp_path: Path, outputs: tuple[str, ...], names: list[str]
-) -> None:
+def test_only_the_outputs_asked_for_are_there(tmp_path: Path, outputs: tuple[str, ...], names: list[str]) -> None:
     """Also those that an earlier run left go, but no file of the user's."""
     write(tmp_path, 4, small_scene())
     (tmp_path / "notes.txt").write_text("mine")
@@ -180,27 +178,28 @@ def test_leaving_without_publishing_leaves_what_was_there(tmp_path: Path) -> Non
     assert not (tmp_path / "fresh").exists()
 
 
+@pytest.mark.parametrize(("rows", "frames"), [(0, 1), (HEIGHT // 2, 1), (HEIGHT, 2)])
 def test_an_interrupted_hand_over_leaves_whole_frames(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, rows: int, frames: int
 ) -> None:
-    """Ctrl-C may come when the positions of a frame, but only half of its picture, are handed over."""
+    """Ctrl-C may come when the positions of a frame, but not all rows of its picture, are handed over."""
 
     def interrupted(encoder: Encoder, picture: NDArray[np.uint8]) -> None:
-        add(encoder, picture[: HEIGHT // 2])
+        add(encoder, picture[:rows])
         raise KeyboardInterrupt
 
     add = Encoder.add
-    with ResultWriter(tmp_path, small_scene(), TEXTURE) as writer:
+    with ResultWriter(tmp_path / "interrupted", small_scene(), TEXTURE) as writer:
         writer.add(position(0), picture(0))
-        monkeypatch.setattr(Encoder, "add", interrupted)
-        with pytest.raises(KeyboardInterrupt):
-            writer.add(position(1), picture(1))
+        with monkeypatch.context() as patch:
+            patch.setattr(Encoder, "add", interrupted)
+            with pytest.raises(KeyboardInterrupt):
+                writer.add(position(1), picture(1))
         writer.finish()
-        assert writer.frames == 1
-        writer.publish({})
-    assert [path.name for path in (tmp_path / "frames").iterdir()] == ["0000.png"]
-    with np.load(tmp_path / "trajectory.npz") as trajectory:
-        np.testing.assert_array_equal(trajectory["position"], [position(0).astype(np.float32)])
+        assert writer.frames == frames
+        writer.publish({"frames": frames})
+    write(tmp_path / "whole", frames, small_scene())
+    assert files(tmp_path / "interrupted") == files(tmp_path / "whole")
 
 
 @pytest.mark.skipif(sys.platform == "win32", reason="no sessions")
@@ -306,9 +305,7 @@ def refused(directory: Path, meanwhile: Callable[[ResultWriter], None] = lambda 
 
 def test_a_file_in_the_place_of_the_directory(tmp_path: Path) -> None:
     (tmp_path / "out").write_text("mine")
-    assert refused(tmp_path / "out") == (
-        f"{tmp_path / 'out'}: cannot write: Not a directory; choose another --out"
-    )
+    assert refused(tmp_path / "out") == (f"{tmp_path / 'out'}: cannot write: Not a directory; choose another --out")
 
 
 @pytest.mark.skipif(not hasattr(os, "geteuid") or os.geteuid() == 0, reason="root may write everywhere")
@@ -350,7 +347,6 @@ def test_the_record_is_strict_json(tmp_path: Path) -> None:
         writer.publish({"image": "Schleimhaut-Ä.png", "odd": "\udcff.png"})
     text = (tmp_path / "run.json").read_bytes().decode()
     assert text == (
-        '{\n  "image": "Schleimhaut-Ä.png",\n  "odd": "\\udcff.png",\n'
-        '  "outputs": [\n    "run.json"\n  ]\n}\n'
+        '{\n  "image": "Schleimhaut-Ä.png",\n  "odd": "\\udcff.png",\n  "outputs": [\n    "run.json"\n  ]\n}\n'
     )
     assert json.loads(text)["odd"] == "\udcff.png"

@@ -150,9 +150,7 @@ def test_a_second_run_is_refused_until_the_first_ends(directory: Path) -> None:
 
 
 @pytest.mark.skipif(sys.platform == "win32", reason="no lock")
-def test_the_lock_of_a_directory_that_was_removed_is_no_lock(
-    directory: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_the_lock_of_a_directory_that_was_removed_is_no_lock(directory: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Between opening the lock and locking it, the run that held it may end and remove it."""
     import fcntl
 

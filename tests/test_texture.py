@@ -317,9 +317,7 @@ def test_no_warning_is_left_behind() -> None:
     exif = Image.Exif()
     exif[ORIENTATION] = 6
     Image.fromarray(COLOURS).save("a.jpg", exif=exif)
-    broken = (
-        Path("a.jpg").read_bytes().replace(exif.tobytes()[:14], exif.tobytes()[:10] + b"\xff\xff\xff\xff")
-    )
+    broken = Path("a.jpg").read_bytes().replace(exif.tobytes()[:14], exif.tobytes()[:10] + b"\xff\xff\xff\xff")
     Path("a.jpg").write_bytes(broken)
     with warnings.catch_warnings():
         warnings.simplefilter("error")
