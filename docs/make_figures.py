@@ -63,7 +63,7 @@ def strip(pictures: list[Image.Image], gap: int = 6) -> Image.Image:
 def main() -> None:
     """Write every picture."""
     IMAGES.mkdir(exist_ok=True)
-    animation("press", 384)
+    animation("press", 340)
     animation("retina", 320, "render.camera={eye: [0, -0.3, 0.36], target: [0, -0.012, 0], fov: 44}", image=RETINA)
     strip(frames(SCENES / "figure-3.yaml", STAGES, (400, 250))).save(IMAGES / "figure-3.png", optimize=True)
     stills = [frames(SCENES / f"{name}.yaml", (moment,), (400, 400))[0] for name, moment in MOMENTS.items()]

@@ -13,19 +13,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from taichi_msm import look
 from taichi_msm.encoding import Encoder, Job
 from taichi_msm.errors import FilesError
+from taichi_msm.gif import Picture
 from taichi_msm.publication import ANIMATION, FRAMES, RECORD, TRAJECTORY, Publication
 from taichi_msm.scene import Scene
 from taichi_msm.trajectory import TrajectoryWriter
-
-Picture = NDArray[np.uint8]
-
-# The animation's palette is made from so many texels along each axis, at these fractions of their light. Most
-# of the surface faces the headlight, so full light counts twice (0.5 dB).
-TEXELS = 128
-LIGHT = (1.0, 1.0, 0.85, 0.7, 0.5, 0.3)
 
 
 class ResultWriter:
@@ -36,17 +29,15 @@ class ResultWriter:
     Args:
         directory: where the results go; made where it does not exist. Files there that no run writes stay.
         scene: what is run; its `output` says which files are wanted.
-        texture: colours of the sheet, shape (height, width, 3); None where no picture is wanted.
 
     Raises:
         FilesError: on entering and in every method, when the directory cannot be written, or another run
             writes there.
     """
 
-    def __init__(self, directory: Path, scene: Scene, texture: Picture | None) -> None:
+    def __init__(self, directory: Path, scene: Scene) -> None:
         self._directory = directory
         self._scene = scene
-        self._texture = texture
         self._publication = Publication(directory)
         self._encoder: Encoder | None = None
         self._trajectory: TrajectoryWriter | None = None
@@ -116,14 +107,13 @@ class ResultWriter:
         scene = self._scene
         with self._errors_told(), ExitStack() as opened:
             opened.enter_context(self._publication)
-            if self._texture is not None and scene.draws:
+            if scene.draws:
                 job = Job(
                     directory=self._publication.staged,
                     size=scene.render.size,
                     rate=scene.time.frames_per_second,
                     png="png" in scene.output,
                     gif="gif" in scene.output,
-                    samples=_samples(scene, self._texture),
                     background=scene.render.background,
                 )
                 self._encoder = Encoder(job, inherit=self._publication.lock_descriptors)
@@ -154,21 +144,3 @@ class ResultWriter:
             remedy = "free some space or choose another --out" if full else "choose another --out"
             reason = error.strerror or error
             raise FilesError(f"{self._directory}: cannot write: {reason}; {remedy}") from error
-
-
-def _samples(scene: Scene, texture: Picture) -> Picture:
-    """Foresee the colours of the animation.
-
-    Args:
-        scene: what is drawn.
-        texture: colours of the sheet, shape (height, width, 3).
-
-    Returns:
-        Colours, shape (height, width, 3).
-    """
-    stride = -(-max(texture.shape) // TEXELS)
-    texels = texture[::stride, ::stride].astype(np.float64)
-    samples = [texels * light for light in (LIGHT if scene.render.shading == "headlight" else (1.0,))]
-    if scene.render.wireframe:
-        samples.append(texels * (1 - look.WIRE_OPACITY) + np.array(look.WIRE_COLOUR) * look.WIRE_OPACITY)
-    return np.round(np.concatenate(samples)).astype(np.uint8)

@@ -160,10 +160,11 @@ class Publication:
 
     def _release(self) -> None:
         """Unlock, and remove the directories that are empty and ours."""
-        if self._lock is not None:
-            self._lock_path.unlink(missing_ok=True)
-            self._lock.close()
         with suppress(OSError):
+            if self._lock is not None:
+                self._lock_path.unlink()
             self._staging.rmdir()
             if self._created:
                 self._directory.rmdir()
+        if self._lock is not None:
+            self._lock.close()

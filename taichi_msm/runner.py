@@ -70,7 +70,7 @@ def run(
     texture = load_texture(scene) if scene.draws else None
     frames = scene.time.frames + 1
     record: dict[str, Any] = {"status": "complete"}
-    with ResultWriter(Path(directory), scene, texture) as writer:
+    with ResultWriter(Path(directory), scene) as writer:
         with Simulation(scene, arch, threads, texture) as simulation:
             watch = Stopwatch()
             startup = time.perf_counter() - started

@@ -52,7 +52,8 @@ class Simulation:
         self.device = runtime.start(arch, threads)
         self.frame = 0
         self.max_displacement = 0.0
-        self._rest = rest_positions(scene.sheet)
+        rest = rest_positions(scene.sheet)
+        self._rest_x, self._rest_y = rest[0, :, 0], rest[:, :1, 1]
         self._dynamics = Dynamics(scene, self.device)
         self._texture = texture
         self._drawing: Drawing | None = None
@@ -84,8 +85,11 @@ class Simulation:
         Returns:
             Positions [m], shape (rows, cols, 3), in the scene's precision.
         """
-        displacement = self._dynamics.displacement()
-        return (self._rest + displacement).astype(displacement.dtype)
+        position = self._dynamics.displacement()
+        # Summed in float64 and rounded once, without a copy of the sheet.
+        np.add(position[..., 0], self._rest_x, out=position[..., 0], casting="same_kind")
+        np.add(position[..., 1], self._rest_y, out=position[..., 1], casting="same_kind")
+        return position
 
     def draw(self, camera: View | None = None) -> NDArray[np.uint8]:
         """Draw the sheet as it is now.
@@ -132,16 +136,16 @@ class Simulation:
     def _watch(self) -> None:
         """Stop a simulation that has gone wrong."""
         displacement = self._dynamics.displacement()
-        distance = np.sqrt(np.square(displacement, dtype=np.float64).sum(axis=-1))
-        bound = MOST_SHEET_SIZES * max(self.scene.sheet.size)
-        worst = int(np.argmax(np.where(np.isfinite(distance), distance, np.inf)))
-        i, j = np.unravel_index(worst, distance.shape)
-        largest = float(distance[i, j])
-        if not largest <= bound:
+        with np.errstate(over="ignore", invalid="ignore"):
+            square = np.einsum("ijk,ijk->ij", displacement, displacement)
+        i, j = (int(index) for index in np.unravel_index(square.argmax(), square.shape))
+        largest = float(np.linalg.norm(displacement[i, j].astype(float)))
+        size = max(self.scene.sheet.size)
+        # Written so that NaN is found as well: argmax points at it, and it is not below anything.
+        if not largest <= MOST_SHEET_SIZES * size:
             raise DivergedError(
-                f"diverged before {self.time:g} s, step {self._dynamics.steps_done}: point ({i}, {j}) is {largest:g} m "
-                f"from its rest position, the sheet {max(self.scene.sheet.size):g} m long; the step is "
-                f"{step(self.scene):g} s of at most {stable_step(self.scene):g} s; "
-                "try a weaker probes.N.force or a smaller time.step"
+                f"diverged before {self.time:g} s, step {self.steps}: point ({i}, {j}) is {largest:g} m from its rest "
+                f"position, and the sheet is {size:g} m long; the step is {step(self.scene):g} s of at most "
+                f"{stable_step(self.scene):g} s; try a weaker probes.N.force or a smaller time.step"
             )
         self.max_displacement = max(self.max_displacement, largest)

@@ -120,6 +120,12 @@ def test_equal_frames_become_one_that_lasts_longer(tmp_path: Path, palette: Pale
     assert blocks((tmp_path / "a.gif").read_bytes()).delays == [12, 8, 16]
 
 
+def test_a_late_change_does_not_take_the_place_of_a_long_rest(tmp_path: Path, palette: Palette) -> None:
+    """The last frame's slot is 1/100 s long; the rest before it makes room for 2/100 s."""
+    write(tmp_path / "a.gif", [grey(0)] * 120 + [grey(1)], 120, palette)
+    assert blocks((tmp_path / "a.gif").read_bytes()).delays == [99, 2]
+
+
 def test_all_frames_equal_at_a_high_rate(tmp_path: Path, palette: Palette) -> None:
     write(tmp_path / "a.gif", [grey(0)] * 121, 120, palette)
     assert sum(blocks((tmp_path / "a.gif").read_bytes()).delays) == 101

@@ -4,6 +4,7 @@ import json
 import math
 import os
 import random
+import re
 import time
 from collections.abc import Callable
 from pathlib import Path
@@ -471,8 +472,9 @@ def test_a_billion_laughs_stay_small(load: Load) -> None:
 def test_a_large_wrong_file_is_answered_soon_and_in_short(load: Load, text: str) -> None:
     before = time.process_time()
     found = lines(load, text)
-    # 0.3 to 0.7 s on the machine that the limits were chosen on; the rest is for slower ones.
-    assert time.process_time() - before < 3
+    # 0.3 to 0.7 s on the machine that the limits were chosen on, and up to 4 s where PyYAML lacks its C parser; the
+    # rest is for slower machines.
+    assert time.process_time() - before < (3 if yaml.__with_libyaml__ else 20)
     assert len(found) == MAX_LINES + 1
     assert found[-1] == "and more"
 
@@ -735,6 +737,14 @@ def test_a_region_of_the_image(load: Load) -> None:
 
 
 @pytest.mark.parametrize("parser", ["CSafeLoader", "SafeLoader"])
+@pytest.mark.parametrize("escape", ["\\ud800", "\\U00110000"])
+def test_escapes_of_what_is_no_character(load: Load, monkeypatch: pytest.MonkeyPatch, parser: str, escape: str) -> None:
+    monkeypatch.setattr(yaml_reader, "_LOADER", getattr(yaml, parser, yaml.SafeLoader))
+    (line,) = lines(load, f'{GOOD}"{escape}": 1\n')
+    assert re.match(r"s\.yaml:\d+:\d+: not valid YAML: ", line)
+
+
+@pytest.mark.parametrize("parser", ["CSafeLoader", "SafeLoader"])
 def test_no_text_brings_up_any_other_error(load: Load, monkeypatch: pytest.MonkeyPatch, parser: str) -> None:
     monkeypatch.setattr(yaml_reader, "_LOADER", getattr(yaml, parser, yaml.SafeLoader))
     rng = random.Random(1)
@@ -747,8 +757,8 @@ def test_no_text_brings_up_any_other_error(load: Load, monkeypatch: pytest.Monke
     ]
     pieces += ["!!int", "<<: ", "---\n", "...\n", "1e999", "-1", ".nan", "null", "%YAML 9\n"]
     outcomes: set[str] = set()
-    for broken in range(400):
-        text = whole if broken else whole + '"\\ud800": 1\n'
+    for _ in range(400):
+        text = whole
         for _ in range(rng.randint(1, 4)):
             start = rng.randrange(len(text))
             piece = rng.choice(pieces) * rng.choice((1, 1, 30))
