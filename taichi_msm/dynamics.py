@@ -25,7 +25,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from taichi_msm.lattice import fixed_points, rest_positions, spacing, springs
+from taichi_msm.lattice import axes, fixed_points, spacing, springs
 from taichi_msm.loads import decay, grips, schedule
 from taichi_msm.runtime import Device, ti
 from taichi_msm.scene import Scene
@@ -191,13 +191,12 @@ class Dynamics:
     def _place(self) -> None:
         """Write what never changes: who moves, where the edges are, and how the standing grips decay."""
         s, scene = self.structure, self.scene
-        rest = rest_positions(scene.sheet)
         moves = ~fixed_points(scene.sheet)
         column = np.arange(s.cols)
         # Rows are of three kinds: the first, any in between, the last.
-        by_column = [*moves[[0, s.rows // 2, -1]], rest[0, :, 0], column > 0, column < s.cols - 1]
-        standing = [decay(grip, scene, rest) for grip in grips(scene) if not grip.moves]
-        self._write(self._in_lanes(np.array(by_column)), self._in_lanes(np.array(standing or [rest[..., 2]])))
+        by_column = [*moves[[0, s.rows // 2, -1]], axes(scene.sheet)[0], column > 0, column < s.cols - 1]
+        standing = [decay(grip, scene) for grip in grips(scene) if not grip.moves] or [np.zeros((s.rows, s.cols))]
+        self._write(self._in_lanes(np.array(by_column)), self._in_lanes(np.array(standing)))
 
     def _in_lanes(self, values: NDArray[Any]) -> NDArray[Any]:
         """Lay columns out in strips: (..., cols) -> (..., strip + 2, lanes), the halo and the padding 0."""

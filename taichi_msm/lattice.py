@@ -37,16 +37,23 @@ def spacing(sheet: Sheet) -> tuple[float, float]:
     return width / (cols - 1), height / (rows - 1)
 
 
+def axes(sheet: Sheet) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Give x of the columns, shape (cols,), and y of the rows, shape (rows, 1), at rest [m].
+
+    x_j = (j / (cols - 1) - 1/2) width, y_i = (1/2 - i / (rows - 1)) height.
+    """
+    (rows, cols), (height, width) = sheet.points, sheet.size
+    return (np.arange(cols) / (cols - 1) - 0.5) * width, (0.5 - np.arange(rows)[:, None] / (rows - 1)) * height
+
+
 def rest_positions(sheet: Sheet) -> NDArray[np.float64]:
-    """Place the points: X_ij = ((j/(cols-1) - 1/2) width, (1/2 - i/(rows-1)) height, 0).
+    """Place the points: X_ij = (x_j, y_i, 0).
 
     Returns:
         Rest positions [m], shape (rows, cols, 3).
     """
-    (rows, cols), (height, width) = sheet.points, sheet.size
-    position = np.zeros((rows, cols, 3))
-    position[..., 0] = (np.arange(cols) / (cols - 1) - 0.5) * width
-    position[..., 1] = ((0.5 - np.arange(rows) / (rows - 1)) * height)[:, None]
+    position = np.zeros((*sheet.points, 3))
+    position[..., 0], position[..., 1] = axes(sheet)
     return position
 
 

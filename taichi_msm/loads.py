@@ -13,6 +13,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from taichi_msm.lattice import axes
 from taichi_msm.scene import Probe, Scene, Sheet
 from taichi_msm.stability import steps_per_frame
 
@@ -90,19 +91,15 @@ def grips(scene: Scene) -> tuple[Grip, ...]:
     return tuple(parts)
 
 
-def decay(grip: Grip, scene: Scene, rest: Array) -> Array:
+def decay(grip: Grip, scene: Scene) -> Array:
     """Evaluate exp(-falloff d - offset) of a standing grip (eq. 5).
-
-    Args:
-        grip: a grip that does not move.
-        scene: its scene.
-        rest: rest positions [m], shape (rows, cols, 3).
 
     Returns:
         Share of the force that each point feels, shape (rows, cols).
     """
     probe = scene.probes[grip.probe]
-    distance = np.hypot(rest[..., 0] - grip.points[0, 0], rest[..., 1] - grip.points[0, 1])
+    x, y = axes(scene.sheet)
+    distance = np.hypot(x - grip.points[0, 0], y - grip.points[0, 1])
     return np.exp(-probe.falloff * distance - probe.offset)
 
 

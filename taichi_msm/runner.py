@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import platform
 import sys
 import time
@@ -69,12 +70,11 @@ def run(
     device = runtime.start(arch, threads)
     texture = load_texture(scene) if scene.draws else None
     frames = scene.time.frames + 1
-    record: dict[str, Any] = {"status": "complete"}
+    ending: dict[str, Any] = {"status": "complete"}
     with ResultWriter(Path(directory), scene) as writer:
         with Simulation(scene, arch, threads, texture) as simulation:
             watch = Stopwatch()
             startup = time.perf_counter() - started
-            written = 0
             try:
                 progress("compile", 0, frames)
                 simulation.compile()
@@ -86,40 +86,39 @@ def run(
                     picture = simulation.draw() if scene.draws else None
                     watch.lap("render")
                     writer.add(simulation.positions(), picture)
-                    written = frame + 1
-                    progress("frames", written, frames)
+                    progress("frames", frame + 1, frames)
                     watch.lap("hand over")
             except KeyboardInterrupt:
-                record = {"status": "interrupted"}
+                ending = {"status": "interrupted"}
             except DivergedError as error:
-                record = {"status": "diverged", "error": str(error)}
-            progress("write", written, frames)
-            limit = stable_step(scene)
-            record |= {
-                "scene": scene.model_dump(mode="json"),
-                "overrides": list(overrides),
-                "step": step(scene),
-                "stable_step": limit if limit < float("inf") else None,
-                "steps_per_frame": steps_per_frame(scene),
-                "steps": simulation.steps,
-                "frames": written,
-                "max_displacement": simulation.max_displacement,
-                "arch": device.arch,
-                "threads": device.threads,
-                "versions": versions(),
-            }
+                ending = {"status": "diverged", "error": str(error)}
+        progress("write", writer.frames, frames)
         writer.finish()
-        seconds = watch.seconds
-        record["timings"] = {
-            "startup": startup,
-            "compile": seconds.get("compile", 0.0),
-            "simulate": seconds.get("simulate", 0.0),
-            "render": seconds.get("render", 0.0),
-            "encode": writer.encode_seconds,
-            "total": time.perf_counter() - started,
+        limit = stable_step(scene)
+        record = {
+            **ending,
+            "scene": scene.model_dump(mode="json"),
+            "overrides": list(overrides),
+            "step": step(scene),
+            "stable_step": limit if limit < math.inf else None,
+            "steps_per_frame": steps_per_frame(scene),
+            "steps": simulation.steps,
+            "frames": writer.frames,
+            "max_displacement": simulation.max_displacement,
+            "timings": {
+                "startup": startup,
+                "compile": watch.seconds.get("compile", 0.0),
+                "simulate": watch.seconds.get("simulate", 0.0),
+                "render": watch.seconds.get("render", 0.0),
+                "encode": writer.encode_seconds,
+                "total": time.perf_counter() - started,
+            },
+            "arch": device.arch,
+            "threads": device.threads,
+            "versions": versions(),
         }
-        record["outputs"] = writer.publish(record)
-    return record
+        outputs = writer.publish(record)
+    return {**record, "outputs": outputs}
 
 
 def versions() -> dict[str, str]:

@@ -12,7 +12,7 @@ from taichi_msm import runtime
 from taichi_msm.camera import View
 from taichi_msm.dynamics import Dynamics
 from taichi_msm.errors import DivergedError
-from taichi_msm.lattice import rest_positions
+from taichi_msm.lattice import axes
 from taichi_msm.scene import Scene
 from taichi_msm.stability import stable_step, step, steps_per_frame
 from taichi_msm.texture import load_texture
@@ -52,9 +52,8 @@ class Simulation:
         self.device = runtime.start(arch, threads)
         self.frame = 0
         self.max_displacement = 0.0
-        rest = rest_positions(scene.sheet)
-        self._rest_x, self._rest_y = rest[0, :, 0], rest[:, :1, 1]
         self._dynamics = Dynamics(scene, self.device)
+        self._position = self._read()
         self._texture = texture
         self._drawing: Drawing | None = None
 
@@ -72,24 +71,21 @@ class Simulation:
         """Simulate a number of frames; the scene's loads go on as its keys say.
 
         Raises:
-            DivergedError: when a point is no longer finite or has left every bound. `positions` is then worthless.
+            DivergedError: when a point is no longer finite or has left every bound. `positions` and `draw` then give
+                the last frame that was good.
         """
         for _ in range(frames):
             self._dynamics.advance(steps_per_frame(self.scene))
             self.frame += 1
-            self._watch()
+            self._position = self._read()
 
     def positions(self) -> NDArray[Any]:
-        """Read where the points are.
+        """Give where the points are.
 
         Returns:
-            Positions [m], shape (rows, cols, 3), in the scene's precision.
+            Positions [m], shape (rows, cols, 3), in the scene's precision; not to be written to.
         """
-        position = self._dynamics.displacement()
-        # Summed in float64 and rounded once, without a copy of the sheet.
-        np.add(position[..., 0], self._rest_x, out=position[..., 0], casting="same_kind")
-        np.add(position[..., 1], self._rest_y, out=position[..., 1], casting="same_kind")
-        return position
+        return self._position
 
     def draw(self, camera: View | None = None) -> NDArray[np.uint8]:
         """Draw the sheet as it is now.
@@ -103,7 +99,7 @@ class Simulation:
         Raises:
             SceneError: when the scene's picture cannot be read.
         """
-        return self._drawn().draw(self.positions(), camera)
+        return self._drawn().draw(self._position, camera)
 
     def compile(self) -> None:
         """Compile now what would be compiled by the first frame."""
@@ -133,9 +129,19 @@ class Simulation:
             self._drawing = Drawing(self.scene, texture)
         return self._drawing
 
-    def _watch(self) -> None:
-        """Stop a simulation that has gone wrong."""
+    def _read(self) -> NDArray[Any]:
+        """Read where the points are, if the simulation has not gone wrong."""
         displacement = self._dynamics.displacement()
+        self._watch(displacement)
+        position, (x, y) = displacement, axes(self.scene.sheet)
+        # Summed in float64 and rounded once, without a copy of the sheet.
+        np.add(position[..., 0], x, out=position[..., 0], casting="same_kind")
+        np.add(position[..., 1], y, out=position[..., 1], casting="same_kind")
+        position.flags.writeable = False
+        return position
+
+    def _watch(self, displacement: NDArray[Any]) -> None:
+        """Stop a simulation that has gone wrong."""
         with np.errstate(over="ignore", invalid="ignore"):
             square = np.einsum("ijk,ijk->ij", displacement, displacement)
         i, j = (int(index) for index in np.unravel_index(square.argmax(), square.shape))
