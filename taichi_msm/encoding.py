@@ -35,7 +35,7 @@ WAITING_BYTES = 256 << 20
 
 # Our path, so that the child finds this package where we did. It must not run the caller's main module, as
 # multiprocessing would: a script that calls us need not be guarded against its own import.
-_CHILD = "import sys; sys.path[:] = {path!r}; from taichi_msm.encoding import main; main({job!r})"
+_CHILD = "import sys; sys.path[:] = {path!r}; from taichi_msm.encoding import main; main()"
 
 
 @dataclass(frozen=True)
@@ -80,15 +80,12 @@ class Encoder:
         inherit: file descriptors that the process holds open while it lives.
 
     Raises:
-        OSError: here or in the methods, whatever failed in the process; `finish` always tells.
+        OSError: here or in the methods, when a file cannot be written or the process ends; `finish` always tells.
     """
 
     def __init__(self, job: Job, inherit: tuple[int, ...] = ()) -> None:
-        # A job does not fit in a pipe, and the process is slow to start: through a file, nobody waits.
-        path = job.directory / "job"
-        path.write_bytes(pickle.dumps(job))
         self._process = subprocess.Popen(
-            [sys.executable, "-c", _CHILD.format(path=sys.path, job=str(path.absolute()))],
+            [sys.executable, "-c", _CHILD.format(path=sys.path)],
             stdin=subprocess.PIPE,
             stdout=subprocess.PIPE,
             pass_fds=inherit,
@@ -101,6 +98,7 @@ class Encoder:
         self._pictures = self._process.stdin
         self._answer = self._process.stdout
         self._report: Report | None = None
+        pickle.dump(job, self._pictures)
 
     def add(self, picture: Picture) -> None:
         """Hand over the next picture, shape (height, width, 3); waits while too many are not encoded yet."""
@@ -120,7 +118,7 @@ class Encoder:
                 answer = self._answer.read()
             code = self._process.wait()
             result = pickle.loads(answer) if answer else None
-            if isinstance(result, OSError):
+            if isinstance(result, Exception):
                 raise result
             if not isinstance(result, Report):
                 raise ChildProcessError(f"the encoder ended with exit code {code}")
@@ -136,13 +134,16 @@ class Encoder:
         self._process.wait()
 
 
-def main(path: str) -> None:
-    """Be the process: read a job from a file and its pictures from stdin, report on stdout."""
-    answer: Report | OSError
+def main() -> None:
+    """Be the process: read a job and its pictures from stdin, report on stdout."""
+    answer: Report | Exception
     try:
-        answer = encode(pickle.loads(Path(path).read_bytes()), sys.stdin.buffer)
+        answer = encode(pickle.load(sys.stdin.buffer), sys.stdin.buffer)
     except OSError as error:
         answer = error
+    except Exception as error:
+        # Not every exception can be pickled.
+        answer = RuntimeError(f"in the encoder: {type(error).__name__}: {error}")
     pickle.dump(answer, sys.stdout.buffer)
 
 
@@ -156,29 +157,43 @@ def encode(job: Job, source: BinaryIO) -> Report:
     Raises:
         OSError: when a file cannot be written.
     """
-    gif: GifWriter | None = None
     width, height = job.size
     depth = max(1, min(WAITING, WAITING_BYTES // (3 * width * height)))
     frames = 0
     seconds = 0.0
     pending: deque[Future[float]] = deque()
-    with ThreadPoolExecutor(min(depth, os.cpu_count() or 1)) as stills, ThreadPoolExecutor(1) as film:
+    film = _Film(job)
+    with ThreadPoolExecutor(min(depth, os.cpu_count() or 1)) as stills, ThreadPoolExecutor(1) as reel:
         for picture in _pictures(source, job.size):
             if job.png:
                 path = job.directory / frame_name(frames)
                 pending.append(stills.submit(_seconds, _write_png, picture, path))
             if job.gif:
-                if gif is None:
-                    palette = Palette(shades(picture), job.background)
-                    gif = GifWriter(job.directory / ANIMATION, job.size, job.rate, palette)
-                pending.append(film.submit(_seconds, gif.add, picture))
+                pending.append(reel.submit(_seconds, film.add, picture))
             frames += 1
             while len(pending) > depth * (job.png + job.gif):
                 seconds += pending.popleft().result()
         seconds += sum(task.result() for task in pending)
-    if gif:
-        seconds += _seconds(gif.close)
+    seconds += _seconds(film.close)
     return Report(frames, seconds)
+
+
+class _Film:
+    """The animation, begun when its first frame has shown which colours it needs."""
+
+    def __init__(self, job: Job) -> None:
+        self._job = job
+        self._gif: GifWriter | None = None
+
+    def add(self, picture: Picture) -> None:
+        if self._gif is None:
+            palette = Palette(shades(picture), self._job.background)
+            self._gif = GifWriter(self._job.directory / ANIMATION, self._job.size, self._job.rate, palette)
+        self._gif.add(picture)
+
+    def close(self) -> None:
+        if self._gif is not None:
+            self._gif.close()
 
 
 def _pictures(source: BinaryIO, size: tuple[int, int]) -> Iterator[Picture]:

@@ -238,11 +238,11 @@ def full_disk(*_: object, **__: object) -> None:
     raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
 
 
-@pytest.mark.parametrize("target", ["write_bytes", "write_text", "replace"])
+@pytest.mark.parametrize("target", ["write_text", "replace"])
 def test_a_full_disk_is_one_line_and_changes_nothing(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, target: str
 ) -> None:
-    """When the job is written, the record, or the marker."""
+    """When the record is written, or the marker."""
     write(tmp_path, 3, small_scene())
     before = files(tmp_path)
     monkeypatch.setattr(Path, target, full_disk)
