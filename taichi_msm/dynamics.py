@@ -42,7 +42,7 @@ POINT_STEPS_PER_LAUNCH = 40_000_000
 MAX_STEPS_PER_LAUNCH = 8192
 
 # On a GPU a launch is a chain of this many kernels, one a step.
-GPU_STEPS_PER_LAUNCH = 16
+GPU_STEPS_PER_LAUNCH = 8
 
 # Taichi gives a CPU thread at least this many iterations of a parallel loop: make_cpu_multithreaded_range_for.cpp.
 ITERATIONS_PER_THREAD = 512

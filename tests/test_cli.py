@@ -209,6 +209,15 @@ def test_wrong_input_is_one_clear_text(
     assert sorted(path.name for path in small.iterdir()) == ["small.yaml", "speckle.png"], "nothing is left behind"
 
 
+def test_an_arch_that_is_not_there_is_one_clear_text(small: Path) -> None:
+    done = program("run", "small.yaml", "--arch", "cuda")
+    if done.returncode == 0:
+        pytest.skip("this machine has CUDA")
+    error = "--arch cuda: not available on this machine; take --arch cpu\n"
+    assert (done.returncode, done.stdout, done.stderr) == (2, "", error)
+    assert not (small / "output").exists()
+
+
 def test_errors_as_json(small: Path, capsys: pytest.CaptureFixture[str]) -> None:
     code, out, err = call(capsys, "check", "small.yaml", "--json", "--set", "damping=-1")
     line = "--set damping=-1: damping: -1 is not allowed; expected a number, 0 or more, in N s/m"
