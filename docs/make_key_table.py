@@ -20,13 +20,13 @@ END = "<!-- end of keys -->\n"
 def rows(section: dict[str, Any], definitions: dict[str, Any], prefix: str = "") -> Iterator[str]:
     """Give a line for every key of a section and of the sections below it."""
     for name, key in section["properties"].items():
-        default = json.dumps(key["default"]) if "default" in key else ""
         below = list(_references(key))
-        if below and name != "camera":
-            default = ""
-        shown = f"`{default}`" if default not in ("", "null") else ""
-        required = " (required)" if name in section.get("required", ()) and not below else ""
-        yield f"| `{prefix}{name}` | {key['description']}{required} | {key['expects']} | {shown} |"
+        default = f"`{json.dumps(key['default'])}`" if key.get("default") is not None else ""
+        if name in section.get("required", ()):
+            default = "**required**"
+        elif below and name != "camera":
+            default = "none" if "items" in key else "those below"
+        yield f"| `{prefix}{name}` | {key['description']} | {key['expects']} | {default} |"
         for reference in below:
             yield from rows(definitions[reference], definitions, f"{prefix}{name}.{'N.' if 'items' in key else ''}")
 

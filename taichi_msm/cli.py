@@ -22,6 +22,7 @@ DONE, BUG, WRONG_INPUT, DIVERGED, FILES, INTERRUPTED = 0, 1, 2, 3, 4, 130
 EXIT_CODES = {"complete": DONE, "diverged": DIVERGED, "interrupted": INTERRUPTED}
 
 scene_argument = click.argument("scene", metavar="SCENE")
+image_option = click.option("--image", metavar="FILE", help="Another picture on the scene's sheet.")
 set_option = click.option(
     "--set",
     "overrides",
@@ -41,7 +42,7 @@ def program() -> None:
 @program.command()
 @scene_argument
 @click.option("--out", metavar="DIR", help="Where the results go.  [default: output/<name of the scene file>]")
-@click.option("--image", metavar="FILE", help="Another picture on the scene's sheet.")
+@image_option
 @set_option
 @click.option("--arch", metavar="cpu|cuda", default="cpu", show_default=True, help="Where to compute.")
 @click.option("--threads", type=click.IntRange(min=1), metavar="N", help="CPU threads.  [default: every core]")
@@ -79,24 +80,25 @@ def run(
         )
     if as_json:
         print_json({"directory": str(directory), **record})
-    elif not quiet:
-        click.echo(summary(record, directory))
     if record["status"] != "complete":
         reason = record.get("error", "interrupted")
         complain([f"{scene}: {reason}; frames in {directory}: {record['frames']}"])
+    elif not quiet and not as_json:
+        click.echo(summary(record, directory))
     return EXIT_CODES[record["status"]]
 
 
 @program.command()
 @scene_argument
+@image_option
 @set_option
 @json_option
-def check(scene: str, overrides: tuple[str, ...], as_json: bool) -> int:
+def check(scene: str, image: str | None, overrides: tuple[str, ...], as_json: bool) -> int:
     """Validate SCENE and say what it would take; compute nothing."""
     from taichi_msm import budget, stability
     from taichi_msm.scene_file import load_scene
 
-    loaded = load_scene(scene, overrides)
+    loaded = load_scene(scene, overrides, image)
     need = budget.estimate(loaded)
     limit = stability.stable_step(loaded)
     facts = {

@@ -50,11 +50,12 @@ class Progress:
 
 
 def summary(record: Mapping[str, Any], directory: Path) -> str:
-    """Say in two lines what a run did and how long it took."""
+    """Say in a few lines what a run did and how long it took."""
     times = record["timings"]
     stages = ", ".join(f"{stage} {seconds:.2f}" for stage, seconds in times.items() if stage != "total")
+    still = "" if record["max_displacement"] > 0 else "\nnothing moved: does a probe press where and when it should?"
     return (
         f"{directory}: {record['frames']} frames, {record['steps']} steps of {record['step']:.4g} s, "
         f"largest displacement {record['max_displacement']:.4g} m\n"
-        f"{times['total']:.2f} s: {stages} (encode overlaps)"
+        f"{times['total']:.2f} s: {stages} (encode overlaps){still}"
     )

@@ -33,6 +33,8 @@ Byte = Annotated[Whole, Field(ge=0, le=255)]
 Text = Annotated[str, Field(strict=True, min_length=1)]
 Side = Literal["top", "bottom", "left", "right"]
 Vector = tuple[Number, Number, Number]
+# A tool may come from beyond the edge, but pixels are no fractions.
+Fraction = Annotated[Number, Field(ge=-1, le=2)]
 
 
 def key(default: Any = ..., *, means: str, expects: str) -> Any:
@@ -85,11 +87,11 @@ class Springs(Section):
 class Probe(Section):
     """A tool: where it acts, how hard, and when (eq. 5)."""
 
-    at: tuple[Number, Number] | Annotated[tuple[Vector, ...], Field(min_length=1)] = key(
+    at: tuple[Fraction, Fraction] | Annotated[tuple[tuple[Number, Fraction, Fraction], ...], Field(min_length=1)] = key(
         (0.5, 0.5),
         means="control point: fraction of the width from the left, of the height from the top; "
         "or keys [[t, across, down], ...], linear between, held outside",
-        expects="[across, down], or keys [[t, across, down], ...]",
+        expects="[across, down], fractions from -1 to 2, or keys [[t, across, down], ...]",
     )
     force: Vector = key(means="force at 100 % [N]", expects="three numbers: [x, y, z] in newtons")
     load: Annotated[tuple[tuple[Number, Number], ...], Field(min_length=1)] = key(
@@ -227,7 +229,7 @@ class Scene(Section):
 
     image: Text | None = key(
         None,
-        means="the picture on the sheet: PNG, JPEG, WebP, BMP or TIFF; relative to the scene file",
+        means="the picture on the sheet: PNG, JPEG, WebP, BMP or TIFF; relative to the scene file; required to draw",
         expects="the path of a picture",
     )
     region: tuple[Whole, Whole, Whole, Whole] | None = key(

@@ -205,7 +205,9 @@ class _Draft:
             elif not isinstance(holder, list):
                 return Problem(here, f"{flow(holder)} has no keys to set one of; set it as a whole")
             elif not (isinstance(part, int) and part < len(holder)):
-                return Problem((*here, part), f"no such item; the list has {len(holder)}, numbered from 0")
+                example = ".".join(str(one) for one in (*here, 0, *path[n:][isinstance(part, int) :]))
+                said = f"no such item; the list has {len(holder)}, numbered from 0, as in {example}"
+                return Problem((*here, part), said)
             here = (*here, part)
             if n == len(path) - 1:
                 holder[part] = value

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from taichi_msm import runtime
 from taichi_msm.camera import View
 from taichi_msm.dynamics import Dynamics
-from taichi_msm.errors import DivergedError
+from taichi_msm.errors import DivergedError, MsmError
 from taichi_msm.lattice import axes
 from taichi_msm.scene import Scene
 from taichi_msm.stability import stable_step, step, steps_per_frame
@@ -52,6 +52,7 @@ class Simulation:
         self.device = runtime.start(arch, threads)
         self.frame = 0
         self.max_displacement = 0.0
+        self._closed = False
         self._dynamics = Dynamics(scene, self.device)
         self._position = self._read()
         self._texture = texture
@@ -70,10 +71,17 @@ class Simulation:
     def advance(self, frames: int = 1) -> None:
         """Simulate a number of frames; the scene's loads go on as its keys say.
 
+        Args:
+            frames: how many, 0 or more.
+
         Raises:
+            MsmError: when the simulation is closed.
             DivergedError: when a point is no longer finite or has left every bound. `positions` and `draw` then give
                 the last frame that was good.
         """
+        if not (isinstance(frames, int) and frames >= 0):
+            raise ValueError(f"{frames!r} frames cannot be simulated; take a whole number, 0 or more")
+        self._require_open()
         for _ in range(frames):
             self._dynamics.advance(steps_per_frame(self.scene))
             self.frame += 1
@@ -99,6 +107,7 @@ class Simulation:
         Raises:
             SceneError: when the scene's picture cannot be read.
         """
+        self._require_open()
         return self._drawn().draw(self._position, camera)
 
     def compile(self) -> None:
@@ -108,7 +117,8 @@ class Simulation:
             self.draw()
 
     def close(self) -> None:
-        """Free the memory of the fields."""
+        """Free the memory of the fields. `positions` still gives the last frame."""
+        self._closed = True
         self._dynamics.close()
         if self._drawing is not None:
             self._drawing.close()
@@ -120,6 +130,11 @@ class Simulation:
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
         self.close()
+
+    def _require_open(self) -> None:
+        # The kernels would write to memory that is freed.
+        if self._closed:
+            raise MsmError("this simulation is closed; make another")
 
     def _drawn(self) -> Drawing:
         if self._drawing is None:

@@ -42,7 +42,7 @@ probes:
 ROOT_KEYS = "image, region, sheet, springs, damping, probes, time, render, output"
 POINTS = "expected two whole numbers, 2 to 4096: [rows, cols]"
 A_PROBE_KEY = "expected keys [[t, percent], ...], t in seconds"
-AN_AT = "expected [across, down], or keys [[t, across, down], ...]"
+AN_AT = "expected [across, down], fractions from -1 to 2, or keys [[t, across, down], ...]"
 A_CAMERA = "expected top, oblique, or {eye: [x, y, z], target: [x, y, z], up: [x, y, z], fov: degrees}"
 VECTOR_M = "expected three numbers: [x, y, z] in metres"
 NO_PICTURE = "image: a picture is needed to draw png or gif; name one, or set output to [trajectory] or []"
@@ -643,11 +643,12 @@ def test_an_override_mends_a_fault_of_the_file(load: Load) -> None:
         ),
         (
             ["probes.1.offset=1"],
-            "--set probes.1.offset=1: probes.1: no such item; the list has 1, numbered from 0",
+            "--set probes.1.offset=1: probes.1: no such item; the list has 1, numbered from 0, as in probes.0.offset",
         ),
         (
             ["probes.first.offset=1"],
-            "--set probes.first.offset=1: probes.first: no such item; the list has 1, numbered from 0",
+            "--set probes.first.offset=1: probes.first: no such item; the list has 1, numbered from 0, "
+            "as in probes.0.first.offset",
         ),
         (
             ["damping.x=1"],
@@ -686,7 +687,7 @@ def test_errors_in_overrides(load: Load, overrides: Any, expected: str) -> None:
 
 def test_an_item_of_a_list_that_is_not_there(load: Load) -> None:
     assert lines(load, GOOD, ["probes.0.load=[[0, 1]]"]) == [
-        "--set probes.0.load=[[0, 1]]: probes.0: no such item; the list has 0, numbered from 0"
+        "--set probes.0.load=[[0, 1]]: probes.0: no such item; the list has 0, numbered from 0, as in probes.0.load"
     ]
 
 
@@ -806,7 +807,7 @@ def random_scene(seed: int) -> dict[str, Any]:
 
     def keys(width: int) -> list[list[float]]:
         times = sorted(rng.sample(range(-5, 40), rng.randint(1, 5)))
-        return [[t / 10, *(some(-2, 2) for _ in range(width))] for t in times]
+        return [[t / 10, *(some(-1, 2) for _ in range(width))] for t in times]
 
     def thinned(section: dict[str, Any], *kept: str) -> dict[str, Any]:
         return {key: value for key, value in section.items() if key in kept or rng.random() < 0.6}

@@ -1,0 +1,80 @@
+"""The Python API."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+import taichi_msm
+from taichi_msm import DivergedError, MsmError, Simulation, reference
+from taichi_msm.runtime import Device
+from tests.scenes import scene, speckle
+
+
+def test_frames_positions_and_pictures(device: Device) -> None:
+    made = scene(render={"size": [40, 30], "refine": 1})
+    twin = reference.simulate(made)
+    with Simulation(made, threads=device.threads, texture=speckle(30, 40)) as simulation:
+        np.testing.assert_array_equal(simulation.positions(), twin[0])
+        simulation.advance(3)
+        assert simulation.frame == 3
+        assert simulation.time == pytest.approx(0.12)
+        np.testing.assert_allclose(simulation.positions(), twin[3], atol=1e-13)
+        apart = np.abs(simulation.draw().astype(int) - reference.draw(made, twin[3], speckle(30, 40)))
+        assert (apart > 1).mean() < 0.01
+        simulation.advance(0)
+        assert simulation.frame == 3
+    assert simulation.max_displacement == pytest.approx(np.linalg.norm(twin[:4] - twin[0], axis=-1).max())
+
+
+def test_positions_of_a_frame_stay_as_they_were(device: Device) -> None:
+    with Simulation(scene(), threads=device.threads) as simulation:
+        simulation.advance()
+        before = simulation.positions()
+        copy = before.copy()
+        simulation.advance()
+        np.testing.assert_array_equal(before, copy)
+        with pytest.raises(ValueError, match="read-only"):
+            before[0, 0, 0] = 1
+
+
+def test_after_a_divergence_the_last_good_frame_is_there(device: Device) -> None:
+    # At 0.1 s the load jumps to what tears the sheet apart.
+    made = scene(probes=[{"force": [0, 0, 1], "load": [[0, 0], [0.1, 100], [0.1, 1e15]], "falloff": 20}])
+    with Simulation(made, threads=device.threads) as simulation:
+        simulation.advance(2)
+        good = simulation.positions()
+        with pytest.raises(DivergedError, match=r"diverged before 0\.12 s, step \d+: point \(\d+, \d+\) is "):
+            simulation.advance(5)
+        np.testing.assert_array_equal(simulation.positions(), good)
+
+
+def test_a_closed_simulation_says_so(device: Device) -> None:
+    with Simulation(scene(), threads=device.threads) as simulation:
+        simulation.advance()
+    assert np.isfinite(simulation.positions()).all()
+    with pytest.raises(MsmError, match="closed"):
+        simulation.advance()
+    with pytest.raises(MsmError, match="closed"):
+        simulation.draw()
+
+
+@pytest.mark.parametrize("frames", [-1, 1.5])
+def test_frames_are_counted(frames: int, device: Device) -> None:
+    with (
+        Simulation(scene(), threads=device.threads) as simulation,
+        pytest.raises(ValueError, match="take a whole number, 0 or more"),
+    ):
+        simulation.advance(frames)
+
+
+def test_one_device_a_process(device: Device) -> None:
+    with pytest.raises(taichi_msm.DeviceError, match="Taichi already runs on cpu with 2 threads in this process"):
+        Simulation(scene(), threads=device.threads + 1)
+
+
+def test_the_names_of_the_api() -> None:
+    for name in taichi_msm.__all__:
+        assert getattr(taichi_msm, name).__doc__
+    with pytest.raises(AttributeError, match="no attribute 'simulate'"):
+        taichi_msm.simulate  # noqa: B018
