@@ -27,7 +27,7 @@ from numpy.typing import NDArray
 
 from taichi_msm.lattice import axes, fixed_points, spacing, springs
 from taichi_msm.loads import decay, grips, schedule
-from taichi_msm.runtime import Device, ti
+from taichi_msm.runtime import Device, available_threads, ti
 from taichi_msm.scene import Scene
 from taichi_msm.stability import step
 
@@ -94,12 +94,14 @@ def structure(scene: Scene, device: Device) -> Structure:
     rows, cols = scene.sheet.points
     fixed = fixed_points(scene.sheet)
     on_cpu = device.arch == "cpu"
+    # Workers wait by spinning: more of them than cores would only keep each other from their work.
+    cores = min(device.threads, available_threads())
     return Structure(
         rows=rows,
         cols=cols,
         precision=scene.time.precision,
         lanes=LANES[scene.time.precision] if on_cpu else 1,
-        workers=max(1, min(device.threads, rows * cols // POINTS_PER_WORKER, rows // 2)) if on_cpu else 0,
+        workers=max(1, min(cores, rows * cols // POINTS_PER_WORKER, rows // 2)) if on_cpu else 0,
         neighbours=tuple((spring.down, spring.right) for spring in springs(scene)),
         open_edges=not (fixed[[0, -1]].all() and fixed[:, [0, -1]].all()),
         virtual=scene.springs.virtual > 0 and (scene.springs.virtual_active == "always" or bool(scene.probes)),
