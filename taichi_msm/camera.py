@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator
 from typing import NamedTuple
 
@@ -18,8 +19,8 @@ OBLIQUE_DIRECTION = np.array([0.0, -0.64, 0.77])
 OBLIQUE_FOV = 32.0
 OBLIQUE_MARGIN = 1.04
 
-# Nothing nearer to the eye than this fraction of the distance to the target is drawn.
-NEAR = 1e-3
+# Nothing nearer to the eye's plane than this fraction of the sheet's diagonal is drawn.
+NEAR = 1e-9
 
 
 class View(NamedTuple):
@@ -43,8 +44,8 @@ def view(scene: Scene) -> View:
     if camera == "top":
         return _top(scene)
     if isinstance(camera, Camera):
-        return _pinhole(camera, scene.render.size)
-    return _pinhole(_oblique(scene), scene.render.size)
+        return _pinhole(camera, scene)
+    return _pinhole(_oblique(scene), scene)
 
 
 def problems(scene: Scene) -> Iterator[Problem]:
@@ -79,16 +80,16 @@ def _axes(camera: Camera) -> Array:
     return np.stack([right, np.cross(toward, right), toward])
 
 
-def _pinhole(camera: Camera, size: tuple[int, int]) -> View:
+def _pinhole(camera: Camera, scene: Scene) -> View:
     """Look from the eye to the target; fov is the angle from the picture's bottom to its top."""
-    columns, lines = size
+    columns, lines = scene.render.size
     axes = _axes(camera)
     right, up, depth = axes * np.array([[1.0], [1.0], [-1.0]])
     eye = np.array(camera.eye)
     focal = lines / 2 / np.tan(np.radians(camera.fov) / 2)
     rows = [focal * right + columns / 2 * depth, -focal * up + lines / 2 * depth, depth, depth]
     matrix = np.array([[*row, -row @ eye] for row in rows])
-    return View(matrix, axes[2], NEAR * float(np.linalg.norm(np.subtract(camera.eye, camera.target))))
+    return View(matrix, axes[2], NEAR * math.hypot(*scene.sheet.size))
 
 
 def _oblique(scene: Scene) -> Camera:

@@ -8,6 +8,7 @@ STARTED = time.perf_counter()
 
 import json
 import os
+import signal
 import sys
 from collections.abc import Sequence
 from pathlib import Path
@@ -64,20 +65,35 @@ def run(
     loaded = load_scene(scene, overrides, image)
     directory = Path(out) if out is not None else Path("output") / Path(scene).stem
 
+    if not out and out is not None:
+        raise click.BadParameter("is empty; name a directory", param_hint="--out")
+
     from taichi_msm import runner
     from taichi_msm.console import Progress, summary
 
     recorded = [*overrides, *([f"image={image}"] if image is not None else [])]
-    with Progress(quiet=quiet or as_json) as progress:
-        record = runner.run(
-            loaded,
-            directory,
-            arch=arch,
-            threads=threads,
-            overrides=recorded,
-            started=STARTED,
-            progress=progress.update,
-        )
+    with Progress(quiet=quiet or as_json) as bar:
+
+        def progress(stage: str, done: int, total: int) -> None:
+            bar.update(stage, done, total)
+            # From here on there is something to tidy; and what is being put in place is put in place.
+            signal.signal(signal.SIGINT, signal.SIG_IGN if stage == "write" else signal.default_int_handler)
+
+        try:
+            record = runner.run(
+                loaded,
+                directory,
+                arch=arch,
+                threads=threads,
+                overrides=recorded,
+                started=STARTED,
+                progress=progress,
+            )
+        except SceneError as error:
+            raise SceneError([f"{scene}: {line}" for line in error.lines]) from None
+        except KeyboardInterrupt:
+            complain(["interrupted; nothing was written"])
+            return INTERRUPTED
     if as_json:
         print_json({"directory": str(directory), **record})
     if record["status"] != "complete":
@@ -175,10 +191,11 @@ def main(arguments: Sequence[str] | None = None) -> int:
         return WRONG_INPUT
     except click.ClickException as error:
         return fail(WRONG_INPUT, [f"taichi-msm: {error.format_message()} (see taichi-msm --help)"])
-    except (KeyboardInterrupt, click.Abort):
-        return fail(INTERRUPTED, ["interrupted; nothing was written"])
-    except BrokenPipeError:
+    except OSError as error:
+        # Nobody reads stdout any more, or its disk is full; the interpreter is not to try again when it ends.
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        if not isinstance(error, BrokenPipeError):
+            complain([f"taichi-msm: cannot read or write: {error.strerror or error}"])
         return FILES
     except Exception as error:
         if os.environ.get("TAICHI_MSM_TRACEBACK"):

@@ -144,7 +144,8 @@ def main() -> None:
     except Exception as error:
         # Not every exception can be pickled.
         answer = RuntimeError(f"in the encoder: {type(error).__name__}: {error}")
-    pickle.dump(answer, sys.stdout.buffer)
+    with suppress(BrokenPipeError):  # when who asked was killed
+        os.write(sys.stdout.fileno(), pickle.dumps(answer))
 
 
 def encode(job: Job, source: BinaryIO) -> Report:

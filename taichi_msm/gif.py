@@ -169,7 +169,7 @@ class GifWriter:
         else:
             self._write_first(until=start)
         self._waiting.append(_Shown(start, indices))
-        self._write_first(until=max(end, start + SHORTEST))
+        self._write_first(until=max(end, start + 1))
 
     def _write_first(self, until: int) -> None:
         """Write the frame that waits longest; a delay too long for one frame is shared by repetitions."""

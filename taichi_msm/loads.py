@@ -13,7 +13,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from taichi_msm.lattice import axes
+from taichi_msm.lattice import axes, fixed_points
 from taichi_msm.scene import Probe, Scene, Sheet
 from taichi_msm.stability import steps_per_frame
 
@@ -101,6 +101,17 @@ def decay(grip: Grip, scene: Scene) -> Array:
     x, y = axes(scene.sheet)
     distance = np.hypot(x - grip.points[0, 0], y - grip.points[0, 1])
     return np.exp(-probe.falloff * distance - probe.offset)
+
+
+def free_acceleration(scene: Scene) -> float:
+    """Bound the acceleration that the probes give a sheet that nothing holds [m/s^2]; 0 if a point is fixed."""
+    if fixed_points(scene.sheet).any():
+        return 0.0
+    forces = (
+        math.hypot(*probe.force) * max(abs(percent) for _, percent in probe.load) / 100 * math.exp(-probe.offset)
+        for probe in scene.probes
+    )
+    return sum(forces) / scene.sheet.mass
 
 
 def _between(times: Array, values: Array, t: Array, after: NDArray[np.intp], before: float | Array) -> Array:

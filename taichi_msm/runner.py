@@ -63,20 +63,22 @@ def run(
         What is in run.json; its "status" is "complete", "diverged" (then "error" says where and why) or "interrupted".
 
     Raises:
+        SceneError: when the scene's picture cannot be decoded.
         DeviceError: when the arch is not there.
         FilesError: when the results cannot be written.
+        KeyboardInterrupt: when interrupted before the first frame; nothing is written then.
     """
     started = time.perf_counter() if started is None else started
     device = runtime.start(arch, threads)
     texture = load_texture(scene) if scene.draws else None
     frames = scene.time.frames + 1
     ending: dict[str, Any] = {"status": "complete"}
-    with ResultWriter(Path(directory), scene) as writer:
-        with Simulation(scene, arch, threads, texture) as simulation:
+    with Simulation(scene, arch, threads, texture) as simulation:
+        progress("compile", 0, frames)
+        with ResultWriter(Path(directory), scene) as writer:
             watch = Stopwatch()
             startup = time.perf_counter() - started
             try:
-                progress("compile", 0, frames)
                 simulation.compile()
                 watch.lap("compile")
                 for frame in range(frames):
@@ -89,35 +91,37 @@ def run(
                     progress("frames", frame + 1, frames)
                     watch.lap("hand over")
             except KeyboardInterrupt:
+                if not writer.frames:
+                    raise
                 ending = {"status": "interrupted"}
             except DivergedError as error:
                 ending = {"status": "diverged", "error": str(error)}
-        progress("write", writer.frames, frames)
-        writer.finish()
-        limit = stable_step(scene)
-        record = {
-            **ending,
-            "scene": scene.model_dump(mode="json"),
-            "overrides": list(overrides),
-            "step": step(scene),
-            "stable_step": limit if limit < math.inf else None,
-            "steps_per_frame": steps_per_frame(scene),
-            "steps": simulation.steps,
-            "frames": writer.frames,
-            "max_displacement": simulation.max_displacement,
-            "timings": {
-                "startup": startup,
-                "compile": watch.seconds.get("compile", 0.0),
-                "simulate": watch.seconds.get("simulate", 0.0),
-                "render": watch.seconds.get("render", 0.0),
-                "encode": writer.encode_seconds,
-                "total": time.perf_counter() - started,
-            },
-            "arch": device.arch,
-            "threads": device.threads,
-            "versions": versions(),
-        }
-        outputs = writer.publish(record)
+            progress("write", writer.frames, frames)
+            writer.finish()
+            limit = stable_step(scene)
+            record = {
+                **ending,
+                "scene": scene.model_dump(mode="json"),
+                "overrides": list(overrides),
+                "step": step(scene),
+                "stable_step": limit if limit < math.inf else None,
+                "steps_per_frame": steps_per_frame(scene),
+                "steps": simulation.steps,
+                "frames": writer.frames,
+                "max_displacement": simulation.max_displacement,
+                "timings": {
+                    "startup": startup,
+                    "compile": watch.seconds.get("compile", 0.0),
+                    "simulate": watch.seconds.get("simulate", 0.0),
+                    "render": watch.seconds.get("render", 0.0),
+                    "encode": writer.encode_seconds,
+                    "total": time.perf_counter() - started,
+                },
+                "arch": device.arch,
+                "threads": device.threads,
+                "versions": versions(),
+            }
+            outputs = writer.publish(record)
     return {**record, "outputs": outputs}
 
 

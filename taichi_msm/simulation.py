@@ -13,6 +13,7 @@ from taichi_msm.camera import View
 from taichi_msm.dynamics import Dynamics
 from taichi_msm.errors import DivergedError, MsmError
 from taichi_msm.lattice import axes
+from taichi_msm.loads import free_acceleration
 from taichi_msm.scene import Scene
 from taichi_msm.stability import stable_step, step, steps_per_frame
 from taichi_msm.texture import load_texture
@@ -20,7 +21,7 @@ from taichi_msm.texture import load_texture
 if TYPE_CHECKING:
     from taichi_msm.drawing import Drawing
 
-# Farther from rest than this many sheet sizes is no deformation any more.
+# Farther from rest than this many sheet sizes is no deformation any more; a sheet that nothing holds may fly besides.
 MOST_SHEET_SIZES = 10.0
 
 
@@ -53,6 +54,7 @@ class Simulation:
         self.frame = 0
         self.max_displacement = 0.0
         self._closed = False
+        self._free_acceleration = free_acceleration(scene)
         self._dynamics = Dynamics(scene, self.device)
         self._position = self._read()
         self._texture = texture
@@ -84,8 +86,8 @@ class Simulation:
         self._require_open()
         for _ in range(frames):
             self._dynamics.advance(steps_per_frame(self.scene))
-            self.frame += 1
             self._position = self._read()
+            self.frame += 1
 
     def positions(self) -> NDArray[Any]:
         """Give where the points are.
@@ -163,9 +165,10 @@ class Simulation:
         largest = float(np.linalg.norm(displacement[i, j].astype(float)))
         size = max(self.scene.sheet.size)
         # Written so that NaN is found as well: argmax points at it, and it is not below anything.
-        if not largest <= MOST_SHEET_SIZES * size:
+        time = self.steps * step(self.scene)
+        if not largest <= MOST_SHEET_SIZES * size + self._free_acceleration * time**2 / 2:
             raise DivergedError(
-                f"diverged before {self.time:g} s, step {self.steps}: point ({i}, {j}) is {largest:g} m from its rest "
+                f"diverged before {time:g} s, step {self.steps}: point ({i}, {j}) is {largest:g} m from its rest "
                 f"position, and the sheet is {size:g} m long; the step is {step(self.scene):g} s of at most "
                 f"{stable_step(self.scene):g} s; try a weaker probes.N.force or a smaller time.step"
             )

@@ -52,6 +52,13 @@ def test_right_is_right_and_up_is_up() -> None:
         assert pixel(made, [0, 0, 0.01])[1] < pixel(made, [0, 0, 0])[1]
 
 
+@pytest.mark.parametrize("away", [1e-3, 1.0, 1e6])
+def test_the_distance_of_the_target_does_not_matter(away: float) -> None:
+    near, far = with_camera({"eye": [0, 0, 0.3]}), with_camera({"eye": [0, 0, 0.3], "target": [0, 0, 0.3 - away]})
+    np.testing.assert_allclose(view(far).matrix, view(near).matrix, atol=1e-9)
+    assert view(far).near == view(near).near < 1e-8
+
+
 def test_cameras_that_see_nothing_are_refused() -> None:
     assert [str(p) for p in problems(with_camera({"eye": [0, 0, 0]}))] == [
         "render.camera.eye: [0.0, 0.0, 0.0] is also the target; move one of them"

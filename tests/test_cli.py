@@ -150,16 +150,67 @@ def test_ctrl_c_keeps_the_frames_so_far(small: Path) -> None:
     assert np.load(small / "long" / "trajectory.npz")["position"].shape == (frames, 9, 11, 3)
 
 
+@pytest.mark.parametrize("delay", [0.15, 0.3, 0.45, 0.6, 0.75, 0.9])
+def test_ctrl_c_before_the_first_frame_changes_nothing(delay: float, small: Path) -> None:
+    # A large picture, so that no frame is done in the time.
+    (small / "kept").mkdir()
+    (small / "kept" / "run.json").write_text("earlier")
+    settings = ["--set", "render.size=[4096,4096]", "--set", "render.supersample=4", "--set", "output=[png]"]
+    process = subprocess.Popen(
+        [sys.executable, "-m", "taichi_msm", "run", "small.yaml", "--out", "kept", *settings],
+        stderr=subprocess.PIPE,
+        text=True,
+    )
+    time.sleep(delay)
+    process.send_signal(signal.SIGINT)
+    _, error = process.communicate(timeout=60)
+    assert (process.returncode, error) == (130, "interrupted; nothing was written\n")
+    assert [path.name for path in (small / "kept").iterdir()] == ["run.json"]
+    assert (small / "kept" / "run.json").read_text() == "earlier"
+
+
+def test_more_threads_than_cores_are_no_harm(small: Path) -> None:
+    settings = ["--set", "sheet.points=[200,200]", "--set", "output=[]", "--out", "many"]
+    done = program("run", "small.yaml", "--threads", "16", *settings, timeout=60)
+    assert (done.returncode, done.stderr) == (0, "")
+
+
+@pytest.mark.skipif(not Path("/dev/full").exists(), reason="needs a device that is always full")
+@pytest.mark.parametrize("as_json", [[], ["--json"]])
+def test_stdout_on_a_full_disk_is_4(as_json: list[str], small: Path) -> None:
+    with Path("/dev/full").open("w") as full:
+        done = subprocess.run(
+            [sys.executable, "-m", "taichi_msm", "check", "small.yaml", *as_json],
+            stdout=full,
+            stderr=subprocess.PIPE,
+            text=True,
+            check=False,
+        )
+    assert (done.returncode, done.stderr) == (4, "taichi-msm: cannot read or write: No space left on device\n")
+
+
+def test_a_picture_that_breaks_off_is_one_line(small: Path) -> None:
+    whole = (small / "speckle.png").read_bytes()
+    (small / "speckle.png").write_bytes(whole[: len(whole) // 2])
+    done = program("run", "small.yaml")
+    assert (done.returncode, done.stdout) == (2, "")
+    assert done.stderr.startswith("small.yaml: image: speckle.png cannot be decoded (")
+    assert done.stderr.count("\n") == 1
+
+
 def test_a_killed_run_leaves_the_results_before_it(small: Path) -> None:
     assert program("run", "small.yaml", "--out", "kept").returncode == 0
     before = {path: path.read_bytes() for path in (small / "kept").rglob("*") if path.is_file()}
     process = subprocess.Popen(
-        [sys.executable, "-m", "taichi_msm", "run", "small.yaml", "--out", "kept", "--set", "time.duration=2000"]
+        [sys.executable, "-m", "taichi_msm", "run", "small.yaml", "--out", "kept", "--set", "time.duration=2000"],
+        stderr=subprocess.PIPE,
+        text=True,
     )
     while not (small / "kept" / ".partial" / "new" / "frames").exists():
         time.sleep(0.02)
     process.kill()
-    process.wait()
+    # Its encoder ends soon after, without a word.
+    assert process.communicate(timeout=30)[1] == ""
     assert {path: path.read_bytes() for path in before} == before
     assert program("run", "small.yaml", "--out", "kept").returncode == 0
     assert not (small / "kept" / ".partial").exists()
@@ -185,6 +236,10 @@ def call(capsys: pytest.CaptureFixture[str], *arguments: str) -> tuple[int, str,
             ["check", "small.yaml", "--set", "time.step=0.1"],
             "--set time.step=0.1: time.step: 0.1 s is above the stability limit 0.00499221 s; "
             "try 0.00476190476, or auto\n",
+        ),
+        (
+            ["run", "small.yaml", "--out", ""],
+            "taichi-msm: Invalid value for --out: is empty; name a directory (see taichi-msm --help)\n",
         ),
         (["run"], "taichi-msm: Missing argument 'SCENE'. (see taichi-msm --help)\n"),
         (["jump"], "taichi-msm: No such command 'jump'. (see taichi-msm --help)\n"),

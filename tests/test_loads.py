@@ -28,7 +28,6 @@ def percent(load: list[list[float]], **changes: Any) -> list[float]:
         ([[0, 0], [0.02, 100], [0.02, 0]], [0, 50, 50, 0, 0, 0]),
         ([[0, 0], [0, 100]], [100, 100, 100, 100, 100, 100]),
         ([[0, -80], [0.04, 80]], [-80, -40, 0, 40, 80, 80]),
-        # 0.03 is no binary fraction: the step that meets it is the one a person means.
         ([[0, 0], [0.03, 0], [0.03, 100]], [0, 0, 0, 50, 100, 100]),
         # Keys 1 ns apart are a ramp, not a jump: at the first of them its own value counts.
         ([[0, 0], [0.02, 0], [0.020000001, 100]], [0, 0, 0, 100, 100, 100]),
@@ -36,6 +35,17 @@ def percent(load: list[list[float]], **changes: Any) -> list[float]:
 )
 def test_percent(load: list[list[float]], expected: list[float]) -> None:
     assert percent(load) == expected
+
+
+def test_a_step_meets_a_key_in_spite_of_rounding() -> None:
+    # Three steps of a frame of 10 s: the third ends at 3 / (3 x 0.1) s, which rounds to less than 10 s.
+    made = scene(
+        springs={},
+        probes=[{"force": [100, 0, 0], "load": [[0, 0], [10, 0], [10, 100]]}],
+        time={"duration": 20, "frames_per_second": 0.1, "step": 10 / 3},
+    )
+    assert 3 / (3 * 0.1) < 10
+    assert schedule(made, 0, 6).strength[:, 0, 0].tolist() == [0, 0, 0, 50, 100, 100]
 
 
 @pytest.mark.parametrize(

@@ -49,6 +49,20 @@ def test_after_a_divergence_the_last_good_frame_is_there(device: Device) -> None
         np.testing.assert_array_equal(simulation.positions(), good)
 
 
+def test_a_sheet_that_nothing_holds_may_fly_away(device: Device) -> None:
+    # F = 0.05 N on each point of 1 g for 0.8 s: u = F t^2 / (2 m) = 16 m, forty sheets away, and no error of Verlet.
+    made = scene(
+        sheet={"points": [2, 2], "size": [0.4, 0.4], "mass": 1e-3, "fixed": "none"},
+        springs={"structural": 20},
+        damping=0,
+        probes=[{"force": [0, 0, 0.05], "falloff": 0, "offset": 0}],
+        time={"duration": 0.8},
+    )
+    with Simulation(made, threads=device.threads) as simulation:
+        simulation.advance(20)
+        np.testing.assert_allclose(simulation.positions()[..., 2], 16.0, rtol=1e-12)
+
+
 def test_a_closed_simulation_says_so(device: Device) -> None:
     with Simulation(scene(), threads=device.threads) as simulation:
         simulation.advance()
