@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from taichi_msm import look
 from taichi_msm.camera import View, view
-from taichi_msm.runtime import ti
+from taichi_msm.runtime import FieldTree, ti
 from taichi_msm.scene import Scene
 
 SUBPIXEL_BITS = 8
@@ -130,33 +130,22 @@ class Drawing:
         self._fields.close()
 
 
-class _Fields:
-    """The fields of one drawing, in one tree, which can be freed."""
+class _Fields(FieldTree):
+    """The fields of one drawing."""
 
     def __init__(self, s: Structure) -> None:
-        builder = ti.FieldsBuilder()
-
-        def field(kind: Any, *shape: int) -> Any:
-            made = kind.field() if hasattr(kind, "field") else ti.field(kind)
-            builder.dense(ti.ij, shape).place(made)
-            return made
-
+        super().__init__()
         samples = s.height * s.supersample, s.width * s.supersample
-        self.point = field(vec4, s.rows, s.cols)
-        self.normal: Any = field(vec3, s.rows, s.cols) if s.lit else None
-        self.vertex = field(vec4, *s.vertices)
-        self.snapped = field(vec2i, *s.vertices)
-        self.light: Any = field(ti.f32, *s.vertices) if s.lit else None
+        self.point = self.place(vec4.field(), s.rows, s.cols)
+        self.normal: Any = self.place(vec3.field(), s.rows, s.cols) if s.lit else None
+        self.vertex = self.place(vec4.field(), *s.vertices)
+        self.snapped = self.place(vec2i.field(), *s.vertices)
+        self.light: Any = self.place(ti.field(ti.f32), *s.vertices) if s.lit else None
         # The nearest triangle of every sample: its depth above, its number below.
-        self.nearest = field(ti.u64, *samples)
-        self.picture = field(ti.types.vector(3, ti.u8), s.height, s.width)
-        self.texture = field(ti.u32, s.texture[1], s.texture[0])
-        self._tree = builder.finalize()
-
-    def close(self) -> None:
-        if self._tree is not None:
-            self._tree.destroy()
-            self._tree = None
+        self.nearest = self.place(ti.field(ti.u64), *samples)
+        self.picture = self.place(ti.types.vector(3, ti.u8).field(), s.height, s.width)
+        self.texture = self.place(ti.field(ti.u32), s.texture[1], s.texture[0])
+        self.allocate()
 
 
 def rasteriser(fields: _Fields, width: int, height: int, visit: Callable[..., None]) -> Callable[..., None]:

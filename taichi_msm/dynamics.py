@@ -27,7 +27,7 @@ from numpy.typing import NDArray
 
 from taichi_msm.lattice import axes, fixed_points, spacing, springs
 from taichi_msm.loads import decay, grips, schedule
-from taichi_msm.runtime import Device, available_threads, ti
+from taichi_msm.runtime import Device, FieldTree, available_threads, ti
 from taichi_msm.scene import Scene
 from taichi_msm.stability import step
 
@@ -210,35 +210,26 @@ class Dynamics:
         return out
 
 
-class _Fields:
-    """The fields of one sheet, in one tree, which can be freed."""
+class _Fields(FieldTree):
+    """The fields of one sheet."""
 
     def __init__(self, s: Structure) -> None:
-        real = getattr(ti, s.precision)
-
-        def vector(builder: Any, indices: Any, *shape: int) -> Any:
-            field = ti.Vector.field(s.lanes, real)
-            builder.dense(indices, shape).place(field)
-            return field
-
-        builder = ti.FieldsBuilder()
+        super().__init__()
         width = s.strip + 2
+
+        def vector(*shape: int) -> Any:
+            return self.place(ti.Vector.field(s.lanes, getattr(ti, s.precision)), *shape)
+
         # u_n and u_{n+1} in turn, with a halo of one row above and below; d_n.
-        self.displacement = [vector(builder, ti.ijk, 2, s.rows + 2, width) for _ in range(3)]
-        self.difference = [vector(builder, ti.ij, s.rows, width) for _ in range(3)]
+        self.displacement = [vector(2, s.rows + 2, width) for _ in range(3)]
+        self.difference = [vector(s.rows, width) for _ in range(3)]
         # Whether the points move, of a first, middle and last row; their place across; whether they have a left and
         # a right neighbour.
-        self.by_column = vector(builder, ti.ij, 6, width)
-        self.decay = vector(builder, ti.ijk, max(1, s.grips.count(False)), s.rows, width)
+        self.by_column = vector(6, width)
+        self.decay = vector(max(1, s.grips.count(False)), s.rows, width)
         # The number of steps that each worker has done.
-        self.done = ti.field(ti.i64)
-        builder.dense(ti.i, max(1, s.workers) * COUNTER_STRIDE).place(self.done)
-        self._tree = builder.finalize()
-
-    def close(self) -> None:
-        if self._tree is not None:
-            self._tree.destroy()
-            self._tree = None
+        self.done = self.place(ti.field(ti.i64), max(1, s.workers) * COUNTER_STRIDE)
+        self.allocate()
 
 
 def _kernels(s: Structure, fields: _Fields) -> tuple[Callable[..., None], ...]:

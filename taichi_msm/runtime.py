@@ -7,10 +7,11 @@ import io
 import os
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 from taichi_msm.errors import DeviceError
 
-__all__ = ["ARCHS", "Device", "available_threads", "start", "ti"]
+__all__ = ["ARCHS", "Device", "FieldTree", "available_threads", "start", "ti"]
 
 # No banner on stdout, which may be JSON, and no call home.
 os.environ.setdefault("ENABLE_TAICHI_HEADER_PRINT", "0")
@@ -38,6 +39,29 @@ class Device:
 
     arch: str
     threads: int
+
+
+class FieldTree:
+    """Fields that are allocated together and can be freed: a Taichi process has room for 512 such trees."""
+
+    def __init__(self) -> None:
+        self._builder = ti.FieldsBuilder()
+        self._tree: Any = None
+
+    def place(self, field: Any, *shape: int) -> Any:
+        """Give a field its shape; returns the field."""
+        self._builder.dense((ti.i, ti.ij, ti.ijk)[len(shape) - 1], shape).place(field)
+        return field
+
+    def allocate(self) -> None:
+        """Make the memory of all fields placed, filled with zeros."""
+        self._tree = self._builder.finalize()
+
+    def close(self) -> None:
+        """Free the memory. Kernels that use it must not be called again."""
+        if self._tree is not None:
+            self._tree.destroy()
+            self._tree = None
 
 
 _device: Device | None = None
