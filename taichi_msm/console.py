@@ -2,10 +2,14 @@
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Mapping
 from pathlib import Path
 from types import TracebackType
-from typing import Any
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from rich.progress import Progress as Bar
 
 STAGES = {
     "start": "starting Taichi",
@@ -19,34 +23,34 @@ class Progress:
     """A progress bar on stderr; silent where quiet or where stderr is not a terminal."""
 
     def __init__(self, quiet: bool) -> None:
-        from rich.console import Console
-        from rich.progress import BarColumn, MofNCompleteColumn, TextColumn, TimeElapsedColumn
-        from rich.progress import Progress as Bar
-
-        console = Console(stderr=True)
-        self._bar = Bar(
-            TextColumn("{task.description:24}"),
-            BarColumn(),
-            MofNCompleteColumn(),
-            TimeElapsedColumn(),
-            console=console,
-            transient=True,
-            disable=quiet or not console.is_terminal,
-        )
-        self._task = self._bar.add_task(STAGES["start"])
+        self._bar = None if quiet or not sys.stderr.isatty() else _bar()
+        if self._bar is not None:
+            self._task = self._bar.add_task(STAGES["start"], total=None)
 
     def update(self, stage: str, done: int, total: int) -> None:
         """Show the stage and the frames done."""
-        self._bar.update(self._task, description=STAGES[stage], completed=done, total=total)
+        if self._bar is not None:
+            self._bar.update(self._task, description=STAGES[stage], completed=done, total=total)
 
     def __enter__(self) -> Progress:
-        self._bar.start()
+        if self._bar is not None:
+            self._bar.start()
         return self
 
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        self._bar.stop()
+        if self._bar is not None:
+            self._bar.stop()
+
+
+def _bar() -> Bar:
+    from rich.console import Console
+    from rich.progress import BarColumn, MofNCompleteColumn, TextColumn, TimeElapsedColumn
+    from rich.progress import Progress as Bar
+
+    columns = TextColumn("{task.description:24}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn()
+    return Bar(*columns, console=Console(stderr=True), transient=True)
 
 
 def summary(record: Mapping[str, Any], directory: Path) -> str:

@@ -73,55 +73,55 @@ def run(
     texture = load_texture(scene) if scene.draws else None
     frames = scene.time.frames + 1
     ending: dict[str, Any] = {"status": "complete"}
-    with Simulation(scene, arch, threads, texture) as simulation:
-        progress("compile", 0, frames)
-        with ResultWriter(Path(directory), scene) as writer:
-            watch = Stopwatch()
-            startup = time.perf_counter() - started
-            try:
-                simulation.compile()
-                watch.lap("compile")
-                for frame in range(frames):
-                    if frame:
-                        simulation.advance()
-                    watch.lap("simulate")
-                    picture = simulation.draw() if scene.draws else None
-                    watch.lap("render")
-                    writer.add(simulation.positions(), picture)
-                    progress("frames", frame + 1, frames)
-                    watch.lap("hand over")
-            except KeyboardInterrupt:
-                if not writer.frames:
-                    raise
-                ending = {"status": "interrupted"}
-            except DivergedError as error:
-                ending = {"status": "diverged", "error": str(error)}
-            progress("write", writer.frames, frames)
-            writer.finish()
-            limit = stable_step(scene)
-            record = {
-                **ending,
-                "scene": scene.model_dump(mode="json"),
-                "overrides": list(overrides),
-                "step": step(scene),
-                "stable_step": limit if limit < math.inf else None,
-                "steps_per_frame": steps_per_frame(scene),
-                "steps": simulation.steps,
-                "frames": writer.frames,
-                "max_displacement": simulation.max_displacement,
-                "timings": {
-                    "startup": startup,
-                    "compile": watch.seconds.get("compile", 0.0),
-                    "simulate": watch.seconds.get("simulate", 0.0),
-                    "render": watch.seconds.get("render", 0.0),
-                    "encode": writer.encode_seconds,
-                    "total": time.perf_counter() - started,
-                },
-                "arch": device.arch,
-                "threads": device.threads,
-                "versions": versions(),
-            }
-            outputs = writer.publish(record)
+    progress("compile", 0, frames)
+    # In this order, so that the encoder starts up while kernels are compiled.
+    with ResultWriter(Path(directory), scene) as writer, Simulation(scene, arch, threads, texture) as simulation:
+        watch = Stopwatch()
+        startup = time.perf_counter() - started
+        try:
+            simulation.compile()
+            watch.lap("compile")
+            for frame in range(frames):
+                if frame:
+                    simulation.advance()
+                watch.lap("simulate")
+                picture = simulation.draw() if scene.draws else None
+                watch.lap("render")
+                writer.add(simulation.positions(), picture)
+                progress("frames", frame + 1, frames)
+                watch.lap("hand over")
+        except KeyboardInterrupt:
+            if not writer.frames:
+                raise
+            ending = {"status": "interrupted"}
+        except DivergedError as error:
+            ending = {"status": "diverged", "error": str(error)}
+        progress("write", writer.frames, frames)
+        writer.finish()
+        limit = stable_step(scene)
+        record = {
+            **ending,
+            "scene": scene.model_dump(mode="json"),
+            "overrides": list(overrides),
+            "step": step(scene),
+            "stable_step": limit if limit < math.inf else None,
+            "steps_per_frame": steps_per_frame(scene),
+            "steps": simulation.steps,
+            "frames": writer.frames,
+            "max_displacement": simulation.max_displacement,
+            "timings": {
+                "startup": startup,
+                "compile": watch.seconds.get("compile", 0.0),
+                "simulate": watch.seconds.get("simulate", 0.0),
+                "render": watch.seconds.get("render", 0.0),
+                "encode": writer.encode_seconds,
+                "total": time.perf_counter() - started,
+            },
+            "arch": device.arch,
+            "threads": device.threads,
+            "versions": versions(),
+        }
+        outputs = writer.publish(record)
     return {**record, "outputs": outputs}
 
 
