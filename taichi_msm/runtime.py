@@ -5,6 +5,8 @@ from __future__ import annotations
 import contextlib
 import io
 import os
+import tempfile
+import time
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -26,6 +28,9 @@ if "TAICHI_MSM_TRACEBACK" not in os.environ:
     ASTTransformerContext.get_pos_info = lambda self, node: ""
 
 ARCHS = ("cpu", "cuda")
+
+# A lock on Taichi's cache that is older than this was left by a process that was killed [s].
+STALE_LOCK = 60.0
 
 
 @dataclass(frozen=True)
@@ -101,7 +106,27 @@ def start(arch: str = "cpu", threads: int | None = None) -> Device:
     return _device
 
 
+def _cache() -> dict[str, Any]:
+    """Give Taichi's options for keeping compiled kernels for the next process."""
+    folder = Path(os.environ.get("TI_OFFLINE_CACHE_FILE_PATH") or ti.lang.impl.default_cfg().offline_cache_file_path)
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        with tempfile.TemporaryFile(dir=folder):
+            pass
+    except OSError:
+        # Taichi crashes at the end of a process whose folder it cannot write, even where it is not to.
+        os.environ.pop("TI_OFFLINE_CACHE_FILE_PATH", None)
+        return {"offline_cache": False, "offline_cache_file_path": tempfile.gettempdir()}
+    # Held for milliseconds, but a process that was killed leaves it, and no other uses the cache until it is gone.
+    lock = folder / "ticache.lock"
+    with contextlib.suppress(OSError):
+        if time.time() - lock.stat().st_mtime > STALE_LOCK:
+            lock.unlink()
+    return {}
+
+
 def _initialise(device: Device) -> None:
+    cache = _cache()
     try:
         # Taichi prints the arch and, where a driver is missing, its search for it. Without fast_math every operation
         # rounds as IEEE 754 says, so that the bits of a result do not depend on threads, lanes or the compiler's mood.
@@ -110,6 +135,7 @@ def _initialise(device: Device) -> None:
                 arch=getattr(ti, device.arch),
                 cpu_max_num_threads=device.threads,
                 enable_fallback=False,
+                **cache,
                 fast_math=False,
                 log_level=ti.ERROR,
             )

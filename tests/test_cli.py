@@ -169,6 +169,29 @@ def test_ctrl_c_before_the_first_frame_changes_nothing(delay: float, small: Path
     assert (small / "kept" / "run.json").read_text() == "earlier"
 
 
+def test_without_a_place_for_compiled_kernels(small: Path) -> None:
+    (small / "file").touch()
+    environment = {**os.environ, "TI_OFFLINE_CACHE_FILE_PATH": str(small / "file" / "below")}
+    done = program("run", "small.yaml", "--set", "output=[]", env=environment)
+    assert (done.returncode, done.stderr) == (0, "")
+
+
+def test_a_stale_lock_does_not_cost_the_cache(small: Path) -> None:
+    environment = {**os.environ, "TI_OFFLINE_CACHE_FILE_PATH": str(small / "cache")}
+    (small / "cache").mkdir()
+    lock = small / "cache" / "ticache.lock"
+    for age, kept in ((3600, True), (0, False)):
+        lock.touch()
+        os.utime(lock, (time.time() - age, time.time() - age))
+        for path in (small / "cache").glob("*.tic"):
+            path.unlink()
+        done = program("run", "small.yaml", "--set", "output=[]", "--out", "here", env=environment)
+        assert done.returncode == 0, done.stderr
+        assert bool(list((small / "cache").glob("*.tic"))) == kept, (
+            "someone else's lock is respected, a dead one's is not"
+        )
+
+
 def test_more_threads_than_cores_are_no_harm(small: Path) -> None:
     settings = ["--set", "sheet.points=[200,200]", "--set", "output=[]", "--out", "many"]
     done = program("run", "small.yaml", "--threads", "16", *settings, timeout=60)
