@@ -56,18 +56,6 @@ def load_scene(
     return scene
 
 
-def parse_override(text: str) -> tuple[Key, Any]:
-    """Split "probes.0.load=[[0, 100]]" into the key, ("probes", 0, "load"), and the value, read as YAML.
-
-    Raises:
-        SceneError: when there is no key, or the value is not YAML.
-    """
-    override = _parse_text(text)
-    if override.problems:
-        raise SceneError([_line(override.name, problem) for problem in override.problems])
-    return override.path, override.value
-
-
 def schema() -> dict[str, Any]:
     """Describe the scene for editors, as JSON Schema (draft 2020-12).
 

@@ -338,7 +338,6 @@ def test_a_bug_is_one_line(small: Path, capsys: pytest.CaptureFixture[str], monk
     def broken(*arguments: object) -> None:
         raise ZeroDivisionError("by zero\nin two lines")
 
-    monkeypatch.setattr("taichi_msm.budget.estimate", broken)
     monkeypatch.delenv("TAICHI_MSM_TRACEBACK", raising=False)
     monkeypatch.setattr("taichi_msm.scene_file.load_scene", broken)
     code, _, err = call(capsys, "check", "small.yaml")
@@ -347,7 +346,3 @@ def test_a_bug_is_one_line(small: Path, capsys: pytest.CaptureFixture[str], monk
         "taichi-msm: a bug: ZeroDivisionError: by zero in two lines; "
         "please report it with what TAICHI_MSM_TRACEBACK=1 prints\n"
     )
-
-
-def test_environment_of_this_test_is_not_changed() -> None:
-    assert "TAICHI_MSM_TRACEBACK" not in os.environ

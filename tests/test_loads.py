@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from taichi_msm.loads import grips, schedule
-from tests.scenes import SHEET, SPRINGS, scene
+from tests.scenes import SPRINGS, scene
 
 # 25 frames a second in 4 steps of 0.01 s.
 STEPS = {"duration": 1.0, "step": 0.01}
@@ -99,7 +99,3 @@ def test_a_jump_of_the_control_point_shares_the_force_between_both_places() -> N
     np.testing.assert_allclose(strength.T, [[8, 8, 4, 0, 0], [0, 0, 2, 4, 4]])
     point = schedule(made, 0, 5).point
     np.testing.assert_allclose(point[2], [[-0.2, 0.15], [0.2, -0.15]])
-
-
-def test_the_sheet_of_these_tests() -> None:
-    assert SHEET["size"] == [0.3, 0.4]
