@@ -8,7 +8,6 @@ STARTED = time.perf_counter()
 
 import json
 import os
-import signal
 import sys
 from collections.abc import Sequence
 from pathlib import Path
@@ -18,8 +17,9 @@ import click
 
 from taichi_msm import __version__
 from taichi_msm.errors import DeviceError, FilesError, SceneError
+from taichi_msm.interruption import INTERRUPTED, Interruption
 
-DONE, BUG, WRONG_INPUT, DIVERGED, FILES, INTERRUPTED = 0, 1, 2, 3, 4, 130
+DONE, BUG, WRONG_INPUT, DIVERGED, FILES = 0, 1, 2, 3, 4
 EXIT_CODES = {"complete": DONE, "diverged": DIVERGED, "interrupted": INTERRUPTED}
 
 scene_argument = click.argument("scene", metavar="SCENE")
@@ -72,12 +72,15 @@ def run(
     from taichi_msm.console import Progress, summary
 
     recorded = [*overrides, *([f"image={image}"] if image is not None else [])]
+    interruption = Interruption()
     with Progress(quiet=quiet or as_json) as bar:
 
         def progress(stage: str, done: int, total: int) -> None:
             bar.update(stage, done, total)
-            # From here on there is something to tidy; and what is being put in place is put in place.
-            signal.signal(signal.SIGINT, signal.SIG_IGN if stage == "write" else signal.default_int_handler)
+            # Before the first stage the process may end at once; and what is being put in place is put in place.
+            interruption.listen()
+            if stage != "write":
+                interruption.grant()
 
         try:
             record = runner.run(

@@ -57,7 +57,8 @@ def run(
         threads: number of CPU threads; None takes every core.
         overrides: the overrides that made the scene, for the record.
         started: `time.perf_counter()` when the program began; None: now.
-        progress: called with the stage, the frames done and the frames in all.
+        progress: called with the stage, the frames done and the frames in all; what it raises stops the run there,
+            KeyboardInterrupt keeping the frames done.
 
     Returns:
         What is in run.json; its "status" is "complete", "diverged" (then "error" says where and why) or "interrupted".
@@ -81,14 +82,15 @@ def run(
         try:
             simulation.compile()
             watch.lap("compile")
+            progress("frames", 0, frames)
             for frame in range(frames):
                 if frame:
                     simulation.advance()
                 watch.lap("simulate")
+                progress("frames", frame, frames)
                 picture = simulation.draw() if scene.draws else None
                 watch.lap("render")
                 writer.add(simulation.positions(), picture)
-                progress("frames", frame + 1, frames)
                 watch.lap("hand over")
         except KeyboardInterrupt:
             if not writer.frames:

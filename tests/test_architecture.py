@@ -13,7 +13,7 @@ PACKAGE = Path(__file__).parent.parent / "taichi_msm"
 
 # A module imports from earlier lines only.
 ORDER = [
-    {"errors", "look"},
+    {"errors", "look", "interruption"},
     {"scene"},
     {"stability", "lattice", "camera", "texture"},
     {"loads", "budget", "yaml_reader"},
