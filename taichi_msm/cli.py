@@ -47,6 +47,7 @@ def program() -> None:
 @set_option
 @click.option("--arch", metavar="cpu|cuda", default="cpu", show_default=True, help="Where to compute.")
 @click.option("--threads", type=click.IntRange(min=1), metavar="N", help="CPU threads.  [default: every core]")
+@click.option("--estimate-error", is_flag=True, help="Say how wrong the step is, by pilot runs.")
 @click.option("--quiet", is_flag=True, help="No progress and no summary.")
 @json_option
 def run(
@@ -56,6 +57,7 @@ def run(
     overrides: tuple[str, ...],
     arch: str,
     threads: int | None,
+    estimate_error: bool,
     quiet: bool,
     as_json: bool,
 ) -> int:
@@ -89,6 +91,7 @@ def run(
                 arch=arch,
                 threads=threads,
                 overrides=recorded,
+                error_wanted=estimate_error,
                 started=STARTED,
                 progress=progress,
             )

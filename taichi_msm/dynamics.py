@@ -70,6 +70,7 @@ class Structure:
         neighbours: the springs of a point, as (down, right).
         open_edges: whether a point at an edge moves, so that springs beyond the edge must be left out.
         virtual: whether there are virtual springs.
+        damped: whether there is damping.
         grips: for every grip whether it moves.
     """
 
@@ -81,6 +82,7 @@ class Structure:
     neighbours: tuple[tuple[int, int], ...]
     open_edges: bool
     virtual: bool
+    damped: bool
     grips: tuple[bool, ...]
 
     @property
@@ -105,6 +107,7 @@ def structure(scene: Scene, device: Device) -> Structure:
         neighbours=tuple((spring.down, spring.right) for spring in springs(scene)),
         open_edges=not (fixed[[0, -1]].all() and fixed[:, [0, -1]].all()),
         virtual=scene.springs.virtual > 0 and (scene.springs.virtual_active == "always" or bool(scene.probes)),
+        damped=scene.damping > 0,
         grips=tuple(grip.moves for grip in grips(scene)),
     )
 
@@ -120,12 +123,29 @@ class Dynamics:
 
     def __init__(self, scene: Scene, device: Device, layout: Structure | None = None) -> None:
         self.scene = scene
+        self._device = device
         self.structure = layout or structure(scene, device)
         self.steps_done = 0
         self.launches = 0
         self._real = np.dtype(np.float32 if self.structure.precision == "f32" else np.float64)
         self._fields = _Fields(self.structure)
         self._advance, self._read, self._write = _kernels(self.structure, self._fields)
+        self._arguments = self._numbers()
+        self._place()
+
+    def restart(self, scene: Scene) -> None:
+        """Begin again at rest with other numbers, such as another step; nothing is compiled.
+
+        Args:
+            scene: a checked scene that differs in numbers only: points, precision and the terms used are the same.
+
+        Raises:
+            ValueError: when it needs another kernel.
+        """
+        if structure(scene, self._device) != structure(self.scene, self._device):
+            raise ValueError("this scene needs another kernel; make another Dynamics")
+        self.scene = scene
+        self.steps_done = 0
         self._arguments = self._numbers()
         self._place()
 
@@ -191,7 +211,7 @@ class Dynamics:
         return table.astype(self._real)
 
     def _place(self) -> None:
-        """Write what never changes: who moves, where the edges are, and how the standing grips decay."""
+        """Put the sheet at rest and write what steps do not change: who moves, the edges, the decay of grips."""
         s, scene = self.structure, self.scene
         moves = ~fixed_points(scene.sheet)
         column = np.arange(s.cols)
@@ -240,7 +260,7 @@ def _kernels(s: Structure, fields: _Fields) -> tuple[Callable[..., None], ...]:
     rows, cols, lanes, strip, workers = s.rows, s.cols, s.lanes, s.strip, s.workers
     u, d = fields.displacement, fields.difference
     by_column, decay, done = fields.by_column, fields.decay, fields.done
-    neighbours, open_edges, virtual, grip_moves = s.neighbours, s.open_edges, s.virtual, s.grips
+    neighbours, open_edges, virtual, damped, grip_moves = s.neighbours, s.open_edges, s.virtual, s.damped, s.grips
     standing = [grip_moves[:n].count(False) for n in range(len(grip_moves))]
 
     @ti.func
@@ -302,9 +322,16 @@ def _kernels(s: Structure, fields: _Fields) -> tuple[Callable[..., None], ...]:
         if i == rows - 1:
             kind = 2
         gain = loads[n, 0] * by_column[kind, b]
-        d_x = keep * d[0][i, b] + gain * force_x
-        d_y = keep * d[1][i, b] + gain * force_y
-        d_z = keep * d[2][i, b] + gain * force_z
+        d_x = d[0][i, b]
+        d_y = d[1][i, b]
+        d_z = d[2][i, b]
+        if ti.static(damped):
+            d_x *= keep
+            d_y *= keep
+            d_z *= keep
+        d_x += gain * force_x
+        d_y += gain * force_y
+        d_z += gain * force_z
         d[0][i, b] = d_x
         d[1][i, b] = d_y
         d[2][i, b] = d_z
@@ -390,5 +417,13 @@ def _kernels(s: Structure, fields: _Fields) -> tuple[Callable[..., None], ...]:
         for g, i, b in decay:
             for lane in ti.static(range(lanes)):
                 decay[g, i, b][lane] = standing[g, i, b, lane]
+        for now, i, b in u[0]:
+            for c in ti.static(range(3)):
+                u[c][now, i, b] = ti.Vector.zero(real, lanes)
+        for i, b in d[0]:
+            for c in ti.static(range(3)):
+                d[c][i, b] = ti.Vector.zero(real, lanes)
+        for n in done:
+            done[n] = 0
 
     return (advance_cpu if workers else advance_gpu), read, write

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
+from fractions import Fraction
 from typing import NamedTuple
 
 import numpy as np
@@ -20,6 +21,9 @@ from taichi_msm.stability import steps_per_frame
 # A key is on a step when their times differ by no more than rounding, as a fraction of the time: decimal key times
 # meet binary step times.
 SNAP = 1e-13
+
+# Jumps that only so fine steps meet are met by none.
+MOST_CUTS = 1000
 
 Array = NDArray[np.float64]
 
@@ -131,7 +135,60 @@ def schedule(scene: Scene, first: int, count: int) -> Schedule:
     The time of step n is n / (frames per second x steps per frame), never a sum of steps.
     """
     rate = scene.time.frames_per_second * steps_per_frame(scene)
-    t = np.arange(first, first + count) / rate
+    return loads_at(scene, np.arange(first, first + count) / rate)
+
+
+def loads_at(scene: Scene, t: Array) -> Schedule:
+    """Evaluate the loads at times that increase [s], shape (steps,)."""
+    t, left, right = _both_sides(scene, t)
+    return Schedule(_mean(left.strength, right.strength, t), right.point, _mean(left.active, right.active, t))
+
+
+def key_times(scene: Scene) -> Array:
+    """List the times of all keys after 0 and before the end [s], where the loads are not smooth."""
+    times = {time for probe in scene.probes for time, _ in probe.load}
+    times |= {float(time) for grip in grips(scene) for time in grip.times}
+    return np.array(sorted(time for time in times if 0 < time < scene.time.duration))
+
+
+def jumps(scene: Scene) -> Array:
+    """List the times after 0 and before the end at which a force or the activity of the virtual springs jumps [s]."""
+    t, left, right = _both_sides(scene, key_times(scene))
+    changes = (left.strength != right.strength).any(axis=(1, 2))
+    if scene.springs.virtual > 0:
+        changes |= left.active != right.active
+    return t[changes]
+
+
+def steps_to_meet_jumps(scene: Scene) -> int:
+    """Find the number of steps a frame of which every multiple has a step at every jump; 0 where none up to 1000 has."""
+    frames = [Fraction(float(t) * scene.time.frames_per_second).limit_denominator(MOST_CUTS) for t in jumps(scene)]
+    steps = math.lcm(*(share.denominator for share in frames))
+    return steps if steps <= MOST_CUTS and _meet(scene, steps, jumps(scene)) else 0
+
+
+def meets_jumps(scene: Scene) -> bool:
+    """Tell whether every jump falls on a step and no ramp is shorter than one: if not, the method is of order 1."""
+    steps = steps_per_frame(scene)
+    rate = scene.time.frames_per_second * steps
+    return _meet(scene, steps, jumps(scene)) and shortest_ramp(scene) * rate >= 1 - SNAP
+
+
+def _meet(scene: Scene, steps: int, times: Array) -> bool:
+    rate = scene.time.frames_per_second * steps
+    return bool((np.abs(np.round(times * rate) / rate - times) <= SNAP * times).all())
+
+
+def shortest_ramp(scene: Scene) -> float:
+    """Find the shortest time between two keys of one list that are no jump [s]; infinite where there is none."""
+    lists = [np.array([time for time, _ in probe.load]) for probe in scene.probes]
+    gaps = np.concatenate([np.diff(times) for times in [*lists, *(grip.times for grip in grips(scene))]] or [[]])
+    return float(np.min(gaps[gaps > 0], initial=math.inf))
+
+
+def _both_sides(scene: Scene, t: Array) -> tuple[Array, Schedule, Schedule]:
+    """Take the left and the right limits of the loads; the times come back moved onto the keys that they mean."""
+    count = len(t)
     percent = np.zeros((len(scene.probes), 2, count))
     pressing = np.zeros((2, count), dtype=bool)
     for index, probe in enumerate(scene.probes):
@@ -142,20 +199,21 @@ def schedule(scene: Scene, first: int, count: int) -> Schedule:
         for side, after in enumerate(_limits(times, t)):
             percent[index, side] = _between(times, values, t, after, 0.0)
             pressing[side] |= nonzero[after]
+    if scene.springs.virtual_active == "always":
+        pressing[:] = True
 
     parts = grips(scene)
-    strength = np.zeros((count, len(parts), 3))
+    strength = np.zeros((2, count, len(parts), 3))
     point = np.zeros((count, len(parts), 2))
     for n, part in enumerate(parts):
         t = _snap(t, np.array([part.start, part.end]))
-        left = percent[part.probe, 0] * ((part.start < t) & (t <= part.end))
-        right = percent[part.probe, 1] * ((part.start <= t) & (t < part.end))
-        strength[:, n] = np.multiply.outer(_mean(left, right, t) / 100, scene.probes[part.probe].force)
+        holds = (part.start < t) & (t <= part.end), (part.start <= t) & (t < part.end)
+        for side in (0, 1):
+            share = percent[part.probe, side] * holds[side] / 100
+            strength[side, :, n] = np.multiply.outer(share, scene.probes[part.probe].force)
         point[:, n] = _between(part.times, part.points, t, _limits(part.times, t)[1], part.points[0])
-    always = scene.springs.virtual_active == "always"
-    return Schedule(
-        strength, point, np.ones(count) if always else _mean(left=pressing[0] * 1.0, right=pressing[1] * 1.0, t=t)
-    )
+    active = pressing * 1.0
+    return t, Schedule(strength[0], point, active[0]), Schedule(strength[1], point, active[1])
 
 
 def _snap(t: Array, keys: Array) -> Array:
@@ -172,4 +230,4 @@ def _limits(times: Array, t: Array) -> tuple[NDArray[np.intp], NDArray[np.intp]]
 
 def _mean(left: Array, right: Array, t: Array) -> Array:
     """Take the mean of both limits; at t = 0, before which nothing is, the right one."""
-    return np.where(t <= 0, right, (left + right) / 2)
+    return np.where(t.reshape((-1,) + (1,) * (left.ndim - 1)) <= 0, right, (left + right) / 2)

@@ -7,6 +7,8 @@ import platform
 import sys
 import time
 from collections.abc import Callable, Sequence
+from dataclasses import asdict
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -14,6 +16,7 @@ import numpy
 import PIL
 
 from taichi_msm import __version__, runtime
+from taichi_msm.accuracy import Estimate, choose_step, estimate_error
 from taichi_msm.errors import DivergedError
 from taichi_msm.files import ResultWriter
 from taichi_msm.scene import Scene
@@ -45,6 +48,7 @@ def run(
     arch: str = "cpu",
     threads: int | None = None,
     overrides: Sequence[str] = (),
+    error_wanted: bool = False,
     started: float | None = None,
     progress: Progress = lambda stage, done, total: None,
 ) -> dict[str, Any]:
@@ -56,6 +60,7 @@ def run(
         arch: cpu or cuda.
         threads: number of CPU threads; None takes every core.
         overrides: the overrides that made the scene, for the record.
+        error_wanted: whether to estimate the error of the step; a tolerance in the scene does in any case.
         started: `time.perf_counter()` when the program began; None: now.
         progress: called with the stage, the frames done and the frames in all; what it raises stops the run there,
             KeyboardInterrupt keeping the frames done.
@@ -64,7 +69,7 @@ def run(
         What is in run.json; its "status" is "complete", "diverged" (then "error" says where and why) or "interrupted".
 
     Raises:
-        SceneError: when the scene's picture cannot be decoded.
+        SceneError: when the scene's picture cannot be decoded, or no step meets its tolerance.
         DeviceError: when the arch is not there.
         FilesError: when the results cannot be written.
         KeyboardInterrupt: when interrupted before the first frame; nothing is written then.
@@ -74,11 +79,18 @@ def run(
     texture = load_texture(scene) if scene.draws else None
     frames = scene.time.frames + 1
     ending: dict[str, Any] = {"status": "complete"}
+    watch = Stopwatch()
+    given, estimate = scene, None
+    if scene.time.tolerance is not None:
+        scene, estimate = choose_step(scene, device, partial(progress, "pilot"))
+    elif error_wanted:
+        estimate = estimate_error(scene, device, partial(progress, "pilot"))
+    watch.lap("pilot")
     progress("compile", 0, frames)
     # In this order, so that the encoder starts up while kernels are compiled.
     with ResultWriter(Path(directory), scene) as writer, Simulation(scene, arch, threads, texture) as simulation:
-        watch = Stopwatch()
-        startup = time.perf_counter() - started
+        startup = time.perf_counter() - started - watch.seconds["pilot"]
+        watch.lap("startup")
         try:
             simulation.compile()
             watch.lap("compile")
@@ -103,7 +115,7 @@ def run(
         limit = stable_step(scene)
         record = {
             **ending,
-            "scene": scene.model_dump(mode="json"),
+            "scene": given.model_dump(mode="json"),
             "overrides": list(overrides),
             "step": step(scene),
             "stable_step": limit if limit < math.inf else None,
@@ -111,8 +123,11 @@ def run(
             "steps": simulation.steps,
             "frames": writer.frames,
             "max_displacement": simulation.max_displacement,
+            "shortest_spring": simulation.shortest_spring,
+            "error_estimate": None if estimate is None else error_record(estimate),
             "timings": {
                 "startup": startup,
+                "pilot": watch.seconds["pilot"],
                 "compile": watch.seconds.get("compile", 0.0),
                 "simulate": watch.seconds.get("simulate", 0.0),
                 "render": watch.seconds.get("render", 0.0),
@@ -125,6 +140,12 @@ def run(
         }
         outputs = writer.publish(record)
     return {**record, "outputs": outputs}
+
+
+def error_record(estimate: Estimate) -> dict[str, Any]:
+    """Write an estimate down for run.json, where null stands for a pilot run that diverged."""
+    known = {key: value if value < math.inf else None for key, value in asdict(estimate).items()}
+    return {key: known[key] for key in ("error", "rounding", "order")}
 
 
 def versions() -> dict[str, str]:

@@ -19,6 +19,10 @@ WHOLE = 1e-6
 LARGEST = 1e30
 SMALLEST = 1e-30
 
+# Below, rounding in f64 is no longer small beside the error; above, an error is no error of something.
+SMALLEST_TOLERANCE = 1e-10
+LARGEST_TOLERANCE = 0.5
+
 # The type of the errors raised here: their message is for the user as it is, and their context may name the
 # `key` (or item) below the validated value that is at fault.
 REFUSED = "refused"
@@ -144,6 +148,12 @@ class Time(Section):
         means="time step [s], a whole fraction of a frame; auto: half the stability limit or less",
         expects="auto, or a number above 0, in seconds",
     )
+    tolerance: Annotated[Number, Field(ge=SMALLEST_TOLERANCE, le=LARGEST_TOLERANCE)] | None = key(
+        None,
+        means="largest error of any frame, as a fraction of the largest displacement, that step: auto may make; "
+        "pilot runs find the step",
+        expects=f"a number, {SMALLEST_TOLERANCE:g} to {LARGEST_TOLERANCE:g}",
+    )
     damping_difference: Literal["central", "backward"] = key(
         "central",
         means="difference that stands for the velocity in the damping: central is of order 2, backward "
@@ -173,6 +183,16 @@ class Time(Section):
                     "frames": f"{frames:.12g}",
                     "nearest": f"{nearest:.12g}",
                 },
+            )
+        return self
+
+    @model_validator(mode="after")
+    def _one_way_to_the_step(self) -> Time:
+        if self.tolerance is not None and self.step != "auto":
+            raise PydanticCustomError(
+                REFUSED,
+                "a tolerance chooses the step, but step is {step}; set step: auto or remove the tolerance",
+                {"key": "tolerance", "step": f"{self.step:.12g}"},
             )
         return self
 

@@ -9,10 +9,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from taichi_msm import runtime
+from taichi_msm.accuracy import choose_step
 from taichi_msm.camera import View
 from taichi_msm.dynamics import Dynamics
 from taichi_msm.errors import DivergedError, MsmError
-from taichi_msm.lattice import axes
+from taichi_msm.lattice import axes, shortest_spring
 from taichi_msm.loads import free_acceleration
 from taichi_msm.scene import Scene
 from taichi_msm.stability import stable_step, step, steps_per_frame
@@ -29,17 +30,20 @@ class Simulation:
     """A sheet that moves by frames and can be drawn. Usable in a with statement, which frees its memory.
 
     Args:
-        scene: what `load_scene` returned.
+        scene: what `load_scene` returned; where it has a tolerance, pilot runs choose the step first.
         arch: cpu or cuda.
         threads: number of CPU threads; None takes every core.
         texture: the picture on the sheet, shape (height, width, 3); None: the scene's own, read when it is drawn.
 
     Raises:
         DeviceError: when the arch is not there, or Taichi already runs on another one in this process.
+        SceneError: when no step meets the scene's tolerance.
 
     Attributes:
+        scene: the scene, with the step that was chosen.
         frame: number of frames simulated so far.
         max_displacement: largest displacement of any frame so far [m].
+        shortest_spring: smallest length of a spring over its rest length at any frame so far.
     """
 
     def __init__(
@@ -49,10 +53,13 @@ class Simulation:
         threads: int | None = None,
         texture: NDArray[np.uint8] | None = None,
     ) -> None:
-        self.scene = scene
         self.device = runtime.start(arch, threads)
+        if scene.time.tolerance is not None:
+            scene, _ = choose_step(scene, self.device)
+        self.scene = scene
         self.frame = 0
         self.max_displacement = 0.0
+        self.shortest_spring = 1.0
         self._closed = False
         self._free_acceleration = free_acceleration(scene)
         self._dynamics = Dynamics(scene, self.device)
@@ -150,6 +157,7 @@ class Simulation:
         """Read where the points are, if the simulation has not gone wrong."""
         displacement = self._dynamics.displacement()
         self._watch(displacement)
+        self.shortest_spring = min(self.shortest_spring, shortest_spring(self.scene, displacement))
         position, (x, y) = displacement, axes(self.scene.sheet)
         # Summed in float64 and rounded once, without a copy of the sheet.
         np.add(position[..., 0], x, out=position[..., 0], casting="same_kind")

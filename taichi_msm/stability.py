@@ -34,13 +34,20 @@ def stable_step(scene: Scene) -> float:
 def steps_per_frame(scene: Scene) -> int:
     """Count the steps of one frame.
 
-    auto: the fewest whose step is at most half the stability limit. A given step is what the scene says.
+    auto: the fewest whose step is at most half the stability limit; a tolerance may ask for more, which
+    `accuracy.choose_step` finds. A given step is what the scene says.
     """
     frame = 1 / scene.time.frames_per_second
     if scene.time.step == "auto":
         # The small slack keeps a frame that is exactly n half-limits from being cut into n + 1 by rounding.
         return max(1, math.ceil(2 * frame / stable_step(scene) * (1 - 1e-12)))
     return max(1, round(frame / scene.time.step))
+
+
+def with_steps(scene: Scene, count: int) -> Scene:
+    """Give a frame of the scene so many steps."""
+    given = {"step": 1 / scene.time.frames_per_second / count, "tolerance": None}
+    return scene.model_copy(update={"time": scene.time.model_copy(update=given)})
 
 
 def step(scene: Scene) -> float:

@@ -1,0 +1,231 @@
+"""How wrong a step is, by pilot runs at h and h / 2, and the largest step that is right enough.
+
+The error of a displacement u_h is taken against Richardson's extrapolation of both pilots, which are in float64:
+
+    u* = u_{h/2} + (u_{h/2} - u_h) / (2^p - 1)        p: order of the method
+
+so that it holds the error of the scene's own precision too. An error is the largest of any point at any frame, over the
+largest displacement of any point at any frame.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from contextlib import ExitStack
+from dataclasses import dataclass
+from types import TracebackType
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from taichi_msm.dynamics import Dynamics
+from taichi_msm.errors import SceneError
+from taichi_msm.loads import meets_jumps, steps_to_meet_jumps
+from taichi_msm.runtime import Device
+from taichi_msm.scene import LARGEST_TOLERANCE, Scene
+from taichi_msm.stability import steps_per_frame, with_steps
+
+# The step found is the largest but for some 10 %: its error is at least this share of the tolerance.
+CLOSE = 0.75
+
+# The pilot runs of one search, and how much finer each may be than the one before.
+MOST_PILOTS = 12
+LARGEST_CUT = 8.0
+
+Progress = Callable[[int, int], None]
+
+
+@dataclass(frozen=True)
+class Estimate:
+    """What is known about the error of a step.
+
+    Attributes:
+        steps_per_frame: the step, as a fraction of a frame.
+        error: largest error, as a fraction of the largest displacement; infinite where a pilot diverged.
+        rounding: the part of it that comes from f32; 0 for f64.
+        order: of the method in this scene and at this step.
+    """
+
+    steps_per_frame: int
+    error: float
+    rounding: float
+    order: int
+
+
+def order(scene: Scene) -> int:
+    """Tell the order of the method for the scene's step: 2, or 1 with backward differences or where a jump is missed."""
+    central = scene.time.damping_difference == "central" or scene.damping == 0
+    return 2 if central and meets_jumps(scene) else 1
+
+
+def estimate_error(scene: Scene, device: Device, progress: Progress = lambda done, total: None) -> Estimate:
+    """Estimate the error of the scene's own step.
+
+    Args:
+        scene: a checked scene.
+        device: what `runtime.start` returned.
+        progress: called with the frames done and the frames in all.
+    """
+    with Pilots(scene, device) as pilots:
+        return pilots.estimate(steps_per_frame(scene), progress)
+
+
+def choose_step(scene: Scene, device: Device, progress: Progress = lambda done, total: None) -> tuple[Scene, Estimate]:
+    """Find the largest stable step whose estimated error is within the scene's tolerance.
+
+    Args:
+        scene: a checked scene with a tolerance.
+        device: what `runtime.start` returned.
+        progress: called with the frames done and the frames in all of each pilot run.
+
+    Returns:
+        The scene with that step, and its error.
+
+    Raises:
+        SceneError: when no step is good enough; says which precision or which tolerance would do.
+    """
+    assert scene.time.tolerance is not None
+    with Pilots(scene, device) as pilots:
+        found = _search(scene.time.tolerance, steps_per_frame(scene), steps_to_meet_jumps(scene), pilots, progress)
+    return with_steps(scene, found.steps_per_frame), found
+
+
+class Pilots:
+    """The runs beside each other, frame by frame: h and h / 2 in float64, and h in the scene's own precision.
+
+    Usable in a with statement, which frees their memory.
+    """
+
+    def __init__(self, scene: Scene, device: Device) -> None:
+        self._scene = scene
+        self._exact = _in_double(scene)
+        with ExitStack() as opened:
+
+            def dynamics(scene: Scene) -> Dynamics:
+                made = Dynamics(scene, device)
+                opened.callback(made.close)
+                return made
+
+            self._coarse, self._fine = dynamics(self._exact), dynamics(self._exact)
+            self._own = self._coarse if scene.time.precision == "f64" else dynamics(scene)
+            self._open = opened.pop_all()
+
+    def estimate(self, steps: int, progress: Progress) -> Estimate:
+        """Run the scene with so many steps a frame.
+
+        Args:
+            steps: steps per frame of the coarse pilot and of the one in the scene's precision.
+            progress: called with the frames done and the frames in all.
+        """
+        scene = with_steps(self._scene, steps)
+        self._fine.restart(with_steps(self._exact, 2 * steps))
+        self._coarse.restart(with_steps(self._exact, steps))
+        if self._own is not self._coarse:
+            self._own.restart(scene)
+        p, frames = order(scene), scene.time.frames
+        error = rounding = largest = 0.0
+        for frame in range(frames):
+            progress(frame, frames)
+            self._fine.advance(2 * steps)
+            self._coarse.advance(steps)
+            if self._own is not self._coarse:
+                self._own.advance(steps)
+            fine, coarse, own = (one.displacement() for one in (self._fine, self._coarse, self._own))
+            with np.errstate(all="ignore"):
+                exact = fine + (fine - coarse) / (2**p - 1)
+                error = max(error, _longest(own - exact))
+                rounding = max(rounding, _longest(own - coarse))
+                largest = max(largest, _longest(exact))
+        scale = 1 / largest if largest > 0 else 0.0
+        return Estimate(steps, error * scale if error * scale < math.inf else math.inf, rounding * scale, p)
+
+    def close(self) -> None:
+        """Free the fields."""
+        self._open.close()
+
+    def __enter__(self) -> Pilots:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.close()
+
+
+def _in_double(scene: Scene) -> Scene:
+    return scene.model_copy(update={"time": scene.time.model_copy(update={"precision": "f64"})})
+
+
+def _longest(vectors: NDArray[Any]) -> float:
+    """Give the length of the longest vector, infinite where one is not finite."""
+    longest = math.sqrt(np.einsum("ijk,ijk->ij", vectors, vectors, dtype=np.float64).max())
+    return longest if longest < math.inf else math.inf
+
+
+def _above(error: float) -> float:
+    """Round up to one digit, with some room."""
+    digit = 10.0 ** math.floor(math.log10(error))
+    return float(f"{math.ceil(1.2 * error / digit) * digit:.3g}")
+
+
+def _search(tolerance: float, least: int, meeting: int, pilots: Pilots, progress: Progress) -> Estimate:
+    """Narrow down the steps a frame between too few and enough."""
+    too_few, enough, failures = least - 1, None, []
+    steps = least
+    for _ in range(MOST_PILOTS):
+        found = pilots.estimate(steps, progress)
+        if found.error <= tolerance:
+            enough = found
+        else:
+            too_few = steps
+            failures.append(found)
+            if found.rounding > CLOSE * tolerance or _stuck(failures):
+                break
+        if enough and (enough.error >= CLOSE * tolerance or enough.steps_per_frame - too_few <= 1):
+            return enough
+        steps = _next(found, tolerance, meeting)
+        steps = max(steps, too_few + 1)
+        if enough and steps >= enough.steps_per_frame:
+            return enough
+    if enough:
+        return enough
+    raise SceneError([_out_of_reach(tolerance, failures)])
+
+
+def _next(found: Estimate, tolerance: float, meeting: int) -> int:
+    """Guess the steps a frame that are just enough, from an error that falls as the step to the power of its order."""
+    target = (1 + CLOSE) / 2 * tolerance - found.rounding
+    too_large = (found.error - found.rounding) / target if found.error < math.inf else math.inf
+    cut = min(too_large ** (1 / found.order), LARGEST_CUT)
+    steps = max(1, math.ceil(found.steps_per_frame * cut))
+    # A step at every jump makes the method one of order 2; where that costs little it is worth it.
+    return math.ceil(steps / meeting) * meeting if 0 < meeting <= steps else steps
+
+
+def _stuck(failures: list[Estimate]) -> bool:
+    """Tell whether twice in a row much smaller steps hardly helped."""
+    if len(failures) < 3:
+        return False
+    return all(
+        after.error > before.error / math.sqrt(after.steps_per_frame / before.steps_per_frame)
+        for before, after in zip(failures[-3:-1], failures[-2:], strict=True)
+    )
+
+
+def _out_of_reach(tolerance: float, failures: list[Estimate]) -> str:
+    best = min(failures, key=lambda one: one.error)
+    last = failures[-1]
+    if last.rounding > CLOSE * tolerance:
+        return (
+            f"time.tolerance: {tolerance:g} is out of reach of f32, whose rounding alone makes an error of "
+            f"{last.rounding:.2g} here; take time.precision: f64, or a tolerance of {_above(4 * last.rounding):g}"
+        )
+    remedy = "take a weaker load or a shorter time"
+    if best.error < LARGEST_TOLERANCE / 2:
+        remedy += f", or a tolerance of {_above(best.error):g}"
+    return (
+        f"time.tolerance: {tolerance:g} is out of reach: with {last.steps_per_frame} steps a frame the error is still "
+        f"{last.error:.2g}, and it hardly falls any more; {remedy}"
+    )
