@@ -55,7 +55,7 @@ class Estimate:
 
 
 def order(scene: Scene) -> int:
-    """Tell the order of the method for the scene's step: 2, or 1 with backward differences or where a jump is missed."""
+    """Tell the order of the method at this step: 1 with backward differences or where it misses a jump, else 2."""
     central = scene.time.damping_difference == "central" or scene.damping == 0
     return 2 if central and meets_jumps(scene) else 1
 

@@ -78,8 +78,8 @@ def notes(record: Mapping[str, Any]) -> Iterator[str]:
         yield "nothing moved: does a probe press where and when it should?"
     if record["shortest_spring"] < SHORTEST:
         yield (
-            f"a spring was pressed to {record['shortest_spring']:.2g} of its rest length: below {SHORTEST} the sheet folds "
-            "over itself and small errors grow; look at --estimate-error, or press less"
+            f"a spring was pressed to {record['shortest_spring']:.2g} of its rest length: below {SHORTEST} the "
+            "sheet folds over itself and small errors grow; look at --estimate-error, or press less"
         )
 
 

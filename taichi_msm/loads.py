@@ -161,7 +161,7 @@ def jumps(scene: Scene) -> Array:
 
 
 def steps_to_meet_jumps(scene: Scene) -> int:
-    """Find the number of steps a frame of which every multiple has a step at every jump; 0 where none up to 1000 has."""
+    """Find the number of steps a frame of which every multiple has a step at every jump; 0 where there is none."""
     frames = [Fraction(float(t) * scene.time.frames_per_second).limit_denominator(MOST_CUTS) for t in jumps(scene)]
     steps = math.lcm(*(share.denominator for share in frames))
     return steps if steps <= MOST_CUTS and _meet(scene, steps, jumps(scene)) else 0
@@ -182,8 +182,8 @@ def _meet(scene: Scene, steps: int, times: Array) -> bool:
 def shortest_ramp(scene: Scene) -> float:
     """Find the shortest time between two keys of one list that are no jump [s]; infinite where there is none."""
     lists = [np.array([time for time, _ in probe.load]) for probe in scene.probes]
-    gaps = np.concatenate([np.diff(times) for times in [*lists, *(grip.times for grip in grips(scene))]] or [[]])
-    return float(np.min(gaps[gaps > 0], initial=math.inf))
+    gaps = [np.diff(times) for times in [*lists, *(grip.times for grip in grips(scene))]]
+    return min((float(gap) for each in gaps for gap in each if gap > 0), default=math.inf)
 
 
 def _both_sides(scene: Scene, t: Array) -> tuple[Array, Schedule, Schedule]:
