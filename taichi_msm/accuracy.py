@@ -25,7 +25,7 @@ from taichi_msm.errors import SceneError
 from taichi_msm.loads import meets_jumps, steps_to_meet_jumps
 from taichi_msm.runtime import Device
 from taichi_msm.scene import LARGEST_TOLERANCE, Scene
-from taichi_msm.stability import steps_per_frame, with_steps
+from taichi_msm.stability import steps_per_frame, with_steps, with_time
 
 # The step found is the largest but for some 10 %: its error is at least this share of the tolerance.
 CLOSE = 0.75
@@ -100,7 +100,7 @@ class Pilots:
 
     def __init__(self, scene: Scene, device: Device) -> None:
         self._scene = scene
-        self._exact = _in_double(scene)
+        self._exact = with_time(scene, precision="f64")
         with ExitStack() as opened:
 
             def dynamics(scene: Scene) -> Dynamics:
@@ -135,9 +135,9 @@ class Pilots:
             fine, coarse, own = (one.displacement() for one in (self._fine, self._coarse, self._own))
             with np.errstate(all="ignore"):
                 exact = fine + (fine - coarse) / (2**p - 1)
-                error = max(error, _longest(own - exact))
-                rounding = max(rounding, _longest(own - coarse))
-                largest = max(largest, _longest(exact))
+                error = max(error, longest(own - exact))
+                rounding = max(rounding, longest(own - coarse))
+                largest = max(largest, longest(exact))
         scale = 1 / largest if largest > 0 else 0.0
         return Estimate(steps, error * scale if error * scale < math.inf else math.inf, rounding * scale, p)
 
@@ -154,14 +154,11 @@ class Pilots:
         self.close()
 
 
-def _in_double(scene: Scene) -> Scene:
-    return scene.model_copy(update={"time": scene.time.model_copy(update={"precision": "f64"})})
-
-
-def _longest(vectors: NDArray[Any]) -> float:
-    """Give the length of the longest vector, infinite where one is not finite."""
-    longest = math.sqrt(np.einsum("ijk,ijk->ij", vectors, vectors, dtype=np.float64).max())
-    return longest if longest < math.inf else math.inf
+def longest(vectors: NDArray[Any]) -> float:
+    """Give the length of the longest vector, shape (..., 3); infinite where one is not finite."""
+    with np.errstate(all="ignore"):
+        length = math.sqrt(np.einsum("...k,...k->...", vectors, vectors, dtype=np.float64).max())
+    return length if length < math.inf else math.inf
 
 
 def _above(error: float) -> float:

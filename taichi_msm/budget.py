@@ -67,12 +67,14 @@ def estimate(scene: Scene) -> Budget:
     """Estimate what the scene will need."""
     rows, cols = scene.sheet.points
     points = rows * cols
-    number = _number_bytes(scene)
+    numbers = STATE_NUMBERS + OUTPUT_NUMBERS + len(scene.probes)
+    # Pilot runs are two more sheets, in f64.
+    sheets = _number_bytes(scene) + (2 * 8 if scene.time.tolerance is not None else 0)
     return Budget(
         points=points,
         steps=scene.time.frames * stability.steps_per_frame(scene),
         frames=scene.time.frames + 1,
-        simulation_bytes=points * number * (STATE_NUMBERS + OUTPUT_NUMBERS + len(scene.probes)),
+        simulation_bytes=points * sheets * numbers,
         surface_bytes=_surface_bytes(scene) if scene.draws else 0,
         picture_bytes=_picture_bytes(scene) if scene.draws else 0,
         disk_bytes=_disk_bytes(scene),

@@ -9,15 +9,19 @@ STARTED = time.perf_counter()
 import json
 import os
 import sys
-from collections.abc import Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import click
 
 from taichi_msm import __version__
 from taichi_msm.errors import DeviceError, FilesError, SceneError
 from taichi_msm.interruption import INTERRUPTED, Interruption
+
+if TYPE_CHECKING:
+    from taichi_msm.console import Progress
 
 DONE, BUG, WRONG_INPUT, DIVERGED, FILES = 0, 1, 2, 3, 4
 EXIT_CODES = {"complete": DONE, "diverged": DIVERGED, "interrupted": INTERRUPTED}
@@ -30,6 +34,10 @@ set_option = click.option(
     metavar="KEY=VALUE",
     multiple=True,
     help="Override a key of the scene by its dotted path, e.g. sheet.points=[61,61]; list items by index.",
+)
+arch_option = click.option("--arch", metavar="cpu|cuda", default="cpu", show_default=True, help="Where to compute.")
+threads_option = click.option(
+    "--threads", type=click.IntRange(min=1), metavar="N", help="CPU threads.  [default: every core]"
 )
 json_option = click.option("--json", "as_json", is_flag=True, help="Print one JSON object on stdout and nothing else.")
 
@@ -45,8 +53,8 @@ def program() -> None:
 @click.option("--out", metavar="DIR", help="Where the results go.  [default: output/<name of the scene file>]")
 @image_option
 @set_option
-@click.option("--arch", metavar="cpu|cuda", default="cpu", show_default=True, help="Where to compute.")
-@click.option("--threads", type=click.IntRange(min=1), metavar="N", help="CPU threads.  [default: every core]")
+@arch_option
+@threads_option
 @click.option("--estimate-error", is_flag=True, help="Say how wrong the step is, by pilot runs.")
 @click.option("--quiet", is_flag=True, help="No progress and no summary.")
 @json_option
@@ -65,25 +73,13 @@ def run(
     from taichi_msm.scene_file import load_scene
 
     loaded = load_scene(scene, overrides, image)
-    directory = Path(out) if out is not None else Path("output") / Path(scene).stem
-
-    if not out and out is not None:
-        raise click.BadParameter("is empty; name a directory", param_hint="--out")
+    directory = result_directory(out, Path(scene).stem)
 
     from taichi_msm import runner
     from taichi_msm.console import Progress, summary
 
     recorded = [*overrides, *([f"image={image}"] if image is not None else [])]
-    interruption = Interruption()
-    with Progress(quiet=quiet or as_json) as bar:
-
-        def progress(stage: str, done: int, total: int) -> None:
-            bar.update(stage, done, total)
-            # Before the first stage the process may end at once; and what is being put in place is put in place.
-            interruption.listen()
-            if stage != "write":
-                interruption.grant()
-
+    with Progress(quiet=quiet or as_json) as bar, naming(scene):
         try:
             record = runner.run(
                 loaded,
@@ -93,10 +89,8 @@ def run(
                 overrides=recorded,
                 error_wanted=estimate_error,
                 started=STARTED,
-                progress=progress,
+                progress=interruptible(bar),
             )
-        except SceneError as error:
-            raise SceneError([f"{scene}: {line}" for line in error.lines]) from None
         except KeyboardInterrupt:
             complain(["interrupted; nothing was written"])
             return INTERRUPTED
@@ -138,10 +132,11 @@ def check(scene: str, image: str | None, overrides: tuple[str, ...], as_json: bo
         return DONE
     import yaml
 
+    at_least = ", at least, as time.tolerance may ask for more" if loaded.time.tolerance is not None else ""
     click.echo(yaml.safe_dump(facts["scene"], sort_keys=False, default_flow_style=None), nl=False)
     click.echo(
         f"\n{need.points} points, {need.frames} frames, {need.steps} steps of {facts['step']:.6g} s "
-        f"(limit {limit:.6g} s), {facts['steps_per_frame']} a frame\n"
+        f"(limit {limit:.6g} s), {facts['steps_per_frame']} a frame{at_least}\n"
         f"about {need.memory_bytes / 2**20:.0f} MiB of memory, {need.disk_bytes / 2**20:.1f} MiB on disk"
     )
     return DONE
@@ -154,6 +149,97 @@ def schema() -> int:
 
     print_json(schema())
     return DONE
+
+
+@program.command()
+@scene_argument
+@click.option("--out", metavar="DIR", help="Where the report goes.  [default: output/<name of the scene file>-study]")
+@image_option
+@set_option
+@arch_option
+@threads_option
+@click.option(
+    "--tolerance",
+    type=click.FloatRange(min=0, min_open=True),
+    metavar="ERROR",
+    help="Largest error, as a fraction of the largest displacement.  [default: the scene's, or 1e-3]",
+)
+@click.option("--quick", is_flag=True, help="Half a minute instead of minutes: fewer and shorter measurements.")
+@json_option
+def study(
+    scene: str,
+    out: str | None,
+    image: str | None,
+    overrides: tuple[str, ...],
+    arch: str,
+    threads: int | None,
+    tolerance: float | None,
+    quick: bool,
+    as_json: bool,
+) -> int:
+    """Measure how fast and how wrong every setting of SCENE is, and recommend one."""
+    from taichi_msm.scene_file import load_scene
+
+    loaded = load_scene(scene, overrides, image)
+    directory = result_directory(out, f"{Path(scene).stem}-study")
+
+    from rich.console import Console
+
+    from taichi_msm.console import Progress
+    from taichi_msm.study.measure import study as measure
+    from taichi_msm.study.report import as_record, write_report
+    from taichi_msm.study.table import print_summary
+
+    with Progress(quiet=as_json) as bar, naming(scene):
+        found = measure(
+            loaded,
+            Path(scene).stem,
+            tolerance=tolerance,
+            quick=quick,
+            arch=arch,
+            threads=threads,
+            progress=interruptible(bar),
+        )
+    if not found.stepping:
+        complain(["interrupted; nothing was written"])
+        return INTERRUPTED
+    outputs = write_report(found, directory)
+    if as_json:
+        print_json({"directory": str(directory), **as_record(found), "outputs": outputs})
+    else:
+        print_summary(found, Console())
+        click.echo(f"{directory}: {', '.join(outputs)}")
+    return EXIT_CODES[found.status]
+
+
+def result_directory(out: str | None, default: str) -> Path:
+    """Choose where results go."""
+    if out == "":
+        raise click.BadParameter("is empty; name a directory", param_hint="--out")
+    return Path(out) if out is not None else Path("output") / default
+
+
+@contextmanager
+def naming(scene: str) -> Iterator[None]:
+    """Name the scene in errors that are found after it was loaded."""
+    try:
+        yield
+    except SceneError as error:
+        raise SceneError([f"{scene}: {line}" for line in error.lines]) from None
+
+
+def interruptible(bar: Progress) -> Callable[[str, int, int], None]:
+    """Show the progress of some work, which Ctrl-C then stops where it reports."""
+    interruption = Interruption()
+
+    def progress(stage: str, done: int, total: int) -> None:
+        bar.update(stage, done, total)
+        # Before the first stage the process may end at once; and what is being put in place is put in place.
+        interruption.listen()
+        if stage != "write":
+            interruption.grant()
+
+    return progress
 
 
 def print_json(value: Any) -> None:

@@ -19,6 +19,10 @@ STAGES = {
     "pilot": "pilot runs",
     "compile": "compiling the kernels",
     "frames": "simulating and drawing",
+    "stepping": "measuring the stepping",
+    "dop853": "measuring DOP853",
+    "drawing": "measuring the drawing",
+    "terms": "measuring every term",
     "write": "writing",
 }
 
@@ -60,7 +64,7 @@ def _bar() -> Bar:
 def summary(record: Mapping[str, Any], directory: Path) -> str:
     """Say in a few lines what a run did, how wrong it may be, and how long it took."""
     times = record["timings"]
-    stages = ", ".join(f"{stage} {seconds:.2f}" for stage, seconds in times.items() if stage != "total" and seconds > 0)
+    stages = ", ".join(f"{stage} {seconds:.2f}" for stage, seconds in times.items() if stage != "total")
     lines = [
         f"{directory}: {record['frames']} frames, {record['steps']} steps of {record['step']:.4g} s, "
         f"largest displacement {record['max_displacement']:.4g} m",

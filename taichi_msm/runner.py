@@ -127,7 +127,7 @@ def run(
             "error_estimate": None if estimate is None else error_record(estimate),
             "timings": {
                 "startup": startup,
-                "pilot": watch.seconds["pilot"],
+                **({"pilot": watch.seconds["pilot"]} if estimate is not None else {}),
                 "compile": watch.seconds.get("compile", 0.0),
                 "simulate": watch.seconds.get("simulate", 0.0),
                 "render": watch.seconds.get("render", 0.0),

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator
+from typing import Any
 
 from taichi_msm.errors import Problem
 from taichi_msm.scene import WHOLE, Scene
@@ -44,10 +45,14 @@ def steps_per_frame(scene: Scene) -> int:
     return max(1, round(frame / scene.time.step))
 
 
+def with_time(scene: Scene, **changes: Any) -> Scene:
+    """Change keys of the scene's time."""
+    return scene.model_copy(update={"time": scene.time.model_copy(update=changes)})
+
+
 def with_steps(scene: Scene, count: int) -> Scene:
     """Give a frame of the scene so many steps."""
-    given = {"step": 1 / scene.time.frames_per_second / count, "tolerance": None}
-    return scene.model_copy(update={"time": scene.time.model_copy(update=given)})
+    return with_time(scene, step=1 / scene.time.frames_per_second / count, tolerance=None)
 
 
 def step(scene: Scene) -> float:

@@ -43,6 +43,8 @@ def test_simulation() -> None:
     assert estimate(scene(probes=[PROBE, PROBE])).simulation_bytes == 1200 * 4 * 23
     precise = scene(time={"duration": 2, "precision": "f64"})
     assert estimate(precise).simulation_bytes == 1200 * 8 * 21
+    piloted = scene(time={"duration": 1, "tolerance": 1e-3})
+    assert estimate(piloted).simulation_bytes == 1200 * (4 + 8 + 8) * 21
 
 
 def test_drawing(tmp_path: Path) -> None:

@@ -114,6 +114,51 @@ def test_another_picture_on_the_same_sheet(small: Path) -> None:
     assert record["overrides"][-1] == "image=elsewhere/green.png"
 
 
+def test_a_tolerance_chooses_the_step_and_is_reported(small: Path) -> None:
+    done = program("run", "small.yaml", "--set", "output=[]", "--set", "time.tolerance=1e-4", "--out", "here")
+    assert (done.returncode, done.stderr) == (0, "")
+    record = json.loads((small / "here" / "run.json").read_text())
+    assert record["steps_per_frame"] > 41
+    assert record["steps"] == 4 * record["steps_per_frame"]
+    assert record["scene"]["time"]["tolerance"] == 1e-4
+    assert record["scene"]["time"]["step"] == "auto"
+    estimate = record["error_estimate"]
+    assert set(estimate) == {"error", "rounding", "order"}
+    assert 0 < estimate["rounding"] < estimate["error"] <= 1e-4
+    assert f"error about {estimate['error']:.2g} of the largest displacement, by pilot runs" in done.stdout
+    assert record["timings"]["pilot"] > 0
+    # The step as run.json gives it makes the same run without pilot runs, whose error it is.
+    settings = ["--set", "output=[]", "--set", f"time.step={record['step']!r}"]
+    again = program("run", "small.yaml", *settings, "--estimate-error", "--json", "--out", "again")
+    assert json.loads(again.stdout)["error_estimate"] == estimate
+    assert json.loads(again.stdout)["steps"] == record["steps"]
+
+
+def test_a_tolerance_out_of_reach_is_refused_and_keeps_earlier_results(small: Path) -> None:
+    (small / "kept").mkdir()
+    (small / "kept" / "run.json").write_text("earlier")
+    done = program("run", "small.yaml", "--set", "output=[]", "--set", "time.tolerance=1e-9", "--out", "kept")
+    assert done.returncode == 2
+    assert done.stderr.startswith(
+        "small.yaml: time.tolerance: 1e-09 is out of reach of f32, whose rounding alone makes"
+    )
+    assert done.stderr.count("\n") == 1
+    assert (small / "kept" / "run.json").read_text() == "earlier"
+
+
+def test_check_says_that_a_tolerance_may_take_more_steps(small: Path) -> None:
+    done = program("check", "small.yaml", "--set", "time.tolerance=1e-4")
+    assert "at least, as time.tolerance may ask for more" in done.stdout
+
+
+def test_springs_that_are_pressed_together_are_told_of(small: Path) -> None:
+    settings = ["--set", "output=[]", "--set", "probes.0.force=[40000,0,0]", "--set", "time.duration=0.1"]
+    done = program("run", "small.yaml", *settings, "--out", "here")
+    record = json.loads((small / "here" / "run.json").read_text())
+    assert record["shortest_spring"] < 0.5
+    assert f"a spring was pressed to {record['shortest_spring']:.2g} of its rest length" in done.stdout
+
+
 def test_a_simulation_that_runs_away_stops_with_3(small: Path) -> None:
     # Within the step's limit, but pressed with a force that folds the springs over.
     done = program("run", "small.yaml", "--set", "probes.0.force=[0,0,-1e12]", "--out", "wild")

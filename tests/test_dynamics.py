@@ -14,7 +14,7 @@ from taichi_msm.dynamics import GPU_STEPS_PER_LAUNCH, LANES, POINTS_PER_WORKER, 
 from taichi_msm.lattice import rest_positions
 from taichi_msm.runtime import Device, available_threads
 from taichi_msm.scene import Scene
-from taichi_msm.stability import stable_step, step, steps_per_frame
+from taichi_msm.stability import stable_step, step, steps_per_frame, with_steps
 from tests.scenes import PRESS, SHEET, SPRINGS, random_scene, scene
 
 ROUNDING = {"f32": 2.0**-24, "f64": 2.0**-53}
@@ -201,3 +201,41 @@ def test_symmetries(device: Device) -> None:
     # A quarter turn counter-clockwise: the top right corner goes to the top left one; (x, y) becomes (-y, x).
     turned = motion([0.4, 0.3], [0.2, 0.7], [-2, 1, -3], [11, 9])
     np.testing.assert_allclose(np.rot90(turned, -1, (1, 2))[..., [1, 0, 2]] * [1, -1, 1], plain, atol=scale)
+
+
+def test_a_restart_is_a_new_start(device: Device) -> None:
+    other = scene(probes=[{**PRESS, "at": [0.2, 0.3]}], damping=0.02, sheet={**SHEET, "size": [0.4, 0.2], "mass": 2e-3})
+    dynamics = Dynamics(scene(), device)
+    dynamics.advance(77)
+    for made in (other, with_steps(other, 50), scene()):
+        dynamics.restart(made)
+        frames = [dynamics.displacement()]
+        for _ in range(made.time.frames):
+            dynamics.advance(steps_per_frame(made))
+            frames.append(dynamics.displacement())
+        np.testing.assert_array_equal(frames, simulate(made, device))
+    dynamics.close()
+
+
+@pytest.mark.parametrize(
+    "changes",
+    [
+        {"probes": []},
+        {"damping": 0},
+        {"springs": {"shear": 1}},
+        {"time": {"precision": "f32"}},
+        {"sheet": {**SHEET, "points": [9, 12]}},
+    ],
+)
+def test_a_restart_with_what_needs_another_kernel_is_refused(changes: dict[str, Any], device: Device) -> None:
+    dynamics = Dynamics(scene(), device)
+    with pytest.raises(ValueError, match="another kernel"):
+        dynamics.restart(scene(**changes))
+    dynamics.close()
+
+
+def test_damping_of_0_is_left_out(device: Device) -> None:
+    # Not multiplied by 1: what a scene does not use is not in its kernel.
+    assert not structure(scene(damping=0), device).damped
+    assert structure(scene(), device).damped
+    assert_like_twin(scene(damping=0, time={"duration": 0.08}), device)

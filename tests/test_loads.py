@@ -5,7 +5,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from taichi_msm.loads import grips, schedule
+from taichi_msm.loads import grips, jumps, key_times, meets_jumps, schedule, shortest_ramp, steps_to_meet_jumps
+from taichi_msm.stability import with_steps
 from tests.scenes import SPRINGS, scene
 
 # 25 frames a second in 4 steps of 0.01 s.
@@ -99,3 +100,43 @@ def test_a_jump_of_the_control_point_shares_the_force_between_both_places() -> N
     np.testing.assert_allclose(strength.T, [[8, 8, 4, 0, 0], [0, 0, 2, 4, 4]])
     point = schedule(made, 0, 5).point
     np.testing.assert_allclose(point[2], [[-0.2, 0.15], [0.2, -0.15]])
+
+
+def test_keys_and_jumps() -> None:
+    load = [[-1, 0], [0, 0], [0.1, 50], [0.1, 100], [0.3, 100], [0.5, 0], [0.7, 0], [2, 1]]
+    at = [[0, 0, 0], [0.25, 0, 1], [0.25, 1, 1], [0.6, 1, 0]]
+    made = scene(springs=SOFT, probes=[{"force": [0, 0, 8], "load": load, "at": at}], time=STEPS)
+    np.testing.assert_allclose(key_times(made), [0.1, 0.25, 0.3, 0.5, 0.6, 0.7])
+    # The load jumps at 0.1 s, the control point at 0.25 s; the virtual springs end at 0.5 s and are back at 0.7 s.
+    np.testing.assert_allclose(jumps(made), [0.1, 0.25, 0.5, 0.7])
+    without = scene(springs={**SOFT, "virtual": 0}, probes=made.model_dump()["probes"], time=STEPS)
+    np.testing.assert_allclose(jumps(without), [0.1, 0.25])
+    assert shortest_ramp(made) == pytest.approx(0.1)
+    assert jumps(scene(probes=[])).size == key_times(scene(probes=[])).size == 0
+    assert shortest_ramp(scene(probes=[])) == np.inf
+
+
+def test_a_first_key_that_presses_is_a_jump() -> None:
+    made = scene(springs=SOFT, probes=[{"force": [0, 0, 8], "load": [[0.1, 100]]}], time=STEPS)
+    np.testing.assert_allclose(jumps(made), [0.1])
+
+
+@pytest.mark.parametrize(
+    ("times", "steps"),
+    [
+        ([0.12], 1),
+        ([0.13], 4),
+        ([0.13, 0.15], 4),
+        ([0.13, 0.04 / 3], 12),
+        ([0.1 * 2**0.5], 0),
+        ([0.0401], 400),
+        ([], 1),
+    ],
+)
+def test_steps_that_meet_every_jump(times: list[float], steps: int) -> None:
+    probes = [{"force": [0, 0, 8], "load": [[0, 100], [time, 100], [time, 0]]} for time in times]
+    made = scene(springs=SOFT, probes=probes, time={"duration": 1.0})
+    assert steps_to_meet_jumps(made) == steps
+    if steps:
+        assert meets_jumps(with_steps(made, 3 * steps))
+    assert meets_jumps(with_steps(made, 7)) == (steps == 1)

@@ -1,0 +1,104 @@
+"""What the form in which the state is stored costs in f32: rounding against the same steps in f64.
+
+    python benchmarks/stored_form.py
+
+The paper's sheet (scenes/figure-3.yaml) at 18,000 steps a second, in NumPy.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from taichi_msm import load_scene
+from taichi_msm.lattice import fixed_points, rest_positions, springs
+from taichi_msm.loads import Schedule, decay, grips, schedule
+from taichi_msm.scene import Scene
+from taichi_msm.stability import step, steps_per_frame, with_steps
+
+SCENE = Path(__file__).parent.parent / "scenes" / "figure-3.yaml"
+STEPS_PER_SECOND = 18000
+
+FORMS = {
+    "positions x_n, x_{n-1}": "positions",
+    "displacements u_n, u_{n-1}": "displacements",
+    "displacement and difference u_n, u_n - u_{n-1}": "difference",
+}
+
+Array = NDArray[Any]
+
+
+def elastic_force(scene: Scene, values: Array, form: str) -> Array:
+    """Sum k (L - L0) (Q - P) / L in the precision of the values: positions, or displacements."""
+    rows, cols = scene.sheet.points
+    real = values.dtype.type
+    force = np.zeros_like(values)
+    for spring in springs(scene):
+        here = np.s_[
+            max(0, -spring.down) : rows - max(0, spring.down), max(0, -spring.right) : cols - max(0, spring.right)
+        ]
+        there = np.s_[
+            max(0, spring.down) : rows - max(0, -spring.down), max(0, spring.right) : cols - max(0, -spring.right)
+        ]
+        between = values[there] - values[here]
+        if form != "positions":
+            between += np.array([*spring.offset, 0], real)
+        length = np.sqrt((between * between).sum(axis=-1, keepdims=True))
+        force[here] += real(spring.stiffness) * (1 - real(spring.length) / length) * between
+    return force
+
+
+def displacements(scene: Scene, real: type, form: str) -> Array:
+    """Step the scene with its state stored in one form; gives the displacements of all frames."""
+    h, m = step(scene), scene.sheet.mass
+    g = scene.damping / m
+    keep = real((1 - g * h / 2) / (1 + g * h / 2))
+    rest64 = rest_positions(scene.sheet)
+    rest = rest64.astype(real)
+    moves = ~fixed_points(scene.sheet)[..., None]
+    share = [decay(grip, scene).astype(real)[..., None] for grip in grips(scene)]
+    loads: Schedule = schedule(scene, 0, scene.time.frames * steps_per_frame(scene))
+    now = rest.copy() if form == "positions" else np.zeros_like(rest)
+    # The one before, or the difference from it.
+    other = now.copy()
+    frames = []
+    for n in range(len(loads.active)):
+        u = now - rest if form == "positions" else now
+        force = elastic_force(scene, now, form) - real(scene.springs.virtual * loads.active[n]) * u
+        for part, strength in zip(share, loads.strength[n], strict=True):
+            force += part * strength.astype(real)
+        gain = real(h * h / m / (1 + g * h / 2) if n else h * h / m / 2)
+        if form == "difference":
+            other = keep * other + gain * force * moves
+            now = now + other
+        else:
+            now, other = now + keep * (now - other) + gain * force * moves, now
+        if (n + 1) % steps_per_frame(scene) == 0:
+            frames.append((now.astype(float) - rest64) if form == "positions" else now.astype(float))
+    return np.array(frames)
+
+
+def measure() -> dict[str, float]:
+    """Give the rounding of every form as a fraction of the largest displacement."""
+    scene = load_scene(SCENE, ["output=[]"])
+    scene = with_steps(scene, round(STEPS_PER_SECOND / scene.time.frames_per_second))
+    exact = displacements(scene, np.float64, "difference")
+    largest = np.linalg.norm(exact, axis=-1).max()
+    return {
+        name: float(np.linalg.norm(displacements(scene, np.float32, form) - exact, axis=-1).max() / largest)
+        for name, form in FORMS.items()
+    }
+
+
+def main() -> None:
+    """Print the table."""
+    print("| stored | rounding in f32 |\n|---|---:|")
+    for name, error in measure().items():
+        print(f"| {name} | {error:.2g} |")
+
+
+if __name__ == "__main__":
+    main()

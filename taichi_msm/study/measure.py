@@ -1,0 +1,184 @@
+"""A whole study: stepping, SciPy beside it, drawing, terms; what is done stays when it is interrupted."""
+
+from __future__ import annotations
+
+import os
+import platform
+import time
+from collections.abc import Callable
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+from taichi_msm import budget, runtime
+from taichi_msm.errors import SceneError
+from taichi_msm.lattice import rest_positions
+from taichi_msm.runner import versions
+from taichi_msm.runtime import Device
+from taichi_msm.scene import Scene
+from taichi_msm.study.peer import TooSlowError, solve
+from taichi_msm.study.pictures import PictureStudy
+from taichi_msm.study.result import Peer, Study, Timing
+from taichi_msm.study.stepping import SteppingStudy, observed_orders
+from taichi_msm.study.terms import TermStudy
+from taichi_msm.texture import load_texture
+
+TOLERANCE = 1e-3
+
+# Trajectories of the whole scene in memory at one time: the reference, and those that it is made of or compared with.
+TRAJECTORIES = 6
+
+Progress = Callable[[str, int, int], None]
+
+
+class Effort:
+    """How long the parts of a study may take.
+
+    Attributes:
+        longest_run: of stepping through the whole scene once [s].
+        peer: of SciPy, for each of its tolerances [s].
+        peer_rtols: these tolerances.
+        sample: of one measurement of a step [s].
+    """
+
+    def __init__(self, quick: bool) -> None:
+        self.quick = quick
+        self.longest_run = 0.25 if quick else 2.0
+        self.peer = 10.0 if quick else 20.0
+        self.peer_rtols = (1e-4,) if quick else (1e-2, 1e-4, 1e-6, 1e-8)
+        self.sample = 0.02 if quick else 0.1
+
+
+def study(
+    scene: Scene,
+    name: str,
+    *,
+    tolerance: float | None = None,
+    quick: bool = False,
+    arch: str = "cpu",
+    threads: int | None = None,
+    progress: Progress = lambda stage, done, total: None,
+) -> Study:
+    """Measure what every setting of a scene costs on this machine, and how wrong it is.
+
+    Args:
+        scene: what `load_scene` returned.
+        name: what to call it.
+        tolerance: the error that is allowed, as a fraction of the largest displacement; None: the scene's, or 1e-3.
+        quick: whether to spend some ten seconds instead of minutes.
+        arch: cpu or cuda.
+        threads: number of CPU threads; None takes every core.
+        progress: called with the stage, the work done and all of it; where it raises KeyboardInterrupt, what is done
+            is returned.
+
+    Raises:
+        SceneError: when the picture cannot be decoded, or the trajectories do not fit in memory.
+        DeviceError: when the arch is not there.
+    """
+    device = runtime.start(arch, threads)
+    _require_memory(scene)
+    texture = load_texture(scene) if scene.image is not None else None
+    found = Study(
+        scene=name,
+        settings=scene.model_dump(mode="json"),
+        status="complete",
+        tolerance=tolerance or scene.time.tolerance or TOLERANCE,
+        machine=machine(device),
+    )
+    effort = Effort(quick)
+    # The step is what is studied.
+    scene = scene.model_copy(update={"time": scene.time.model_copy(update={"tolerance": None})})
+    try:
+        with SteppingStudy(scene, device, effort.longest_run, partial(progress, "stepping")) as stepping:
+            try:
+                stepping.run()
+            finally:
+                found.reference, found.stepping = stepping.reference, stepping.points()
+                found.orders = observed_orders(found.stepping)
+        _measure_peer(scene, stepping, effort, found, progress)
+        _measure_pictures(scene, stepping, texture, effort, found, progress)
+        terms = TermStudy(scene, device, effort.sample, partial(progress, "terms"))
+        try:
+            terms.run()
+        finally:
+            found.terms = terms.points()
+    except KeyboardInterrupt:
+        found.status = "interrupted"
+        found.notes.append("interrupted: what was measured until then")
+    return found
+
+
+def machine(device: Device) -> dict[str, Any]:
+    """Describe where the study ran."""
+    return {
+        "cpu": _cpu(),
+        "cores": os.cpu_count(),
+        "arch": device.arch,
+        "threads": device.threads,
+        "versions": versions(),
+    }
+
+
+def _cpu() -> str:
+    """Name the processor."""
+    try:
+        lines = Path("/proc/cpuinfo").read_text(encoding="utf-8").splitlines()
+        return next(line.split(":", 1)[1].strip() for line in lines if line.startswith("model name"))
+    except (OSError, StopIteration):
+        return platform.processor() or platform.machine()
+
+
+def _require_memory(scene: Scene) -> None:
+    rows, cols = scene.sheet.points
+    needed = TRAJECTORIES * scene.time.frames * rows * cols * 3 * 8
+    available = budget.available_memory()
+    if needed > available:
+        raise SceneError(
+            [
+                f"time.duration: a study keeps the trajectories of all frames, {needed / 2**30:.3g} GiB here, but "
+                f"{available / 2**30:.3g} GiB is free; study a shorter time.duration or fewer sheet.points"
+            ]
+        )
+
+
+def _measure_peer(scene: Scene, stepping: SteppingStudy, effort: Effort, found: Study, progress: Progress) -> None:
+    """Solve by DOP853 at several tolerances, each as often as its time allows."""
+    assert stepping.reference is not None
+    rtols = effort.peer_rtols
+    for index, rtol in enumerate(rtols):
+        samples: list[float] = []
+        deadline = time.perf_counter() + effort.peer
+        atol = rtol * (stepping.reference.largest or 1.0) / 10
+        tick = partial(progress, "dop853", index, len(rtols))
+        try:
+            while len(samples) < 5:
+                start = time.perf_counter()
+                frames, evaluations = solve(scene, rtol, atol, deadline, tick)
+                samples.append(time.perf_counter() - start)
+        except ImportError:
+            found.notes.append('DOP853 was left out: it needs SciPy; pip install "taichi-msm[report]"')
+            return
+        except TooSlowError:
+            if not samples:
+                found.notes.append(f"DOP853 takes more than {effort.peer:g} s at rtol {rtol:g} or fails there")
+                return
+        error = stepping.relative(frames)
+        found.peers.append(Peer(rtol, error, stepping.known(error), evaluations, Timing.of(samples)))
+
+
+def _measure_pictures(
+    scene: Scene, stepping: SteppingStudy, texture: Any, effort: Effort, found: Study, progress: Progress
+) -> None:
+    """Draw the most deformed frame of the reference."""
+    if texture is None:
+        found.notes.append("drawing was left out: the scene names no image")
+        return
+    assert stepping.frames is not None
+    deformed = max(stepping.frames, key=lambda frame: (frame**2).sum(axis=-1).max())
+    position = rest_positions(scene.sheet) + deformed
+    pictures = PictureStudy(scene, position, texture, effort.quick, partial(progress, "drawing"))
+    try:
+        pictures.run()
+    finally:
+        found.drawing = pictures.points()
+        found.notes += pictures.notes

@@ -1,0 +1,82 @@
+"""The same equations by SciPy's DOP853, as a careful person would solve them without this program."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Iterator
+from itertools import pairwise
+
+import numpy as np
+from numpy.typing import NDArray
+
+from taichi_msm import reference
+from taichi_msm.lattice import fixed_points
+from taichi_msm.loads import Schedule, key_times, loads_at
+from taichi_msm.scene import Scene
+
+# Loads are read this far inside a piece between two keys, as a fraction of it: at its ends they may jump.
+INSIDE = 1e-9
+
+Array = NDArray[np.float64]
+
+
+class TooSlowError(Exception):
+    """The time allowed is over."""
+
+
+def solve(scene: Scene, rtol: float, atol: float, deadline: float, tick: Callable[[], None]) -> tuple[Array, int]:
+    """Integrate piece by piece between the keys of the loads.
+
+    Args:
+        scene: a checked scene.
+        rtol: relative tolerance.
+        atol: absolute tolerance of displacements [m] and velocities [m/s].
+        deadline: `time.perf_counter()` at which to give up.
+        tick: called now and then.
+
+    Returns:
+        Displacements at every frame but the first [m], shape (F, rows, cols, 3); and the number of evaluations.
+
+    Raises:
+        TooSlowError: at the deadline.
+        ImportError: when SciPy is not installed.
+    """
+    from scipy.integrate import solve_ivp
+
+    shape = (*scene.sheet.points, 3)
+    moves = ~fixed_points(scene.sheet)[..., None]
+    state = np.zeros(2 * int(np.prod(shape)))
+    evaluations = 0
+    found = []
+    for start, end, frames in _pieces(scene):
+        margin = INSIDE * (end - start)
+        first = loads_at(scene, np.array([start + margin, end - margin]))
+
+        def motion(t: float, y: Array, start: float = start, end: float = end, ends: Schedule = first) -> Array:
+            if time.perf_counter() > deadline:
+                raise TooSlowError
+            tick()
+            share = (t - start) / (end - start)
+            loads = Schedule(*(each[:1] + share * (each[1:] - each[:1]) for each in ends))
+            u, v = y.reshape(2, *shape)
+            force = reference.force(scene, u, loads, 0) - scene.damping * v
+            return np.concatenate([v.ravel(), (force / scene.sheet.mass * moves).ravel()])
+
+        times = np.union1d(frames, end)
+        solved = solve_ivp(motion, (start, end), state, "DOP853", t_eval=times, rtol=rtol, atol=atol)
+        if not solved.success:
+            raise TooSlowError
+        state = solved.y[:, -1]
+        evaluations += solved.nfev
+        found += [column[: state.size // 2].reshape(shape) for column in solved.y.T[: len(frames)]]
+    return np.array(found), evaluations
+
+
+def _pieces(scene: Scene) -> Iterator[tuple[float, float, Array]]:
+    """Cut the time at the keys: start, end, and the times of the frames after start, up to and with end."""
+    frames = np.arange(1, scene.time.frames + 1) / scene.time.frames_per_second
+    bounds = [0.0, *key_times(scene), float(frames[-1])]
+    for start, end in pairwise(bounds):
+        # A key that is on a frame but for rounding is on it.
+        near = frames[(frames > start * (1 + INSIDE)) & (frames <= end * (1 + INSIDE))]
+        yield start, end, np.minimum(near, end)

@@ -1,0 +1,132 @@
+"""Work and precision of the drawing: every refinement and supersampling, on the most deformed frame."""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Callable
+from contextlib import ExitStack
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from taichi_msm import budget
+from taichi_msm.drawing import Drawing
+from taichi_msm.scene import Scene
+from taichi_msm.study.result import Drawn, Timing
+
+REFINES = (0, 1, 2, 5, 10, 20)
+SUPERSAMPLES = (1, 2, 3, 4)
+
+# What the truth is drawn with, if there is memory for it; it must be finer than all that it judges.
+FINEST = {"refine": 40, "supersample": 8}
+
+ROUNDS = 5
+
+Picture = NDArray[np.uint8]
+
+
+@dataclass
+class _Trial:
+    refine: int
+    supersample: int
+    picture: Picture
+    samples: list[float] = field(default_factory=list)
+
+
+class PictureStudy:
+    """Measures the drawing of one position of the sheet.
+
+    Args:
+        scene: a checked scene with a picture.
+        position: of the mass points [m], shape (rows, cols, 3).
+        texture: the picture on the sheet, shape (height, width, 3).
+        quick: whether to vary refinement and supersampling one at a time.
+        progress: called with the drawings done and the drawings in all; may raise KeyboardInterrupt.
+
+    Attributes:
+        notes: what was left out.
+    """
+
+    def __init__(
+        self,
+        scene: Scene,
+        position: NDArray[Any],
+        texture: Picture,
+        quick: bool,
+        progress: Callable[[int, int], None],
+    ) -> None:
+        self.notes: list[str] = []
+        self._scene = scene
+        self._position = np.ascontiguousarray(position, np.float32)
+        self._texture = texture
+        self._progress = progress
+        self._truth: Picture | None = None
+        self._trials: list[_Trial] = []
+        own = scene.render
+        self._settings = [
+            (refine, supersample)
+            for supersample in sorted({*SUPERSAMPLES, own.supersample})
+            for refine in sorted({*REFINES, own.refine})
+            if not quick or refine == own.refine or supersample == own.supersample
+        ]
+
+    def run(self) -> None:
+        """Draw the truth, then every setting, all of them in turn."""
+        memory = budget.available_memory() // 2
+        if not self._draw_truth(memory):
+            return
+        with ExitStack() as opened:
+            drawings = []
+            for number, (refine, supersample) in enumerate(self._settings):
+                self._progress(number, len(self._settings) * ROUNDS)
+                scene = _with_render(self._scene, refine=refine, supersample=supersample)
+                memory -= budget.estimate(scene).drawing_bytes
+                if memory < 0:
+                    self.notes.append(
+                        f"drawing was not measured from refine {refine}, supersample {supersample} on: memory"
+                    )
+                    break
+                drawing = Drawing(scene, self._texture)
+                opened.callback(drawing.close)
+                drawings.append(drawing)
+                self._trials.append(_Trial(refine, supersample, drawing.draw(self._position)))
+            for round_ in range(ROUNDS):
+                for number, (drawing, trial) in enumerate(zip(drawings, self._trials, strict=True)):
+                    self._progress(round_ * len(drawings) + number, len(drawings) * ROUNDS)
+                    start = time.perf_counter()
+                    drawing.draw(self._position)
+                    trial.samples.append(time.perf_counter() - start)
+
+    def points(self) -> list[Drawn]:
+        """Give what is known so far."""
+        return [self._point(trial) for trial in self._trials if trial.samples]
+
+    def _draw_truth(self, memory: int) -> bool:
+        scene = _with_render(self._scene, **FINEST)
+        if budget.estimate(scene).drawing_bytes > memory:
+            self.notes.append("drawing was not measured: there is no memory for a picture fine enough to judge by")
+            return False
+        drawing = Drawing(scene, self._texture)
+        self._truth = drawing.draw(self._position)
+        drawing.close()
+        return True
+
+    def _point(self, trial: _Trial) -> Drawn:
+        assert self._truth is not None
+        difference = trial.picture.astype(np.int16) - self._truth
+        square = float(np.mean(difference.astype(np.float64) ** 2))
+        return Drawn(
+            refine=trial.refine,
+            supersample=trial.supersample,
+            psnr=10 * math.log10(255**2 / square) if square > 0 else None,
+            largest_error=int(np.abs(difference).max()),
+            seconds=Timing.of(trial.samples),
+        )
+
+
+def _with_render(scene: Scene, **changes: int) -> Scene:
+    # Beyond what a scene may ask for, as there is no check.
+    return scene.model_copy(update={"render": scene.render.model_copy(update=changes), "output": ("png",)})

@@ -1,0 +1,257 @@
+"""The files of a study: everything as JSON, a flat table, tables to paste, a picture."""
+
+from __future__ import annotations
+
+import csv
+import errno
+import io
+import json
+import math
+import tempfile
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+from taichi_msm.errors import FilesError
+from taichi_msm.study.result import Peer, Stepping, Study, Timing
+from taichi_msm.study.table import decibels, duration, number, printable, shortfall, timing, where, wrong
+
+PICTURE, FLAT, PAGE, RECORD = "study.png", "study.csv", "study.md", "study.json"
+
+WITHOUT_MATPLOTLIB = 'study.png needs matplotlib: pip install "taichi-msm[report]"'
+
+COLUMNS = (
+    "part",
+    "method",
+    "precision",
+    "damping_difference",
+    "steps_per_frame",
+    "step",
+    "rtol",
+    "evaluations",
+    "refine",
+    "supersample",
+    "without",
+    "error",
+    "rounding",
+    "known",
+    "psnr",
+    "largest_error",
+    "seconds_median",
+    "seconds_fastest",
+    "seconds_slowest",
+    "runs",
+)
+
+Row = dict[str, Any]
+
+
+def write_report(study: Study, directory: Path) -> list[str]:
+    """Write the report of a study in the place of an earlier one.
+
+    Every file is whole or not there, and the record is the last to come.
+
+    Args:
+        study: complete or not; gets a note where the picture cannot be drawn.
+        directory: made where it does not exist. Its other files stay.
+
+    Returns:
+        The names of what was written, study.json the last.
+
+    Raises:
+        FilesError: when the directory cannot be written.
+    """
+    with _errors_told(directory):
+        directory.mkdir(parents=True, exist_ok=True)
+        with tempfile.TemporaryDirectory(prefix=".partial-", dir=directory) as name:
+            staged = Path(name)
+            outputs = [PICTURE] if _draw(study, staged / PICTURE) else []
+            outputs += [FLAT, PAGE, RECORD]
+            _write(staged / FLAT, _flat(study))
+            _write(staged / PAGE, _page(study))
+            record = {**as_record(study), "outputs": outputs}
+            _write(staged / RECORD, json.dumps(record, indent=2, ensure_ascii=False, allow_nan=False) + "\n")
+            if PICTURE not in outputs:
+                (directory / PICTURE).unlink(missing_ok=True)
+            for output in outputs:
+                (staged / output).replace(directory / output)
+    return outputs
+
+
+def as_record(study: Study) -> Row:
+    """Give everything as what JSON holds; a number that is not finite is null."""
+    methods = [{"method": one.method, **asdict(one)} for one in study.stepping]
+    return _finite({**asdict(study), "stepping": methods, "recommendation": study.recommendation()})
+
+
+def _finite(value: Any) -> Any:
+    if isinstance(value, dict):
+        return {key: _finite(inner) for key, inner in value.items()}
+    if isinstance(value, (list, tuple)):
+        return [_finite(inner) for inner in value]
+    return None if isinstance(value, float) and not math.isfinite(value) else value
+
+
+def _draw(study: Study, path: Path) -> bool:
+    """Draw the picture if there is something to draw, and something to draw it with."""
+    try:
+        from taichi_msm.study.plot import panels, plot
+    except ImportError:
+        if WITHOUT_MATPLOTLIB not in study.notes:
+            study.notes.append(WITHOUT_MATPLOTLIB)
+        return False
+    if not any(panels(study)):
+        return False
+    plot(study, path)
+    return True
+
+
+def _write(path: Path, text: str) -> None:
+    # A file name that is not UTF-8 has surrogates, whose backslash form is their JSON form.
+    path.write_text(text, encoding="utf-8", errors="backslashreplace", newline="")
+
+
+@contextmanager
+def _errors_told(directory: Path) -> Iterator[None]:
+    """Turn any error of the system into one line with its remedy."""
+    try:
+        yield
+    except OSError as error:
+        full = error.errno in (errno.ENOSPC, getattr(errno, "EDQUOT", None))
+        remedy = "free some space or choose another --out" if full else "choose another --out"
+        raise FilesError(f"{directory}: cannot write: {error.strerror or error}; {remedy}") from error
+
+
+def _flat(study: Study) -> str:
+    """Write one line for each measurement, under the columns of all parts."""
+    text = io.StringIO()
+    table = csv.DictWriter(text, COLUMNS, lineterminator="\n")
+    table.writeheader()
+    table.writerows(_rows(study))
+    return text.getvalue()
+
+
+def _rows(study: Study) -> Iterator[Row]:
+    record = as_record(study)
+    parts = {"stepping": "stepping", "peers": "dop853", "drawing": "drawing", "terms": "term"}
+    for key, part in parts.items():
+        for found in record[key]:
+            seconds = found.pop("seconds")
+            times = {f"seconds_{each}": seconds[each] for each in ("median", "fastest", "slowest")}
+            method = {"method": "DOP853"} if part == "dop853" else {}
+            yield {"part": part, **method, **found, **times, "runs": seconds["runs"]}
+
+
+def _page(study: Study) -> str:
+    """Write the tables to paste."""
+    versions = study.machine["versions"]
+    state = "" if study.status == "complete" else f" ({study.status})"
+    blocks = [
+        f"# {printable(study.scene)}: speed against error{state}",
+        f"Measured on {where(study)}, with taichi-msm {versions['taichi-msm']}, Taichi {versions['taichi']}, "
+        f"NumPy {versions['numpy']} and Python {versions['python']} ({versions['platform']}). "
+        "Times are medians, with the fastest and the slowest in brackets.",
+        *_stepping(study),
+        *_drawing(study),
+        *_terms(study),
+    ]
+    if study.notes:
+        blocks += ["## Notes", "\n".join(f"- {note}" for note in study.notes)]
+    blocks.append("## Recommendation")
+    if (reason := shortfall(study)) is not None:
+        blocks.append(reason)
+    if lines := study.recommendation():
+        blocks.append("\n".join(["```yaml", *lines, "```"]))
+    return "\n\n".join(blocks) + "\n"
+
+
+def _stepping(study: Study) -> Iterator[str]:
+    if not study.stepping and not study.peers:
+        return
+    yield "## Stepping"
+    if (reference := study.reference) is not None:
+        yield (
+            "An error is the largest of any point at any frame, as a fraction of the largest displacement, "
+            f"{number(reference.largest)} m. The reference is central differences in f64, extrapolated, with up to "
+            f"{reference.steps_per_frame} steps a frame; its own error is about {number(reference.error)}. "
+            f"The tolerance is {study.tolerance:g}."
+        )
+    best = study.best_stepping
+    rows = [
+        (
+            one.method,
+            duration(one.step),
+            str(one.steps_per_frame),
+            wrong(one),
+            "" if one.rounding is None else number(one.rounding),
+            timing(one.seconds),
+            "recommended" if one is best else "",
+        )
+        for one in study.stepping
+    ]
+    yield _table(
+        ("method", "step", "steps/frame", "error", "of it rounding", "time of the scene", ""), rows, left=(0, 6)
+    )
+    orders = [f"{method} {order:.2f}" for method, order in study.orders.items() if order is not None]
+    if orders:
+        yield f"Observed orders: {', '.join(orders)}."
+    if study.peers:
+        yield "SciPy's DOP853 on the same equations:"
+        peers = [(f"{one.rtol:g}", wrong(one), str(one.evaluations), timing(one.seconds)) for one in study.peers]
+        yield _table(("rtol", "error", "evaluations", "time of the scene"), peers)
+    every: list[Stepping | Peer] = [*study.stepping, *study.peers]
+    if any(wrong(one).startswith("<") for one in every):
+        yield "An error with < is at most about that; the reference is not exact enough to tell it."
+
+
+def _drawing(study: Study) -> Iterator[str]:
+    if not study.drawing:
+        return
+    yield "## Drawing"
+    yield (
+        "The most deformed frame, against a picture of high refinement and supersampling. The largest error is of any "
+        "colour of any pixel, from 0 to 255."
+    )
+    best = study.best_drawing
+    rows = [
+        (
+            str(one.refine),
+            str(one.supersample),
+            decibels(one),
+            str(one.largest_error),
+            timing(one.seconds),
+            "recommended" if one is best else "",
+        )
+        for one in study.drawing
+    ]
+    yield _table(("refine", "supersample", "PSNR", "largest error", "time of a frame", ""), rows, left=(5,))
+
+
+def _terms(study: Study) -> Iterator[str]:
+    if not study.terms:
+        return
+    yield "## Terms"
+    whole = study.terms[0].seconds.median
+    rows = [(one.without or "nothing", timing(one.seconds), _share(one.seconds, whole)) for one in study.terms]
+    yield _table(("without", "time of a step", "of the whole step"), rows, left=(0,))
+
+
+def _share(seconds: Timing, whole: float) -> str:
+    return f"{100 * seconds.median / whole:.0f} %"
+
+
+def _table(head: Sequence[str], rows: Sequence[Sequence[str]], left: Sequence[int] = ()) -> str:
+    """Write a Markdown table, numbers to the right; `left` names the columns of words."""
+    widths = [max(len(row[column]) for row in [head, *rows]) for column in range(len(head))]
+    rule = ["-" * width if column in left else "-" * (width - 1) + ":" for column, width in enumerate(widths)]
+
+    def line(cells: Sequence[str]) -> str:
+        padded = [
+            cell.ljust(width) if column in left else cell.rjust(width)
+            for column, (cell, width) in enumerate(zip(cells, widths, strict=True))
+        ]
+        return f"| {' | '.join(padded)} |"
+
+    return "\n".join([line(head), line(rule), *map(line, rows)])

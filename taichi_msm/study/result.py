@@ -1,0 +1,192 @@
+"""What a study finds out: plain data, and the setting it recommends."""
+
+from __future__ import annotations
+
+import statistics
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+# A picture is refined enough when no finer one of the same supersampling is closer to the truth by more than this [dB].
+REFINED_ENOUGH = 0.1
+
+
+@dataclass(frozen=True)
+class Timing:
+    """Seconds of repeated, equal work.
+
+    Attributes:
+        median, fastest, slowest: [s].
+        runs: how often it was done.
+    """
+
+    median: float
+    fastest: float
+    slowest: float
+    runs: int
+
+    @classmethod
+    def of(cls, samples: Sequence[float]) -> Timing:
+        """Sum up samples [s], at least one."""
+        return cls(statistics.median(samples), min(samples), max(samples), len(samples))
+
+
+@dataclass(frozen=True)
+class Reference:
+    """What the errors of the stepping are measured against: central differences in f64, extrapolated.
+
+    Attributes:
+        steps_per_frame: of its finest run.
+        error: its own, estimated by halving the step, as a fraction of the largest displacement.
+        largest: the largest displacement of any point at any frame [m].
+    """
+
+    steps_per_frame: int
+    error: float
+    largest: float
+
+
+@dataclass(frozen=True)
+class Stepping:
+    """One way to step the scene.
+
+    Attributes:
+        precision: f32 or f64.
+        damping_difference: central or backward.
+        steps_per_frame: n ...
+        step: ... and the step that it makes [s].
+        error: largest error of any point at any frame, as a fraction of the largest displacement; None: it diverged.
+        rounding: the part of it that f32 makes; None for f64.
+        known: whether the reference is exact enough for this error; if not, the error is at most about this.
+        seconds: of stepping through the whole scene, compiled and warm.
+    """
+
+    precision: str
+    damping_difference: str
+    steps_per_frame: int
+    step: float
+    error: float | None
+    rounding: float | None
+    known: bool
+    seconds: Timing
+
+    @property
+    def method(self) -> str:
+        """Name the method, such as f32 central."""
+        return f"{self.precision} {self.damping_difference}"
+
+
+@dataclass(frozen=True)
+class Peer:
+    """SciPy's DOP853 on the same equations.
+
+    Attributes:
+        rtol: its relative tolerance; the absolute one is rtol x the largest displacement / 10.
+        error: as above.
+        known: as above.
+        evaluations: of the forces.
+        seconds: of the whole scene.
+    """
+
+    rtol: float
+    error: float
+    known: bool
+    evaluations: int
+    seconds: Timing
+
+
+@dataclass(frozen=True)
+class Drawn:
+    """One way to draw the most deformed frame.
+
+    Attributes:
+        refine, supersample: the setting.
+        psnr: against a picture of high refinement and supersampling [dB]; None: equal.
+        largest_error: of any colour of any pixel [0 to 255].
+        seconds: of one frame.
+    """
+
+    refine: int
+    supersample: int
+    psnr: float | None
+    largest_error: int
+    seconds: Timing
+
+
+@dataclass(frozen=True)
+class Term:
+    """What a step costs without one term of the model.
+
+    Attributes:
+        without: the key whose term is left out; empty: nothing is.
+        seconds: of one step.
+    """
+
+    without: str
+    seconds: Timing
+
+
+@dataclass
+class Study:
+    """Speed against error of one scene on one machine.
+
+    Attributes:
+        scene: its name.
+        settings: the scene as resolved.
+        status: complete or interrupted.
+        tolerance: the error that is allowed, as a fraction of the largest displacement.
+        machine: cpu, cores, arch, threads and versions.
+        reference: None where the study was interrupted before.
+        stepping: in the order of methods and, within one, of falling steps.
+        orders: of every method, by regression over the points above the rounding floor; None: too few of them.
+        peers: DOP853 at several tolerances.
+        drawing: in the order of supersample and refine; empty where the scene has no picture.
+        terms: the first of them leaves nothing out.
+        notes: what a reader must know, such as parts left out and why.
+    """
+
+    scene: str
+    settings: dict[str, Any]
+    status: str
+    tolerance: float
+    machine: dict[str, Any]
+    reference: Reference | None = None
+    stepping: list[Stepping] = field(default_factory=list)
+    orders: dict[str, float | None] = field(default_factory=dict)
+    peers: list[Peer] = field(default_factory=list)
+    drawing: list[Drawn] = field(default_factory=list)
+    terms: list[Term] = field(default_factory=list)
+    notes: list[str] = field(default_factory=list)
+
+    @property
+    def best_stepping(self) -> Stepping | None:
+        """Find the fastest stepping within the tolerance; None where there is none."""
+        good = [one for one in self.stepping if one.error is not None and one.error <= self.tolerance]
+        return min(good, key=lambda one: one.seconds.median, default=None)
+
+    @property
+    def best_drawing(self) -> Drawn | None:
+        """Find the fastest refinement that is refined enough, at the scene's own supersampling."""
+        own = self.settings["render"]["supersample"]
+        same = [one for one in self.drawing if one.supersample == own]
+        best = max((_decibels(one) for one in same), default=0.0)
+        good = [one for one in same if _decibels(one) >= best - REFINED_ENOUGH]
+        return min(good, key=lambda one: one.seconds.median, default=None)
+
+    def recommendation(self) -> list[str]:
+        """Write the lines to put in the scene."""
+        lines = []
+        if (step := self.best_stepping) is not None:
+            lines += [
+                "time:",
+                f"  step: {step.step:.12g}",
+                f"  damping_difference: {step.damping_difference}",
+                f"  precision: {step.precision}",
+            ]
+        if (drawn := self.best_drawing) is not None:
+            lines += ["render:", f"  refine: {drawn.refine}", f"  supersample: {drawn.supersample}"]
+        return lines
+
+
+def _decibels(drawn: Drawn) -> float:
+    return float("inf") if drawn.psnr is None else drawn.psnr

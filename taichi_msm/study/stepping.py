@@ -1,0 +1,213 @@
+"""Work and precision of the stepping: every precision and damping difference, from the largest stable step down."""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack
+from dataclasses import dataclass, field
+from types import TracebackType
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from taichi_msm.accuracy import longest
+from taichi_msm.dynamics import Dynamics
+from taichi_msm.loads import steps_to_meet_jumps
+from taichi_msm.runtime import Device
+from taichi_msm.scene import Scene
+from taichi_msm.stability import stable_step, step, with_steps, with_time
+from taichi_msm.study.result import Reference, Stepping, Timing
+
+PRECISIONS = ("f64", "f32")
+DIFFERENCES = ("central", "backward")
+
+# Every setting is timed so often, all of them in turn.
+ROUNDS = 5
+
+# An error is known when the reference is so many times more exact.
+MARGIN = 20
+
+# The runs of a series, whatever they cost, and how often the finest one may be halved for the reference.
+LEAST_HALVINGS = 2
+
+Frames = NDArray[Any]
+Progress = Callable[[int, int], None]
+
+
+@dataclass
+class _Trial:
+    """One setting, and what is known of it so far."""
+
+    precision: str
+    difference: str
+    steps: int
+    error: float = math.inf
+    rounding: float | None = None
+    samples: list[float] = field(default_factory=list)
+
+
+class SteppingStudy:
+    """Measures the stepping of one scene. Usable in a with statement, which frees its memory.
+
+    Args:
+        scene: a checked scene.
+        device: what `runtime.start` returned.
+        longest_run: a run is to take no longer than about this [s].
+        progress: called with the runs done and the runs in all; may raise KeyboardInterrupt, which leaves what is done.
+
+    Attributes:
+        frames: displacements of the reference at every frame but the first [m], shape (F, rows, cols, 3).
+        reference: what is known of it.
+    """
+
+    def __init__(self, scene: Scene, device: Device, longest_run: float, progress: Progress) -> None:
+        self.scene = scene
+        self.frames: Frames | None = None
+        self.reference: Reference | None = None
+        self._longest_run = longest_run
+        self._progress = progress
+        self._trials: list[_Trial] = []
+        self._done = 0
+        self._to_do = 1
+        with ExitStack() as opened:
+            self._dynamics = {p: Dynamics(with_time(scene, precision=p), device) for p in PRECISIONS}
+            for dynamics in self._dynamics.values():
+                opened.callback(dynamics.close)
+            self._open = opened.pop_all()
+
+    def run(self) -> None:
+        """Make the reference, then the errors, then the times."""
+        for dynamics in self._dynamics.values():
+            self._progress(0, self._to_do)
+            dynamics.compile()
+        series = {difference: list(self._series(difference)) for difference in DIFFERENCES}
+        finest = max(steps for counts in series.values() for steps in counts)
+        self._to_do = 3 + ROUNDS * len(PRECISIONS) * sum(len(counts) for counts in series.values())
+        self._make_reference(finest)
+        for difference, counts in series.items():
+            self._measure_errors(difference, counts)
+        self._to_do = self._done + (ROUNDS - 1) * len(self._trials)
+        for _ in range(ROUNDS - 1):
+            for trial in self._trials:
+                self._run(trial.precision, trial.difference, trial.steps, trial.samples)
+
+    def points(self) -> list[Stepping]:
+        """Give what is known so far, in the order of methods and of falling steps."""
+        ordered = sorted(self._trials, key=lambda one: (one.precision, one.difference != "central", one.steps))
+        return [self._point(trial) for trial in ordered if trial.samples]
+
+    def relative(self, frames: Frames) -> float:
+        """Give the largest error of frames against the reference, as a fraction of the largest displacement."""
+        assert self.frames is not None
+        assert self.reference is not None
+        return longest(frames - self.frames) / self.reference.largest if self.reference.largest > 0 else 0.0
+
+    def known(self, error: float) -> bool:
+        """Tell whether the reference is exact enough to know an error."""
+        assert self.reference is not None
+        return error >= MARGIN * self.reference.error
+
+    def close(self) -> None:
+        """Free the fields."""
+        self._open.close()
+
+    def __enter__(self) -> SteppingStudy:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.close()
+
+    def _series(self, difference: str) -> Iterator[int]:
+        """Count the steps a frame, from the largest stable step down by halvings to what may be afforded."""
+        limit = stable_step(with_time(self.scene, damping_difference=difference))
+        steps = max(1, math.ceil(1 / self.scene.time.frames_per_second / limit * (1 - 1e-12)))
+        samples: list[float] = []
+        self._run("f64", difference, steps, samples)
+        seconds = samples[0]
+        for halving in range(64):
+            if halving > LEAST_HALVINGS and seconds * 2**halving > self._longest_run:
+                return
+            yield steps * 2**halving
+
+    def _make_reference(self, finest: int) -> None:
+        """Extrapolate central differences from steps well below the finest that is measured.
+
+        u* = u_{h/2} + (u_{h/2} - u_h) / 3; its error is at most about its distance from the same at twice the step.
+        """
+        meeting = max(1, steps_to_meet_jumps(self.scene))
+        steps = math.ceil(finest / meeting) * meeting
+        coarse, middle, fine = (self._run("f64", "central", steps * 2**halving, []) for halving in range(3))
+        before = middle + (middle - coarse) / 3
+        self.frames = fine + (fine - middle) / 3
+        largest = longest(self.frames)
+        error = longest(self.frames - before) / largest if largest > 0 else 0.0
+        self.reference = Reference(4 * steps, error, largest)
+
+    def _measure_errors(self, difference: str, counts: list[int]) -> None:
+        """Run every step once, in f32 until rounding dominates and in f64 until the reference is not exact enough."""
+        assert self.reference is not None
+        going = set(PRECISIONS)
+        for steps in counts:
+            exact: Frames | None = None
+            for precision in PRECISIONS:
+                if precision not in going:
+                    continue
+                trial = _Trial(precision, difference, steps)
+                frames = self._run(precision, difference, steps, trial.samples)
+                trial.error = self.relative(frames)
+                self._trials.append(trial)
+                if precision == "f64":
+                    exact = frames
+                elif exact is not None and self.reference.largest > 0:
+                    trial.rounding = longest(frames - exact) / self.reference.largest
+                dominated = trial.rounding is not None and trial.rounding > trial.error / 2
+                if trial.error < math.inf and (dominated or not self.known(trial.error)):
+                    going.discard(precision)
+
+    def _run(self, precision: str, difference: str, steps: int, samples: list[float]) -> Frames:
+        """Step through the scene; appends the seconds of stepping alone to the samples."""
+        dynamics = self._dynamics[precision]
+        dynamics.restart(with_steps(with_time(self.scene, precision=precision, damping_difference=difference), steps))
+        frames = np.empty((self.scene.time.frames, *self.scene.sheet.points, 3), precision.replace("f", "float"))
+        seconds = 0.0
+        for frame in frames:
+            self._progress(self._done, self._to_do)
+            start = time.perf_counter()
+            dynamics.advance(steps)
+            seconds += time.perf_counter() - start
+            frame[:] = dynamics.displacement()
+        samples.append(seconds)
+        self._done += 1
+        return frames
+
+    def _point(self, trial: _Trial) -> Stepping:
+        made = with_steps(self.scene, trial.steps)
+        finite = trial.error < math.inf
+        return Stepping(
+            precision=trial.precision,
+            damping_difference=trial.difference,
+            steps_per_frame=trial.steps,
+            step=step(made),
+            error=trial.error if finite else None,
+            rounding=trial.rounding if finite else None,
+            known=finite and self.known(trial.error),
+            seconds=Timing.of(trial.samples),
+        )
+
+
+def observed_orders(points: list[Stepping]) -> dict[str, float | None]:
+    """Fit the order of every method over the points where the step, and not rounding, makes the error."""
+    orders: dict[str, float | None] = {}
+    for method in dict.fromkeys(point.method for point in points):
+        fit = [
+            (math.log(point.step), math.log(point.error))
+            for point in points
+            if point.method == method and point.error and point.known and (point.rounding or 0) < point.error / 10
+        ]
+        orders[method] = float(np.polyfit(*zip(*fit, strict=True), 1)[0]) if len(fit) > 2 else None
+    return orders

@@ -1,0 +1,84 @@
+"""What each term of the model costs: the step with one term after another left out."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack
+
+from taichi_msm.dynamics import Dynamics
+from taichi_msm.runtime import Device
+from taichi_msm.scene import Scene
+from taichi_msm.stability import steps_per_frame, with_steps
+from taichi_msm.study.result import Term, Timing
+
+ROUNDS = 9
+
+Progress = Callable[[int, int], None]
+
+
+class TermStudy:
+    """Measures the step of a scene without one term after another.
+
+    Args:
+        scene: a checked scene.
+        device: what `runtime.start` returned.
+        sample: about how long one measurement takes [s].
+        progress: called with the measurements done and all of them; may raise KeyboardInterrupt.
+    """
+
+    def __init__(self, scene: Scene, device: Device, sample: float, progress: Progress) -> None:
+        self._device = device
+        self._variants = dict(variants(scene))
+        self._samples: dict[str, list[float]] = {name: [] for name in self._variants}
+        self._sample = sample
+        self._progress = progress
+
+    def run(self) -> None:
+        """Compile every variant, then step them in turn."""
+        with ExitStack() as opened:
+            sheets: dict[str, Dynamics] = {}
+            for name, scene in self._variants.items():
+                self._progress(0, len(self._variants))
+                sheets[name] = Dynamics(scene, self._device)
+                opened.callback(sheets[name].close)
+                sheets[name].compile()
+            frames = self._frames(sheets[""])
+            for round_ in range(ROUNDS):
+                for number, (name, scene) in enumerate(self._variants.items()):
+                    self._progress(round_ * len(sheets) + number, ROUNDS * len(sheets))
+                    # From rest, so that all variants step through the same stretch of the scene.
+                    sheets[name].restart(scene)
+                    self._samples[name].append(_step_seconds(sheets[name], frames))
+
+    def points(self) -> list[Term]:
+        """Give what is known so far, the whole scene first."""
+        return [Term(name, Timing.of(samples)) for name, samples in self._samples.items() if samples]
+
+    def _frames(self, whole: Dynamics) -> int:
+        """Count the frames that a measurement takes."""
+        seconds = _step_seconds(whole, 1) * steps_per_frame(whole.scene)
+        return max(1, min(whole.scene.time.frames, round(self._sample / seconds)))
+
+
+def variants(scene: Scene) -> Iterator[tuple[str, Scene]]:
+    """Leave out one term after another, at the same step; the first variant is the whole scene."""
+    # Fixed, as without a spring the largest stable step is another.
+    scene = with_steps(scene, steps_per_frame(scene))
+    yield "", scene
+    for name in ("structural", "shear", "virtual"):
+        if getattr(scene.springs, name) > 0:
+            yield f"springs.{name}", scene.model_copy(update={"springs": scene.springs.model_copy(update={name: 0.0})})
+    if scene.damping > 0:
+        yield "damping", scene.model_copy(update={"damping": 0.0})
+    for index in range(len(scene.probes)):
+        others = scene.probes[:index] + scene.probes[index + 1 :]
+        yield f"probes.{index}", scene.model_copy(update={"probes": others})
+
+
+def _step_seconds(dynamics: Dynamics, frames: int) -> float:
+    """Give the time of one step [s]."""
+    steps = frames * steps_per_frame(dynamics.scene)
+    start = time.perf_counter()
+    dynamics.advance(steps)
+    return (time.perf_counter() - start) / steps

@@ -1,0 +1,169 @@
+"""The estimate of an error against the error itself, and the step chosen by it."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from taichi_msm.accuracy import Estimate, Pilots, choose_step, estimate_error, longest, order
+from taichi_msm.dynamics import Dynamics, Structure, structure
+from taichi_msm.errors import SceneError
+from taichi_msm.runtime import Device
+from taichi_msm.scene import Scene
+from taichi_msm.simulation import Simulation
+from taichi_msm.stability import stable_step, step, steps_per_frame, with_steps, with_time
+from tests.scenes import PRESS, SHEET, SPRINGS, scene
+
+SOFT_PRESS = {**PRESS, "force": [0, 300, -1000]}
+STIFF = {"structural": 2e4, "shear": 1e4, "virtual": 5e2}
+
+# Four kinds of scene: pressed and let go on a step, stiff with a release between two frames, dragged, and let go where
+# no step is.
+SCENES: dict[str, Any] = {
+    "release": {"probes": [SOFT_PRESS], "damping": 0.02},
+    "stiff": {
+        "springs": STIFF,
+        "probes": [{**PRESS, "force": [0, 0, -1e6], "load": [[0, 0], [0.05, 100], [0.13, 100], [0.13, 0]]}],
+        "damping": 0.5,
+        "time": {"duration": 0.2},
+    },
+    "dragged": {
+        "probes": [{"at": [[0, 0.2, 0.5], [0.3, 0.8, 0.4]], "force": [200, 0, -500], "falloff": 20}],
+        "damping": 0.05,
+    },
+    "between": {
+        "probes": [{**SOFT_PRESS, "load": [[0, 0], [0.1, 100], [0.1 * 2**0.5, 100], [0.1 * 2**0.5, 0]]}],
+        "damping": 0.02,
+    },
+}
+
+
+COMPILED: dict[Structure, Dynamics] = {}
+
+
+def frames(made: Scene, device: Device, cut: int | None = None) -> NDArray[np.float64]:
+    """Displacements of every frame."""
+    if cut is not None:
+        made = with_steps(made, cut)
+    shape = structure(made, device)
+    if shape not in COMPILED:
+        COMPILED[shape] = Dynamics(made, device)
+    dynamics = COMPILED[shape]
+    dynamics.restart(made)
+    found = []
+    for _ in range(made.time.frames):
+        dynamics.advance(steps_per_frame(made))
+        found.append(dynamics.displacement().astype(np.float64))
+    return np.array(found)
+
+
+def true_error(made: Scene, device: Device, fine: int) -> float:
+    """Error of the scene's step, by a float64 run with so many times more steps, whose own error is 1 % of it."""
+    exact = with_time(with_steps(made, fine * steps_per_frame(made)), precision="f64")
+    reference = frames(exact, device)
+    return longest(frames(made, device) - reference) / longest(reference)
+
+
+@pytest.mark.parametrize(("precision", "tolerance"), [("f32", 5e-4), ("f64", 5e-5)])
+@pytest.mark.parametrize("kind", SCENES)
+def test_the_step_chosen_is_right_and_the_largest(kind: str, precision: str, tolerance: float, device: Device) -> None:
+    sections = SCENES[kind]
+    made = scene(**sections | {"time": {"precision": precision, "tolerance": tolerance, **sections.get("time", {})}})
+    chosen, estimate = choose_step(made, device)
+    assert estimate.error <= tolerance
+    # A release between steps is of order 1, and 64 times finer is needed to know it.
+    error = true_error(chosen, device, fine=64 if kind == "between" else 12)
+    assert error <= 1.5 * tolerance, estimate
+    assert estimate.steps_per_frame == steps_per_frame(chosen) >= steps_per_frame(made)
+    if kind != "between" and steps_per_frame(chosen) > steps_per_frame(made):
+        # Half as many steps would not have done.
+        with Pilots(chosen, device) as pilots:
+            assert pilots.estimate(steps_per_frame(chosen) // 2, lambda done, total: None).error > tolerance
+
+
+@pytest.mark.parametrize("difference", ["central", "backward"])
+@pytest.mark.parametrize("kind", SCENES)
+def test_an_estimate_is_near_the_error(kind: str, difference: str, device: Device) -> None:
+    sections = SCENES[kind]
+    made = scene(**sections | {"time": {"damping_difference": difference, **sections.get("time", {})}})
+    estimate = estimate_error(made, device)
+    exact = with_time(made, damping_difference="central")
+    reference = frames(exact, device, cut=64 * steps_per_frame(made))
+    error = longest(frames(made, device) - reference) / longest(reference)
+    # Where the step misses a jump by d the error is d plus the rest, and the difference of both pilots a quarter of a
+    # step plus 3/4 of the rest, which counts twice. Where it does not, Richardson is exact but for the next order.
+    misses = kind in ("stiff", "between")
+    assert error / 1.5 < estimate.error < (3 if misses else 1.5) * error
+
+
+def test_rounding_is_part_of_the_estimate(device: Device) -> None:
+    made = with_steps(scene(probes=[SOFT_PRESS], damping=0.02, time={"precision": "f32"}), 2000)
+    estimate = estimate_error(made, device)
+    exact = frames(with_time(made, precision="f64"), device)
+    rounding = longest(frames(made, device) - exact) / longest(exact)
+    assert estimate.rounding == pytest.approx(rounding, rel=1e-3)
+    assert estimate.rounding > estimate.error / 2
+    assert estimate_error(with_time(made, precision="f64"), device).rounding == 0
+
+
+def test_what_f32_cannot_reach_names_f64(device: Device) -> None:
+    made = scene(probes=[SOFT_PRESS], damping=0.02, time={"precision": "f32", "tolerance": 1e-8})
+    with pytest.raises(SceneError, match=r"^time.tolerance: 1e-08 is out of reach of f32, .* take time.precision: f64"):
+        choose_step(made, device)
+
+
+def test_a_motion_that_does_not_converge_is_refused(device: Device) -> None:
+    # Pushed in along the sheet without damping, the points collide and scatter.
+    probe = {"force": [3e5, 1e5, -1e4], "falloff": 20}
+    made = scene(probes=[probe], damping=0, time={"duration": 2.0, "tolerance": 1e-3})
+    with pytest.raises(SceneError, match=r"^time.tolerance: 0.001 is out of reach: with \d+ steps a frame the error"):
+        choose_step(made, device)
+
+
+def test_a_sheet_that_does_not_move_has_no_error(device: Device) -> None:
+    made = scene(probes=[], time={"tolerance": 1e-6})
+    assert choose_step(made, device)[1] == Estimate(steps_per_frame(made), 0.0, 0.0, 2)
+
+
+def test_a_simulation_meets_the_tolerance_by_itself(device: Device) -> None:
+    made = scene(probes=[SOFT_PRESS], damping=0.02, time={"tolerance": 2e-4})
+    with Simulation(made, threads=2) as simulation:
+        assert step(simulation.scene) < step(made) <= stable_step(made) / 2
+
+
+def test_progress_may_interrupt(device: Device) -> None:
+    def stop(done: int, total: int) -> None:
+        assert total == 10
+        if done == 3:
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        estimate_error(scene(), device, stop)
+
+
+# 25 frames a second in steps of 0.01 s.
+ON, BETWEEN = 0.1, 0.105
+
+
+@pytest.mark.parametrize(
+    ("expected", "sections"),
+    [
+        (2, {"probes": [{**PRESS, "load": [[0, 100], [ON, 100], [ON, 0]]}]}),
+        (1, {"probes": [{**PRESS, "load": [[0, 100], [BETWEEN, 100], [BETWEEN, 0]]}]}),
+        # A kink between steps is no jump,
+        (2, {"probes": [{**PRESS, "load": [[0, 0], [BETWEEN, 100]]}], "springs": {**SPRINGS, "virtual": 0}}),
+        # but the virtual springs vanish with the last of the load,
+        (1, {"probes": [{**PRESS, "load": [[0, 100], [BETWEEN, 0]]}]}),
+        (2, {"probes": [{**PRESS, "load": [[0, 100], [BETWEEN, 0]]}], "springs": {**SPRINGS, "virtual": 0}}),
+        # and a ramp within a step is one, to a step.
+        (1, {"probes": [{**PRESS, "load": [[0, 0], [ON, 0], [ON + 1e-9, 100]]}]}),
+        (1, {"probes": [{**PRESS, "at": [[0, 0, 0], [BETWEEN, 1, 0], [BETWEEN, 0, 0]]}]}),
+        (1, {"probes": [], "time": {"damping_difference": "backward"}}),
+        (2, {"probes": [], "time": {"damping_difference": "backward"}, "damping": 0}),
+    ],
+)
+def test_order(expected: int, sections: dict[str, Any]) -> None:
+    assert order(scene(sheet=SHEET, **sections | {"time": {"step": 0.01, **sections.get("time", {})}})) == expected

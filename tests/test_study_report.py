@@ -1,0 +1,440 @@
+"""The report of a study says what was measured, for people and for machines, and is whole or not there."""
+
+from __future__ import annotations
+
+import csv
+import errno
+import io
+import json
+import sys
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import yaml
+from numpy.typing import NDArray
+from PIL import Image
+from rich.console import Console
+
+from taichi_msm.errors import FilesError
+from taichi_msm.study.report import COLUMNS, WITHOUT_MATPLOTLIB, as_record, write_report
+from taichi_msm.study.result import Drawn, Peer, Reference, Stepping, Study, Term, Timing
+from taichi_msm.study.table import duration, number, print_summary, timing
+from tests.scenes import scene
+
+FILES = ["study.png", "study.csv", "study.md", "study.json"]
+
+VERSIONS = {
+    "taichi-msm": "0.1.0",
+    "python": "3.11.7",
+    "taichi": "1.7.4",
+    "numpy": "2.4.6",
+    "pillow": "12.2.0",
+    "platform": "linux x86_64",
+}
+MACHINE = {"cpu": "AMD EPYC 7R13", "cores": 4, "arch": "cpu", "threads": 2, "versions": VERSIONS}
+
+# The floor that rounding makes in f32, as a fraction of the largest displacement.
+FLOOR = 3e-6
+
+
+def spread(median: float, runs: int = 5) -> Timing:
+    return Timing(median, 0.9 * median, 1.3 * median, runs)
+
+
+def series(precision: str, difference: str) -> list[Stepping]:
+    """Points of order 2 or 1, the coarsest of which diverged."""
+    points = [Stepping(precision, difference, 10, 0.004, None, None, False, spread(0.02))]
+    for halving in range(6):
+        exact = 1e-3 / 4**halving if difference == "central" else 2.7e-3 / 2**halving
+        rounding = FLOOR if precision == "f32" else None
+        error = exact + (rounding or 0.0)
+        seconds = (0.03 if precision == "f32" else 0.05) * 2**halving
+        known = error > 2e-6
+        points.append(
+            Stepping(
+                precision, difference, 20 * 2**halving, 0.002 / 2**halving, error, rounding, known, spread(seconds)
+            )
+        )
+    return points
+
+
+def realistic() -> Study:
+    """Like the study of scenes/press.yaml."""
+    found = Study("press", scene(render={"refine": 2}).model_dump(mode="json"), "complete", 1e-3, MACHINE)
+    found.reference = Reference(2560, 1e-7, 0.0644)
+    for precision in ("f32", "f64"):
+        for difference in ("central", "backward"):
+            found.stepping += series(precision, difference)
+            found.orders[f"{precision} {difference}"] = 1.98 if difference == "central" else 1.01
+    found.peers = [
+        Peer(10.0**-digits, 10.0 ** (-digits - 2), digits < 4, 2000 + 500 * digits, spread(3 + digits, 1))
+        for digits in (2, 4, 6)
+    ]
+    found.drawing = [
+        Drawn(
+            refine,
+            supersample,
+            50 + 5 * supersample - 4 / (1 + refine) ** 3,
+            12 - refine,
+            spread(0.01 * supersample**2),
+        )
+        for supersample in (1, 2, 4)
+        for refine in (0, 1, 2, 5)
+    ]
+    names = ("", "springs.structural", "springs.shear", "springs.virtual", "damping", "probes.0")
+    found.terms = [Term(name, spread(23e-6 - 2e-6 * len(name) / 9, 9)) for name in names]
+    found.notes = ["DOP853 takes more than 20 s at rtol 1e-08 or fails there"]
+    return found
+
+
+def interrupted() -> Study:
+    """Stopped before the reference was there."""
+    return Study("press", realistic().settings, "interrupted", 1e-3, MACHINE, notes=["interrupted: what was measured"])
+
+
+def halfway() -> Study:
+    found = replace(realistic(), status="interrupted", peers=[], drawing=[], terms=[])
+    return replace(found, stepping=found.stepping[:3], orders={"f32 central": None})
+
+
+def diverged() -> Study:
+    return replace(realistic(), stepping=[point for point in realistic().stepping if point.error is None], peers=[])
+
+
+def motionless() -> Study:
+    """Nothing moved: every error is 0, and every picture is the same."""
+    found = realistic()
+    found.reference = Reference(2560, 0.0, 0.0)
+    found.stepping = [replace(point, error=0.0, rounding=None, known=True) for point in found.stepping]
+    found.peers = [replace(peer, error=0.0, known=True) for peer in found.peers]
+    found.drawing = [replace(drawn, psnr=None, largest_error=0) for drawn in found.drawing]
+    return found
+
+
+def without_reference() -> Study:
+    """Every run diverged, the reference with them."""
+    found = diverged()
+    found.reference = Reference(40, float("nan"), float("inf"))
+    found.peers = [Peer(1e-4, float("nan"), False, 100, spread(1, 1))]
+    return found
+
+
+def one_point() -> Study:
+    found = realistic()
+    return replace(found, stepping=found.stepping[1:2], peers=[], drawing=found.drawing[:1], terms=found.terms[:1])
+
+
+def oddly_named() -> Study:
+    return replace(realistic(), scene="[bold]$x$ 呼 \udcff | :smile:")
+
+
+def on_a_gpu() -> Study:
+    return replace(realistic(), machine={**MACHINE, "arch": "cuda", "threads": None})
+
+
+CASES = [
+    realistic,
+    interrupted,
+    halfway,
+    diverged,
+    motionless,
+    without_reference,
+    one_point,
+    oddly_named,
+    on_a_gpu,
+]
+every_case = pytest.mark.parametrize("made", CASES, ids=lambda made: made.__name__)
+
+
+def pixels(path: Path) -> NDArray[np.uint8]:
+    with Image.open(path) as picture:
+        return np.asarray(picture.convert("RGB"))
+
+
+def page(directory: Path) -> str:
+    return (directory / "study.md").read_text(encoding="utf-8")
+
+
+def terminal(found: Study, width: int = 80) -> str:
+    out = io.StringIO()
+    print_summary(found, Console(file=out, width=width))
+    return out.getvalue()
+
+
+def forbid_matplotlib(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "matplotlib", None)
+    monkeypatch.delitem(sys.modules, "taichi_msm.study.plot", raising=False)
+
+
+@every_case
+def test_every_study_is_reported(made: Callable[[], Study], tmp_path: Path) -> None:
+    pytest.importorskip("matplotlib")
+    found = made()
+    outputs = write_report(found, tmp_path / "new" / "out")
+    assert outputs in (FILES, FILES[1:])
+    assert sorted(outputs) == sorted(path.name for path in (tmp_path / "new" / "out").iterdir())
+    record = json.loads((tmp_path / "new" / "out" / "study.json").read_text(encoding="utf-8"))
+    assert record["status"] == found.status
+    assert len(terminal(found).splitlines()) > 2
+    assert page(tmp_path / "new" / "out").count("## Recommendation") == 1
+
+
+def test_the_record_has_everything(tmp_path: Path) -> None:
+    found = realistic()
+    outputs = write_report(found, tmp_path)
+    record = json.loads((tmp_path / "study.json").read_text(encoding="utf-8"))
+    assert record.pop("outputs") == outputs
+    assert record == json.loads(json.dumps(as_record(found)))
+    assert record["recommendation"] == found.recommendation()
+    back = [
+        Stepping(
+            **{key: value for key, value in one.items() if key not in ("method", "seconds")},
+            seconds=Timing(**one["seconds"]),
+        )
+        for one in record["stepping"]
+    ]
+    assert back == found.stepping
+    assert [one["method"] for one in record["stepping"]] == [point.method for point in found.stepping]
+    assert record["machine"] == MACHINE
+    assert record["settings"] == found.settings
+
+
+def test_numbers_that_json_has_not_are_null() -> None:
+    record = as_record(without_reference())
+    assert record["reference"] == {"steps_per_frame": 40, "error": None, "largest": None}
+    assert record["peers"][0]["error"] is None
+
+
+def test_the_flat_table_has_every_measurement(tmp_path: Path) -> None:
+    found = realistic()
+    write_report(found, tmp_path)
+    with (tmp_path / "study.csv").open(encoding="utf-8", newline="") as file:
+        rows = list(csv.DictReader(file))
+    assert list(rows[0]) == list(COLUMNS)
+    parts = [row["part"] for row in rows]
+    assert {part: parts.count(part) for part in parts} == {"stepping": 28, "dop853": 3, "drawing": 12, "term": 6}
+    first, second = rows[:2]
+    assert first["error"] == first["rounding"] == first["psnr"] == ""
+    assert float(second["error"]) == found.stepping[1].error
+    assert (second["method"], second["known"], second["runs"]) == ("f32 central", "True", "5")
+    peer = rows[28]
+    assert (peer["method"], float(peer["rtol"]), peer["evaluations"]) == ("DOP853", 0.01, "3000")
+    assert float(rows[31]["psnr"]) == found.drawing[0].psnr
+    assert float(rows[-1]["seconds_slowest"]) == found.terms[-1].seconds.slowest
+    assert rows[-1]["without"] == "probes.0"
+
+
+def test_the_page_has_all_tables(tmp_path: Path) -> None:
+    found = realistic()
+    write_report(found, tmp_path)
+    text = page(tmp_path)
+    heads = [line for line in text.splitlines() if line.startswith("#")]
+    assert heads == [
+        "# press: speed against error",
+        "## Stepping",
+        "## Drawing",
+        "## Terms",
+        "## Notes",
+        "## Recommendation",
+    ]
+    assert "AMD EPYC 7R13, 2 threads" in text
+    assert "Taichi 1.7.4" in text
+    assert "its own error is about 1.00e-07" in text
+    rows = [[cell.strip() for cell in line.strip("|").split("|")] for line in text.splitlines() if line.startswith("|")]
+    # Four tables, each with a head and a rule.
+    assert len(rows) == 28 + 3 + 12 + 6 + 4 * 2
+    assert ["f32 central", "4.00 ms", "10", "diverged", "", "20.0 ms (18.0 to 26.0)", ""] in rows
+    assert ["f32 central", "1.00 ms", "40", "0.000253", "3.00e-06", "60.0 ms (54.0 to 78.0)", "recommended"] in rows
+    assert ["f64 central", "62.5 us", "640", "< 9.77e-07", "", "1.60 s (1.44 to 2.08)", ""] in rows
+    assert ["1e-06", "< 1.00e-08", "5000", "9.00 s (once)"] in rows
+    assert "An error with < is at most about that" in text
+    assert "Observed orders: f32 central 1.98, f32 backward 1.01" in text
+    assert ["2", "1", "54.9 dB", "10", "10.0 ms (9.00 to 13.0)", "recommended"] in rows
+    assert ["nothing", "23.0 us (20.7 to 29.9)", "100 %"] in rows
+    assert ["springs.structural", "19.0 us (17.1 to 24.7)", "83 %"] in rows
+    assert "- DOP853 takes more" in text
+    block = text.split("```yaml\n")[1].split("```")[0]
+    assert yaml.safe_load(block) == {
+        "time": {"step": 0.001, "damping_difference": "central", "precision": "f32"},
+        "render": {"refine": 2, "supersample": 1},
+    }
+
+
+def test_a_page_without_upper_bounds_does_not_explain_them(tmp_path: Path) -> None:
+    write_report(one_point(), tmp_path)
+    assert "<" not in page(tmp_path)
+
+
+def test_the_page_says_that_no_step_is_good_enough(tmp_path: Path) -> None:
+    write_report(replace(realistic(), tolerance=1e-9), tmp_path)
+    text = page(tmp_path)
+    assert "No step that was measured is within the tolerance of 1e-09; the closest is f64 central at 62.5 us" in text
+    assert "time.tolerance" in text
+    write_report(diverged(), tmp_path)
+    assert "within the tolerance of 0.001: all diverged." in page(tmp_path)
+    write_report(interrupted(), tmp_path)
+    assert "none was measured" in page(tmp_path)
+    assert "(interrupted)" in page(tmp_path)
+
+
+@every_case
+def test_the_picture_is_readable_and_keeps_inside(made: Callable[[], Study], tmp_path: Path) -> None:
+    pytest.importorskip("matplotlib")
+    if "study.png" not in write_report(made(), tmp_path):
+        assert made in (interrupted,)
+        return
+    picture = pixels(tmp_path / "study.png")
+    height, width, _ = picture.shape
+    assert 1200 <= width <= 2000
+    assert 700 <= height <= 1500
+    assert (picture == 255).all(axis=-1).mean() > 0.8
+    assert len(np.unique(picture.reshape(-1, 3), axis=0)) > 100
+    # Nothing is cut off.
+    assert (picture[:, [0, -1]] == 255).all()
+    assert (picture[[0, -1]] == 255).all()
+
+
+def test_parts_that_are_missing_leave_no_hole(tmp_path: Path) -> None:
+    pytest.importorskip("matplotlib")
+    sizes = {}
+    for name, made in {"all": realistic(), "half": halfway()}.items():
+        write_report(made, tmp_path)
+        sizes[name] = pixels(tmp_path / "study.png").shape[1]
+    assert sizes["half"] < sizes["all"]
+
+
+def test_drawing_the_picture_changes_no_settings_of_others(tmp_path: Path) -> None:
+    matplotlib = pytest.importorskip("matplotlib")
+    matplotlib.rcParams["lines.linewidth"] = 7
+    before = dict(matplotlib.rcParams)
+    write_report(realistic(), tmp_path)
+    assert dict(matplotlib.rcParams) == before
+    assert "matplotlib.pyplot" not in sys.modules
+    matplotlib.rcdefaults()
+
+
+def test_without_matplotlib_there_is_a_note_and_no_old_picture(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (tmp_path / "study.png").write_bytes(b"of an earlier study")
+    (tmp_path / "mine.txt").write_text("mine")
+    forbid_matplotlib(monkeypatch)
+    found = realistic()
+    for _ in range(2):
+        assert write_report(found, tmp_path) == FILES[1:]
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["mine.txt", *sorted(FILES[1:])]
+    assert found.notes.count(WITHOUT_MATPLOTLIB) == 1
+    assert json.loads((tmp_path / "study.json").read_text())["notes"] == found.notes
+    assert WITHOUT_MATPLOTLIB in page(tmp_path)
+    assert f"note: {WITHOUT_MATPLOTLIB}" in terminal(found)
+
+
+def test_a_study_with_nothing_to_draw_removes_the_old_picture(tmp_path: Path) -> None:
+    (tmp_path / "study.png").write_bytes(b"of an earlier study")
+    assert write_report(interrupted(), tmp_path) == FILES[1:]
+    assert not (tmp_path / "study.png").exists()
+
+
+def test_a_file_in_the_place_of_the_directory_is_told(tmp_path: Path) -> None:
+    out = tmp_path / "out"
+    out.write_text("a file")
+    with pytest.raises(FilesError) as caught:
+        write_report(realistic(), out)
+    assert str(caught.value) == f"{out}: cannot write: File exists; choose another --out"
+    assert out.read_text() == "a file"
+
+
+def test_a_full_disk_leaves_the_earlier_report(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    write_report(one_point(), tmp_path)
+    before = {path.name: path.read_bytes() for path in tmp_path.iterdir()}
+    write = Path.write_text
+
+    def full(path: Path, *arguments: Any, **options: Any) -> int:
+        if path.name == "study.json":
+            raise OSError(errno.ENOSPC, "No space left on device")
+        return write(path, *arguments, **options)
+
+    monkeypatch.setattr(Path, "write_text", full)
+    with pytest.raises(FilesError, match=r": cannot write: No space left on device; free some space or choose another"):
+        write_report(realistic(), tmp_path)
+    assert {path.name: path.read_bytes() for path in tmp_path.iterdir()} == before
+
+
+def test_the_record_comes_last(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    moved = []
+    move = Path.replace
+
+    def watch(path: Path, target: Path) -> Path:
+        moved.append(target.name)
+        return move(path, target)
+
+    monkeypatch.setattr(Path, "replace", watch)
+    assert write_report(realistic(), tmp_path) == moved
+    assert moved[-1] == "study.json"
+
+
+def test_the_summary_is_short_and_ends_in_the_recommendation() -> None:
+    found = realistic()
+    text = terminal(found)
+    assert text.rstrip().endswith("\n".join(["To put in the scene:", "", *found.recommendation()]))
+    lines = text.splitlines()
+    assert len(lines) < 40
+    assert max(map(len, lines[2:])) <= 80
+    rows = [" ".join(line.split()) for line in lines]
+    assert "* f32 central 1.00 ms 0.000253 60.0 ms (54.0 to 78.0) 1.98" in rows
+    # The coarsest of order 1 within the tolerance.
+    assert "f64 backward 500 us 0.000675 200 ms (180 to 260) 1.01" in rows
+    assert "DOP853 rtol 0.01 0.000100 5.00 s (once)" in rows
+    assert "* 2 1 54.9 dB 10 10.0 ms (9.00 to 13.0)" in rows
+    assert sum(" dB " in row for row in rows) == 3
+    assert "note: DOP853 takes more than 20 s at rtol 1e-08 or fails there" in rows
+    assert "* recommended" in rows
+
+
+def test_the_summary_marks_what_is_above_the_tolerance() -> None:
+    text = terminal(replace(realistic(), tolerance=5e-7))
+    rows = [" ".join(line.split()) for line in text.splitlines()]
+    assert "f64 central 62.5 us < 9.77e-07 ! 1.60 s (1.44 to 2.08) 1.98" in rows
+    assert "! above the tolerance < at most about" in rows
+    assert "No step that was measured is within the tolerance of 5e-07; the closest is f64 central" in text
+    # The drawing is recommended all the same.
+    assert text.rstrip().endswith("render:\n  refine: 2\n  supersample: 1")
+
+
+def test_the_summary_of_a_method_that_diverged() -> None:
+    rows = [" ".join(line.split()) for line in terminal(diverged()).splitlines()]
+    assert "f32 central 4.00 ms diverged 20.0 ms (18.0 to 26.0) 1.98" in rows
+
+
+def test_names_are_printed_as_they_are() -> None:
+    assert terminal(oddly_named()).startswith("[bold]$x$ 呼 \\udcff | :smile: on AMD EPYC 7R13, 2 threads\n")
+
+
+@pytest.mark.parametrize(
+    ("seconds", "text"),
+    [
+        (0.0, "0.00 us"),
+        (1.234e-7, "0.123 us"),
+        (22.54e-6, "22.5 us"),
+        (0.99949e-3, "999 us"),
+        (0.9996e-3, "1.00 ms"),
+        (0.1, "100 ms"),
+        (0.9999, "1.00 s"),
+        (59.96, "60.0 s"),
+        (1234.5, "1234 s"),
+    ],
+)
+def test_times_read_well(seconds: float, text: str) -> None:
+    assert duration(seconds) == text
+
+
+def test_numbers_have_three_digits() -> None:
+    written = [number(value) for value in (0.0, 1.0, 0.00027, 2.7e-9, 99.96, 999.6, 1e7)]
+    assert written == ["0.00", "1.00", "0.000270", "2.70e-09", "100", "1000", "1.00e+07"]
+
+
+def test_a_spread_is_in_the_unit_of_its_median() -> None:
+    assert timing(Timing(0.0011, 0.0009, 0.012, 5)) == "1.10 ms (0.900 to 12.0)"
+    assert timing(Timing(0.0011, 0.0011, 0.0011, 1)) == "1.10 ms (once)"
