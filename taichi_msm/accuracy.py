@@ -2,7 +2,7 @@
 
 The error of a displacement u_h is taken against Richardson's extrapolation of both pilots, which are in float64:
 
-    u* = u_{h/2} + (u_{h/2} - u_h) / (2^p - 1)        p: order of the method
+    u* = u_{h/r} + (u_{h/r} - u_h) / (r^p - 1)        p: order of the method, r = 2
 
 so that it holds the error of the scene's own precision too. An error is the largest of any point at any frame, over the
 largest displacement of any point at any frame.
@@ -22,10 +22,10 @@ from numpy.typing import NDArray
 
 from taichi_msm.dynamics import Dynamics
 from taichi_msm.errors import SceneError
-from taichi_msm.loads import meets_jumps, steps_to_meet_jumps
+from taichi_msm.loads import meets_jumps, shortest_event, steps_to_meet_jumps
 from taichi_msm.runtime import Device
 from taichi_msm.scene import LARGEST_TOLERANCE, Scene
-from taichi_msm.stability import steps_per_frame, with_steps, with_time
+from taichi_msm.stability import step, steps_per_frame, with_steps, with_time
 
 # The step found is the largest but for some 10 %: its error is at least this share of the tolerance.
 CLOSE = 0.75
@@ -33,6 +33,9 @@ CLOSE = 0.75
 # The pilot runs of one search, and how much finer each may be than the one before.
 MOST_PILOTS = 12
 LARGEST_CUT = 8.0
+
+# How much finer the other pilot may be; where it must be finer yet, the error is not known.
+FINEST = 64
 
 Progress = Callable[[int, int], None]
 
@@ -43,7 +46,8 @@ class Estimate:
 
     Attributes:
         steps_per_frame: the step, as a fraction of a frame.
-        error: largest error, as a fraction of the largest displacement; infinite where a pilot diverged.
+        error: largest error, as a fraction of the largest displacement; infinite where it is not known, because a
+            pilot diverged or the step does not resolve what happens.
         rounding: the part of it that comes from f32; 0 for f64.
         order: of the method in this scene and at this step.
     """
@@ -92,6 +96,15 @@ def choose_step(scene: Scene, device: Device, progress: Progress = lambda done, 
     return with_steps(scene, found.steps_per_frame), found
 
 
+def refinement(scene: Scene) -> int:
+    """Tell how much finer the other pilot must be: twice, or until its steps resolve the damping, g h / r <= 1.
+
+    Where they do not, central differences make velocities change their sign at every step, in both pilots alike.
+    """
+    g = scene.damping / scene.sheet.mass
+    return max(2, math.ceil(g * step(scene)))
+
+
 class Pilots:
     """The runs beside each other, frame by frame: h and h / 2 in float64, and h in the scene's own precision.
 
@@ -120,7 +133,10 @@ class Pilots:
             progress: called with the frames done and the frames in all.
         """
         scene = with_steps(self._scene, steps)
-        self._fine.restart(with_steps(self._exact, 2 * steps))
+        finer = refinement(scene)
+        if finer > FINEST or shortest_event(scene) < 2 * step(scene):
+            return Estimate(steps, math.inf, 0.0, order(scene))
+        self._fine.restart(with_steps(self._exact, finer * steps))
         self._coarse.restart(with_steps(self._exact, steps))
         if self._own is not self._coarse:
             self._own.restart(scene)
@@ -128,13 +144,13 @@ class Pilots:
         error = rounding = largest = 0.0
         for frame in range(frames):
             progress(frame, frames)
-            self._fine.advance(2 * steps)
+            self._fine.advance(finer * steps)
             self._coarse.advance(steps)
             if self._own is not self._coarse:
                 self._own.advance(steps)
             fine, coarse, own = (one.displacement() for one in (self._fine, self._coarse, self._own))
             with np.errstate(all="ignore"):
-                exact = fine + (fine - coarse) / (2**p - 1)
+                exact = fine + (fine - coarse) / (finer**p - 1)
                 error = max(error, longest(own - exact))
                 rounding = max(rounding, longest(own - coarse))
                 largest = max(largest, longest(exact))
@@ -206,7 +222,7 @@ def _stuck(failures: list[Estimate]) -> bool:
     if len(failures) < 3:
         return False
     return all(
-        after.error > before.error / math.sqrt(after.steps_per_frame / before.steps_per_frame)
+        after.error >= before.error / math.sqrt(after.steps_per_frame / before.steps_per_frame)
         for before, after in zip(failures[-3:-1], failures[-2:], strict=True)
     )
 
@@ -214,6 +230,12 @@ def _stuck(failures: list[Estimate]) -> bool:
 def _out_of_reach(tolerance: float, failures: list[Estimate]) -> str:
     best = min(failures, key=lambda one: one.error)
     last = failures[-1]
+    if best.error == math.inf:
+        return (
+            f"time.tolerance: {tolerance:g} is out of reach: with {last.steps_per_frame} steps a frame the error is "
+            "not known yet, as runs diverge or a step is longer than the damping or the load; take a weaker load, "
+            "less damping or keys farther apart"
+        )
     if last.rounding > CLOSE * tolerance:
         return (
             f"time.tolerance: {tolerance:g} is out of reach of f32, whose rounding alone makes an error of "

@@ -187,9 +187,10 @@ def study(
 
     from taichi_msm.console import Progress
     from taichi_msm.study.measure import study as measure
-    from taichi_msm.study.report import as_record, write_report
+    from taichi_msm.study.report import as_record, require_writable, write_report
     from taichi_msm.study.table import print_summary
 
+    require_writable(directory)
     with Progress(quiet=as_json) as bar, naming(scene):
         found = measure(
             loaded,

@@ -3,16 +3,13 @@
 from __future__ import annotations
 
 import sys
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from pathlib import Path
 from types import TracebackType
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from rich.progress import Progress as Bar
-
-# Down to this share of its rest length no spring shakes the limit of stability (see `stability.highest_frequency`).
-SHORTEST = 0.5
 
 STAGES = {
     "start": "starting Taichi",
@@ -68,30 +65,7 @@ def summary(record: Mapping[str, Any], directory: Path) -> str:
     lines = [
         f"{directory}: {record['frames']} frames, {record['steps']} steps of {record['step']:.4g} s, "
         f"largest displacement {record['max_displacement']:.4g} m",
-        *notes(record),
+        *record["notes"],
         f"{times['total']:.2f} s: {stages}{' (encode overlaps)' if times['encode'] > 0 else ''}",
     ]
     return "\n".join(lines)
-
-
-def notes(record: Mapping[str, Any]) -> Iterator[str]:
-    """Say what one should know before trusting the result of a run."""
-    if record["error_estimate"] is not None:
-        yield estimated(record["error_estimate"])
-    if record["max_displacement"] == 0:
-        yield "nothing moved: does a probe press where and when it should?"
-    if record["shortest_spring"] < SHORTEST:
-        yield (
-            f"a spring was pressed to {record['shortest_spring']:.2g} of its rest length: below {SHORTEST} the "
-            "sheet folds over itself and small errors grow; look at --estimate-error, or press less"
-        )
-
-
-def estimated(estimate: Mapping[str, Any]) -> str:
-    """Say how wrong a run is."""
-    if estimate["error"] is None:
-        return "error not known: a pilot run diverged"
-    said = f"error about {estimate['error']:.2g} of the largest displacement, by pilot runs"
-    if estimate["rounding"] > estimate["error"] / 2:
-        said += f"; most of it is rounding in f32 ({estimate['rounding']:.2g}): time.precision: f64 makes it smaller"
-    return said

@@ -282,11 +282,15 @@ def _kernels(s: Structure, fields: _Fields) -> tuple[Callable[..., None], ...]:
                 length = ti.sqrt(dx * dx + dy * dy)
             elif ti.static(down != 0):
                 length = dy
-            to_x = u[0][now, i + 1 + down, b + right] - x + right * dx
-            to_y = u[1][now, i + 1 + down, b + right] - y - down * dy
+            by_x = u[0][now, i + 1 + down, b + right] - x
+            by_y = u[1][now, i + 1 + down, b + right] - y
             to_z = u[2][now, i + 1 + down, b + right] - z
-            square = ti.max(to_x * to_x + to_y * to_y + to_z * to_z, tiny)
-            pull = stiffness - stiffness * length / ti.sqrt(square)
+            to_x = by_x + right * dx
+            to_y = by_y - down * dy
+            # L^2 - L0^2, by which (L - L0) / L keeps the digits of a small motion.
+            longer = by_x * (to_x + right * dx) + by_y * (to_y - down * dy) + to_z * to_z
+            long = ti.sqrt(ti.max(to_x * to_x + to_y * to_y + to_z * to_z, tiny))
+            pull = stiffness * longer / (long * (long + length))
             if ti.static(open_edges and right < 0):
                 pull *= by_column[HAS_LEFT, b]
             if ti.static(open_edges and right > 0):

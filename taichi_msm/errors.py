@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import errno
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 
 Path = tuple[str | int, ...]
@@ -51,3 +53,18 @@ class DivergedError(MsmError):
 
 class FilesError(MsmError):
     """Reading or writing failed; the message names the path and the remedy."""
+
+
+@contextmanager
+def writing(directory: object) -> Iterator[None]:
+    """Turn any error of the system into one line with its remedy.
+
+    Raises:
+        FilesError: in the place of an OSError.
+    """
+    try:
+        yield
+    except OSError as error:
+        full = error.errno in (errno.ENOSPC, getattr(errno, "EDQUOT", None))
+        remedy = "free some space or choose another --out" if full else "choose another --out"
+        raise FilesError(f"{directory}: cannot write: {error.strerror or error}; {remedy}") from error

@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-import errno
 import json
-from collections.abc import Iterator, Mapping
-from contextlib import ExitStack, contextmanager
+from collections.abc import Mapping
+from contextlib import ExitStack
 from pathlib import Path
 from types import TracebackType
 from typing import Any
@@ -14,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from taichi_msm.encoding import Encoder, Job
-from taichi_msm.errors import FilesError
+from taichi_msm.errors import writing
 from taichi_msm.gif import Picture
 from taichi_msm.publication import ANIMATION, FRAMES, RECORD, TRAJECTORY, Publication
 from taichi_msm.scene import Scene
@@ -63,7 +62,7 @@ class ResultWriter:
             position: positions [m], shape (rows, cols, 3).
             picture: colours, shape (height, width, 3); None where none is wanted.
         """
-        with self._errors_told():
+        with writing(self._directory):
             # In this order, whatever is interrupted, there are at least as many positions as pictures.
             if self._trajectory:
                 self._trajectory.add(position)
@@ -75,7 +74,7 @@ class ResultWriter:
         """Wait until every frame is encoded and close the files."""
         if self._finished:
             return
-        with self._errors_told():
+        with writing(self._directory):
             if self._encoder:
                 report = self._encoder.finish()
                 self._frames, self._encode_seconds = report.frames, report.seconds
@@ -93,7 +92,7 @@ class ResultWriter:
             The names of what was written, run.json the last.
         """
         self.finish()
-        with self._errors_told():
+        with writing(self._directory):
             staged = self._publication.staged
             outputs = [name for name in (FRAMES, ANIMATION, TRAJECTORY) if (staged / name).exists()]
             outputs.append(RECORD)
@@ -105,7 +104,7 @@ class ResultWriter:
 
     def __enter__(self) -> ResultWriter:
         scene = self._scene
-        with self._errors_told(), ExitStack() as opened:
+        with writing(self._directory), ExitStack() as opened:
             opened.enter_context(self._publication)
             if scene.draws:
                 job = Job(
@@ -133,14 +132,3 @@ class ResultWriter:
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
         self._open.close()
-
-    @contextmanager
-    def _errors_told(self) -> Iterator[None]:
-        """Turn any error of the system into one line with its remedy."""
-        try:
-            yield
-        except OSError as error:
-            full = error.errno in (errno.ENOSPC, getattr(errno, "EDQUOT", None))
-            remedy = "free some space or choose another --out" if full else "choose another --out"
-            reason = error.strerror or error
-            raise FilesError(f"{self._directory}: cannot write: {reason}; {remedy}") from error

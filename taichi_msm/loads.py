@@ -181,9 +181,22 @@ def _meet(scene: Scene, steps: int, times: Array) -> bool:
 
 def shortest_ramp(scene: Scene) -> float:
     """Find the shortest time between two keys of one list that are no jump [s]; infinite where there is none."""
-    lists = [np.array([time for time, _ in probe.load]) for probe in scene.probes]
-    gaps = [np.diff(times) for times in [*lists, *(grip.times for grip in grips(scene))]]
-    return min((float(gap) for each in gaps for gap in each if gap > 0), default=math.inf)
+    return min((float(gap) for times in _key_lists(scene) for gap in np.diff(times) if gap > 0), default=math.inf)
+
+
+def shortest_event(scene: Scene) -> float:
+    """Find the shortest time in which more than a jump or a ramp happens: three keys of one list [s]; or infinity.
+
+    What takes less than two steps may fall between them, or be counted in full for the one instant that a step sees.
+    """
+    spans = [times[2:] - times[:-2] for times in _key_lists(scene) if len(times) > 2]
+    return min((float(span) for each in spans for span in each), default=math.inf)
+
+
+def _key_lists(scene: Scene) -> list[Array]:
+    """List the times of every list of keys [s]."""
+    loads = [np.array([time for time, _ in probe.load]) for probe in scene.probes]
+    return [*loads, *(control_points(probe, scene.sheet)[0] for probe in scene.probes)]
 
 
 def _both_sides(scene: Scene, t: Array) -> tuple[Array, Schedule, Schedule]:

@@ -19,6 +19,7 @@ from taichi_msm import __version__, runtime
 from taichi_msm.accuracy import Estimate, choose_step, estimate_error
 from taichi_msm.errors import DivergedError
 from taichi_msm.files import ResultWriter
+from taichi_msm.notes import notes
 from taichi_msm.scene import Scene
 from taichi_msm.simulation import Simulation
 from taichi_msm.stability import stable_step, step, steps_per_frame
@@ -124,6 +125,7 @@ def run(
             "frames": writer.frames,
             "max_displacement": simulation.max_displacement,
             "shortest_spring": simulation.shortest_spring,
+            "notes": list(notes(scene, simulation.max_displacement, simulation.shortest_spring, estimate)),
             "error_estimate": None if estimate is None else error_record(estimate),
             "timings": {
                 "startup": startup,

@@ -168,7 +168,7 @@ class Simulation:
     def _watch(self, displacement: NDArray[Any]) -> None:
         """Stop a simulation that has gone wrong."""
         with np.errstate(over="ignore", invalid="ignore"):
-            square = np.einsum("ijk,ijk->ij", displacement, displacement)
+            square = np.einsum("ijk,ijk->ij", displacement, displacement, dtype=np.float64)
         i, j = (int(index) for index in np.unravel_index(square.argmax(), square.shape))
         largest = float(np.linalg.norm(displacement[i, j].astype(float)))
         size = max(self.scene.sheet.size)

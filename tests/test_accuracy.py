@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from taichi_msm.accuracy import Estimate, Pilots, choose_step, estimate_error, longest, order
 from taichi_msm.dynamics import Dynamics, Structure, structure
 from taichi_msm.errors import SceneError
+from taichi_msm.notes import notes
 from taichi_msm.runtime import Device
 from taichi_msm.scene import Scene
 from taichi_msm.simulation import Simulation
@@ -167,3 +168,38 @@ ON, BETWEEN = 0.1, 0.105
 )
 def test_order(expected: int, sections: dict[str, Any]) -> None:
     assert order(scene(sheet=SHEET, **sections | {"time": {"step": 0.01, **sections.get("time", {})}})) == expected
+
+
+@pytest.mark.parametrize("damping", [3.0, 20.0])
+def test_damping_within_a_step_is_known_or_not_told(damping: float, device: Device) -> None:
+    # g h = 7 and 47. A load that is there at once makes velocities change their sign at every step, at h and at h / 2.
+    made = scene(probes=[{**SOFT_PRESS, "load": [[0, 100]]}], damping=damping)
+    estimate = estimate_error(made, device)
+    reference = frames(made, device, cut=128 * steps_per_frame(made))
+    error = longest(frames(made, device) - reference) / longest(reference)
+    assert error / 1.5 < estimate.error < 1.5 * error
+    assert "velocities change their sign" in "".join(notes(made, 1.0, 1.0, None))
+
+
+def test_damping_within_a_hundredth_of_a_step_has_no_estimate(device: Device) -> None:
+    made = scene(probes=[{**SOFT_PRESS, "load": [[0, 100]]}], damping=100.0)
+    assert estimate_error(made, device).error == np.inf
+    assert next(notes(made, 1.0, 1.0, estimate_error(made, device))).startswith("error not known")
+
+
+@pytest.mark.parametrize("pulse", [[0.2005, 0.2006], [0.2, 0.2 + 1e-9], [0.2021, 0.2032]])
+def test_a_load_shorter_than_a_step_has_no_estimate_until_steps_are_shorter(pulse: list[float], device: Device) -> None:
+    start, end = pulse
+    made = scene(probes=[{**SOFT_PRESS, "load": [[start, 0], [start, 100], [end, 100], [end, 0]]}])
+    assert estimate_error(made, device).error == np.inf
+    assert "three keys of a load" in "".join(notes(made, 1.0, 1.0, None))
+    fine = with_steps(made, int(2 * 0.04 / (end - start)) + 1)
+    assert not list(notes(fine, 1.0, 1.0, None))
+
+
+def test_a_scene_that_is_all_right_has_no_notes() -> None:
+    assert not list(notes(scene(), 1.0, 0.51, None))
+    assert next(notes(scene(), 0.0, 0.49, Estimate(40, 1e-3, 1e-4, 2))) == (
+        "error about 0.001 of the largest displacement, by pilot runs"
+    )
+    assert len(list(notes(scene(), 0.0, 0.49, None))) == 2

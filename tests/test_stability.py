@@ -70,3 +70,21 @@ def test_a_step_above_the_limit_is_refused_with_the_limit() -> None:
 def test_a_step_divides_a_frame() -> None:
     assert refused(0.011) == ["time.step: 0.011 s does not divide a frame of 0.04 s; try 0.01"]
     assert refused(0.04 / 7) == []
+
+
+@pytest.mark.parametrize(
+    ("said", "changes"),
+    [
+        ("sheet.size: cells of 3e-17 m in a sheet of 3e-16 m leave the range of f32", {"size": [3e-16, 3e-16]}),
+        ("sheet.size: cells of 3e+17 m in a sheet of 3e+18 m leave the range of f32", {"size": [3e18, 3e18]}),
+        ("time.precision: f32 cannot hold the", {"mass": 1e29}),
+    ],
+)
+def test_what_f32_cannot_hold_is_refused(said: str, changes: dict[str, Any]) -> None:
+    sections = {"sheet": {**SHEET, "points": [11, 11], **changes}, "springs": {"structural": 3.0}}
+    sections |= {"time": {"frames_per_second": 1e3, "step": 1e-3}} if "mass" in changes else {}
+    single = scene(**sections | {"time": {**sections.get("time", {}), "precision": "f32"}})
+    (problem,) = problems(single)
+    assert str(problem).startswith(said)
+    assert "f64" in str(problem)
+    assert not list(problems(scene(**sections)))

@@ -169,7 +169,7 @@ def test_a_quick_study_of_pictures_varies_one_at_a_time(device: Device) -> None:
 
 
 def stepping_point(error: float | None, seconds: float, **changes: Any) -> Stepping:
-    values = {"precision": "f32", "damping_difference": "central", "steps_per_frame": 40, "step": 0.001}
+    values: dict[str, Any] = {"precision": "f32", "damping_difference": "central", "steps_per_frame": 40, "step": 0.001}
     return Stepping(
         **values | changes, error=error, rounding=0.0, known=True, seconds=Timing(seconds, seconds, seconds, 5)
     )

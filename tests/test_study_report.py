@@ -49,7 +49,7 @@ def series(precision: str, difference: str) -> list[Stepping]:
     """Points of order 2 or 1, the coarsest of which diverged."""
     points = [Stepping(precision, difference, 10, 0.004, None, None, False, spread(0.02))]
     for halving in range(6):
-        exact = 1e-3 / 4**halving if difference == "central" else 2.7e-3 / 2**halving
+        exact = 9e-4 / 4**halving if difference == "central" else 2.7e-3 / 2**halving
         rounding = FLOOR if precision == "f32" else None
         error = exact + (rounding or 0.0)
         seconds = (0.03 if precision == "f32" else 0.05) * 2**halving
@@ -78,7 +78,7 @@ def realistic() -> Study:
         Drawn(
             refine,
             supersample,
-            50 + 5 * supersample - 4 / (1 + refine) ** 3,
+            50 + 5 * supersample - 4 / (1 + refine) ** 4,
             12 - refine,
             spread(0.01 * supersample**2),
         )
@@ -129,7 +129,7 @@ def one_point() -> Study:
 
 
 def oddly_named() -> Study:
-    return replace(realistic(), scene="[bold]$x$ 呼 \udcff | :smile:")
+    return replace(one_point(), scene="[bold]$x$ 呼 \udcff | :smile:")
 
 
 def on_a_gpu() -> Study:
@@ -165,17 +165,19 @@ def terminal(found: Study, width: int = 80) -> str:
     return out.getvalue()
 
 
-def forbid_matplotlib(monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.fixture
+def no_picture(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Spare the time of drawing it."""
     monkeypatch.setitem(sys.modules, "matplotlib", None)
     monkeypatch.delitem(sys.modules, "taichi_msm.study.plot", raising=False)
 
 
+@pytest.mark.usefixtures("no_picture")
 @every_case
 def test_every_study_is_reported(made: Callable[[], Study], tmp_path: Path) -> None:
-    pytest.importorskip("matplotlib")
     found = made()
     outputs = write_report(found, tmp_path / "new" / "out")
-    assert outputs in (FILES, FILES[1:])
+    assert outputs == FILES[1:]
     assert sorted(outputs) == sorted(path.name for path in (tmp_path / "new" / "out").iterdir())
     record = json.loads((tmp_path / "new" / "out" / "study.json").read_text(encoding="utf-8"))
     assert record["status"] == found.status
@@ -183,6 +185,7 @@ def test_every_study_is_reported(made: Callable[[], Study], tmp_path: Path) -> N
     assert page(tmp_path / "new" / "out").count("## Recommendation") == 1
 
 
+@pytest.mark.usefixtures("no_picture")
 def test_the_record_has_everything(tmp_path: Path) -> None:
     found = realistic()
     outputs = write_report(found, tmp_path)
@@ -209,6 +212,7 @@ def test_numbers_that_json_has_not_are_null() -> None:
     assert record["peers"][0]["error"] is None
 
 
+@pytest.mark.usefixtures("no_picture")
 def test_the_flat_table_has_every_measurement(tmp_path: Path) -> None:
     found = realistic()
     write_report(found, tmp_path)
@@ -228,6 +232,7 @@ def test_the_flat_table_has_every_measurement(tmp_path: Path) -> None:
     assert rows[-1]["without"] == "probes.0"
 
 
+@pytest.mark.usefixtures("no_picture")
 def test_the_page_has_all_tables(tmp_path: Path) -> None:
     found = realistic()
     write_report(found, tmp_path)
@@ -248,27 +253,29 @@ def test_the_page_has_all_tables(tmp_path: Path) -> None:
     # Four tables, each with a head and a rule.
     assert len(rows) == 28 + 3 + 12 + 6 + 4 * 2
     assert ["f32 central", "4.00 ms", "10", "diverged", "", "20.0 ms (18.0 to 26.0)", ""] in rows
-    assert ["f32 central", "1.00 ms", "40", "0.000253", "3.00e-06", "60.0 ms (54.0 to 78.0)", "recommended"] in rows
-    assert ["f64 central", "62.5 us", "640", "< 9.77e-07", "", "1.60 s (1.44 to 2.08)", ""] in rows
+    assert ["f32 central", "2.00 ms", "20", "0.000903", "3.00e-06", "30.0 ms (27.0 to 39.0)", "recommended"] in rows
+    assert ["f64 central", "62.5 us", "640", "< 8.79e-07", "", "1.60 s (1.44 to 2.08)", ""] in rows
     assert ["1e-06", "< 1.00e-08", "5000", "9.00 s (once)"] in rows
     assert "An error with < is at most about that" in text
     assert "Observed orders: f32 central 1.98, f32 backward 1.01" in text
-    assert ["2", "1", "54.9 dB", "10", "10.0 ms (9.00 to 13.0)", "recommended"] in rows
+    assert ["2", "1", "55.0 dB", "10", "10.0 ms (9.00 to 13.0)", "recommended"] in rows
     assert ["nothing", "23.0 us (20.7 to 29.9)", "100 %"] in rows
     assert ["springs.structural", "19.0 us (17.1 to 24.7)", "83 %"] in rows
     assert "- DOP853 takes more" in text
     block = text.split("```yaml\n")[1].split("```")[0]
     assert yaml.safe_load(block) == {
-        "time": {"step": 0.001, "damping_difference": "central", "precision": "f32"},
+        "time": {"step": 0.002, "damping_difference": "central", "precision": "f32"},
         "render": {"refine": 2, "supersample": 1},
     }
 
 
+@pytest.mark.usefixtures("no_picture")
 def test_a_page_without_upper_bounds_does_not_explain_them(tmp_path: Path) -> None:
     write_report(one_point(), tmp_path)
     assert "<" not in page(tmp_path)
 
 
+@pytest.mark.usefixtures("no_picture")
 def test_the_page_says_that_no_step_is_good_enough(tmp_path: Path) -> None:
     write_report(replace(realistic(), tolerance=1e-9), tmp_path)
     text = page(tmp_path)
@@ -281,46 +288,38 @@ def test_the_page_says_that_no_step_is_good_enough(tmp_path: Path) -> None:
     assert "(interrupted)" in page(tmp_path)
 
 
-@every_case
+@pytest.mark.parametrize("made", CASES[:-1], ids=lambda made: made.__name__)
 def test_the_picture_is_readable_and_keeps_inside(made: Callable[[], Study], tmp_path: Path) -> None:
     pytest.importorskip("matplotlib")
-    if "study.png" not in write_report(made(), tmp_path):
-        assert made in (interrupted,)
+    outputs = write_report(made(), tmp_path)
+    assert outputs == (FILES[1:] if made is interrupted else FILES)
+    if made is interrupted:
         return
     picture = pixels(tmp_path / "study.png")
     height, width, _ = picture.shape
-    assert 1200 <= width <= 2000
-    assert 700 <= height <= 1500
-    assert (picture == 255).all(axis=-1).mean() > 0.8
-    assert len(np.unique(picture.reshape(-1, 3), axis=0)) > 100
+    # One panel alone is narrower, so that parts that are missing leave no hole.
+    assert width == (1200 if made in (halfway, motionless) else 1800)
+    assert 700 <= height <= 1300
+    assert (picture == 255).all(axis=-1).mean() > 0.7
+    assert len(np.unique(picture @ (1 << 16, 1 << 8, 1))) > 100
     # Nothing is cut off.
     assert (picture[:, [0, -1]] == 255).all()
     assert (picture[[0, -1]] == 255).all()
 
 
-def test_parts_that_are_missing_leave_no_hole(tmp_path: Path) -> None:
-    pytest.importorskip("matplotlib")
-    sizes = {}
-    for name, made in {"all": realistic(), "half": halfway()}.items():
-        write_report(made, tmp_path)
-        sizes[name] = pixels(tmp_path / "study.png").shape[1]
-    assert sizes["half"] < sizes["all"]
-
-
 def test_drawing_the_picture_changes_no_settings_of_others(tmp_path: Path) -> None:
     matplotlib = pytest.importorskip("matplotlib")
     matplotlib.rcParams["lines.linewidth"] = 7
-    before = dict(matplotlib.rcParams)
-    write_report(realistic(), tmp_path)
-    assert dict(matplotlib.rcParams) == before
-    assert "matplotlib.pyplot" not in sys.modules
+    before = matplotlib.rcParams.copy()
+    write_report(one_point(), tmp_path)
+    assert matplotlib.rcParams.copy() == before
     matplotlib.rcdefaults()
 
 
-def test_without_matplotlib_there_is_a_note_and_no_old_picture(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.usefixtures("no_picture")
+def test_without_matplotlib_there_is_a_note_and_no_old_picture(tmp_path: Path) -> None:
     (tmp_path / "study.png").write_bytes(b"of an earlier study")
     (tmp_path / "mine.txt").write_text("mine")
-    forbid_matplotlib(monkeypatch)
     found = realistic()
     for _ in range(2):
         assert write_report(found, tmp_path) == FILES[1:]
@@ -346,6 +345,7 @@ def test_a_file_in_the_place_of_the_directory_is_told(tmp_path: Path) -> None:
     assert out.read_text() == "a file"
 
 
+@pytest.mark.usefixtures("no_picture")
 def test_a_full_disk_leaves_the_earlier_report(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     write_report(one_point(), tmp_path)
     before = {path.name: path.read_bytes() for path in tmp_path.iterdir()}
@@ -362,6 +362,7 @@ def test_a_full_disk_leaves_the_earlier_report(tmp_path: Path, monkeypatch: pyte
     assert {path.name: path.read_bytes() for path in tmp_path.iterdir()} == before
 
 
+@pytest.mark.usefixtures("no_picture")
 def test_the_record_comes_last(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     moved = []
     move = Path.replace
@@ -383,11 +384,11 @@ def test_the_summary_is_short_and_ends_in_the_recommendation() -> None:
     assert len(lines) < 40
     assert max(map(len, lines[2:])) <= 80
     rows = [" ".join(line.split()) for line in lines]
-    assert "* f32 central 1.00 ms 0.000253 60.0 ms (54.0 to 78.0) 1.98" in rows
+    assert "* f32 central 2.00 ms 0.000903 30.0 ms (27.0 to 39.0) 1.98" in rows
     # The coarsest of order 1 within the tolerance.
     assert "f64 backward 500 us 0.000675 200 ms (180 to 260) 1.01" in rows
     assert "DOP853 rtol 0.01 0.000100 5.00 s (once)" in rows
-    assert "* 2 1 54.9 dB 10 10.0 ms (9.00 to 13.0)" in rows
+    assert "* 2 1 55.0 dB 10 10.0 ms (9.00 to 13.0)" in rows
     assert sum(" dB " in row for row in rows) == 3
     assert "note: DOP853 takes more than 20 s at rtol 1e-08 or fails there" in rows
     assert "* recommended" in rows
@@ -396,7 +397,7 @@ def test_the_summary_is_short_and_ends_in_the_recommendation() -> None:
 def test_the_summary_marks_what_is_above_the_tolerance() -> None:
     text = terminal(replace(realistic(), tolerance=5e-7))
     rows = [" ".join(line.split()) for line in text.splitlines()]
-    assert "f64 central 62.5 us < 9.77e-07 ! 1.60 s (1.44 to 2.08) 1.98" in rows
+    assert "f64 central 62.5 us < 8.79e-07 ! 1.60 s (1.44 to 2.08) 1.98" in rows
     assert "! above the tolerance < at most about" in rows
     assert "No step that was measured is within the tolerance of 5e-07; the closest is f64 central" in text
     # The drawing is recommended all the same.

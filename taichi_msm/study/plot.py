@@ -133,6 +133,11 @@ def _figure(study: Study) -> Figure:
     axes = figure.subplot_mosaic(layout, width_ratios=columns, height_ratios=rows)
     for name, panel in shown.items():
         panel(axes[name], study)
+    # Now that every panel is there, it is known how large each is.
+    layout_engine.execute(figure)
+    figure.set_layout_engine("none")
+    if "drawing" in axes:
+        _label_refinements(axes["drawing"], study)
     return figure
 
 
@@ -272,30 +277,26 @@ def _plot_drawing(axes: Axes, study: Study) -> None:
     axes.margins(x=0.1)
     _span(axes.set_ylim, [1e3 * seconds for seconds in _extremes(drawings)], 0.8)
     _tick_plainly(axes.yaxis)
-    supersamples = sorted({drawn.supersample for drawn in drawings})
-    lines = [[drawn for drawn in drawings if drawn.supersample == supersample] for supersample in supersamples]
-    for supersample, own, colour in zip(supersamples, lines, cycle(SUPERSAMPLES)):
+    for own, colour in zip(_by_supersample(study), cycle(SUPERSAMPLES)):
         _plot_spread(axes, [drawn.psnr or 0.0 for drawn in own], [drawn.seconds for drawn in own], colour, 1e3)
         places = zip(*map(_place, own), strict=True)
-        axes.plot(*places, color=colour, marker="o", markersize=4, zorder=3, label=str(supersample))
+        axes.plot(*places, color=colour, marker="o", markersize=4, zorder=3, label=str(own[0].supersample))
     best = study.best_drawing
     if best is not None and _drawable(best.psnr):
         axes.plot(*_place(best), **RING)
-    _label_refinements(axes, lines, best)
     axes.legend(title="supersample", loc="lower right", ncols=2, columnspacing=1.4)
 
 
-def _label_refinements(axes: Axes, lines: Sequence[Sequence[Drawn]], best: Drawn | None) -> None:
-    """Write the refinement beside each point where nothing else is, the best one's first.
+def _by_supersample(study: Study) -> list[list[Drawn]]:
+    """Sort what can be drawn into one line for each supersampling."""
+    drawings = [drawn for drawn in study.drawing if _drawable(drawn.psnr)]
+    supersamples = sorted({drawn.supersample for drawn in drawings})
+    return [[drawn for drawn in drawings if drawn.supersample == supersample] for supersample in supersamples]
 
-    Args:
-        axes: with all but the labels.
-        lines: the points of every line.
-        best: what is ringed.
-    """
-    figure = axes.figure
-    assert isinstance(figure, Figure)
-    figure.draw_without_rendering()
+
+def _label_refinements(axes: Axes, study: Study) -> None:
+    """Write the refinement beside each point where nothing else is, the recommended one's first."""
+    lines, best = _by_supersample(study), study.best_drawing
     # Places are in points of print.
     paths = [axes.transData.transform([_place(drawn) for drawn in line]) * 72 / DPI for line in lines]
     taken = [Bbox.from_bounds(x - 2, y - 2, 4, 4) for path in paths for x, y in _dots(path)]

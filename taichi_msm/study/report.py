@@ -3,18 +3,16 @@
 from __future__ import annotations
 
 import csv
-import errno
 import io
 import json
 import math
 import tempfile
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
-from taichi_msm.errors import FilesError
+from taichi_msm.errors import writing
 from taichi_msm.study.result import Peer, Stepping, Study, Timing
 from taichi_msm.study.table import decibels, duration, number, printable, shortfall, timing, where, wrong
 
@@ -48,6 +46,21 @@ COLUMNS = (
 Row = dict[str, Any]
 
 
+def require_writable(directory: Path) -> None:
+    """Find out before a long measurement whether its report can be written.
+
+    Raises:
+        FilesError: when it cannot.
+    """
+    with writing(directory):
+        existed = directory.exists()
+        directory.mkdir(parents=True, exist_ok=True)
+        with tempfile.TemporaryDirectory(prefix=".partial-", dir=directory):
+            pass
+        if not existed:
+            directory.rmdir()
+
+
 def write_report(study: Study, directory: Path) -> list[str]:
     """Write the report of a study in the place of an earlier one.
 
@@ -63,7 +76,7 @@ def write_report(study: Study, directory: Path) -> list[str]:
     Raises:
         FilesError: when the directory cannot be written.
     """
-    with _errors_told(directory):
+    with writing(directory):
         directory.mkdir(parents=True, exist_ok=True)
         with tempfile.TemporaryDirectory(prefix=".partial-", dir=directory) as name:
             staged = Path(name)
@@ -111,17 +124,6 @@ def _draw(study: Study, path: Path) -> bool:
 def _write(path: Path, text: str) -> None:
     # A file name that is not UTF-8 has surrogates, whose backslash form is their JSON form.
     path.write_text(text, encoding="utf-8", errors="backslashreplace", newline="")
-
-
-@contextmanager
-def _errors_told(directory: Path) -> Iterator[None]:
-    """Turn any error of the system into one line with its remedy."""
-    try:
-        yield
-    except OSError as error:
-        full = error.errno in (errno.ENOSPC, getattr(errno, "EDQUOT", None))
-        remedy = "free some space or choose another --out" if full else "choose another --out"
-        raise FilesError(f"{directory}: cannot write: {error.strerror or error}; {remedy}") from error
 
 
 def _flat(study: Study) -> str:

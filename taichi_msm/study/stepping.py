@@ -209,5 +209,6 @@ def observed_orders(points: list[Stepping]) -> dict[str, float | None]:
             for point in points
             if point.method == method and point.error and point.known and (point.rounding or 0) < point.error / 10
         ]
-        orders[method] = float(np.polyfit(*zip(*fit, strict=True), 1)[0]) if len(fit) > 2 else None
+        steps, errors = np.array(fit).reshape(-1, 2).T
+        orders[method] = float(np.polyfit(steps, errors, 1)[0]) if len(fit) > 2 else None
     return orders

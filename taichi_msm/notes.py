@@ -1,0 +1,56 @@
+"""What one should know before trusting the result of a run."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+
+from taichi_msm.accuracy import Estimate
+from taichi_msm.loads import shortest_event
+from taichi_msm.scene import Scene
+from taichi_msm.stability import step
+
+# Down to this share of its rest length no spring shakes the limit of stability (see `stability.highest_frequency`).
+SHORTEST = 0.5
+
+
+def notes(scene: Scene, max_displacement: float, shortest_spring: float, estimate: Estimate | None) -> Iterator[str]:
+    """Say what is remarkable about a run, one line each.
+
+    Args:
+        scene: with the step that was taken.
+        max_displacement: largest displacement [m].
+        shortest_spring: smallest length of a spring over its rest length.
+        estimate: of the error, if it was wanted.
+    """
+    if estimate is not None:
+        yield error(estimate)
+    if max_displacement == 0:
+        yield "nothing moved: does a probe press where and when it should?"
+    if shortest_spring < SHORTEST:
+        yield (
+            f"a spring was pressed to {shortest_spring:.2g} of its rest length: below {SHORTEST} the sheet folds over "
+            "itself and small errors grow; look at --estimate-error, or press less"
+        )
+    h, event = step(scene), shortest_event(scene)
+    if event < 2 * h:
+        yield (
+            f"three keys of a load or control point lie within {event:.2g} s, less than two steps of {h:.2g} s: steps "
+            f"may miss what happens there, or count it too much; take a time.step of at most {event / 2:.2g} s"
+        )
+    quick = scene.damping / scene.sheet.mass * h
+    if quick > 2 and scene.time.damping_difference == "central":
+        yield (
+            f"the damping stops a point within 1/{quick:.3g} of a step: velocities change their sign at every step; "
+            f"take a time.step of at most {2 * h / quick:.2g} s"
+        )
+
+
+def error(estimate: Estimate) -> str:
+    """Say how wrong a run is."""
+    if estimate.error == math.inf:
+        return "error not known: a pilot run diverged, or a step is longer than the damping or the load"
+    said = f"error about {estimate.error:.2g} of the largest displacement, by pilot runs"
+    if estimate.rounding > estimate.error / 2:
+        said += f"; most of it is rounding in f32 ({estimate.rounding:.2g}): time.precision: f64 makes it smaller"
+    return said
