@@ -180,7 +180,13 @@ def _plot_stepping(axes: Axes, study: Study) -> None:
     _tick_plainly(axes.yaxis)
     for order, line in guides:
         axes.plot(*zip(*line, strict=True), color=GREY, linewidth=0.7)
-        axes.annotate(f"order {order}", line[-1], (-3, 0), **LABEL, ha="right", va="center")
+        (error, seconds), (other_error, other_seconds) = line
+        middle = math.sqrt(error * other_error), math.sqrt(seconds * other_seconds)
+        text = f"order {order}"
+        if order == 1:
+            axes.annotate(text, middle, (3, 3), **LABEL, ha="left", va="bottom", bbox=BLANK)
+        else:
+            axes.annotate(text, middle, (-3, -3), **LABEL, ha="right", va="top", bbox=BLANK)
     axes.axvline(study.tolerance, color=GREY, linewidth=0.8, linestyle=(0, (6, 3)))
     top = axes.get_xaxis_transform()
     axes.annotate("tolerance", (study.tolerance, 1), (-3, 0), xycoords=top, **LABEL, ha="right", va="top", rotation=90)
