@@ -51,7 +51,7 @@ def elastic_force(scene: Scene, values: Array, form: str) -> Array:
     return force
 
 
-def displacements(scene: Scene, real: type, form: str) -> Array:
+def displacements(scene: Scene, real: type[np.floating[Any]], form: str) -> Array:
     """Step the scene with its state stored in one form; gives the displacements of all frames."""
     h, m = step(scene), scene.sheet.mass
     g = scene.damping / m

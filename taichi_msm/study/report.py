@@ -117,7 +117,12 @@ def _draw(study: Study, path: Path) -> bool:
         return False
     if not any(panels(study)):
         return False
-    plot(study, path)
+    try:
+        plot(study, path)
+    except Exception as error:
+        # Minutes of measurement are not to be lost for the sake of their picture.
+        study.notes.append(f"study.png could not be drawn: {type(error).__name__}: {error}")
+        return False
     return True
 
 
