@@ -1,11 +1,13 @@
 from __future__ import annotations
 
 import os
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
 
-from taichi_msm import runtime
+from taichi_msm import accuracy, runtime, simulation
+from tests.pool import Pool
 
 
 @pytest.fixture(scope="session")
@@ -23,3 +25,19 @@ def root() -> Path:
 def own_kernel_cache(tmp_path_factory: pytest.TempPathFactory) -> None:
     """Kernels compiled by the tests, also in child processes, come from this tree and no earlier one."""
     os.environ["TI_OFFLINE_CACHE_FILE_PATH"] = str(tmp_path_factory.mktemp("ticache"))
+
+
+@pytest.fixture(scope="session")
+def sheets() -> Iterator[Pool]:
+    """Compiled sheets for all tests."""
+    sheets = Pool()
+    yield sheets
+    sheets.close()
+
+
+@pytest.fixture
+def pool(sheets: Pool, monkeypatch: pytest.MonkeyPatch) -> Pool:
+    """Compiled sheets, which pilot runs and simulations use too."""
+    monkeypatch.setattr(accuracy, "Dynamics", sheets.lend)
+    monkeypatch.setattr(simulation, "Dynamics", sheets.lend)
+    return sheets

@@ -9,13 +9,13 @@ import pytest
 from numpy.typing import NDArray
 
 from taichi_msm.accuracy import Estimate, Pilots, choose_step, estimate_error, longest, order
-from taichi_msm.dynamics import Dynamics, Structure, structure
 from taichi_msm.errors import SceneError
 from taichi_msm.notes import notes
 from taichi_msm.runtime import Device
 from taichi_msm.scene import Scene
 from taichi_msm.simulation import Simulation
 from taichi_msm.stability import stable_step, step, steps_per_frame, with_steps, with_time
+from tests.pool import Pool
 from tests.scenes import PRESS, SHEET, SPRINGS, scene
 
 SOFT_PRESS = {**PRESS, "force": [0, 300, -1000]}
@@ -42,41 +42,37 @@ SCENES: dict[str, Any] = {
 }
 
 
-COMPILED: dict[Structure, Dynamics] = {}
-
-
-def frames(made: Scene, device: Device, cut: int | None = None) -> NDArray[np.float64]:
+def frames(made: Scene, pool: Pool, device: Device, cut: int | None = None) -> NDArray[np.float64]:
     """Displacements of every frame."""
     if cut is not None:
         made = with_steps(made, cut)
-    shape = structure(made, device)
-    if shape not in COMPILED:
-        COMPILED[shape] = Dynamics(made, device)
-    dynamics = COMPILED[shape]
-    dynamics.restart(made)
+    dynamics = pool.lend(made, device)
     found = []
     for _ in range(made.time.frames):
         dynamics.advance(steps_per_frame(made))
         found.append(dynamics.displacement().astype(np.float64))
+    dynamics.close()
     return np.array(found)
 
 
-def true_error(made: Scene, device: Device, fine: int) -> float:
+def true_error(made: Scene, pool: Pool, device: Device, fine: int) -> float:
     """Error of the scene's step, by a float64 run with so many times more steps, whose own error is 1 % of it."""
     exact = with_time(with_steps(made, fine * steps_per_frame(made)), precision="f64")
-    reference = frames(exact, device)
-    return longest(frames(made, device) - reference) / longest(reference)
+    reference = frames(exact, pool, device)
+    return longest(frames(made, pool, device) - reference) / longest(reference)
 
 
 @pytest.mark.parametrize(("precision", "tolerance"), [("f32", 5e-4), ("f64", 5e-5)])
 @pytest.mark.parametrize("kind", SCENES)
-def test_the_step_chosen_is_right_and_the_largest(kind: str, precision: str, tolerance: float, device: Device) -> None:
+def test_the_step_chosen_is_right_and_the_largest(
+    kind: str, precision: str, tolerance: float, pool: Pool, device: Device
+) -> None:
     sections = SCENES[kind]
     made = scene(**sections | {"time": {"precision": precision, "tolerance": tolerance, **sections.get("time", {})}})
     chosen, estimate = choose_step(made, device)
     assert estimate.error <= tolerance
     # A release between steps is of order 1, and 64 times finer is needed to know it.
-    error = true_error(chosen, device, fine=64 if kind == "between" else 12)
+    error = true_error(chosen, pool, device, fine=64 if kind == "between" else 12)
     assert error <= 1.5 * tolerance, estimate
     assert estimate.steps_per_frame == steps_per_frame(chosen) >= steps_per_frame(made)
     if kind != "between" and steps_per_frame(chosen) > steps_per_frame(made):
@@ -87,36 +83,36 @@ def test_the_step_chosen_is_right_and_the_largest(kind: str, precision: str, tol
 
 @pytest.mark.parametrize("difference", ["central", "backward"])
 @pytest.mark.parametrize("kind", SCENES)
-def test_an_estimate_is_near_the_error(kind: str, difference: str, device: Device) -> None:
+def test_an_estimate_is_near_the_error(kind: str, difference: str, pool: Pool, device: Device) -> None:
     sections = SCENES[kind]
     made = scene(**sections | {"time": {"damping_difference": difference, **sections.get("time", {})}})
     estimate = estimate_error(made, device)
     exact = with_time(made, damping_difference="central")
-    reference = frames(exact, device, cut=64 * steps_per_frame(made))
-    error = longest(frames(made, device) - reference) / longest(reference)
+    reference = frames(exact, pool, device, cut=64 * steps_per_frame(made))
+    error = longest(frames(made, pool, device) - reference) / longest(reference)
     # Where the step misses a jump by d the error is d plus the rest, and the difference of both pilots a quarter of a
     # step plus 3/4 of the rest, which counts twice. Where it does not, Richardson is exact but for the next order.
     misses = kind in ("stiff", "between")
     assert error / 1.5 < estimate.error < (3 if misses else 1.5) * error
 
 
-def test_rounding_is_part_of_the_estimate(device: Device) -> None:
+def test_rounding_is_part_of_the_estimate(pool: Pool, device: Device) -> None:
     made = with_steps(scene(probes=[SOFT_PRESS], damping=0.02, time={"precision": "f32"}), 2000)
     estimate = estimate_error(made, device)
-    exact = frames(with_time(made, precision="f64"), device)
-    rounding = longest(frames(made, device) - exact) / longest(exact)
+    exact = frames(with_time(made, precision="f64"), pool, device)
+    rounding = longest(frames(made, pool, device) - exact) / longest(exact)
     assert estimate.rounding == pytest.approx(rounding, rel=1e-3)
     assert estimate.rounding > estimate.error / 2
     assert estimate_error(with_time(made, precision="f64"), device).rounding == 0
 
 
-def test_what_f32_cannot_reach_names_f64(device: Device) -> None:
+def test_what_f32_cannot_reach_names_f64(pool: Pool, device: Device) -> None:
     made = scene(probes=[SOFT_PRESS], damping=0.02, time={"precision": "f32", "tolerance": 1e-8})
     with pytest.raises(SceneError, match=r"^time.tolerance: 1e-08 is out of reach of f32, .* take time.precision: f64"):
         choose_step(made, device)
 
 
-def test_a_motion_that_does_not_converge_is_refused(device: Device) -> None:
+def test_a_motion_that_does_not_converge_is_refused(pool: Pool, device: Device) -> None:
     # Pushed in along the sheet without damping, the points collide and scatter.
     probe = {"force": [3e5, 1e5, -1e4], "falloff": 20}
     made = scene(probes=[probe], damping=0, time={"duration": 2.0, "tolerance": 1e-3})
@@ -124,18 +120,18 @@ def test_a_motion_that_does_not_converge_is_refused(device: Device) -> None:
         choose_step(made, device)
 
 
-def test_a_sheet_that_does_not_move_has_no_error(device: Device) -> None:
+def test_a_sheet_that_does_not_move_has_no_error(pool: Pool, device: Device) -> None:
     made = scene(probes=[], time={"tolerance": 1e-6})
     assert choose_step(made, device)[1] == Estimate(steps_per_frame(made), 0.0, 0.0, 2)
 
 
-def test_a_simulation_meets_the_tolerance_by_itself(device: Device) -> None:
+def test_a_simulation_meets_the_tolerance_by_itself(pool: Pool, device: Device) -> None:
     made = scene(probes=[SOFT_PRESS], damping=0.02, time={"tolerance": 2e-4})
     with Simulation(made, threads=2) as simulation:
         assert step(simulation.scene) < step(made) <= stable_step(made) / 2
 
 
-def test_progress_may_interrupt(device: Device) -> None:
+def test_progress_may_interrupt(pool: Pool, device: Device) -> None:
     def stop(done: int, total: int) -> None:
         assert total == 10
         if done == 3:
@@ -171,24 +167,26 @@ def test_order(expected: int, sections: dict[str, Any]) -> None:
 
 
 @pytest.mark.parametrize("damping", [3.0, 20.0])
-def test_damping_within_a_step_is_known_or_not_told(damping: float, device: Device) -> None:
+def test_damping_within_a_step_is_known_or_not_told(damping: float, pool: Pool, device: Device) -> None:
     # g h = 7 and 47. A load that is there at once makes velocities change their sign at every step, at h and at h / 2.
     made = scene(probes=[{**SOFT_PRESS, "load": [[0, 100]]}], damping=damping)
     estimate = estimate_error(made, device)
-    reference = frames(made, device, cut=128 * steps_per_frame(made))
-    error = longest(frames(made, device) - reference) / longest(reference)
+    reference = frames(made, pool, device, cut=128 * steps_per_frame(made))
+    error = longest(frames(made, pool, device) - reference) / longest(reference)
     assert error / 1.5 < estimate.error < 1.5 * error
     assert "velocities change their sign" in "".join(notes(made, 1.0, 1.0, None))
 
 
-def test_damping_within_a_hundredth_of_a_step_has_no_estimate(device: Device) -> None:
+def test_damping_within_a_hundredth_of_a_step_has_no_estimate(pool: Pool, device: Device) -> None:
     made = scene(probes=[{**SOFT_PRESS, "load": [[0, 100]]}], damping=100.0)
     assert estimate_error(made, device).error == np.inf
     assert next(notes(made, 1.0, 1.0, estimate_error(made, device))).startswith("error not known")
 
 
 @pytest.mark.parametrize("pulse", [[0.2005, 0.2006], [0.2, 0.2 + 1e-9], [0.2021, 0.2032]])
-def test_a_load_shorter_than_a_step_has_no_estimate_until_steps_are_shorter(pulse: list[float], device: Device) -> None:
+def test_a_load_shorter_than_a_step_has_no_estimate_until_steps_are_shorter(
+    pulse: list[float], pool: Pool, device: Device
+) -> None:
     start, end = pulse
     made = scene(probes=[{**SOFT_PRESS, "load": [[start, 0], [start, 100], [end, 100], [end, 0]]}])
     assert estimate_error(made, device).error == np.inf

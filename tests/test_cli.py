@@ -14,6 +14,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+import yaml
 from PIL import Image
 
 from taichi_msm import reference
@@ -157,6 +158,73 @@ def test_springs_that_are_pressed_together_are_told_of(small: Path) -> None:
     record = json.loads((small / "here" / "run.json").read_text())
     assert record["shortest_spring"] < 0.5
     assert f"a spring was pressed to {record['shortest_spring']:.2g} of its rest length" in done.stdout
+
+
+def test_a_study_ends_in_lines_that_the_scene_takes(small: Path) -> None:
+    done = program(
+        "study",
+        "small.yaml",
+        "--quick",
+        "--json",
+        "--tolerance",
+        "2e-3",
+        "--set",
+        "damping=0.02",
+        "--set",
+        "image=null",
+        "--set",
+        "output=[]",
+    )
+    assert (done.returncode, done.stderr) == (0, "")
+    found = json.loads(done.stdout)
+    assert found["directory"] == "output/small-study"
+    assert found["outputs"] == ["study.png", "study.csv", "study.md", "study.json"]
+    assert sorted(path.name for path in (small / "output" / "small-study").iterdir()) == sorted(found["outputs"])
+    assert (found["status"], found["tolerance"]) == ("complete", 2e-3)
+    assert found["notes"] == ["drawing was left out: the scene names no image"]
+    assert all(found[part] for part in ("stepping", "peers", "terms", "reference", "machine"))
+    assert max(peer["error"] for peer in found["peers"]) < 1e-2, "two methods agree"
+    # The lines, put into the scene, make a run as right as they promise.
+    recommended = yaml.safe_load("\n".join(found["recommendation"]))
+    settings = [f"time.{key}={value}" for key, value in recommended["time"].items()]
+    overrides = [word for setting in ["damping=0.02", "output=[]", *settings] for word in ("--set", setting)]
+    again = program("run", "small.yaml", *overrides, "--estimate-error", "--json", "--out", "again")
+    promised = next(
+        one["error"]
+        for one in found["stepping"]
+        if f"{one['step']:.12g}" == f"{recommended['time']['step']:.12g}"
+        and (one["damping_difference"], one["precision"]) == tuple(recommended["time"].values())[1:]
+    )
+    assert promised <= 2e-3
+    assert json.loads(again.stdout)["error_estimate"]["error"] == pytest.approx(promised, rel=0.3)
+
+
+def test_a_study_that_could_not_be_written_is_not_begun(small: Path) -> None:
+    (small / "file").touch()
+    for out in ("file", "file/below"):
+        done = program("study", "small.yaml", "--out", out, timeout=20)
+        assert done.returncode == 4
+        assert done.stderr.startswith(f"{out}: cannot write: ")
+        assert done.stderr.count("\n") == 1
+
+
+@pytest.mark.parametrize("seconds", [2.0, 8.0])
+def test_ctrl_c_leaves_what_a_study_has_done(seconds: float, small: Path) -> None:
+    process = subprocess.Popen(
+        [sys.executable, "-m", "taichi_msm", "study", "small.yaml", "--out", "here"],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+    )
+    time.sleep(seconds)
+    process.send_signal(signal.SIGINT)
+    printed, error = process.communicate(timeout=30)
+    assert process.returncode == 130
+    if (small / "here").exists():
+        assert (error, "interrupted" in printed) == ("", True)
+        assert json.loads((small / "here" / "study.json").read_text())["status"] == "interrupted"
+    else:
+        assert error == "interrupted; nothing was written\n"
 
 
 def test_a_simulation_that_runs_away_stops_with_3(small: Path) -> None:

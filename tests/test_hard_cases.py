@@ -6,8 +6,6 @@ Errors are of displacements, and fractions of the largest one of the run, as in 
 from __future__ import annotations
 
 import math
-from collections import defaultdict
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -15,15 +13,15 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from taichi_msm import accuracy, lattice, reference, simulation
+from taichi_msm import lattice, reference
 from taichi_msm.accuracy import estimate_error
-from taichi_msm.dynamics import Dynamics, Structure, structure
 from taichi_msm.loads import meets_jumps
 from taichi_msm.runtime import Device
 from taichi_msm.scene import Scene
 from taichi_msm.scene_file import load_scene
 from taichi_msm.simulation import MOST_SHEET_SIZES, Simulation
 from taichi_msm.stability import stable_step, step, steps_per_frame, with_steps
+from tests.pool import Pool
 
 Array = NDArray[np.float64]
 
@@ -38,46 +36,6 @@ SHORT = sorted(path.stem for path in FOLDER.glob("*.yaml") if path.stem not in L
 
 # Twin and kernel are compared for so many steps of points: a second or less a case.
 TWIN_STEPS_OF_POINTS = 300_000
-
-
-class Pool:
-    """Sheets that are compiled once for each structure and lent to whoever asks for a Dynamics."""
-
-    def __init__(self) -> None:
-        self._idle: dict[Structure, list[Dynamics]] = defaultdict(list)
-
-    def lend(self, scene: Scene, device: Device) -> Dynamics:
-        idle = self._idle[structure(scene, device)]
-        if not idle:
-            return Lent(scene, device, idle)
-        idle[-1].restart(scene)
-        return idle.pop()
-
-    def close(self) -> None:
-        for idle in self._idle.values():
-            for dynamics in idle:
-                Dynamics.close(dynamics)
-
-
-class Lent(Dynamics):
-    """A Dynamics that goes back to its pool when it is closed."""
-
-    def __init__(self, scene: Scene, device: Device, idle: list[Dynamics]) -> None:
-        super().__init__(scene, device)
-        self._idle = idle
-
-    def close(self) -> None:
-        self._idle.append(self)
-
-
-@pytest.fixture(scope="module")
-def pool(device: Device) -> Iterator[Pool]:
-    pool = Pool()
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(accuracy, "Dynamics", pool.lend)
-        patch.setattr(simulation, "Dynamics", pool.lend)
-        yield pool
-    pool.close()
 
 
 def hard(name: str) -> Scene:

@@ -44,8 +44,8 @@ class Effort:
     def __init__(self, quick: bool) -> None:
         self.quick = quick
         self.longest_run = 0.25 if quick else 2.0
-        self.peer = 15.0 if quick else 30.0
-        self.peer_rtols = (1e-4,) if quick else (1e-2, 1e-4, 1e-6, 1e-8)
+        self.peer = 10.0 if quick else 15.0
+        self.peer_rtols = (1e-4,) if quick else (1e-3, 1e-5, 1e-7)
         self.sample = 0.02 if quick else 0.1
 
 
