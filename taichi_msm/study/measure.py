@@ -6,6 +6,7 @@ import os
 import platform
 import time
 from collections.abc import Callable
+from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -16,6 +17,7 @@ from taichi_msm.lattice import rest_positions
 from taichi_msm.runner import versions
 from taichi_msm.runtime import Device
 from taichi_msm.scene import Scene
+from taichi_msm.stability import with_time
 from taichi_msm.study.peer import TooSlowError, solve
 from taichi_msm.study.pictures import PictureStudy
 from taichi_msm.study.result import Peer, Study, Timing
@@ -31,22 +33,27 @@ TRAJECTORIES = 6
 Progress = Callable[[str, int, int], None]
 
 
+@dataclass(frozen=True)
 class Effort:
     """How long the parts of a study may take.
 
     Attributes:
+        quick: whether to vary the settings of drawing one at a time.
         longest_run: of stepping through the whole scene once [s].
         peer: of SciPy, for each of its tolerances [s].
         peer_rtols: these tolerances.
         sample: of one measurement of a step [s].
     """
 
-    def __init__(self, quick: bool) -> None:
-        self.quick = quick
-        self.longest_run = 0.25 if quick else 2.0
-        self.peer = 10.0 if quick else 15.0
-        self.peer_rtols = (1e-4,) if quick else (1e-3, 1e-5, 1e-7)
-        self.sample = 0.02 if quick else 0.1
+    quick: bool
+    longest_run: float
+    peer: float
+    peer_rtols: tuple[float, ...]
+    sample: float
+
+
+QUICK = Effort(True, longest_run=0.25, peer=10.0, peer_rtols=(1e-4,), sample=0.02)
+FULL = Effort(False, longest_run=2.0, peer=15.0, peer_rtols=(1e-3, 1e-5, 1e-7), sample=0.1)
 
 
 def study(
@@ -85,9 +92,9 @@ def study(
         tolerance=tolerance or scene.time.tolerance or TOLERANCE,
         machine=machine(device),
     )
-    effort = Effort(quick)
+    effort = QUICK if quick else FULL
     # The step is what is studied.
-    scene = scene.model_copy(update={"time": scene.time.model_copy(update={"tolerance": None})})
+    scene = with_time(scene, tolerance=None)
     try:
         with SteppingStudy(scene, device, effort.longest_run, partial(progress, "stepping")) as stepping:
             try:
