@@ -22,6 +22,7 @@ from numpy.typing import NDArray
 
 from taichi_msm.dynamics import Dynamics
 from taichi_msm.errors import SceneError
+from taichi_msm.lattice import rest_positions
 from taichi_msm.loads import meets_jumps, shortest_event, steps_to_meet_jumps
 from taichi_msm.runtime import Device
 from taichi_msm.scene import LARGEST_TOLERANCE, Scene
@@ -48,7 +49,7 @@ class Estimate:
         steps_per_frame: the step, as a fraction of a frame.
         error: largest error, as a fraction of the largest displacement; infinite where it is not known, because a
             pilot diverged or the step does not resolve what happens.
-        rounding: the part of it that comes from f32; 0 for f64.
+        rounding: the part of it that comes from f32, that of the positions in the trajectory included; 0 for f64.
         order: of the method in this scene and at this step.
     """
 
@@ -148,7 +149,8 @@ class Pilots:
             self._coarse.advance(steps)
             if self._own is not self._coarse:
                 self._own.advance(steps)
-            fine, coarse, own = (one.displacement() for one in (self._fine, self._coarse, self._own))
+            fine, coarse = self._fine.displacement(), self._coarse.displacement()
+            own = coarse if self._own is self._coarse else self._as_written(self._own.displacement())
             with np.errstate(all="ignore"):
                 exact = fine + (fine - coarse) / (finer**p - 1)
                 error = max(error, longest(own - exact))
@@ -156,6 +158,13 @@ class Pilots:
                 largest = max(largest, longest(exact))
         scale = 1 / largest if largest > 0 else 0.0
         return Estimate(steps, error * scale if error * scale < math.inf else math.inf, rounding * scale, p)
+
+    def _as_written(self, displacement: NDArray[np.float32]) -> NDArray[Any]:
+        """Round as the trajectory does, whose positions in f32 have the digits of the sheet's size."""
+        if "trajectory" not in self._scene.output:
+            return displacement
+        rest = rest_positions(self._scene.sheet)
+        return (rest + displacement).astype(np.float32) - rest
 
     def close(self) -> None:
         """Free the fields."""
@@ -209,9 +218,13 @@ def _search(tolerance: float, least: int, meeting: int, pilots: Pilots, progress
 
 def _next(found: Estimate, tolerance: float, meeting: int) -> int:
     """Guess the steps a frame that are just enough, from an error that falls as the step to the power of its order."""
-    target = (1 + CLOSE) / 2 * tolerance - found.rounding
-    too_large = (found.error - found.rounding) / target if found.error < math.inf else math.inf
-    cut = min(too_large ** (1 / found.order), LARGEST_CUT)
+    if found.error == math.inf:
+        cut = LARGEST_CUT
+    else:
+        # What the step may make of it, beside rounding, and what it does.
+        allowed = max((1 + CLOSE) / 2 * tolerance - found.rounding, tolerance / 16)
+        made = max(found.error - found.rounding, 0.0)
+        cut = min((made / allowed) ** (1 / found.order), LARGEST_CUT)
     steps = max(1, math.ceil(found.steps_per_frame * cut))
     # A step at every jump makes the method one of order 2; where that costs little it is worth it.
     return math.ceil(steps / meeting) * meeting if 0 < meeting <= steps else steps

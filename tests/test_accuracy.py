@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from contextlib import suppress
 from typing import Any
 
 import numpy as np
@@ -201,3 +202,20 @@ def test_a_scene_that_is_all_right_has_no_notes() -> None:
         "error about 0.001 of the largest displacement, by pilot runs"
     )
     assert len(list(notes(scene(), 0.0, 0.49, None))) == 2
+
+
+def test_positions_written_in_f32_have_the_digits_of_the_sheet(pool: Pool, device: Device) -> None:
+    # Points move by some 4 um on a sheet of 0.4 m, whose positions f32 rounds by up to 2^-27 m: half a unit at 0.2 m.
+    faint = {"probes": [{**SOFT_PRESS, "force": [0, 0, -0.5]}], "time": {"precision": "f32"}}
+    written = scene(**faint, output=["trajectory"])
+    estimate = estimate_error(written, device)
+    twin = frames(with_time(written, precision="f64"), pool, device)
+    assert 0.3 * 2**-27 < estimate.rounding * longest(twin) < 3**0.5 * 2**-27
+    assert estimate_error(scene(**faint), device).rounding < 1e-5
+    with pytest.raises(SceneError, match="out of reach of f32"):
+        choose_step(with_time(written, tolerance=estimate.rounding / 2), device)
+    # Where rounding alone nearly takes up the tolerance, a step is found or the reason told.
+    for share in (1.0, 1.1, 1.3):
+        with suppress(SceneError):
+            found = choose_step(with_time(written, tolerance=share * estimate.rounding), device)[1]
+            assert found.error <= share * estimate.rounding
