@@ -50,12 +50,14 @@ class Estimate:
         error: largest error, as a fraction of the largest displacement; infinite where it is not known, because a
             pilot diverged or the step does not resolve what happens.
         rounding: the part of it that comes from f32, that of the positions in the trajectory included; 0 for f64.
+        in_f64: the error of the same step in f64.
         order: of the method in this scene and at this step.
     """
 
     steps_per_frame: int
     error: float
     rounding: float
+    in_f64: float
     order: int
 
 
@@ -136,13 +138,13 @@ class Pilots:
         scene = with_steps(self._scene, steps)
         finer = refinement(scene)
         if finer > FINEST or shortest_event(scene) < 2 * step(scene):
-            return Estimate(steps, math.inf, 0.0, order(scene))
+            return Estimate(steps, math.inf, 0.0, math.inf, order(scene))
         self._fine.restart(with_steps(self._exact, finer * steps))
         self._coarse.restart(with_steps(self._exact, steps))
         if self._own is not self._coarse:
             self._own.restart(scene)
         p, frames = order(scene), scene.time.frames
-        error = rounding = largest = 0.0
+        error = rounding = in_f64 = largest = 0.0
         for frame in range(frames):
             progress(frame, frames)
             self._fine.advance(finer * steps)
@@ -155,9 +157,15 @@ class Pilots:
                 exact = fine + (fine - coarse) / (finer**p - 1)
                 error = max(error, longest(own - exact))
                 rounding = max(rounding, longest(own - coarse))
+                in_f64 = max(in_f64, longest(coarse - exact))
                 largest = max(largest, longest(exact))
-        scale = 1 / largest if largest > 0 else 0.0
-        return Estimate(steps, error * scale if error * scale < math.inf else math.inf, rounding * scale, p)
+
+        def share(part: float) -> float:
+            # Nothing moves, nothing is wrong; and what is not finite is not known.
+            relative = part / largest if largest > 0 else 0.0
+            return relative if relative < math.inf else math.inf
+
+        return Estimate(steps, share(error), share(rounding), share(in_f64), p)
 
     def _as_written(self, displacement: NDArray[np.float32]) -> NDArray[Any]:
         """Round as the trajectory does, whose positions in f32 have the digits of the sheet's size."""
@@ -226,8 +234,12 @@ def _next(found: Estimate, tolerance: float, meeting: int) -> int:
         made = max(found.error - found.rounding, 0.0)
         cut = min((made / allowed) ** (1 / found.order), LARGEST_CUT)
     steps = max(1, math.ceil(found.steps_per_frame * cut))
-    # A step at every jump makes the method one of order 2; where that costs little it is worth it.
-    return math.ceil(steps / meeting) * meeting if 0 < meeting <= steps else steps
+    if meeting == 0:
+        return steps
+    if found.order == 1:
+        # With a step at every jump the method is one of order 2, and the coarsest such step may do.
+        return min(steps, math.ceil((found.steps_per_frame + 1) / meeting) * meeting)
+    return math.ceil(steps / meeting) * meeting
 
 
 def _stuck(failures: list[Estimate]) -> bool:

@@ -87,7 +87,7 @@ def run(
                 arch=arch,
                 threads=threads,
                 overrides=recorded,
-                error_wanted=estimate_error,
+                estimate_error=estimate_error,
                 started=STARTED,
                 progress=interruptible(bar),
             )
@@ -160,11 +160,11 @@ def schema() -> int:
 @threads_option
 @click.option(
     "--tolerance",
-    type=click.FloatRange(min=0, min_open=True),
+    type=float,
     metavar="ERROR",
     help="Largest error, as a fraction of the largest displacement.  [default: the scene's, or 1e-3]",
 )
-@click.option("--quick", is_flag=True, help="Half a minute instead of minutes: fewer and shorter measurements.")
+@click.option("--quick", is_flag=True, help="A minute instead of several: fewer and shorter measurements.")
 @json_option
 def study(
     scene: str,
@@ -178,16 +178,20 @@ def study(
     as_json: bool,
 ) -> int:
     """Measure how fast and how wrong every setting of SCENE is, and recommend one."""
+    from taichi_msm.scene import LARGEST_TOLERANCE, SMALLEST_TOLERANCE
     from taichi_msm.scene_file import load_scene
 
     loaded = load_scene(scene, overrides, image)
     directory = result_directory(out, f"{Path(scene).stem}-study")
+    if tolerance is not None and not SMALLEST_TOLERANCE <= tolerance <= LARGEST_TOLERANCE:
+        expected = f"expected a number, {SMALLEST_TOLERANCE:g} to {LARGEST_TOLERANCE:g}"
+        raise click.BadParameter(f"{tolerance:g} is not allowed; {expected}", param_hint="--tolerance")
 
     from rich.console import Console
 
     from taichi_msm.console import Progress
     from taichi_msm.study.measure import study as measure
-    from taichi_msm.study.report import as_record, require_writable, write_report
+    from taichi_msm.study.report import RECORD, as_record, require_writable, write_report
     from taichi_msm.study.table import print_summary
 
     require_writable(directory)
@@ -204,6 +208,9 @@ def study(
     if not found.stepping:
         complain(["interrupted; nothing was written"])
         return INTERRUPTED
+    if found.status == "interrupted" and (directory / RECORD).exists():
+        # An earlier study is not to be lost for a part of another.
+        directory /= "interrupted"
     outputs = write_report(found, directory)
     if as_json:
         print_json({"directory": str(directory), **as_record(found), "outputs": outputs})

@@ -15,8 +15,8 @@ from typing import Any
 import numpy
 import PIL
 
-from taichi_msm import __version__, runtime
-from taichi_msm.accuracy import Estimate, choose_step, estimate_error
+from taichi_msm import __version__, accuracy, runtime
+from taichi_msm.accuracy import Estimate
 from taichi_msm.errors import DivergedError
 from taichi_msm.files import ResultWriter
 from taichi_msm.notes import notes
@@ -49,7 +49,7 @@ def run(
     arch: str = "cpu",
     threads: int | None = None,
     overrides: Sequence[str] = (),
-    error_wanted: bool = False,
+    estimate_error: bool = False,
     started: float | None = None,
     progress: Progress = lambda stage, done, total: None,
 ) -> dict[str, Any]:
@@ -61,7 +61,7 @@ def run(
         arch: cpu or cuda.
         threads: number of CPU threads; None takes every core.
         overrides: the overrides that made the scene, for the record.
-        error_wanted: whether to estimate the error of the step; a tolerance in the scene does in any case.
+        estimate_error: whether to estimate the error of the step; a tolerance in the scene does in any case.
         started: `time.perf_counter()` when the program began; None: now.
         progress: called with the stage, the frames done and the frames in all; what it raises stops the run there,
             KeyboardInterrupt keeping the frames done.
@@ -83,9 +83,9 @@ def run(
     watch = Stopwatch()
     given, estimate = scene, None
     if scene.time.tolerance is not None:
-        scene, estimate = choose_step(scene, device, partial(progress, "pilot"))
-    elif error_wanted:
-        estimate = estimate_error(scene, device, partial(progress, "pilot"))
+        scene, estimate = accuracy.choose_step(scene, device, partial(progress, "pilot"))
+    elif estimate_error:
+        estimate = accuracy.estimate_error(scene, device, partial(progress, "pilot"))
     watch.lap("pilot")
     progress("compile", 0, frames)
     # In this order, so that the encoder starts up while kernels are compiled.
@@ -147,7 +147,7 @@ def run(
 def error_record(estimate: Estimate) -> dict[str, Any]:
     """Write an estimate down for run.json, where null stands for a pilot run that diverged."""
     known = {key: value if value < math.inf else None for key, value in asdict(estimate).items()}
-    return {key: known[key] for key in ("error", "rounding", "order")}
+    return {key: known[key] for key in ("error", "rounding", "in_f64", "order")}
 
 
 def versions() -> dict[str, str]:

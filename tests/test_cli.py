@@ -124,7 +124,7 @@ def test_a_tolerance_chooses_the_step_and_is_reported(small: Path) -> None:
     assert record["scene"]["time"]["tolerance"] == 1e-4
     assert record["scene"]["time"]["step"] == "auto"
     estimate = record["error_estimate"]
-    assert set(estimate) == {"error", "rounding", "order"}
+    assert set(estimate) == {"error", "rounding", "in_f64", "order"}
     assert 0 < estimate["rounding"] < estimate["error"] <= 1e-4
     assert f"error about {estimate['error']:.2g} of the largest displacement, by pilot runs" in done.stdout
     assert record["timings"]["pilot"] > 0
@@ -206,6 +206,32 @@ def test_a_study_that_could_not_be_written_is_not_begun(small: Path) -> None:
         assert done.returncode == 4
         assert done.stderr.startswith(f"{out}: cannot write: ")
         assert done.stderr.count("\n") == 1
+
+
+def test_a_study_refuses_a_tolerance_that_is_none(small: Path) -> None:
+    for given, said in (
+        ("2", "2 is not allowed; expected a number, 1e-10 to 0.5"),
+        ("abc", "'abc' is not a valid float"),
+    ):
+        done = program("study", "small.yaml", "--tolerance", given)
+        assert done.returncode == 2
+        assert said in done.stderr
+
+
+def test_an_interrupted_study_does_not_replace_an_earlier_one(small: Path) -> None:
+    (small / "here").mkdir()
+    (small / "here" / "study.json").write_text("earlier")
+    process = subprocess.Popen(
+        [sys.executable, "-m", "taichi_msm", "study", "small.yaml", "--out", "here"],
+        stdout=subprocess.DEVNULL,
+        stderr=subprocess.DEVNULL,
+    )
+    time.sleep(12)
+    process.send_signal(signal.SIGINT)
+    assert process.wait(timeout=30) == 130
+    assert (small / "here" / "study.json").read_text() == "earlier"
+    part = small / "here" / "interrupted" / "study.json"
+    assert not part.exists() or json.loads(part.read_text())["status"] == "interrupted"
 
 
 @pytest.mark.parametrize("seconds", [2.0, 8.0])

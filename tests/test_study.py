@@ -83,12 +83,33 @@ def test_observed_orders(stepping: SteppingStudy) -> None:
 
 def test_orders_are_fitted_above_the_rounding_floor() -> None:
     def point(step: float, error: float, rounding: float) -> Stepping:
-        return Stepping("f32", "central", 1, step, error, rounding, True, Timing(1, 1, 1, 5))
+        return Stepping("f32", "central", 1, step, error, rounding, True, True, Timing(1, 1, 1, 5))
 
     points = [point(0.1**n, 0.1 ** (2 * n) + 1e-6, 1e-6) for n in range(5)]
     # The points of 1e-6 and 2e-6 are mostly rounding; the next is, by 1 %.
     assert observed_orders(points) == {"f32 central": pytest.approx(2, abs=0.01)}
     assert observed_orders(points[2:]) == {"f32 central": None}
+
+
+def test_steps_that_miss_a_jump_are_not_fitted_with_those_that_meet_it() -> None:
+    def point(step: float, error: float, meets: bool) -> Stepping:
+        return Stepping("f64", "central", 1, step, error, None, True, meets, Timing(1, 1, 1, 5))
+
+    missing, meeting = (
+        [point(0.1**n, 0.1**n, False) for n in range(3)],
+        [point(0.1**n, 0.01**n, True) for n in range(3)],
+    )
+    assert observed_orders([*missing, *meeting]) == {"f64 central": pytest.approx(2)}
+    assert observed_orders(missing) == {"f64 central": pytest.approx(1)}
+
+
+def test_a_series_meets_the_jumps_after_its_first_step(device: Device) -> None:
+    # A release at 3.25 frames: every fourth step of a frame meets it.
+    made = scene(probes=[{**SOFT_PRESS, "load": [[0, 100], [0.13, 100], [0.13, 0]]}], time={"duration": 0.2})
+    with SteppingStudy(made, device, 0.001, nothing) as measured:
+        measured.run()
+        counts = [point.steps_per_frame for point in measured.points() if point.method == "f64 central"]
+    assert counts == [9, 12, 24]
 
 
 def test_dop853_solves_moving_and_jumping_probes() -> None:
@@ -173,7 +194,12 @@ def test_a_quick_study_of_pictures_varies_one_at_a_time(device: Device) -> None:
 def stepping_point(error: float | None, seconds: float, **changes: Any) -> Stepping:
     values: dict[str, Any] = {"precision": "f32", "damping_difference": "central", "steps_per_frame": 40, "step": 0.001}
     return Stepping(
-        **values | changes, error=error, rounding=0.0, known=True, seconds=Timing(seconds, seconds, seconds, 5)
+        **values | changes,
+        error=error,
+        rounding=0.0,
+        known=True,
+        meets_jumps=True,
+        seconds=Timing(seconds, seconds, seconds, 5),
     )
 
 
@@ -190,9 +216,11 @@ def test_the_recommendation_is_the_cheapest_within_the_tolerance() -> None:
         stepping_point(5e-4, 2.0, step=0.0005),
         stepping_point(None, 0.5),
     ]
+    made.settings["time"]["tolerance"] = 1e-4
     made.drawing = [drawn(0, 40.0, 1.0), drawn(1, 49.95, 2.0), drawn(2, 50.0, 3.0), drawn(1, 60.0, 0.1, supersample=2)]
     assert made.recommendation() == [
         "time:",
+        "  tolerance: null",
         "  step: 0.0005",
         "  damping_difference: central",
         "  precision: f32",

@@ -47,7 +47,7 @@ def spread(median: float, runs: int = 5) -> Timing:
 
 def series(precision: str, difference: str) -> list[Stepping]:
     """Points of order 2 or 1, the coarsest of which diverged."""
-    points = [Stepping(precision, difference, 10, 0.004, None, None, False, spread(0.02))]
+    points = [Stepping(precision, difference, 10, 0.004, None, None, False, True, spread(0.02))]
     for halving in range(6):
         exact = 9e-4 / 4**halving if difference == "central" else 2.7e-3 / 2**halving
         rounding = FLOOR if precision == "f32" else None
@@ -56,7 +56,15 @@ def series(precision: str, difference: str) -> list[Stepping]:
         known = error > 2e-6
         points.append(
             Stepping(
-                precision, difference, 20 * 2**halving, 0.002 / 2**halving, error, rounding, known, spread(seconds)
+                precision,
+                difference,
+                20 * 2**halving,
+                0.002 / 2**halving,
+                error,
+                rounding,
+                known,
+                True,
+                spread(seconds),
             )
         )
     return points

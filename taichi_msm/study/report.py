@@ -35,6 +35,7 @@ COLUMNS = (
     "error",
     "rounding",
     "known",
+    "meets_jumps",
     "psnr",
     "largest_error",
     "seconds_median",

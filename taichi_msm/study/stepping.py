@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from taichi_msm.accuracy import longest
 from taichi_msm.dynamics import Dynamics
-from taichi_msm.loads import steps_to_meet_jumps
+from taichi_msm.loads import meets_jumps, steps_to_meet_jumps
 from taichi_msm.runtime import Device
 from taichi_msm.scene import Scene
 from taichi_msm.stability import stable_step, step, with_steps, with_time
@@ -30,8 +30,11 @@ ROUNDS = 5
 # An error is known when the reference is so many times more exact.
 MARGIN = 20
 
-# The runs of a series, whatever they cost, and how often the finest one may be halved for the reference.
+# The steps of a series below the largest stable one, whatever they cost.
 LEAST_HALVINGS = 2
+
+# Steps that meet every jump are not looked for where they are finer than the largest stable one by more than this.
+COARSEST = 16
 
 Frames = NDArray[Any]
 Progress = Callable[[int, int], None]
@@ -128,11 +131,16 @@ class SteppingStudy:
         steps = max(1, math.ceil(1 / self.scene.time.frames_per_second / limit * (1 - 1e-12)))
         samples: list[float] = []
         self._run("f64", difference, steps, samples)
-        seconds = samples[0]
+        # After the first they meet every jump, if that is possible: else the method would be of order 1.
+        meeting = steps_to_meet_jumps(self.scene)
+        misses = meeting > 1 and steps % meeting > 0 and meeting <= COARSEST * steps
+        finer = math.ceil(steps / meeting) * meeting if misses else 2 * steps
+        affordable = samples[0] * finer / steps
+        yield steps
         for halving in range(64):
-            if halving > LEAST_HALVINGS and seconds * 2**halving > self._longest_run:
+            if halving >= LEAST_HALVINGS and affordable * 2**halving > self._longest_run:
                 return
-            yield steps * 2**halving
+            yield finer * 2**halving
 
     def _make_reference(self, finest: int) -> None:
         """Extrapolate central differences from steps well below the finest that is measured.
@@ -196,6 +204,7 @@ class SteppingStudy:
             error=trial.error if finite else None,
             rounding=trial.rounding if finite else None,
             known=finite and self.known(trial.error),
+            meets_jumps=meets_jumps(made),
             seconds=Timing.of(trial.samples),
         )
 
@@ -203,11 +212,17 @@ class SteppingStudy:
 def observed_orders(points: list[Stepping]) -> dict[str, float | None]:
     """Fit the order of every method over the points where the step, and not rounding, makes the error."""
     orders: dict[str, float | None] = {}
+    # Steps that miss a jump make a method of another order, and count only where none meets it.
+    meets = any(point.meets_jumps for point in points)
     for method in dict.fromkeys(point.method for point in points):
         fit = [
             (math.log(point.step), math.log(point.error))
             for point in points
-            if point.method == method and point.error and point.known and (point.rounding or 0) < point.error / 10
+            if point.method == method
+            and point.error
+            and point.known
+            and point.meets_jumps == meets
+            and (point.rounding or 0) < point.error / 10
         ]
         steps, errors = np.array(fit).reshape(-1, 2).T
         orders[method] = float(np.polyfit(steps, errors, 1)[0]) if len(fit) > 2 else None
