@@ -129,6 +129,16 @@ def test_dop853_solves_moving_and_jumping_probes() -> None:
     assert evaluations > 100
 
 
+def test_a_timing_is_a_median_with_its_spread() -> None:
+    assert Timing.of([3.0, 1.0, 9.0, 2.0, 4.0]) == Timing(3.0, 1.0, 9.0, 5)
+
+
+def test_an_error_near_that_of_the_reference_is_not_known(stepping: SteppingStudy) -> None:
+    assert stepping.reference is not None
+    assert stepping.known(21 * stepping.reference.error)
+    assert not stepping.known(19 * stepping.reference.error)
+
+
 def test_dop853_gives_up_in_time() -> None:
     with pytest.raises(TooSlowError):
         solve(scene(), 1e-3, 1e-6, 0.0, lambda: None)
