@@ -14,6 +14,7 @@ import math
 from collections.abc import Callable
 from contextlib import ExitStack
 from dataclasses import dataclass
+from itertools import pairwise
 from types import TracebackType
 from typing import Any
 
@@ -23,7 +24,7 @@ from numpy.typing import NDArray
 from taichi_msm.dynamics import Dynamics
 from taichi_msm.errors import SceneError
 from taichi_msm.lattice import rest_positions
-from taichi_msm.loads import meets_jumps, shortest_event, steps_to_meet_jumps
+from taichi_msm.loads import farthest_displacement, meets_jumps, shortest_event, steps_to_meet_jumps
 from taichi_msm.runtime import Device
 from taichi_msm.scene import LARGEST_TOLERANCE, Scene
 from taichi_msm.stability import step, steps_per_frame, with_steps, with_time
@@ -34,6 +35,9 @@ CLOSE = 0.75
 # The pilot runs of one search, and how much finer each may be than the one before.
 MOST_PILOTS = 12
 LARGEST_CUT = 8.0
+
+# How much finer the other pilot is where a jump is missed.
+MISSING = 16
 
 # How much finer the other pilot may be; where it must be finer yet, the error is not known.
 FINEST = 64
@@ -100,12 +104,14 @@ def choose_step(scene: Scene, device: Device, progress: Progress = lambda done, 
 
 
 def refinement(scene: Scene) -> int:
-    """Tell how much finer the other pilot must be: twice, or until its steps resolve the damping, g h / r <= 1.
+    """Tell how much finer the other pilot must be: twice, where steps meet every jump and resolve the damping.
 
-    Where they do not, central differences make velocities change their sign at every step, in both pilots alike.
+    A missed jump is moved by up to half a step, in both pilots: those of a press and its release may be moved so that
+    the difference of h and h / 2 hides both, but hardly that of h and h / 16. And where g h / r > 1, central
+    differences make velocities change their sign at every step, in both pilots alike.
     """
     g = scene.damping / scene.sheet.mass
-    return max(2, math.ceil(g * step(scene)))
+    return max(2 if meets_jumps(scene) else MISSING, math.ceil(g * step(scene)))
 
 
 class Pilots:
@@ -144,6 +150,7 @@ class Pilots:
         if self._own is not self._coarse:
             self._own.restart(scene)
         p, frames = order(scene), scene.time.frames
+        farthest = farthest_displacement(scene, scene.time.duration)
         error = rounding = in_f64 = largest = 0.0
         for frame in range(frames):
             progress(frame, frames)
@@ -163,7 +170,7 @@ class Pilots:
         def share(part: float) -> float:
             # Nothing moves, nothing is wrong; and what is not finite is not known.
             relative = part / largest if largest > 0 else 0.0
-            return relative if relative < math.inf else math.inf
+            return relative if relative < math.inf and largest <= farthest else math.inf
 
         return Estimate(steps, share(error), share(rounding), share(in_f64), p)
 
@@ -243,12 +250,12 @@ def _next(found: Estimate, tolerance: float, meeting: int) -> int:
 
 
 def _stuck(failures: list[Estimate]) -> bool:
-    """Tell whether twice in a row much smaller steps hardly helped."""
-    if len(failures) < 3:
+    """Tell whether three times in a row much smaller steps hardly helped."""
+    if len(failures) < 4:
         return False
     return all(
         after.error >= before.error / math.sqrt(after.steps_per_frame / before.steps_per_frame)
-        for before, after in zip(failures[-3:-1], failures[-2:], strict=True)
+        for before, after in pairwise(failures[-4:])
     )
 
 

@@ -22,6 +22,9 @@ from taichi_msm.stability import steps_per_frame
 # meet binary step times.
 SNAP = 1e-13
 
+# Farther from rest than this many sheet sizes is no deformation any more; a sheet that nothing holds may fly besides.
+MOST_SHEET_SIZES = 10.0
+
 # Jumps that only so fine steps meet are met by none.
 MOST_CUTS = 1000
 
@@ -116,6 +119,11 @@ def free_acceleration(scene: Scene) -> float:
         for probe in scene.probes
     )
     return sum(forces) / scene.sheet.mass
+
+
+def farthest_displacement(scene: Scene, time: float) -> float:
+    """Bound how far a point may be from rest after some time [m]; farther, the simulation has gone wrong."""
+    return MOST_SHEET_SIZES * max(scene.sheet.size) + free_acceleration(scene) * time**2 / 2
 
 
 def _between(times: Array, values: Array, t: Array, after: NDArray[np.intp], before: float | Array) -> Array:

@@ -14,16 +14,13 @@ from taichi_msm.camera import View
 from taichi_msm.dynamics import Dynamics
 from taichi_msm.errors import DivergedError, MsmError
 from taichi_msm.lattice import axes, shortest_spring
-from taichi_msm.loads import free_acceleration
+from taichi_msm.loads import farthest_displacement
 from taichi_msm.scene import Scene
 from taichi_msm.stability import stable_step, step, steps_per_frame
 from taichi_msm.texture import load_texture
 
 if TYPE_CHECKING:
     from taichi_msm.drawing import Drawing
-
-# Farther from rest than this many sheet sizes is no deformation any more; a sheet that nothing holds may fly besides.
-MOST_SHEET_SIZES = 10.0
 
 
 class Simulation:
@@ -61,7 +58,6 @@ class Simulation:
         self.max_displacement = 0.0
         self.shortest_spring = 1.0
         self._closed = False
-        self._free_acceleration = free_acceleration(scene)
         self._dynamics = Dynamics(scene, self.device)
         self._position = self._read()
         self._texture = texture
@@ -174,7 +170,7 @@ class Simulation:
         size = max(self.scene.sheet.size)
         # Written so that NaN is found as well: argmax points at it, and it is not below anything.
         time = self.steps * step(self.scene)
-        if not largest <= MOST_SHEET_SIZES * size + self._free_acceleration * time**2 / 2:
+        if not largest <= farthest_displacement(self.scene, time):
             raise DivergedError(
                 f"diverged before {time:g} s, step {self.steps}: point ({i}, {j}) is {largest:g} m from its rest "
                 f"position, and the sheet is {size:g} m long; the step is {step(self.scene):g} s of at most "

@@ -96,7 +96,7 @@ def test_an_estimate_is_near_the_error(kind: str, difference: str, pool: Pool, d
     misses = kind in ("stiff", "between")
     assert error / 1.5 < estimate.error < (3 if misses else 1.5) * error
     if not misses and difference == "central":
-        # The next power of h: (w h)^2 / 24 of the error at most, with w h <= 1, and twice that for the kinks of the load.
+        # The next power of h is (w h)^2 / 24 of the error at most, w h <= 1; and twice that for the kinks of the load.
         assert estimate.error == pytest.approx(error, rel=1 / 12)
 
 
@@ -252,3 +252,22 @@ def test_the_error_in_f64_is_that_of_the_step(device: Device, pool: Pool) -> Non
     assert f"with time.precision: f64 it is about {double.error:.2g}" in said
     (said,) = notes(made, 1.0, 1.0, double)
     assert "f64" not in said
+
+
+@pytest.mark.parametrize("ends", [(0.0044889, 0.0121111), (0.0067778, 0.0164444), (0.0045111, 0.0160444)])
+def test_a_press_and_release_that_are_missed_alike_do_not_hide_each_other(
+    ends: tuple[float, float], device: Device, pool: Pool
+) -> None:
+    # Both are moved by parts of a step that the difference of h and h / 2 may not show.
+    on, off = ends
+    made = scene(
+        springs={**SPRINGS, "virtual_active": "always"},
+        damping=0.001,
+        probes=[{**SOFT_PRESS, "load": [[on, 0], [on, 100], [off, 100], [off, 0]]}],
+        time={"frames_per_second": 5},
+    )
+    for tolerance in (1e-2, 3e-3):
+        chosen, estimate = choose_step(with_time(made, tolerance=tolerance), device)
+        truth = frames(made, pool, device, cut=200_000)
+        error = longest(frames(chosen, pool, device) - truth) / longest(truth)
+        assert error <= 1.5 * tolerance, estimate

@@ -15,11 +15,11 @@ from numpy.typing import NDArray
 
 from taichi_msm import lattice, reference
 from taichi_msm.accuracy import estimate_error
-from taichi_msm.loads import meets_jumps
+from taichi_msm.loads import MOST_SHEET_SIZES, meets_jumps
 from taichi_msm.runtime import Device
 from taichi_msm.scene import Scene
 from taichi_msm.scene_file import load_scene
-from taichi_msm.simulation import MOST_SHEET_SIZES, Simulation
+from taichi_msm.simulation import Simulation
 from taichi_msm.stability import stable_step, step, steps_per_frame, with_steps
 from tests.pool import Pool
 

@@ -249,6 +249,12 @@ def test_the_step_recommended_is_one_that_a_scene_takes() -> None:
     assert step(scene(time={"step": float(text)})) == 1 / (25 * 77)
 
 
+def test_of_one_method_the_largest_step_is_recommended() -> None:
+    made = Study("press", scene().model_dump(), "complete", 1e-3, {})
+    made.stepping = [stepping_point(5e-4, 1.1, step=0.001), stepping_point(1e-4, 1.0, step=0.0005)]
+    assert made.best_stepping is made.stepping[0]
+
+
 def test_an_interruption_leaves_what_is_done(device: Device) -> None:
     calls = 0
 

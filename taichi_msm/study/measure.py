@@ -53,7 +53,7 @@ class Effort:
 
 
 QUICK = Effort(True, longest_run=0.25, peer=10.0, peer_rtols=(1e-4,), sample=0.02)
-FULL = Effort(False, longest_run=2.0, peer=15.0, peer_rtols=(1e-3, 1e-5, 1e-7), sample=0.1)
+FULL = Effort(False, longest_run=2.0, peer=30.0, peer_rtols=(1e-3, 1e-5, 1e-7), sample=0.1)
 
 
 def study(

@@ -162,9 +162,13 @@ class Study:
 
     @property
     def best_stepping(self) -> Stepping | None:
-        """Find the fastest stepping within the tolerance; None where there is none."""
+        """Find the fastest stepping within the tolerance; None where there is none.
+
+        Of one method it is the largest step, whatever the noise of the clock says.
+        """
         good = [one for one in self.stepping if one.error is not None and one.error <= self.tolerance]
-        return min(good, key=lambda one: one.seconds.median, default=None)
+        largest = {one.method: one for one in sorted(good, key=lambda one: one.step)}
+        return min(largest.values(), key=lambda one: one.seconds.median, default=None)
 
     @property
     def best_drawing(self) -> Drawn | None:
@@ -183,7 +187,8 @@ class Study:
             if self.settings["time"]["tolerance"] is not None:
                 lines.append("  tolerance: null")
             lines += [
-                f"  step: {step.step:.12g}",
+                # All digits: rounded up, the largest stable step would be above the limit.
+                f"  step: {step.step!r}",
                 f"  damping_difference: {step.damping_difference}",
                 f"  precision: {step.precision}",
             ]

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from taichi_msm.accuracy import longest
 from taichi_msm.dynamics import Dynamics
-from taichi_msm.loads import meets_jumps, steps_to_meet_jumps
+from taichi_msm.loads import farthest_displacement, meets_jumps, steps_to_meet_jumps
 from taichi_msm.runtime import Device
 from taichi_msm.scene import Scene
 from taichi_msm.stability import stable_step, step, with_steps, with_time
@@ -150,8 +150,12 @@ class SteppingStudy:
         meeting = max(1, steps_to_meet_jumps(self.scene))
         steps = math.ceil(finest / meeting) * meeting
         coarse, middle, fine = (self._run("f64", "central", steps * 2**halving, []) for halving in range(3))
-        before = middle + (middle - coarse) / 3
-        self.frames = fine + (fine - middle) / 3
+        if meets_jumps(with_steps(self.scene, steps)):
+            before = middle + (middle - coarse) / 3
+            self.frames = fine + (fine - middle) / 3
+        else:
+            # Missed jumps are moved by up to half a step: extrapolation would not help.
+            before, self.frames = coarse, fine
         largest = longest(self.frames)
         error = longest(self.frames - before) / largest if largest > 0 else 0.0
         self.reference = Reference(4 * steps, error, largest)
@@ -168,6 +172,8 @@ class SteppingStudy:
                 trial = _Trial(precision, difference, steps)
                 frames = self._run(precision, difference, steps, trial.samples)
                 trial.error = self.relative(frames)
+                if longest(frames) > farthest_displacement(self.scene, self.scene.time.duration):
+                    trial.error = math.inf
                 self._trials.append(trial)
                 if precision == "f64":
                     exact = frames
