@@ -251,7 +251,7 @@ def main() -> None:
             margin=MARGIN,
             coarse_step=f"{1000 * first['step']:.3g} ms",
             coarse_error=significant(first["error"]),
-            peer=peers(press),
+            peer=peers(studies["grasp"]),
             difference_table=difference_table(press),
             backward_cost=significant(cost_of_backward(press, 5e-4)),
             backward_cost_fine=significant(cost_of_backward(press, 1e-4)),
