@@ -194,8 +194,8 @@ def peers(found: Record) -> str:
     best = min(good, key=lambda one: one["seconds"]["median"])
     ours = points(found, "f64 central")[-1]
     return (
-        f"takes {best['seconds']['median']:.3g} s for an error of {significant(best['error'])}; this program in f64 takes "
-        f"{ours['seconds']['median']:.2g} s for {significant(ours['error'])}"
+        f"takes {best['seconds']['median']:.3g} s for an error of {significant(best['error'])}; this program in f64 "
+        f"takes {ours['seconds']['median']:.2g} s for {significant(ours['error'])}"
     )
 
 
