@@ -63,7 +63,7 @@ def true_error(made: Scene, pool: Pool, device: Device, fine: int) -> float:
     return longest(frames(made, pool, device) - reference) / longest(reference)
 
 
-@pytest.mark.parametrize(("precision", "tolerance"), [("f32", 5e-4), ("f64", 5e-5)])
+@pytest.mark.parametrize(("precision", "tolerance"), [("f32", 5e-4), pytest.param("f64", 5e-5, marks=pytest.mark.slow)])
 @pytest.mark.parametrize("kind", SCENES)
 def test_the_step_chosen_is_right_and_the_largest(
     kind: str, precision: str, tolerance: float, pool: Pool, device: Device
@@ -254,7 +254,7 @@ def test_the_error_in_f64_is_that_of_the_step(device: Device, pool: Pool) -> Non
     assert "f64" not in said
 
 
-@pytest.mark.parametrize("ends", [(0.0044889, 0.0121111), (0.0067778, 0.0164444), (0.0045111, 0.0160444)])
+@pytest.mark.parametrize("ends", [(0.0044889, 0.0121111), pytest.param((0.0067778, 0.0164444), marks=pytest.mark.slow)])
 def test_a_press_and_release_that_are_missed_alike_do_not_hide_each_other(
     ends: tuple[float, float], device: Device, pool: Pool
 ) -> None:

@@ -218,6 +218,7 @@ def test_a_study_refuses_a_tolerance_that_is_none(small: Path) -> None:
         assert said in done.stderr
 
 
+@pytest.mark.slow
 def test_an_interrupted_study_does_not_replace_an_earlier_one(small: Path) -> None:
     (small / "here").mkdir()
     (small / "here" / "study.json").write_text("earlier")
@@ -234,7 +235,7 @@ def test_an_interrupted_study_does_not_replace_an_earlier_one(small: Path) -> No
     assert not part.exists() or json.loads(part.read_text())["status"] == "interrupted"
 
 
-@pytest.mark.parametrize("seconds", [2.0, 8.0])
+@pytest.mark.parametrize("seconds", [2.0, pytest.param(8.0, marks=pytest.mark.slow)])
 def test_ctrl_c_leaves_what_a_study_has_done(seconds: float, small: Path) -> None:
     process = subprocess.Popen(
         [sys.executable, "-m", "taichi_msm", "study", "small.yaml", "--out", "here"],

@@ -130,6 +130,7 @@ def test_only_the_pinch_is_noted(name: str, pool: Pool, device: Device) -> None:
         assert run.max_displacement == pytest.approx(largest, rel=4 * F32)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", SHORT)
 def test_the_kernel_is_like_the_twin(name: str, pool: Pool, device: Device) -> None:
     scene = in_double(hard(name))
@@ -246,6 +247,7 @@ def shadow_energy(scene: Scene, before: Array, after: Array) -> float:
     return kinetic + potential + h**2 / (12 * m) * float((force(middle) ** 2).sum()) - curvature / 24
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", sorted(LONG))
 def test_a_million_steps_keep_the_energy(name: str, pool: Pool, device: Device) -> None:
     scene = hard(name)
