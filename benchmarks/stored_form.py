@@ -33,16 +33,10 @@ Array = NDArray[Any]
 
 def elastic_force(scene: Scene, values: Array, form: str) -> Array:
     """Sum k (L - L0) (Q - P) / L in the precision of the values: positions, or displacements."""
-    rows, cols = scene.sheet.points
     real = values.dtype.type
     force = np.zeros_like(values)
     for spring in springs(scene):
-        here = np.s_[
-            max(0, -spring.down) : rows - max(0, spring.down), max(0, -spring.right) : cols - max(0, spring.right)
-        ]
-        there = np.s_[
-            max(0, spring.down) : rows - max(0, -spring.down), max(0, spring.right) : cols - max(0, -spring.right)
-        ]
+        here, there = spring.ends(scene.sheet.points)
         between = values[there] - values[here]
         if form != "positions":
             between += np.array([*spring.offset, 0], real)

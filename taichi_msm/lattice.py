@@ -12,6 +12,8 @@ from taichi_msm.scene import Scene, Sheet
 
 SIDES = ("top", "bottom", "left", "right")
 
+Window = tuple[slice, slice]
+
 
 class Spring(NamedTuple):
     """One of the springs that leave a point.
@@ -29,6 +31,17 @@ class Spring(NamedTuple):
     offset: tuple[float, float]
     length: float
     stiffness: float
+
+    def ends(self, points: tuple[int, int]) -> tuple[Window, Window]:
+        """Select the points of a sheet (rows, cols) that have this spring, and the neighbours to which it leads."""
+        i, i_q = _ends(self.down, points[0])
+        j, j_q = _ends(self.right, points[1])
+        return (i, j), (i_q, j_q)
+
+
+def _ends(ahead: int, count: int) -> tuple[slice, slice]:
+    """Select, of so many in a row, those with a neighbour so far ahead, and these neighbours."""
+    return slice(max(0, -ahead), count - max(0, ahead)), slice(max(0, ahead), count - max(0, -ahead))
 
 
 def spacing(sheet: Sheet) -> tuple[float, float]:
@@ -102,15 +115,12 @@ def shortest_spring(scene: Scene, displacement: NDArray[Any]) -> float:
     Returns:
         The smallest L / L0 of all springs; 1 where there are none.
     """
-    rows, cols = scene.sheet.points
     smallest = 1.0
     for spring in springs(scene):
         if (spring.down, spring.right) < (0, 0):
             continue
-        left, right = max(0, -spring.right), max(0, spring.right)
-        between = (
-            displacement[spring.down :, right : cols - left] - displacement[: rows - spring.down, left : cols - right]
-        )
+        here, there = spring.ends(scene.sheet.points)
+        between = displacement[there] - displacement[here]
         between[..., 0] += spring.offset[0]
         between[..., 1] += spring.offset[1]
         square = np.einsum("ijk,ijk->ij", between, between).min(initial=math.inf)

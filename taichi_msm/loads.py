@@ -14,7 +14,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from taichi_msm.lattice import axes, fixed_points
+from taichi_msm.lattice import axes
 from taichi_msm.scene import Probe, Scene, Sheet
 from taichi_msm.stability import steps_per_frame
 
@@ -112,7 +112,7 @@ def decay(grip: Grip, scene: Scene) -> Array:
 
 def free_acceleration(scene: Scene) -> float:
     """Bound the acceleration that the probes give a sheet that nothing holds [m/s^2]; 0 if a point is fixed."""
-    if fixed_points(scene.sheet).any():
+    if scene.sheet.fixed not in ("none", ()):
         return 0.0
     forces = (
         math.hypot(*probe.force) * max(abs(percent) for _, percent in probe.load) / 100 * math.exp(-probe.offset)

@@ -30,17 +30,13 @@ def elastic_force(scene: Scene, displacement: Array) -> Array:
     Returns:
         Force [N], shape (rows, cols, 3).
     """
-    rows, cols = scene.sheet.points
     force = np.zeros_like(displacement)
     for spring in springs(scene):
-        i = slice(max(0, -spring.down), rows - max(0, spring.down))
-        j = slice(max(0, -spring.right), cols - max(0, spring.right))
-        i_q = slice(max(0, spring.down), rows - max(0, -spring.down))
-        j_q = slice(max(0, spring.right), cols - max(0, -spring.right))
-        between = displacement[i_q, j_q] - displacement[i, j] + np.array([*spring.offset, 0.0])
+        here, there = spring.ends(scene.sheet.points)
+        between = displacement[there] - displacement[here] + np.array([*spring.offset, 0.0])
         length = np.linalg.norm(between, axis=-1, keepdims=True)
         pull = np.divide(length - spring.length, length, out=np.zeros_like(length), where=length > 0)
-        force[i, j] += spring.stiffness * pull * between
+        force[here] += spring.stiffness * pull * between
     return force
 
 

@@ -143,15 +143,12 @@ def energy(made: Scene, u: NDArray[Any], v: NDArray[Any]) -> float:
     """Kinetic and potential energy [J] at the middle of a step."""
     from taichi_msm.lattice import springs
 
-    rows, cols = made.sheet.points
     total = 0.5 * made.sheet.mass * (v**2).sum() + 0.5 * made.springs.virtual * (u**2).sum()
     x = u + rest_positions(made.sheet)
     for spring in springs(made):
         if (spring.down, spring.right) > (0, 0):
-            left = max(0, -spring.right)
-            p = x[: rows - spring.down, left : cols - max(0, spring.right)]
-            q = x[spring.down :, left + spring.right : cols - max(0, spring.right) + spring.right]
-            stretch = np.linalg.norm(q - p, axis=-1) - spring.length
+            here, there = spring.ends(made.sheet.points)
+            stretch = np.linalg.norm(x[there] - x[here], axis=-1) - spring.length
             total += 0.5 * spring.stiffness * (stretch**2).sum()
     return float(total)
 

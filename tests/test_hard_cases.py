@@ -234,13 +234,11 @@ def shadow_energy(scene: Scene, before: Array, after: Array) -> float:
         return reference.elastic_force(scene, u) * ~lattice.fixed_points(scene.sheet)[..., None]
 
     potential = 0.0
-    rows, cols = scene.sheet.points
     x = middle + lattice.rest_positions(scene.sheet)
     for spring in lattice.springs(scene):
         if spring.down >= 0 and (spring.down, spring.right) != (0, -1):
-            left, right = max(0, -spring.right), max(0, spring.right)
-            between = x[spring.down :, right : cols - left] - x[: rows - spring.down, left : cols - right]
-            stretch = np.linalg.norm(between, axis=-1) - spring.length
+            here, there = spring.ends(scene.sheet.points)
+            stretch = np.linalg.norm(x[there] - x[here], axis=-1) - spring.length
             potential += spring.stiffness / 2 * float((stretch**2).sum())
     curvature = -float(((after - before) * (force(after) - force(before))).sum())
     kinetic = m / 2 * float((v**2).sum())

@@ -42,6 +42,9 @@ def test_springs_lead_to_the_rest_positions_of_the_neighbours() -> None:
         between = rest[4 + spring.down, 4 + spring.right] - rest[4, 4]
         np.testing.assert_allclose(between[:2], spring.offset, atol=1e-15)
         assert spring.length == pytest.approx(np.linalg.norm(between))
+        here, there = spring.ends(made.sheet.points)
+        np.testing.assert_allclose(rest[there] - rest[here] - [*spring.offset, 0], 0, atol=1e-15)
+        assert rest[here].shape == (9 - abs(spring.down), 11 - abs(spring.right), 3), "all that have it"
         assert spring.stiffness == (10 if spring.down and spring.right else 20)
     assert len(springs(made)) == 8
     assert len(springs(scene(springs={"shear": 1}))) == 4
