@@ -1,8 +1,8 @@
-"""How wrong a step is, by pilot runs at h and h / 2, and the largest step that is right enough.
+"""How wrong a step is, by pilot runs at h and h / r, and the largest step that is right enough.
 
 The error of a displacement u_h is taken against Richardson's extrapolation of both pilots, which are in float64:
 
-    u* = u_{h/r} + (u_{h/r} - u_h) / (r^p - 1)        p: order of the method, r = 2
+    u* = u_{h/r} + (u_{h/r} - u_h) / (r^p - 1)        p: order of the method, r: `refinement`, mostly 2
 
 so that it holds the error of the scene's own precision too. An error is the largest of any point at any frame, over the
 largest displacement of any point at any frame.
@@ -12,10 +12,9 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from contextlib import ExitStack
+from contextlib import ExitStack, closing
 from dataclasses import dataclass
 from itertools import pairwise
-from types import TracebackType
 from typing import Any
 
 import numpy as np
@@ -79,7 +78,7 @@ def estimate_error(scene: Scene, device: Device, progress: Progress = lambda don
         device: what `runtime.start` returned.
         progress: called with the frames done and the frames in all.
     """
-    with Pilots(scene, device) as pilots:
+    with closing(Pilots(scene, device)) as pilots:
         return pilots.estimate(steps_per_frame(scene), progress)
 
 
@@ -98,7 +97,7 @@ def choose_step(scene: Scene, device: Device, progress: Progress = lambda done, 
         SceneError: when no step is good enough; says which precision or which tolerance would do.
     """
     assert scene.time.tolerance is not None
-    with Pilots(scene, device) as pilots:
+    with closing(Pilots(scene, device)) as pilots:
         found = _search(scene.time.tolerance, steps_per_frame(scene), steps_to_meet_jumps(scene), pilots, progress)
     return with_steps(scene, found.steps_per_frame), found
 
@@ -115,10 +114,7 @@ def refinement(scene: Scene) -> int:
 
 
 class Pilots:
-    """The runs beside each other, frame by frame: h and h / 2 in float64, and h in the scene's own precision.
-
-    Usable in a with statement, which frees their memory.
-    """
+    """The runs beside each other, frame by frame: h and h / r in float64, and h in the scene's own precision."""
 
     def __init__(self, scene: Scene, device: Device) -> None:
         self._scene = scene
@@ -184,14 +180,6 @@ class Pilots:
     def close(self) -> None:
         """Free the fields."""
         self._open.close()
-
-    def __enter__(self) -> Pilots:
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        self.close()
 
 
 def longest(vectors: NDArray[Any]) -> float:

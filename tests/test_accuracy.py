@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from contextlib import suppress
+from contextlib import closing, suppress
 from typing import Any
 
 import numpy as np
@@ -78,7 +78,7 @@ def test_the_step_chosen_is_right_and_the_largest(
     assert estimate.steps_per_frame == steps_per_frame(chosen) >= steps_per_frame(made)
     if kind != "between" and steps_per_frame(chosen) > steps_per_frame(made):
         # Half as many steps would not have done.
-        with Pilots(chosen, device) as pilots:
+        with closing(Pilots(chosen, device)) as pilots:
             assert pilots.estimate(steps_per_frame(chosen) // 2, lambda done, total: None).error > tolerance
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from contextlib import closing
 from typing import Any
 
 import numpy as np
@@ -31,7 +32,7 @@ def nothing(done: int, total: int) -> None:
 def stepping(device: Device) -> Any:
     """A study of a small scene with a release on a step."""
     made = scene(probes=[SOFT_PRESS], damping=0.02, time={"damping_difference": "backward"})
-    with SteppingStudy(made, device, 0.05, nothing) as measured:
+    with closing(SteppingStudy(made, device, 0.05, nothing)) as measured:
         measured.run()
         yield measured
 
@@ -106,7 +107,7 @@ def test_steps_that_miss_a_jump_are_not_fitted_with_those_that_meet_it() -> None
 def test_a_series_meets_the_jumps_after_its_first_step(device: Device) -> None:
     # A release at 3.25 frames: every fourth step of a frame meets it.
     made = scene(probes=[{**SOFT_PRESS, "load": [[0, 100], [0.13, 100], [0.13, 0]]}], time={"duration": 0.2})
-    with SteppingStudy(made, device, 0.001, nothing) as measured:
+    with closing(SteppingStudy(made, device, 0.001, nothing)) as measured:
         measured.run()
         counts = [point.steps_per_frame for point in measured.points() if point.method == "f64 central"]
     assert counts == [9, 12, 24]
@@ -264,7 +265,7 @@ def test_an_interruption_leaves_what_is_done(device: Device) -> None:
         if calls > 90:
             raise KeyboardInterrupt
 
-    with SteppingStudy(scene(probes=[SOFT_PRESS]), device, 0.01, stop) as measured:
+    with closing(SteppingStudy(scene(probes=[SOFT_PRESS]), device, 0.01, stop)) as measured:
         with pytest.raises(KeyboardInterrupt):
             measured.run()
         assert measured.reference is not None

@@ -6,6 +6,7 @@ import os
 import platform
 import time
 from collections.abc import Callable
+from contextlib import closing
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -72,7 +73,7 @@ def study(
         scene: what `load_scene` returned.
         name: what to call it.
         tolerance: the error that is allowed, as a fraction of the largest displacement; None: the scene's, or 1e-3.
-        quick: whether to spend some ten seconds instead of minutes.
+        quick: whether to measure fewer settings for a shorter time: about a minute for a small sheet.
         arch: cpu or cuda.
         threads: number of CPU threads; None takes every core.
         progress: called with the stage, the work done and all of it; where it raises KeyboardInterrupt, what is done
@@ -96,7 +97,7 @@ def study(
     # The step is what is studied.
     scene = with_time(scene, tolerance=None)
     try:
-        with SteppingStudy(scene, device, effort.longest_run, partial(progress, "stepping")) as stepping:
+        with closing(SteppingStudy(scene, device, effort.longest_run, partial(progress, "stepping"))) as stepping:
             try:
                 stepping.run()
             finally:

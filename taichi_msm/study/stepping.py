@@ -7,7 +7,6 @@ import time
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack
 from dataclasses import dataclass, field
-from types import TracebackType
 from typing import Any
 
 import numpy as np
@@ -53,7 +52,7 @@ class _Trial:
 
 
 class SteppingStudy:
-    """Measures the stepping of one scene. Usable in a with statement, which frees its memory.
+    """Measures the stepping of one scene.
 
     Args:
         scene: a checked scene.
@@ -76,8 +75,9 @@ class SteppingStudy:
         self._done = 0
         self._to_do = 1
         with ExitStack() as opened:
-            self._dynamics = {p: Dynamics(with_time(scene, precision=p), device) for p in PRECISIONS}
-            for dynamics in self._dynamics.values():
+            self._dynamics: dict[str, Dynamics] = {}
+            for precision in PRECISIONS:
+                dynamics = self._dynamics[precision] = Dynamics(with_time(scene, precision=precision), device)
                 opened.callback(dynamics.close)
             self._open = opened.pop_all()
 
@@ -116,14 +116,6 @@ class SteppingStudy:
     def close(self) -> None:
         """Free the fields."""
         self._open.close()
-
-    def __enter__(self) -> SteppingStudy:
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        self.close()
 
     def _series(self, difference: str) -> Iterator[int]:
         """Count the steps a frame, from the largest stable step down by halvings to what may be afforded."""
