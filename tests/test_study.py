@@ -195,6 +195,12 @@ def test_pictures_are_judged_by_a_finer_one(device: Device, monkeypatch: pytest.
     assert psnr[0, 1] == pytest.approx(10 * np.log10(255**2 / (apart**2).mean()), abs=0.1)
 
 
+def test_psnr_is_of_values_to_255() -> None:
+    black = np.zeros((4, 5, 3), np.uint8)
+    assert pictures.psnr(black + np.uint8(51), black) == pytest.approx(20 * np.log10(5), abs=1e-12)
+    assert pictures.psnr(black, black) is None
+
+
 def test_a_quick_study_of_pictures_varies_one_at_a_time(device: Device) -> None:
     made = scene(render={"size": [6, 4], "refine": 2, "supersample": 3})
     measured = PictureStudy(made, rest_positions(made.sheet), speckle(3, 3), True, nothing)

@@ -116,15 +116,19 @@ class PictureStudy:
 
     def _point(self, trial: _Trial) -> Drawn:
         assert self._truth is not None
-        difference = trial.picture.astype(np.int16) - self._truth
-        square = float(np.mean(difference.astype(np.float64) ** 2))
         return Drawn(
             refine=trial.refine,
             supersample=trial.supersample,
-            psnr=10 * math.log10(255**2 / square) if square > 0 else None,
-            largest_error=int(np.abs(difference).max()),
+            psnr=psnr(trial.picture, self._truth),
+            largest_error=int(np.abs(trial.picture.astype(np.int16) - self._truth).max()),
             seconds=Timing.of(trial.samples),
         )
+
+
+def psnr(picture: Picture, truth: Picture) -> float | None:
+    """Give the peak signal-to-noise ratio [dB], 10 log10(255^2 / mean square error); None where they are the same."""
+    square = float(np.mean((picture.astype(np.float64) - truth) ** 2))
+    return 10 * math.log10(255**2 / square) if square > 0 else None
 
 
 def _with_render(scene: Scene, **changes: int) -> Scene:
