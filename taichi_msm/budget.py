@@ -15,13 +15,9 @@ from taichi_msm.scene import Scene
 
 MAX_STEPS = 10**12
 
-# A triangle's number shares 64 bits with its depth, and the highest number means none.
-MAX_TRIANGLES = 2**32 - 2
-
 # Bytes of the parts of a drawing.
-VERTEX_BYTES = 28  # position and shade of one vertex of the refined surface
-POINT_BYTES = 40  # a mass point on its way to the surface
-SAMPLE_BYTES = 8  # depth and triangle of one sample of the picture
+POINT_BYTES = 36  # a mass point, as it is seen, and its normal
+SAMPLE_BYTES = 12  # depth and colour of one sample of the picture
 PIXEL_BYTES = 3 * 12  # colours of one pixel, from sums to bytes
 TEXEL_BYTES = 4
 
@@ -39,8 +35,7 @@ class Budget:
         steps: time steps in all.
         frames: frames in all, the one at rest included.
         simulation_bytes: memory for the state of the sheet and its output.
-        surface_bytes: memory for the refined surface; 0 where nothing is drawn.
-        picture_bytes: memory for a frame and the texture; 0 where nothing is drawn.
+        drawing_bytes: memory for a frame and the texture; 0 where nothing is drawn.
         disk_bytes: size of the files, about.
     """
 
@@ -48,14 +43,8 @@ class Budget:
     steps: int
     frames: int
     simulation_bytes: int
-    surface_bytes: int
-    picture_bytes: int
+    drawing_bytes: int
     disk_bytes: int
-
-    @property
-    def drawing_bytes(self) -> int:
-        """Memory for drawing."""
-        return self.surface_bytes + self.picture_bytes
 
     @property
     def memory_bytes(self) -> int:
@@ -75,8 +64,7 @@ def estimate(scene: Scene) -> Budget:
         steps=scene.time.frames * stability.steps_per_frame(scene),
         frames=scene.time.frames + 1,
         simulation_bytes=points * sheets * numbers,
-        surface_bytes=_surface_bytes(scene) if scene.draws else 0,
-        picture_bytes=_picture_bytes(scene) if scene.draws else 0,
+        drawing_bytes=_drawing_bytes(scene) if scene.draws else 0,
         disk_bytes=_disk_bytes(scene),
     )
 
@@ -96,32 +84,19 @@ def available_memory() -> int:
 def problems(scene: Scene) -> Iterator[Problem]:
     """Say what makes the scene too large, with the numbers and the key to change."""
     yield from _step_problems(scene)
-    too_fine = list(_triangle_problems(scene))
-    yield from too_fine or _memory_problems(scene)
+    yield from _memory_problems(scene)
 
 
 def _number_bytes(scene: Scene) -> int:
     return 4 if scene.time.precision == "f32" else 8
 
 
-def _refined(scene: Scene) -> tuple[int, int]:
-    """Count the cells of the refined surface, down and across."""
+def _drawing_bytes(scene: Scene) -> int:
     rows, cols = scene.sheet.points
-    n = scene.render.refine
-    return (rows - 1) * (n + 1), (cols - 1) * (n + 1)
-
-
-def _surface_bytes(scene: Scene) -> int:
-    rows, cols = scene.sheet.points
-    down, across = _refined(scene)
-    return (down + 1) * (across + 1) * VERTEX_BYTES + rows * cols * POINT_BYTES
-
-
-def _picture_bytes(scene: Scene) -> int:
     width, height = scene.render.size
     texture_width, texture_height = texture.texture_size(scene) or (0, 0)
     frame = width * height * (scene.render.supersample**2 * SAMPLE_BYTES + PIXEL_BYTES)
-    return frame + texture_width * texture_height * TEXEL_BYTES
+    return rows * cols * POINT_BYTES + frame + texture_width * texture_height * TEXEL_BYTES
 
 
 def _disk_bytes(scene: Scene) -> int:
@@ -149,16 +124,6 @@ def _step_problems(scene: Scene) -> Iterator[Problem]:
         yield Problem(("time", "step"), f"{count}, {limit}; take a longer step or a shorter time")
 
 
-def _triangle_problems(scene: Scene) -> Iterator[Problem]:
-    down, across = _refined(scene)
-    if scene.draws and 2 * down * across > MAX_TRIANGLES:
-        yield Problem(
-            ("render", "refine"),
-            f"{scene.render.refine} makes {2 * down * across:.3g} triangles, "
-            f"more than the {MAX_TRIANGLES:.3g} that can be drawn; refine less",
-        )
-
-
 def _memory_problems(scene: Scene) -> Iterator[Problem]:
     budget, available = estimate(scene), available_memory()
     if budget.memory_bytes <= available:
@@ -167,8 +132,7 @@ def _memory_problems(scene: Scene) -> Iterator[Problem]:
     width, height = scene.render.size
     parts: list[tuple[int, Key, str]] = [
         (budget.simulation_bytes, ("sheet", "points"), f"{rows} x {cols} points"),
-        (budget.surface_bytes, ("render", "refine"), f"a surface refined by {scene.render.refine}"),
-        (budget.picture_bytes, ("render", "size"), f"frames of {width} x {height} pixels and their texture"),
+        (budget.drawing_bytes, ("render", "size"), f"frames of {width} x {height} pixels and their texture"),
     ]
     size, key, name = max(parts)
     yield Problem(

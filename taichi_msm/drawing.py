@@ -1,11 +1,17 @@
 """Kernel 2: bilinear refinement, projection, rasterisation of textured triangles, shading.
 
 A point of the surface is carried as (X, Y, w, depth), what the camera's matrix makes of it. That map is linear, so
-refining the projected mass points is refining the surface, and the perspective needs no special case.
+refining the projected mass points is refining the surface, and the perspective needs no special case: within a cell,
+the surface between four mass points, with s to the right and t down,
 
-Coverage is decided in whole numbers: a vertex is snapped to 1/256 px, and a pixel whose centre is on an edge belongs
-to the triangle into which an infinitely small step to the left and then down leads. So every pixel of a tessellated
-surface is drawn exactly once. Depth, texture coordinates and light come from the unsnapped vertices.
+    P(s, t) = A + B s + C t + D s t,    seen at pixel (x, y) where    X - x w = 0,  Y - y w = 0.
+
+No vertex is stored. A pixel inside the outline of a cell solves these two equations, which tells the small quad, its
+side of the diagonal the triangle, and the triangle's own two linear equations the place on it. A cell that is folded or
+reaches behind the camera is drawn triangle by triangle instead.
+
+The picture is cut into bands of rows, each drawn by one thread, and a row into chunks of as many pixels as a vector has
+lanes, on which every operation is one vector instruction; on a GPU of one pixel, and a band is a row.
 """
 
 # No `from __future__ import annotations` here: Taichi reads the annotations of a kernel.
@@ -19,20 +25,20 @@ from numpy.typing import NDArray
 
 from taichi_msm import look
 from taichi_msm.camera import View, view
-from taichi_msm.runtime import FieldTree, ti
+from taichi_msm.runtime import ITERATIONS_PER_THREAD, FieldTree, started, ti
 from taichi_msm.scene import Scene
 
-SUBPIXEL_BITS = 8
-SUBPIXEL = 1 << SUBPIXEL_BITS
+# Pixels of a chunk, and rows of pixels of a band.
+LANES = 8
+BAND_ROWS = 16
 
-# Beyond this many pixels from the corner, or behind the camera, a vertex cannot be snapped.
-SNAP_LIMIT = 1 << 21
-UNSNAPPED = -(1 << 31)
+# Farther than anything that is drawn.
+INFINITY = 3e38
 
-# No triangle, infinitely far away.
-EMPTY = (1 << 64) - 1
+# By so much of a side a triangle that is drawn by itself may be overstepped, so that no gap is left beside it.
+OVERSTEP = 1e-5
 
-vec2i = ti.types.vector(2, ti.i32)
+vec2 = ti.types.vector(2, ti.f32)
 vec3 = ti.types.vector(3, ti.f32)
 vec4 = ti.types.vector(4, ti.f32)
 mat4 = ti.types.matrix(4, 4, ti.f32)
@@ -50,6 +56,8 @@ class Structure:
         texture: width, height of the texture [px].
         lit: whether there is a headlight.
         wireframe: whether the mass-point mesh is drawn.
+        lanes: samples of a chunk.
+        band_rows: rows of pixels of a band.
     """
 
     rows: int
@@ -61,16 +69,24 @@ class Structure:
     texture: tuple[int, int]
     lit: bool
     wireframe: bool
+    lanes: int
+    band_rows: int
 
     @property
-    def vertices(self) -> tuple[int, int]:
-        """Rows and columns of vertices."""
-        return (self.rows - 1) * (self.refine + 1) + 1, (self.cols - 1) * (self.refine + 1) + 1
+    def channel_bits(self) -> int:
+        """Bits of one channel of a sample's colour: where samples are averaged fractions of a grey level count."""
+        return 8 if self.supersample == 1 else 20
+
+    @property
+    def levels(self) -> int:
+        """What grey levels of samples are multiplied by to fill these bits."""
+        return 1 << (self.channel_bits - 8)
 
 
 def structure(scene: Scene, texture: NDArray[np.uint8]) -> Structure:
     """Find out what the scene's picture needs."""
     (rows, cols), (width, height), render = scene.sheet.points, scene.render.size, scene.render
+    on_cpu = started().arch == "cpu"
     return Structure(
         rows=rows,
         cols=cols,
@@ -81,6 +97,8 @@ def structure(scene: Scene, texture: NDArray[np.uint8]) -> Structure:
         texture=(texture.shape[1], texture.shape[0]),
         lit=render.shading == "headlight",
         wireframe=render.wireframe,
+        lanes=LANES if on_cpu else 1,
+        band_rows=BAND_ROWS if on_cpu else 1,
     )
 
 
@@ -98,9 +116,10 @@ class Drawing:
         self._fields = _Fields(self.structure)
         self._draw = _kernel(self.structure, self._fields)
         self._view = view(scene)
-        self._background = ti.Vector(scene.render.background, ti.f32)
+        levels = [level * self.structure.levels for level in scene.render.background]
+        self._background = sum(level << (self.structure.channel_bits * n) for n, level in enumerate(levels))
         packed = texture.astype(np.uint32) @ np.array([1, 1 << 8, 1 << 16], np.uint32)
-        self._fields.texture.from_numpy(packed)
+        self._fields.texture.from_numpy(packed.ravel())
 
     def draw(self, position: NDArray[Any], camera: View | None = None) -> NDArray[np.uint8]:
         """Draw the sheet.
@@ -114,7 +133,7 @@ class Drawing:
         """
         s, camera = self.structure, camera or self._view
         scale = np.array([[s.supersample], [s.supersample], [1], [1]])
-        out = np.empty((s.height, s.width, 3), np.uint8)
+        out = np.empty(s.height * s.width * 3, np.uint8)
         self._draw(
             np.ascontiguousarray(position, np.float32),
             mat4((camera.matrix * scale).tolist()),
@@ -123,7 +142,7 @@ class Drawing:
             self._background,
             out,
         )
-        return out
+        return out.reshape(s.height, s.width, 3)
 
     def close(self) -> None:
         """Free the fields."""
@@ -135,189 +154,312 @@ class _Fields(FieldTree):
 
     def __init__(self, s: Structure) -> None:
         super().__init__()
-        samples = s.height * s.supersample, s.width * s.supersample
+        samples = s.height * s.supersample, -(-s.width * s.supersample // s.lanes)
+        # Of the mass points: (X, Y, w, depth), the place in the picture [samples], the unit normal.
         self.point = self.place(vec4.field(), s.rows, s.cols)
+        self.place_seen = self.place(vec2.field(), s.rows, s.cols)
         self.normal: Any = self.place(vec3.field(), s.rows, s.cols) if s.lit else None
-        self.vertex = self.place(vec4.field(), *s.vertices)
-        self.snapped = self.place(vec2i.field(), *s.vertices)
-        self.light: Any = self.place(ti.field(ti.f32), *s.vertices) if s.lit else None
-        # The nearest triangle of every sample: its depth above, its number below.
-        self.nearest = self.place(ti.field(ti.u64), *samples)
-        self.picture = self.place(ti.types.vector(3, ti.u8).field(), s.height, s.width)
-        self.texture = self.place(ti.field(ti.u32), s.texture[1], s.texture[0])
+        # Of every row of mass points its highest and its lowest place in the picture.
+        self.reach = self.place(vec2.field(), s.rows)
+        # Of every sample the depth of what is seen there, and its colour.
+        self.depth = self.place(ti.Vector.field(s.lanes, ti.f32), *samples)
+        self.colour = self.place(ti.Vector.field(s.lanes, ti.u32 if s.supersample == 1 else ti.u64), *samples)
+        self.texture = self.place(ti.field(ti.u32), s.texture[1] * s.texture[0])
         self.allocate()
-
-
-def rasteriser(fields: _Fields, width: int, height: int, visit: Callable[..., None]) -> Callable[..., None]:
-    """Make the function that finds the pixels of a triangle.
-
-    Args:
-        fields: holds the vertices.
-        width: of the screen [px].
-        height: of the screen [px].
-        visit: Taichi function of x, y, number of the triangle and its three corners; called once for every pixel.
-
-    Returns:
-        Taichi function of the number of a triangle, its three corners (row, column), and the camera's near distance.
-    """
-    vertex, snapped = fields.vertex, fields.snapped
-
-    @ti.func
-    def edge(p, q, x, y):
-        """Twice the signed area of p, q and the sample, less what keeps an edge from being drawn twice."""
-        dx = ti.cast(q[0] - p[0], ti.i64)
-        dy = ti.cast(q[1] - p[1], ti.i64)
-        owned = dy > 0 or (dy == 0 and dx > 0)
-        return dx * (y - p[1]) - dy * (x - p[0]) - ti.cast(not owned, ti.i64)
-
-    @ti.func
-    def snapped_pixels(number, a, b, c, p, q, r):
-        """Visit the pixels of the triangle p, q, r, counter-clockwise in whole numbers."""
-        half = SUBPIXEL // 2
-        low = ti.min(p, ti.min(q, r))
-        high = ti.max(p, ti.max(q, r))
-        for y in range(
-            ti.max((low[1] + half - 1) >> SUBPIXEL_BITS, 0), ti.min((high[1] - half) >> SUBPIXEL_BITS, height - 1) + 1
-        ):
-            for x in range(
-                ti.max((low[0] + half - 1) >> SUBPIXEL_BITS, 0),
-                ti.min((high[0] - half) >> SUBPIXEL_BITS, width - 1) + 1,
-            ):
-                at_x = x * SUBPIXEL + half
-                at_y = y * SUBPIXEL + half
-                if edge(p, q, at_x, at_y) >= 0 and edge(q, r, at_x, at_y) >= 0 and edge(r, p, at_x, at_y) >= 0:
-                    visit(x, y, number, a, b, c)
-
-    @ti.func
-    def crossing_pixels(number, a, b, c, near):
-        """Visit the pixels of a triangle that reaches behind the camera or very far out; edges may be drawn twice."""
-        va, vb, vc = vertex[a], vertex[b], vertex[c]
-        x = vec3(va[0], vb[0], vc[0])
-        y = vec3(va[1], vb[1], vc[1])
-        w = vec3(va[2], vb[2], vc[2])
-        outside = (
-            x.max() < 0 or y.max() < 0 or w.max() <= near or (x - width * w).min() > 0 or (y - height * w).min() > 0
-        )
-        if not outside:
-            for j in range(height):
-                for i in range(width):
-                    share = weights(va, vb, vc, i + 0.5, j + 0.5)
-                    if share.min() >= 0 and share.dot(w) > near:
-                        visit(i, j, number, a, b, c)
-
-    @ti.func
-    def rasterise(number, a, b, c, near):
-        p, q, r = snapped[a], snapped[b], snapped[c]
-        if p[0] == UNSNAPPED or q[0] == UNSNAPPED or r[0] == UNSNAPPED:
-            crossing_pixels(number, a, b, c, near)
-        else:
-            area = ti.cast(q[0] - p[0], ti.i64) * (r[1] - p[1]) - ti.cast(q[1] - p[1], ti.i64) * (r[0] - p[0])
-            if area != 0:
-                snapped_pixels(number, a, b, c, p, ti.select(area > 0, q, r), ti.select(area > 0, r, q))
-
-    return rasterise
-
-
-@ti.func
-def weights(a, b, c, x, y):
-    """Share of each corner in the point of the triangle seen at (x, y); see `reference.weights`."""
-    ax = a[0] - x * a[2]
-    ay = a[1] - y * a[2]
-    bx = b[0] - x * b[2]
-    by = b[1] - y * b[2]
-    cx = c[0] - x * c[2]
-    cy = c[1] - y * c[2]
-    share = vec3(bx * cy - cx * by, cx * ay - ax * cy, ax * by - bx * ay)
-    total = share.sum()
-    # Seen edge-on, a triangle has no inside.
-    return ti.select(total != 0, share / total, vec3(-1))
-
-
-@ti.func
-def ordered(depth):
-    """Map a float to a whole number of the same order."""
-    bits = ti.bit_cast(depth, ti.u32)
-    sign = ti.u32(1 << 31)
-    return ti.select(bits >= sign, ~bits, bits | sign)
 
 
 def _kernel(s: Structure, fields: _Fields) -> Callable[..., None]:
     """Compile the drawing of one structure."""
-    point, normal, vertex, snapped, light = fields.point, fields.normal, fields.vertex, fields.snapped, fields.light
-    nearest, picture, texture = fields.nearest, fields.picture, fields.texture
-    rows, cols, parts = s.rows, s.cols, s.refine + 1
-    vertex_rows, vertex_cols = s.vertices
-    factor = s.supersample
-    width, height = s.width * factor, s.height * factor
+    point, seen_at, normal, reach = fields.point, fields.place_seen, fields.normal, fields.reach
+    depth, colour, texture = fields.depth, fields.colour, fields.texture
+    rows, cols, parts, lanes, factor = s.rows, s.cols, s.refine + 1, s.lanes, s.supersample
+    s_width, s_height = s.width, s.height
+    width = s_width * factor
+    chunks = -(-width // lanes)
+    bands = -(-s.height // s.band_rows)
+    band_rows = s.band_rows
     texture_width, texture_height = s.texture
     lit, wireframe = s.lit, s.wireframe
-    wire_colour = look.WIRE_COLOUR
+    part = 1 / parts
+    levels, channel_bits = s.levels, s.channel_bits
+    word = ti.u32 if factor == 1 else ti.u64
+    weight = factor * factor * levels
+    centres = [lane + 0.5 for lane in range(lanes)]
+    several = ti.types.vector(lanes, ti.f32)
 
     @ti.func
-    def depth_test(x, y, number, a, b, c):
-        va, vb, vc = vertex[a], vertex[b], vertex[c]
-        share = weights(va, vb, vc, x + 0.5, y + 0.5)
-        depth = share[0] * va[3] + share[1] * vb[3] + share[2] * vc[3]
-        ti.atomic_min(nearest[y, x], (ti.cast(ordered(depth), ti.u64) << 32) | ti.cast(number, ti.u64))
-
-    rasterise = rasteriser(fields, width, height, depth_test)
-
-    @ti.func
-    def corners(number):
-        """Corners (row, column) of a triangle: quads in rows, each cut from its top left to its bottom right."""
-        quad = ti.cast(number // 2, ti.i32)
-        r = quad // (vertex_cols - 1)
-        c = quad % (vertex_cols - 1)
-        upper = ti.cast(number % 2, ti.i32)
-        return vec2i(r, c), vec2i(r + 1, c + upper), vec2i(r + 1 - upper, c + 1)
+    def on_triangle(x, y, p_x, p_y, p_w, r_x, r_y, r_w, d_x, d_y, d_w):
+        """Find (s, t) where the triangle P + R s + D t, each (X, Y, w), is seen at (x, y)."""
+        p_1 = p_x - x * p_w
+        r_1 = r_x - x * r_w
+        d_1 = d_x - x * d_w
+        p_2 = p_y - y * p_w
+        r_2 = r_y - y * r_w
+        d_2 = d_y - y * d_w
+        share = 1.0 / (r_1 * d_2 - r_2 * d_1)
+        return (p_2 * d_1 - p_1 * d_2) * share, (p_1 * r_2 - p_2 * r_1) * share
 
     @ti.func
-    def mesh_lines(a, b, c, va, vb, vc, x, y):
-        """Share of the mesh lines in the colour of a sample; see `reference.wire_share`."""
-        unit = ti.Vector([(rows - 1) / (vertex_rows - 1), (cols - 1) / (vertex_cols - 1)])
-        here = mesh_place(a, b, c, weights(va, vb, vc, x, y)) * unit
-        right = mesh_place(a, b, c, weights(va, vb, vc, x + 1, y)) * unit
-        below = mesh_place(a, b, c, weights(va, vb, vc, x, y + 1)) * unit
-        slope = ti.sqrt((right - here) ** 2 + (below - here) ** 2)
-        distance = (ti.abs(here - ti.round(here)) / ti.max(slope, 1e-12)).min()
+    def edge(p, q, x, y):
+        """Twice the area of p, q and (x, y), of one sign on each side; the same bits for both cells of an edge."""
+        return (q[0] - p[0]) * (y - p[1]) - (q[1] - p[1]) * (x - p[0])
+
+    @ti.func
+    def turn(p, q, r):
+        return (q[0] - p[0]) * (r[1] - q[1]) - (q[1] - p[1]) * (r[0] - q[0])
+
+    @ti.func
+    def texels(index):
+        found = ti.Vector.zero(ti.u32, lanes)
+        for lane in ti.static(range(lanes)):
+            found[lane] = texture[index[lane]]
+        return found
+
+    @ti.func
+    def channel(packed, k: ti.template()):
+        return ti.cast(ti.cast((packed >> (8 * k)) & 255, ti.i32), ti.f32)
+
+    @ti.func
+    def wire_share(across, down, right_across, right_down, below_across, below_down):
+        """Share of the mesh lines in a sample's colour, from places on the mesh; see `reference.wire_share`."""
+        slope = ti.sqrt((right_across - across) ** 2 + (below_across - across) ** 2)
+        distance = ti.abs(across - ti.round(across)) / ti.max(slope, 1e-12)
+        slope = ti.sqrt((right_down - down) ** 2 + (below_down - down) ** 2)
+        distance = ti.min(distance, ti.abs(down - ti.round(down)) / ti.max(slope, 1e-12))
         return look.WIRE_OPACITY * ti.math.clamp(look.WIRE_WIDTH / 2 * factor + 0.5 - distance, 0.0, 1.0)
 
     @ti.func
-    def mesh_place(a, b, c, share):
-        """Row and column, in vertices, of a point of a triangle."""
-        return share[0] * ti.cast(a, ti.f32) + share[1] * ti.cast(b, ti.f32) + share[2] * ti.cast(c, ti.f32)
+    def small_quad(x, y, inside, side, a, b, c, d):
+        """Find column and line of the small quads of the cell A, B, C, D that are seen at (x, y)."""
+        a_1 = a[0] - x * a[2]
+        b_1 = b[0] - x * b[2]
+        c_1 = c[0] - x * c[2]
+        d_1 = d[0] - x * d[2]
+        a_2 = a[1] - y * a[2]
+        b_2 = b[1] - y * b[2]
+        c_2 = c[1] - y * c[2]
+        d_2 = d[1] - y * d[2]
+        # Without t the two equations are bd s^2 + (ad + bc) s + ac = 0; without s they have the same discriminant.
+        ad = a_1 * d_2 - a_2 * d_1
+        bc = b_1 * c_2 - b_2 * c_1
+        ac = a_1 * c_2 - a_2 * c_1
+        ab = a_1 * b_2 - a_2 * b_1
+        bd = b_1 * d_2 - b_2 * d_1
+        linear = ad + bc
+        root = ti.sqrt(ti.max(linear * linear - 4 * bd * ac, 0.0)) * side
+        s = ti.select(inside, -2 * ac / (linear + root), 0.0)
+        t = ti.select(inside, -2 * ab / (ad - bc - root), 0.0)
+        return (
+            ti.math.clamp(ti.floor(s * parts), 0.0, parts - 1),
+            ti.math.clamp(ti.floor(t * parts), 0.0, parts - 1),
+        )
 
     @ti.func
-    def texel(a, b):
-        packed = texture[ti.math.clamp(b, 0, texture_height - 1), ti.math.clamp(a, 0, texture_width - 1)]
-        return vec3(packed & 255, (packed >> 8) & 255, (packed >> 16) & 255)
+    def draw_cell(i, j, top, bottom, near, toward):
+        """Draw what is in rows top to bottom - 1 of the cell to the right and below of mass point (i, j)."""
+        a, right, down, far = point[i, j], point[i, j + 1], point[i + 1, j], point[i + 1, j + 1]
+        b = right - a
+        c = down - a
+        d = far - right - c
+        seen_a, seen_b, seen_c, seen_d = seen_at[i, j], seen_at[i, j + 1], seen_at[i + 1, j], seen_at[i + 1, j + 1]
+        before = a[2] > near and right[2] > near and down[2] > near and far[2] > near
+        turns = vec4(
+            turn(seen_a, seen_b, seen_d),
+            turn(seen_b, seen_d, seen_c),
+            turn(seen_d, seen_c, seen_a),
+            turn(seen_c, seen_a, seen_b),
+        )
+        whole = before and (turns.min() > 0 or turns.max() < 0)
+        side = ti.select(turns[0] > 0, 1.0, -1.0)
+
+        # Where the texture is, in texels, exact to a fraction of one on any sheet.
+        texel_x = ti.cast(j, ti.f64) * texture_width / (cols - 1) - 0.5
+        texel_y = ti.cast(i, ti.f64) * texture_height / (rows - 1) - 0.5
+        first_x = ti.floor(texel_x, ti.i32)
+        first_y = ti.floor(texel_y, ti.i32)
+        begin_x = ti.cast(texel_x - first_x, ti.f32)
+        begin_y = ti.cast(texel_y - first_y, ti.f32)
+
+        pieces = ti.select(whole, 1, 2 * parts * parts)
+        for piece in range(pieces):
+            # Of a triangle that is drawn by itself: its quad, and whether it is below the diagonal.
+            quad = piece // 2
+            quad_s = ti.cast(quad % parts, ti.f32)
+            quad_t = ti.cast(quad // parts, ti.f32)
+            lower = piece % 2 == 0
+            low_x, high_x, low_y, high_y = 0.0, ti.cast(width, ti.f32), -INFINITY, INFINITY
+            if whole:
+                low_x = ti.min(seen_a[0], seen_b[0], seen_c[0], seen_d[0])
+                high_x = ti.max(seen_a[0], seen_b[0], seen_c[0], seen_d[0])
+                low_y = ti.min(seen_a[1], seen_b[1], seen_c[1], seen_d[1])
+                high_y = ti.max(seen_a[1], seen_b[1], seen_c[1], seen_d[1])
+            else:
+                s0, t0 = quad_s / parts, quad_t / parts
+                s1, t1 = (quad_s + 1) / parts, (quad_t + 1) * part
+                one = a + b * s0 + (c + d * s0) * t0
+                two = a + b * s1 + (c + d * s1) * t1
+                three = a + b * s0 + (c + d * s0) * t1
+                if not lower:
+                    three = a + b * s1 + (c + d * s1) * t0
+                if one[2] > near and two[2] > near and three[2] > near:
+                    low_x = ti.min(one[0] / one[2], two[0] / two[2], three[0] / three[2])
+                    high_x = ti.max(one[0] / one[2], two[0] / two[2], three[0] / three[2])
+                    low_y = ti.min(one[1] / one[2], two[1] / two[2], three[1] / three[2])
+                    high_y = ti.max(one[1] / one[2], two[1] / two[2], three[1] / three[2])
+                elif one[2] <= near and two[2] <= near and three[2] <= near:
+                    high_x = -1.0
+            first_row = ti.cast(ti.math.clamp(ti.floor(low_y), top, bottom), ti.i32)
+            end_row = ti.cast(ti.math.clamp(ti.ceil(high_y + 0.5), top, bottom), ti.i32)
+            first_chunk = ti.cast(ti.math.clamp(ti.floor(low_x), 0.0, width), ti.i32) // lanes
+            end_chunk = ti.cast(ti.math.clamp(ti.ceil(high_x + 0.5), 0.0, width) + (lanes - 1), ti.i32) // lanes
+            for row in range(first_row, end_row):
+                y = row + 0.5
+                for chunk in range(first_chunk, end_chunk):
+                    x = ti.cast(chunk * lanes, ti.f32) + several(centres)
+                    inside = several(0.0) == 0.0
+                    column = several(quad_s)
+                    line = several(quad_t)
+                    if whole:
+                        # Left and upper edges belong to a cell, right and lower ones do not.
+                        inside = (
+                            (edge(seen_a, seen_c, x, y) * side <= 0)
+                            & (edge(seen_b, seen_d, x, y) * side > 0)
+                            & (edge(seen_a, seen_b, x, y) * side >= 0)
+                            & (edge(seen_c, seen_d, x, y) * side < 0)
+                        )
+                        if ti.static(parts > 1):
+                            column, line = small_quad(x, y, inside, side, a, b, c, d)
+                    draw_samples(
+                        row, chunk, x, y, inside, column, line, whole, lower, side, near, a, b, c, d,
+                        i, j, first_x, first_y, begin_x, begin_y, toward,
+                    )  # fmt: skip
 
     @ti.func
-    def sample(place):
-        """Filter the texture at a place of the mesh, in vertices."""
-        x = place[1] * (texture_width / (vertex_cols - 1)) - 0.5
-        y = place[0] * (texture_height / (vertex_rows - 1)) - 0.5
-        a = ti.floor(x, ti.i32)
-        b = ti.floor(y, ti.i32)
-        across = x - a
-        down = y - b
-        upper = texel(a, b) * (1 - across) + texel(a + 1, b) * across
-        lower = texel(a, b + 1) * (1 - across) + texel(a + 1, b + 1) * across
-        return upper * (1 - down) + lower * down
+    def draw_samples(
+        row, chunk, x, y, inside, column, line, whole, lower, side, near, a, b, c, d,
+        i, j, first_x, first_y, begin_x, begin_y, toward,
+    ):  # fmt: skip
+        """Draw a chunk of samples of the cell A, B, C, D, in its small quads."""
+        # The small quad: P = A + B s + C t + D s t again.
+        s0 = column * part
+        t0 = line * part
+        p_x = a[0] + b[0] * s0 + (c[0] + d[0] * s0) * t0
+        p_y = a[1] + b[1] * s0 + (c[1] + d[1] * s0) * t0
+        p_w = a[2] + b[2] * s0 + (c[2] + d[2] * s0) * t0
+        p_z = a[3] + b[3] * s0 + (c[3] + d[3] * s0) * t0
+        r_x = (b[0] + d[0] * t0) * part
+        r_y = (b[1] + d[1] * t0) * part
+        r_w = (b[2] + d[2] * t0) * part
+        r_z = (b[3] + d[3] * t0) * part
+        d_x = (c[0] + d[0] * s0) * part
+        d_y = (c[1] + d[1] * s0) * part
+        d_w = (c[2] + d[2] * s0) * part
+        d_z = (c[3] + d[3] * s0) * part
+        twist = d * (part * part)
+        # Its triangles share the diagonal from P to F; the lower one has t > s.
+        f_w = p_w + r_w + d_w + twist[2]
+        below = (
+            (p_x - x * p_w) * (p_y + r_y + d_y + twist[1] - y * f_w)
+            - (p_y - y * p_w) * (p_x + r_x + d_x + twist[0] - x * f_w)
+        ) * side >= 0
+        if not whole:
+            below = (several(0.0) == 0.0) == lower
+        r_x += ti.select(below, twist[0], 0.0)
+        r_y += ti.select(below, twist[1], 0.0)
+        r_w += ti.select(below, twist[2], 0.0)
+        r_z += ti.select(below, twist[3], 0.0)
+        d_x += ti.select(below, 0.0, twist[0])
+        d_y += ti.select(below, 0.0, twist[1])
+        d_w += ti.select(below, 0.0, twist[2])
+        d_z += ti.select(below, 0.0, twist[3])
+        s, t = on_triangle(x, y, p_x, p_y, p_w, r_x, r_y, r_w, d_x, d_y, d_w)
+        if not whole:
+            upper_limit = ti.select(below, t, s)
+            lower_limit = ti.select(below, s, t)
+            inside = (
+                (lower_limit >= -OVERSTEP)
+                & (upper_limit <= 1 + OVERSTEP)
+                & (lower_limit <= upper_limit + OVERSTEP)
+                & (p_w + r_w * s + d_w * t > near)
+            )
+        z = p_z + r_z * s + d_z * t
+        visible = inside & (z < depth[row, chunk])
+        if any_of(visible):
+            across = ti.select(visible, (column + s) * part, 0.0)
+            along = ti.select(visible, (line + t) * part, 0.0)
+            u = begin_x + across * (texture_width / (cols - 1))
+            v = begin_y + along * (texture_height / (rows - 1))
+            floor_u = ti.floor(u)
+            floor_v = ti.floor(v)
+            left = ti.math.clamp(ti.cast(floor_u, ti.i32) + first_x, 0, texture_width - 1)
+            right = ti.math.clamp(ti.cast(floor_u, ti.i32) + (first_x + 1), 0, texture_width - 1)
+            upper = ti.math.clamp(ti.cast(floor_v, ti.i32) + first_y, 0, texture_height - 1) * texture_width
+            under = ti.math.clamp(ti.cast(floor_v, ti.i32) + (first_y + 1), 0, texture_height - 1) * texture_width
+            upper_left = texels(upper + left)
+            upper_right = texels(upper + right)
+            lower_left = texels(under + left)
+            lower_right = texels(under + right)
+            u -= floor_u
+            v -= floor_v
+            light = several(1.0)
+            if ti.static(lit):
+                n_a, n_b, n_c = normal[i, j], normal[i, j + 1] - normal[i, j], normal[i + 1, j] - normal[i, j]
+                n_d = normal[i + 1, j + 1] - normal[i, j + 1] - n_c
+                n_x = n_a[0] + n_b[0] * across + (n_c[0] + n_d[0] * across) * along
+                n_y = n_a[1] + n_b[1] * across + (n_c[1] + n_d[1] * across) * along
+                n_z = n_a[2] + n_b[2] * across + (n_c[2] + n_d[2] * across) * along
+                length = ti.sqrt(n_x * n_x + n_y * n_y + n_z * n_z)
+                light = ti.abs(n_x * toward[0] + n_y * toward[1] + n_z * toward[2]) / ti.max(length, 1e-30)
+            wire = several(0.0)
+            if ti.static(wireframe):
+                s_right, t_right = on_triangle(x + 1, y, p_x, p_y, p_w, r_x, r_y, r_w, d_x, d_y, d_w)
+                s_below, t_below = on_triangle(x, y + 1, p_x, p_y, p_w, r_x, r_y, r_w, d_x, d_y, d_w)
+                wire = wire_share(
+                    across, along,
+                    (column + s_right) * part, (line + t_right) * part,
+                    (column + s_below) * part, (line + t_below) * part,
+                )  # fmt: skip
+            bits = ti.Vector.zero(word, lanes)
+            for n in ti.static(range(3)):
+                up = channel(upper_left, n)
+                up += (channel(upper_right, n) - up) * u
+                low = channel(lower_left, n)
+                low += (channel(lower_right, n) - low) * u
+                grey = (up + (low - up) * v) * light
+                if ti.static(wireframe):
+                    grey += (look.WIRE_COLOUR[n] - grey) * wire
+                bits |= ti.cast(ti.cast(grey * levels + 0.5, ti.i32), word) << (channel_bits * n)
+            depth[row, chunk] = ti.select(visible, z, depth[row, chunk])
+            colour[row, chunk] = ti.select(visible, bits, colour[row, chunk])
 
     @ti.func
-    def shade(number, x, y):
-        """Colour of the sample (x, y) on a triangle."""
-        a, b, c = corners(number)
-        va, vb, vc = vertex[a], vertex[b], vertex[c]
-        share = weights(va, vb, vc, x, y)
-        colour = sample(mesh_place(a, b, c, share))
-        if ti.static(lit):
-            colour *= share[0] * light[a] + share[1] * light[b] + share[2] * light[c]
-        if ti.static(wireframe):
-            wire = mesh_lines(a, b, c, va, vb, vc, x, y)
-            colour += (vec3(wire_colour) - colour) * wire
-        return colour
+    def any_of(condition):
+        return ti.cast(condition, ti.i32).sum() != 0
+
+    @ti.func
+    def resolve(row, out: ti.template()):
+        """Give out the colours of a row of pixels, each the mean of its samples."""
+        for x in range(s_width):
+            total = ti.Vector.zero(ti.u32, 3)
+            for v, u in ti.static(ti.ndrange(factor, factor)):
+                sample = x * factor + u
+                bits = colour[row * factor + v, sample // lanes][sample % lanes]
+                for n in ti.static(range(3)):
+                    total[n] += ti.cast((bits >> (channel_bits * n)) & ((1 << channel_bits) - 1), ti.u32)
+            at = (row * s_width + x) * 3
+            for n in ti.static(range(3)):
+                out[at + n] = ti.cast((2 * total[n] + weight) // (2 * weight), ti.u8)
+
+    @ti.func
+    def unpack(row, out: ti.template()):
+        """Give out the colours of a row of pixels of one sample each."""
+        for chunk in range(chunks):
+            bits = colour[row, chunk]
+            at = (row * s_width + chunk * lanes) * 3
+            for lane in ti.static(range(lanes)):
+                if s_width % lanes == 0 or chunk * lanes + lane < s_width:
+                    for n in ti.static(range(3)):
+                        out[at + 3 * lane + n] = ti.cast((bits[lane] >> (channel_bits * n)) & 255, ti.u8)
 
     @ti.kernel
     def draw(
@@ -325,65 +467,55 @@ def _kernel(s: Structure, fields: _Fields) -> Callable[..., None]:
         matrix: mat4,
         toward: vec3,
         near: ti.f32,
-        background: vec3,
-        out: ti.types.ndarray(dtype=ti.u8, ndim=3),
+        background: word,
+        out: ti.types.ndarray(dtype=ti.u8, ndim=1),
     ):
-        for i, j in point:
-            point[i, j] = matrix @ vec4(position[i, j, 0], position[i, j, 1], position[i, j, 2], 1)
-            if ti.static(lit):
-                i0 = ti.max(i - 1, 0)
-                i1 = ti.min(i + 1, rows - 1)
-                j0 = ti.max(j - 1, 0)
-                j1 = ti.min(j + 1, cols - 1)
-                right = vec3(0)
-                up = vec3(0)
-                for k in ti.static(range(3)):
-                    right[k] = position[i, j1, k] - position[i, j0, k]
-                    up[k] = position[i0, j, k] - position[i1, j, k]
-                across = right.cross(up)
-                normal[i, j] = across / ti.max(across.norm(), 1e-30)
+        for index in range(rows * ITERATIONS_PER_THREAD):
+            if index % ITERATIONS_PER_THREAD == 0:
+                i = index // ITERATIONS_PER_THREAD
+                low, high = INFINITY, -INFINITY
+                for j in range(cols):
+                    p = matrix @ vec4(position[i, j, 0], position[i, j, 1], position[i, j, 2], 1)
+                    point[i, j] = p
+                    seen_at[i, j] = vec2(p[0] / p[2], p[1] / p[2])
+                    if p[2] > near:
+                        low = ti.min(low, p[1] / p[2])
+                        high = ti.max(high, p[1] / p[2])
+                    else:
+                        low, high = -INFINITY, INFINITY
+                    if ti.static(lit):
+                        i0 = ti.max(i - 1, 0)
+                        i1 = ti.min(i + 1, rows - 1)
+                        j0 = ti.max(j - 1, 0)
+                        j1 = ti.min(j + 1, cols - 1)
+                        right = vec3(0)
+                        up = vec3(0)
+                        for k in ti.static(range(3)):
+                            right[k] = position[i, j1, k] - position[i, j0, k]
+                            up[k] = position[i0, j, k] - position[i1, j, k]
+                        across = right.cross(up)
+                        normal[i, j] = across / ti.max(across.norm(), 1e-30)
+                reach[i] = vec2(low, high)
 
-        for r, c in vertex:
-            i = ti.min(r // parts, rows - 2)
-            j = ti.min(c // parts, cols - 2)
-            s = (r - i * parts) / parts
-            t = (c - j * parts) / parts
-            upper = point[i, j] * (1 - t) + point[i, j + 1] * t
-            lower = point[i + 1, j] * (1 - t) + point[i + 1, j + 1] * t
-            v = upper * (1 - s) + lower * s
-            vertex[r, c] = v
-            x = v[0] / v[2]
-            y = v[1] / v[2]
-            if v[2] > near and ti.abs(x) < SNAP_LIMIT and ti.abs(y) < SNAP_LIMIT:
-                snapped[r, c] = vec2i(ti.round(x * SUBPIXEL, ti.i32), ti.round(y * SUBPIXEL, ti.i32))
-            else:
-                snapped[r, c] = vec2i(UNSNAPPED)
-            if ti.static(lit):
-                n = (normal[i, j] * (1 - t) + normal[i, j + 1] * t) * (1 - s) + (
-                    normal[i + 1, j] * (1 - t) + normal[i + 1, j + 1] * t
-                ) * s
-                light[r, c] = ti.abs(n.dot(toward)) / ti.max(n.norm(), 1e-30)
-
-        for y, x in nearest:
-            nearest[y, x] = ti.u64(EMPTY)
-
-        for r, c in ti.ndrange(vertex_rows - 1, vertex_cols - 1):
-            for upper in range(2):
-                number = (ti.cast(r, ti.u32) * (vertex_cols - 1) + c) * 2 + upper
-                rasterise(number, vec2i(r, c), vec2i(r + 1, c + upper), vec2i(r + 1 - upper, c + 1), near)
-
-        for y, x in picture:
-            colour = vec3(0)
-            for j, i in ti.ndrange(factor, factor):
-                key = nearest[y * factor + j, x * factor + i]
-                if key == ti.u64(EMPTY):
-                    colour += background
-                else:
-                    number = ti.cast(key & ti.u64(0xFFFFFFFF), ti.u32)
-                    colour += shade(number, x * factor + i + 0.5, y * factor + j + 0.5)
-            colour = ti.floor(colour / (factor * factor) + 0.5)
-            for k in ti.static(range(3)):
-                picture[y, x][k] = ti.cast(colour[k], ti.u8)
-                out[y, x, k] = picture[y, x][k]
+        for index in range(bands * ITERATIONS_PER_THREAD):
+            if index % ITERATIONS_PER_THREAD == 0:
+                first_row = index // ITERATIONS_PER_THREAD * band_rows
+                end_row = ti.min(first_row + band_rows, s_height)
+                top, bottom = first_row * factor, end_row * factor
+                for row in range(top, bottom):
+                    for chunk in range(chunks):
+                        depth[row, chunk] = several(INFINITY)
+                        colour[row, chunk] = ti.Vector.zero(word, lanes) + background
+                for i in range(rows - 1):
+                    low = ti.min(reach[i][0], reach[i + 1][0])
+                    high = ti.max(reach[i][1], reach[i + 1][1])
+                    if low < bottom and high > top:
+                        for j in range(cols - 1):
+                            draw_cell(i, j, top, bottom, near, toward)
+                for row in range(first_row, end_row):
+                    if ti.static(factor == 1):
+                        unpack(row, out)
+                    else:
+                        resolve(row, out)
 
     return draw

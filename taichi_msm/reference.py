@@ -146,6 +146,27 @@ def normals(position: Array) -> Array:
     return np.divide(normal, length, out=np.zeros_like(normal), where=length > 0)
 
 
+def headlight(normal: Array, u: Array, v: Array, toward: Array) -> Array:
+    """Give the cosine between the direction of the light and the normal, interpolated bilinearly between mass points.
+
+    Args:
+        normal: unit normals of the mass points, shape (rows, cols, 3).
+        u: 0 at the left edge to 1 at the right one, any shape.
+        v: 0 at the top edge to 1 at the bottom one, the same shape.
+        toward: unit vector toward the light, shape (3,).
+
+    Returns:
+        Share of the colour that is seen, 0 to 1, the shape of u.
+    """
+    place = [v * (normal.shape[0] - 1), u * (normal.shape[1] - 1)]
+    i, j = (np.clip(np.floor(p).astype(int), 0, count - 2) for p, count in zip(place, normal.shape, strict=False))
+    s, t = (place[1] - j)[..., None], (place[0] - i)[..., None]
+    upper = normal[i, j] * (1 - s) + normal[i, j + 1] * s
+    lower = normal[i + 1, j] * (1 - s) + normal[i + 1, j + 1] * s
+    here = upper * (1 - t) + lower * t
+    return np.asarray(np.abs(here @ toward) / np.maximum(np.linalg.norm(here, axis=-1), 1e-30))
+
+
 def sample(texture: NDArray[np.uint8], u: Array, v: Array) -> Array:
     """Filter the texture bilinearly, clamped at its edge; texel (a, b) has its centre at ((a + 1/2)/w, (b + 1/2)/h).
 
@@ -236,17 +257,13 @@ def draw(scene: Scene, position: Array, texture: NDArray[np.uint8]) -> NDArray[n
     projected = np.concatenate([position, np.ones((rows, cols, 1))], axis=-1) @ matrix.T
     u, v = np.meshgrid(np.arange(cols) / (cols - 1), np.arange(rows) / (rows - 1))
     surface = refine(np.concatenate([projected, u[..., None], v[..., None]], axis=-1), scene.render.refine)
-    normal = refine(normals(position), scene.render.refine)
-    light = np.ones(normal.shape[:2])
-    if scene.render.shading == "headlight":
-        light = np.abs(normal @ camera.toward) / np.maximum(np.linalg.norm(normal, axis=-1), 1e-30)
-    vertex = np.concatenate([surface, light[..., None]], axis=-1)
+    normal = normals(position)
 
     colour = np.empty((height, width, 3))
     colour[:] = scene.render.background
     nearest = np.full((height, width), np.inf)
-    for r, c in np.ndindex(vertex.shape[0] - 1, vertex.shape[1] - 1):
-        corners = vertex[r, c], vertex[r + 1, c], vertex[r + 1, c + 1], vertex[r, c + 1]
+    for r, c in np.ndindex(surface.shape[0] - 1, surface.shape[1] - 1):
+        corners = surface[r, c], surface[r + 1, c], surface[r + 1, c + 1], surface[r, c + 1]
         for triangle in (np.array(corners[:3]), np.array([corners[0], *corners[2:]])):
             if (triangle[:, 2] > camera.near).all():
                 corner = triangle[:, :2] / triangle[:, 2:3] - 0.5
@@ -259,10 +276,13 @@ def draw(scene: Scene, position: Array, texture: NDArray[np.uint8]) -> NDArray[n
             box = np.s_[top : bottom + 1, left : right + 1]
             y, x = np.mgrid[box].astype(float) + 0.5
             share = weights(triangle, x, y)
-            w, depth, u, v, light = np.tensordot(triangle[:, 2:].T, share, 1)
+            w, depth, u, v = np.tensordot(triangle[:, 2:].T, share, 1)
             seen = (share >= -1e-12).all(axis=0) & (w > camera.near) & (depth < nearest[box])
             nearest[box][seen] = depth[seen]
-            lit = sample(texture, np.where(seen, u, 0), np.where(seen, v, 0)) * light[..., None]
+            u, v = np.where(seen, u, 0), np.where(seen, v, 0)
+            lit = sample(texture, u, v)
+            if scene.render.shading == "headlight":
+                lit *= headlight(normal, u, v, camera.toward)[..., None]
             if scene.render.wireframe:
                 wire = wire_share(scene, triangle, x, y)[..., None]
                 lit = lit * (1 - wire) + np.array(look.WIRE_COLOUR) * wire

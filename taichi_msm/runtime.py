@@ -13,7 +13,7 @@ from typing import Any
 
 from taichi_msm.errors import DeviceError
 
-__all__ = ["ARCHS", "Device", "FieldTree", "available_threads", "start", "ti"]
+__all__ = ["ARCHS", "ITERATIONS_PER_THREAD", "Device", "FieldTree", "available_threads", "start", "started", "ti"]
 
 # No banner on stdout, which may be JSON, and no call home.
 os.environ.setdefault("ENABLE_TAICHI_HEADER_PRINT", "0")
@@ -31,6 +31,10 @@ ARCHS = ("cpu", "cuda")
 
 # A lock on Taichi's cache that is older than this was left by a process that was killed [s].
 STALE_LOCK = 60.0
+
+
+# Taichi gives a CPU thread at least this many iterations of a parallel loop: make_cpu_multithreaded_range_for.cpp.
+ITERATIONS_PER_THREAD = 512
 
 
 @dataclass(frozen=True)
@@ -79,6 +83,12 @@ def available_threads() -> int:
         quota, period = Path("/sys/fs/cgroup/cpu.max").read_text().split()
         cores = min(cores, max(1, int(quota) // int(period)))
     return cores
+
+
+def started() -> Device:
+    """Give the device that runs."""
+    assert _device is not None, "runtime.start comes first"
+    return _device
 
 
 def start(arch: str = "cpu", threads: int | None = None) -> Device:

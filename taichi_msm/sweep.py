@@ -24,10 +24,7 @@ from typing import Any
 from numpy.typing import NDArray
 
 from taichi_msm.forces import SheetFields, Structure, point_step, spring_forces
-from taichi_msm.runtime import ti
-
-# Taichi gives a CPU thread at least this many iterations of a parallel loop: make_cpu_multithreaded_range_for.cpp.
-ITERATIONS_PER_THREAD = 512
+from taichi_msm.runtime import ITERATIONS_PER_THREAD, ti
 
 # Integers between the progress counters of two workers, so that each has a cache line of its own.
 COUNTER_STRIDE = 16
