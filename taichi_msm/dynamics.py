@@ -46,6 +46,9 @@ NUMBERS_PER_POINT = 9
 POINT_STEPS_PER_LAUNCH = 40_000_000
 MAX_STEPS_PER_LAUNCH = 8192
 
+# Loads are tabulated for so many steps at a time: for one of a few frames' steps NumPy takes as long.
+STEPS_PER_TABLE = 4096
+
 
 def structure(scene: Scene, device: Device) -> Structure:
     """Find out what the scene needs: absent terms are left out of the kernel."""
@@ -96,12 +99,10 @@ class Dynamics:
         self.scene = scene
         self._device = device
         self.structure = layout or structure(scene, device)
-        self.steps_done = 0
         self.launches = 0
         self._real = np.dtype(np.float32 if self.structure.precision == "f32" else np.float64)
         self._sheet: Sweep | Gather = (Sweep if self.structure.workers else Gather)(self.structure)
-        self._arguments = self._numbers()
-        self._place()
+        self._begin()
 
     def restart(self, scene: Scene) -> None:
         """Begin again at rest with other numbers, such as another step; nothing is compiled.
@@ -115,9 +116,7 @@ class Dynamics:
         if structure(scene, self._device) != structure(self.scene, self._device):
             raise ValueError("this scene needs another kernel; make another Dynamics")
         self.scene = scene
-        self.steps_done = 0
-        self._arguments = self._numbers()
-        self._place()
+        self._begin()
 
     def advance(self, steps: int) -> None:
         """Take a number of steps."""
@@ -128,13 +127,13 @@ class Dynamics:
         end = self.steps_done + steps
         while self.steps_done < end:
             count = min(most, end - self.steps_done)
-            self._sheet.advance(count, self._arguments, self._table(count))
+            self._sheet.advance(count, self._arguments, self._next_loads(count))
             self.steps_done += count
             self.launches += 1
 
     def compile(self) -> None:
         """Compile the step and the read-out without moving anything."""
-        self._sheet.advance(0, self._arguments, self._table(1))
+        self._sheet.advance(0, self._arguments, self._loads)
         self.displacement()
 
     def displacement(self) -> NDArray[Any]:
@@ -151,6 +150,13 @@ class Dynamics:
         """Free the fields."""
         self._sheet.close()
 
+    def _begin(self) -> None:
+        """Put the sheet at rest."""
+        self.steps_done = 0
+        self._arguments = self._numbers()
+        self._first_tabled, self._loads = 0, self._table(0, STEPS_PER_TABLE)
+        self._place()
+
     def _numbers(self) -> tuple[float, ...]:
         """Give the numbers of the scene in the order of the kernel's arguments."""
         scene, h = self.scene, step(self.scene)
@@ -160,17 +166,26 @@ class Dynamics:
         dx, dy = spacing(scene.sheet)
         return keep, dx, dy, scene.springs.structural, scene.springs.shear, scene.sheet.size[0] / 2
 
-    def _table(self, count: int) -> NDArray[Any]:
-        """Tabulate the loads of the next steps, shape (count, columns)."""
+    def _next_loads(self, count: int) -> NDArray[Any]:
+        """Give the table of the loads of the next steps, shape (count, columns)."""
+        done = self.steps_done - self._first_tabled
+        if done + count > len(self._loads):
+            done = 0
+            self._first_tabled = self.steps_done
+            self._loads = self._table(self.steps_done, max(count, STEPS_PER_TABLE))
+        return self._loads[done : done + count]
+
+    def _table(self, first: int, count: int) -> NDArray[Any]:
+        """Tabulate the loads of steps first, ..., first + count - 1, shape (count, columns)."""
         scene, h = self.scene, step(self.scene)
         g = scene.damping / scene.sheet.mass
-        loads = schedule(scene, self.steps_done, count)
+        loads = schedule(scene, first, count)
         parts = grips(scene)
         table = np.empty((count, GRIP_COLUMN + GRIP_COLUMNS * len(parts)))
         table[:, 0] = h * h / scene.sheet.mass
         if scene.time.damping_difference == "central":
             table[:, 0] /= 1 + g * h / 2
-        if self.steps_done == 0:
+        if first == 0:
             table[0, 0] = h * h / scene.sheet.mass / 2
         table[:, 1] = scene.springs.virtual * loads.active
         grip = table[:, GRIP_COLUMN:].reshape(count, len(parts), GRIP_COLUMNS)

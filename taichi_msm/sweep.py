@@ -245,6 +245,7 @@ def _kernels(s: Structure, fields: _Fields) -> tuple[Any, Any, Any]:
 
     @ti.kernel
     def read(out: ti.types.ndarray(dtype=real, ndim=3)):
+        ti.loop_config(serialize=workers == 1)
         for i, b in ti.ndrange(rows, (1, strip + 1)):
             for lane in ti.static(range(lanes)):
                 j = lane * strip + b - 1
