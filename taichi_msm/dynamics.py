@@ -14,6 +14,7 @@ which is the position form without its cancellation: in f32 it keeps the digits 
 
 from __future__ import annotations
 
+import math
 from typing import Any
 
 import numpy as np
@@ -93,6 +94,12 @@ class Dynamics:
         scene: a checked scene.
         device: what `runtime.start` returned.
         layout: another structure than the scene's own; for tests.
+
+    Attributes:
+        structure: what the kernels are compiled for.
+        steps_done: number of steps taken.
+        launches: number of launches of the kernel.
+        shortest_spring: the least L / L0 of all springs when `displacement` was read last.
     """
 
     def __init__(self, scene: Scene, device: Device, layout: Structure | None = None) -> None:
@@ -137,13 +144,15 @@ class Dynamics:
         self.displacement()
 
     def displacement(self) -> NDArray[Any]:
-        """Read the displacements.
+        """Read the displacements, and see how far springs are compressed.
 
         Returns:
             x - X [m], shape (rows, cols, 3), in the scene's precision.
         """
         out = np.empty((self.structure.rows, self.structure.cols, 3), self._real)
-        self._sheet.read(out)
+        least = np.empty(self.structure.rows, self._real)
+        self._sheet.read(spacing(self.scene.sheet), out, least)
+        self.shortest_spring = math.sqrt(least.min())
         return out
 
     def close(self) -> None:
@@ -153,6 +162,7 @@ class Dynamics:
     def _begin(self) -> None:
         """Put the sheet at rest."""
         self.steps_done = 0
+        self.shortest_spring = 1.0
         self._arguments = self._numbers()
         self._first_tabled, self._loads = 0, self._table(0, STEPS_PER_TABLE)
         self._place()

@@ -142,6 +142,41 @@ def spring_forces(s: Structure, fields: SheetFields) -> tuple[Callable[..., Any]
     return along, ahead
 
 
+def compression(s: Structure, fields: SheetFields) -> Callable[..., Any]:
+    """Make the function that gives the least (L / L0)^2 of the springs to the right of an entry and to a row below."""
+    u, by_column, open_edges = fields.displacement, fields.by_column, s.open_edges
+    real, lanes, structural, shear = getattr(ti, s.precision), s.lanes, s.structural, s.shear
+
+    @ti.func
+    def ratio(p, q, b, right: ti.template(), x0, y0):
+        x = u[0][q, b + right] - u[0][p, b] + x0
+        y = u[1][q, b + right] - u[1][p, b] + y0
+        z = u[2][q, b + right] - u[2][p, b]
+        found = (x * x + y * y + z * z) / (x0 * x0 + y0 * y0)
+        # Beyond the edge there is no spring, and 1 is what a spring at rest has.
+        if ti.static(open_edges and right < 0):
+            found = ti.select(by_column[HAS_LEFT, b] > 0, found, 1)
+        if ti.static(open_edges and right > 0):
+            found = ti.select(by_column[HAS_RIGHT, b] > 0, found, 1)
+        return found
+
+    @ti.func
+    def smallest(p, q, b, dx, dy, there):
+        """Entry b of row p, and row q below it if it is there."""
+        found = ti.Vector.zero(real, lanes) + 1
+        if ti.static(structural):
+            found = ti.min(found, ratio(p, p, b, 1, dx, 0))
+        if there:
+            if ti.static(structural):
+                found = ti.min(found, ratio(p, q, b, 0, 0, -dy))
+            if ti.static(shear):
+                found = ti.min(found, ratio(p, q, b, -1, -dx, -dy))
+                found = ti.min(found, ratio(p, q, b, 1, dx, -dy))
+        return found.min()
+
+    return smallest
+
+
 def point_step(s: Structure, fields: SheetFields) -> Callable[..., None]:
     """Make the function that adds to the forces of springs those of the tissue and the probes, and steps a point.
 

@@ -9,7 +9,7 @@ from typing import Any
 
 from numpy.typing import NDArray
 
-from taichi_msm.forces import SheetFields, Structure, point_step, spring_forces
+from taichi_msm.forces import SheetFields, Structure, compression, point_step, spring_forces
 from taichi_msm.runtime import ti
 
 # A launch is a chain of this many kernels, one a step.
@@ -38,9 +38,9 @@ class Gather:
         self._advance(self._now, count, *numbers, table)
         self._now = (self._now + count) % 2
 
-    def read(self, out: NDArray[Any]) -> None:
-        """Copy the displacements."""
-        self._read(self._now, out)
+    def read(self, spacing: tuple[float, float], out: NDArray[Any], least: NDArray[Any]) -> None:
+        """Copy the displacements, and find the least (L / L0)^2 of every row."""
+        self._read(self._now, *spacing, out, least)
 
     def rest(self, by_column: NDArray[Any], decay: NDArray[Any]) -> None:
         """Put the sheet at rest."""
@@ -60,6 +60,7 @@ def _kernels(s: Structure, fields: _Fields) -> tuple[Any, Any, Any]:
     u, d, by_column, decay = fields.displacement, fields.difference, fields.by_column, fields.decay
     along, ahead = spring_forces(s, fields)
     move = point_step(s, fields)
+    smallest = compression(s, fields)
 
     @ti.func
     def by_row(p, q, b, there, dx, up, structural, shear):
@@ -111,10 +112,21 @@ def _kernels(s: Structure, fields: _Fields) -> tuple[Any, Any, Any]:
                     step((now + n) % 2, i, b, n, keep, dx, dy, structural, shear, top, loads)
 
     @ti.kernel
-    def read(now: ti.i32, out: ti.types.ndarray(dtype=real, ndim=3)):
-        for i, j in ti.ndrange(rows, cols):
-            for c in ti.static(range(3)):
-                out[i, j, c] = u[c][now * (rows + 2) + i + 1, j + 1][0]
+    def read(
+        now: ti.i32,
+        dx: real,
+        dy: real,
+        out: ti.types.ndarray(dtype=real, ndim=3),
+        least: ti.types.ndarray(dtype=real, ndim=1),
+    ):
+        for i in range(rows):
+            p = now * (rows + 2) + i + 1
+            found = ti.cast(1, real)
+            for b in range(1, cols + 1):
+                found = ti.min(found, smallest(p, p + 1, b, dx, dy, i < rows - 1))
+                for c in ti.static(range(3)):
+                    out[i, b - 1, c] = u[c][p, b][0]
+            least[i] = found
 
     @ti.kernel
     def write(columns: ti.types.ndarray(dtype=real, ndim=3), shares: ti.types.ndarray(dtype=real, ndim=4)):

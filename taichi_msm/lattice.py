@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -103,26 +103,3 @@ def springs(scene: Scene) -> tuple[Spring, ...]:
         for down, right in around
     )
     return tuple(spring for spring in stencil if spring.stiffness > 0)
-
-
-def shortest_spring(scene: Scene, displacement: NDArray[Any]) -> float:
-    """Find how far the springs are compressed.
-
-    Args:
-        scene: the scene.
-        displacement: x - X [m], shape (rows, cols, 3).
-
-    Returns:
-        The smallest L / L0 of all springs; 1 where there are none.
-    """
-    smallest = 1.0
-    for spring in springs(scene):
-        if (spring.down, spring.right) < (0, 0):
-            continue
-        here, there = spring.ends(scene.sheet.points)
-        between = displacement[there] - displacement[here]
-        between[..., 0] += spring.offset[0]
-        between[..., 1] += spring.offset[1]
-        square = np.einsum("ijk,ijk->ij", between, between).min(initial=math.inf)
-        smallest = min(smallest, math.sqrt(square) / spring.length)
-    return smallest

@@ -5,6 +5,7 @@ Not to be confused with an independent check: it is itself tested against closed
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator
 
 import numpy as np
@@ -38,6 +39,29 @@ def elastic_force(scene: Scene, displacement: Array) -> Array:
         pull = np.divide(length - spring.length, length, out=np.zeros_like(length), where=length > 0)
         force[here] += spring.stiffness * pull * between
     return force
+
+
+def shortest_spring(scene: Scene, displacement: Array) -> float:
+    """Find how far the springs are compressed.
+
+    Args:
+        scene: the scene.
+        displacement: x - X [m], shape (rows, cols, 3).
+
+    Returns:
+        The smallest L / L0 of all springs; 1 where there are none.
+    """
+    smallest = 1.0
+    for spring in springs(scene):
+        if (spring.down, spring.right) < (0, 0):
+            continue
+        here, there = spring.ends(scene.sheet.points)
+        between = displacement[there] - displacement[here]
+        between[..., 0] += spring.offset[0]
+        between[..., 1] += spring.offset[1]
+        square = np.einsum("ijk,ijk->ij", between, between).min(initial=math.inf)
+        smallest = min(smallest, math.sqrt(square) / spring.length)
+    return smallest
 
 
 def surgical_force(scene: Scene, loads: Schedule, n: int) -> Array:

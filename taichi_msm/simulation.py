@@ -13,7 +13,7 @@ from taichi_msm.accuracy import choose_step
 from taichi_msm.camera import View
 from taichi_msm.dynamics import Dynamics
 from taichi_msm.errors import DivergedError, MsmError
-from taichi_msm.lattice import axes, shortest_spring
+from taichi_msm.lattice import axes
 from taichi_msm.loads import farthest_displacement
 from taichi_msm.scene import Scene
 from taichi_msm.stability import stable_step, step, steps_per_frame
@@ -153,7 +153,7 @@ class Simulation:
         """Read where the points are, if the simulation has not gone wrong."""
         displacement = self._dynamics.displacement()
         self._watch(displacement)
-        self.shortest_spring = min(self.shortest_spring, shortest_spring(self.scene, displacement))
+        self.shortest_spring = min(self.shortest_spring, self._dynamics.shortest_spring)
         position, (x, y) = displacement, axes(self.scene.sheet)
         # Summed in float64 and rounded once, without a copy of the sheet.
         np.add(position[..., 0], x, out=position[..., 0], casting="same_kind")

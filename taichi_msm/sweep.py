@@ -23,7 +23,7 @@ from typing import Any
 
 from numpy.typing import NDArray
 
-from taichi_msm.forces import SheetFields, Structure, point_step, spring_forces
+from taichi_msm.forces import SheetFields, Structure, compression, point_step, spring_forces
 from taichi_msm.runtime import ITERATIONS_PER_THREAD, ti
 
 # Integers between the progress counters of two workers, so that each has a cache line of its own.
@@ -65,9 +65,15 @@ class Sweep:
         self._advance(self._steps, count, *numbers, table)
         self._steps += count
 
-    def read(self, out: NDArray[Any]) -> None:
-        """Copy the displacements, shape (rows, cols, 3)."""
-        self._read(out)
+    def read(self, spacing: tuple[float, float], out: NDArray[Any], least: NDArray[Any]) -> None:
+        """Copy the displacements, shape (rows, cols, 3), and find the least (L / L0)^2 of every row, shape (rows,).
+
+        Args:
+            spacing: dx and dy.
+            out: filled with the displacements.
+            least: filled with the ratios, of the springs in a row of points and to the row below.
+        """
+        self._read(*spacing, out, least)
 
     def rest(self, by_column: NDArray[Any], decay: NDArray[Any]) -> None:
         """Put the sheet at rest; the arrays are those of `SheetFields`, with lanes as their last axis."""
@@ -89,6 +95,7 @@ def _kernels(s: Structure, fields: _Fields) -> tuple[Any, Any, Any]:
     by_column, decay, done = fields.by_column, fields.decay, fields.done
     along, ahead = spring_forces(s, fields)
     move = point_step(s, fields)
+    smallest = compression(s, fields)
 
     @ti.func
     def sweep_row(p, q, there, i, slot, n, moving, keep, dx, dy, structural, shear, top, up, loads: ti.template()):
@@ -244,14 +251,22 @@ def _kernels(s: Structure, fields: _Fields) -> tuple[Any, Any, Any]:
                                     publish(worker, END, i, first + n + 1)
 
     @ti.kernel
-    def read(out: ti.types.ndarray(dtype=real, ndim=3)):
+    def read(
+        dx: real, dy: real, out: ti.types.ndarray(dtype=real, ndim=3), least: ti.types.ndarray(dtype=real, ndim=1)
+    ):
         ti.loop_config(serialize=workers == 1)
-        for i, b in ti.ndrange(rows, (1, strip + 1)):
-            for lane in ti.static(range(lanes)):
-                j = lane * strip + b - 1
-                if j < cols:
-                    for c in ti.static(range(3)):
-                        out[i, j, c] = u[c][i, b][lane]
+        for index in range(rows * ITERATIONS_PER_THREAD):
+            if index % ITERATIONS_PER_THREAD == 0:
+                i = index // ITERATIONS_PER_THREAD
+                found = ti.cast(1, real)
+                for b in range(1, strip + 1):
+                    found = ti.min(found, smallest(i, i + 1, b, dx, dy, i < rows - 1))
+                    for lane in ti.static(range(lanes)):
+                        j = lane * strip + b - 1
+                        if j < cols:
+                            for c in ti.static(range(3)):
+                                out[i, j, c] = u[c][i, b][lane]
+                least[i] = found
 
     @ti.kernel
     def write(columns: ti.types.ndarray(dtype=real, ndim=3), shares: ti.types.ndarray(dtype=real, ndim=4)):

@@ -17,6 +17,7 @@ from taichi_msm.lattice import rest_positions
 from taichi_msm.runtime import Device, available_threads
 from taichi_msm.scene import Scene
 from taichi_msm.stability import stable_step, step, steps_per_frame, with_steps
+from tests.pool import Pool
 from tests.scenes import PRESS, SHEET, SPRINGS, random_scene, scene
 
 ROUNDING = {"f32": 2.0**-24, "f64": 2.0**-53}
@@ -127,6 +128,38 @@ def test_absent_terms_are_left_out(device: Device) -> None:
     assert not structure(scene(probes=[]), device).virtual, "loaded, but nothing ever loads"
     assert structure(scene(), device).virtual
     assert structure(scene(), device).lanes == LANES["f64"]
+
+
+@pytest.mark.parametrize("fixed", ["border", "none"])
+@pytest.mark.parametrize(
+    "springs",
+    [{"structural": 20, "shear": 10}, {"structural": 20}, {"shear": 10}, {}],
+    ids=["both", "4", "diagonal", "0"],
+)
+def test_the_shortest_spring_is_that_of_the_twin(
+    springs: dict[str, Any], fixed: str, pool: Pool, device: Device
+) -> None:
+    # Pushed along the sheet, at each of whose sides in turn springs are compressed the most.
+    found = []
+    for at, force in (
+        ([0.1, 0.4], [-30, 9, 0]),
+        ([0.9, 0.5], [30, 5, 2]),
+        ([0.4, 0.1], [3, 30, 0]),
+        ([0.5, 1], [5, 9, 1]),
+    ):
+        made = scene(
+            sheet={**SHEET, "fixed": fixed},
+            springs=springs,
+            probes=[{"at": at, "force": force, "offset": 6, "falloff": 20}],
+            time={"duration": 0.08},
+        )
+        dynamics = pool.lend(made, device)
+        dynamics.advance(30)
+        u = dynamics.displacement()
+        assert dynamics.shortest_spring == pytest.approx(reference.shortest_spring(made, u), abs=1e-12)
+        found.append(dynamics.shortest_spring)
+        dynamics.close()
+    assert (min(found) < 0.999) == bool(springs)
 
 
 def test_nothing_moves_without_a_load(device: Device) -> None:

@@ -5,7 +5,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from taichi_msm.lattice import fixed_points, rest_positions, shortest_spring, springs
+from taichi_msm.lattice import fixed_points, rest_positions, springs
 from tests.scenes import SHEET, scene
 
 
@@ -48,24 +48,3 @@ def test_springs_lead_to_the_rest_positions_of_the_neighbours() -> None:
         assert spring.stiffness == (10 if spring.down and spring.right else 20)
     assert len(springs(made)) == 8
     assert len(springs(scene(springs={"shear": 1}))) == 4
-
-
-@pytest.mark.parametrize(
-    ("point", "to", "ratio"),
-    [
-        # The sheet is 0.3 m high and 0.4 m wide; a cell is 0.0375 m by 0.04 m.
-        ((4, 5), (0.01, 0, 0), 0.75),
-        ((4, 5), (-0.01, 0, 0), 0.75),
-        ((4, 5), (0, 0.03, 0), 0.2),
-        ((8, 10), (-0.02, 0.01875, 0), 0.5),
-        ((0, 10), (-0.04, -0.0375, 0), 0.0),
-        ((4, 5), (0, 0, 5.0), 1.0),
-    ],
-)
-def test_the_shortest_spring(point: tuple[int, int], to: tuple[float, float, float], ratio: float) -> None:
-    displacement = np.zeros((9, 11, 3))
-    displacement[point] = to
-    before = displacement.copy()
-    assert shortest_spring(scene(), displacement) == pytest.approx(ratio, abs=1e-12)
-    np.testing.assert_array_equal(displacement, before)
-    assert shortest_spring(scene(springs={}), displacement) == 1

@@ -108,3 +108,24 @@ def test_agrees_with_dop853() -> None:
     assert 3.8 < errors[0] / errors[1] < 4.2
     assert errors[1] < 1e-3 * np.abs(exact).max()
     assert np.abs(exact).max() > 0.01
+
+
+@pytest.mark.parametrize(
+    ("point", "to", "ratio"),
+    [
+        # The sheet is 0.3 m high and 0.4 m wide; a cell is 0.0375 m by 0.04 m.
+        ((4, 5), (0.01, 0, 0), 0.75),
+        ((4, 5), (-0.01, 0, 0), 0.75),
+        ((4, 5), (0, 0.03, 0), 0.2),
+        ((8, 10), (-0.02, 0.01875, 0), 0.5),
+        ((0, 10), (-0.04, -0.0375, 0), 0.0),
+        ((4, 5), (0, 0, 5.0), 1.0),
+    ],
+)
+def test_the_shortest_spring(point: tuple[int, int], to: tuple[float, float, float], ratio: float) -> None:
+    displacement = np.zeros((9, 11, 3))
+    displacement[point] = to
+    before = displacement.copy()
+    assert reference.shortest_spring(scene(), displacement) == pytest.approx(ratio, abs=1e-12)
+    np.testing.assert_array_equal(displacement, before)
+    assert reference.shortest_spring(scene(springs={}), displacement) == 1
