@@ -12,6 +12,9 @@ SAMPLES = 3
 # A sample is long enough for the clock when it takes this [s].
 LONG_ENOUGH = 0.2
 
+# What takes longer is timed once in a process [s].
+SLOW = 2.0
+
 
 def seconds(work: Callable[[int], object], longest: int = 1 << 20) -> float:
     """Time a piece of work that can be repeated within one call.
@@ -27,6 +30,8 @@ def seconds(work: Callable[[int], object], longest: int = 1 << 20) -> float:
     while took < LONG_ENOUGH / 4 and count < longest:
         count = min(longest, 4 * count)
         took = _once(work, count)
+    if took > SLOW:
+        return took
     count = max(1, min(longest, round(count * LONG_ENOUGH / took)))
     return statistics.median(_once(work, count) / count for _ in range(SAMPLES))
 

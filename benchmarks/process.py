@@ -33,13 +33,12 @@ class FailedError(Exception):
     """A measurement ended with an error; the message is its last line."""
 
 
-def call(task: str, threads: int | None = None, **arguments: Any) -> Any:
+def call(task: str, **arguments: Any) -> Any:
     """Call a function in a process of its own.
 
     Args:
         task: "module:function"; what it takes and gives is JSON.
-        threads: of the pools that are sized by the environment; None: theirs.
-        arguments: of the function.
+        arguments: of the function; `threads` also sizes the pools that look into the environment.
 
     Raises:
         UnavailableError: when what it needs is not installed.
@@ -48,7 +47,7 @@ def call(task: str, threads: int | None = None, **arguments: Any) -> Any:
     command = [sys.executable, "-m", "benchmarks.process", task, json.dumps(arguments)]
     try:
         done = subprocess.run(
-            command, cwd=ROOT, env=_environment(threads), capture_output=True, text=True, check=False, timeout=PATIENCE
+            command, cwd=ROOT, env=_environment(arguments.get("threads")), capture_output=True, text=True, check=False, timeout=PATIENCE
         )
     except subprocess.TimeoutExpired:
         raise FailedError(f"takes more than {PATIENCE:g} s") from None
@@ -64,6 +63,7 @@ def _environment(threads: int | None) -> dict[str, str]:
     environment = {
         **os.environ,
         "JAX_PLATFORMS": "cpu",
+        "NUMBA_CACHE_DIR": str(CACHE / "numba"),
         "TI_OFFLINE_CACHE_FILE_PATH": str(CACHE / "taichi"),
         "WARP_CACHE_PATH": str(CACHE / "warp"),
     }

@@ -15,13 +15,13 @@ from benchmarks.stepping.problem import FORCE, Array, Problem
 from taichi_msm.lattice import spacing
 
 
-@numba.njit(fastmath=True, inline="always")
+@numba.njit(fastmath=True, inline="always", cache=True)
 def pull(to_x, to_y, to_z, length, stiffness):
     """Give the force of a spring over the vector along it."""
     return stiffness - stiffness * length / math.sqrt(to_x * to_x + to_y * to_y + to_z * to_z)
 
 
-@numba.njit(fastmath=True, error_model="numpy")
+@numba.njit(fastmath=True, error_model="numpy", cache=True)
 def step_row(ux, uy, uz, wx, wy, wz, share, i, load, dx, dy, diagonal, structural, shear, virtual, keep, gain):
     """Step the points of a row: u is u_n, w becomes u_{n+1} from u_{n-1}."""
     load_x, load_y, load_z = load
@@ -68,7 +68,7 @@ def step_row(ux, uy, uz, wx, wy, wz, share, i, load, dx, dy, diagonal, structura
         pz[j] = z + keep * (z - pz[j]) + gain * fz
 
 
-@numba.njit(parallel=True, fastmath=True, error_model="numpy")
+@numba.njit(parallel=True, fastmath=True, error_model="numpy", cache=True)
 def advance(now, before, share, load, dx, dy, diagonal, structural, shear, virtual, keep, gain, first_gain, done, steps):
     """Take the steps; now and before, shape (3, n, n), change places after each."""
     n = share.shape[0]
