@@ -18,7 +18,7 @@ typedef float Vector __attribute__((vector_size(WIDTH)));
 extern "C" void triad(float *a, const float *b, const float *c, std::int64_t n, std::int64_t repeats) {
 #pragma omp parallel
     for (std::int64_t round = 0; round < repeats; ++round) {
-#pragma omp for simd schedule(static)
+#pragma omp for simd schedule(static) nowait
         for (std::int64_t i = 0; i < n; ++i) a[i] = b[i] + 3.0f * c[i];
     }
 }

@@ -62,7 +62,7 @@ def _race(*arguments: Any, **work: Any) -> Entries:
 def stepping(effort: Effort, progress: Progress) -> dict[str, Entries]:
     """Step beside all peers."""
     return {
-        str(n): _race(STEPPING, PEERS, effort.rounds, _prefix(progress, f"{n} x {n}"), points=n) for n in effort.points
+        str(n): _race(STEPPING, PEERS, effort.rounds, prefixed(progress, f"{n} x {n}"), points=n) for n in effort.points
     }
 
 
@@ -74,7 +74,7 @@ def drawing(effort: Effort, progress: Progress) -> dict[str, dict[str, Entries]]
                 DRAWING,
                 peers,
                 effort.rounds,
-                _prefix(progress, f"{kind} {pixels} px"),
+                prefixed(progress, f"{kind} {pixels} px"),
                 pixels=pixels,
                 refine=REFINE,
                 lit=kind == "lit",
@@ -88,14 +88,15 @@ def drawing(effort: Effort, progress: Progress) -> dict[str, dict[str, Entries]]
 def size(effort: Effort, progress: Progress) -> dict[str, Entries]:
     """Step sheets of every size."""
     return {
-        str(n): _race(STEPPING, FASTEST, effort.rounds, _prefix(progress, f"{n} x {n}"), points=n) for n in effort.sizes
+        str(n): _race(STEPPING, FASTEST, effort.rounds, prefixed(progress, f"{n} x {n}"), points=n)
+        for n in effort.sizes
     }
 
 
 def refine(effort: Effort, progress: Progress) -> dict[str, Entries]:
     """Draw with every refinement."""
     return {
-        str(n): _draw(effort, _prefix(progress, f"refine {n}"), pixels=PIXELS, refine=n, lit=True)
+        str(n): _draw(effort, prefixed(progress, f"refine {n}"), pixels=PIXELS, refine=n, lit=True)
         for n in effort.refines
     }
 
@@ -103,7 +104,7 @@ def refine(effort: Effort, progress: Progress) -> dict[str, Entries]:
 def resolution(effort: Effort, progress: Progress) -> dict[str, Entries]:
     """Draw pictures of every size."""
     return {
-        str(pixels): _draw(effort, _prefix(progress, f"{pixels} px"), pixels=pixels, refine=REFINE, lit=True)
+        str(pixels): _draw(effort, prefixed(progress, f"{pixels} px"), pixels=pixels, refine=REFINE, lit=True)
         for pixels in effort.resolutions
     }
 
@@ -112,7 +113,7 @@ def threads(effort: Effort, progress: Progress) -> dict[str, dict[str, Entries]]
     """Step and draw with every number of threads."""
     found: dict[str, dict[str, Entries]] = {}
     for count in thread_counts():
-        say = _prefix(progress, f"{count} threads")
+        say = prefixed(progress, f"{count} threads")
         for points in THREADS_POINTS:
             found.setdefault(f"{points} x {points} points", {})[str(count)] = _race(
                 STEPPING, FASTEST, effort.rounds, say, threads=count, points=points
@@ -134,8 +135,9 @@ def _draw(effort: Effort, progress: Progress, **work: Any) -> Entries:
     return _race(DRAWING, {"taichi_msm": LIT["taichi_msm"]}, effort.rounds, progress, **work)
 
 
-def _prefix(progress: Progress, prefix: str) -> Progress:
-    return lambda text: progress(f"{prefix}, {text}")
+def prefixed(progress: Progress, prefix: str) -> Progress:
+    """Say of what the progress is."""
+    return lambda text: progress(f"{prefix}: {text}")
 
 
 PARTS: dict[str, Callable[[Effort, Progress], Any]] = {

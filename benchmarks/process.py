@@ -47,7 +47,13 @@ def call(task: str, **arguments: Any) -> Any:
     command = [sys.executable, "-m", "benchmarks.process", task, json.dumps(arguments)]
     try:
         done = subprocess.run(
-            command, cwd=ROOT, env=_environment(arguments.get("threads")), capture_output=True, text=True, check=False, timeout=PATIENCE
+            command,
+            cwd=ROOT,
+            env=_environment(arguments.get("threads")),
+            capture_output=True,
+            text=True,
+            check=False,
+            timeout=PATIENCE,
         )
     except subprocess.TimeoutExpired:
         raise FailedError(f"takes more than {PATIENCE:g} s") from None

@@ -1,4 +1,4 @@
-"""OpenGL by moderngl, on a processor Mesa's llvmpipe: mass points go in as textures, shaders refine, light and filter."""
+"""OpenGL by moderngl, on a processor by llvmpipe: mass points go in as textures; shaders refine, light and filter."""
 
 from __future__ import annotations
 
@@ -71,9 +71,9 @@ class OpenGl:
         self._picture = context.texture(texture.shape[1::-1], 3, texture.tobytes(), alignment=1)
         self._picture.filter = moderngl.LINEAR, moderngl.LINEAR
         self._picture.repeat_x = self._picture.repeat_y = False
-        quad = (np.arange(n - 1)[:, None] * n + np.arange(n - 1)).ravel()[:, None]
+        quad = np.arange(n - 1)[:, None, None] * n + np.arange(n - 1)[:, None]
         # Each small quad is cut from its top left to its bottom right corner.
-        index = context.buffer((quad + [0, n, n + 1, 0, n + 1, 1]).astype(np.int32).tobytes())
+        index = context.buffer(np.add(quad, [0, n, n + 1, 0, n + 1, 1]).astype(np.int32).tobytes())
         self._sheet = context.vertex_array(program, [], index_buffer=index)
         self._frame = context.framebuffer(
             [context.texture((pixels, pixels), 3)], context.depth_renderbuffer((pixels, pixels))

@@ -78,8 +78,8 @@ class Vtk:
     @staticmethod
     def _triangles(n: int) -> vtk.vtkCellArray:
         """Cut each small quad from its top left to its bottom right corner."""
-        quad = (np.arange(n - 1)[:, None] * n + np.arange(n - 1)).ravel()[:, None]
-        corners = (quad + [0, n, n + 1, 0, n + 1, 1]).ravel()
+        quad = np.arange(n - 1)[:, None, None] * n + np.arange(n - 1)[:, None]
+        corners = np.add(quad, [0, n, n + 1, 0, n + 1, 1]).ravel()
         cells = vtk.vtkCellArray()
         cells.SetData(
             numpy_to_vtkIdTypeArray(np.arange(0, len(corners) + 1, 3), deep=True),

@@ -69,7 +69,9 @@ def step_row(ux, uy, uz, wx, wy, wz, share, i, load, dx, dy, diagonal, structura
 
 
 @numba.njit(parallel=True, fastmath=True, error_model="numpy", cache=True)
-def advance(now, before, share, load, dx, dy, diagonal, structural, shear, virtual, keep, gain, first_gain, done, steps):
+def advance(
+    now, before, share, load, dx, dy, diagonal, structural, shear, virtual, keep, gain, first_gain, done, steps
+):
     """Take the steps; now and before, shape (3, n, n), change places after each."""
     n = share.shape[0]
     for step in range(done, done + steps):

@@ -36,9 +36,9 @@ def step(
     gain: float,
 ):
     """Step an inner point."""
-    row, col = wp.tid()
-    i = row + 1
-    j = col + 1
+    i, j = wp.tid()
+    i += 1
+    j += 1
     u = now[i, j]
     right = wp.vec3(c.dx, 0.0, 0.0)
     up = wp.vec3(0.0, c.dy, 0.0)
