@@ -13,9 +13,9 @@ from benchmarks.clock import seconds
 from benchmarks.process import CACHE
 from benchmarks.stepping.problem import Problem, Stepper
 
-# Largest distance of any point from where float64 has it, as a fraction of the largest displacement. What a peer that
-# stores u_n and u_{n-1} in f32 loses by rounding is a tenth of it (docs/accuracy.md: what the stored form buys).
-TOLERANCE = 1e-3
+# Largest distance of any point from where float64 has it, as a fraction of the largest displacement. In f32 rounding
+# makes some 1e-6 of it, a spring too few or a wrong first step far more.
+TOLERANCE = 1e-4
 
 
 def steps_to_check(points: int) -> int:
