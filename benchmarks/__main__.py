@@ -55,7 +55,8 @@ def main() -> None:
     results = json.loads(kept.read_text(encoding="utf-8")) if kept.exists() else {}
     # Kernels and answers of an earlier run may be those of other code.
     shutil.rmtree(CACHE, ignore_errors=True)
-    results |= {"machine": page.machine(), "rounds": effort.rounds}
+    if options.parts != ["page"] or not results:
+        results |= {"machine": page.machine(), "rounds": effort.rounds}
     for part in options.parts or PARTS:
         if part != "page":
             results[part] = PARTS[part](effort, prefixed(progress, part))

@@ -115,10 +115,10 @@ def threads(effort: Effort, progress: Progress) -> dict[str, dict[str, Entries]]
     for count in thread_counts():
         say = prefixed(progress, f"{count} threads")
         for points in THREADS_POINTS:
-            found.setdefault(f"{points} x {points} points", {})[str(count)] = _race(
+            found.setdefault(f"{points} × {points} points", {})[str(count)] = _race(
                 STEPPING, FASTEST, effort.rounds, say, threads=count, points=points
             )
-        found.setdefault(f"{PIXELS} x {PIXELS} pixels", {})[str(count)] = _draw(
+        found.setdefault(f"{PIXELS} × {PIXELS} pixels", {})[str(count)] = _draw(
             effort, say, threads=count, pixels=PIXELS, refine=REFINE, lit=True
         )
     return found

@@ -13,6 +13,7 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.ticker import FixedLocator, FuncFormatter, LogLocator, NullFormatter, NullLocator
 
+from benchmarks.drawing.problem import POINTS
 from taichi_msm.study.plot import BLUE, DPI, GREEN, GREY, INK, NARROW, ORANGE, PURPLE, STYLE, VERMILION, WIDE
 from taichi_msm.study.result import Timing
 
@@ -70,11 +71,12 @@ def _plot_sizes(axes: Axes, results: Results, scale: Callable[[float], float]) -
 
 
 def _refine(axes: Axes, results: Results) -> None:
-    vertices = {str(30 * (int(refine) + 1) + 1): entries for refine, entries in results["refine"].items()}
-    series = by_peer(vertices)
-    axes.set(title="Drawing against refinement", ylabel="ms", xlabel="n, of n × n vertices; 512 × 512 pixels")
+    # Along the axis are vertices, as the logarithm of a refine of 0 is nowhere.
+    cells = POINTS - 1
+    series = by_peer({str(cells * (int(refine) + 1) + 1): entries for refine, entries in results["refine"].items()})
+    axes.set(title="Drawing against refinement", ylabel="ms", xlabel="refine; 512 × 512 pixels")
     _plot(axes, series, lambda n: 1e3)
-    _tick_at(axes.xaxis, sorted(series["taichi_msm"]))
+    _tick_at(axes.xaxis, sorted(series["taichi_msm"]), lambda vertices: (vertices - 1) / cells - 1)
 
 
 def _resolution(axes: Axes, results: Results) -> None:
@@ -129,10 +131,10 @@ def _plot(axes: Axes, series: Series, scale: Callable[[float], float]) -> None:
     _tick_plainly(axes.yaxis)
 
 
-def _tick_at(axis: Axis, places: list[float]) -> None:
+def _tick_at(axis: Axis, places: list[float], name: Callable[[float], float] = lambda value: value) -> None:
     axis.set_major_locator(FixedLocator(places))
     axis.set_minor_locator(NullLocator())
-    axis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
+    axis.set_major_formatter(FuncFormatter(lambda value, _: f"{name(value):g}"))
 
 
 def _tick_plainly(axis: Axis) -> None:

@@ -87,7 +87,8 @@ def answer(task: str, arguments: dict[str, Any]) -> dict[str, Any]:
     except ModuleNotFoundError as error:
         return {"unavailable": f"{error.name} is not installed"}
     except (ImportError, UnavailableError) as error:
-        return {"unavailable": str(error).splitlines()[0]}
+        # What follows in parentheses is a path.
+        return {"unavailable": str(error).splitlines()[0].split(" (")[0]}
 
 
 if __name__ == "__main__":

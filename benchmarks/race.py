@@ -53,7 +53,7 @@ def race(
         progress(f"{name}: check")
         entry = Entry(name)
         entries.append(entry)
-        found = _try(entry, f"{part}:check", {"peer": module, "threads": threads, **work})
+        found = _try(entry, progress, f"{part}:check", {"peer": module, "threads": threads, **work})
         if found is not None:
             entry.answer, entry.compile = found["answer"], found["compile"]
             if not found["right"]:
@@ -62,18 +62,22 @@ def race(
         for entry in entries:
             if not entry.said:
                 progress(f"{entry.name}: round {number + 1} of {rounds}")
-                seconds = _try(entry, f"{part}:clock", {"peer": peers[entry.name], "threads": threads, **work})
+                seconds = _try(
+                    entry, progress, f"{part}:clock", {"peer": peers[entry.name], "threads": threads, **work}
+                )
                 if seconds is not None:
                     entry.samples.append(seconds)
     return entries
 
 
-def _try(entry: Entry, task: str, arguments: dict[str, Any]) -> Any:
+def _try(entry: Entry, progress: Progress, task: str, arguments: dict[str, Any]) -> Any:
     """Call a task; where that fails, the entry says why."""
     try:
         return call(task, **arguments)
     except UnavailableError as error:
         entry.said = f"skipped: {error}"
     except FailedError as error:
-        entry.said = f"failed: {error}"
+        # The rest may name folders of this machine, which the page must not.
+        entry.said = f"failed: {str(error).split(':')[0]}"
+        progress(f"{entry.name} failed: {error}")
     return None

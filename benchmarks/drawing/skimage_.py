@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from skimage.transform import PiecewiseAffineTransform, warp
 
 from benchmarks.drawing.problem import SIDE, Picture, Problem
+from benchmarks.process import UnavailableError
 
 
 class Warp:
@@ -37,4 +38,6 @@ class Warp:
 def prepare(problem: Problem, threads: int | None) -> Warp:
     """Set up the warp; scikit-image takes one thread."""
     del threads
+    if not hasattr(PiecewiseAffineTransform, "from_estimate"):
+        raise UnavailableError("needs scikit-image 0.26")
     return Warp(problem)
