@@ -98,7 +98,17 @@ def page(results: Results) -> str:
         pixel_flops=bounds.PIXEL_FLOPS,
         frame_steps=steps_per_frame(load_scene(ROOT / whole_run.SCENE)),
         launch_share=launch_share(results),
+        warm_shares=warm_shares(results),
     )
+
+
+def warm_shares(results: Results) -> str:
+    """Say which share of a warm run each stage has."""
+    if "whole_run" not in results:
+        return NOT_MEASURED
+    warm = {stage: Timing.of(times).median for stage, times in results["whole_run"]["warm"].items()}
+    stages = [stage for stage in warm if stage not in ("process", "total")]
+    return ", ".join(f"{stage} {100 * warm[stage] / warm['process']:.0f} %" for stage in stages)
 
 
 def launch_share(results: Results) -> str:

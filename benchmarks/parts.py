@@ -148,5 +148,5 @@ PARTS: dict[str, Callable[[Effort, Progress], Any]] = {
     "refine": refine,
     "resolution": resolution,
     "threads": threads,
-    "bounds": lambda effort, progress: bounds.measure(effort.sizes, progress),
+    "bounds": lambda effort, progress: bounds.measure(effort.sizes, effort.rounds, progress),
 }
