@@ -45,11 +45,14 @@ def publish(results: dict[str, Any], quick: bool) -> None:
 def main() -> None:
     """Measure and publish."""
     parser = argparse.ArgumentParser(prog="python -m benchmarks", description=str(__doc__).splitlines()[0])
-    parser.add_argument("parts", nargs="*", metavar="PART", choices=[[], "page", *PARTS], help=", ".join(PARTS))
+    parser.add_argument("parts", nargs="*", metavar="PART", help=", ".join(["page", *PARTS]))
     parser.add_argument(
         "--quick", action="store_true", help="fewer sizes and rounds; writes to output/benchmarks/quick"
     )
     options = parser.parse_args()
+    unknown = set(options.parts) - {"page", *PARTS}
+    if unknown:
+        parser.error(f"{', '.join(sorted(unknown))}: not a part; take some of {', '.join(['page', *PARTS])}")
     effort = QUICK if options.quick else FULL
     kept = OUTPUT / ("quick.json" if options.quick else "results.json")
     results = json.loads(kept.read_text(encoding="utf-8")) if kept.exists() else {}
