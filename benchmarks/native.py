@@ -19,9 +19,9 @@ def library(source: Path) -> ctypes.CDLL:
         UnavailableError: when there is no g++, or it fails.
     """
     built = CACHE / f"{source.stem}.so"
+    if shutil.which("g++") is None:
+        raise UnavailableError("g++ is not installed")
     if not built.exists():
-        if shutil.which("g++") is None:
-            raise UnavailableError("g++ is not installed")
         CACHE.mkdir(parents=True, exist_ok=True)
         done = subprocess.run(
             ["g++", *OPTIONS, str(source), "-o", str(built)], capture_output=True, text=True, check=False

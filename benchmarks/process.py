@@ -1,13 +1,7 @@
-"""Every measurement is a process of its own: Taichi has one device a process, and pools of threads spin.
-
-    python -m benchmarks.process MODULE:FUNCTION ARGUMENTS
-
-calls the function with the arguments, a JSON object, and prints what it returns as JSON on the last line.
-"""
+"""Every measurement is a process of its own: Taichi has one device a process, and pools of threads spin."""
 
 from __future__ import annotations
 
-import importlib
 import json
 import os
 import subprocess
@@ -44,7 +38,7 @@ def call(task: str, **arguments: Any) -> Any:
         UnavailableError: when what it needs is not installed.
         FailedError: when it ends with another error or takes too long.
     """
-    command = [sys.executable, "-m", "benchmarks.process", task, json.dumps(arguments)]
+    command = [sys.executable, "-m", "benchmarks.child", task, json.dumps(arguments)]
     try:
         done = subprocess.run(
             command,
@@ -57,6 +51,8 @@ def call(task: str, **arguments: Any) -> Any:
         )
     except subprocess.TimeoutExpired:
         raise FailedError(f"takes more than {PATIENCE:g} s") from None
+    if done.returncode < 0:
+        raise FailedError(f"signal {-done.returncode}")
     if done.returncode:
         raise FailedError((done.stderr.strip().splitlines() or [f"exit code {done.returncode}"])[-1])
     answer = json.loads(done.stdout.splitlines()[-1])
@@ -77,19 +73,3 @@ def _environment(threads: int | None) -> dict[str, str]:
         pools = ("OMP_NUM_THREADS", "NUMBA_NUM_THREADS", "OPENBLAS_NUM_THREADS", "LP_NUM_THREADS")
         environment |= dict.fromkeys(pools, str(threads))
     return environment
-
-
-def answer(task: str, arguments: dict[str, Any]) -> dict[str, Any]:
-    """Call a function here; gives what it returned, or why it is not available."""
-    module, function = task.split(":")
-    try:
-        return {"returned": getattr(importlib.import_module(module), function)(**arguments)}
-    except ModuleNotFoundError as error:
-        return {"unavailable": f"{error.name} is not installed"}
-    except (ImportError, UnavailableError) as error:
-        # What follows in parentheses is a path.
-        return {"unavailable": str(error).splitlines()[0].split(" (")[0]}
-
-
-if __name__ == "__main__":
-    print("\n" + json.dumps(answer(sys.argv[1], json.loads(sys.argv[2]))))

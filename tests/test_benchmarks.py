@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from benchmarks import page, process, race
+from benchmarks import child, page, process, race
 from benchmarks.drawing.measure import psnr
 from benchmarks.stepping import PEERS, measure, numpy_
 from benchmarks.stepping.problem import Array, Problem
@@ -27,7 +27,7 @@ def in_this_process(monkeypatch: pytest.MonkeyPatch) -> None:
     """Every call is made here."""
 
     def call(task: str, **arguments: Any) -> Any:
-        answer = process.answer(task, arguments)
+        answer = child.answer(task, arguments)
         if "unavailable" in answer:
             raise process.UnavailableError(answer["unavailable"])
         return answer["returned"]
@@ -88,6 +88,12 @@ def test_a_measurement_is_a_process_of_its_own() -> None:
     assert process.call("json:dumps", obj=[1]) == "[1]"
     with pytest.raises(process.FailedError, match="TypeError"):
         process.call("json:dumps", nothing=1)
+
+
+def test_a_peer_without_its_compiler_is_skipped_with_its_word(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("PATH", "")
+    with pytest.raises(process.UnavailableError, match=r"g\+\+ is not installed"):
+        process.call("benchmarks.stepping.measure:check", peer=PEERS["C++, OpenMP"], points=5)
 
 
 def test_the_load_reaches_every_point() -> None:

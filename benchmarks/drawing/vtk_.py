@@ -15,6 +15,10 @@ class Vtk:
     """The mesh, its texture and its window."""
 
     def __init__(self, problem: Problem) -> None:
+        self._window = vtk.vtkRenderWindow()
+        self._window.OffScreenRenderingOn()
+        if not self._window.SupportsOpenGL():
+            raise UnavailableError("no OpenGL without a window")
         n = problem.vertices
         self._refinement = problem.refinement
         self._position, self._normal = (np.zeros((n * n, 3), np.float32) for _ in range(2))
@@ -40,13 +44,9 @@ class Vtk:
         camera.SetPosition(0, 0, 1)
         camera.SetFocalPoint(0, 0, 0)
         camera.SetClippingRange(0.1, 2)
-        self._window = vtk.vtkRenderWindow()
-        self._window.OffScreenRenderingOn()
         self._window.SetMultiSamples(0)
         self._window.SetSize(problem.pixels, problem.pixels)
         self._window.AddRenderer(renderer)
-        if not self._window.SupportsOpenGL():
-            raise UnavailableError("no OpenGL without a window")
         self._pixels = vtk.vtkUnsignedCharArray()
 
     def draw(self, position: NDArray[np.float32]) -> Picture:

@@ -9,6 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from benchmarks.stepping.problem import Array, Problem
+from taichi_msm.lattice import springs
 
 
 class Stepper:
@@ -19,8 +20,7 @@ class Stepper:
         now, before = (tuple(jnp.zeros((n, n)) for _ in range(3)) for _ in range(2))
         self._state = now, before, jnp.int32(0)
         self._load = tuple(jnp.array(share[1:-1, 1:-1]) for share in problem.load)
-        springs = [(s.down, s.right, *s.offset, s.length, s.stiffness) for s in problem.springs]
-        springs += [(-down, -right, -x, -y, length, k) for down, right, x, y, length, k in springs]
+        stencil = springs(problem.scene)
         virtual, keep, gain, first_gain = (
             problem.scene.springs.virtual,
             problem.keep,
@@ -32,7 +32,7 @@ class Stepper:
             now, before, done = state
             x, y, z = (u[1:-1, 1:-1] for u in now)
             force = [share - virtual * u for share, u in zip(load, (x, y, z), strict=True)]
-            for down, right, off_x, off_y, length, stiffness in springs:
+            for down, right, (off_x, off_y), length, stiffness in stencil:
                 there = [u[1 + down : n - 1 + down, 1 + right : n - 1 + right] for u in now]
                 to = there[0] - x + off_x, there[1] - y + off_y, there[2] - z
                 pull = stiffness - stiffness * length * jax.lax.rsqrt(to[0] * to[0] + to[1] * to[1] + to[2] * to[2])

@@ -5,6 +5,7 @@
 import taichi as ti
 
 from benchmarks.stepping.problem import Array, Problem, Stepper
+from taichi_msm.lattice import springs
 
 
 class PlainTaichi:
@@ -15,8 +16,7 @@ class PlainTaichi:
         n = problem.points
         now, before, load = (ti.Vector.field(3, ti.f32, shape=(n, n)) for _ in range(3))
         load.from_numpy(problem.load.transpose(1, 2, 0).copy())
-        springs = [(s.down, s.right, *s.offset, s.length, s.stiffness) for s in problem.springs]
-        springs += [(-down, -right, -x, -y, length, k) for down, right, x, y, length, k in springs]
+        stencil = [(s.down, s.right, *s.offset, s.length, s.stiffness) for s in springs(problem.scene)]
         virtual, keep = problem.scene.springs.virtual, problem.keep
 
         @ti.kernel
@@ -24,7 +24,7 @@ class PlainTaichi:
             for i, j in ti.ndrange((1, n - 1), (1, n - 1)):
                 u = now[i, j]
                 force = load[i, j] - virtual * u
-                for spring in ti.static(springs):
+                for spring in ti.static(stencil):
                     down, right, x, y, length, stiffness = ti.static(spring)
                     between = now[i + down, j + right] - u + ti.Vector([x, y, 0.0])
                     force += stiffness * (1 - length / between.norm()) * between
