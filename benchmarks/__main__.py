@@ -64,6 +64,8 @@ def main() -> None:
         if part != "page":
             results[part] = PARTS[part](effort, prefixed(progress, part))
             keep(results, kept)
+    # The answers of large sheets are large.
+    shutil.rmtree(CACHE, ignore_errors=True)
     publish(results, options.quick)
 
 
