@@ -25,9 +25,9 @@ SAMPLE_BYTES = 8  # depth and triangle of one sample of the picture
 PIXEL_BYTES = 3 * 12  # colours of one pixel, from sums to bytes
 TEXEL_BYTES = 4
 
-# Numbers for each mass point: displacement, difference and sums of forces; and the copies made for output.
-STATE_NUMBERS = 9
-OUTPUT_NUMBERS = 12
+# Numbers for each mass point: displacement and difference; and the copies made at the start and for output.
+STATE_NUMBERS = 6
+OUTPUT_NUMBERS = 15
 
 
 @dataclass(frozen=True)

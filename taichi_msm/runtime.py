@@ -130,6 +130,7 @@ def _initialise(device: Device) -> None:
     try:
         # Taichi prints the arch and, where a driver is missing, its search for it. Without fast_math every operation
         # rounds as IEEE 754 says, so that the bits of a result do not depend on threads, lanes or the compiler's mood.
+        # Taichi's optimisation of control flow takes half of the time of compiling, for what LLVM does again.
         with contextlib.redirect_stdout(io.StringIO()):
             ti.init(
                 arch=getattr(ti, device.arch),
@@ -137,6 +138,7 @@ def _initialise(device: Device) -> None:
                 enable_fallback=False,
                 **cache,
                 fast_math=False,
+                cfg_optimization=False,
                 log_level=ti.ERROR,
             )
     except Exception as error:

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 from collections import defaultdict
 
-from taichi_msm.dynamics import Dynamics, Structure, structure
+from taichi_msm.dynamics import Dynamics, structure
+from taichi_msm.forces import Structure
 from taichi_msm.runtime import Device
 from taichi_msm.scene import Scene
 

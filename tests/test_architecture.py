@@ -20,6 +20,8 @@ ORDER = [
     {"loads", "budget", "yaml_reader"},
     {"validation"},
     {"scene_file", "reference", "runtime"},
+    {"forces"},
+    {"sweep", "gather"},
     {"dynamics", "drawing", "gif", "publication", "trajectory"},
     {"accuracy", "encoding"},
     {"simulation", "notes"},

@@ -1,0 +1,203 @@
+"""What both forms of kernel 1 are made of: the force of a spring, and the step of a point.
+
+A value of the sheet is a vector of lanes, each of another column; on a GPU of one.
+"""
+
+# No `from __future__ import annotations` here: Taichi reads the annotations of a kernel.
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+from taichi_msm.runtime import FieldTree, ti
+
+# Rows of the field by_column; the first three say which points of a first, a middle and a last row move.
+MOVES, ACROSS, HAS_LEFT, HAS_RIGHT = 0, 3, 4, 5
+
+# Columns of the table of loads: gain, stiffness of the virtual springs, then for each grip force (3), point (2),
+# falloff and offset.
+GRIP_COLUMN, GRIP_COLUMNS = 2, 7
+
+
+@dataclass(frozen=True)
+class Structure:
+    """What a kernel is compiled for; numbers are its arguments.
+
+    Attributes:
+        rows, cols: points of the sheet.
+        precision: f32 or f64.
+        lanes: strips of columns.
+        workers: bands of rows that step side by side; 0 on a GPU, where every point does.
+        depth: steps that a band takes in one sweep.
+        structural, shear: whether there are springs of that family.
+        fixed_rows: whether every point of the first row is fixed, and of the last.
+        open_edges: whether a point at an edge moves, so that springs beyond the edge must be left out.
+        virtual: whether there are virtual springs.
+        damped: whether there is damping.
+        grips: for every grip whether it moves.
+    """
+
+    rows: int
+    cols: int
+    precision: str
+    lanes: int
+    workers: int
+    depth: int
+    structural: bool
+    shear: bool
+    fixed_rows: tuple[bool, bool]
+    open_edges: bool
+    virtual: bool
+    damped: bool
+    grips: tuple[bool, ...]
+
+    @property
+    def strip(self) -> int:
+        """Number of columns of a strip."""
+        return -(-self.cols // self.lanes)
+
+
+class SheetFields(FieldTree):
+    """The fields of one sheet; entry 0 and the last one of a row are the halo of its strips.
+
+    Args:
+        s: the structure.
+        stored_rows: rows of displacements.
+
+    Attributes:
+        displacement: u of x, y and z, each of shape (stored rows, strip + 2).
+        difference: d of x, y and z, each of shape (rows, strip + 2).
+        by_column: whether the points move, of a first, middle and last row; their place across [m]; whether they have
+            a left and a right neighbour: shape (6, strip + 2).
+        decay: of every standing grip, shape (standing grips, rows, strip + 2).
+    """
+
+    def __init__(self, s: Structure, stored_rows: int) -> None:
+        super().__init__()
+        self._lanes, self._real = s.lanes, getattr(ti, s.precision)
+        width = s.strip + 2
+        self.displacement = [self.vector(stored_rows, width) for _ in range(3)]
+        self.difference = [self.vector(s.rows, width) for _ in range(3)]
+        self.by_column = self.vector(6, width)
+        self.decay = self.vector(max(1, s.grips.count(False)), s.rows, width)
+
+    def vector(self, *shape: int) -> Any:
+        """Place a field of vectors of lanes."""
+        return self.place(ti.Vector.field(self._lanes, self._real), *shape)
+
+
+def spring_forces(s: Structure, fields: SheetFields) -> tuple[Callable[..., Any], Callable[..., Any]]:
+    """Make the functions that give the force of a spring along a row, and of one to the row ahead.
+
+    With q = u_Q - u_P and the rest vector o from P to Q, L^2 - L0^2 = q (q + 2 o), so that the force
+
+        k (L - L0) (Q - P) / L = k (L^2 - L0^2) / (L^2 + L0 L) (o + q)                         (eq. 2)
+
+    keeps the digits of a small motion on a large sheet. Swapping P and Q changes its sign and not one bit more.
+    """
+    u, by_column, open_edges = fields.displacement, fields.by_column, s.open_edges
+    # L^2 comes from L^2 - L0^2 with a few roundings of L0^2: this much more keeps it above 0 where two points meet.
+    above = 1 + 16 * (2.0**-24 if s.precision == "f32" else 2.0**-53)
+
+    @ti.func
+    def pull(longer, length, stiffness):
+        square = longer + length * length * above
+        return stiffness * longer / (square + length * ti.sqrt(square))
+
+    @ti.func
+    def along(p, b, dx, stiffness):
+        """Force on entry b of row p by its right neighbour."""
+        x = u[0][p, b + 1] - u[0][p, b]
+        y = u[1][p, b + 1] - u[1][p, b]
+        z = u[2][p, b + 1] - u[2][p, b]
+        to_x = x + dx
+        force = pull(x * (to_x + dx) + y * y + z * z, dx, stiffness)
+        if ti.static(open_edges):
+            force *= by_column[HAS_RIGHT, b]
+        return force * to_x, force * y, force * z
+
+    @ti.func
+    def ahead(p, q, b, right: ti.template(), dx, dy, stiffness, there):
+        """Force on entry b of row p by entry b + right of row q, which is dy above; there: 0 without a row q."""
+        x = u[0][q, b + right] - u[0][p, b]
+        y = u[1][q, b + right] - u[1][p, b]
+        z = u[2][q, b + right] - u[2][p, b]
+        to_x = x
+        to_y = y + dy
+        longer = x * x + y * (to_y + dy) + z * z
+        length = ti.abs(dy)
+        if ti.static(right != 0):
+            to_x = x + right * dx
+            longer = x * (to_x + right * dx) + y * (to_y + dy) + z * z
+            length = ti.sqrt(dx * dx + dy * dy)
+        force = pull(longer, length, stiffness)
+        if ti.static(open_edges):
+            force *= there
+        if ti.static(open_edges and right < 0):
+            force *= by_column[HAS_LEFT, b]
+        if ti.static(open_edges and right > 0):
+            force *= by_column[HAS_RIGHT, b]
+        return force * to_x, force * to_y, force * z
+
+    return along, ahead
+
+
+def point_step(s: Structure, fields: SheetFields) -> Callable[..., None]:
+    """Make the function that adds to the forces of springs those of the tissue and the probes, and steps a point.
+
+    d_{n+1} = keep d_n + gain F_n,    u_{n+1} = u_n + d_{n+1}                                  (eq. 6 to 9)
+    """
+    real = getattr(ti, s.precision)
+    rows, lanes, virtual, damped, grip_moves = s.rows, s.lanes, s.virtual, s.damped, s.grips
+    u, d, by_column, decay = fields.displacement, fields.difference, fields.by_column, fields.decay
+    standing = [grip_moves[:n].count(False) for n in range(len(grip_moves))]
+
+    @ti.func
+    def move(p, q, i, b, n, spring_x, spring_y, spring_z, keep, dy, top, loads: ti.template()):
+        """Step entry b of row i of the sheet, stored in row p, into row q; n is the row of the table."""
+        x = u[0][p, b]
+        y = u[1][p, b]
+        z = u[2][p, b]
+        force_x, force_y, force_z = spring_x, spring_y, spring_z
+        if ti.static(virtual):
+            force_x -= loads[n, 1] * x
+            force_y -= loads[n, 1] * y
+            force_z -= loads[n, 1] * z
+        for g in ti.static(range(len(grip_moves))):
+            column = ti.static(GRIP_COLUMN + GRIP_COLUMNS * g)
+            share = ti.Vector.zero(real, lanes)
+            if ti.static(grip_moves[g]):
+                off_x = by_column[ACROSS, b] - loads[n, column + 3]
+                off_y = top - i * dy - loads[n, column + 4]
+                distance = ti.sqrt(off_x * off_x + off_y * off_y)
+                share = ti.exp(-loads[n, column + 5] * distance - loads[n, column + 6])
+            else:
+                share = decay[standing[g], i, b]
+            force_x += loads[n, column] * share
+            force_y += loads[n, column + 1] * share
+            force_z += loads[n, column + 2] * share
+
+        kind = MOVES + 1
+        if i == 0:
+            kind = MOVES
+        if i == rows - 1:
+            kind = MOVES + 2
+        gain = loads[n, 0] * by_column[kind, b]
+        d_x = d[0][i, b]
+        d_y = d[1][i, b]
+        d_z = d[2][i, b]
+        if ti.static(damped):
+            d_x *= keep
+            d_y *= keep
+            d_z *= keep
+        d_x += gain * force_x
+        d_y += gain * force_y
+        d_z += gain * force_z
+        d[0][i, b] = d_x
+        d[1][i, b] = d_y
+        d[2][i, b] = d_z
+        u[0][q, b] = x + d_x
+        u[1][q, b] = y + d_y
+        u[2][q, b] = z + d_z
+
+    return move
