@@ -1,21 +1,20 @@
-"""Time a whole run, with an empty cache of compiled kernels and with a warm one, and a check.
-
-python benchmarks/whole_run.py [SCENE]
-"""
+"""A whole run of the program, with an empty cache of compiled kernels and with a warm one, and a check."""
 
 from __future__ import annotations
 
 import json
 import os
-import statistics
 import subprocess
 import sys
 import tempfile
 import time
-from pathlib import Path
 
-ROUNDS = 5
-SCENE = Path(__file__).parent.parent / "scenes" / "press.yaml"
+from benchmarks.process import ROOT
+from benchmarks.race import Progress
+
+SCENE = "scenes/press.yaml"
+
+Samples = dict[str, dict[str, list[float]]]
 
 
 def command(*arguments: str, cache: str) -> tuple[float, str]:
@@ -23,6 +22,7 @@ def command(*arguments: str, cache: str) -> tuple[float, str]:
     start = time.perf_counter()
     done = subprocess.run(
         [sys.executable, "-m", "taichi_msm", *arguments],
+        cwd=ROOT,
         env={**os.environ, "TI_OFFLINE_CACHE_FILE_PATH": cache},
         check=True,
         capture_output=True,
@@ -31,24 +31,20 @@ def command(*arguments: str, cache: str) -> tuple[float, str]:
     return time.perf_counter() - start, done.stdout
 
 
-def main(scene: str) -> None:
-    """Print a table of medians."""
-    samples: dict[str, list[dict[str, float]]] = {"cold": [], "warm": []}
-    checks = []
+def measure(rounds: int, progress: Progress) -> Samples:
+    """Run and check in turn; gives the times of every stage of a cold and a warm run, and of a check [s]."""
+    found: Samples = {"cold": {}, "warm": {}, "check": {}}
     with tempfile.TemporaryDirectory() as directory:
-        for n in range(ROUNDS):
-            cache = f"{directory}/cache{n}"
+        for number in range(rounds):
+            progress(f"round {number + 1} of {rounds}")
+            cache = f"{directory}/cache{number}"
             for kind in ("cold", "warm"):
-                seconds, text = command("run", scene, "--json", "--out", f"{directory}/out", cache=cache)
-                samples[kind].append({"process": seconds, **json.loads(text)["timings"]})
-            checks.append(command("check", scene, cache=cache)[0])
-    stages = list(samples["cold"][0])
-    print("| [s] | " + " | ".join(stages) + " |")
-    print("|---|" + "---:|" * len(stages))
-    for kind, runs in samples.items():
-        print(f"| {kind} | " + " | ".join(f"{statistics.median(run[s] for run in runs):.2f}" for s in stages) + " |")
-    print(f"\ncheck: {statistics.median(checks):.2f} s")
+                seconds, text = command("run", SCENE, "--json", "--out", f"{directory}/out", cache=cache)
+                _add(found[kind], {"process": seconds, **json.loads(text)["timings"]})
+            _add(found["check"], {"process": command("check", SCENE, cache=cache)[0]})
+    return found
 
 
-if __name__ == "__main__":
-    main(sys.argv[1] if len(sys.argv) > 1 else str(SCENE))
+def _add(samples: dict[str, list[float]], stages: dict[str, float]) -> None:
+    for stage, seconds in stages.items():
+        samples.setdefault(stage, []).append(seconds)

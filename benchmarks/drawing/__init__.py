@@ -1,0 +1,15 @@
+"""Drawing beside other ways to do it; the first peer is this program."""
+
+# Those that draw the same scene: the refined surface, lit.
+LIT = {
+    "taichi_msm": "benchmarks.drawing.msm",
+    "moderngl": "benchmarks.drawing.moderngl_",
+    "VTK": "benchmarks.drawing.vtk_",
+}
+
+# Those that warp the picture without light, and this program without light.
+FLAT = {
+    "taichi_msm": "benchmarks.drawing.msm",
+    "cv2.remap": "benchmarks.drawing.cv2_",
+    "PiecewiseAffineTransform": "benchmarks.drawing.skimage_",
+}

@@ -1,0 +1,44 @@
+"""cv2.remap: the picture warped by the displacement of the mass points, without light, depth or folds.
+
+remap asks for every pixel where it comes from, X with X + u(X) = x; three rounds of X = x - u(X) find it.
+"""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from benchmarks.drawing.problem import POINTS, SIDE, Picture, Problem
+
+ROUNDS = 3
+
+
+class Remap:
+    """The maps, made once and filled for every picture."""
+
+    def __init__(self, problem: Problem) -> None:
+        pixels = problem.pixels
+        self._rest, self._texture = problem.rest, problem.texture
+        self._pixel = np.stack(np.meshgrid(*[np.arange(pixels, dtype=np.float32)] * 2), axis=-1)
+        # From pixels to mass points and to texels, whose centres are halves.
+        self._to_points = (POINTS - 1) / pixels
+        self._to_texels = self._texture.shape[0] / pixels
+
+    def draw(self, position: NDArray[np.float32]) -> Picture:
+        """Warp the picture."""
+        moved = (position - self._rest)[..., :2] * (np.array([1, -1], np.float32) * (self._pixel.shape[0] / SIDE))
+        centre = (self._pixel + 0.5) * self._to_points
+        place = centre
+        for _ in range(ROUNDS):
+            back = cv2.remap(moved, place, None, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+            place = centre - back * self._to_points
+        texel = place * (self._to_texels / self._to_points) - 0.5
+        return cv2.remap(self._texture, texel, None, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+
+
+def prepare(problem: Problem, threads: int | None) -> Remap:
+    """Set up the maps."""
+    if threads is not None:
+        cv2.setNumThreads(threads)
+    return Remap(problem)

@@ -1,0 +1,97 @@
+"""The one picture that all peers draw: the paper's sheet, pressed and dragged, seen from the top.
+
+31 x 31 mass points, refined to 331 x 331 vertices, a texture over all of it. What is drawn, from positions of mass
+points to a picture in an array of NumPy, is the work.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from benchmarks.process import CACHE, ROOT
+from taichi_msm import reference
+from taichi_msm.lattice import rest_positions
+from taichi_msm.scene import Scene
+from taichi_msm.texture import load_texture
+
+POINTS, SIDE = 31, 0.33
+
+Picture = NDArray[np.uint8]
+
+
+class Artist(Protocol):
+    """A peer with its problem; each module of a peer has `prepare(problem, threads)`, which makes one."""
+
+    def draw(self, position: NDArray[np.float32]) -> Picture:
+        """Draw the sheet; positions of mass points [m], shape (rows, cols, 3)."""
+
+
+@dataclass(frozen=True)
+class Problem:
+    """What a peer needs.
+
+    Attributes:
+        pixels: width and height of the picture.
+        refine: vertices between two mass points.
+        lit: whether there is a headlight.
+    """
+
+    pixels: int
+    refine: int
+    lit: bool
+
+    @cached_property
+    def scene(self) -> Scene:
+        """The problem as this program takes it."""
+        return Scene.model_validate(
+            {
+                "image": str(ROOT / "scenes" / "textures" / "mucosa.png"),
+                "sheet": {"points": [POINTS, POINTS], "size": [SIDE, SIDE], "mass": 1e-3},
+                "springs": {"structural": 20, "shear": 20, "virtual": 0.5},
+                "damping": 0.02,
+                "probes": [
+                    {"force": [1500, 500, -3000], "load": [[0, 0], [0.2, 100]], "falloff": 60},
+                ],
+                "time": {"duration": 0.4},
+                "render": {
+                    "size": [self.pixels, self.pixels],
+                    "refine": self.refine,
+                    "shading": "headlight" if self.lit else "none",
+                },
+            }
+        )
+
+    @property
+    def vertices(self) -> int:
+        """Vertices along a side."""
+        return (POINTS - 1) * (self.refine + 1) + 1
+
+    @cached_property
+    def texture(self) -> Picture:
+        """The picture on the sheet."""
+        return load_texture(self.scene)
+
+    @cached_property
+    def position(self) -> NDArray[np.float32]:
+        """The sheet as it is pressed, the same for every picture; shape (rows, cols, 3)."""
+        kept = CACHE / "pressed.npy"
+        if not kept.exists():
+            CACHE.mkdir(parents=True, exist_ok=True)
+            np.save(kept, reference.simulate(self.scene)[-1].astype(np.float32))
+        return np.load(kept)
+
+    @cached_property
+    def rest(self) -> NDArray[np.float32]:
+        """The mass points at rest, shape (rows, cols, 3)."""
+        return rest_positions(self.scene.sheet).astype(np.float32)
+
+    @cached_property
+    def refinement(self) -> NDArray[np.float32]:
+        """The matrix that inserts vertices along one axis, shape (vertices, mass points)."""
+        place = np.arange(self.vertices) / (self.refine + 1)
+        return np.maximum(0, 1 - np.abs(place[:, None] - np.arange(POINTS))).astype(np.float32)

@@ -1,0 +1,272 @@
+"""docs/performance.md from what was measured."""
+
+from __future__ import annotations
+
+import shutil
+import subprocess
+from collections.abc import Callable
+from importlib import metadata
+from pathlib import Path
+from typing import Any
+
+from benchmarks import bounds, whole_run
+from benchmarks.drawing.measure import WANTED
+from benchmarks.drawing.problem import POINTS
+from benchmarks.parts import PIXELS, REFINE
+from benchmarks.process import ROOT
+from benchmarks.stepping.measure import TOLERANCE
+from taichi_msm import load_scene
+from taichi_msm.runtime import Device, available_threads
+from taichi_msm.stability import steps_per_frame
+from taichi_msm.study import measure
+from taichi_msm.study.result import Timing
+from taichi_msm.study.table import duration, number, timing
+
+TEMPLATE = ROOT / "docs" / "performance.template"
+OURS = "taichi_msm"
+NOT_MEASURED = "(not measured yet)"
+
+# Whose versions the page names, where they are installed.
+PACKAGES = ("numba", "jax", "warp-lang", "opencv-python-headless", "moderngl", "vtk", "scikit-image")
+
+Results = dict[str, Any]
+Entry = dict[str, Any]
+
+
+def machine() -> Results:
+    """Describe where the benchmarks run."""
+    found = measure.machine(Device("cpu", available_threads()))
+    versions = {"Taichi": found["versions"]["taichi"], "NumPy": found["versions"]["numpy"]}
+    for package in PACKAGES:
+        try:
+            versions[package] = metadata.version(package)
+        except metadata.PackageNotFoundError:
+            continue
+    if shutil.which("g++"):
+        versions["g++"] = subprocess.run(["g++", "-dumpfullversion"], capture_output=True, text=True).stdout.strip()
+    return {
+        "cpu": found["cpu"],
+        "threads": found["threads"],
+        "caches": _caches(),
+        "python": found["versions"]["python"],
+        "versions": ", ".join(f"{name} {version}" for name, version in versions.items()),
+    }
+
+
+def _caches() -> str:
+    """Name the caches of data that the first core sees."""
+    caches = []
+    for folder in sorted(Path("/sys/devices/system/cpu/cpu0/cache").glob("index*")):
+        level, kind, size = ((folder / name).read_text().strip() for name in ("level", "type", "size"))
+        if kind != "Instruction":
+            caches.append(f"L{level} {size.removesuffix('K')} KiB")
+    return ", ".join(caches) or "not known"
+
+
+def tables(results: Results) -> dict[str, str]:
+    """Make every table of the page that was measured."""
+    makers: dict[str, tuple[str, Callable[[], str]]] = {
+        "stepping_table": ("stepping", lambda: stepping_table(results["stepping"])),
+        "ratio_table": ("stepping", lambda: ratio_table(results["stepping"])),
+        "lit_table": ("drawing", lambda: drawing_table(results["drawing"]["lit"])),
+        "flat_table": ("drawing", lambda: drawing_table(results["drawing"]["flat"])),
+        "whole_run_table": ("whole_run", lambda: whole_run_table(results["whole_run"])),
+        "size_table": ("size", lambda: size_table(results["size"])),
+        "threads_table": ("threads", lambda: threads_table(results["threads"])),
+        "machine_table": ("bounds", lambda: machine_table(results["bounds"])),
+        "step_bound_table": ("bounds", lambda: step_bound_table(results)),
+        "drawing_bound_table": ("bounds", lambda: drawing_bound_table(results)),
+    }
+    return {name: make() if part in results else NOT_MEASURED for name, (part, make) in makers.items()}
+
+
+def page(results: Results) -> str:
+    """Fill the template."""
+    return TEMPLATE.read_text(encoding="utf-8").format(
+        **results["machine"],
+        **tables(results),
+        rounds=results["rounds"],
+        tolerance=f"{TOLERANCE:g}",
+        lit_wanted=f"{WANTED[True]:g}",
+        flat_wanted=f"{WANTED[False]:g}",
+        refine=REFINE,
+        pixels=PIXELS,
+        step_bytes=bounds.STEP_BYTES,
+        step_flops=f"{bounds.STEP_FLOPS:g}",
+        step_roots=bounds.STEP_ROOTS,
+        vertex_flops=bounds.VERTEX_FLOPS,
+        pixel_flops=bounds.PIXEL_FLOPS,
+        frame_steps=steps_per_frame(load_scene(ROOT / whole_run.SCENE)),
+        launch_share=launch_share(results),
+        warm_shares=warm_shares(results),
+    )
+
+
+def warm_shares(results: Results) -> str:
+    """Say which share of a warm run each stage has."""
+    if "whole_run" not in results:
+        return NOT_MEASURED
+    warm = {stage: Timing.of(times).median for stage, times in results["whole_run"]["warm"].items()}
+    stages = [stage for stage in warm if stage not in ("process", "total")]
+    return ", ".join(f"{stage} {100 * warm[stage] / warm['process']:.0f} %" for stage in stages)
+
+
+def launch_share(results: Results) -> str:
+    """Say what a launch adds to a step when it takes a whole frame."""
+    found = results.get("bounds", {})
+    if "one_step" not in found:
+        return NOT_MEASURED
+    return duration(found["one_step"] / steps_per_frame(load_scene(ROOT / whole_run.SCENE)))
+
+
+def table(head: list[str], rows: list[list[str]]) -> str:
+    """Write a table, its first column of text and the others of numbers."""
+    lines = ["| " + " | ".join(head) + " |", "|---|" + "---:|" * (len(head) - 1)]
+    return "\n".join(lines + ["| " + " | ".join(row) + " |" for row in rows])
+
+
+def stepping_table(measured: dict[str, list[Entry]]) -> str:
+    """Show the time of a step of every peer."""
+    first = next(iter(measured.values()))
+    rows = []
+    for index, entry in enumerate(first):
+        errors = [entries[index]["answer"] for entries in measured.values()]
+        worst = max((error for error in errors if error is not None), default=None)
+        cells = [_cell(entries[index]) for entries in measured.values()]
+        rows.append([entry["name"], *cells, "-" if worst is None else f"{worst:.1g}", _compile(entry)])
+    return table(["time of a step", *(f"{n} × {n}" for n in measured), "largest error", "compile"], rows)
+
+
+def ratio_table(measured: dict[str, list[Entry]]) -> str:
+    """Show how many times as long as this program the peers take."""
+    return table(
+        ["time / this program's", *(f"{n} × {n}" for n in measured)],
+        [
+            [entry["name"], *(_ratio(entries[index], entries[0]) for entries in measured.values())]
+            for index, entry in enumerate(next(iter(measured.values())))
+            if index
+        ],
+    )
+
+
+def drawing_table(measured: dict[str, list[Entry]]) -> str:
+    """Show the time of a picture of every peer."""
+    first = next(iter(measured.values()))
+    rows = []
+    for index, entry in enumerate(first):
+        near = entry["answer"]
+        agrees = "-" if near is None else f"{near:.1f} dB"
+        cells = [
+            cell
+            for entries in measured.values()
+            for cell in (_cell(entries[index]), _ratio(entries[index], entries[0]))
+        ]
+        rows.append([entry["name"], *cells, agrees, _compile(entry)])
+    head = [word for n in measured for word in (f"{n} × {n}", "/ ours")]
+    return table(["time of a picture", *head, "PSNR", "compile"], rows)
+
+
+def whole_run_table(measured: dict[str, dict[str, list[float]]]) -> str:
+    """Show the time of every stage of a run, and of a check."""
+    stages = list(measured["cold"])
+    rows = [
+        [kind, *(_seconds(times[stage]) if stage in times else "-" for stage in stages)]
+        for kind, times in measured.items()
+    ]
+    return table(["[s]", *stages], rows)
+
+
+def size_table(measured: dict[str, list[Entry]]) -> str:
+    """Show the time of a step of the fastest peers at every size."""
+    names = [entry["name"] for entry in next(iter(measured.values()))]
+    return table(["points", *names], [[f"{n} × {n}", *map(_cell, entries)] for n, entries in measured.items()])
+
+
+def threads_table(measured: dict[str, dict[str, list[Entry]]]) -> str:
+    """Show the time of a step and of a picture with every number of threads."""
+    rows = []
+    for work, by_count in measured.items():
+        for index, entry in enumerate(next(iter(by_count.values()))):
+            rows.append([f"{entry['name']}, {work}", *(_cell(entries[index]) for entries in by_count.values())])
+    counts = next(iter(measured.values()))
+    return table(["work", *(f"{count} threads" if count != "1" else "1 thread" for count in counts)], rows)
+
+
+def machine_table(found: Results) -> str:
+    """Show what the machine can do."""
+    if found["said"]:
+        return f"(not measured: {found['said']})"
+    rows = [
+        ["multiplications with addition", f"{found['flops'] / 1e9:.0f} Gflop/s"],
+        ["reciprocal square roots", f"{found['roots'] / 1e9:.2g} G/s"],
+    ]
+    for points, bandwidth in found["bandwidth"].items():
+        rows.append([f"triad over the state of {points} × {points} points", f"{bandwidth / 1e9:.0f} GB/s"])
+    rows.append(["launch of an empty kernel of Taichi", duration(found["launch"])])
+    rows.append([f"`advance(1)` of {bounds.SMALLEST} × {bounds.SMALLEST} points", duration(found["one_step"])])
+    return table(["what", "measured"], rows)
+
+
+def step_bound_table(results: Results) -> str:
+    """Show how far a step is from what the machine allows, at every size."""
+    found = results["bounds"]
+    if found["said"] or "size" not in results:
+        return NOT_MEASURED
+    rows = []
+    for points, entries in results["size"].items():
+        if points not in found["bandwidth"] or not entries[0]["samples"]:
+            continue
+        count = int(points) ** 2
+        least = {
+            "bytes": bounds.STEP_BYTES * count / found["bandwidth"][points],
+            "flops": bounds.STEP_FLOPS * count / found["flops"],
+            "roots": bounds.STEP_ROOTS * count / found["roots"],
+        }
+        rows.append([f"{points} × {points}", *_against(Timing.of(entries[0]["samples"]).median, least)])
+    return table(["points", "step", "bytes", "flops", "roots", "bound by", "of the bound"], rows)
+
+
+def drawing_bound_table(results: Results) -> str:
+    """Show how far a picture is from what the machine allows, at every size."""
+    found = results["bounds"]
+    if found["said"] or "drawing" not in results:
+        return NOT_MEASURED
+    vertices = ((POINTS - 1) * (REFINE + 1) + 1) ** 2
+    # The slowest of the bandwidths: of a sheet that no cache holds.
+    bandwidth = min(found["bandwidth"].values())
+    rows = []
+    for pixels, entries in results["drawing"]["lit"].items():
+        count = int(pixels) ** 2
+        least = {
+            "bytes": bounds.COLOUR_BYTES * 2 * count / bandwidth,
+            "flops": (bounds.VERTEX_FLOPS * vertices + bounds.PIXEL_FLOPS * count) / found["flops"],
+            "launch": found["launch"],
+        }
+        if entries[0]["samples"]:
+            rows.append([f"{pixels} × {pixels}", *_against(Timing.of(entries[0]["samples"]).median, least)])
+    return table(["pixels", "picture", "bytes", "flops", "launch", "bound by", "of the bound"], rows)
+
+
+def _against(seconds: float, least: dict[str, float]) -> list[str]:
+    """Compare a time with the least times of each kind: the greatest of them is the bound."""
+    binding = max(least, key=lambda kind: least[kind])
+    return [duration(seconds), *map(duration, least.values()), binding, f"{100 * least[binding] / seconds:.0f} %"]
+
+
+def _cell(entry: Entry) -> str:
+    return timing(Timing.of(entry["samples"])) if entry["samples"] else str(entry["said"])
+
+
+def _ratio(entry: Entry, ours: Entry) -> str:
+    if not (entry["samples"] and ours["samples"]):
+        return "-"
+    return number(Timing.of(entry["samples"]).median / Timing.of(ours["samples"]).median)
+
+
+def _compile(entry: Entry) -> str:
+    return "-" if entry["compile"] is None else duration(entry["compile"])
+
+
+def _seconds(samples: list[float]) -> str:
+    known = Timing.of(samples)
+    return f"{known.median:.2f} ({known.fastest:.2f} to {known.slowest:.2f})"

@@ -1,0 +1,152 @@
+"""The parts of the benchmarks and how much of each is measured."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import asdict, dataclass
+from typing import Any
+
+from benchmarks import bounds, whole_run
+from benchmarks.drawing import FLAT, LIT
+from benchmarks.race import Progress, race
+from benchmarks.stepping import FASTEST, PEERS
+from taichi_msm.runtime import available_threads
+
+STEPPING, DRAWING = "benchmarks.stepping.measure", "benchmarks.drawing.measure"
+
+# The picture of the drawing's scaling, and the sheets whose steps are timed with every number of threads.
+PIXELS, REFINE = 512, 10
+THREADS_POINTS = (331, 1024)
+
+
+@dataclass(frozen=True)
+class Effort:
+    """How much is measured.
+
+    Attributes:
+        rounds: how often each is timed.
+        points: sizes of the sheet that all peers step.
+        sizes: sizes of the sheet that the fastest ones step.
+        pixels: sizes of the picture that all peers draw.
+        refines: refinements ...
+        resolutions: ... and sizes of the picture that this program draws.
+    """
+
+    rounds: int
+    points: tuple[int, ...]
+    sizes: tuple[int, ...]
+    pixels: tuple[int, ...]
+    refines: tuple[int, ...]
+    resolutions: tuple[int, ...]
+
+
+FULL = Effort(
+    rounds=5,
+    points=(31, 101, 331, 1024),
+    sizes=(11, 31, 101, 331, 1024, 2048, 4096),
+    pixels=(512, 1024),
+    refines=(0, 1, 2, 4, 10, 20, 40, 64),
+    resolutions=(128, 256, 512, 1024, 2048, 4096),
+)
+QUICK = Effort(
+    rounds=2, points=(31, 331), sizes=(11, 101, 1024), pixels=(512,), refines=(0, 10, 40), resolutions=(256, 1024)
+)
+
+Entries = list[dict[str, Any]]
+
+
+def _race(*arguments: Any, **work: Any) -> Entries:
+    return [asdict(entry) for entry in race(*arguments, **work)]
+
+
+def stepping(effort: Effort, progress: Progress) -> dict[str, Entries]:
+    """Step beside all peers."""
+    return {
+        str(n): _race(STEPPING, PEERS, effort.rounds, prefixed(progress, f"{n} x {n}"), points=n) for n in effort.points
+    }
+
+
+def drawing(effort: Effort, progress: Progress) -> dict[str, dict[str, Entries]]:
+    """Draw beside all peers, lit and flat."""
+    return {
+        kind: {
+            str(pixels): _race(
+                DRAWING,
+                peers,
+                effort.rounds,
+                prefixed(progress, f"{kind} {pixels} px"),
+                pixels=pixels,
+                refine=REFINE,
+                lit=kind == "lit",
+            )
+            for pixels in effort.pixels
+        }
+        for kind, peers in (("lit", LIT), ("flat", FLAT))
+    }
+
+
+def size(effort: Effort, progress: Progress) -> dict[str, Entries]:
+    """Step sheets of every size."""
+    return {
+        str(n): _race(STEPPING, FASTEST, effort.rounds, prefixed(progress, f"{n} x {n}"), points=n)
+        for n in effort.sizes
+    }
+
+
+def refine(effort: Effort, progress: Progress) -> dict[str, Entries]:
+    """Draw with every refinement."""
+    return {
+        str(n): _draw(effort, prefixed(progress, f"refine {n}"), pixels=PIXELS, refine=n, lit=True)
+        for n in effort.refines
+    }
+
+
+def resolution(effort: Effort, progress: Progress) -> dict[str, Entries]:
+    """Draw pictures of every size."""
+    return {
+        str(pixels): _draw(effort, prefixed(progress, f"{pixels} px"), pixels=pixels, refine=REFINE, lit=True)
+        for pixels in effort.resolutions
+    }
+
+
+def threads(effort: Effort, progress: Progress) -> dict[str, dict[str, Entries]]:
+    """Step and draw with every number of threads."""
+    found: dict[str, dict[str, Entries]] = {}
+    for count in thread_counts():
+        say = prefixed(progress, f"{count} threads")
+        for points in THREADS_POINTS:
+            found.setdefault(f"{points} × {points} points", {})[str(count)] = _race(
+                STEPPING, FASTEST, effort.rounds, say, threads=count, points=points
+            )
+        found.setdefault(f"{PIXELS} × {PIXELS} pixels", {})[str(count)] = _draw(
+            effort, say, threads=count, pixels=PIXELS, refine=REFINE, lit=True
+        )
+    return found
+
+
+def thread_counts() -> list[int]:
+    """Give 1, 2, 4, ... and all."""
+    most = available_threads()
+    return sorted({most, *(1 << k for k in range(most.bit_length()) if 1 << k < most)})
+
+
+def _draw(effort: Effort, progress: Progress, **work: Any) -> Entries:
+    """Time this program's drawing."""
+    return _race(DRAWING, {"taichi_msm": LIT["taichi_msm"]}, effort.rounds, progress, **work)
+
+
+def prefixed(progress: Progress, prefix: str) -> Progress:
+    """Say of what the progress is."""
+    return lambda text: progress(f"{prefix}: {text}")
+
+
+PARTS: dict[str, Callable[[Effort, Progress], Any]] = {
+    "stepping": stepping,
+    "drawing": drawing,
+    "whole_run": lambda effort, progress: whole_run.measure(effort.rounds, progress),
+    "size": size,
+    "refine": refine,
+    "resolution": resolution,
+    "threads": threads,
+    "bounds": lambda effort, progress: bounds.measure(effort.sizes, effort.rounds, progress),
+}

@@ -1,0 +1,145 @@
+"""Cost against size, refinement, resolution and threads as pictures, in the look of `taichi-msm study`."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable
+from pathlib import Path
+from typing import Any
+
+from matplotlib import style
+from matplotlib.axes import Axes
+from matplotlib.axis import Axis
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
+from matplotlib.ticker import FixedLocator, FuncFormatter, LogLocator, NullFormatter, NullLocator
+
+from benchmarks.drawing.problem import POINTS
+from taichi_msm.study.plot import BLUE, DPI, GREEN, GREY, INK, NARROW, ORANGE, PURPLE, STYLE, VERMILION, WIDE
+from taichi_msm.study.result import Timing
+
+COLOURS = {"taichi_msm": BLUE, "C++, OpenMP": VERMILION, "Numba": GREEN}
+MARKERS = {"taichi_msm": "o", "C++, OpenMP": "s", "Numba": "D"}
+OTHERS = (ORANGE, PURPLE, INK)
+HEIGHT = 3.4
+
+Results = dict[str, Any]
+Series = dict[str, dict[float, Timing]]
+
+
+def draw(results: Results, folder: Path) -> list[Path]:
+    """Draw what was measured; gives the pictures."""
+    made = []
+    for name, width, panels in (
+        ("size", WIDE, (_per_step, _per_point)),
+        ("drawing", WIDE, (_refine, _resolution)),
+        ("threads", NARROW, (_threads,)),
+    ):
+        parts = ("refine", "resolution") if name == "drawing" else (name,)
+        if all(part in results for part in parts):
+            path = folder / f"performance-{name}.png"
+            _figure(results, width, panels, path)
+            made.append(path)
+    return made
+
+
+def _figure(results: Results, width: float, panels: Iterable[Callable[[Axes, Results], None]], path: Path) -> None:
+    panels = tuple(panels)
+    with style.context(STYLE, after_reset=True):
+        figure = Figure(figsize=(width, HEIGHT), dpi=DPI, layout="constrained")
+        FigureCanvasAgg(figure)
+        for panel, axes in zip(panels, figure.subplots(1, len(panels), squeeze=False)[0], strict=True):
+            panel(axes, results)
+        figure.savefig(path, format="png")
+
+
+def _per_step(axes: Axes, results: Results) -> None:
+    axes.set(title="Time of a step", ylabel="µs")
+    _plot_sizes(axes, results, lambda points: 1e6)
+
+
+def _per_point(axes: Axes, results: Results) -> None:
+    axes.set(title="Time of a step and a point", ylabel="ns")
+    _plot_sizes(axes, results, lambda points: 1e9 / points**2)
+
+
+def _plot_sizes(axes: Axes, results: Results, scale: Callable[[float], float]) -> None:
+    series = by_peer(results["size"])
+    _plot(axes, series, scale)
+    axes.set_xlabel("n, of n × n mass points")
+    _tick_at(axes.xaxis, sorted({at for times in series.values() for at in times}))
+    axes.legend(loc="best")
+
+
+def _refine(axes: Axes, results: Results) -> None:
+    # Along the axis are vertices, as the logarithm of a refine of 0 is nowhere.
+    cells = POINTS - 1
+    series = by_peer({str(cells * (int(refine) + 1) + 1): entries for refine, entries in results["refine"].items()})
+    axes.set(title="Drawing against refinement", ylabel="ms", xlabel="refine; 512 × 512 pixels")
+    _plot(axes, series, lambda n: 1e3)
+    _tick_at(axes.xaxis, sorted(series["taichi_msm"]), lambda vertices: (vertices - 1) / cells - 1)
+
+
+def _resolution(axes: Axes, results: Results) -> None:
+    series = by_peer(results["resolution"])
+    axes.set(title="Drawing against resolution", ylabel="ms", xlabel="n, of n × n pixels; 331 × 331 vertices")
+    _plot(axes, series, lambda n: 1e3)
+    _tick_at(axes.xaxis, sorted(series["taichi_msm"]))
+
+
+def _threads(axes: Axes, results: Results) -> None:
+    """How many times as fast as with one thread."""
+    axes.set(title="Speed-up", xlabel="threads", ylabel="times as fast as with one")
+    counts: set[float] = set()
+    for (work, by_count), line in zip(results["threads"].items(), ("-", "--", ":"), strict=False):
+        for name, times in by_peer(by_count).items():
+            if 1 not in times:
+                continue
+            counts |= set(times)
+            speed = [times[1].median / times[count].median for count in sorted(times)]
+            label = f"{name}, {work}"
+            axes.plot(
+                sorted(times), speed, line, color=COLOURS[name], marker=MARKERS[name], markersize=4.5, label=label
+            )
+    axes.set_xscale("log")
+    axes.set_yscale("log")
+    axes.plot(sorted(counts), sorted(counts), color=GREY, linewidth=0.7, label="as many times as threads")
+    _tick_at(axes.xaxis, sorted(counts))
+    _tick_plainly(axes.yaxis)
+    axes.legend(loc="center left", bbox_to_anchor=(1.02, 0.5))
+
+
+def by_peer(measured: dict[str, list[Results]]) -> Series:
+    """Turn the entries of every size into a line for every peer."""
+    series: Series = {}
+    for at, entries in measured.items():
+        for entry in entries:
+            if entry["samples"]:
+                series.setdefault(entry["name"], {})[float(at)] = Timing.of(entry["samples"])
+    return series
+
+
+def _plot(axes: Axes, series: Series, scale: Callable[[float], float]) -> None:
+    """Draw a line for every peer, and at every point a thin one from the fastest to the slowest round."""
+    for (name, times), other in zip(series.items(), OTHERS, strict=False):
+        at, colour = sorted(times), COLOURS.get(name, other)
+        lows, highs = ([scale(n) * getattr(times[n], end) for n in at] for end in ("fastest", "slowest"))
+        axes.vlines(at, lows, highs, color=colour, linewidth=0.7, alpha=0.6)
+        medians = [scale(n) * times[n].median for n in at]
+        axes.plot(at, medians, color=colour, marker=MARKERS.get(name, "o"), markersize=4.5, label=name, zorder=3)
+    axes.set_xscale("log")
+    axes.set_yscale("log")
+    _tick_plainly(axes.yaxis)
+
+
+def _tick_at(axis: Axis, places: list[float], name: Callable[[float], float] = lambda value: value) -> None:
+    axis.set_major_locator(FixedLocator(places))
+    axis.set_minor_locator(NullLocator())
+    axis.set_major_formatter(FuncFormatter(lambda value, _: f"{name(value):g}"))
+
+
+def _tick_plainly(axis: Axis) -> None:
+    """Write 0.05 rather than 5 x 10^-2."""
+    low, high = axis.get_view_interval()
+    axis.set_major_locator(LogLocator(subs=(1, 2, 5) if high / low < 300 else (1,)))
+    axis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
+    axis.set_minor_formatter(NullFormatter())

@@ -1,0 +1,75 @@
+"""Every measurement is a process of its own: Taichi has one device a process, and pools of threads spin."""
+
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+ROOT = Path(__file__).parent.parent
+
+# What a run makes; ignored by git. Compiled kernels and the answers to compare with are kept for one run only.
+OUTPUT = ROOT / "output" / "benchmarks"
+CACHE = OUTPUT / "cache"
+
+# A measurement that takes longer is given up [s].
+PATIENCE = 900.0
+
+
+class UnavailableError(Exception):
+    """A peer cannot run here; the message says why, in a few words."""
+
+
+class FailedError(Exception):
+    """A measurement ended with an error; the message is its last line."""
+
+
+def call(task: str, **arguments: Any) -> Any:
+    """Call a function in a process of its own.
+
+    Args:
+        task: "module:function"; what it takes and gives is JSON.
+        arguments: of the function; `threads` also sizes the pools that look into the environment.
+
+    Raises:
+        UnavailableError: when what it needs is not installed.
+        FailedError: when it ends with another error or takes too long.
+    """
+    command = [sys.executable, "-m", "benchmarks.child", task, json.dumps(arguments)]
+    try:
+        done = subprocess.run(
+            command,
+            cwd=ROOT,
+            env=_environment(arguments.get("threads")),
+            capture_output=True,
+            text=True,
+            check=False,
+            timeout=PATIENCE,
+        )
+    except subprocess.TimeoutExpired:
+        raise FailedError(f"takes more than {PATIENCE:g} s") from None
+    if done.returncode < 0:
+        raise FailedError(f"signal {-done.returncode}")
+    if done.returncode:
+        raise FailedError((done.stderr.strip().splitlines() or [f"exit code {done.returncode}"])[-1])
+    answer = json.loads(done.stdout.splitlines()[-1])
+    if "unavailable" in answer:
+        raise UnavailableError(answer["unavailable"])
+    return answer["returned"]
+
+
+def _environment(threads: int | None) -> dict[str, str]:
+    environment = {
+        **os.environ,
+        "JAX_PLATFORMS": "cpu",
+        "NUMBA_CACHE_DIR": str(CACHE / "numba"),
+        "TI_OFFLINE_CACHE_FILE_PATH": str(CACHE / "taichi"),
+        "WARP_CACHE_PATH": str(CACHE / "warp"),
+    }
+    if threads is not None:
+        pools = ("OMP_NUM_THREADS", "NUMBA_NUM_THREADS", "OPENBLAS_NUM_THREADS", "LP_NUM_THREADS")
+        environment |= dict.fromkeys(pools, str(threads))
+    return environment

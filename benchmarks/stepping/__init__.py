@@ -1,0 +1,14 @@
+"""Stepping beside other ways to write it; the first peer is this program."""
+
+PEERS = {
+    "taichi_msm": "benchmarks.stepping.msm",
+    "C++, OpenMP": "benchmarks.stepping.cpp",
+    "Numba": "benchmarks.stepping.numba_",
+    "plain Taichi": "benchmarks.stepping.plain_taichi",
+    "JAX": "benchmarks.stepping.jax_",
+    "Warp": "benchmarks.stepping.warp_",
+    "NumPy": "benchmarks.stepping.numpy_",
+}
+
+# Those that are timed at every size and with every number of threads.
+FASTEST = {name: PEERS[name] for name in ("taichi_msm", "C++, OpenMP", "Numba")}

@@ -1,0 +1,106 @@
+"""The one problem that all peers step: n x n points, a fixed border, all three families of springs, a constant load.
+
+With u_n the displacement, F_n all forces but the damping and g = C / m, a step is (docs/model.md, central)
+
+    u_{n+1} = u_n + keep (u_n - u_{n-1}) + gain F_n,    u_1 = gain_0 F_0
+    keep = (1 - g h / 2) / (1 + g h / 2),  gain = h^2 / m / (1 + g h / 2),  gain_0 = h^2 / m / 2
+
+Cells are of one size whatever n is, so that every size is the same motion of single cells, and the load reaches the
+whole sheet, so that no number is so small that the processor takes its slow path. Virtual springs are stiff enough that
+nothing wrinkles, for which wrinkle comes would hang on the last digits.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+from itertools import islice
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from taichi_msm import reference
+from taichi_msm.lattice import Spring, springs
+from taichi_msm.loads import decay, grips
+from taichi_msm.scene import Scene
+from taichi_msm.stability import step
+
+CELL = 0.01
+FORCE = (0.02, 0.01, -0.08)
+
+# From the centre to the middle of a side the load decays by e^-3.
+DECAY = 3.0
+
+Array = NDArray[np.float32]
+
+
+class Stepper(Protocol):
+    """A peer at rest with its problem; each module of a peer has `prepare(problem, threads)`, which makes one."""
+
+    def advance(self, steps: int) -> None:
+        """Take a number of steps, and wait for their end."""
+
+    def displacement(self) -> Array:
+        """Give the displacement, shape (n, n, 3)."""
+
+
+@dataclass(frozen=True)
+class Problem:
+    """The numbers that a peer needs.
+
+    Attributes:
+        points: n.
+    """
+
+    points: int
+
+    @cached_property
+    def scene(self) -> Scene:
+        """The problem as this program takes it."""
+        side = CELL * (self.points - 1)
+        return Scene.model_validate(
+            {
+                "sheet": {"points": [self.points, self.points], "size": [side, side], "mass": 1e-3},
+                "springs": {"structural": 20, "shear": 15, "virtual": 10, "virtual_active": "always"},
+                "damping": 0.01,
+                "probes": [{"force": FORCE, "falloff": 2 * DECAY / side, "offset": 0}],
+                "time": {"duration": 1, "step": 0.002},
+                "output": [],
+            }
+        )
+
+    @cached_property
+    def springs(self) -> tuple[Spring, ...]:
+        """Every spring once, from the point above or to the left."""
+        return tuple(spring for spring in springs(self.scene) if (spring.down, spring.right) > (0, 0))
+
+    @cached_property
+    def load(self) -> Array:
+        """Force on each point, constant in time [N], shape (3, n, n)."""
+        share = decay(grips(self.scene)[0], self.scene)
+        return np.array(FORCE, np.float32)[:, None, None] * share.astype(np.float32)
+
+    @property
+    def keep(self) -> float:
+        """Share of the last difference that the damping leaves."""
+        drag = self._drag
+        return (1 - drag) / (1 + drag)
+
+    @property
+    def gain(self) -> float:
+        """Displacement for a force [m/N]."""
+        return step(self.scene) ** 2 / self.scene.sheet.mass / (1 + self._drag)
+
+    @property
+    def first_gain(self) -> float:
+        """The same of the first step."""
+        return step(self.scene) ** 2 / self.scene.sheet.mass / 2
+
+    @property
+    def _drag(self) -> float:
+        return self.scene.damping * step(self.scene) / self.scene.sheet.mass / 2
+
+    def answer(self, steps: int) -> NDArray[np.float64]:
+        """Take the steps by the program's float64 twin; shape (n, n, 3)."""
+        return next(islice(reference.displacements(self.scene), steps, None))

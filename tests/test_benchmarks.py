@@ -1,0 +1,118 @@
+"""The benchmarks compare like with like: a peer is timed only where its answer is right."""
+
+from __future__ import annotations
+
+import sys
+from dataclasses import asdict
+from types import ModuleType
+from typing import Any
+
+import numpy as np
+import pytest
+
+from benchmarks import child, page, process, race
+from benchmarks.drawing.measure import psnr
+from benchmarks.stepping import PEERS, measure, numpy_
+from benchmarks.stepping.problem import Array, Problem
+from taichi_msm.runtime import Device
+
+
+@pytest.fixture(autouse=True)
+def own_cache(tmp_path: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(measure, "CACHE", tmp_path)
+
+
+@pytest.fixture
+def in_this_process(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Every call is made here."""
+
+    def call(task: str, **arguments: Any) -> Any:
+        answer = child.answer(task, arguments)
+        if "unavailable" in answer:
+            raise process.UnavailableError(answer["unavailable"])
+        return answer["returned"]
+
+    monkeypatch.setattr(race, "call", call)
+    monkeypatch.setattr(measure, "seconds", lambda work: 1.0)
+
+
+class Late(numpy_.Stepper):
+    """Its answer is that of one step before."""
+
+    def displacement(self) -> Array:
+        return np.moveaxis(self._before, 0, -1)
+
+
+class Lost(numpy_.Stepper):
+    """Its answer is no number."""
+
+    def displacement(self) -> Array:
+        return super().displacement() * np.nan
+
+
+def peer(monkeypatch: pytest.MonkeyPatch, stepper: Any) -> str:
+    """Make the module of a peer; gives its name."""
+    module = ModuleType("made_peer")
+    module.prepare = lambda problem, threads: stepper(problem)  # type: ignore[attr-defined]
+    monkeypatch.setitem(sys.modules, module.__name__, module)
+    return module.__name__
+
+
+@pytest.mark.parametrize("name", ["taichi_msm", "NumPy"])
+def test_a_right_answer_is_found_right(name: str, device: Device) -> None:
+    found = measure.check(PEERS[name], 13, device.threads)
+    assert found["right"], found["wanted"]
+    assert found["answer"] < measure.TOLERANCE / 10
+
+
+@pytest.mark.usefixtures("in_this_process")
+@pytest.mark.parametrize("stepper", [Late, Lost])
+def test_a_wrong_answer_is_not_timed(stepper: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+    peers = {"right": PEERS["NumPy"], "wrong": peer(monkeypatch, stepper)}
+    right, wrong = race.race("benchmarks.stepping.measure", peers, 2, lambda text: None, points=13)
+    assert (right.said, right.samples) == ("", [1.0, 1.0])
+    assert wrong.said.startswith("wrong: ")
+    assert not wrong.samples
+
+
+@pytest.mark.usefixtures("in_this_process")
+def test_a_peer_that_is_not_installed_is_skipped_with_its_word() -> None:
+    peers = {"nobody": "benchmarks.stepping.nobody", "NumPy": PEERS["NumPy"]}
+    missing, there = race.race("benchmarks.stepping.measure", peers, 1, lambda text: None, points=13)
+    assert missing.said == "skipped: benchmarks.stepping.nobody is not installed"
+    assert not missing.samples
+    assert there.samples
+
+
+def test_a_measurement_is_a_process_of_its_own() -> None:
+    assert process.call("json:dumps", obj=[1]) == "[1]"
+    with pytest.raises(process.FailedError, match="TypeError"):
+        process.call("json:dumps", nothing=1)
+
+
+def test_a_peer_without_its_compiler_is_skipped_with_its_word(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("PATH", "")
+    with pytest.raises(process.UnavailableError, match=r"g\+\+ is not installed"):
+        process.call("benchmarks.stepping.measure:check", peer=PEERS["C++, OpenMP"], points=5)
+
+
+def test_the_load_reaches_every_point() -> None:
+    for share in np.abs(Problem(101).load):
+        assert share.min() > 0.01 * share.max()
+
+
+def test_the_page_shows_times_and_words() -> None:
+    entries = [
+        asdict(race.Entry("taichi_msm", answer=1e-7, compile=1.0, samples=[2e-6, 4e-6, 3e-6])),
+        asdict(race.Entry("Numba", said="skipped: numba is not installed")),
+    ]
+    text = page.page({"machine": page.machine(), "rounds": 3, "stepping": {"31": entries}})
+    assert "| taichi_msm | 3.00 us (2.00 to 4.00) | 1e-07 | 1.00 s |" in text
+    assert "| Numba | skipped: numba is not installed | - | - |" in text
+    assert page.NOT_MEASURED in text
+
+
+def test_psnr_of_a_step_of_grey() -> None:
+    picture = np.zeros((4, 4, 3), np.uint8)
+    assert psnr(picture, picture) == np.inf
+    assert psnr(picture + np.uint8(1), picture) == pytest.approx(48.13, abs=0.01)
