@@ -34,7 +34,7 @@ LANES = {"f32": 8, "f64": 4}
 BYTES = {"f32": 4, "f64": 8}
 
 # Below this many points a worker costs more in waiting for the others than it saves.
-POINTS_PER_WORKER = 1500
+POINTS_PER_WORKER = 2000
 
 # What a band may take of a core's cache, and the most steps of one sweep.
 CACHE = 1 << 18
