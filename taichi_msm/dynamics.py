@@ -34,7 +34,7 @@ LANES = {"f32": 8, "f64": 4}
 BYTES = {"f32": 4, "f64": 8}
 
 # Below this many points a worker costs more in waiting for the others than it saves.
-POINTS_PER_WORKER = 2000
+POINTS_PER_WORKER = 450
 
 # What a band may take of a core's cache, and the most steps of one sweep.
 CACHE = 1 << 18
@@ -51,15 +51,21 @@ MAX_STEPS_PER_LAUNCH = 8192
 STEPS_PER_TABLE = 4096
 
 
-def structure(scene: Scene, device: Device) -> Structure:
-    """Find out what the scene needs: absent terms are left out of the kernel."""
+def structure(scene: Scene, device: Device, cores: int | None = None) -> Structure:
+    """Find out what the scene needs: absent terms are left out of the kernel.
+
+    Args:
+        scene: a checked scene.
+        device: what `runtime.start` returned.
+        cores: how many cores are free for it; None: all.
+    """
     rows, cols = scene.sheet.points
     fixed = fixed_points(scene.sheet)
     precision = scene.time.precision
     fixed_rows = bool(fixed[0].all()), bool(fixed[-1].all())
     if device.arch == "cpu":
         # Workers wait by spinning: more of them than cores would only keep each other from their work.
-        cores = min(device.threads, available_threads())
+        cores = min(device.threads, available_threads() if cores is None else cores)
         workers = max(1, min(cores, rows * cols // POINTS_PER_WORKER, (rows - sum(fixed_rows)) // 2))
     else:
         workers = 0
@@ -94,6 +100,7 @@ class Dynamics:
         scene: a checked scene.
         device: what `runtime.start` returned.
         layout: another structure than the scene's own; for tests.
+        cores: how many cores are free for it; None: all.
 
     Attributes:
         structure: what the kernels are compiled for.
@@ -102,10 +109,11 @@ class Dynamics:
         shortest_spring: the least L / L0 of all springs when `displacement` was read last.
     """
 
-    def __init__(self, scene: Scene, device: Device, layout: Structure | None = None) -> None:
+    def __init__(self, scene: Scene, device: Device, layout: Structure | None = None, cores: int | None = None) -> None:
         self.scene = scene
         self._device = device
-        self.structure = layout or structure(scene, device)
+        self._cores = cores
+        self.structure = layout or structure(scene, device, cores)
         self.launches = 0
         self._real = np.dtype(np.float32 if self.structure.precision == "f32" else np.float64)
         self._sheet: Sweep | Gather = (Sweep if self.structure.workers else Gather)(self.structure)
@@ -120,7 +128,7 @@ class Dynamics:
         Raises:
             ValueError: when it needs another kernel.
         """
-        if structure(scene, self._device) != structure(self.scene, self._device):
+        if structure(scene, self._device, self._cores) != structure(self.scene, self._device, self._cores):
             raise ValueError("this scene needs another kernel; make another Dynamics")
         self.scene = scene
         self._begin()

@@ -25,6 +25,9 @@ from taichi_msm.simulation import Simulation
 from taichi_msm.stability import stable_step, step, steps_per_frame
 from taichi_msm.texture import load_texture
 
+# Encoding a pixel takes as long as so many steps of a point.
+STEPS_PER_PIXEL = 40
+
 Progress = Callable[[str, int, int], None]
 
 
@@ -89,7 +92,8 @@ def run(
     watch.lap("pilot")
     progress("compile", 0, frames)
     # In this order, so that the encoder starts up while kernels are compiled.
-    with ResultWriter(Path(directory), scene) as writer, Simulation(scene, arch, threads, texture) as simulation:
+    cores = free_cores(scene)
+    with ResultWriter(Path(directory), scene) as writer, Simulation(scene, arch, threads, texture, cores) as simulation:
         startup = time.perf_counter() - started - watch.seconds["pilot"]
         watch.lap("startup")
         try:
@@ -142,6 +146,15 @@ def run(
         }
         outputs = writer.publish(record)
     return {**record, "outputs": outputs}
+
+
+def free_cores(scene: Scene) -> int:
+    """Count the cores that are free for stepping: the encoder needs one of them, unless it mostly waits for frames."""
+    width, height = scene.render.size
+    rows, cols = scene.sheet.points
+    encoding = width * height * STEPS_PER_PIXEL if scene.draws else 0
+    busy = encoding > rows * cols * steps_per_frame(scene)
+    return max(1, runtime.available_threads() - busy)
 
 
 def error_record(estimate: Estimate) -> dict[str, Any]:

@@ -31,6 +31,8 @@ class Simulation:
         arch: cpu or cuda.
         threads: number of CPU threads; None takes every core.
         texture: the picture on the sheet, shape (height, width, 3); None: the scene's own, read when it is drawn.
+        cores: how many cores are free for stepping; None: all. Its threads wait for each other by spinning, and one
+            that has no core holds all of them up.
 
     Raises:
         DeviceError: when the arch is not there, or Taichi already runs on another one in this process.
@@ -49,6 +51,7 @@ class Simulation:
         arch: str = "cpu",
         threads: int | None = None,
         texture: NDArray[np.uint8] | None = None,
+        cores: int | None = None,
     ) -> None:
         self.device = runtime.start(arch, threads)
         if scene.time.tolerance is not None:
@@ -58,7 +61,7 @@ class Simulation:
         self.max_displacement = 0.0
         self.shortest_spring = 1.0
         self._closed = False
-        self._dynamics = Dynamics(scene, self.device)
+        self._dynamics = Dynamics(scene, self.device, cores=cores)
         self._position = self._read()
         self._texture = texture
         self._drawing: Drawing | None = None

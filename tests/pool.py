@@ -16,7 +16,8 @@ class Pool:
     def __init__(self) -> None:
         self._idle: dict[Structure, list[Dynamics]] = defaultdict(list)
 
-    def lend(self, scene: Scene, device: Device) -> Dynamics:
+    def lend(self, scene: Scene, device: Device, cores: int | None = None) -> Dynamics:
+        assert cores is None
         idle = self._idle[structure(scene, device)]
         if not idle:
             return Lent(scene, device, idle)

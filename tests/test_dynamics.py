@@ -110,6 +110,7 @@ def test_large_sheets_are_cut_into_bands(device: Device) -> None:
     for count, workers in ((side, min(2, available_threads())), (side // 2, 1)):
         made = scene(sheet={**SHEET, "points": [count, count]}, time={"duration": 0.04})
         assert structure(made, device).workers == workers
+        assert structure(made, device, cores=1).workers == 1
         assert_like_twin(made, device)
 
 

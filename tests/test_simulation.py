@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import taichi_msm
-from taichi_msm import DivergedError, MsmError, Simulation, reference
+from taichi_msm import DivergedError, MsmError, Simulation, reference, runner, runtime
 from taichi_msm.runtime import Device
 from tests.scenes import scene, speckle
 
@@ -92,3 +92,16 @@ def test_the_names_of_the_api() -> None:
         assert getattr(taichi_msm, name).__doc__
     with pytest.raises(AttributeError, match="no attribute 'simulate'"):
         taichi_msm.simulate  # noqa: B018
+
+
+def test_the_encoder_has_a_core_of_its_own_while_it_works(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(runtime, "available_threads", lambda: 4)
+    made = scene(render={"size": [512, 512]}, time={"step": 0.001})
+    assert runner.free_cores(made) == 4, "nothing to encode"
+    made = made.model_copy(update={"output": ("gif",)})
+    assert runner.free_cores(made) == 3
+    # 40 steps of 10^6 points a frame take longer than its 512 x 512 pixels.
+    large = made.sheet.model_copy(update={"points": (1000, 1000)})
+    assert runner.free_cores(made.model_copy(update={"sheet": large})) == 4
+    monkeypatch.setattr(runtime, "available_threads", lambda: 1)
+    assert runner.free_cores(made) == 1
