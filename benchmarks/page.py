@@ -11,7 +11,6 @@ from typing import Any
 
 from benchmarks import bounds, whole_run
 from benchmarks.drawing.measure import WANTED
-from benchmarks.drawing.problem import POINTS
 from benchmarks.parts import PIXELS, REFINE
 from benchmarks.process import ROOT
 from benchmarks.stepping.measure import TOLERANCE
@@ -94,7 +93,6 @@ def page(results: Results) -> str:
         step_bytes=bounds.STEP_BYTES,
         step_flops=f"{bounds.STEP_FLOPS:g}",
         step_roots=bounds.STEP_ROOTS,
-        vertex_flops=bounds.VERTEX_FLOPS,
         pixel_flops=bounds.PIXEL_FLOPS,
         frame_steps=steps_per_frame(load_scene(ROOT / whole_run.SCENE)),
         launch_share=launch_share(results),
@@ -231,7 +229,6 @@ def drawing_bound_table(results: Results) -> str:
     found = results["bounds"]
     if found["said"] or "drawing" not in results:
         return NOT_MEASURED
-    vertices = ((POINTS - 1) * (REFINE + 1) + 1) ** 2
     # The slowest of the bandwidths: of a sheet that no cache holds.
     bandwidth = min(found["bandwidth"].values())
     rows = []
@@ -239,7 +236,7 @@ def drawing_bound_table(results: Results) -> str:
         count = int(pixels) ** 2
         least = {
             "bytes": bounds.COLOUR_BYTES * 2 * count / bandwidth,
-            "flops": (bounds.VERTEX_FLOPS * vertices + bounds.PIXEL_FLOPS * count) / found["flops"],
+            "flops": bounds.PIXEL_FLOPS * count / found["flops"],
             "launch": found["launch"],
         }
         if entries[0]["samples"]:

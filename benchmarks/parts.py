@@ -41,7 +41,7 @@ class Effort:
 
 
 FULL = Effort(
-    rounds=5,
+    rounds=3,
     points=(31, 101, 331, 1024),
     sizes=(11, 31, 101, 331, 1024, 2048, 4096),
     pixels=(512, 1024),

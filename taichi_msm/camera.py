@@ -20,7 +20,7 @@ OBLIQUE_FOV = 32.0
 OBLIQUE_MARGIN = 1.04
 
 # Nothing nearer to the eye's plane than this fraction of the sheet's diagonal is drawn.
-NEAR = 1e-9
+NEAR = 1e-6
 
 
 class View(NamedTuple):

@@ -35,8 +35,13 @@ BAND_ROWS = 16
 # Farther than anything that is drawn.
 INFINITY = 3e38
 
-# By so much of a side a triangle that is drawn by itself may be overstepped, so that no gap is left beside it.
+# A triangle that is drawn by itself may be overstepped, so that no gap is left beside it: by so much of its side, and
+# of the picture's, for which f32 has places.
 OVERSTEP = 1e-5
+OVERSTEP_OF_PICTURE = 2e-6
+
+# Beyond so many samples f32 has no places for the outline of a cell that is drawn as a whole.
+FARTHEST = float(1 << 16)
 
 vec2 = ti.types.vector(2, ti.f32)
 vec3 = ti.types.vector(3, ti.f32)
@@ -174,7 +179,7 @@ def _kernel(s: Structure, fields: _Fields) -> Callable[..., None]:
     depth, colour, texture = fields.depth, fields.colour, fields.texture
     rows, cols, parts, lanes, factor = s.rows, s.cols, s.refine + 1, s.lanes, s.supersample
     s_width, s_height = s.width, s.height
-    width = s_width * factor
+    width, height = s_width * factor, s_height * factor
     chunks = -(-width // lanes)
     bands = -(-s.height // s.band_rows)
     band_rows = s.band_rows
@@ -269,7 +274,8 @@ def _kernel(s: Structure, fields: _Fields) -> Callable[..., None]:
             turn(seen_d, seen_c, seen_a),
             turn(seen_c, seen_a, seen_b),
         )
-        whole = before and (turns.min() > 0 or turns.max() < 0)
+        farthest = ti.max(ti.abs(seen_a).max(), ti.abs(seen_b).max(), ti.abs(seen_c).max(), ti.abs(seen_d).max())
+        whole = before and farthest < FARTHEST and (turns.min() > 0 or turns.max() < 0)
         side = ti.select(turns[0] > 0, 1.0, -1.0)
 
         # Where the texture is, in texels, exact to a fraction of one on any sheet.
@@ -288,6 +294,7 @@ def _kernel(s: Structure, fields: _Fields) -> Callable[..., None]:
             quad_t = ti.cast(quad // parts, ti.f32)
             lower = piece % 2 == 0
             low_x, high_x, low_y, high_y = 0.0, ti.cast(width, ti.f32), -INFINITY, INFINITY
+            overstep = OVERSTEP
             if whole:
                 low_x = ti.min(seen_a[0], seen_b[0], seen_c[0], seen_d[0])
                 high_x = ti.max(seen_a[0], seen_b[0], seen_c[0], seen_d[0])
@@ -306,6 +313,7 @@ def _kernel(s: Structure, fields: _Fields) -> Callable[..., None]:
                     high_x = ti.max(one[0] / one[2], two[0] / two[2], three[0] / three[2])
                     low_y = ti.min(one[1] / one[2], two[1] / two[2], three[1] / three[2])
                     high_y = ti.max(one[1] / one[2], two[1] / two[2], three[1] / three[2])
+                    overstep += OVERSTEP_OF_PICTURE * (width + height) / ti.max(high_x - low_x, high_y - low_y, 1e-3)
                 elif one[2] <= near and two[2] <= near and three[2] <= near:
                     high_x = -1.0
             first_row = ti.cast(ti.math.clamp(ti.floor(low_y), top, bottom), ti.i32)
@@ -330,13 +338,13 @@ def _kernel(s: Structure, fields: _Fields) -> Callable[..., None]:
                         if ti.static(parts > 1):
                             column, line = small_quad(x, y, inside, side, a, b, c, d)
                     draw_samples(
-                        row, chunk, x, y, inside, column, line, whole, lower, side, near, a, b, c, d,
+                        row, chunk, x, y, inside, column, line, whole, lower, overstep, side, near, a, b, c, d,
                         i, j, first_x, first_y, begin_x, begin_y, toward,
                     )  # fmt: skip
 
     @ti.func
     def draw_samples(
-        row, chunk, x, y, inside, column, line, whole, lower, side, near, a, b, c, d,
+        row, chunk, x, y, inside, column, line, whole, lower, overstep, side, near, a, b, c, d,
         i, j, first_x, first_y, begin_x, begin_y, toward,
     ):  # fmt: skip
         """Draw a chunk of samples of the cell A, B, C, D, in its small quads."""
@@ -377,9 +385,9 @@ def _kernel(s: Structure, fields: _Fields) -> Callable[..., None]:
             upper_limit = ti.select(below, t, s)
             lower_limit = ti.select(below, s, t)
             inside = (
-                (lower_limit >= -OVERSTEP)
-                & (upper_limit <= 1 + OVERSTEP)
-                & (lower_limit <= upper_limit + OVERSTEP)
+                (lower_limit >= -overstep)
+                & (upper_limit <= 1 + overstep)
+                & (lower_limit <= upper_limit + overstep)
                 & (p_w + r_w * s + d_w * t > near)
             )
         z = p_z + r_z * s + d_z * t

@@ -96,12 +96,11 @@ def spring_forces(s: Structure, fields: SheetFields) -> tuple[Callable[..., Any]
     keeps the digits of a small motion on a large sheet. Swapping P and Q changes its sign and not one bit more.
     """
     u, by_column, open_edges = fields.displacement, fields.by_column, s.open_edges
-    # L^2 comes from L^2 - L0^2 with a few roundings of L0^2: this much more keeps it above 0 where two points meet.
-    above = 1 + 16 * (2.0**-24 if s.precision == "f32" else 2.0**-53)
+    # Keeps L = 0 from dividing by 0: the force is then 0, as Q - P is. A literal in a kernel is f32, also among f64.
+    tiny = 1e-36
 
     @ti.func
-    def pull(longer, length, stiffness):
-        square = longer + length * length * above
+    def pull(longer, square, length, stiffness):
         return stiffness * longer / (square + length * ti.sqrt(square))
 
     @ti.func
@@ -111,7 +110,8 @@ def spring_forces(s: Structure, fields: SheetFields) -> tuple[Callable[..., Any]
         y = u[1][p, b + 1] - u[1][p, b]
         z = u[2][p, b + 1] - u[2][p, b]
         to_x = x + dx
-        force = pull(x * (to_x + dx) + y * y + z * z, dx, stiffness)
+        rest = y * y + z * z
+        force = pull(x * (to_x + dx) + rest, to_x * to_x + rest + tiny, dx, stiffness)
         if ti.static(open_edges):
             force *= by_column[HAS_RIGHT, b]
         return force * to_x, force * y, force * z
@@ -124,13 +124,13 @@ def spring_forces(s: Structure, fields: SheetFields) -> tuple[Callable[..., Any]
         z = u[2][q, b + right] - u[2][p, b]
         to_x = x
         to_y = y + dy
-        longer = x * x + y * (to_y + dy) + z * z
+        longer = x * x + (y * (to_y + dy) + z * z)
         length = ti.abs(dy)
         if ti.static(right != 0):
             to_x = x + right * dx
-            longer = x * (to_x + right * dx) + y * (to_y + dy) + z * z
+            longer = x * (to_x + right * dx) + (y * (to_y + dy) + z * z)
             length = ti.sqrt(dx * dx + dy * dy)
-        force = pull(longer, length, stiffness)
+        force = pull(longer, to_x * to_x + to_y * to_y + z * z + tiny, length, stiffness)
         if ti.static(open_edges):
             force *= there
         if ti.static(open_edges and right < 0):

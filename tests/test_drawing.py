@@ -110,6 +110,27 @@ def test_there_are_no_gaps_between_cells(seed: int, device: Device) -> None:
     assert draw(made, position, np.full((4, 4, 3), 255, np.uint8)).all()
 
 
+def test_there_are_no_gaps_between_the_triangles_of_a_crumpled_sheet(device: Device) -> None:
+    # Every cell is moved by more than its size; the border stays, so the sheet covers the picture somehow.
+    made = drawable((9, 9), size=[2000, 1500], refine=64, shading="none")
+    position = rest_positions(made.sheet)
+    position[1:-1, 1:-1, :2] += np.random.default_rng(6).normal(0, 0.04, (7, 7, 2))
+    assert draw(made, position, np.full((4, 4, 3), 255, np.uint8)).all()
+
+
+@pytest.mark.parametrize("y", [0.0, 1e-9, 3e-9, 1e-8, 1e-6, 3e-6])
+def test_a_sheet_that_passes_through_the_eye_is_seen_in_part(y: float, device: Device) -> None:
+    made = drawable(
+        (5, 5),
+        size=[200, 150],
+        refine=1,
+        shading="none",
+        camera={"eye": [0.0123, y, 0.03], "target": [0.0123, y - 1, 0.03], "up": [0, 0, 1], "fov": 90},
+    )
+    position, texture = rest_positions(made.sheet), np.full((4, 4, 3), 255, np.uint8)
+    assert (difference(draw(made, position, texture), reference.draw(made, position, texture)) > 1).mean() < 0.002
+
+
 def test_of_a_folded_sheet_the_upper_layer_is_seen(device: Device) -> None:
     # The right half is folded over the left one, once above it and once below; the sides have their own colours.
     texture = np.zeros((10, 20, 3), np.uint8)

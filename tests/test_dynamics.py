@@ -163,6 +163,27 @@ def test_the_shortest_spring_is_that_of_the_twin(
     assert (min(found) < 0.999) == bool(springs)
 
 
+@pytest.mark.parametrize("precision", ["f32", "f64"])
+@pytest.mark.parametrize("ratio", [0.0, 1e-6, 1e-3, 0.03, 0.5])
+def test_a_spring_that_is_pressed_to_a_point(ratio: float, precision: str, pool: Pool, device: Device) -> None:
+    # A step of 1 s moves the points of the right column, 1 kg each, by half their load; the next one shows the force.
+    sheet = {"points": [2, 2], "size": [1, 1], "mass": 1, "fixed": ["left"]}
+    made = scene(
+        sheet=sheet,
+        springs={"structural": 0.25, "shear": 0.125},
+        damping=0,
+        probes=[
+            {"force": [2 * (ratio - 1), 0, 0], "falloff": 0, "offset": 0, "load": [[0, 100], [0.5, 100], [0.5, 0]]}
+        ],
+        time={"duration": 2, "frames_per_second": 1, "step": 1, "precision": precision},
+    )
+    dynamics = pool.lend(made, device)
+    dynamics.advance(2)
+    twin = reference.simulate(made)[2] - rest_positions(made.sheet)
+    np.testing.assert_allclose(dynamics.displacement(), twin, rtol=0, atol=8 * ROUNDING[precision])
+    dynamics.close()
+
+
 def test_nothing_moves_without_a_load(device: Device) -> None:
     assert not simulate(scene(probes=[], sheet={**SHEET, "fixed": "none"}), device).any()
 
