@@ -76,6 +76,9 @@ def _refine(axes: Axes, results: Results) -> None:
     series = by_peer({str(cells * (int(refine) + 1) + 1): entries for refine, entries in results["refine"].items()})
     axes.set(title="Drawing against refinement", ylabel="ms", xlabel="refine; 512 × 512 pixels")
     _plot(axes, series, lambda n: 1e3)
+    # Times are so nearly the same that an axis without 0 would make hills of noise.
+    axes.set_yscale("linear")
+    axes.set_ylim(bottom=0)
     _tick_at(axes.xaxis, sorted(series["taichi_msm"]), lambda vertices: (vertices - 1) / cells - 1)
 
 
