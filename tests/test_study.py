@@ -178,7 +178,7 @@ def test_terms_are_timed(device: Device) -> None:
 def test_pictures_are_judged_by_a_finer_one(device: Device, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(pictures, "REFINES", (0, 3))
     monkeypatch.setattr(pictures, "SUPERSAMPLES", (1, 4))
-    monkeypatch.setattr(pictures, "FINEST", {"refine": 7, "supersample": 5})
+    monkeypatch.setattr(pictures, "FINEST", {"refine": 4, "supersample": 5})
     made = scene(render={"size": [60, 45], "camera": "oblique", "refine": 3})
     position = rest_positions(made.sheet)
     position[4, 5, 2] += 0.05
