@@ -162,7 +162,7 @@ class _Fields(FieldTree):
         samples = s.height * s.supersample, -(-s.width * s.supersample // s.lanes)
         # Of the mass points: (X, Y, w, depth), the place in the picture [samples], the unit normal.
         self.point = self.place(vec4.field(), s.rows, s.cols)
-        self.place_seen = self.place(vec2.field(), s.rows, s.cols)
+        self.seen_at = self.place(vec2.field(), s.rows, s.cols)
         self.normal: Any = self.place(vec3.field(), s.rows, s.cols) if s.lit else None
         # Of every row of mass points its highest and its lowest place in the picture.
         self.reach = self.place(vec2.field(), s.rows)
@@ -175,7 +175,7 @@ class _Fields(FieldTree):
 
 def _kernel(s: Structure, fields: _Fields) -> Callable[..., None]:
     """Compile the drawing of one structure."""
-    point, seen_at, normal, reach = fields.point, fields.place_seen, fields.normal, fields.reach
+    point, seen_at, normal, reach = fields.point, fields.seen_at, fields.normal, fields.reach
     depth, colour, texture = fields.depth, fields.colour, fields.texture
     rows, cols, parts, lanes, factor = s.rows, s.cols, s.refine + 1, s.lanes, s.supersample
     s_width, s_height = s.width, s.height

@@ -1,4 +1,4 @@
-"""What both forms of kernel 1 are made of: the force of a spring, and the step of a point.
+"""What both forms of kernel 1 are made of: the force of a spring, the step of a point, the sheet at rest.
 
 A value of the sheet is a vector of lanes, each of another column; on a GPU of one.
 """
@@ -236,3 +236,28 @@ def point_step(s: Structure, fields: SheetFields) -> Callable[..., None]:
         u[2][q, b] = z + d_z
 
     return move
+
+
+def rest_kernel(s: Structure, fields: SheetFields) -> Callable[..., None]:
+    """Make the kernel that puts the sheet at rest and writes by_column and decay, whose last axis is the lanes."""
+    real, rows, lanes = getattr(ti, s.precision), s.rows, s.lanes
+    u, d, by_column, decay = fields.displacement, fields.difference, fields.by_column, fields.decay
+
+    @ti.kernel
+    def rest(columns: ti.types.ndarray(dtype=real, ndim=3), shares: ti.types.ndarray(dtype=real, ndim=4)):
+        # One loop for all: each would be compiled by itself.
+        for i, b in u[0]:
+            for c in ti.static(range(3)):
+                u[c][i, b] = ti.Vector.zero(real, lanes)
+            if i < rows:
+                for c in ti.static(range(3)):
+                    d[c][i, b] = ti.Vector.zero(real, lanes)
+                for g in range(decay.shape[0]):
+                    for lane in ti.static(range(lanes)):
+                        decay[g, i, b][lane] = shares[g, i, b, lane]
+            if i == 0:
+                for r in range(by_column.shape[0]):
+                    for lane in ti.static(range(lanes)):
+                        by_column[r, b][lane] = columns[r, b, lane]
+
+    return rest

@@ -9,7 +9,7 @@ from typing import Any
 
 from numpy.typing import NDArray
 
-from taichi_msm.forces import SheetFields, Structure, compression, point_step, spring_forces
+from taichi_msm.forces import SheetFields, Structure, compression, point_step, rest_kernel, spring_forces
 from taichi_msm.runtime import ti
 
 # A launch is a chain of this many kernels, one a step.
@@ -31,7 +31,8 @@ class Gather:
         # Which of the two buffers holds u_n.
         self._now = 0
         self._fields = _Fields(s)
-        self._advance, self._read, self._write = _kernels(s, self._fields)
+        self._advance, self._read = _kernels(s, self._fields)
+        self._rest = rest_kernel(s, self._fields)
 
     def advance(self, count: int, numbers: tuple[float, ...], table: NDArray[Any]) -> None:
         """Take at most STEPS_PER_LAUNCH steps."""
@@ -44,20 +45,19 @@ class Gather:
 
     def rest(self, by_column: NDArray[Any], decay: NDArray[Any]) -> None:
         """Put the sheet at rest."""
-        self._now = 0
-        self._write(by_column, decay)
+        self._rest(by_column, decay)
 
     def close(self) -> None:
         """Free the fields."""
         self._fields.close()
 
 
-def _kernels(s: Structure, fields: _Fields) -> tuple[Any, Any, Any]:
-    """Compile the step, the read-out and the writing of the constants for one structure."""
+def _kernels(s: Structure, fields: _Fields) -> tuple[Any, Any]:
+    """Compile the step and the read-out for one structure."""
     real = getattr(ti, s.precision)
     rows, cols = s.rows, s.cols
     structural_springs, shear_springs = s.structural, s.shear
-    u, d, by_column, decay = fields.displacement, fields.difference, fields.by_column, fields.decay
+    u = fields.displacement
     along, ahead = spring_forces(s, fields)
     move = point_step(s, fields)
     smallest = compression(s, fields)
@@ -128,18 +128,4 @@ def _kernels(s: Structure, fields: _Fields) -> tuple[Any, Any, Any]:
                     out[i, b - 1, c] = u[c][p, b][0]
             least[i] = found
 
-    @ti.kernel
-    def write(columns: ti.types.ndarray(dtype=real, ndim=3), shares: ti.types.ndarray(dtype=real, ndim=4)):
-        for i, b in u[0]:
-            for c in ti.static(range(3)):
-                u[c][i, b][0] = 0
-            if i < rows:
-                for c in ti.static(range(3)):
-                    d[c][i, b][0] = 0
-                for g in range(decay.shape[0]):
-                    decay[g, i, b][0] = shares[g, i, b, 0]
-            if i == 0:
-                for r in range(by_column.shape[0]):
-                    by_column[r, b][0] = columns[r, b, 0]
-
-    return advance, read, write
+    return advance, read

@@ -23,7 +23,7 @@ from typing import Any
 
 from numpy.typing import NDArray
 
-from taichi_msm.forces import SheetFields, Structure, compression, point_step, spring_forces
+from taichi_msm.forces import SheetFields, Structure, compression, point_step, rest_kernel, spring_forces
 from taichi_msm.runtime import ITERATIONS_PER_THREAD, ti
 
 # Integers between the progress counters of two workers, so that each has a cache line of its own.
@@ -50,9 +50,11 @@ class Sweep:
     """The state of a sheet in the memory of a CPU, and its kernels."""
 
     def __init__(self, s: Structure) -> None:
+        # Of this sheet, also before it was put at rest: the workers' counters go on.
         self._steps = 0
         self._fields = _Fields(s)
-        self._advance, self._read, self._write = _kernels(s, self._fields)
+        self._advance, self._read = _kernels(s, self._fields)
+        self._rest = rest_kernel(s, self._fields)
 
     def advance(self, count: int, numbers: tuple[float, ...], table: NDArray[Any]) -> None:
         """Take a number of steps in one launch.
@@ -77,22 +79,20 @@ class Sweep:
 
     def rest(self, by_column: NDArray[Any], decay: NDArray[Any]) -> None:
         """Put the sheet at rest; the arrays are those of `SheetFields`, with lanes as their last axis."""
-        self._steps = 0
-        self._write(by_column, decay)
+        self._rest(by_column, decay)
 
     def close(self) -> None:
         """Free the fields."""
         self._fields.close()
 
 
-def _kernels(s: Structure, fields: _Fields) -> tuple[Any, Any, Any]:
-    """Compile the step, the read-out and the writing of the constants for one structure."""
+def _kernels(s: Structure, fields: _Fields) -> tuple[Any, Any]:
+    """Compile the step and the read-out for one structure."""
     real = getattr(ti, s.precision)
     rows, cols, lanes, strip, workers, depth = s.rows, s.cols, s.lanes, s.strip, s.workers, s.depth
     structural_springs, shear_springs = s.structural, s.shear
     first_row, end_row = int(s.fixed_rows[0]), rows - int(s.fixed_rows[1])
-    u, d, behind = fields.displacement, fields.difference, fields.behind
-    by_column, decay, done = fields.by_column, fields.decay, fields.done
+    u, behind, done = fields.displacement, fields.behind, fields.done
     along, ahead = spring_forces(s, fields)
     move = point_step(s, fields)
     smallest = compression(s, fields)
@@ -268,24 +268,4 @@ def _kernels(s: Structure, fields: _Fields) -> tuple[Any, Any, Any]:
                                 out[i, j, c] = u[c][i, b][lane]
                 least[i] = found
 
-    @ti.kernel
-    def write(columns: ti.types.ndarray(dtype=real, ndim=3), shares: ti.types.ndarray(dtype=real, ndim=4)):
-        # One loop for all: each would be compiled by itself.
-        for i, b in u[0]:
-            for c in ti.static(range(3)):
-                u[c][i, b] = ti.Vector.zero(real, lanes)
-            if i < rows:
-                for c in ti.static(range(3)):
-                    d[c][i, b] = ti.Vector.zero(real, lanes)
-                for g in range(decay.shape[0]):
-                    for lane in ti.static(range(lanes)):
-                        decay[g, i, b][lane] = shares[g, i, b, lane]
-            if i == 0:
-                for r in range(by_column.shape[0]):
-                    for lane in ti.static(range(lanes)):
-                        by_column[r, b][lane] = columns[r, b, lane]
-                if b == 0:
-                    for n in range(done.shape[0]):
-                        done[n] = 0
-
-    return advance, read, write
+    return advance, read
