@@ -199,7 +199,7 @@ class Dynamics:
         g = scene.damping / scene.sheet.mass
         loads = schedule(scene, first, count)
         parts = grips(scene)
-        table = np.empty((count, GRIP_COLUMN + GRIP_COLUMNS * len(parts)))
+        table = np.empty((count, self.structure.load_columns))
         table[:, 0] = h * h / scene.sheet.mass
         if scene.time.damping_difference == "central":
             table[:, 0] /= 1 + g * h / 2

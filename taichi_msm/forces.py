@@ -56,6 +56,11 @@ class Structure:
         """Number of columns of a strip."""
         return -(-self.cols // self.lanes)
 
+    @property
+    def load_columns(self) -> int:
+        """Number of columns of the table of loads."""
+        return GRIP_COLUMN + GRIP_COLUMNS * len(self.grips)
+
 
 class SheetFields(FieldTree):
     """The fields of one sheet; entry 0 and the last one of a row are the halo of its strips.
@@ -188,36 +193,36 @@ def point_step(s: Structure, fields: SheetFields) -> Callable[..., None]:
     standing = [grip_moves[:n].count(False) for n in range(len(grip_moves))]
 
     @ti.func
-    def move(p, q, i, b, n, spring_x, spring_y, spring_z, keep, dy, top, loads: ti.template()):
-        """Step entry b of row i of the sheet, stored in row p, into row q; n is the row of the table."""
+    def move(p, q, i, b, spring_x, spring_y, spring_z, keep, dy, top, now):
+        """Step entry b of row i of the sheet, stored in row p, into row q; now is the row of the table of loads."""
         x = u[0][p, b]
         y = u[1][p, b]
         z = u[2][p, b]
         force_x, force_y, force_z = spring_x, spring_y, spring_z
         if ti.static(virtual):
-            force_x -= loads[n, 1] * x
-            force_y -= loads[n, 1] * y
-            force_z -= loads[n, 1] * z
+            force_x -= now[1] * x
+            force_y -= now[1] * y
+            force_z -= now[1] * z
         for g in ti.static(range(len(grip_moves))):
             column = ti.static(GRIP_COLUMN + GRIP_COLUMNS * g)
             share = ti.Vector.zero(real, lanes)
             if ti.static(grip_moves[g]):
-                off_x = by_column[ACROSS, b] - loads[n, column + 3]
-                off_y = top - i * dy - loads[n, column + 4]
+                off_x = by_column[ACROSS, b] - now[column + 3]
+                off_y = top - i * dy - now[column + 4]
                 distance = ti.sqrt(off_x * off_x + off_y * off_y)
-                share = ti.exp(-loads[n, column + 5] * distance - loads[n, column + 6])
+                share = ti.exp(-now[column + 5] * distance - now[column + 6])
             else:
                 share = decay[standing[g], i, b]
-            force_x += loads[n, column] * share
-            force_y += loads[n, column + 1] * share
-            force_z += loads[n, column + 2] * share
+            force_x += now[column] * share
+            force_y += now[column + 1] * share
+            force_z += now[column + 2] * share
 
         kind = MOVES + 1
         if i == 0:
             kind = MOVES
         if i == rows - 1:
             kind = MOVES + 2
-        gain = loads[n, 0] * by_column[kind, b]
+        gain = now[0] * by_column[kind, b]
         d_x = d[0][i, b]
         d_y = d[1][i, b]
         d_z = d[2][i, b]

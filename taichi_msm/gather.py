@@ -56,7 +56,7 @@ def _kernels(s: Structure, fields: _Fields) -> tuple[Any, Any]:
     """Compile the step and the read-out for one structure."""
     real = getattr(ti, s.precision)
     rows, cols = s.rows, s.cols
-    structural_springs, shear_springs = s.structural, s.shear
+    structural_springs, shear_springs, columns = s.structural, s.shear, s.load_columns
     u = fields.displacement
     along, ahead = spring_forces(s, fields)
     move = point_step(s, fields)
@@ -92,7 +92,8 @@ def _kernels(s: Structure, fields: _Fields) -> tuple[Any, Any]:
             force_x += right_x - left_x
             force_y += right_y - left_y
             force_z += right_z - left_z
-        move(p, (1 - now) * (rows + 2) + i + 1, i, b, n, force_x, force_y, force_z, keep, dy, top, loads)
+        row = ti.Vector([loads[n, c] for c in ti.static(range(columns))])
+        move(p, (1 - now) * (rows + 2) + i + 1, i, b, force_x, force_y, force_z, keep, dy, top, row)
 
     @ti.kernel
     def advance(

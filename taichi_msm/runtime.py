@@ -135,8 +135,27 @@ def _cache() -> dict[str, Any]:
     return {}
 
 
+def _threads() -> list[int]:
+    """List the threads of this process, the oldest first; empty where the system does not tell."""
+    with contextlib.suppress(OSError):
+        return sorted(int(name) for name in os.listdir("/proc/self/task"))
+    return []
+
+
+def _pin(pool: list[int]) -> None:
+    """Give every thread of Taichi's pool a core of its own, if it has as many as there are cores.
+
+    Left to the system two of them may share a core for some 10 ms, the one spinning until the other has done its part.
+    """
+    if hasattr(os, "sched_setaffinity") and len(pool) == len(os.sched_getaffinity(0)):
+        for thread, core in zip(pool, sorted(os.sched_getaffinity(0)), strict=True):
+            with contextlib.suppress(OSError):
+                os.sched_setaffinity(thread, {core})
+
+
 def _initialise(device: Device) -> None:
     cache = _cache()
+    before = _threads()
     try:
         # Taichi prints the arch and, where a driver is missing, its search for it. Without fast_math every operation
         # rounds as IEEE 754 says, so that the bits of a result do not depend on threads, lanes or the compiler's mood.
@@ -153,3 +172,5 @@ def _initialise(device: Device) -> None:
             )
     except Exception as error:
         raise DeviceError(f"--arch {device.arch}: not available on this machine; take --arch cpu") from error
+    # The pool is the last that Taichi starts.
+    _pin([thread for thread in _threads() if thread not in before][-device.threads :])

@@ -29,6 +29,9 @@ from taichi_msm.runtime import ITERATIONS_PER_THREAD, ti
 # Integers between the progress counters of two workers, so that each has a cache line of its own.
 COUNTER_STRIDE = 16
 
+# Bytes of a page.
+PAGE = 4096
+
 # The borders of a band: where its worker begins and where it ends.
 BEGIN, END = 0, 1
 
@@ -40,10 +43,16 @@ class _Fields(SheetFields):
         # Below the sheet's rows, for every worker and border, the two copies.
         super().__init__(s, s.rows + 4 * s.workers)
         # For every worker and step of a pass the forces of the row behind, with the sign of the force on that row.
-        self.behind = [self.vector(s.workers * s.depth, s.strip + 2) for _ in range(3)]
+        self.behind = [self.vector(s.workers * _slots(s), s.strip + 2) for _ in range(3)]
         # The number of steps that each border of each worker has done.
         self.done = self.place(ti.field(ti.i64), 2 * s.workers * COUNTER_STRIDE)
         self.allocate()
+
+
+def _slots(s: Structure) -> int:
+    """Rows of `behind` that a worker has: its steps, then a page, over which one core's prefetcher does not reach."""
+    row_bytes = (s.strip + 2) * s.lanes * (4 if s.precision == "f32" else 8)
+    return s.depth - (-PAGE // row_bytes)
 
 
 class Sweep:
@@ -90,7 +99,8 @@ def _kernels(s: Structure, fields: _Fields) -> tuple[Any, Any]:
     """Compile the step and the read-out for one structure."""
     real = getattr(ti, s.precision)
     rows, cols, lanes, strip, workers, depth = s.rows, s.cols, s.lanes, s.strip, s.workers, s.depth
-    structural_springs, shear_springs = s.structural, s.shear
+    structural_springs, shear_springs, columns = s.structural, s.shear, s.load_columns
+    slots = _slots(s)
     first_row, end_row = int(s.fixed_rows[0]), rows - int(s.fixed_rows[1])
     u, behind, done = fields.displacement, fields.behind, fields.done
     along, ahead = spring_forces(s, fields)
@@ -113,6 +123,8 @@ def _kernels(s: Structure, fields: _Fields) -> tuple[Any, Any]:
         if ti.static(shear_springs):
             x, y, z = ahead(p, q, 0, 1, dx, up, shear, there)
             next_x, next_y, next_z = x, y, z
+        # Read once: the stores to the fields could change the table, for all that the compiler knows.
+        now = ti.Vector([loads[n, c] for c in ti.static(range(columns))])
         for b in range(1, strip + 1):
             force_x, force_y, force_z = zero, zero, zero
             last_x, last_y, last_z = here_x, here_y, here_z
@@ -151,7 +163,7 @@ def _kernels(s: Structure, fields: _Fields) -> tuple[Any, Any]:
             behind[1][slot, b - 1] = last_y
             behind[2][slot, b - 1] = last_z
             if moving:
-                move(p, p, i, b, n, force_x, force_y, force_z, keep, dy, top, loads)
+                move(p, p, i, b, force_x, force_y, force_z, keep, dy, top, now)
         if ti.static(shear_springs):
             x, y, z = ahead(p, q, strip + 1, -1, dx, up, shear, there)
             here_x += x
@@ -222,7 +234,7 @@ def _kernels(s: Structure, fields: _Fields) -> tuple[Any, Any]:
                         for step in range(ti.max(0, k - (high - low) + 1), ti.min(steps, k + 2)):
                             row = k - step
                             n = turn * depth + step
-                            slot = worker * depth + step
+                            slot = worker * slots + step
                             i = begin + row * way
                             p = i
                             q = i + way
