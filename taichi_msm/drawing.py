@@ -25,7 +25,7 @@ from numpy.typing import NDArray
 
 from taichi_msm import look
 from taichi_msm.camera import View, view
-from taichi_msm.runtime import ITERATIONS_PER_THREAD, FieldTree, started, ti
+from taichi_msm.runtime import ITERATIONS_PER_THREAD, FieldTree, quick_compilation, started, ti
 from taichi_msm.scene import Scene
 
 # Pixels of a chunk, and rows of pixels of a band.
@@ -123,8 +123,7 @@ class Drawing:
         self._view = view(scene)
         levels = [level * self.structure.levels for level in scene.render.background]
         self._background = sum(level << (self.structure.channel_bits * n) for n, level in enumerate(levels))
-        packed = texture.astype(np.uint32) @ np.array([1, 1 << 8, 1 << 16], np.uint32)
-        self._fields.texture.from_numpy(packed.ravel())
+        self._texels = (texture.astype(np.uint32) @ np.array([1, 1 << 8, 1 << 16], np.uint32)).ravel()
 
     def draw(self, position: NDArray[Any], camera: View | None = None) -> NDArray[np.uint8]:
         """Draw the sheet.
@@ -139,14 +138,16 @@ class Drawing:
         s, camera = self.structure, camera or self._view
         scale = np.array([[s.supersample], [s.supersample], [1], [1]])
         out = np.empty(s.height * s.width * 3, np.uint8)
-        self._draw(
-            np.ascontiguousarray(position, np.float32),
-            mat4((camera.matrix * scale).tolist()),
-            vec3(camera.toward.tolist()),
-            camera.near,
-            self._background,
-            out,
-        )
+        with quick_compilation():
+            self._draw(
+                np.ascontiguousarray(position, np.float32),
+                self._texels,
+                mat4((camera.matrix * scale).tolist()),
+                vec3(camera.toward.tolist()),
+                camera.near,
+                self._background,
+                out,
+            )
         return out.reshape(s.height, s.width, 3)
 
     def close(self) -> None:
@@ -169,14 +170,13 @@ class _Fields(FieldTree):
         # Of every sample the depth of what is seen there, and its colour.
         self.depth = self.place(ti.Vector.field(s.lanes, ti.f32), *samples)
         self.colour = self.place(ti.Vector.field(s.lanes, ti.u32 if s.supersample == 1 else ti.u64), *samples)
-        self.texture = self.place(ti.field(ti.u32), s.texture[1] * s.texture[0])
         self.allocate()
 
 
 def _kernel(s: Structure, fields: _Fields) -> Callable[..., None]:
     """Compile the drawing of one structure."""
     point, seen_at, normal, reach = fields.point, fields.seen_at, fields.normal, fields.reach
-    depth, colour, texture = fields.depth, fields.colour, fields.texture
+    depth, colour = fields.depth, fields.colour
     rows, cols, parts, lanes, factor = s.rows, s.cols, s.refine + 1, s.lanes, s.supersample
     s_width, s_height = s.width, s.height
     width, height = s_width * factor, s_height * factor
@@ -214,7 +214,7 @@ def _kernel(s: Structure, fields: _Fields) -> Callable[..., None]:
         return (q[0] - p[0]) * (r[1] - q[1]) - (q[1] - p[1]) * (r[0] - q[0])
 
     @ti.func
-    def texels(index):
+    def texels(texture: ti.template(), index):
         found = ti.Vector.zero(ti.u32, lanes)
         for lane in ti.static(range(lanes)):
             found[lane] = texture[index[lane]]
@@ -260,7 +260,7 @@ def _kernel(s: Structure, fields: _Fields) -> Callable[..., None]:
         )
 
     @ti.func
-    def draw_cell(i, j, top, bottom, near, toward):
+    def draw_cell(i, j, top, bottom, near, toward, texture: ti.template()):
         """Draw what is in rows top to bottom - 1 of the cell to the right and below of mass point (i, j)."""
         a, right, down, far = point[i, j], point[i, j + 1], point[i + 1, j], point[i + 1, j + 1]
         b = right - a
@@ -339,13 +339,13 @@ def _kernel(s: Structure, fields: _Fields) -> Callable[..., None]:
                             column, line = small_quad(x, y, inside, side, a, b, c, d)
                     draw_samples(
                         row, chunk, x, y, inside, column, line, whole, lower, overstep, side, near, a, b, c, d,
-                        i, j, first_x, first_y, begin_x, begin_y, toward,
+                        i, j, first_x, first_y, begin_x, begin_y, toward, texture,
                     )  # fmt: skip
 
     @ti.func
     def draw_samples(
         row, chunk, x, y, inside, column, line, whole, lower, overstep, side, near, a, b, c, d,
-        i, j, first_x, first_y, begin_x, begin_y, toward,
+        i, j, first_x, first_y, begin_x, begin_y, toward, texture: ti.template(),
     ):  # fmt: skip
         """Draw a chunk of samples of the cell A, B, C, D, in its small quads."""
         # The small quad: P = A + B s + C t + D s t again.
@@ -403,10 +403,10 @@ def _kernel(s: Structure, fields: _Fields) -> Callable[..., None]:
             right = ti.math.clamp(ti.cast(floor_u, ti.i32) + (first_x + 1), 0, texture_width - 1)
             upper = ti.math.clamp(ti.cast(floor_v, ti.i32) + first_y, 0, texture_height - 1) * texture_width
             under = ti.math.clamp(ti.cast(floor_v, ti.i32) + (first_y + 1), 0, texture_height - 1) * texture_width
-            upper_left = texels(upper + left)
-            upper_right = texels(upper + right)
-            lower_left = texels(under + left)
-            lower_right = texels(under + right)
+            upper_left = texels(texture, upper + left)
+            upper_right = texels(texture, upper + right)
+            lower_left = texels(texture, under + left)
+            lower_right = texels(texture, under + right)
             u -= floor_u
             v -= floor_v
             light = several(1.0)
@@ -472,6 +472,7 @@ def _kernel(s: Structure, fields: _Fields) -> Callable[..., None]:
     @ti.kernel
     def draw(
         position: ti.types.ndarray(dtype=ti.f32, ndim=3),
+        texture: ti.types.ndarray(dtype=ti.u32, ndim=1),
         matrix: mat4,
         toward: vec3,
         near: ti.f32,
@@ -519,7 +520,7 @@ def _kernel(s: Structure, fields: _Fields) -> Callable[..., None]:
                     high = ti.max(reach[i][1], reach[i + 1][1])
                     if low < bottom and high > top:
                         for j in range(cols - 1):
-                            draw_cell(i, j, top, bottom, near, toward)
+                            draw_cell(i, j, top, bottom, near, toward, texture)
                 for row in range(first_row, end_row):
                     if ti.static(factor == 1):
                         unpack(row, out)

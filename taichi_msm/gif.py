@@ -30,7 +30,7 @@ TRANSPARENT = COLOURS
 
 # The palette is chosen from so many pixels of the first frame along each axis, at these levels of light: the sheet is
 # drawn as it rests, and later turns its parts toward the headlight and away from it. Most of it stays as it is.
-SAMPLES = 96
+SAMPLES = 64
 LIGHT = (1.0, 1.0, 1.0, 1.0, 1.15, 1.3, 0.8, 0.6, 0.35, 0.15)
 
 # Pillow's lookup gives each cell of 4 x 4 x 4 colours the entry nearest to the cell's darkest corner. Looking

@@ -7,13 +7,24 @@ import io
 import os
 import tempfile
 import time
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 from taichi_msm.errors import DeviceError
 
-__all__ = ["ARCHS", "ITERATIONS_PER_THREAD", "Device", "FieldTree", "available_threads", "start", "started", "ti"]
+__all__ = [
+    "ARCHS",
+    "ITERATIONS_PER_THREAD",
+    "Device",
+    "FieldTree",
+    "available_threads",
+    "quick_compilation",
+    "start",
+    "started",
+    "ti",
+]
 
 # No banner on stdout, which may be JSON, and no call home.
 os.environ.setdefault("ENABLE_TAICHI_HEADER_PRINT", "0")
@@ -116,6 +127,17 @@ def start(arch: str = "cpu", threads: int | None = None) -> Device:
     return _device
 
 
+@contextlib.contextmanager
+def quick_compilation() -> Iterator[None]:
+    """Launch a kernel, always the same way, whose compilation leaves to LLVM what Taichi would optimise before it."""
+    config = ti.lang.impl.current_cfg()
+    config.advanced_optimization = False
+    try:
+        yield
+    finally:
+        config.advanced_optimization = True
+
+
 def _cache() -> dict[str, Any]:
     """Give Taichi's options for keeping compiled kernels for the next process."""
     folder = Path(os.environ.get("TI_OFFLINE_CACHE_FILE_PATH") or ti.lang.impl.default_cfg().offline_cache_file_path)
@@ -138,7 +160,7 @@ def _cache() -> dict[str, Any]:
 def _threads() -> list[int]:
     """List the threads of this process, the oldest first; empty where the system does not tell."""
     with contextlib.suppress(OSError):
-        return sorted(int(name) for name in os.listdir("/proc/self/task"))
+        return sorted(int(task.name) for task in Path("/proc/self/task").iterdir())
     return []
 
 
