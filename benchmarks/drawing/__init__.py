@@ -11,5 +11,6 @@ LIT = {
 FLAT = {
     "taichi_msm": "benchmarks.drawing.msm",
     "cv2.remap": "benchmarks.drawing.cv2_",
+    "cv2.remap, maps ready": "benchmarks.drawing.cv2_ready",
     "PiecewiseAffineTransform": "benchmarks.drawing.skimage_",
 }

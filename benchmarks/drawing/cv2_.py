@@ -25,16 +25,23 @@ class Remap:
         self._to_points = (POINTS - 1) / pixels
         self._to_texels = self._texture.shape[0] / pixels
 
-    def draw(self, position: NDArray[np.float32]) -> Picture:
-        """Warp the picture."""
+    def texels(self, position: NDArray[np.float32]) -> NDArray[np.float32]:
+        """Find the texel that each pixel shows, shape (pixels, pixels, 2)."""
         moved = (position - self._rest)[..., :2] * (np.array([1, -1], np.float32) * (self._pixel.shape[0] / SIDE))
         centre = (self._pixel + 0.5) * self._to_points
         place = centre
         for _ in range(ROUNDS):
             back = cv2.remap(moved, place, None, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
             place = centre - back * self._to_points
-        texel = place * (self._to_texels / self._to_points) - 0.5
-        return cv2.remap(self._texture, texel, None, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+        return place * (self._to_texels / self._to_points) - 0.5
+
+    def resample(self, texels: NDArray[np.float32]) -> Picture:
+        """Take the colours of texels."""
+        return cv2.remap(self._texture, texels, None, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+
+    def draw(self, position: NDArray[np.float32]) -> Picture:
+        """Warp the picture."""
+        return self.resample(self.texels(position))
 
 
 def prepare(problem: Problem, threads: int | None) -> Remap:

@@ -2,6 +2,7 @@
 
 PEERS = {
     "taichi_msm": "benchmarks.stepping.msm",
+    "taichi_msm, f64": "benchmarks.stepping.msm_f64",
     "C++, OpenMP": "benchmarks.stepping.cpp",
     "Numba": "benchmarks.stepping.numba_",
     "plain Taichi": "benchmarks.stepping.plain_taichi",

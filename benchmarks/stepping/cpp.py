@@ -8,20 +8,22 @@ from pathlib import Path
 import numpy as np
 
 from benchmarks.native import library
-from benchmarks.stepping.problem import FORCE, Array, Problem
+from benchmarks.stepping.planes import Planes
+from benchmarks.stepping.problem import FORCE, Problem
 from taichi_msm.lattice import spacing
 
 FLOATS = np.ctypeslib.ndpointer(np.float32, flags="C_CONTIGUOUS")
 
 
-class Stepper:
+class Stepper(Planes):
     """The arrays of step.cpp."""
 
     def __init__(self, problem: Problem) -> None:
+        super().__init__(problem.points)
         self._advance = library(Path(__file__).with_name("step.cpp")).advance
         self._advance.argtypes = [FLOATS] * 5 + [ctypes.c_int64] * 3
         self._advance.restype = None
-        springs, n = problem.scene.springs, problem.points
+        springs = problem.scene.springs
         self._numbers = np.array(
             [
                 *spacing(problem.scene.sheet),
@@ -36,20 +38,12 @@ class Stepper:
         )
         self._force = np.array(FORCE, np.float32)
         self._share = np.ascontiguousarray(problem.load[0] / self._force[0])
-        self._now, self._before = (np.zeros((3, n, n), np.float32) for _ in range(2))
-        self._done = 0
 
     def advance(self, steps: int) -> None:
         """Take the steps in one call."""
         n = self._share.shape[0]
         self._advance(self._now, self._before, self._share, self._force, self._numbers, n, self._done, steps)
-        self._done += steps
-        if steps % 2:
-            self._now, self._before = self._before, self._now
-
-    def displacement(self) -> Array:
-        """Give the displacement, shape (n, n, 3)."""
-        return np.moveaxis(self._now, 0, -1)
+        self._count(steps)
 
 
 def prepare(problem: Problem, threads: int | None) -> Stepper:

@@ -11,7 +11,8 @@ import math
 import numba
 import numpy as np
 
-from benchmarks.stepping.problem import FORCE, Array, Problem
+from benchmarks.stepping.planes import Planes
+from benchmarks.stepping.problem import FORCE, Problem
 from taichi_msm.lattice import spacing
 
 
@@ -86,11 +87,12 @@ def advance(
             )  # fmt: skip
 
 
-class Stepper:
+class Stepper(Planes):
     """The arrays of the compiled function."""
 
     def __init__(self, problem: Problem) -> None:
-        springs, n = problem.scene.springs, problem.points
+        super().__init__(problem.points)
+        springs = problem.scene.springs
         dx, dy = spacing(problem.scene.sheet)
         self._numbers = tuple(
             np.float32(number)
@@ -108,19 +110,11 @@ class Stepper:
         )
         self._load = tuple(np.float32(force) for force in FORCE)
         self._share = np.ascontiguousarray(problem.load[0] / self._load[0])
-        self._now, self._before = (np.zeros((3, n, n), np.float32) for _ in range(2))
-        self._done = 0
 
     def advance(self, steps: int) -> None:
         """Take the steps in one call."""
         advance(self._now, self._before, self._share, self._load, *self._numbers, self._done, steps)
-        self._done += steps
-        if steps % 2:
-            self._now, self._before = self._before, self._now
-
-    def displacement(self) -> Array:
-        """Give the displacement, shape (n, n, 3)."""
-        return np.moveaxis(self._now, 0, -1)
+        self._count(steps)
 
 
 def prepare(problem: Problem, threads: int | None) -> Stepper:
