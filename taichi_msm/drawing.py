@@ -123,7 +123,11 @@ class Drawing:
         self._view = view(scene)
         levels = [level * self.structure.levels for level in scene.render.background]
         self._background = sum(level << (self.structure.channel_bits * n) for n, level in enumerate(levels))
-        self._texels = (texture.astype(np.uint32) @ np.array([1, 1 << 8, 1 << 16], np.uint32)).ravel()
+        self._texels: Any = (texture.astype(np.uint32) @ np.array([1, 1 << 8, 1 << 16], np.uint32)).ravel()
+        if started().arch != "cpu":
+            # Kept there, or it would travel there and back with every picture.
+            packed, self._texels = self._texels, ti.ndarray(ti.u32, self._texels.size)
+            self._texels.from_numpy(packed)
 
     def draw(self, position: NDArray[Any], camera: View | None = None) -> NDArray[np.uint8]:
         """Draw the sheet.

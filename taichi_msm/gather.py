@@ -92,7 +92,7 @@ def _kernels(s: Structure, fields: _Fields) -> tuple[Any, Any]:
             force_x += right_x - left_x
             force_y += right_y - left_y
             force_z += right_z - left_z
-        row = ti.Vector([loads[n, c] for c in ti.static(range(columns))])
+        row = [loads[n, c] for c in ti.static(range(columns))]
         move(p, (1 - now) * (rows + 2) + i + 1, i, b, force_x, force_y, force_z, keep, dy, top, row)
 
     @ti.kernel

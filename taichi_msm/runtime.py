@@ -131,11 +131,11 @@ def start(arch: str = "cpu", threads: int | None = None) -> Device:
 def quick_compilation() -> Iterator[None]:
     """Launch a kernel, always the same way, whose compilation leaves to LLVM what Taichi would optimise before it."""
     config = ti.lang.impl.current_cfg()
-    config.advanced_optimization = False
+    found, config.advanced_optimization = config.advanced_optimization, False
     try:
         yield
     finally:
-        config.advanced_optimization = True
+        config.advanced_optimization = found
 
 
 def _cache() -> dict[str, Any]:
@@ -158,14 +158,14 @@ def _cache() -> dict[str, Any]:
 
 
 def _threads() -> list[int]:
-    """List the threads of this process, the oldest first; empty where the system does not tell."""
+    """List the threads of this process by their numbers, which mostly grow; empty where the system does not tell."""
     with contextlib.suppress(OSError):
         return sorted(int(task.name) for task in Path("/proc/self/task").iterdir())
     return []
 
 
 def _pin(pool: list[int]) -> None:
-    """Give every thread of Taichi's pool a core of its own, if it has as many as there are cores.
+    """Give every thread of Taichi's pool a core of its own, if it has one for each that this process may use.
 
     Left to the system two of them may share a core for some 10 ms, the one spinning until the other has done its part.
     """
@@ -190,6 +190,8 @@ def _initialise(device: Device) -> None:
                 **cache,
                 fast_math=False,
                 cfg_optimization=False,
+                # No warning of loops over the samples of a pixel.
+                unrolling_limit=0,
                 log_level=ti.ERROR,
             )
     except Exception as error:

@@ -124,7 +124,7 @@ def _kernels(s: Structure, fields: _Fields) -> tuple[Any, Any]:
             x, y, z = ahead(p, q, 0, 1, dx, up, shear, there)
             next_x, next_y, next_z = x, y, z
         # Read once: the stores to the fields could change the table, for all that the compiler knows.
-        now = ti.Vector([loads[n, c] for c in ti.static(range(columns))])
+        now = [loads[n, c] for c in ti.static(range(columns))]
         for b in range(1, strip + 1):
             force_x, force_y, force_z = zero, zero, zero
             last_x, last_y, last_z = here_x, here_y, here_z

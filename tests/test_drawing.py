@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from taichi_msm import drawing as drawing_module
 from taichi_msm import reference
 from taichi_msm.camera import view
 from taichi_msm.drawing import Drawing, structure
@@ -63,6 +65,14 @@ def test_picture_is_like_the_twin(render: dict[str, Any], device: Device) -> Non
     # f32 puts a vertex of a 97-pixel picture at 97 x 2^-24 px, and the speckle changes by at most 255 in 2 px.
     assert (apart > 1).mean() < 0.005
     assert (apart == 1).mean() < 0.01
+
+
+def test_the_form_for_a_gpu_draws_the_same(device: Device, monkeypatch: pytest.MonkeyPatch) -> None:
+    made, texture = drawable(), speckle(50, 70)
+    expected = draw(made, dented(made), texture)
+    monkeypatch.setattr(drawing_module, "started", lambda: replace(device, arch="cuda"))
+    assert structure(made, texture).lanes == 1
+    assert (draw(made, dented(made), texture) == expected).all()
 
 
 @pytest.mark.parametrize("size", [(17, 13), (64, 64), (331, 331), (1021, 509)])

@@ -2,19 +2,48 @@
 
 from __future__ import annotations
 
+import json
 import os
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
 
 import pytest
 
 from taichi_msm import runtime
-from taichi_msm.runtime import Device
+from taichi_msm.drawing import Drawing
+from taichi_msm.lattice import rest_positions
+from tests.scenes import scene, speckle
+
+# Start, make every thread of the pool work, and tell of each thread its processor time [ticks] and its cores.
+WORK = """
+import json, os
+from pathlib import Path
+from taichi_msm import runtime
+from taichi_msm.runtime import ITERATIONS_PER_THREAD, ti
+
+tasks = runtime.start().threads
+sums = ti.field(ti.f64, tasks)
+@ti.kernel
+def work():
+    for i in range(tasks * ITERATIONS_PER_THREAD):
+        if i % ITERATIONS_PER_THREAD == 0:
+            total = ti.cast(0, ti.f64)
+            for j in range(30_000_000):
+                total += ti.sin(total + j)
+            sums[i // ITERATIONS_PER_THREAD] = total
+work()
+threads = [int(task.name) for task in Path("/proc/self/task").iterdir()]
+ticks = {t: int(Path(f"/proc/self/task/{t}/stat").read_text().rsplit(")", 1)[1].split()[11]) for t in threads}
+print(json.dumps([[t == os.getpid(), ticks[t], sorted(os.sched_getaffinity(t))] for t in threads]))
+"""
 
 
 @pytest.mark.parametrize(("cores", "pinned"), [({4, 7}, {11: {4}, 12: {7}}), ({4, 5, 7}, {})])
 def test_threads_that_take_all_cores_have_one_each(
     cores: set[int], pinned: dict[int, set[int]], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """With a core to spare another program's threads may be there, and the system should choose."""
     found: dict[int, set[int]] = {}
     monkeypatch.setattr(os, "sched_getaffinity", lambda process: cores, raising=False)
     monkeypatch.setattr(os, "sched_setaffinity", found.__setitem__, raising=False)
@@ -22,9 +51,34 @@ def test_threads_that_take_all_cores_have_one_each(
     assert found == pinned
 
 
-def test_a_quick_compilation_is_for_one_kernel(device: Device) -> None:
+@pytest.mark.skipif(not Path("/proc/self/task").is_dir(), reason="the system does not tell the cores of threads")
+def test_the_threads_that_are_pinned_are_those_that_work(tmp_path: Path) -> None:
+    cores = sorted(os.sched_getaffinity(0))
+    if runtime.available_threads() != len(cores):
+        pytest.skip("a quota keeps this process from using all of its cores")
+    # Taichi reads the source of a kernel from its file.
+    script = tmp_path / "work.py"
+    script.write_text(WORK)
+    done = subprocess.run([sys.executable, str(script)], capture_output=True, text=True, check=True)
+    threads = json.loads(done.stdout)
+    workers = sorted((thread for thread in threads if not thread[0]), key=lambda thread: thread[1])[-len(cores) :]
+    assert sorted(on for _, _, on in workers) == [[core] for core in cores]
+    assert all(on == cores for thread in threads if thread not in workers for on in [thread[2]])
+
+
+@pytest.mark.usefixtures("device")
+def test_pictures_are_compiled_quickly_and_steps_are_not(monkeypatch: pytest.MonkeyPatch) -> None:
     config = runtime.ti.lang.impl.current_cfg()
-    with pytest.raises(KeyboardInterrupt), runtime.quick_compilation():
-        assert not config.advanced_optimization
+    made = scene(render={"size": [8, 8]})
+    drawing = Drawing(made, speckle(8, 8))
+    seen: list[bool] = []
+
+    def draw(*arguments: Any) -> None:
+        seen.append(config.advanced_optimization)
         raise KeyboardInterrupt
-    assert config.advanced_optimization
+
+    monkeypatch.setattr(drawing, "_draw", draw)
+    with pytest.raises(KeyboardInterrupt):
+        drawing.draw(rest_positions(made.sheet))
+    drawing.close()
+    assert [*seen, config.advanced_optimization] == [False, True]
