@@ -32,7 +32,8 @@ def load_scene(
     """Read a scene and check all that can be checked before computing.
 
     Args:
-        path: the scene file; the image that it, or an override, names is relative to its folder.
+        path: the scene file; the image that it names is relative to its folder, and in it or below. An override may
+            name one elsewhere, relative to the same folder.
         overrides: what to put in place of the file's values: "KEY=VALUE" with a dotted key (items of a list
             by number, probes.0.load) and the value in YAML; or a mapping from dotted keys to values.
         image: another picture for the sheet, relative to the current directory.
@@ -46,8 +47,9 @@ def load_scene(
     draft = _Draft(str(path), _read_file(str(path)))
     for override in _parse_overrides(overrides):
         draft.override(override)
-    draft.find_image(Path(path).parent)
-    if image is not None:
+    if image is None:
+        draft.find_image(Path(path).parent)
+    else:
         draft.override(_Override(f"--image {image}", ("image",), str(image)))
     scene, problems = validate(draft.data)
     draft.report(problems)
@@ -156,8 +158,14 @@ class _Draft:
     def find_image(self, folder: Path) -> None:
         """Make the path of the image, relative to a folder so far, relative to the current directory."""
         image = self.data.get("image")
-        if isinstance(image, str) and image:
-            self.data["image"] = str(folder / image)
+        if not (isinstance(image, str) and image):
+            return
+        self.data["image"] = str(folder / image)
+        # A scene may come from anybody, and is to see no more than what came with it.
+        if ("image",) not in self._overridden and not _is_below(folder / image, folder):
+            said = f"{image} is not below the scene's folder; put the picture there, or name it with --image"
+            self.found.append((self._place(("image",)), Problem(("image",), said)))
+            del self.data["image"]
 
     def report(self, problems: Iterable[Problem]) -> None:
         """Note problems, each at its place, leaving out what was said of the same key before."""
@@ -206,6 +214,15 @@ class _Draft:
                 self._overridden[here] = place
             holder = holder[part]
         return None
+
+
+def _is_below(path: Path, folder: Path) -> bool:
+    """Tell whether a path is in a folder or below it, wherever symbolic links lead."""
+    try:
+        return path.resolve().is_relative_to(folder.resolve())
+    except (OSError, RuntimeError, ValueError):
+        # A loop of links, or no path at all: reading it says so.
+        return True
 
 
 def _read_file(name: str) -> Document:

@@ -727,6 +727,37 @@ def test_the_image_is_relative_to_the_scene_file(tmp_path: Path, monkeypatch: py
     assert load_scene("scenes/s.yaml", {"image": absolute}).image == absolute
 
 
+@pytest.mark.parametrize("name", ["../secret.png", "deep/../../secret.png", "{absolute}", "link.png", "away/secret.png"])
+def test_a_scene_sees_no_picture_outside_its_folder(
+    name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "scenes" / "deep").mkdir(parents=True)
+    monkeypatch.chdir(tmp_path / "scenes")
+    Image.new("RGB", (4, 3)).save("../secret.png")
+    Path("link.png").symlink_to("../secret.png")
+    Path("away").symlink_to("..")
+    name = name.format(absolute=tmp_path / "secret.png")
+    Path("s.yaml").write_text(GOOD + f"image: {name}\nregion: [0, 0, 9, 9]\n")
+    opened: list[str] = []
+    monkeypatch.setattr("taichi_msm.texture._require_file", opened.append)
+    with pytest.raises(SceneError) as caught:
+        load_scene("s.yaml")
+    said = "is not below the scene's folder; put the picture there, or name it with --image"
+    assert caught.value.lines == (f"s.yaml:11:1: image: {name} {said}",)
+    assert not opened
+
+
+def test_a_scene_sees_what_links_in_its_folder_lead_to(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The folder itself may be a link, and a picture may be one to its neighbour."""
+    (tmp_path / "scenes").mkdir()
+    (tmp_path / "link").symlink_to("scenes")
+    monkeypatch.chdir(tmp_path)
+    Image.new("RGB", (4, 3)).save("scenes/own.png")
+    Path("scenes/same.png").symlink_to("own.png")
+    Path("scenes/s.yaml").write_text(GOOD + "image: same.png\n")
+    assert load_scene("link/s.yaml").image == str(Path("link/same.png"))
+
+
 def test_a_region_of_the_image(load: Load) -> None:
     Image.new("RGB", (40, 30)).save("a.png")
     text = GOOD + "image: a.png\nregion: "
