@@ -18,13 +18,13 @@ import click
 
 from taichi_msm import __version__
 from taichi_msm.errors import DeviceError, FilesError, SceneError
-from taichi_msm.interruption import INTERRUPTED, Interruption
+from taichi_msm.interruption import Interruption
 
 if TYPE_CHECKING:
     from taichi_msm.console import Progress
 
 DONE, BUG, WRONG_INPUT, DIVERGED, FILES = 0, 1, 2, 3, 4
-EXIT_CODES = {"complete": DONE, "diverged": DIVERGED, "interrupted": INTERRUPTED}
+EXIT_CODES = {"complete": DONE, "diverged": DIVERGED}
 
 scene_argument = click.argument("scene", metavar="SCENE")
 image_option = click.option("--image", metavar="FILE", help="Another picture on the scene's sheet.")
@@ -78,6 +78,7 @@ def run(
     from taichi_msm import runner
     from taichi_msm.console import Progress, summary
 
+    interruption = Interruption()
     recorded = [*overrides, *([f"image={image}"] if image is not None else [])]
     with Progress(quiet=quiet or as_json) as bar, naming(scene):
         try:
@@ -89,11 +90,11 @@ def run(
                 overrides=recorded,
                 estimate_error=estimate_error,
                 started=STARTED,
-                progress=interruptible(bar),
+                progress=interruptible(bar, interruption),
             )
         except KeyboardInterrupt:
             complain(["interrupted; nothing was written"])
-            return INTERRUPTED
+            return interruption.code
     if as_json:
         print_json({"directory": str(directory), **record})
     if record["status"] != "complete":
@@ -101,7 +102,7 @@ def run(
         complain([f"{scene}: {reason}; frames in {directory}: {record['frames']}"])
     elif not quiet and not as_json:
         click.echo(summary(record, directory))
-    return EXIT_CODES[record["status"]]
+    return EXIT_CODES.get(record["status"], interruption.code)
 
 
 @program.command()
@@ -195,6 +196,7 @@ def study(
     from taichi_msm.study.table import print_summary
 
     require_writable(directory)
+    interruption = Interruption()
     with Progress(quiet=as_json) as bar, naming(scene):
         found = measure(
             loaded,
@@ -203,11 +205,11 @@ def study(
             quick=quick,
             arch=arch,
             threads=threads,
-            progress=interruptible(bar),
+            progress=interruptible(bar, interruption),
         )
     if not found.stepping:
         complain(["interrupted; nothing was written"])
-        return INTERRUPTED
+        return interruption.code
     if found.status == "interrupted" and (directory / RECORD).exists():
         # An earlier study is not to be lost for a part of another.
         directory /= "interrupted"
@@ -217,7 +219,7 @@ def study(
     else:
         print_summary(found, Console())
         click.echo(f"{directory}: {', '.join(outputs)}")
-    return EXIT_CODES[found.status]
+    return EXIT_CODES.get(found.status, interruption.code)
 
 
 def result_directory(out: str | None, default: str) -> Path:
@@ -236,9 +238,8 @@ def naming(scene: str) -> Iterator[None]:
         raise SceneError([f"{scene}: {line}" for line in error.lines]) from None
 
 
-def interruptible(bar: Progress) -> Callable[[str, int, int], None]:
-    """Show the progress of some work, which Ctrl-C then stops where it reports."""
-    interruption = Interruption()
+def interruptible(bar: Progress, interruption: Interruption) -> Callable[[str, int, int], None]:
+    """Show the progress of some work, which an interruption then stops where it reports."""
 
     def progress(stage: str, done: int, total: int) -> None:
         bar.update(stage, done, total)
@@ -268,7 +269,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         arguments: what follows the program's name; None takes the process's.
 
     Returns:
-        The exit code: 0 done, 1 a bug, 2 wrong scene or arguments, 3 diverged, 4 files, 130 interrupted.
+        The exit code: 0 done, 1 a bug, 2 wrong scene or arguments, 3 diverged, 4 files, 130 Ctrl-C, 143 SIGTERM.
     """
     words = list(sys.argv[1:] if arguments is None else arguments)
 

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import os
 import pickle
+import signal
 import subprocess
 import sys
 import time
@@ -89,7 +90,7 @@ class Encoder:
             stdin=subprocess.PIPE,
             stdout=subprocess.PIPE,
             pass_fds=inherit,
-            # Ctrl-C is for us alone: the pictures so far are still to be finished.
+            # Ctrl-C is for us alone: the pictures so far are still to be finished, as they are after a SIGTERM.
             start_new_session=True,
             creationflags=getattr(subprocess, "CREATE_NEW_PROCESS_GROUP", 0),
         )
@@ -137,6 +138,8 @@ class Encoder:
 def main() -> None:
     """Be the process: read a job and its pictures from stdin, report on stdout."""
     answer: Report | Exception
+    # Who ends all processes of a service ends this one too; our pictures end when who asked for them does.
+    signal.signal(signal.SIGTERM, signal.SIG_IGN)
     try:
         answer = encode(pickle.load(sys.stdin.buffer), sys.stdin.buffer)
     except OSError as error:

@@ -1,4 +1,4 @@
-"""Ctrl-C as a request, granted where the work can stop.
+"""Ctrl-C and SIGTERM as a request, granted where the work can stop.
 
 Python raises KeyboardInterrupt between any two bytecodes: inside an import, a destructor or a callback of a library it
 gets lost or turns into another error.
@@ -10,39 +10,51 @@ import os
 import signal
 from types import FrameType
 
-INTERRUPTED = 130
+SIGNALS = (signal.SIGINT, signal.SIGTERM)
 
 
 class Interruption:
-    """Remembers that Ctrl-C was pressed; pressed twice, it ends the process at once."""
+    """Remembers that the program was asked to stop; asked twice, it ends the process at once.
+
+    Attributes:
+        code: the exit code of a program that stops, 128 and the number of the signal.
+    """
 
     def __init__(self) -> None:
+        self.code = _code(signal.SIGINT)
         self._requested = False
 
     def listen(self) -> None:
-        """Take Ctrl-C as a request from now on."""
-        signal.signal(signal.SIGINT, self._request)
+        """Take the signals as a request from now on."""
+        for number in SIGNALS:
+            signal.signal(number, self._request)
 
     def grant(self) -> None:
         """Stop here if it was asked for.
 
         Raises:
-            KeyboardInterrupt: when Ctrl-C was pressed since `listen`.
+            KeyboardInterrupt: when a signal came since `listen`.
         """
         if self._requested:
             raise KeyboardInterrupt
 
-    def _request(self, _number: int, _frame: FrameType | None) -> None:
+    def _request(self, number: int, _frame: FrameType | None) -> None:
+        self.code = _code(number)
         if self._requested:
-            os._exit(INTERRUPTED)
+            os._exit(self.code)
         self._requested = True
 
 
 def leave_at_once() -> None:
-    """End the process at Ctrl-C, as long as there is nothing to keep."""
-    signal.signal(signal.SIGINT, _leave)
+    """End the process at a signal, as long as there is nothing to keep."""
+    for number in SIGNALS:
+        signal.signal(number, _leave)
 
 
-def _leave(_number: int, _frame: FrameType | None) -> None:
+def _leave(number: int, _frame: FrameType | None) -> None:
     os.write(2, b"interrupted; nothing was written\n")
-    os._exit(INTERRUPTED)
+    os._exit(_code(number))
+
+
+def _code(number: int) -> int:
+    return 128 + number

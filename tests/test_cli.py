@@ -266,7 +266,8 @@ def test_a_simulation_that_runs_away_stops_with_3(small: Path) -> None:
     assert np.isfinite(np.load(small / "wild" / "trajectory.npz")["position"]).all()
 
 
-def test_ctrl_c_keeps_the_frames_so_far(small: Path) -> None:
+@pytest.mark.parametrize(("number", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)])
+def test_a_signal_keeps_the_frames_so_far(number: signal.Signals, code: int, small: Path) -> None:
     settings = ["--set", "time.duration=2000", "--set", "render.size=[400,300]", "--set", "output=[png, trajectory]"]
     process = subprocess.Popen(
         [sys.executable, "-m", "taichi_msm", "run", "small.yaml", "--out", "long", *settings],
@@ -278,9 +279,13 @@ def test_ctrl_c_keeps_the_frames_so_far(small: Path) -> None:
         if staged.exists() and len(list(staged.iterdir())) > 3:
             break
         time.sleep(0.05)
-    process.send_signal(signal.SIGINT)
+    if number == signal.SIGTERM:
+        # A service's processes all get it, the encoder too.
+        for child in children(process.pid):
+            os.kill(child, number)
+    process.send_signal(number)
     _, error = process.communicate(timeout=30)
-    assert process.returncode == 130
+    assert process.returncode == code
     record = json.loads((small / "long" / "run.json").read_text())
     assert record["status"] == "interrupted"
     frames = record["frames"]
@@ -290,8 +295,16 @@ def test_ctrl_c_keeps_the_frames_so_far(small: Path) -> None:
     assert np.load(small / "long" / "trajectory.npz")["position"].shape == (frames, 9, 11, 3)
 
 
-@pytest.mark.parametrize("delay", [0.3, 0.5, 0.7, 0.9, 1.2])
-def test_ctrl_c_before_the_first_frame_changes_nothing(delay: float, small: Path) -> None:
+def children(process: int) -> list[int]:
+    """List the processes that another one started."""
+    listed = Path(f"/proc/{process}/task/{process}/children")
+    return [int(child) for child in listed.read_text().split()] if listed.exists() else []
+
+
+@pytest.mark.parametrize(
+    ("number", "delay"), [*((signal.SIGINT, delay) for delay in (0.3, 0.5, 0.7, 0.9, 1.2)), (signal.SIGTERM, 0.8)]
+)
+def test_a_signal_before_the_first_frame_changes_nothing(number: signal.Signals, delay: float, small: Path) -> None:
     # A large picture, so that no frame is done in the time.
     (small / "kept").mkdir()
     (small / "kept" / "run.json").write_text("earlier")
@@ -302,9 +315,9 @@ def test_ctrl_c_before_the_first_frame_changes_nothing(delay: float, small: Path
         text=True,
     )
     time.sleep(delay)
-    process.send_signal(signal.SIGINT)
+    process.send_signal(number)
     _, error = process.communicate(timeout=60)
-    assert (process.returncode, error) == (130, "interrupted; nothing was written\n")
+    assert (process.returncode, error) == (128 + number, "interrupted; nothing was written\n")
     assert [path.name for path in (small / "kept").iterdir()] == ["run.json"]
     assert (small / "kept" / "run.json").read_text() == "earlier"
 
