@@ -249,8 +249,8 @@ class Scene(Section):
 
     image: Text | None = key(
         None,
-        means="the picture on the sheet: PNG, JPEG, WebP, BMP or TIFF; relative to the scene file, in its folder or below; "
-        "required to draw",
+        means="the picture on the sheet: PNG, JPEG, WebP, BMP or TIFF; relative to the scene file, "
+        "in its folder or below; required to draw",
         expects="the path of a picture",
     )
     region: tuple[Whole, Whole, Whole, Whole] | None = key(
