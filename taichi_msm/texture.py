@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import stat
 import warnings
 from collections.abc import Iterator
@@ -114,7 +115,7 @@ def _open(path: str) -> Iterator[Image.Image]:
     from PIL import Image, UnidentifiedImageError
 
     _require_file(path)
-    with warnings.catch_warnings():
+    with _silence(), warnings.catch_warnings():
         warnings.simplefilter("ignore")
         warnings.simplefilter("error", Image.DecompressionBombWarning)
         try:
@@ -131,6 +132,24 @@ def _open(path: str) -> Iterator[Image.Image]:
             raise _PictureError(f"{path} has more than {limit} million pixels; scale it down") from None
         except Exception as error:
             raise _PictureError(f"{path} cannot be decoded ({error}); save it anew") from None
+
+
+@contextmanager
+def _silence() -> Iterator[None]:
+    """Keep from stderr what libtiff and Pillow's log say of a broken picture: the error that is raised says it."""
+    try:
+        stderr = os.dup(2)
+    except OSError:
+        # It is closed.
+        yield
+        return
+    try:
+        with Path(os.devnull).open("wb") as nowhere:
+            os.dup2(nowhere.fileno(), 2)
+        yield
+    finally:
+        os.dup2(stderr, 2)
+        os.close(stderr)
 
 
 def _require_file(path: str) -> None:

@@ -1,0 +1,274 @@
+"""Files that a careless or hostile hand has changed: clean errors, soon, and nothing left behind."""
+
+from __future__ import annotations
+
+import copy
+import io
+import json
+import random
+import shutil
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+from PIL import Image
+
+from taichi_msm.errors import SceneError
+from taichi_msm.runtime import Device
+from taichi_msm.scene import Scene
+from taichi_msm.scene_file import load_scene
+from taichi_msm.texture import load_texture, texture_size
+from tests.mutation import damaged_picture, damaged_text
+from tests.pool import Pool
+from tests.scenes import SHEET, SPRINGS, speckle
+
+resource: Any = pytest.importorskip("resource")
+
+SCENES, OVERRIDES, PICTURES, VALID, BROKEN = 20_000, 2_000, 5_000, 500, 1_500
+
+# The slowest that one input may be [s], and the most that memory may grow over all of them [KiB].
+SLOWEST, GROWTH = 1.0, 50_000
+
+
+@pytest.fixture
+def here(tmp_path: Path, root: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """The current directory, with the textures of the shipped scenes."""
+    (tmp_path / "textures").mkdir()
+    for picture in (root / "scenes" / "textures").glob("*.png"):
+        shutil.copy(picture, tmp_path / "textures")
+    monkeypatch.chdir(tmp_path)
+    return tmp_path
+
+
+@contextmanager
+def in_bounds(folder: Path) -> Iterator[Callable[[Callable[[], object]], bool]]:
+    """Give a function that tries one input, and says whether it was accepted; no input may break a promise."""
+    before, slowest, sizes = sorted(folder.rglob("*")), 0.0, []
+
+    def attempt(work: Callable[[], object]) -> bool:
+        nonlocal slowest
+        refused: tuple[str, ...] | None = None
+        start = time.perf_counter()
+        try:
+            work()
+        except SceneError as error:
+            refused = error.lines
+        slowest = max(slowest, time.perf_counter() - start)
+        sizes.append(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss)
+        if refused is None:
+            return True
+        assert refused
+        assert all(line.isprintable() for line in refused)
+        return False
+
+    yield attempt
+    assert slowest < SLOWEST
+    # After a tenth of them all that is kept has been made.
+    assert sizes[-1] - sizes[len(sizes) // 10] < GROWTH
+    assert sorted(folder.rglob("*")) == before
+
+
+def test_damaged_scenes(here: Path, root: Path) -> None:
+    rng = random.Random(1)
+    scenes = [path.read_bytes() for path in sorted((root / "scenes").glob("*.yaml"))]
+    file = here / "damaged.yaml"
+    file.touch()
+    with in_bounds(here) as attempt:
+        accepted = 0
+        for _ in range(SCENES):
+            file.write_bytes(damaged_text(rng, rng.choice(scenes)))
+            accepted += attempt(lambda: load_scene("damaged.yaml"))
+    assert 0 < accepted < SCENES / 2, "some damage does no harm, and most does"
+
+
+def test_damaged_overrides(here: Path, root: Path) -> None:
+    rng = random.Random(2)
+    shutil.copy(root / "scenes" / "press.yaml", here)
+    keys = ["sheet.points", "probes.0.load", "probes.9.at", "render.camera.eye", "time.step", "image", "a.b", "0", ""]
+    values = ["[61,61]", "[[0,100]]", "1e4", "-1", "null", "{a: 1}", "[", "top", "!!x 1", "&a 1", "[]", "é", "\ud800"]
+    with in_bounds(here) as attempt:
+        for _ in range(OVERRIDES):
+            text = rng.choice(keys) + rng.choice(("=", "=", "", "==")) + rng.choice(values)
+            if rng.random() < 0.5:
+                # As the command line gives bytes that are no UTF-8.
+                damaged = damaged_text(rng, text.encode("utf-8", "surrogatepass"))
+                text = damaged.decode("utf-8", "surrogateescape")
+            attempt(partial(load_scene, "press.yaml", [text]))
+
+
+def pictures() -> list[bytes]:
+    """Small pictures of all formats and kinds of pixels."""
+    colours = Image.fromarray(speckle(13, 17))
+    turned = Image.Exif()
+    turned[0x0112] = 6
+    kinds: list[tuple[str, str, dict[str, Any]]] = [
+        *(("PNG", mode, {}) for mode in ("RGB", "P", "RGBA", "LA", "I;16", "1")),
+        *(("JPEG", mode, {"exif": turned}) for mode in ("RGB", "L", "CMYK")),
+        *(("WEBP", mode, {"lossless": mode == "RGBA"}) for mode in ("RGB", "RGBA")),
+        *(("TIFF", "RGB", {"compression": name}) for name in ("raw", "tiff_lzw", "jpeg", "tiff_deflate")),
+        ("BMP", "RGB", {}),
+        ("GIF", "P", {}),
+    ]
+    made = []
+    for form, mode, options in kinds:
+        file = io.BytesIO()
+        (colours.convert("L") if mode == "I;16" else colours).convert(mode).save(file, form, **options)
+        made.append(file.getvalue())
+    return made
+
+
+def test_damaged_pictures(here: Path, capfd: pytest.CaptureFixture[str]) -> None:
+    rng = random.Random(3)
+    whole = pictures()
+    scene = Scene.model_validate(
+        {"image": "damaged.png", "sheet": SHEET, "springs": SPRINGS, "time": {"duration": 0.04}}
+    )
+    file = here / "damaged.png"
+    file.touch()
+
+    def read() -> None:
+        texture_size(scene)
+        texture = load_texture(scene)
+        assert texture.dtype == np.uint8
+        assert texture.ndim == 3
+
+    with in_bounds(here) as attempt:
+        accepted = 0
+        for _ in range(PICTURES):
+            file.write_bytes(damaged_picture(rng, rng.choice(whole)))
+            accepted += attempt(read)
+    assert 0 < accepted < PICTURES / 2
+    assert capfd.readouterr() == ("", ""), "no library talks past us"
+
+
+def number(low: float, high: float) -> st.SearchStrategy[float]:
+    """Positive numbers of every size."""
+    return st.floats(np.log(low), np.log(high)).map(lambda power: float(np.exp(power)))
+
+
+@st.composite
+def valid_scenes(draw: st.DrawFn) -> dict[str, Any]:
+    """A scene that keeps every rule; of few structures, so that few kernels are compiled."""
+    rate = draw(st.sampled_from([10, 24, 25, 30, 60]))
+    times = sorted(draw(st.sets(st.integers(0, 100), min_size=1, max_size=4)))
+    load = [[t / 100, draw(st.floats(-100, 100))] for t in times]
+    if draw(st.booleans()):
+        load.append([load[-1][0], draw(st.floats(-100, 100))])
+    return {
+        "sheet": {
+            "points": [5, 7],
+            "size": [draw(number(0.01, 10)), draw(number(0.01, 10))],
+            "mass": draw(number(1e-6, 1e3)),
+            "fixed": draw(st.sampled_from(["border", "none"])),
+        },
+        "springs": {
+            "structural": draw(number(1e-3, 1e6)),
+            "shear": draw(number(1e-3, 1e6)),
+            "virtual": draw(number(1e-3, 1e6)),
+            "virtual_active": draw(st.sampled_from(["loaded", "always"])),
+        },
+        "damping": draw(number(1e-6, 10)),
+        "probes": [
+            {
+                "at": [draw(st.floats(0, 1)), draw(st.floats(0, 1))],
+                "force": [draw(st.floats(-1e3, 1e3)) for _ in range(3)],
+                "load": load,
+                "falloff": draw(st.floats(0, 1e3)),
+                "offset": draw(st.floats(0, 20)),
+            }
+        ],
+        "time": {
+            "duration": draw(st.integers(1, 9)) / rate,
+            "frames_per_second": rate,
+            "damping_difference": draw(st.sampled_from(["central", "backward"])),
+            "precision": draw(st.sampled_from(["f32", "f64"])),
+        },
+        "output": [],
+    }
+
+
+def write(scene: dict[str, Any]) -> str:
+    """Write a scene, one key a line."""
+    lines = []
+    for key, value in scene.items():
+        inner = value[0] if key == "probes" else value
+        if isinstance(inner, dict) and key != "output":
+            lines += [f"{key}:", *(f"  {name}: {flow(one)}" for name, one in inner.items())]
+        else:
+            lines.append(f"{key}: {flow(value)}")
+        if key == "probes":
+            lines[-len(inner)] = lines[-len(inner)].replace("  ", "- ", 1)
+    return "\n".join(lines) + "\n"
+
+
+def flow(value: Any) -> str:
+    """Write a value on one line: JSON is YAML, but for what is no number."""
+    return json.dumps(value).replace("Infinity", ".inf").replace("NaN", ".nan")
+
+
+QUIET = settings(
+    deadline=None,
+    database=None,
+    derandomize=True,
+    suppress_health_check=[HealthCheck.function_scoped_fixture, HealthCheck.too_slow],
+)
+
+
+@settings(QUIET, max_examples=VALID)
+@given(scene=valid_scenes())
+def test_a_scene_that_keeps_every_rule_runs(scene: dict[str, Any], here: Path, sheets: Pool, device: Device) -> None:
+    Path("valid.yaml").write_text(write(scene))
+    dynamics = sheets.lend(load_scene("valid.yaml"), device)
+    dynamics.advance(3)
+    displacement = dynamics.displacement()
+    dynamics.close()
+    assert np.isfinite(displacement).all()
+
+
+# Values that break one rule, each of the key above them.
+RULES: dict[str, list[Any]] = {
+    "sheet.points": [[1, 7], [5, 4097], [5], 5, "five", [5.5, 7], [5, True], None],
+    "sheet.size": [[0, 1], [-1, 1], [1], [float("inf"), 1]],
+    "sheet.mass": [0, -1, float("nan"), True, [1], {"a": 1}],
+    "sheet.fixed": ["all", ["left", "middle"], 1],
+    "springs.structural": [-1, "stiff", float("inf")],
+    "springs.virtual_active": ["never", 1],
+    "damping": [-1, [1], "some"],
+    "probes.0.at": [[0.5], "middle", [[0, 0.5, 0.5], [0, 0.5]]],
+    "probes.0.force": [[1, 2], [1, 2, "x"], 3],
+    "probes.0.load": [[[1, 0], [0, 1]], [[0]], [[0, 0], [0, 1], [0, 2]], "full"],
+    "time.duration": [0, -1, 1.23456],
+    "time.frames_per_second": [0, "film"],
+    "time.damping_difference": ["forward"],
+    "time.precision": ["f16", 32],
+    "time.step": [1e6, "fast", 0],
+    "output": [["mp4"], "png", {"png": True}],
+}
+
+
+@settings(QUIET, max_examples=BROKEN)
+@given(scene=valid_scenes(), rule=st.sampled_from([(key, value) for key in RULES for value in RULES[key]]))
+def test_a_scene_that_breaks_one_rule_is_refused_where_it_does(
+    scene: dict[str, Any], rule: tuple[str, Any], here: Path
+) -> None:
+    key, value = rule
+    broken: Any = copy.deepcopy(scene)
+    *sections, name = key.split(".")
+    holder = broken
+    for section in sections:
+        holder = holder[int(section) if section.isdigit() else section]
+    holder[name] = value
+    text = write(broken)
+    Path("broken.yaml").write_text(text)
+    with pytest.raises(SceneError) as caught:
+        load_scene("broken.yaml")
+    line = next(n for n, said in enumerate(text.splitlines(), 1) if said.lstrip("- ").startswith(f"{name}:"))
+    places = [said.split(": ")[:2] for said in caught.value.lines]
+    assert all(at.startswith(f"broken.yaml:{line}:") and where.startswith(key) for at, where in places), caught.value
