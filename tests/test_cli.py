@@ -160,6 +160,7 @@ def test_springs_that_are_pressed_together_are_told_of(small: Path) -> None:
     assert f"a spring was pressed to {record['shortest_spring']:.2g} of its rest length" in done.stdout
 
 
+@pytest.mark.slow
 def test_a_study_ends_in_lines_that_the_scene_takes(small: Path) -> None:
     done = program(
         "study",

@@ -54,3 +54,10 @@ def test_every_link_of_the_readme_leads_somewhere(root: Path) -> None:
     assert links
     for link in links:
         assert link in headings or (root / link).exists(), link
+
+
+def test_every_promise_has_its_test(root: Path) -> None:
+    named = re.findall(r"`(tests/\w+\.py)::(\w+)`", (root / "docs" / "trust.md").read_text(encoding="utf-8"))
+    assert named
+    for file, test in named:
+        assert f"\ndef {test}(" in (root / file).read_text(encoding="utf-8"), test
