@@ -76,6 +76,8 @@ class FieldTree:
     def allocate(self) -> None:
         """Make the memory of all fields placed, filled with zeros."""
         self._tree = self._builder.finalize()
+        # Taichi looks at new fields before the next kernel, and crashes if they are freed by then.
+        ti.lang.impl.get_runtime().materialize()
 
     def close(self) -> None:
         """Free the memory. Kernels that use it must not be called again."""

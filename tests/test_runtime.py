@@ -63,7 +63,15 @@ def test_the_threads_that_are_pinned_are_those_that_work(tmp_path: Path) -> None
     threads = json.loads(done.stdout)
     workers = sorted((thread for thread in threads if not thread[0]), key=lambda thread: thread[1])[-len(cores) :]
     assert sorted(on for _, _, on in workers) == [[core] for core in cores]
-    assert all(on == cores for thread in threads if thread not in workers for on in [thread[2]])
+    assert all(on == cores for main, ticks, on in threads if [main, ticks, on] not in workers)
+
+
+def test_fields_may_be_freed_before_any_kernel_runs() -> None:
+    """In a process of its own, where none has run."""
+    script = "from taichi_msm import runtime; from taichi_msm.drawing import Drawing; from taichi_msm.dynamics import "
+    script += "Dynamics; from tests.scenes import *; device = runtime.start(); "
+    script += "Drawing(scene(), speckle(8, 8)).close(); Dynamics(scene(), device).advance(1)"
+    subprocess.run([sys.executable, "-c", script], cwd=Path(__file__).parent.parent, check=True)
 
 
 @pytest.mark.usefixtures("device")
