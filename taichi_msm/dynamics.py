@@ -20,7 +20,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from taichi_msm.forces import ACROSS, GRIP_COLUMN, GRIP_COLUMNS, HAS_LEFT, HAS_RIGHT, MOVES, Structure
+from taichi_msm.forces import ACROSS, BYTES, GRIP_COLUMN, GRIP_COLUMNS, HAS_LEFT, HAS_RIGHT, MOVES, Structure
 from taichi_msm.gather import STEPS_PER_LAUNCH, Gather
 from taichi_msm.lattice import axes, fixed_points, spacing
 from taichi_msm.loads import decay, grips, schedule
@@ -31,7 +31,6 @@ from taichi_msm.sweep import Sweep
 
 # Lanes of a 256-bit vector.
 LANES = {"f32": 8, "f64": 4}
-BYTES = {"f32": 4, "f64": 8}
 
 # Below this many points a worker costs more in waiting for the others than it saves.
 POINTS_PER_WORKER = 450

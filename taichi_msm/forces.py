@@ -18,6 +18,9 @@ MOVES, ACROSS, HAS_LEFT, HAS_RIGHT = 0, 3, 4, 5
 # falloff and offset.
 GRIP_COLUMN, GRIP_COLUMNS = 2, 7
 
+# Bytes of a number.
+BYTES = {"f32": 4, "f64": 8}
+
 
 @dataclass(frozen=True)
 class Structure:

@@ -23,7 +23,7 @@ from typing import Any
 
 from numpy.typing import NDArray
 
-from taichi_msm.forces import SheetFields, Structure, compression, point_step, rest_kernel, spring_forces
+from taichi_msm.forces import BYTES, SheetFields, Structure, compression, point_step, rest_kernel, spring_forces
 from taichi_msm.runtime import ITERATIONS_PER_THREAD, ti
 
 # Integers between the progress counters of two workers, so that each has a cache line of its own.
@@ -51,7 +51,7 @@ class _Fields(SheetFields):
 
 def _slots(s: Structure) -> int:
     """Rows of `behind` that a worker has: its steps, then a page, over which one core's prefetcher does not reach."""
-    row_bytes = (s.strip + 2) * s.lanes * (4 if s.precision == "f32" else 8)
+    row_bytes = (s.strip + 2) * s.lanes * BYTES[s.precision]
     return s.depth - (-PAGE // row_bytes)
 
 

@@ -45,28 +45,28 @@ def assert_like_twin(made: Scene, device: Device, layout: Structure | None = Non
 
 
 @pytest.mark.parametrize("precision", ["f32", "f64"])
-@pytest.mark.parametrize("seed", range(6))
+@pytest.mark.parametrize("seed", [*range(6), *(pytest.param(seed, marks=pytest.mark.slow) for seed in (6, 7))])
 def test_random_scene_is_like_the_twin(seed: int, precision: str, device: Device) -> None:
     assert_like_twin(random_scene(seed, precision), device)
+
+
+# Each of a structure of its own, so that all take long: these, and as slow ones the others.
+FIXED = ("border", "corners", "none", ["top"], ["left"], ["left", "bottom"])
+QUICK_SHEETS = {
+    (2, 2): ("corners", "none", ["left"]),
+    (2, 9): ("border", "none", ["top"]),
+    (9, 2): ("corners", ["left", "bottom"]),
+    (3, 8): ("border", "none"),
+    (4, 17): ("border", "corners", ["top"], ["left", "bottom"]),
+}
 
 
 @pytest.mark.parametrize(
     ("points", "fixed"),
     [
-        ([2, 2], "corners"),
-        ([2, 2], "none"),
-        ([2, 2], ["left"]),
-        ([2, 9], "border"),
-        ([2, 9], ["top"]),
-        ([2, 9], "none"),
-        ([9, 2], "corners"),
-        ([9, 2], ["left", "bottom"]),
-        ([3, 8], "border"),
-        ([3, 8], "none"),
-        ([4, 17], "border"),
-        ([4, 17], "corners"),
-        ([4, 17], ["top"]),
-        ([4, 17], ["left", "bottom"]),
+        pytest.param(list(points), fixed, marks=() if fixed in quick else pytest.mark.slow)
+        for points, quick in QUICK_SHEETS.items()
+        for fixed in FIXED
     ],
 )
 def test_small_sheets_and_fixed_sides(points: list[int], fixed: Any, device: Device) -> None:
@@ -88,13 +88,13 @@ def test_bands_and_passes_do_not_change_the_bits(fixed: Any, device: Device) -> 
     assert (whole.workers, whole.depth) == (1, 1)
     plain = simulate(made, device)
     # Also passes longer than a band has rows, and a last one that is not full.
-    for workers, depth in ((1, 3), (2, 1), (2, 16)):
+    for workers, depth in ((1, 3), (2, 1), (2, 4), (2, 16)):
         assert steps_per_frame(made) % depth != 0 or depth == 1
         layout = replace(whole, workers=workers, depth=depth)
         assert simulate(made, device, layout).tobytes() == plain.tobytes(), (workers, depth)
 
 
-@pytest.mark.parametrize("workers", [3, 10])
+@pytest.mark.parametrize("workers", [3, pytest.param(4, marks=pytest.mark.slow), 10])
 def test_more_bands_than_threads_give_the_same_bits(workers: int, device: Device) -> None:
     # Bands that end at one border are those of the second and third worker, and it takes as many threads to step them
     # at one time; but one step a launch, nobody waits.

@@ -196,13 +196,13 @@ def write(scene: dict[str, Any]) -> str:
     """Write a scene, one key a line."""
     lines = []
     for key, value in scene.items():
-        inner = value[0] if key == "probes" else value
-        if isinstance(inner, dict) and key != "output":
-            lines += [f"{key}:", *(f"  {name}: {flow(one)}" for name, one in inner.items())]
+        if key in ("sheet", "springs", "time"):
+            lines += [f"{key}:", *(f"  {name}: {flow(one)}" for name, one in value.items())]
+        elif key == "probes":
+            first, *others = (f"{name}: {flow(one)}" for name, one in value[0].items())
+            lines += ["probes:", f"- {first}", *(f"  {other}" for other in others)]
         else:
             lines.append(f"{key}: {flow(value)}")
-        if key == "probes":
-            lines[-len(inner)] = lines[-len(inner)].replace("  ", "- ", 1)
     return "\n".join(lines) + "\n"
 
 

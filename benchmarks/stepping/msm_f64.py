@@ -5,9 +5,9 @@ from __future__ import annotations
 from benchmarks.stepping.problem import Problem, Stepper
 from taichi_msm import runtime
 from taichi_msm.dynamics import Dynamics
+from taichi_msm.stability import with_time
 
 
 def prepare(problem: Problem, threads: int | None) -> Stepper:
     """Set up the sheet at rest."""
-    time = problem.scene.time.model_copy(update={"precision": "f64"})
-    return Dynamics(problem.scene.model_copy(update={"time": time}), runtime.start("cpu", threads))
+    return Dynamics(with_time(problem.scene, precision="f64"), runtime.start("cpu", threads))
