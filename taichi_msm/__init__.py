@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from taichi_msm.errors import DeviceError, DivergedError, FilesError, MsmError, SceneError
-    from taichi_msm.runner import run
+    from taichi_msm.runner import resume, run
     from taichi_msm.scene import Scene
     from taichi_msm.scene_file import load_scene
     from taichi_msm.simulation import Simulation
@@ -25,6 +25,7 @@ __all__ = [
     "SceneError",
     "Simulation",
     "load_scene",
+    "resume",
     "run",
 ]
 
@@ -33,7 +34,7 @@ _HOMES = {
     "Scene": "scene",
     "Simulation": "simulation",
     "load_scene": "scene_file",
-    "run": "runner",
+    **dict.fromkeys(("resume", "run"), "runner"),
 }
 
 

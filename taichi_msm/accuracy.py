@@ -14,16 +14,18 @@ import math
 from collections.abc import Callable
 from contextlib import ExitStack, closing
 from dataclasses import dataclass
+from functools import partial
 from itertools import pairwise
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from taichi_msm.divergence import farthest_displacement
 from taichi_msm.dynamics import Dynamics
 from taichi_msm.errors import SceneError
 from taichi_msm.lattice import rest_positions
-from taichi_msm.loads import farthest_displacement, meets_jumps, shortest_event, steps_to_meet_jumps
+from taichi_msm.loads import meets_jumps, shortest_event, steps_to_meet_jumps
 from taichi_msm.runtime import Device
 from taichi_msm.scene import LARGEST_TOLERANCE, Scene
 from taichi_msm.stability import step, steps_per_frame, with_steps, with_time
@@ -149,11 +151,12 @@ class Pilots:
         farthest = farthest_displacement(scene, scene.time.duration)
         error = rounding = in_f64 = largest = 0.0
         for frame in range(frames):
-            progress(frame, frames)
-            self._fine.advance(finer * steps)
-            self._coarse.advance(steps)
+            pause = partial(progress, frame, frames)
+            pause()
+            self._fine.advance(finer * steps, pause)
+            self._coarse.advance(steps, pause)
             if self._own is not self._coarse:
-                self._own.advance(steps)
+                self._own.advance(steps, pause)
             fine, coarse = self._fine.displacement(), self._coarse.displacement()
             own = coarse if self._own is self._coarse else self._as_written(self._own.displacement())
             with np.errstate(all="ignore"):

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import math
 import os
+import shutil
 import sys
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -10,7 +12,7 @@ from pathlib import Path
 
 from taichi_msm import stability, texture
 from taichi_msm.errors import Path as Key
-from taichi_msm.errors import Problem
+from taichi_msm.errors import Problem, SceneError
 from taichi_msm.scene import Scene
 
 MAX_STEPS = 10**12
@@ -20,6 +22,9 @@ POINT_BYTES = 36  # a mass point, as it is seen, and its normal
 SAMPLE_BYTES = 12  # depth and colour of one sample of the picture
 PIXEL_BYTES = 3 * 12  # colours of one pixel, from sums to bytes
 TEXEL_BYTES = 4
+
+# Bytes of a pixel in a file.
+PIXEL_FILE_BYTES = {"png": 2, "gif": 1}
 
 # Numbers for each mass point: displacement and difference; and the copies made at the start and for output.
 STATE_NUMBERS = 6
@@ -36,7 +41,9 @@ class Budget:
         frames: frames in all, the one at rest included.
         simulation_bytes: memory for the state of the sheet and its output.
         drawing_bytes: memory for a frame and the texture; 0 where nothing is drawn.
-        disk_bytes: size of the files, about.
+        picture_bytes: size of the files with pictures, about.
+        trajectory_bytes: size of the trajectory.
+        working_bytes: disk space that is taken besides until the run ends.
     """
 
     points: int
@@ -44,28 +51,40 @@ class Budget:
     frames: int
     simulation_bytes: int
     drawing_bytes: int
-    disk_bytes: int
+    picture_bytes: int
+    trajectory_bytes: int
+    working_bytes: int
 
     @property
     def memory_bytes(self) -> int:
         """Memory in use at one time. Trajectories do not count: they are streamed to disk."""
         return self.simulation_bytes + self.drawing_bytes
 
+    @property
+    def disk_bytes(self) -> int:
+        """Size of all files."""
+        return self.picture_bytes + self.trajectory_bytes
+
 
 def estimate(scene: Scene) -> Budget:
     """Estimate what the scene will need."""
     rows, cols = scene.sheet.points
     points = rows * cols
+    frames, pixels = scene.time.frames + 1, math.prod(scene.render.size)
+    positions = frames * points * 3 * _number_bytes(scene)
     numbers = STATE_NUMBERS + OUTPUT_NUMBERS + len(scene.probes)
     # Pilot runs are two more sheets, in f64.
     sheets = _number_bytes(scene) + (2 * 8 if scene.time.tolerance is not None else 0)
     return Budget(
         points=points,
         steps=scene.time.frames * stability.steps_per_frame(scene),
-        frames=scene.time.frames + 1,
+        frames=frames,
         simulation_bytes=points * sheets * numbers,
         drawing_bytes=_drawing_bytes(scene) if scene.draws else 0,
-        disk_bytes=_disk_bytes(scene),
+        picture_bytes=frames * sum(pixels * PIXEL_FILE_BYTES.get(kind, 0) for kind in set(scene.output)),
+        trajectory_bytes=positions if "trajectory" in scene.output else 0,
+        # Two of the states with which a run can go on, and all its positions.
+        working_bytes=2 * points * STATE_NUMBERS * _number_bytes(scene) + (positions if scene.output else 0),
     )
 
 
@@ -87,6 +106,34 @@ def problems(scene: Scene) -> Iterator[Problem]:
     yield from _memory_problems(scene)
 
 
+def require_disk(scene: Scene, directory: Path) -> None:
+    """Make sure that there is room for the results.
+
+    Args:
+        scene: a checked scene.
+        directory: where they are to go; it may not be there yet.
+
+    Raises:
+        SceneError: when there is not, with the numbers and the key to change.
+    """
+    budget, free = estimate(scene), _free_disk(directory)
+    needed = budget.disk_bytes + budget.working_bytes
+    if needed <= free:
+        return
+    rows, cols = scene.sheet.points
+    width, height = scene.render.size
+    parts = [
+        (needed - budget.picture_bytes, "sheet.points", f"positions of {rows} x {cols} points"),
+        (budget.picture_bytes, "render.size", f"pictures of {width} x {height} pixels"),
+    ]
+    size, key, name = max(parts)
+    said = (
+        f"{budget.frames} frames need {_gib(needed)} on disk, {_gib(size)} of it for {name}, but {_gib(free)} is free "
+        f"for {directory}; take less, fewer time.frames_per_second, less output or another --out"
+    )
+    raise SceneError([f"{key}: {said}"])
+
+
 def _number_bytes(scene: Scene) -> int:
     return 4 if scene.time.precision == "f32" else 8
 
@@ -97,18 +144,6 @@ def _drawing_bytes(scene: Scene) -> int:
     texture_width, texture_height = texture.texture_size(scene) or (0, 0)
     frame = width * height * (scene.render.supersample**2 * SAMPLE_BYTES + PIXEL_BYTES)
     return rows * cols * POINT_BYTES + frame + texture_width * texture_height * TEXEL_BYTES
-
-
-def _disk_bytes(scene: Scene) -> int:
-    """Estimate the size of the files: for a pixel 2 bytes in a png, 1 in a gif."""
-    rows, cols = scene.sheet.points
-    width, height = scene.render.size
-    frame_bytes = {
-        "trajectory": rows * cols * 3 * _number_bytes(scene),
-        "png": width * height * 2,
-        "gif": width * height,
-    }
-    return (scene.time.frames + 1) * sum(frame_bytes[kind] for kind in set(scene.output))
 
 
 def _step_problems(scene: Scene) -> Iterator[Problem]:
@@ -140,6 +175,16 @@ def _memory_problems(scene: Scene) -> Iterator[Problem]:
         f"the scene needs {_gib(budget.memory_bytes)} of memory, {_gib(size)} of it for {name}, "
         f"but {_gib(available)} is free; take less",
     )
+
+
+def _free_disk(directory: Path) -> int:
+    """Tell how much may be written to a directory [bytes]; sys.maxsize where the system does not tell."""
+    for path in (directory, *directory.absolute().parents):
+        try:
+            return shutil.disk_usage(path).free
+        except OSError:
+            continue
+    return sys.maxsize
 
 
 def _gib(size: int) -> str:

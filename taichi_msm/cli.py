@@ -8,6 +8,7 @@ STARTED = time.perf_counter()
 
 import json
 import os
+import shlex
 import sys
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
@@ -24,6 +25,9 @@ if TYPE_CHECKING:
     from taichi_msm.console import Progress
 
 DONE, BUG, WRONG_INPUT, DIVERGED, FILES = 0, 1, 2, 3, 4
+# What may be typed beside --resume.
+RESUMABLE = ("resume", "threads", "quiet", "as_json")
+
 EXIT_CODES = {"complete": DONE, "diverged": DIVERGED}
 
 scene_argument = click.argument("scene", metavar="SCENE")
@@ -49,57 +53,77 @@ def program() -> None:
 
 
 @program.command()
-@scene_argument
+@click.argument("scene", metavar="SCENE", required=False)
 @click.option("--out", metavar="DIR", help="Where the results go.  [default: output/<name of the scene file>]")
 @image_option
 @set_option
 @arch_option
 @threads_option
 @click.option("--estimate-error", is_flag=True, help="Say how wrong the step is, by pilot runs.")
+@click.option("--resume", metavar="DIR", help="Go on with the unfinished run into DIR, instead of SCENE.")
 @click.option("--quiet", is_flag=True, help="No progress and no summary.")
 @json_option
+@click.pass_context
 def run(
-    scene: str,
+    context: click.Context,
+    scene: str | None,
     out: str | None,
     image: str | None,
     overrides: tuple[str, ...],
     arch: str,
     threads: int | None,
     estimate_error: bool,
+    resume: str | None,
     quiet: bool,
     as_json: bool,
 ) -> int:
     """Simulate SCENE, draw its frames and write them."""
-    from taichi_msm.scene_file import load_scene
+    if resume is not None:
+        for option in context.command.params:
+            if option.name not in RESUMABLE and was_given(context, option):
+                name = option.opts[0] if isinstance(option, click.Option) else "SCENE"
+                raise click.UsageError(f"--resume goes on with a run as it was begun; leave out {name}")
+        directory = result_directory(resume, option="--resume")
+        if not going_on(directory):
+            raise click.BadParameter(f"there is no unfinished run in {directory}", param_hint="--resume")
+    elif scene is None:
+        raise click.MissingParameter(param_hint="'SCENE'", param_type="argument")
+    else:
+        from taichi_msm.scene_file import load_scene
 
-    loaded = load_scene(scene, overrides, image)
-    directory = result_directory(out, Path(scene).stem)
+        loaded = load_scene(scene, overrides, image)
+        directory = result_directory(out, Path(scene).stem)
 
     from taichi_msm import runner
     from taichi_msm.console import Progress, summary
 
     interruption = Interruption()
-    recorded = [*overrides, *([f"image={image}"] if image is not None else [])]
-    with Progress(quiet=quiet or as_json) as bar, naming(scene):
+    with Progress(quiet=quiet or as_json) as bar, resumable(directory):
+        progress = interruptible(bar, interruption)
         try:
-            record = runner.run(
-                loaded,
-                directory,
-                arch=arch,
-                threads=threads,
-                overrides=recorded,
-                estimate_error=estimate_error,
-                started=STARTED,
-                progress=interruptible(bar, interruption),
-            )
+            if scene is None:
+                record = runner.resume(directory, threads=threads, started=STARTED, progress=progress)
+            else:
+                with naming(scene):
+                    record = runner.run(
+                        loaded,
+                        directory,
+                        arch=arch,
+                        threads=threads,
+                        overrides=[*overrides, *([f"image={image}"] if image is not None else [])],
+                        estimate_error=estimate_error,
+                        started=STARTED,
+                        progress=progress,
+                    )
         except KeyboardInterrupt:
-            complain(["interrupted; nothing was written"])
+            complain([f"interrupted; nothing was written{going_on(directory)}"])
             return interruption.code
     if as_json:
         print_json({"directory": str(directory), **record})
     if record["status"] != "complete":
-        reason = record.get("error", "interrupted")
-        complain([f"{scene}: {reason}; frames in {directory}: {record['frames']}"])
+        said = f"{scene or resume}: {record.get('error', 'interrupted')}; frames in {directory}: {record['frames']}"
+        then = f"; last good state: {record['dump']}" if record.get("dump") else going_on(directory)
+        complain([said + then])
     elif not quiet and not as_json:
         click.echo(summary(record, directory))
     return EXIT_CODES.get(record["status"], interruption.code)
@@ -116,6 +140,8 @@ def check(scene: str, image: str | None, overrides: tuple[str, ...], as_json: bo
     from taichi_msm.scene_file import load_scene
 
     loaded = load_scene(scene, overrides, image)
+    with naming(scene):
+        budget.require_disk(loaded, result_directory(None, Path(scene).stem))
     need = budget.estimate(loaded)
     limit = stability.stable_step(loaded)
     facts = {
@@ -127,6 +153,7 @@ def check(scene: str, image: str | None, overrides: tuple[str, ...], as_json: bo
         "frames": need.frames,
         "memory": need.memory_bytes,
         "disk": need.disk_bytes,
+        "disk_while_running": need.disk_bytes + need.working_bytes,
     }
     if as_json:
         print_json(facts)
@@ -138,7 +165,8 @@ def check(scene: str, image: str | None, overrides: tuple[str, ...], as_json: bo
     click.echo(
         f"\n{need.points} points, {need.frames} frames, {need.steps} steps of {facts['step']:.6g} s "
         f"(limit {limit:.6g} s), {facts['steps_per_frame']} a frame{at_least}\n"
-        f"about {need.memory_bytes / 2**20:.0f} MiB of memory, {need.disk_bytes / 2**20:.1f} MiB on disk"
+        f"about {need.memory_bytes / 2**20:.0f} MiB of memory, {need.disk_bytes / 2**20:.1f} MiB on disk, "
+        f"{need.working_bytes / 2**20:.1f} MiB more while it runs"
     )
     return DONE
 
@@ -222,11 +250,34 @@ def study(
     return EXIT_CODES.get(found.status, interruption.code)
 
 
-def result_directory(out: str | None, default: str) -> Path:
+def was_given(context: click.Context, parameter: click.Parameter) -> bool:
+    """Tell whether a parameter was typed."""
+    return context.get_parameter_source(str(parameter.name)) is click.core.ParameterSource.COMMANDLINE
+
+
+def result_directory(out: str | None, default: str = "", option: str = "--out") -> Path:
     """Choose where results go."""
     if out == "":
-        raise click.BadParameter("is empty; name a directory", param_hint="--out")
+        raise click.BadParameter("is empty; name a directory", param_hint=option)
     return Path(out) if out is not None else Path("output") / default
+
+
+def going_on(directory: Path) -> str:
+    """Say how to go on with the unfinished run into a directory; nothing where there is none."""
+    from taichi_msm.publication import checkpoint_in
+
+    if not checkpoint_in(directory).exists():
+        return ""
+    return f"; go on with: taichi-msm run --resume {shlex.quote(str(directory))}"
+
+
+@contextmanager
+def resumable(directory: Path) -> Iterator[None]:
+    """Say in errors how to go on with a run that has begun."""
+    try:
+        yield
+    except FilesError as error:
+        raise FilesError(f"{error}{going_on(directory)}") from None
 
 
 @contextmanager

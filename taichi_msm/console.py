@@ -16,6 +16,7 @@ STAGES = {
     "pilot": "pilot runs",
     "compile": "compiling the kernels",
     "frames": "simulating and drawing",
+    "diagnosis": "finding out why it diverged",
     "stepping": "measuring the stepping",
     "dop853": "measuring DOP853",
     "drawing": "measuring the drawing",

@@ -15,12 +15,24 @@ which is the position form without its cancellation: in f32 it keeps the digits 
 from __future__ import annotations
 
 import math
-from typing import Any
+from collections.abc import Callable
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from taichi_msm.forces import ACROSS, BYTES, GRIP_COLUMN, GRIP_COLUMNS, HAS_LEFT, HAS_RIGHT, MOVES, Structure
+from taichi_msm.forces import (
+    ACROSS,
+    BYTES,
+    GRIP_COLUMN,
+    GRIP_COLUMNS,
+    HAS_LEFT,
+    HAS_RIGHT,
+    MEASURES,
+    MOVES,
+    Readings,
+    Structure,
+)
 from taichi_msm.gather import STEPS_PER_LAUNCH, Gather
 from taichi_msm.lattice import axes, fixed_points, spacing
 from taichi_msm.loads import decay, grips, schedule
@@ -48,6 +60,23 @@ MAX_STEPS_PER_LAUNCH = 8192
 
 # Loads are tabulated for so many steps at a time: for one of a few frames' steps NumPy takes as long.
 STEPS_PER_TABLE = 4096
+
+
+Pause = Callable[[], None]
+
+
+class State(NamedTuple):
+    """All that the next steps depend on.
+
+    Attributes:
+        steps: number of steps taken, n.
+        displacement: u_n [m], shape (rows, cols, 3).
+        difference: d_n = u_n - u_{n-1} [m], shape (rows, cols, 3).
+    """
+
+    steps: int
+    displacement: NDArray[Any]
+    difference: NDArray[Any]
 
 
 def structure(scene: Scene, device: Device, cores: int | None = None) -> Structure:
@@ -105,7 +134,8 @@ class Dynamics:
         structure: what the kernels are compiled for.
         steps_done: number of steps taken.
         launches: number of launches of the kernel.
-        shortest_spring: the least L / L0 of all springs when `displacement` was read last.
+        shortest_spring: the least L / L0 of all springs when `displacement` or `state` was read last.
+        energy: of the motion and of the stretched springs, without the virtual ones, then [J].
     """
 
     def __init__(self, scene: Scene, device: Device, layout: Structure | None = None, cores: int | None = None) -> None:
@@ -116,13 +146,14 @@ class Dynamics:
         self.launches = 0
         self._real = np.dtype(np.float32 if self.structure.precision == "f32" else np.float64)
         self._sheet: Sweep | Gather = (Sweep if self.structure.workers else Gather)(self.structure)
-        self._begin()
+        self._begin(None)
 
-    def restart(self, scene: Scene) -> None:
-        """Begin again at rest with other numbers, such as another step; nothing is compiled.
+    def restart(self, scene: Scene, state: State | None = None) -> None:
+        """Begin again with other numbers, such as another step; nothing is compiled.
 
         Args:
             scene: a checked scene that differs in numbers only: points, precision and the terms used are the same.
+            state: where to begin, as `state` gave it with the same step; None: at rest.
 
         Raises:
             ValueError: when it needs another kernel.
@@ -130,10 +161,15 @@ class Dynamics:
         if structure(scene, self._device, self._cores) != structure(self.scene, self._device, self._cores):
             raise ValueError("this scene needs another kernel; make another Dynamics")
         self.scene = scene
-        self._begin()
+        self._begin(state)
 
-    def advance(self, steps: int) -> None:
-        """Take a number of steps."""
+    def advance(self, steps: int, pause: Pause = lambda: None) -> None:
+        """Take a number of steps.
+
+        Args:
+            steps: how many.
+            pause: called after every launch; what it raises stops the sheet there, and it can go on.
+        """
         points = self.structure.rows * self.structure.cols
         most = max(1, min(MAX_STEPS_PER_LAUNCH, POINT_STEPS_PER_LAUNCH // points))
         if self.structure.workers == 0:
@@ -144,6 +180,7 @@ class Dynamics:
             self._sheet.advance(count, self._arguments, self._next_loads(count))
             self.steps_done += count
             self.launches += 1
+            pause()
 
     def compile(self) -> None:
         """Compile the step and the read-out without moving anything."""
@@ -151,28 +188,48 @@ class Dynamics:
         self.displacement()
 
     def displacement(self) -> NDArray[Any]:
-        """Read the displacements, and see how far springs are compressed.
+        """Read the displacements, and measure the sheet.
 
         Returns:
             x - X [m], shape (rows, cols, 3), in the scene's precision.
         """
-        out = np.empty((self.structure.rows, self.structure.cols, 3), self._real)
-        least = np.empty(self.structure.rows, self._real)
-        self._sheet.read(spacing(self.scene.sheet), out, least)
-        self.shortest_spring = math.sqrt(least.min())
-        return out
+        return self._read(moving=False).displacement
+
+    def state(self) -> State:
+        """Read all that the next steps depend on, and measure the sheet."""
+        found = self._read(moving=True)
+        return State(self.steps_done, found.displacement, found.difference)
+
+    def _read(self, *, moving: bool) -> Readings:
+        s, sheet = self.structure, self.scene.sheet
+        shape = (s.rows, s.cols, 3)
+        found = Readings(
+            np.empty(shape, self._real),
+            moving,
+            np.empty(shape if moving else (1, 1, 3), self._real),
+            np.empty((s.rows, MEASURES), self._real),
+        )
+        dx, dy = spacing(sheet)
+        self._sheet.read((dx, dy), found)
+        self.shortest_spring = math.sqrt(max(0.0, 1.0 + float(found.measures[:, 0].min())))
+        along, down, diagonal, motion = found.measures[:, 1:].sum(axis=0, dtype=np.float64)
+        springs, h = self.scene.springs, step(self.scene)
+        stretching = springs.structural * (along * dx**2 + down * dy**2) + springs.shear * diagonal * (dx**2 + dy**2)
+        self.energy = float(stretching + sheet.mass * motion / h**2) / 2
+        return found
 
     def close(self) -> None:
         """Free the fields."""
         self._sheet.close()
 
-    def _begin(self) -> None:
-        """Put the sheet at rest."""
-        self.steps_done = 0
+    def _begin(self, state: State | None) -> None:
+        """Put the sheet at rest, or where it was."""
+        self.steps_done = 0 if state is None else state.steps
         self.shortest_spring = 1.0
+        self.energy = 0.0
         self._arguments = self._numbers()
-        self._first_tabled, self._loads = 0, self._table(0, STEPS_PER_TABLE)
-        self._place()
+        self._first_tabled, self._loads = self.steps_done, self._table(self.steps_done, STEPS_PER_TABLE)
+        self._place(state)
 
     def _numbers(self) -> tuple[float, ...]:
         """Give the numbers of the scene in the order of the kernel's arguments."""
@@ -212,8 +269,8 @@ class Dynamics:
             grip[:, n, 5:] = scene.probes[part.probe].falloff, scene.probes[part.probe].offset
         return table.astype(self._real)
 
-    def _place(self) -> None:
-        """Put the sheet at rest and write what steps do not change: who moves, the edges, the decay of grips."""
+    def _place(self, state: State | None) -> None:
+        """Put the sheet where it begins and write what no step changes: who moves, the edges, the decay of grips."""
         s, scene = self.structure, self.scene
         moves = ~fixed_points(scene.sheet)
         column = np.arange(s.cols)
@@ -227,7 +284,9 @@ class Dynamics:
         decays = np.zeros((max(1, len(standing)), s.rows, s.strip + 2, s.lanes), self._real)
         for out, grip in zip(decays, standing, strict=False):
             out[:] = self._in_lanes(decay(grip, scene))
-        self._sheet.rest(self._in_lanes(by_column), decays)
+        nothing = np.zeros((1, 1, 3), self._real)
+        start = (False, nothing, nothing) if state is None else (True, state.displacement, state.difference)
+        self._sheet.start(self._in_lanes(by_column), decays, *start)
 
     def _in_lanes(self, values: NDArray[Any]) -> NDArray[Any]:
         """Lay columns out in strips with their halo: (rows, cols) -> (rows, strip + 2, lanes); 0 where is none."""

@@ -12,34 +12,50 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from taichi_msm.checkpoint import Checkpoint
+from taichi_msm.divergence import Saved
 from taichi_msm.encoding import Encoder, Job
 from taichi_msm.errors import writing
 from taichi_msm.gif import Picture
 from taichi_msm.publication import ANIMATION, FRAMES, RECORD, TRAJECTORY, Publication
 from taichi_msm.scene import Scene
-from taichi_msm.trajectory import TrajectoryWriter
+from taichi_msm.trajectory import write_trajectory
 
 
 class ResultWriter:
     """Writes the frames of a run as they come, and puts all in place at the end.
 
-    Within the with statement the files grow out of sight; leaving it without `publish` discards them.
+    Within the with statement the files grow out of sight. Left without `publish` they go; but of a run with a plan,
+    once it has a frame, the checkpoint stays until its results are published as complete.
 
     Args:
         directory: where the results go; made where it does not exist. Files there that no run writes stay.
         scene: what is run; its `output` says which files are wanted.
+        plan: what another process must know to go on with this run, in JSON.
+        resumes: whether this run is to go on from its checkpoint in the directory.
 
     Raises:
         FilesError: on entering and in every method, when the directory cannot be written, or another run
             writes there.
+
+    Attributes:
+        saved: where the run is to go on; None: at rest.
     """
 
-    def __init__(self, directory: Path, scene: Scene) -> None:
+    def __init__(
+        self, directory: Path, scene: Scene, plan: Mapping[str, Any] | None = None, *, resumes: bool = False
+    ) -> None:
+        self.saved: Saved | None = None
         self._directory = directory
         self._scene = scene
-        self._publication = Publication(directory)
+        self._plan = plan
+        self._resumes = resumes
+        self._publication = Publication(directory, keep=resumes)
+        self._precision = np.float32 if scene.time.precision == "f32" else np.float64
+        self._checkpoint = Checkpoint(
+            self._publication.checkpoint, scene.sheet.points, self._precision, stores=bool(scene.output)
+        )
         self._encoder: Encoder | None = None
-        self._trajectory: TrajectoryWriter | None = None
         self._open = ExitStack()
         self._frames = 0
         self._finished = False
@@ -55,6 +71,16 @@ class ResultWriter:
         """Processor time spent encoding pictures, beside the simulation [s]; known after `finish`."""
         return self._encode_seconds
 
+    @property
+    def stored(self) -> int:
+        """Number of frames whose positions are there; those of a run that is resumed are from the start."""
+        return self._checkpoint.frames
+
+    def position(self, frame: int) -> NDArray[Any]:
+        """Read the positions of a frame that is stored [m], shape (rows, cols, 3)."""
+        with writing(self._directory):
+            return self._checkpoint.position(frame)
+
     def add(self, position: NDArray[Any], picture: Picture | None) -> None:
         """Add the next frame.
 
@@ -64,11 +90,27 @@ class ResultWriter:
         """
         with writing(self._directory):
             # In this order, whatever is interrupted, there are at least as many positions as pictures.
-            if self._trajectory:
-                self._trajectory.add(position)
+            if self._frames == self.stored:
+                self._checkpoint.add(position)
+                self._publication.keep = self._plan is not None
             if self._encoder and picture is not None:
                 self._encoder.add(picture)
             self._frames += 1
+
+    @property
+    def due(self) -> bool:
+        """Whether it is time to save where the run is."""
+        return self.stored > 0 and self._checkpoint.due
+
+    def save(self, saved: Saved) -> Path:
+        """Keep where the run is, in case it ends here; gives the file that has it."""
+        with writing(self._directory):
+            return self._checkpoint.save(saved)
+
+    def load(self) -> Saved | None:
+        """Give what was saved last; None: nothing was."""
+        with writing(self._directory):
+            return self._checkpoint.load()
 
     def finish(self) -> None:
         """Wait until every frame is encoded and close the files."""
@@ -78,8 +120,15 @@ class ResultWriter:
             if self._encoder:
                 report = self._encoder.finish()
                 self._frames, self._encode_seconds = report.frames, report.seconds
-            if self._trajectory:
-                self._trajectory.finish(self._frames)
+            if "trajectory" in self._scene.output:
+                write_trajectory(
+                    self._publication.staged / TRAJECTORY,
+                    self._checkpoint.positions,
+                    self._frames,
+                    self._scene.sheet.points,
+                    self._precision,
+                    self._scene.time.frames_per_second,
+                )
         self._finished = True
 
     def publish(self, record: Mapping[str, Any]) -> list[str]:
@@ -100,6 +149,7 @@ class ResultWriter:
             # A file name that is not UTF-8 has surrogates, whose backslash form is their JSON form.
             (staged / RECORD).write_text(text + "\n", encoding="utf-8", errors="backslashreplace")
             self._publication.publish()
+            self._publication.keep &= record.get("status") != "complete"
         return outputs
 
     def __enter__(self) -> ResultWriter:
@@ -117,14 +167,12 @@ class ResultWriter:
                 )
                 self._encoder = Encoder(job, inherit=self._publication.lock_descriptors)
                 opened.callback(self._encoder.abort)
-            if "trajectory" in scene.output:
-                self._trajectory = TrajectoryWriter(
-                    self._publication.staged / TRAJECTORY,
-                    scene.sheet.points,
-                    np.float32 if scene.time.precision == "f32" else np.float64,
-                    scene.time.frames_per_second,
-                )
-                opened.callback(self._trajectory.close)
+            opened.callback(self._checkpoint.close)
+            if self._resumes:
+                self.saved = self._checkpoint.go_on()
+            else:
+                self._checkpoint.begin(self._plan or {})
+            self._frames = 0 if scene.draws else self.stored
             self._open = opened.pop_all()
         return self
 

@@ -1,4 +1,4 @@
-"""What both forms of kernel 1 are made of: the force of a spring, the step of a point, the sheet at rest.
+"""What both forms of kernel 1 are made of: the force of a spring, the step of a point, strains, the start.
 
 A value of the sheet is a vector of lanes, each of another column; on a GPU of one.
 """
@@ -7,7 +7,9 @@ A value of the sheet is a vector of lanes, each of another column; on a GPU of o
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
+
+from numpy.typing import NDArray
 
 from taichi_msm.runtime import FieldTree, ti
 
@@ -17,6 +19,10 @@ MOVES, ACROSS, HAS_LEFT, HAS_RIGHT = 0, 3, 4, 5
 # Columns of the table of loads: gain, stiffness of the virtual springs, then for each grip force (3), point (2),
 # falloff and offset.
 GRIP_COLUMN, GRIP_COLUMNS = 2, 7
+
+# What is read of every row of points: the least of (L^2 - L0^2) / L0^2, the sums of (L / L0 - 1)^2 of springs along the
+# row, down and diagonal, and the sum of |d|^2.
+MEASURES = 5
 
 # Bytes of a number.
 BYTES = {"f32": 4, "f64": 8}
@@ -63,6 +69,22 @@ class Structure:
     def load_columns(self) -> int:
         """Number of columns of the table of loads."""
         return GRIP_COLUMN + GRIP_COLUMNS * len(self.grips)
+
+
+class Readings(NamedTuple):
+    """What is read of a sheet, in the order of the kernel's arguments.
+
+    Attributes:
+        displacement: u, shape (rows, cols, 3).
+        moving: whether the differences are wanted too.
+        difference: d, shape (rows, cols, 3); any shape where they are not wanted.
+        measures: of every row of points, shape (rows, MEASURES).
+    """
+
+    displacement: NDArray[Any]
+    moving: bool
+    difference: NDArray[Any]
+    measures: NDArray[Any]
 
 
 class SheetFields(FieldTree):
@@ -150,39 +172,56 @@ def spring_forces(s: Structure, fields: SheetFields) -> tuple[Callable[..., Any]
     return along, ahead
 
 
-def compression(s: Structure, fields: SheetFields) -> Callable[..., Any]:
-    """Make the function that gives the least (L / L0)^2 of the springs to the right of an entry and to a row below."""
+def strains(s: Structure, fields: SheetFields) -> Callable[..., Any]:
+    """Make the function that tells how far springs are stretched: those to the right of an entry and to a row below.
+
+    The function gives, in every lane, the least (L^2 - L0^2) / L0^2 of all of them, and the sums of (L / L0 - 1)^2 of
+    those along the row, those down and the diagonals.
+    """
     u, by_column, open_edges = fields.displacement, fields.by_column, s.open_edges
     real, lanes, structural, shear = getattr(ti, s.precision), s.lanes, s.structural, s.shear
 
     @ti.func
-    def ratio(p, q, b, right: ti.template(), x0, y0):
-        x = u[0][q, b + right] - u[0][p, b] + x0
-        y = u[1][q, b + right] - u[1][p, b] + y0
+    def longer(p, q, b, right: ti.template(), x0, y0):
+        """(L^2 - L0^2) / L0^2 of the spring from entry b of row p to entry b + right of row q; with all its digits."""
+        x = u[0][q, b + right] - u[0][p, b]
+        y = u[1][q, b + right] - u[1][p, b]
         z = u[2][q, b + right] - u[2][p, b]
-        found = (x * x + y * y + z * z) / (x0 * x0 + y0 * y0)
-        # Beyond the edge there is no spring, and 1 is what a spring at rest has.
+        found = (x * (x + 2 * x0) + (y * (y + 2 * y0) + z * z)) / (x0 * x0 + y0 * y0)
+        # Beyond the edge there is no spring.
         if ti.static(open_edges and right < 0):
-            found = ti.select(by_column[HAS_LEFT, b] > 0, found, 1)
+            found = ti.select(by_column[HAS_LEFT, b] > 0, found, 0)
         if ti.static(open_edges and right > 0):
-            found = ti.select(by_column[HAS_RIGHT, b] > 0, found, 1)
+            found = ti.select(by_column[HAS_RIGHT, b] > 0, found, 0)
         return found
 
     @ti.func
-    def smallest(p, q, b, dx, dy, there):
+    def square(share):
+        """(L / L0 - 1)^2, given (L^2 - L0^2) / L0^2, which rounding may put below -1."""
+        stretch = share / (1 + ti.sqrt(ti.max(share + 1, 0)))
+        return stretch * stretch
+
+    @ti.func
+    def strain(p, q, b, dx, dy, there):
         """Entry b of row p, and row q below it if it is there."""
-        found = ti.Vector.zero(real, lanes) + 1
+        zero = ti.Vector.zero(real, lanes)
+        least, along, down, diagonal = zero, zero, zero, zero
         if ti.static(structural):
-            found = ti.min(found, ratio(p, p, b, 1, dx, 0))
+            share = longer(p, p, b, 1, dx, 0)
+            least = ti.min(least, share)
+            along = square(share)
         if there:
             if ti.static(structural):
-                found = ti.min(found, ratio(p, q, b, 0, 0, -dy))
+                share = longer(p, q, b, 0, 0, -dy)
+                least = ti.min(least, share)
+                down = square(share)
             if ti.static(shear):
-                found = ti.min(found, ratio(p, q, b, -1, -dx, -dy))
-                found = ti.min(found, ratio(p, q, b, 1, dx, -dy))
-        return found.min()
+                left, right = longer(p, q, b, -1, -dx, -dy), longer(p, q, b, 1, dx, -dy)
+                least = ti.min(least, ti.min(left, right))
+                diagonal = square(left) + square(right)
+        return least, along, down, diagonal
 
-    return smallest
+    return strain
 
 
 def point_step(s: Structure, fields: SheetFields) -> Callable[..., None]:
@@ -246,26 +285,46 @@ def point_step(s: Structure, fields: SheetFields) -> Callable[..., None]:
     return move
 
 
-def rest_kernel(s: Structure, fields: SheetFields) -> Callable[..., None]:
-    """Make the kernel that puts the sheet at rest and writes by_column and decay, whose last axis is the lanes."""
-    real, rows, lanes = getattr(ti, s.precision), s.rows, s.lanes
+def start_kernel(s: Structure, fields: SheetFields) -> Callable[..., None]:
+    """Make the kernel that puts the sheet where it begins and writes what steps do not change.
+
+    Its arguments: `by_column` and `decay`, whose last axis is the lanes; for every stored row of displacements the row
+    of the sheet that it holds, or -1; whether displacements and differences are given, and these, of shape
+    (rows, cols, 3), or else any: the sheet is at rest.
+    """
+    real, rows, cols, lanes, strip = getattr(ti, s.precision), s.rows, s.cols, s.lanes, s.strip
     u, d, by_column, decay = fields.displacement, fields.difference, fields.by_column, fields.decay
 
     @ti.kernel
-    def rest(columns: ti.types.ndarray(dtype=real, ndim=3), shares: ti.types.ndarray(dtype=real, ndim=4)):
+    def start(
+        columns: ti.types.ndarray(dtype=real, ndim=3),
+        shares: ti.types.ndarray(dtype=real, ndim=4),
+        source: ti.types.ndarray(dtype=ti.i32, ndim=1),
+        given: ti.i32,
+        displacement: ti.types.ndarray(dtype=real, ndim=3),
+        difference: ti.types.ndarray(dtype=real, ndim=3),
+    ):
         # One loop for all: each would be compiled by itself.
-        for i, b in u[0]:
+        for p, b in u[0]:
             for c in ti.static(range(3)):
-                u[c][i, b] = ti.Vector.zero(real, lanes)
-            if i < rows:
-                for c in ti.static(range(3)):
-                    d[c][i, b] = ti.Vector.zero(real, lanes)
+                u[c][p, b] = ti.Vector.zero(real, lanes)
+                if p < rows:
+                    d[c][p, b] = ti.Vector.zero(real, lanes)
+            for lane in ti.static(range(lanes)):
+                j = lane * strip + b - 1
+                if given and 0 <= j < cols:
+                    for c in ti.static(range(3)):
+                        if source[p] >= 0:
+                            u[c][p, b][lane] = displacement[source[p], j, c]
+                        if p < rows and 0 < b <= strip:
+                            d[c][p, b][lane] = difference[p, j, c]
+            if p < rows:
                 for g in range(decay.shape[0]):
                     for lane in ti.static(range(lanes)):
-                        decay[g, i, b][lane] = shares[g, i, b, lane]
-            if i == 0:
+                        decay[g, p, b][lane] = shares[g, p, b, lane]
+            if p == 0:
                 for r in range(by_column.shape[0]):
                     for lane in ti.static(range(lanes)):
                         by_column[r, b][lane] = columns[r, b, lane]
 
-    return rest
+    return start

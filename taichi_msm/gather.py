@@ -7,9 +7,19 @@ The layout is the plain one: one lane, an entry a column, around the sheet a hal
 
 from typing import Any
 
+import numpy as np
 from numpy.typing import NDArray
 
-from taichi_msm.forces import SheetFields, Structure, compression, point_step, rest_kernel, spring_forces
+from taichi_msm.forces import (
+    MEASURES,
+    Readings,
+    SheetFields,
+    Structure,
+    point_step,
+    spring_forces,
+    start_kernel,
+    strains,
+)
 from taichi_msm.runtime import ti
 
 # A launch is a chain of this many kernels, one a step.
@@ -32,20 +42,23 @@ class Gather:
         self._now = 0
         self._fields = _Fields(s)
         self._advance, self._read = _kernels(s, self._fields)
-        self._rest = rest_kernel(s, self._fields)
+        self._start = start_kernel(s, self._fields)
+        # Both buffers hold the sheet, each within its halo.
+        halved = np.pad(np.arange(s.rows, dtype=np.int32), 1, constant_values=-1)
+        self._source = np.concatenate([halved, halved])
 
     def advance(self, count: int, numbers: tuple[float, ...], table: NDArray[Any]) -> None:
         """Take at most STEPS_PER_LAUNCH steps."""
         self._advance(self._now, count, *numbers, table)
         self._now = (self._now + count) % 2
 
-    def read(self, spacing: tuple[float, float], out: NDArray[Any], least: NDArray[Any]) -> None:
-        """Copy the displacements, and find the least (L / L0)^2 of every row."""
-        self._read(self._now, *spacing, out, least)
+    def read(self, spacing: tuple[float, float], out: Readings) -> None:
+        """Copy what is asked for, and measure every row."""
+        self._read(self._now, *spacing, *out)
 
-    def rest(self, by_column: NDArray[Any], decay: NDArray[Any]) -> None:
-        """Put the sheet at rest."""
-        self._rest(by_column, decay)
+    def start(self, by_column: NDArray[Any], decay: NDArray[Any], *state: Any) -> None:
+        """Put the sheet where it begins."""
+        self._start(by_column, decay, self._source, *state)
 
     def close(self) -> None:
         """Free the fields."""
@@ -57,10 +70,10 @@ def _kernels(s: Structure, fields: _Fields) -> tuple[Any, Any]:
     real = getattr(ti, s.precision)
     rows, cols = s.rows, s.cols
     structural_springs, shear_springs, columns = s.structural, s.shear, s.load_columns
-    u = fields.displacement
+    u, d = fields.displacement, fields.difference
     along, ahead = spring_forces(s, fields)
     move = point_step(s, fields)
-    smallest = compression(s, fields)
+    strain = strains(s, fields)
 
     @ti.func
     def by_row(p, q, b, there, dx, up, structural, shear):
@@ -117,16 +130,27 @@ def _kernels(s: Structure, fields: _Fields) -> tuple[Any, Any]:
         now: ti.i32,
         dx: real,
         dy: real,
-        out: ti.types.ndarray(dtype=real, ndim=3),
-        least: ti.types.ndarray(dtype=real, ndim=1),
+        displacement: ti.types.ndarray(dtype=real, ndim=3),
+        moving: ti.i32,
+        difference: ti.types.ndarray(dtype=real, ndim=3),
+        measures: ti.types.ndarray(dtype=real, ndim=2),
     ):
         for i in range(rows):
             p = now * (rows + 2) + i + 1
-            found = ti.cast(1, real)
+            found = ti.Vector.zero(real, MEASURES)
             for b in range(1, cols + 1):
-                found = ti.min(found, smallest(p, p + 1, b, dx, dy, i < rows - 1))
+                least, along, down, diagonal = strain(p, p + 1, b, dx, dy, i < rows - 1)
+                found[0] = ti.min(found[0], least[0])
+                found[1] += along[0]
+                found[2] += down[0]
+                found[3] += diagonal[0]
                 for c in ti.static(range(3)):
-                    out[i, b - 1, c] = u[c][p, b][0]
-            least[i] = found
+                    displacement[i, b - 1, c] = u[c][p, b][0]
+                    change = d[c][i, b][0]
+                    found[4] += change * change
+                    if moving:
+                        difference[i, b - 1, c] = change
+            for m in ti.static(range(MEASURES)):
+                measures[i, m] = found[m]
 
     return advance, read

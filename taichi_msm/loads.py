@@ -22,9 +22,6 @@ from taichi_msm.stability import steps_per_frame
 # meet binary step times.
 SNAP = 1e-13
 
-# Farther from rest than this many sheet sizes is no deformation any more; a sheet that nothing holds may fly besides.
-MOST_SHEET_SIZES = 10.0
-
 # Jumps that only so fine steps meet are met by none.
 MOST_CUTS = 1000
 
@@ -110,22 +107,6 @@ def decay(grip: Grip, scene: Scene) -> Array:
     return np.exp(-probe.falloff * distance - probe.offset)
 
 
-def free_acceleration(scene: Scene) -> float:
-    """Bound the acceleration that the probes give a sheet that nothing holds [m/s^2]; 0 if a point is fixed."""
-    if scene.sheet.fixed not in ("none", ()):
-        return 0.0
-    forces = (
-        math.hypot(*probe.force) * max(abs(percent) for _, percent in probe.load) / 100 * math.exp(-probe.offset)
-        for probe in scene.probes
-    )
-    return sum(forces) / scene.sheet.mass
-
-
-def farthest_displacement(scene: Scene, time: float) -> float:
-    """Bound how far a point may be from rest after some time [m]; farther, the simulation has gone wrong."""
-    return MOST_SHEET_SIZES * max(scene.sheet.size) + free_acceleration(scene) * time**2 / 2
-
-
 def _between(times: Array, values: Array, t: Array, after: NDArray[np.intp], before: float | Array) -> Array:
     """Interpolate between the keys after[n] - 1 and after[n]; `before` the first key, the last value after the last."""
     low = np.clip(after - 1, 0, len(times) - 1)
@@ -157,6 +138,41 @@ def key_times(scene: Scene) -> Array:
     times = {time for probe in scene.probes for time, _ in probe.load}
     times |= {float(time) for grip in grips(scene) for time in grip.times}
     return np.array(sorted(time for time in times if 0 < time < scene.time.duration))
+
+
+class Envelope:
+    """How hard the loads push at most from one time to another.
+
+    Args:
+        scene: a checked scene.
+    """
+
+    def __init__(self, scene: Scene) -> None:
+        keys = np.array(sorted({time for times in _key_lists(scene) for time in times if time > 0} | {0.0}))
+        # After the last key nothing changes.
+        self._times, left, right = _both_sides(scene, np.append(keys, keys[-1] + 1))
+        self._left, self._right = (np.linalg.norm(side.strength, axis=-1) for side in (left, right))
+        self._active = right.active > 0
+        self._begins = left.active < right.active
+
+    def between(self, begin: float, end: float) -> tuple[Array, bool, int]:
+        """Bound what the loads do from one time to another, both included.
+
+        Returns:
+            The largest force at each grip's control point [N], shape (grips,); whether the virtual springs act at any
+            time; and how often they begin to.
+        """
+        first, last = self._times.searchsorted(begin, "left"), self._times.searchsorted(end, "right")
+        forces = [self._at(begin), self._at(end), *self._left[first:last], *self._right[first:last]]
+        active = self._active[max(0, first - 1) : last].any()
+        return np.max(forces, axis=0), bool(active), int(self._begins[first:last].sum())
+
+    def _at(self, t: float) -> Array:
+        """Bound the forces at one time: no force is greater than its limits at the keys before and after."""
+        after = min(int(self._times.searchsorted(t, "right")), len(self._times) - 1)
+        before = after - 1
+        share = min(1.0, (t - self._times[before]) / (self._times[after] - self._times[before]))
+        return (1 - share) * self._right[before] + share * self._left[after]
 
 
 def jumps(scene: Scene) -> Array:

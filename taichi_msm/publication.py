@@ -33,6 +33,11 @@ RECORD = "run.json"
 STAGING = ".partial"
 
 
+def checkpoint_in(directory: Path) -> Path:
+    """Tell where an unfinished run into a directory keeps what it needs to go on."""
+    return directory / STAGING / "checkpoint"
+
+
 def frame_name(number: int) -> str:
     """Name the picture of a frame."""
     return f"{FRAMES}/{number:04}.png"
@@ -53,6 +58,7 @@ class Publication:
 
     Args:
         directory: where the results go; made where it does not exist.
+        keep: whether the checkpoint that is there is to stay.
 
     Raises:
         FilesError: on entering, when another process publishes there.
@@ -60,9 +66,13 @@ class Publication:
 
     Attributes:
         staged: the directory to write the new files in, under their final names.
+        checkpoint: where an unfinished run keeps what it needs to go on.
+        keep: whether it stays when the with statement is left.
     """
 
-    def __init__(self, directory: Path) -> None:
+    def __init__(self, directory: Path, *, keep: bool = False) -> None:
+        self.keep = keep
+        self.checkpoint = checkpoint_in(directory)
         self.staged = directory / STAGING / "new"
         self._directory = directory
         self._staging = directory / STAGING
@@ -127,8 +137,10 @@ class Publication:
             (self._directory / FRAMES).rmdir()
 
     def _clear(self) -> None:
-        """Empty the staging directory but for the lock."""
+        """Empty the staging directory but for the lock and what is to be kept."""
         for path in self._staging.iterdir():
+            if path == self.checkpoint and self.keep:
+                continue
             if path.is_dir():
                 shutil.rmtree(path)
             elif path != self._lock_path:

@@ -7,19 +7,24 @@ import platform
 import sys
 import time
 from collections.abc import Callable, Sequence
+from contextlib import suppress
 from dataclasses import asdict
 from functools import partial
 from pathlib import Path
 from typing import Any
 
-import numpy
+import numpy as np
 import PIL
+from numpy.typing import NDArray
 
-from taichi_msm import __version__, accuracy, runtime
+from taichi_msm import __version__, accuracy, budget, runtime
 from taichi_msm.accuracy import Estimate
+from taichi_msm.divergence import Course
 from taichi_msm.errors import DivergedError
 from taichi_msm.files import ResultWriter
 from taichi_msm.notes import notes
+from taichi_msm.plan import Plan, digest, read_plan
+from taichi_msm.runtime import Device
 from taichi_msm.scene import Scene
 from taichi_msm.simulation import Simulation
 from taichi_msm.stability import stable_step, step, steps_per_frame
@@ -32,17 +37,25 @@ Progress = Callable[[str, int, int], None]
 
 
 class Stopwatch:
-    """Adds up the seconds of every stage."""
+    """Adds up the seconds of every stage.
 
-    def __init__(self) -> None:
+    Args:
+        started: `time.perf_counter()` when the first stage began; None: now.
+    """
+
+    def __init__(self, started: float | None) -> None:
         self.seconds: dict[str, float] = {}
-        self._last = time.perf_counter()
+        self._started = self._last = time.perf_counter() if started is None else started
 
     def lap(self, stage: str) -> None:
         """Count the time since the last lap for a stage."""
         now = time.perf_counter()
         self.seconds[stage] = self.seconds.get(stage, 0.0) + now - self._last
         self._last = now
+
+    def total(self) -> float:
+        """Tell the time since the beginning [s]."""
+        return time.perf_counter() - self._started
 
 
 def run(
@@ -66,86 +79,151 @@ def run(
         overrides: the overrides that made the scene, for the record.
         estimate_error: whether to estimate the error of the step; a tolerance in the scene does in any case.
         started: `time.perf_counter()` when the program began; None: now.
-        progress: called with the stage, the frames done and the frames in all; what it raises stops the run there,
-            KeyboardInterrupt keeping the frames done.
+        progress: called with the stage, the frames done and the frames in all, often; what it raises stops the run
+            there, KeyboardInterrupt keeping the frames done.
 
     Returns:
         What is in run.json; its "status" is "complete", "diverged" (then "error" says where and why) or "interrupted".
+        After the last two, and where the process was killed, `resume` goes on.
 
     Raises:
-        SceneError: when the scene's picture cannot be decoded, or no step meets its tolerance.
+        SceneError: when the scene's picture cannot be decoded, no step meets its tolerance, or the disk has no room for
+            the results.
         DeviceError: when the arch is not there.
         FilesError: when the results cannot be written.
         KeyboardInterrupt: when interrupted before the first frame; nothing is written then.
     """
-    started = time.perf_counter() if started is None else started
+    watch = Stopwatch(started)
+    budget.require_disk(scene, Path(directory))
     device = runtime.start(arch, threads)
     texture = load_texture(scene) if scene.draws else None
-    frames = scene.time.frames + 1
-    ending: dict[str, Any] = {"status": "complete"}
-    watch = Stopwatch()
+    watch.lap("startup")
     given, estimate = scene, None
     if scene.time.tolerance is not None:
         scene, estimate = accuracy.choose_step(scene, device, partial(progress, "pilot"))
     elif estimate_error:
         estimate = accuracy.estimate_error(scene, device, partial(progress, "pilot"))
     watch.lap("pilot")
+    plan = Plan(given, scene, tuple(overrides), estimate, arch, digest(texture), versions())
+    with ResultWriter(Path(directory), scene, plan.as_json()) as writer:
+        return _carry_out(plan, writer, device, texture, watch, progress)
+
+
+def resume(
+    directory: str | Path,
+    *,
+    threads: int | None = None,
+    started: float | None = None,
+    progress: Progress = lambda stage, done, total: None,
+) -> dict[str, Any]:
+    """Go on with a run that was interrupted, killed, short of disk space or diverged; the result has the same bits.
+
+    Args:
+        directory: where the results of the run go.
+        threads: as for `run`.
+        started: as for `run`.
+        progress: as for `run`.
+
+    Returns:
+        What `run` does.
+
+    Raises:
+        SceneError: when the scene's picture cannot be decoded.
+        DeviceError: when the arch is not there.
+        FilesError: when there is nothing to resume, or what there is cannot be used; and as for `run`.
+        KeyboardInterrupt: when interrupted before there is a frame more; all is as it was then.
+    """
+    watch = Stopwatch(started)
+    plan = read_plan(Path(directory))
+    texture = load_texture(plan.scene) if plan.scene.draws else None
+    plan.require_same(digest(texture), versions())
+    device = runtime.start(plan.arch, threads)
+    watch.lap("startup")
+    with ResultWriter(Path(directory), plan.scene, plan.as_json(), resumes=True) as writer:
+        return _carry_out(plan, writer, device, texture, watch, progress)
+
+
+def _carry_out(
+    plan: Plan,
+    writer: ResultWriter,
+    device: Device,
+    texture: NDArray[np.uint8] | None,
+    watch: Stopwatch,
+    progress: Progress,
+) -> dict[str, Any]:
+    """Simulate and draw what the results lack."""
+    scene = plan.scene
+    frames = scene.time.frames + 1
+    resumed = writer.stored
+    ending: dict[str, Any] = {"status": "complete"}
+
+    def pause() -> None:
+        watch.lap("simulate")
+        progress("frames", writer.frames, frames)
+        if writer.due:
+            writer.save(simulation.save())
+        watch.lap("hand over")
+
     progress("compile", 0, frames)
-    # In this order, so that the encoder starts up while kernels are compiled.
-    cores = free_cores(scene)
-    with ResultWriter(Path(directory), scene) as writer, Simulation(scene, arch, threads, texture, cores) as simulation:
-        startup = time.perf_counter() - started - watch.seconds["pilot"]
+    # The encoder starts up while kernels are compiled.
+    with Simulation(scene, device.arch, device.threads, texture, free_cores(scene)) as simulation:
         watch.lap("startup")
         try:
-            simulation.compile()
+            simulation.compile(partial(progress, "compile", 0, frames))
             watch.lap("compile")
-            progress("frames", 0, frames)
-            for frame in range(frames):
-                if frame:
-                    simulation.advance()
-                watch.lap("simulate")
+            if writer.saved:
+                simulation.go_on(writer.saved)
+            for frame in range(writer.frames, frames):
                 progress("frames", frame, frames)
-                picture = simulation.draw() if scene.draws else None
-                watch.lap("render")
-                writer.add(simulation.positions(), picture)
                 watch.lap("hand over")
+                if frame > simulation.frame:
+                    simulation.advance(pause=pause)
+                watch.lap("simulate")
+                position = writer.position(frame) if frame < resumed else simulation.positions()
+                picture = simulation.draw(positions=position) if scene.draws else None
+                watch.lap("render")
+                writer.add(position, picture)
         except KeyboardInterrupt:
-            if not writer.frames:
+            if simulation.steps > 0 and writer.stored:
+                # What went wrong within this frame is found when it is resumed.
+                with suppress(DivergedError):
+                    writer.save(simulation.save())
+            # Frames that were there before are no new results.
+            if writer.frames <= resumed:
                 raise
             ending = {"status": "interrupted"}
         except DivergedError as error:
-            ending = {"status": "diverged", "error": str(error)}
+            ending = {"status": "diverged", "error": str(error), "dump": None}
+            with suppress(KeyboardInterrupt):
+                found = simulation.diagnose(writer.load(), partial(progress, "diagnosis", writer.frames, frames))
+                ending |= {"error": found.message, "dump": str(writer.save(found.good))}
         progress("write", writer.frames, frames)
         writer.finish()
-        limit = stable_step(scene)
-        record = {
-            **ending,
-            "scene": given.model_dump(mode="json"),
-            "overrides": list(overrides),
-            "step": step(scene),
-            "stable_step": limit if limit < math.inf else None,
-            "steps_per_frame": steps_per_frame(scene),
-            "steps": simulation.steps,
-            "frames": writer.frames,
-            "max_displacement": simulation.max_displacement,
-            "shortest_spring": simulation.shortest_spring,
-            "notes": list(notes(scene, simulation.max_displacement, simulation.shortest_spring, estimate)),
-            "error_estimate": None if estimate is None else error_record(estimate),
-            "timings": {
-                "startup": startup,
-                **({"pilot": watch.seconds["pilot"]} if estimate is not None else {}),
-                "compile": watch.seconds.get("compile", 0.0),
-                "simulate": watch.seconds.get("simulate", 0.0),
-                "render": watch.seconds.get("render", 0.0),
-                "encode": writer.encode_seconds,
-                "total": time.perf_counter() - started,
-            },
-            "arch": device.arch,
-            "threads": device.threads,
-            "versions": versions(),
-        }
+        record = {**ending, **_facts(plan, simulation.course), "frames": writer.frames, "resumed": resumed}
+        pilot = ["pilot"] if plan.estimate is not None and "pilot" in watch.seconds else []
+        stages = ["startup", *pilot, "compile", "simulate", "render"]
+        seconds = {stage: watch.seconds.get(stage, 0.0) for stage in stages}
+        record["timings"] = {**seconds, "encode": writer.encode_seconds, "total": watch.total()}
+        record |= {"arch": device.arch, "threads": device.threads, "versions": plan.versions}
         outputs = writer.publish(record)
     return {**record, "outputs": outputs}
+
+
+def _facts(plan: Plan, course: Course) -> dict[str, Any]:
+    """Say what was run, and what is known of its last frame, for run.json."""
+    scene, limit = plan.scene, stable_step(plan.scene)
+    return {
+        "scene": plan.given.model_dump(mode="json"),
+        "overrides": list(plan.overrides),
+        "step": step(scene),
+        "stable_step": limit if limit < math.inf else None,
+        "steps_per_frame": steps_per_frame(scene),
+        "steps": course.frame * steps_per_frame(scene),
+        "max_displacement": course.max_displacement,
+        "shortest_spring": course.shortest_spring,
+        "notes": list(notes(scene, course.max_displacement, course.shortest_spring, plan.estimate)),
+        "error_estimate": None if plan.estimate is None else error_record(plan.estimate),
+    }
 
 
 def free_cores(scene: Scene) -> int:
@@ -169,7 +247,7 @@ def versions() -> dict[str, str]:
         "taichi-msm": __version__,
         "python": platform.python_version(),
         "taichi": ".".join(str(part) for part in runtime.ti.__version__),
-        "numpy": numpy.__version__,
+        "numpy": np.__version__,
         "pillow": PIL.__version__,
         "platform": f"{sys.platform} {platform.machine()}",
     }

@@ -11,12 +11,13 @@ from numpy.typing import NDArray
 from taichi_msm import runtime
 from taichi_msm.accuracy import choose_step
 from taichi_msm.camera import View
-from taichi_msm.dynamics import Dynamics
+from taichi_msm.diagnosis import Diagnosis, diagnose
+from taichi_msm.divergence import Course, Saved, Watch
+from taichi_msm.dynamics import Dynamics, Pause
 from taichi_msm.errors import DivergedError, MsmError
 from taichi_msm.lattice import axes
-from taichi_msm.loads import farthest_displacement
 from taichi_msm.scene import Scene
-from taichi_msm.stability import stable_step, step, steps_per_frame
+from taichi_msm.stability import step, steps_per_frame
 from taichi_msm.texture import load_texture
 
 if TYPE_CHECKING:
@@ -40,9 +41,6 @@ class Simulation:
 
     Attributes:
         scene: the scene, with the step that was chosen.
-        frame: number of frames simulated so far.
-        max_displacement: largest displacement of any frame so far [m].
-        shortest_spring: smallest length of a spring over its rest length at any frame so far.
     """
 
     def __init__(
@@ -57,14 +55,17 @@ class Simulation:
         if scene.time.tolerance is not None:
             scene, _ = choose_step(scene, self.device)
         self.scene = scene
-        self.frame = 0
-        self.max_displacement = 0.0
-        self.shortest_spring = 1.0
+        self._watch = Watch(scene)
         self._closed = False
         self._dynamics = Dynamics(scene, self.device, cores=cores)
-        self._position = self._read()
+        self._position = self._place(self._dynamics.displacement())
         self._texture = texture
         self._drawing: Drawing | None = None
+
+    @property
+    def frame(self) -> int:
+        """Number of frames simulated so far."""
+        return self.course.frame
 
     @property
     def time(self) -> float:
@@ -76,11 +77,18 @@ class Simulation:
         """Number of steps taken so far."""
         return self._dynamics.steps_done
 
-    def advance(self, frames: int = 1) -> None:
+    @property
+    def course(self) -> Course:
+        """What is known of the run up to the last frame."""
+        return self._watch.course
+
+    def advance(self, frames: int = 1, pause: Pause = lambda: None) -> None:
         """Simulate a number of frames; the scene's loads go on as its keys say.
 
         Args:
             frames: how many, 0 or more.
+            pause: called some times a second, between steps; what it raises stops the simulation there, and the next
+                call goes on.
 
         Raises:
             MsmError: when the simulation is closed.
@@ -91,9 +99,28 @@ class Simulation:
             raise ValueError(f"{frames!r} frames cannot be simulated; take a whole number, 0 or more")
         self._require_open()
         for _ in range(frames):
-            self._dynamics.advance(steps_per_frame(self.scene))
+            end = (self.frame + 1) * steps_per_frame(self.scene)
+            self._dynamics.advance(end - self.steps, pause)
             self._position = self._read()
-            self.frame += 1
+
+    def save(self) -> Saved:
+        """Give all that is needed to go on from here in another simulation.
+
+        Raises:
+            MsmError: when the simulation is closed.
+            DivergedError: as for `advance`.
+        """
+        self._require_open()
+        state = self._dynamics.state()
+        self._require_good(self._watch.judge(self._dynamics, state.displacement))
+        return Saved(state, self.course)
+
+    def go_on(self, saved: Saved) -> None:
+        """Be where a simulation of the same scene was, maybe between two frames; what follows has the same bits."""
+        self._require_open()
+        self._dynamics.restart(self.scene, saved.state)
+        self._position = self._place(self._dynamics.displacement())
+        self._watch.course = saved.course
 
     def positions(self) -> NDArray[Any]:
         """Give where the points are.
@@ -103,11 +130,22 @@ class Simulation:
         """
         return self._position
 
-    def draw(self, camera: View | None = None) -> NDArray[np.uint8]:
+    def diagnose(self, start: Saved | None = None, pause: Pause = lambda: None) -> Diagnosis:
+        """Find out why `advance` said that the simulation diverged; it cannot advance afterwards, but by `go_on`.
+
+        Args:
+            start: what `save` gave before; None: the simulation is repeated from rest.
+            pause: called some times a second; what it raises stops the search.
+        """
+        self._require_open()
+        return diagnose(self._dynamics, start, pause)
+
+    def draw(self, camera: View | None = None, positions: NDArray[Any] | None = None) -> NDArray[np.uint8]:
         """Draw the sheet as it is now.
 
         Args:
             camera: another view than the scene's.
+            positions: other positions of the points [m], such as those of an earlier frame, shape (rows, cols, 3).
 
         Returns:
             Colours, shape (height, width, 3).
@@ -116,11 +154,16 @@ class Simulation:
             SceneError: when the scene's picture cannot be read.
         """
         self._require_open()
-        return self._drawn().draw(self._position, camera)
+        return self._drawn().draw(self._position if positions is None else positions, camera)
 
-    def compile(self) -> None:
-        """Compile now what would be compiled by the first frame."""
+    def compile(self, pause: Pause = lambda: None) -> None:
+        """Compile now what would be compiled by the first frame.
+
+        Args:
+            pause: called between kernels; what it raises stops here.
+        """
         self._dynamics.compile()
+        pause()
         if self.scene.draws:
             self.draw()
 
@@ -153,30 +196,20 @@ class Simulation:
         return self._drawing
 
     def _read(self) -> NDArray[Any]:
-        """Read where the points are, if the simulation has not gone wrong."""
+        """Read where the points are, if the simulation has not gone wrong since the last frame."""
         displacement = self._dynamics.displacement()
-        self._watch(displacement)
-        self.shortest_spring = min(self.shortest_spring, self._dynamics.shortest_spring)
+        self._require_good(self._watch.follow(self._dynamics, displacement))
+        return self._place(displacement)
+
+    def _require_good(self, wrong: str) -> None:
+        if wrong:
+            raise DivergedError(f"diverged before {self.steps * step(self.scene):g} s, step {self.steps}: {wrong}")
+
+    def _place(self, displacement: NDArray[Any]) -> NDArray[Any]:
+        """Turn displacements into positions."""
         position, (x, y) = displacement, axes(self.scene.sheet)
         # Summed in float64 and rounded once, without a copy of the sheet.
         np.add(position[..., 0], x, out=position[..., 0], casting="same_kind")
         np.add(position[..., 1], y, out=position[..., 1], casting="same_kind")
         position.flags.writeable = False
         return position
-
-    def _watch(self, displacement: NDArray[Any]) -> None:
-        """Stop a simulation that has gone wrong."""
-        with np.errstate(over="ignore", invalid="ignore"):
-            square = np.einsum("ijk,ijk->ij", displacement, displacement, dtype=np.float64)
-        i, j = (int(index) for index in np.unravel_index(square.argmax(), square.shape))
-        largest = float(np.linalg.norm(displacement[i, j].astype(float)))
-        size = max(self.scene.sheet.size)
-        # Written so that NaN is found as well: argmax points at it, and it is not below anything.
-        time = self.steps * step(self.scene)
-        if not largest <= farthest_displacement(self.scene, time):
-            raise DivergedError(
-                f"diverged before {time:g} s, step {self.steps}: point ({i}, {j}) is {largest:g} m from its rest "
-                f"position, and the sheet is {size:g} m long; the step is {step(self.scene):g} s of at most "
-                f"{stable_step(self.scene):g} s; try a weaker probes.N.force or a smaller time.step"
-            )
-        self.max_displacement = max(self.max_displacement, largest)

@@ -21,9 +21,10 @@ so the bits of a result do not depend on the number of workers.
 
 from typing import Any
 
+import numpy as np
 from numpy.typing import NDArray
 
-from taichi_msm.forces import BYTES, SheetFields, Structure, compression, point_step, rest_kernel, spring_forces
+from taichi_msm.forces import BYTES, Readings, SheetFields, Structure, point_step, spring_forces, start_kernel, strains
 from taichi_msm.runtime import ITERATIONS_PER_THREAD, ti
 
 # Integers between the progress counters of two workers, so that each has a cache line of its own.
@@ -55,6 +56,22 @@ def _slots(s: Structure) -> int:
     return s.depth - (-PAGE // row_bytes)
 
 
+def _source(s: Structure) -> NDArray[np.int32]:
+    """Tell which row of the sheet every stored row holds: below the sheet's own, the copies at the bands' borders."""
+    rows = list(range(s.rows))
+    first, end = _stepped(s)
+    for worker in range(s.workers):
+        low, high = (first + (end - first) * n // s.workers for n in (worker, worker + 1))
+        borders = (low, high - 1) if worker % 2 else (high - 1, low)
+        rows += [row for row in borders for _ in range(2)]
+    return np.array(rows, np.int32)
+
+
+def _stepped(s: Structure) -> tuple[int, int]:
+    """Give the first row that is stepped and the one after the last."""
+    return int(s.fixed_rows[0]), s.rows - int(s.fixed_rows[1])
+
+
 class Sweep:
     """The state of a sheet in the memory of a CPU, and its kernels."""
 
@@ -63,7 +80,8 @@ class Sweep:
         self._steps = 0
         self._fields = _Fields(s)
         self._advance, self._read = _kernels(s, self._fields)
-        self._rest = rest_kernel(s, self._fields)
+        self._start = start_kernel(s, self._fields)
+        self._source = _source(s)
 
     def advance(self, count: int, numbers: tuple[float, ...], table: NDArray[Any]) -> None:
         """Take a number of steps in one launch.
@@ -76,19 +94,18 @@ class Sweep:
         self._advance(self._steps, count, *numbers, table)
         self._steps += count
 
-    def read(self, spacing: tuple[float, float], out: NDArray[Any], least: NDArray[Any]) -> None:
-        """Copy the displacements, shape (rows, cols, 3), and find the least (L / L0)^2 of every row, shape (rows,).
+    def read(self, spacing: tuple[float, float], out: Readings) -> None:
+        """Copy what is asked for, and measure every row.
 
         Args:
             spacing: dx and dy.
-            out: filled with the displacements.
-            least: filled with the ratios, of the springs in a row of points and to the row below.
+            out: what is filled.
         """
-        self._read(*spacing, out, least)
+        self._read(*spacing, *out)
 
-    def rest(self, by_column: NDArray[Any], decay: NDArray[Any]) -> None:
-        """Put the sheet at rest; the arrays are those of `SheetFields`, with lanes as their last axis."""
-        self._rest(by_column, decay)
+    def start(self, by_column: NDArray[Any], decay: NDArray[Any], *state: Any) -> None:
+        """Put the sheet where it begins; the arguments are those of `forces.start_kernel`, without the stored rows."""
+        self._start(by_column, decay, self._source, *state)
 
     def close(self) -> None:
         """Free the fields."""
@@ -101,11 +118,11 @@ def _kernels(s: Structure, fields: _Fields) -> tuple[Any, Any]:
     rows, cols, lanes, strip, workers, depth = s.rows, s.cols, s.lanes, s.strip, s.workers, s.depth
     structural_springs, shear_springs, columns = s.structural, s.shear, s.load_columns
     slots = _slots(s)
-    first_row, end_row = int(s.fixed_rows[0]), rows - int(s.fixed_rows[1])
-    u, behind, done = fields.displacement, fields.behind, fields.done
+    first_row, end_row = _stepped(s)
+    u, d, behind, done = fields.displacement, fields.difference, fields.behind, fields.done
     along, ahead = spring_forces(s, fields)
     move = point_step(s, fields)
-    smallest = compression(s, fields)
+    strain = strains(s, fields)
 
     @ti.func
     def sweep_row(p, q, there, i, slot, n, moving, keep, dx, dy, structural, shear, top, up, loads: ti.template()):
@@ -264,20 +281,36 @@ def _kernels(s: Structure, fields: _Fields) -> tuple[Any, Any]:
 
     @ti.kernel
     def read(
-        dx: real, dy: real, out: ti.types.ndarray(dtype=real, ndim=3), least: ti.types.ndarray(dtype=real, ndim=1)
+        dx: real,
+        dy: real,
+        displacement: ti.types.ndarray(dtype=real, ndim=3),
+        moving: ti.i32,
+        difference: ti.types.ndarray(dtype=real, ndim=3),
+        measures: ti.types.ndarray(dtype=real, ndim=2),
     ):
         ti.loop_config(serialize=workers == 1)
         for index in range(rows * ITERATIONS_PER_THREAD):
             if index % ITERATIONS_PER_THREAD == 0:
                 i = index // ITERATIONS_PER_THREAD
-                found = ti.cast(1, real)
+                zero = ti.Vector.zero(real, lanes)
+                least, along, down, diagonal, motion = zero, zero, zero, zero, zero
                 for b in range(1, strip + 1):
-                    found = ti.min(found, smallest(i, i + 1, b, dx, dy, i < rows - 1))
+                    shortest, right, below, across = strain(i, i + 1, b, dx, dy, i < rows - 1)
+                    least = ti.min(least, shortest)
+                    along += right
+                    down += below
+                    diagonal += across
+                    for c in ti.static(range(3)):
+                        motion += d[c][i, b] * d[c][i, b]
                     for lane in ti.static(range(lanes)):
                         j = lane * strip + b - 1
                         if j < cols:
                             for c in ti.static(range(3)):
-                                out[i, j, c] = u[c][i, b][lane]
-                least[i] = found
+                                displacement[i, j, c] = u[c][i, b][lane]
+                                if moving:
+                                    difference[i, j, c] = d[c][i, b][lane]
+                measures[i, 0] = least.min()
+                for m, part in ti.static(enumerate((along, down, diagonal, motion))):
+                    measures[i, m + 1] = part.sum()
 
     return advance, read

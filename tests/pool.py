@@ -17,10 +17,9 @@ class Pool:
         self._idle: dict[Structure, list[Dynamics]] = defaultdict(list)
 
     def lend(self, scene: Scene, device: Device, cores: int | None = None) -> Dynamics:
-        assert cores is None
-        idle = self._idle[structure(scene, device)]
+        idle = self._idle[structure(scene, device, cores)]
         if not idle:
-            return Lent(scene, device, idle)
+            return Lent(scene, device, idle, cores)
         idle[-1].restart(scene)
         return idle.pop()
 
@@ -33,8 +32,8 @@ class Pool:
 class Lent(Dynamics):
     """A Dynamics that goes back to its pool when it is closed."""
 
-    def __init__(self, scene: Scene, device: Device, idle: list[Dynamics]) -> None:
-        super().__init__(scene, device)
+    def __init__(self, scene: Scene, device: Device, idle: list[Dynamics], cores: int | None) -> None:
+        super().__init__(scene, device, cores=cores)
         self._idle = idle
 
     def close(self) -> None:

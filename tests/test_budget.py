@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import os
+import shutil
 import sys
 from pathlib import Path
 from typing import Any
@@ -9,7 +10,8 @@ import pytest
 from PIL import Image
 
 from taichi_msm import budget
-from taichi_msm.budget import available_memory, estimate, problems
+from taichi_msm.budget import available_memory, estimate, problems, require_disk
+from taichi_msm.errors import SceneError
 from taichi_msm.scene import Scene
 
 PROBE = {"force": [0, 0, 1]}
@@ -180,3 +182,29 @@ def test_systems_without_proc(monkeypatch: pytest.MonkeyPatch) -> None:
     assert 2**20 < available_memory() < sys.maxsize
     monkeypatch.delattr(os, "sysconf")
     assert available_memory() == sys.maxsize
+
+
+def test_results_that_do_not_fit_on_the_disk_are_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Positions are there twice while the trajectory is written, and two states of 6 numbers a point."""
+    made = scene(render={"size": [50, 60]}, output=["png", "trajectory"])
+    needed = 21 * (50 * 60 * 2 + 2 * 1200 * 3 * 4) + 2 * 1200 * 6 * 4
+    below = tmp_path / "not" / "there"
+
+    disk_usage = shutil.disk_usage
+
+    def leave(free: int) -> None:
+        monkeypatch.setattr(shutil, "disk_usage", lambda path: disk_usage(path)._replace(free=free))
+
+    leave(needed)
+    require_disk(made, below)
+    leave(needed - 1)
+    with pytest.raises(SceneError) as told:
+        require_disk(made, below)
+    assert str(told.value) == (
+        "sheet.points: 21 frames need 0.000734 GiB on disk, 0.000617 GiB of it for positions of 30 x 40 points, but "
+        f"0.000734 GiB is free for {below}; take less, fewer time.frames_per_second, less output or another --out"
+    )
+    with pytest.raises(
+        SceneError, match=r"^render.size: 21 frames need .* of it for pictures of 500 x 600 pixels, but"
+    ):
+        require_disk(scene(render={"size": [500, 600]}, output=["png"]), below)

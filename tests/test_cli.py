@@ -259,8 +259,15 @@ def test_a_simulation_that_runs_away_stops_with_3(small: Path) -> None:
     # Within the step's limit, but pressed with a force that folds the springs over.
     done = program("run", "small.yaml", "--set", "probes.0.force=[0,0,-1e12]", "--out", "wild")
     assert done.returncode == 3
-    assert done.stderr.startswith("small.yaml: diverged before 0.1 s, step 41: point (4, 5) is ")
+    assert done.stderr.startswith("small.yaml: diverged at 0.00487805 s, step 2: point (4, 5) is ")
+    assert "; likely cause: probes.0.force, which reaches 4.54e+07 N at this point; " in done.stderr
+    assert done.stderr.endswith("; frames in wild: 1; last good state: wild/.partial/checkpoint/state.npz\n")
     assert done.stderr.count("\n") == 1
+    with np.load(small / "wild/.partial/checkpoint/state.npz") as dump:
+        assert dump["steps"] == 1
+        assert np.isfinite(dump["displacement"]).all()
+    again = program("run", "--resume", "wild")
+    assert (again.returncode, again.stderr) == (3, done.stderr.replace("small.yaml", "wild"))
     record = json.loads((small / "wild" / "run.json").read_text())
     assert (record["status"], record["frames"]) == ("diverged", 1)
     assert [path.name for path in (small / "wild" / "frames").iterdir()] == ["0000.png"]
@@ -291,7 +298,8 @@ def test_a_signal_keeps_the_frames_so_far(number: signal.Signals, code: int, sma
     assert record["status"] == "interrupted"
     frames = record["frames"]
     assert 3 < frames < 20000
-    assert error == f"small.yaml: interrupted; frames in long: {frames}\n"
+    then = "go on with: taichi-msm run --resume long"
+    assert error == f"small.yaml: interrupted; frames in long: {frames}; {then}\n"
     assert len(list((small / "long" / "frames").iterdir())) == frames
     assert np.load(small / "long" / "trajectory.npz")["position"].shape == (frames, 9, 11, 3)
 
@@ -417,6 +425,18 @@ def call(capsys: pytest.CaptureFixture[str], *arguments: str) -> tuple[int, str,
         (
             ["run", "small.yaml", "--out", ""],
             "taichi-msm: Invalid value for --out: is empty; name a directory (see taichi-msm --help)\n",
+        ),
+        (
+            ["run", "--resume", "nowhere"],
+            "taichi-msm: Invalid value for --resume: there is no unfinished run in nowhere (see taichi-msm --help)\n",
+        ),
+        (
+            ["run", "small.yaml", "--resume", "there"],
+            "taichi-msm: --resume goes on with a run as it was begun; leave out SCENE (see taichi-msm --help)\n",
+        ),
+        (
+            ["run", "--resume", "there", "--set", "damping=1"],
+            "taichi-msm: --resume goes on with a run as it was begun; leave out --set (see taichi-msm --help)\n",
         ),
         (["run"], "taichi-msm: Missing argument 'SCENE'. (see taichi-msm --help)\n"),
         (["jump"], "taichi-msm: No such command 'jump'. (see taichi-msm --help)\n"),

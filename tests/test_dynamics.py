@@ -252,6 +252,54 @@ def energy(made: Scene, u: NDArray[Any], v: NDArray[Any]) -> float:
     return float(total)
 
 
+@pytest.mark.parametrize(
+    "change",
+    [
+        pytest.param({}, id="one band"),
+        pytest.param({"workers": 2}, id="two bands"),
+        pytest.param({"workers": 2, "depth": 4}, id="passes of four steps"),
+        pytest.param({"workers": 0, "lanes": 1, "depth": 1}, id="as on a GPU"),
+    ],
+)
+def test_a_state_is_gone_on_from_with_the_same_bits(change: dict[str, Any], device: Device) -> None:
+    """On odd sheets whose columns do not fill the strips, and after an odd number of steps."""
+    made = scene(
+        sheet={**SHEET, "points": [13, 19], "fixed": ["top", "left"]},
+        probes=[PRESS, {**PRESS, "at": [[0, 0.1, 0.1], [0.4, 0.9, 0.9]]}],
+        time={"precision": "f32"},
+    )
+    dynamics = Dynamics(made, device, replace(structure(made, device), **change))
+    dynamics.advance(37)
+    state, energy = dynamics.state(), dynamics.energy
+    dynamics.advance(50)
+    end = dynamics.state()
+    dynamics.restart(made, state)
+    again = dynamics.state()
+    assert dynamics.energy == energy
+    dynamics.advance(50)
+    for there, here in ((again, state), (dynamics.state(), end)):
+        assert there.steps == here.steps
+        assert there.displacement.tobytes() == here.displacement.tobytes()
+        assert there.difference.tobytes() == here.difference.tobytes()
+    assert end.difference.any()
+    dynamics.close()
+
+
+@pytest.mark.parametrize("lanes", [1, 8])
+@pytest.mark.parametrize("seed", [0, 1, 3, 4])
+def test_the_energy_is_that_of_motion_and_springs(seed: int, lanes: int, device: Device) -> None:
+    made = random_scene(seed)
+    layout = structure(made, device)
+    dynamics = Dynamics(made, device, layout if lanes > 1 else replace(layout, workers=0, lanes=1, depth=1))
+    dynamics.advance(33)
+    state = dynamics.state()
+    without_virtual = made.model_copy(update={"springs": made.springs.model_copy(update={"virtual": 0.0})})
+    expected = energy(without_virtual, state.displacement, state.difference / step(made))
+    assert dynamics.energy == pytest.approx(expected, rel=1e-12)
+    assert dynamics.shortest_spring == pytest.approx(reference.shortest_spring(made, state.displacement), rel=1e-12)
+    dynamics.close()
+
+
 @pytest.mark.parametrize("difference", ["central", "backward"])
 def test_just_under_the_limit_stays_bounded(difference: str, device: Device) -> None:
     coarse = scene(time={"duration": 1, "damping_difference": difference})

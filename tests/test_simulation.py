@@ -24,7 +24,7 @@ def test_frames_positions_and_pictures(device: Device) -> None:
         assert (apart > 1).mean() < 0.01
         simulation.advance(0)
         assert simulation.frame == 3
-    assert simulation.max_displacement == pytest.approx(np.linalg.norm(twin[:4] - twin[0], axis=-1).max())
+    assert simulation.course.max_displacement == pytest.approx(np.linalg.norm(twin[:4] - twin[0], axis=-1).max())
 
 
 def test_positions_of_a_frame_stay_as_they_were(device: Device) -> None:

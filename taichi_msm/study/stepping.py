@@ -13,8 +13,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from taichi_msm.accuracy import longest
+from taichi_msm.divergence import farthest_displacement
 from taichi_msm.dynamics import Dynamics
-from taichi_msm.loads import farthest_displacement, meets_jumps, steps_to_meet_jumps
+from taichi_msm.loads import meets_jumps, steps_to_meet_jumps
 from taichi_msm.runtime import Device
 from taichi_msm.scene import Scene
 from taichi_msm.stability import stable_step, step, with_steps, with_time

@@ -1,0 +1,117 @@
+"""Why a run went wrong, and which step would have gone right: it is repeated, and tried with finer steps."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+
+from taichi_msm.divergence import Course, Saved, Watch, farthest
+from taichi_msm.dynamics import Dynamics, Pause
+from taichi_msm.lattice import rest_positions
+from taichi_msm.loads import control_points
+from taichi_msm.scene import Scene
+from taichi_msm.stability import step, steps_per_frame, with_steps
+
+# How much finer the steps are that are tried, and how many steps of points that may take in all: seconds of one core.
+CUTS = (2, 4, 8, 16, 32, 64)
+MOST_POINT_STEPS = 1_000_000_000
+
+
+@dataclass(frozen=True)
+class Diagnosis:
+    """What is found about a divergence.
+
+    Attributes:
+        message: the time, the step, the point, the key that most likely did it and the remedy.
+        good: where the run was when it was fine for the last time.
+    """
+
+    message: str
+    good: Saved
+
+
+def diagnose(dynamics: Dynamics, start: Saved | None, pause: Pause) -> Diagnosis:
+    """Find out how a run went wrong in the frame at whose end, or within which, it is.
+
+    Args:
+        dynamics: of the run; where it is afterwards is of no use.
+        start: where the run was when it was fine; None: at rest.
+        pause: called often; what it raises stops the search.
+    """
+    scene, bad = dynamics.scene, dynamics.steps_done
+    state, course = start or (None, Course())
+    per_frame, watch = steps_per_frame(scene), Watch(scene, course)
+    dynamics.restart(scene, state)
+    wrong = ""
+    while not wrong and dynamics.steps_done < bad:
+        low = dynamics.state()
+        dynamics.advance(min(bad, (watch.course.frame + 1) * per_frame) - low.steps, pause)
+        wrong = watch.follow(dynamics, dynamics.displacement())
+    if not wrong:
+        said = "but not when it was repeated: this machine makes errors; go on with --resume"
+        message = f"diverged before {bad * step(scene):.6g} s, step {bad}, {said}"
+        return Diagnosis(message, Saved(low, watch.course))
+    high = dynamics.steps_done
+    while high - low.steps > 1:
+        dynamics.restart(scene, low)
+        dynamics.advance((high - low.steps) // 2, pause)
+        middle = dynamics.state()
+        if watch.judge(dynamics, middle.displacement):
+            high = middle.steps
+        else:
+            low = middle
+    dynamics.restart(scene, low)
+    dynamics.advance(1)
+    displacement = dynamics.displacement()
+    wrong = watch.judge(dynamics, displacement)
+    cause = _cause(dynamics, high, farthest(displacement)[:2], pause)
+    message = f"diverged at {high * step(scene):.6g} s, step {high}: {wrong}; {cause}"
+    return Diagnosis(message, Saved(low, watch.course))
+
+
+def _cause(dynamics: Dynamics, bad: int, point: tuple[int, int], pause: Pause) -> str:
+    """Name the key that most likely did it: the step, if a finer one goes well, or else a force."""
+    scene = dynamics.scene
+    per_frame, points = steps_per_frame(scene), math.prod(scene.sheet.points)
+    frames = -(-bad // per_frame)
+    tried, work = math.inf, 0
+    for cut in CUTS:
+        finer = with_steps(scene, cut * per_frame)
+        work += frames * steps_per_frame(finer) * points
+        if work > MOST_POINT_STEPS:
+            break
+        if _goes_well(dynamics, finer, frames, pause):
+            return f"likely cause: time.step, {step(scene):.6g} s; with {step(finer):.9g} s it goes well here"
+        tried = step(finer)
+    index, force = _strongest_probe(scene, point)
+    said = f"likely cause: probes.{index}.force, which reaches {force:.3g} N at this point"
+    if tried < math.inf:
+        return f"{said}; take less, as no time.step of {tried:.3g} s or more goes well here"
+    return f"{said}; take less, or a time.step below {step(scene):.6g} s, of which none was tried: it would take long"
+
+
+def _goes_well(dynamics: Dynamics, scene: Scene, frames: int, pause: Pause) -> bool:
+    """Tell whether so many frames from rest go well."""
+    dynamics.restart(scene)
+    watch = Watch(scene)
+    for _ in range(frames):
+        dynamics.advance(steps_per_frame(scene), pause)
+        if watch.follow(dynamics, dynamics.displacement()):
+            return False
+    return True
+
+
+def _strongest_probe(scene: Scene, point: tuple[int, int]) -> tuple[int, float]:
+    """Find the probe that pushes a point hardest at any time, and how hard [N]."""
+    rest = rest_positions(scene.sheet)[point][:2]
+
+    def force(index: int) -> float:
+        probe = scene.probes[index]
+        nearest = np.linalg.norm(control_points(probe, scene.sheet)[1] - rest, axis=1).min()
+        most = max(abs(percent) for _, percent in probe.load) / 100 * math.hypot(*probe.force)
+        return float(most * math.exp(-probe.falloff * nearest - probe.offset))
+
+    strongest = max(range(len(scene.probes)), key=force)
+    return strongest, force(strongest)

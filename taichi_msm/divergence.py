@@ -1,0 +1,171 @@
+"""What shows that a simulation has gone wrong: no number, too far away, or more energy than the load can have given."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from taichi_msm.dynamics import Dynamics, State
+from taichi_msm.lattice import axes, spacing
+from taichi_msm.loads import Envelope, Grip, decay, grips
+from taichi_msm.scene import Scene
+from taichi_msm.stability import stable_step, step
+
+# Farther from rest than this many sheet sizes is no deformation any more; a sheet that nothing holds may fly besides.
+MOST_SHEET_SIZES = 10.0
+
+# The energy of Verlet's method swings by 1 / (1 - (h / h_stable)^2) about the true one, and somewhat more where springs
+# are pressed to a point; it may be this many times what the load explains.
+SWING = 4.0
+
+# What rounding may make of the largest energy there was.
+ROUNDING = 1e-9
+
+
+@dataclass(frozen=True)
+class Course:
+    """What is known of a run at a frame, besides where the points are.
+
+    Attributes:
+        frame: its number.
+        max_displacement: largest displacement of any frame so far [m].
+        shortest_spring: smallest length of a spring over its rest length at any frame so far.
+        energy: of motion and springs, without the virtual ones, at this frame [J].
+        reach: root of the sum of all squared displacements at this frame [m].
+        peak: largest energy of any frame so far [J].
+    """
+
+    frame: int = 0
+    max_displacement: float = 0.0
+    shortest_spring: float = 1.0
+    energy: float = 0.0
+    reach: float = 0.0
+    peak: float = 0.0
+
+
+class Saved(NamedTuple):
+    """Where a run was.
+
+    Attributes:
+        state: at some step.
+        course: of the last frame up to it.
+    """
+
+    state: State
+    course: Course
+
+
+def free_acceleration(scene: Scene) -> float:
+    """Bound the acceleration that the probes give a sheet that nothing holds [m/s^2]; 0 if a point is fixed."""
+    if scene.sheet.fixed not in ("none", ()):
+        return 0.0
+    forces = (
+        math.hypot(*probe.force) * max(abs(percent) for _, percent in probe.load) / 100 * math.exp(-probe.offset)
+        for probe in scene.probes
+    )
+    return sum(forces) / scene.sheet.mass
+
+
+def farthest_displacement(scene: Scene, time: float) -> float:
+    """Bound how far a point may be from rest after some time [m]; farther, the simulation has gone wrong."""
+    return MOST_SHEET_SIZES * max(scene.sheet.size) + free_acceleration(scene) * time**2 / 2
+
+
+class Watch:
+    """Judges the frames of a run.
+
+    With E the energy of motion and springs, and F the forces of the probes, damping takes energy and the probes give
+    dE/dt <= |F| |v|, |v| <= (2 E / m)^(1/2), where |F| and |v| are over all points; so from time a to b
+
+        E(b)^(1/2) <= E(a)^(1/2) + (2 m)^(-1/2) integral of |F| from a to b
+
+    The virtual springs hold K / 2 |u|^2 more. Where they begin to act, that is added, as they pull from where the
+    points are.
+
+    Args:
+        scene: what is run.
+        course: of the frame where the watch begins.
+
+    Attributes:
+        course: of the last frame that was fine.
+    """
+
+    def __init__(self, scene: Scene, course: Course | None = None) -> None:
+        self.course = course or Course()
+        self._scene = scene
+        self._loads = Envelope(scene)
+        self._shares = np.array([_share(grip, scene) for grip in grips(scene)])
+        limit = stable_step(scene)
+        self._swing = SWING / max(1e-9, 1 - (step(scene) / limit) ** 2)
+
+    def follow(self, dynamics: Dynamics, displacement: NDArray[np.floating]) -> str:
+        """Judge a frame that was reached and, if it is fine, take note of it; the arguments are those of `judge`."""
+        wrong = self.judge(dynamics, displacement)
+        if not wrong:
+            course = self.course
+            self.course = Course(
+                frame=course.frame + 1,
+                max_displacement=max(course.max_displacement, farthest(displacement)[2]),
+                shortest_spring=min(course.shortest_spring, dynamics.shortest_spring),
+                energy=dynamics.energy,
+                reach=math.sqrt(np.einsum("ijk,ijk->", displacement, displacement, dtype=np.float64)),
+                peak=max(course.peak, dynamics.energy),
+            )
+        return wrong
+
+    def judge(self, dynamics: Dynamics, displacement: NDArray[np.floating]) -> str:
+        """Say what is wrong at the present step; nothing if it is fine.
+
+        Args:
+            dynamics: the run, whose last frame was taken note of.
+            displacement: as just read from it [m], shape (rows, cols, 3).
+        """
+        begin, end = self.course.frame / self._scene.time.frames_per_second, dynamics.steps_done * step(self._scene)
+        i, j, largest = farthest(displacement)
+        # Written so that NaN is found as well: it is not below anything.
+        if not largest <= farthest_displacement(self._scene, end):
+            size = max(self._scene.sheet.size)
+            return f"point ({i}, {j}) is {largest:g} m from its rest position, and the sheet is {size:g} m long"
+        most = self._most_energy(begin, end)
+        if not dynamics.energy <= most:
+            return (
+                f"motion and springs hold {dynamics.energy:.3g} J, and the load explains {most:.3g} J at most; "
+                f"point ({i}, {j}) is farthest from its rest position, {largest:g} m"
+            )
+        return ""
+
+    def _most_energy(self, begin: float, end: float) -> float:
+        """Bound the energy at the end of a time by what it was at its beginning, a frame that was taken note of [J]."""
+        course, mass, virtual = self.course, self._scene.sheet.mass, self._scene.springs.virtual / 2
+        forces, active, activations = self._loads.between(begin, end)
+        push = float((forces * self._shares).sum())
+        root = math.sqrt(course.energy + active * virtual * course.reach**2) + push * (end - begin) / math.sqrt(
+            2 * mass
+        )
+        reach = course.reach + (end - begin) * root * math.sqrt(2 / mass)
+        return self._swing * (root**2 + activations * virtual * reach**2) + ROUNDING * course.peak
+
+
+def farthest(displacement: NDArray[np.floating]) -> tuple[int, int, float]:
+    """Find the point that is farthest from rest, or not finite: its row, its column and how far [m]."""
+    with np.errstate(over="ignore", invalid="ignore"):
+        square = np.einsum("ijk,ijk->ij", displacement, displacement, dtype=np.float64)
+        # argmax points at NaN.
+        i, j = (int(index) for index in np.unravel_index(square.argmax(), square.shape))
+        return i, j, float(np.linalg.norm(displacement[i, j].astype(float)))
+
+
+def _share(grip: Grip, scene: Scene) -> float:
+    """Bound |F| over all points for a force of 1 N at the control point."""
+    if not grip.moves:
+        return float(np.linalg.norm(decay(grip, scene)))
+    # From anywhere the points are no nearer than from one of them, but for half a cell; and around one there are no
+    # more than in four sheets that meet there.
+    probe = scene.probes[grip.probe]
+    x, y = axes(scene.sheet)
+    nearest = np.maximum(np.hypot(x - x[0], y - y[0]) - math.hypot(*spacing(scene.sheet)) / 2, 0)
+    return 2 * float(np.linalg.norm(np.exp(-probe.falloff * nearest - probe.offset)))

@@ -1,0 +1,86 @@
+"""What a run is to do, in words that another process understands, so that it can go on with it."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import ValidationError
+
+from taichi_msm.accuracy import Estimate
+from taichi_msm.checkpoint import PLAN
+from taichi_msm.errors import FilesError
+from taichi_msm.publication import checkpoint_in
+from taichi_msm.scene import Scene
+
+
+@dataclass(frozen=True)
+class Plan:
+    """Everything that the bits of a result depend on, and what its record says.
+
+    Attributes:
+        given: the scene as it was loaded.
+        scene: the scene with the step that was chosen.
+        overrides: what made the scene, beside its file.
+        estimate: of the error of the step, if it was wanted.
+        arch: cpu or cuda.
+        picture: the digest of the picture on the sheet.
+        versions: what the results depend on besides.
+    """
+
+    given: Scene
+    scene: Scene
+    overrides: tuple[str, ...]
+    estimate: Estimate | None
+    arch: str
+    picture: str
+    versions: Mapping[str, str]
+
+    def as_json(self) -> dict[str, Any]:
+        """Write it down."""
+        known = None if self.estimate is None else asdict(self.estimate)
+        scenes = {"given": self.given.model_dump(mode="json"), "scene": self.scene.model_dump(mode="json")}
+        return {**vars(self), **scenes, "estimate": known}
+
+    def require_same(self, picture: str, versions: Mapping[str, str]) -> None:
+        """Make sure that what follows has the bits of one run.
+
+        Raises:
+            FilesError: when the picture or a version is another one.
+        """
+        if picture != self.picture:
+            raise FilesError(f"{self.scene.image} is another picture than when the run began; run the scene again")
+        others = [f"{key} {self.versions.get(key)}" for key in versions if versions[key] != self.versions.get(key)]
+        if others:
+            raise FilesError(f"the run was begun with {', '.join(others)}; take these, or run the scene again")
+
+
+def read_plan(directory: Path) -> Plan:
+    """Read the plan of the unfinished run into a directory.
+
+    Raises:
+        FilesError: when there is none, or it is damaged.
+    """
+    path = checkpoint_in(directory) / PLAN
+    try:
+        found = json.loads(path.read_text(encoding="utf-8"))
+        estimate = None if found["estimate"] is None else Estimate(**found["estimate"])
+        scenes = {key: Scene.model_validate(found[key]) for key in ("given", "scene")}
+        return Plan(**{**found, **scenes, "overrides": tuple(found["overrides"]), "estimate": estimate})
+    except (FileNotFoundError, NotADirectoryError):
+        raise FilesError(f"{directory}: there is no unfinished run to go on with") from None
+    except OSError as error:
+        raise FilesError(f"{path}: {(error.strerror or str(error)).lower()}") from error
+    except (ValueError, KeyError, TypeError, ValidationError) as error:
+        raise FilesError(f"{path} is damaged; run the scene again") from error
+
+
+def digest(picture: NDArray[np.uint8] | None) -> str:
+    """Tell pictures apart; empty where there is none."""
+    return "" if picture is None else hashlib.sha256(repr(picture.shape).encode() + picture.tobytes()).hexdigest()

@@ -1,0 +1,149 @@
+"""Simulations that go wrong, by faults that are put into them, and what is said of them."""
+
+from __future__ import annotations
+
+import math
+import re
+from collections.abc import Callable
+
+import numpy as np
+import pytest
+
+from taichi_msm import DivergedError, Simulation
+from taichi_msm.diagnosis import Diagnosis
+from taichi_msm.divergence import Course, Saved
+from taichi_msm.dynamics import State
+from taichi_msm.runtime import Device
+from taichi_msm.scene import Scene
+from taichi_msm.stability import stable_step, steps_per_frame, with_steps
+from tests.pool import Pool
+from tests.scenes import scene
+
+# Pressed for three frames.
+PRESS = {"force": [0, 300, -1000], "load": [[0, 100], [0.12, 100], [0.12, 0]], "falloff": 20}
+
+# What is added to one number of the state, and at which frames. A fault that is no larger than what a press does is one
+# that the load explains, and can be found when nothing presses.
+FAULTS = {
+    "displacement is no number": ("displacement", np.nan, (1, 2, 4, 6, 9)),
+    "displacement is infinite": ("displacement", -np.inf, (1, 2, 4, 6, 9)),
+    "difference is no number": ("difference", np.nan, (1, 2, 4, 6, 9)),
+    "difference is infinite": ("difference", np.inf, (1, 2, 4, 6, 9)),
+    "thrown far away": ("displacement", 1e3, (1, 2, 4, 6, 9)),
+    "thrown fast": ("difference", 1e2, (1, 2, 4, 6, 9)),
+    "moved by a third of the sheet": ("displacement", 0.1, (4, 5, 6, 8, 9)),
+    "pushed": ("difference", -0.02, (4, 5, 6, 8, 9)),
+}
+
+
+def pressed(precision: str = "f32", **sections: object) -> Scene:
+    return scene(**{"probes": [PRESS], "time": {"precision": precision}, **sections})
+
+
+def rest(made: Scene) -> Saved:
+    nothing = np.zeros((*made.sheet.points, 3), made.time.precision.replace("f", "float"))
+    return Saved(State(0, nothing, nothing), Course())
+
+
+def with_fault(saved: Saved, part: str, change: float, random: np.random.Generator) -> Saved:
+    """Add to one number of a point that moves."""
+    wrong = getattr(saved.state, part).copy()
+    rows, cols, _ = wrong.shape
+    wrong[random.integers(1, rows - 1), random.integers(1, cols - 1), random.integers(3)] += np.float32(change)
+    return saved._replace(state=saved.state._replace(**{part: wrong}))
+
+
+@pytest.mark.parametrize("name", FAULTS)
+def test_faults_are_found_within_a_frame(name: str, device: Device, pool: Pool) -> None:
+    """Put in at 40 places, found at 40."""
+    made = pressed()
+    part, change, frames = FAULTS[name]
+    with Simulation(made, threads=device.threads) as simulation:
+        for frame in frames:
+            simulation.go_on(rest(made))
+            simulation.advance(frame)
+            good = simulation.positions()
+            simulation.go_on(with_fault(simulation.save(), part, change, np.random.default_rng(frame)))
+            with pytest.raises(DivergedError, match=r"diverged before [.\d]+ s, step \d+: .*point \(\d+, \d+\) is"):
+                simulation.advance()
+            assert simulation.frame == frame, "the frame that went wrong does not count"
+            assert np.isfinite(good).all()
+
+
+@pytest.mark.parametrize("active", ["loaded", "always"])
+@pytest.mark.parametrize("precision", ["f32", "f64"])
+def test_no_fault_is_found_where_there_is_none(precision: str, active: str, device: Device, pool: Pool) -> None:
+    """Also near the limit of the step, where the energy swings, and where virtual springs begin to pull from afar."""
+    loads = [100, 100, 0, 0, -100, -100, 0, 0, 1, 0]
+    jumps = list(zip([0, 0.1, 0.1, 0.14, 0.14, 0.2, 0.2, 0.3, 0.3, 0.7], loads, strict=True))
+    made = pressed(
+        springs={"structural": 20, "shear": 10, "virtual": 5, "virtual_active": active},
+        damping=0,
+        probes=[{**PRESS, "load": jumps}, {**PRESS, "at": [[0, -0.5, 0.5], [0.8, 1.5, 0.5]]}],
+        time={"duration": 0.8, "precision": precision},
+    )
+    for steps in (steps_per_frame(made), math.ceil(1 / 25 / stable_step(made) / 0.995)):
+        with Simulation(with_steps(made, steps), threads=device.threads) as simulation:
+            simulation.advance(20)
+            assert simulation.course.peak > 1e-3
+
+
+def diagnosed(made: Scene, device: Device, fault: Callable[[Simulation], None] = lambda _: None) -> Diagnosis:
+    """What is found about a run that diverges."""
+    with Simulation(made, threads=device.threads) as simulation:
+        simulation.advance()
+        start = simulation.save()
+        fault(simulation)
+        with pytest.raises(DivergedError):
+            simulation.advance(made.time.frames)
+        return simulation.diagnose(start)
+
+
+def test_a_force_that_is_too_strong_is_named(device: Device, pool: Pool) -> None:
+    weak = {"force": [0, 0, 1], "at": [0.2, 0.2]}
+    torn = {"force": [0, 0, -1], "load": [[0, 0], [0.1, 100], [0.1, 1e9]], "falloff": 20}
+    made = pressed(probes=[weak, torn])
+    found = diagnosed(made, device)
+    assert re.fullmatch(
+        r"diverged at 0\.1\d* s, step \d+: point \(4, 5\) is [.\d]+ m from its rest position, and the sheet is 0\.4 m "
+        r"long; likely cause: probes\.1\.force, which reaches 454 N at this point; take less, as no time\.step of "
+        r"[-.\de]+ s or more goes well here",
+        found.message,
+    )
+    # The step named is the first: one less is fine, and it is not.
+    bad = int(re.findall(r"step (\d+)", found.message)[0])
+    assert found.good.state.steps == bad - 1
+    assert np.isfinite(found.good.state.displacement).all()
+    with Simulation(made, threads=device.threads) as simulation:
+        simulation.go_on(found.good)
+        with pytest.raises(DivergedError):
+            simulation.advance()
+
+
+def test_a_step_that_is_too_long_is_named(device: Device, pool: Pool) -> None:
+    """It counts a blow that is over in a thousandth of a second as if it lasted for a whole step."""
+    blow = [[0, 0], [0.0995, 0], [0.1, 100], [0.1005, 0]]
+    made = pressed("f64", probes=[{"force": [0, 0, -3e7], "load": blow, "falloff": 20}])
+    made = with_steps(made, 10)
+    found = diagnosed(made, device).message
+    assert "; likely cause: time.step, 0.004 s; with 0.00" in found
+    finer = float(re.findall(r"with ([.\d]+) s it goes well here", found)[0])
+    with Simulation(with_steps(made, round(1 / 25 / finer)), threads=device.threads) as simulation:
+        simulation.advance(3)
+
+
+def test_a_machine_that_makes_errors_is_told_of(device: Device, pool: Pool) -> None:
+    def flip(simulation: Simulation) -> None:
+        simulation.advance(3)
+        simulation.go_on(with_fault(simulation.save(), "displacement", np.nan, np.random.default_rng(1)))
+
+    made = pressed()
+    found = diagnosed(made, device, flip)
+    assert found.message.endswith("but not when it was repeated: this machine makes errors; go on with --resume")
+    with Simulation(made, threads=device.threads) as simulation:
+        simulation.go_on(found.good)
+        simulation.advance(made.time.frames - simulation.frame)
+        resumed = simulation.positions()
+    with Simulation(made, threads=device.threads) as simulation:
+        simulation.advance(made.time.frames)
+        np.testing.assert_array_equal(simulation.positions(), resumed)

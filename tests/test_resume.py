@@ -1,0 +1,254 @@
+"""Runs that end early, and go on: the result has the bits of a run that was left alone."""
+
+from __future__ import annotations
+
+import errno
+import json
+import os
+import shutil
+import subprocess
+import sys
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+from PIL import Image
+
+from taichi_msm import FilesError, dynamics, resume, run, runner
+from taichi_msm.checkpoint import PLAN, POSITIONS, STATE, Checkpoint
+from taichi_msm.publication import checkpoint_in
+from taichi_msm.runtime import Device
+from taichi_msm.scene import Scene
+from taichi_msm.scene_file import load_scene
+from tests.pool import Pool
+from tests.scenes import speckle
+from tests.test_files import files
+
+SCENE = """\
+image: speckle.png
+sheet: {points: [9, 11], size: [0.3, 0.4], mass: 1.0e-3}
+springs: {structural: 20, shear: 10, virtual: 0.5}
+damping: 0.01
+probes:
+  - at: [[0, 0.2, 0.5], [2, 0.8, 0.5]]
+    force: [0, 300, -1000]
+    load: [[0, 0], [0.1, 100], [1.5, 100], [1.5, 0]]
+    falloff: 20
+time: {duration: 2, frames_per_second: 50, step: 2.0e-5}
+render: {size: [40, 30], refine: 1}
+"""
+
+
+@pytest.fixture
+def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """A directory to work in, with scene.yaml and its picture."""
+    Image.fromarray(speckle(30, 40)).save(tmp_path / "speckle.png")
+    (tmp_path / "scene.yaml").write_text(SCENE)
+    monkeypatch.chdir(tmp_path)
+    return tmp_path
+
+
+def results(directory: Path) -> dict[str, bytes]:
+    """All files but the record, which tells the time."""
+    return {name: data for name, data in files(directory).items() if name != "run.json"}
+
+
+def published(directory: Path) -> dict[str, bytes]:
+    """All files but the checkpoint."""
+    return {name: data for name, data in files(directory).items() if not name.startswith(".partial")}
+
+
+class Stop:
+    """Progress that interrupts a run when it tells of its frames for the n-th time."""
+
+    def __init__(self, after: int) -> None:
+        self._left = after
+
+    def __call__(self, stage: str, done: int, total: int) -> None:
+        self._left -= stage == "frames"
+        if self._left < 0 and stage != "write":
+            raise KeyboardInterrupt
+
+
+def interrupted(made: Scene, directory: str, device: Device, after: int = 12) -> dict[str, Any]:
+    """The record of a run that is interrupted after some of its frames."""
+    record = run(made, directory, threads=device.threads, progress=Stop(after))
+    assert record["status"] == "interrupted"
+    assert 0 < record["frames"] <= made.time.frames
+    return record
+
+
+@pytest.mark.parametrize(
+    "output", ["png, gif, trajectory", pytest.param("gif", marks=pytest.mark.slow), "trajectory", ""]
+)
+def test_a_run_that_is_interrupted_goes_on_to_the_same_bits(
+    output: str, folder: Path, device: Device, pool: Pool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Again and again, at a frame's end and within one, and while earlier frames are drawn anew."""
+    monkeypatch.setattr(dynamics, "MAX_STEPS_PER_LAUNCH", 300)
+    made = load_scene("scene.yaml", ["time.duration=0.12", f"output=[{output}]"])
+    whole = run(made, "whole", threads=device.threads)
+    record = run(made, "parts", threads=device.threads, progress=Stop(5))
+    steps = []
+    for after in range(4, 40, 4):
+        assert record["status"] == "interrupted"
+        with np.load(checkpoint_in(Path("parts")) / STATE) as state:
+            steps.append(int(state["steps"]))
+        before = published(folder / "parts")
+        try:
+            record = resume("parts", threads=device.threads, progress=Stop(after))
+        except KeyboardInterrupt:
+            assert published(folder / "parts") == before, "no frame more, and nothing lost"
+        if record["status"] == "complete":
+            break
+    assert record["status"] == "complete"
+    assert steps == sorted(steps)
+    assert any(step % 1000 for step in steps), "within a frame"
+    assert results(folder / "parts") == results(folder / "whole")
+    for key in ("steps", "frames", "max_displacement", "shortest_spring", "notes", "outputs", "scene", "overrides"):
+        assert record[key] == whole[key]
+    assert not (folder / "parts" / ".partial").exists()
+
+
+def test_the_error_estimated_at_the_start_is_kept(folder: Path, device: Device, pool: Pool) -> None:
+    made = load_scene(
+        "scene.yaml", ["time.step=auto", "time.tolerance=0.01", "time.duration=0.2", "output=[trajectory]"]
+    )
+    record = interrupted(made, "parts", device)
+    again = resume("parts", threads=device.threads)
+    assert again["status"] == "complete"
+    for key in ("error_estimate", "step", "steps_per_frame", "scene"):
+        assert again[key] == record[key]
+    assert again["error_estimate"]["error"] <= 0.01
+
+
+def test_a_run_that_finds_the_disk_full_goes_on_when_it_is_not(
+    folder: Path, device: Device, pool: Pool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    made = load_scene("scene.yaml", ["time.duration=0.2"])
+    run(made, "whole", threads=device.threads)
+    run(made, "parts", threads=device.threads, overrides=["earlier"])
+    earlier = files(folder / "parts")
+    add = Checkpoint.add
+
+    def full(checkpoint: Checkpoint, position: NDArray[Any]) -> None:
+        if checkpoint.frames == 6:
+            # Half of the positions fit.
+            checkpoint.positions.write(position.tobytes()[:500])
+            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+        add(checkpoint, position)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(Checkpoint, "add", full)
+        with pytest.raises(FilesError, match="No space left on device; free some space or choose another --out"):
+            run(made, "parts", threads=device.threads)
+    left = files(folder / "parts")
+    assert {name: left[name] for name in earlier} == earlier
+    assert sorted(set(left) - set(earlier)) == [f".partial/checkpoint/{name}" for name in (PLAN, POSITIONS, STATE)]
+    assert 0 < resume("parts", threads=device.threads)["resumed"] <= 6
+    assert results(folder / "parts") == results(folder / "whole")
+
+
+def test_a_new_run_begins_anew(folder: Path, device: Device, pool: Pool) -> None:
+    made = load_scene("scene.yaml", ["time.duration=0.2", "output=[trajectory]"])
+    interrupted(made, "parts", device)
+    assert checkpoint_in(Path("parts")).exists()
+    assert run(made, "parts", threads=device.threads)["resumed"] == 0
+    assert not (folder / "parts" / ".partial").exists()
+    with pytest.raises(FilesError, match="parts: there is no unfinished run to go on with"):
+        resume("parts", threads=device.threads)
+
+
+@pytest.mark.parametrize(
+    ("name", "damage"),
+    [
+        (PLAN, lambda data: data[: len(data) // 2]),
+        (PLAN, lambda data: b"[]"),
+        (PLAN, lambda data: data.replace(b'"rows"', b'"sheep"').replace(b'"points"', b'"sheep"')),
+        (STATE, lambda data: data[: len(data) // 2]),
+        (STATE, lambda data: b"nothing like it"),
+        (POSITIONS, lambda data: data[:-500]),
+    ],
+)
+def test_what_is_damaged_is_not_gone_on_with(
+    name: str, damage: Callable[[bytes], bytes], folder: Path, device: Device, pool: Pool
+) -> None:
+    interrupted(load_scene("scene.yaml", ["time.duration=0.2", "output=[trajectory]"]), "parts", device)
+    path = checkpoint_in(Path("parts")) / name
+    path.write_bytes(damage(path.read_bytes()))
+    before = files(folder / "parts")
+    with pytest.raises(FilesError, match=rf"^parts/.partial/checkpoint/{name} is damaged; run the scene again"):
+        resume("parts", threads=device.threads)
+    assert files(folder / "parts") == before
+
+
+def test_another_picture_or_version_is_not_gone_on_with(
+    folder: Path, device: Device, pool: Pool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    interrupted(load_scene("scene.yaml", ["time.duration=0.2"]), "parts", device)
+    before = files(folder / "parts")
+    others = {**runner.versions(), "taichi": "1.7.99"}
+    with monkeypatch.context() as patch:
+        patch.setattr(runner, "versions", lambda: others)
+        with pytest.raises(FilesError, match=r"^the run was begun with taichi 1\.7\.\d; take these, or run the scene"):
+            resume("parts", threads=device.threads)
+    Image.fromarray(speckle(30, 40, 1)).save(folder / "speckle.png")
+    with pytest.raises(FilesError, match=r"^speckle\.png is another picture than when the run began; run the scene"):
+        resume("parts", threads=device.threads)
+    assert files(folder / "parts") == before
+
+
+def killed(arguments: list[str], seconds: float) -> bool:
+    """Run the program for some time at most; tells whether it was killed then."""
+    command = [sys.executable, "-m", "taichi_msm", "run", *arguments, "--quiet"]
+    with subprocess.Popen(command, stderr=subprocess.PIPE) as process:
+        try:
+            _, error = process.communicate(timeout=seconds)
+        except subprocess.TimeoutExpired:
+            process.kill()
+            process.communicate()
+            return True
+    assert (process.returncode, error) == (0, b"")
+    return False
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="kills with SIGKILL")
+@pytest.mark.parametrize("kills", [5, pytest.param(50, marks=pytest.mark.slow)])
+def test_a_run_that_is_killed_at_any_moment_goes_on_to_the_same_bits(kills: int, folder: Path) -> None:
+    start = time.perf_counter()
+    assert not killed(["scene.yaml", "--out", "whole"], 100)
+    whole = time.perf_counter() - start
+    random = np.random.default_rng(kills)
+    done = 0
+    while done < kills:
+        shutil.rmtree(folder / "parts", ignore_errors=True)
+        going = True
+        while going:
+            begun = (checkpoint_in(folder / "parts") / PLAN).exists()
+            # A run that was killed twice is left to end.
+            seconds = whole * random.uniform(0.3, 1.1) if done < kills else 100
+            going = killed(["--resume", "parts"] if begun else ["scene.yaml", "--out", "parts"], seconds)
+            done += going
+            if going:
+                assert_readable(folder / "parts")
+        assert results(folder / "parts") == results(folder / "whole")
+        assert not (folder / "parts" / ".partial").exists()
+
+
+def assert_readable(directory: Path) -> None:
+    """Every file under a final name is whole."""
+    for path in directory.glob("frames/*.png"):
+        with Image.open(path) as image:
+            image.load()
+    if (directory / "animation.gif").exists():
+        with Image.open(directory / "animation.gif") as image:
+            image.seek(getattr(image, "n_frames", 1) - 1)
+    if (directory / "trajectory.npz").exists():
+        with np.load(directory / "trajectory.npz") as trajectory:
+            assert np.isfinite(trajectory["position"]).all()
+    if (directory / "run.json").exists():
+        json.loads((directory / "run.json").read_text())
