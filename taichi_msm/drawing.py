@@ -226,7 +226,8 @@ def _kernel(s: Structure, fields: _Fields) -> Callable[..., None]:
 
     @ti.func
     def channel(packed, k: ti.template()):
-        return ti.cast(ti.cast((packed >> (8 * k)) & 255, ti.i32), ti.f32)
+        # Not shifted: Taichi's debug mode cannot compile the shift of a vector. The machine code is the same.
+        return ti.cast(ti.cast((packed // (1 << (8 * k))) & 255, ti.i32), ti.f32)
 
     @ti.func
     def wire_share(across, down, right_across, right_down, below_across, below_down):
@@ -440,7 +441,7 @@ def _kernel(s: Structure, fields: _Fields) -> Callable[..., None]:
                 grey = (up + (low - up) * v) * light
                 if ti.static(wireframe):
                     grey += (look.WIRE_COLOUR[n] - grey) * wire
-                bits |= ti.cast(ti.cast(grey * levels + 0.5, ti.i32), word) << (channel_bits * n)
+                bits |= ti.cast(ti.cast(grey * levels + 0.5, ti.i32), word) * word(1 << (channel_bits * n))
             depth[row, chunk] = ti.select(visible, z, depth[row, chunk])
             colour[row, chunk] = ti.select(visible, bits, colour[row, chunk])
 
