@@ -36,11 +36,11 @@ class MsmError(Exception):
 
 
 class SceneError(MsmError):
-    """A scene that cannot be run; `lines` holds one line for each fault."""
+    """A scene that cannot be run; `lines` holds one line for each fault, whatever characters the user's names hold."""
 
     def __init__(self, lines: Sequence[str]) -> None:
-        super().__init__("\n".join(lines))
-        self.lines = tuple(lines)
+        self.lines = tuple(printable(line) for line in lines)
+        super().__init__("\n".join(self.lines))
 
 
 class DeviceError(MsmError):
@@ -53,6 +53,11 @@ class DivergedError(MsmError):
 
 class FilesError(MsmError):
     """Reading or writing failed; the message names the path and the remedy."""
+
+
+def printable(text: str) -> str:
+    """Write what would break a line, steer a terminal or be no character as its escape."""
+    return "".join(c if c.isprintable() else c.encode("unicode_escape").decode() for c in text)
 
 
 @contextmanager

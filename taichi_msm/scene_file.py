@@ -268,7 +268,5 @@ def _error(place: str, message: str) -> SceneError:
 
 
 def _line(place: str, problem: Problem) -> str:
-    """Write one problem as one line, whatever characters the user's names hold."""
-    short = Problem(tuple(cut(str(part)) for part in problem.path), problem.message)
-    line = f"{place}: {short}"
-    return "".join(c if c.isprintable() else c.encode("unicode_escape").decode() for c in line)
+    """Write one problem as one line."""
+    return f"{place}: {Problem(tuple(cut(str(part)) for part in problem.path), problem.message)}"

@@ -231,6 +231,7 @@ def gif_named_png(name: str) -> None:
         (lambda _: None, "no such file or directory; name a picture that can be read"),
         (lambda name: Path(name).mkdir(), "is a directory; name a picture"),
         (os.mkfifo, "is not a regular file; name a picture"),
+        (lambda name: Path(name).symlink_to("/dev/zero"), "is not a regular file; name a picture"),
         (
             lambda name: Path(name).write_text("text"),
             "is not a PNG, JPEG, WebP, BMP or TIFF picture; convert it",
@@ -246,7 +247,7 @@ def gif_named_png(name: str) -> None:
             "has pixels of kind I; save it as 8-bit RGB",
         ),
     ],
-    ids=["missing", "directory", "pipe", "text", "empty", "gif", "float", "32 bits"],
+    ids=["missing", "directory", "pipe", "device", "text", "empty", "gif", "float", "32 bits"],
 )
 def test_files_that_are_no_pictures(make: Any, fault: str) -> None:
     make("a.png")
@@ -272,6 +273,13 @@ def test_truncated_pictures(name: str) -> None:
     line = refusal(name)
     assert line.startswith(f"image: {name} ")
     assert line.endswith(("; save it anew", "; convert it"))
+
+
+def test_a_name_is_one_line_that_steers_no_terminal() -> None:
+    name = "a\n\x1b[31m.png"
+    Image.fromarray(COLOURS).save(name)
+    Path(name).write_bytes(Path(name).read_bytes()[:45])
+    assert refusal(name).startswith("image: a\\n\\x1b[31m.png cannot be decoded (")
 
 
 def test_broken_pictures_bring_up_no_other_error() -> None:
