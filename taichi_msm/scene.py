@@ -12,6 +12,9 @@ MAX_PROBES = 16
 MAX_PIXELS = 8192
 MAX_REFINE = 64
 
+# Systems have a limit near this for the path of a file.
+MAX_PATH = 4096
+
 # Times that differ by less than this fraction of a frame are one instant: 0.1 s x 30 /s is 3 frames.
 WHOLE = 1e-6
 
@@ -34,7 +37,7 @@ Whole = Annotated[int, Field(strict=True)]
 Count = Annotated[Whole, Field(ge=2, le=MAX_POINTS)]
 Pixels = Annotated[Whole, Field(ge=1, le=MAX_PIXELS)]
 Byte = Annotated[Whole, Field(ge=0, le=255)]
-Text = Annotated[str, Field(strict=True, min_length=1)]
+FilePath = Annotated[str, Field(strict=True, min_length=1, max_length=MAX_PATH)]
 Side = Literal["top", "bottom", "left", "right"]
 Vector = tuple[Number, Number, Number]
 # A tool may come from beyond the edge, but pixels are no fractions.
@@ -247,7 +250,7 @@ class Render(Section):
 class Scene(Section):
     """Everything a run needs; what the YAML file says, checked and with its defaults filled in."""
 
-    image: Text | None = key(
+    image: FilePath | None = key(
         None,
         means="the picture on the sheet: PNG, JPEG, WebP, BMP or TIFF; relative to the scene file, "
         "in its folder or below; required to draw",

@@ -13,9 +13,9 @@ from typing import Any, NamedTuple
 
 from taichi_msm.errors import Path as Key
 from taichi_msm.errors import Problem, SceneError
-from taichi_msm.scene import Scene
+from taichi_msm.scene import MAX_PATH, Scene
 from taichi_msm.validation import cut, flow, validate
-from taichi_msm.yaml_reader import Document, Mark, UnreadableError, mark_at, read
+from taichi_msm.yaml_reader import MAX_DEPTH, Document, Mark, UnreadableError, mark_at, read
 
 MAX_BYTES = 2**20
 
@@ -23,6 +23,7 @@ MAX_BYTES = 2**20
 MAX_LINES = 100
 
 _NO_KEY = Problem((), "expected KEY=VALUE, such as sheet.points=[61,61]")
+_NO_PATH = Problem((), "expected a key such as sheet.points")
 _INDEX = re.compile("[0-9]{1,9}")
 
 
@@ -35,7 +36,8 @@ def load_scene(
         path: the scene file; the image that it names is relative to its folder, and in it or below. An override may
             name one elsewhere, relative to the same folder.
         overrides: what to put in place of the file's values: "KEY=VALUE" with a dotted key (items of a list
-            by number, probes.0.load) and the value in YAML; or a mapping from dotted keys to values.
+            by number, probes.0.load) and the value in YAML, which errors call --set; or a mapping from dotted keys
+            to values, which they call override.
         image: another picture for the sheet, relative to the current directory.
 
     Returns:
@@ -50,7 +52,7 @@ def load_scene(
     if image is None:
         draft.find_image(Path(path).parent)
     else:
-        draft.override(_Override(f"--image {image}", ("image",), str(image)))
+        draft.override(_Override(f"--image {cut(str(image))}", ("image",), str(image)))
     scene, problems = validate(draft.data)
     draft.report(problems)
     if scene is None or draft.found:
@@ -83,8 +85,8 @@ def _parse_overrides(overrides: Sequence[str] | Mapping[str, Any]) -> Iterator[_
 
 
 def _parse_text(text: str) -> _Override:
-    name = f"--set {text}"
     key, equals, value = text.partition("=")
+    name = f"--set {cut(key)}{equals}{cut(value)}"
     path = _parse_key(key)
     if not equals or not path:
         return _Override(name, (), problems=[_NO_KEY])
@@ -98,20 +100,21 @@ def _parse_text(text: str) -> _Override:
 
 def _parse_value(key: str, value: Any) -> _Override:
     path = _parse_key(key)
+    name = f"override {cut(key)}"
     if not path:
-        return _Override(f"--set {key}", (), problems=[_NO_KEY])
+        return _Override(name, (), problems=[_NO_PATH])
     try:
         plain = json.loads(json.dumps(value))
     except (TypeError, ValueError, RecursionError):
         problem = Problem(path, f"a file cannot hold this {type(value).__name__}; use numbers, text, lists, dicts")
-        return _Override(f"--set {key}", path, problems=[problem])
-    return _Override(f"--set {key}={flow(plain)}", path, plain)
+        return _Override(name, path, problems=[problem])
+    return _Override(f"{name}={flow(plain)}", path, plain)
 
 
 def _parse_key(key: str) -> Key:
     """Split a dotted key; into nothing, if it is none."""
     parts = key.split(".")
-    if not all(part and part.isprintable() for part in parts):
+    if len(parts) > MAX_DEPTH or not all(part and part.isprintable() for part in parts):
         return ()
     return tuple(int(part) if _INDEX.fullmatch(part) else part for part in parts)
 
@@ -158,7 +161,7 @@ class _Draft:
     def find_image(self, folder: Path) -> None:
         """Make the path of the image, relative to a folder so far, relative to the current directory."""
         image = self.data.get("image")
-        if not (isinstance(image, str) and image):
+        if not (isinstance(image, str) and 0 < len(image) <= MAX_PATH):
             return
         self.data["image"] = str(folder / image)
         # A scene may come from anybody, and is to see no more than what came with it.

@@ -19,6 +19,9 @@ from taichi_msm.errors import Path
 MAX_DEPTH = 20
 MAX_NODES = 100_000
 
+# Nobody reads further, and a broken file of the greatest size has tens of thousands.
+MAX_FAULTS = 1000
+
 # Longer plain scalars are text, whatever they look like: no number of a scene needs more, and Python refuses
 # to read integers of several thousand digits.
 MAX_NUMBER_LENGTH = 100
@@ -66,7 +69,7 @@ class Document(NamedTuple):
     Attributes:
         data: None, bool, int, float, str, and lists and dicts of them; None for an empty text.
         marks: where each key, and each item of a list, stands.
-        faults: what is wrong but did not stop the reading.
+        faults: what is wrong but did not stop the reading, the first of it.
     """
 
     data: Any
@@ -181,7 +184,8 @@ class _Reader:
             self._refuse(event, path, f"tag {tag} is not allowed; remove it")
 
     def _refuse(self, event: Any, path: Path, message: str) -> None:
-        self.faults.append(Fault(_mark(event.start_mark), path, message))
+        if len(self.faults) < MAX_FAULTS:
+            self.faults.append(Fault(_mark(event.start_mark), path, message))
 
     def _items(self, path: Path) -> list[Any]:
         items: list[Any] = []

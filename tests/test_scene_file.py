@@ -268,6 +268,10 @@ WRONG_VALUES = {
         GOOD + 'image: "a\\0b"\n',
         ["s.yaml:11:1: image: a\\x00b is not a path; name a picture"],
     ),
+    "image of a name longer than any path": (
+        GOOD + f"image: {'../' * 300_000}\n",
+        [f's.yaml:11:1: image: "{"../" * 19}..... is not allowed; expected the path of a picture'],
+    ),
 }
 
 SEVERAL_KINDS = {
@@ -399,6 +403,7 @@ def test_errors(load: Load, text: str, expected: list[str]) -> None:
         ("é: 1\nü: ".encode() + b"\xfc", "s.yaml:2:4: not UTF-8; save the file as UTF-8"),
         (b"\xef\xbb\xbfa: \xfc", "s.yaml:1:4: not UTF-8; save the file as UTF-8"),
         (GOOD.encode("utf-16"), "s.yaml:1:1: not UTF-8; save the file as UTF-8"),
+        (GOOD.encode("utf-16-le"), "s.yaml:1:2: character U+0000 is not allowed; remove it"),
         (GOOD.encode("utf-16-be"), "s.yaml:1:1: character U+0000 is not allowed; remove it"),
         ("a:\n " + "[" * 21 + "]" * 21, "s.yaml:2:22: nested more than 20 deep; a scene is flatter"),
         ("- " * 1000, "s.yaml:1:43: nested more than 20 deep; a scene is flatter"),
@@ -443,6 +448,18 @@ def test_what_yaml_has_and_scenes_do_not(load: Load) -> None:
         "s.yaml:12:5: <<: alias *m is not allowed; write the value out",
         "s.yaml:13:1: a second document begins here; keep one",
     ]
+
+
+def test_the_first_thousand_faults_are_enough() -> None:
+    assert len(yaml_reader.read("- *a\n" * 2000).faults) == yaml_reader.MAX_FAULTS
+
+
+def test_a_huge_file_is_not_read(load: Load) -> None:
+    with Path("huge.yaml").open("wb") as file:
+        file.truncate(10**10)
+    with pytest.raises(SceneError, match=r"^huge\.yaml: larger than 1 MiB; a scene is smaller$"):
+        load_scene("huge.yaml")
+    assert load is not None
 
 
 def test_no_object_is_made_of_a_tag(load: Load) -> None:
@@ -576,6 +593,7 @@ def test_a_faulty_section_brings_up_no_other_error(load: Load) -> None:
         ("./folder/../none.yaml", "./folder/../none.yaml: no such file or directory"),
         ("folder", "folder: a directory; name a scene file"),
         ("pipe", "pipe: not a regular file; name a scene file"),
+        ("/dev/zero", "/dev/zero: not a regular file; name a scene file"),
         ("a\0b", "a\\x00b: not a path; name a scene file"),
         ("x" * 300, f"{'x' * 300}: file name too long"),
     ],
@@ -617,6 +635,18 @@ def test_overrides_from_python(load: Load) -> None:
     scene = load(GOOD, {"sheet.points": (6, 7), "probes": [{"force": [0, 0, 1]}], "probes.0.falloff": 3})
     assert scene.sheet.points == (6, 7)
     assert scene.probes[0].falloff == 3
+
+
+def test_a_long_override_is_named_in_short(load: Load) -> None:
+    assert lines(load, GOOD, [f"image={'x' * 5000}"], image="y" * 5000) == [
+        f'--image {"y" * 60}...: image: "{"y" * 59}... is not allowed; expected the path of a picture'
+    ]
+    assert lines(load, GOOD, [f"sheet.points=[{'1, ' * 5000}1]"]) == [
+        f"--set sheet.points=[{'1, ' * 19}1,...: sheet.points: [{'1, ' * 19}1,... is not allowed; {POINTS}"
+    ]
+    assert lines(load, GOOD, [f"image{'.a' * 60_000}=1"]) == [
+        f"--set image{'.a' * 27}....=1: expected KEY=VALUE, such as sheet.points=[61,61]"
+    ]
 
 
 def test_an_override_mends_a_fault_of_the_file(load: Load) -> None:
@@ -663,20 +693,20 @@ def test_an_override_mends_a_fault_of_the_file(load: Load) -> None:
         ),
         (["damping=&a 1"], "--set damping=&a 1: damping: anchor &a is not allowed; remove it"),
         (["\udcff=1"], "--set \\udcff=1: expected KEY=VALUE, such as sheet.points=[61,61]"),
-        ({"\udcff": 1}, "--set \\udcff: expected KEY=VALUE, such as sheet.points=[61,61]"),
+        ({"\udcff": 1}, "override \\udcff: expected a key such as sheet.points"),
         (
             {"image": "\udcff"},
-            '--set image="\\udcff": image: "\\udcff" is not allowed; expected the path of a picture',
+            'override image="\\udcff": image: "\\udcff" is not allowed; expected the path of a picture',
         ),
         (["image=\udcff"], "--set image=\\udcff: image: character U+DCFF is not allowed; remove it"),
         (["damping=a\nb\0"], "--set damping=a\\nb\\x00: damping: character U+0000 is not allowed; remove it"),
         (
             {"sheet.mass": 0},
-            "--set sheet.mass=0: sheet.mass: 0 is not allowed; expected a number above 0, in kg",
+            "override sheet.mass=0: sheet.mass: 0 is not allowed; expected a number above 0, in kg",
         ),
         (
             {"sheet.mass": {1, 2}},
-            "--set sheet.mass: sheet.mass: a file cannot hold this set; use numbers, text, lists, dicts",
+            "override sheet.mass: sheet.mass: a file cannot hold this set; use numbers, text, lists, dicts",
         ),
     ],
     ids=str,
