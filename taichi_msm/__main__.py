@@ -1,5 +1,6 @@
 """`taichi-msm`, which `python -m taichi_msm` is too."""
 
+import io
 import sys
 
 from taichi_msm import interruption
@@ -8,6 +9,9 @@ from taichi_msm import interruption
 def main() -> int:
     """Run the command line of the process."""
     interruption.leave_at_once()
+    if isinstance(sys.stdout, io.TextIOWrapper):
+        # A file name need not be text; errors, on stderr, are printed this way already.
+        sys.stdout.reconfigure(errors="backslashreplace")
     from taichi_msm.cli import main
 
     return main()

@@ -461,6 +461,39 @@ def test_wrong_input_is_one_clear_text(
     assert sorted(path.name for path in small.iterdir()) == ["small.yaml", "speckle.png"], "nothing is left behind"
 
 
+@pytest.mark.parametrize(
+    "stem",
+    [
+        "with a space",
+        "Schleimhaut Ä🧠",
+        "-dash",
+        pytest.param("\udcff", marks=pytest.mark.skipif(sys.platform != "linux", reason="names are text there")),
+    ],
+    ids=ascii,
+)
+def test_scenes_of_any_name(stem: str, small: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    (small / "small.yaml").rename(f"{stem}.yaml")
+    code, out, err = call(capsys, "check", "--", f"{stem}.yaml")
+    assert (code, out[:19], err) == (0, "image: speckle.png\n", "")
+    Path(f"{stem}.yaml").write_text(SMALL.replace("shear", "shaer"))
+    shown = "\\udcff" if stem == "\udcff" else stem
+    error = f"{shown}.yaml:3:27: springs.shaer: unknown key; did you mean 'shear'?\n"
+    assert call(capsys, "check", "--", f"{stem}.yaml") == (2, "", error)
+
+
+def test_a_locale_without_letters(small: Path) -> None:
+    """No name of a file but ASCII can be decoded there, nor one in a scene be encoded."""
+    plain = {"LC_ALL": "C", "PYTHONUTF8": "0", "PYTHONCOERCECLOCALE": "0"}
+    environment = {name: value for name, value in os.environ.items() if name != "PYTHONIOENCODING"} | plain
+    (small / "é.yaml").write_text(SMALL.replace("speckle", "ü").replace("shear", "shaer"), encoding="utf-8")
+    done = program("check", "é.yaml", env=environment)
+    assert (done.returncode, done.stdout) == (2, "")
+    assert done.stderr == (
+        "\\udcc3\\udca9.yaml:1:1: image: ü.png is not a path; name a picture\n"
+        "\\udcc3\\udca9.yaml:3:27: springs.shaer: unknown key; did you mean 'shear'?\n"
+    )
+
+
 def test_an_arch_that_is_not_there_is_one_clear_text(small: Path) -> None:
     done = program("run", "small.yaml", "--arch", "cuda")
     if done.returncode == 0:
