@@ -104,15 +104,15 @@ class Watch:
 
     def follow(self, dynamics: Dynamics, displacement: NDArray[np.floating]) -> str:
         """Judge a frame that was reached and, if it is fine, take note of it; the arguments are those of `judge`."""
-        wrong = self.judge(dynamics, displacement)
+        where, course = farthest(displacement), self.course
+        wrong = self._fault(dynamics, where)
         if not wrong:
-            course = self.course
             self.course = Course(
                 frame=course.frame + 1,
-                max_displacement=max(course.max_displacement, farthest(displacement)[2]),
+                max_displacement=max(course.max_displacement, where.distance),
                 shortest_spring=min(course.shortest_spring, dynamics.shortest_spring),
                 energy=dynamics.energy,
-                reach=math.sqrt(np.einsum("ijk,ijk->", displacement, displacement, dtype=np.float64)),
+                reach=where.reach,
                 peak=max(course.peak, dynamics.energy),
             )
         return wrong
@@ -124,17 +124,20 @@ class Watch:
             dynamics: the run, whose last frame was taken note of.
             displacement: as just read from it [m], shape (rows, cols, 3).
         """
+        return self._fault(dynamics, farthest(displacement))
+
+    def _fault(self, dynamics: Dynamics, where: Farthest) -> str:
         begin, end = self.course.frame / self._scene.time.frames_per_second, dynamics.steps_done * step(self._scene)
-        i, j, largest = farthest(displacement)
+        point, distance, energy = f"point ({where.row}, {where.column})", where.distance, dynamics.energy
         # Written so that NaN is found as well: it is not below anything.
-        if not largest <= farthest_displacement(self._scene, end):
+        if not distance <= farthest_displacement(self._scene, end):
             size = max(self._scene.sheet.size)
-            return f"point ({i}, {j}) is {largest:g} m from its rest position, and the sheet is {size:g} m long"
+            return f"{point} is {distance:g} m from its rest position, and the sheet is {size:g} m long"
         most = self._most_energy(begin, end)
-        if not dynamics.energy <= most:
+        if not energy < math.inf or energy > most:
             return (
-                f"motion and springs hold {dynamics.energy:.3g} J, and the load explains {most:.3g} J at most; "
-                f"point ({i}, {j}) is farthest from its rest position, {largest:g} m"
+                f"motion and springs hold {energy:.3g} J, and the load explains {most:.3g} J at most; "
+                f"{point} is farthest from its rest position, {distance:g} m"
             )
         return ""
 
@@ -143,20 +146,37 @@ class Watch:
         course, mass, virtual = self.course, self._scene.sheet.mass, self._scene.springs.virtual / 2
         forces, active, activations = self._loads.between(begin, end)
         push = float((forces * self._shares).sum())
-        root = math.sqrt(course.energy + active * virtual * course.reach**2) + push * (end - begin) / math.sqrt(
-            2 * mass
-        )
+        # Products and no powers, which raise where a product is infinite.
+        root = math.sqrt(course.energy + active * virtual * course.reach * course.reach)
+        root += push * (end - begin) / math.sqrt(2 * mass)
         reach = course.reach + (end - begin) * root * math.sqrt(2 / mass)
-        return self._swing * (root**2 + activations * virtual * reach**2) + ROUNDING * course.peak
+        return self._swing * (root * root + activations * virtual * reach * reach) + ROUNDING * course.peak
 
 
-def farthest(displacement: NDArray[np.floating]) -> tuple[int, int, float]:
-    """Find the point that is farthest from rest, or not finite: its row, its column and how far [m]."""
+class Farthest(NamedTuple):
+    """The point that is farthest from rest, or not finite.
+
+    Attributes:
+        row, column: which it is.
+        distance: from its rest position [m].
+        reach: root of the sum of all points' squared displacements [m].
+    """
+
+    row: int
+    column: int
+    distance: float
+    reach: float
+
+
+def farthest(displacement: NDArray[np.floating]) -> Farthest:
+    """Find the point that is farthest from rest; displacement [m] of shape (rows, cols, 3)."""
     with np.errstate(over="ignore", invalid="ignore"):
         square = np.einsum("ijk,ijk->ij", displacement, displacement, dtype=np.float64)
         # argmax points at NaN.
-        i, j = (int(index) for index in np.unravel_index(square.argmax(), square.shape))
-        return i, j, float(np.linalg.norm(displacement[i, j].astype(float)))
+        row, column = (int(index) for index in np.unravel_index(square.argmax(), square.shape))
+        return Farthest(
+            row, column, float(np.linalg.norm(displacement[row, column].astype(float))), math.sqrt(square.sum())
+        )
 
 
 def _share(grip: Grip, scene: Scene) -> float:

@@ -18,6 +18,7 @@ from taichi_msm.checkpoint import PLAN
 from taichi_msm.errors import FilesError
 from taichi_msm.publication import checkpoint_in
 from taichi_msm.scene import Scene
+from taichi_msm.texture import load_texture
 
 
 @dataclass(frozen=True)
@@ -29,6 +30,7 @@ class Plan:
         scene: the scene with the step that was chosen.
         overrides: what made the scene, beside its file.
         estimate: of the error of the step, if it was wanted.
+        folder: the current directory, from which the scene's picture is found.
         arch: cpu or cuda.
         picture: the digest of the picture on the sheet.
         versions: what the results depend on besides.
@@ -38,6 +40,7 @@ class Plan:
     scene: Scene
     overrides: tuple[str, ...]
     estimate: Estimate | None
+    folder: str
     arch: str
     picture: str
     versions: Mapping[str, str]
@@ -47,6 +50,13 @@ class Plan:
         known = None if self.estimate is None else asdict(self.estimate)
         scenes = {"given": self.given.model_dump(mode="json"), "scene": self.scene.model_dump(mode="json")}
         return {**vars(self), **scenes, "estimate": known}
+
+    def load_texture(self) -> NDArray[np.uint8] | None:
+        """Read the picture of the scene, if it draws; raises what `texture.load_texture` does."""
+        if not self.scene.draws:
+            return None
+        image = str(Path(self.folder) / str(self.scene.image))
+        return load_texture(self.scene.model_copy(update={"image": image}))
 
     def require_same(self, picture: str, versions: Mapping[str, str]) -> None:
         """Make sure that what follows has the bits of one run.

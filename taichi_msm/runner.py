@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from taichi_msm import __version__, accuracy, budget, runtime
 from taichi_msm.accuracy import Estimate
 from taichi_msm.divergence import Course
-from taichi_msm.errors import DivergedError
+from taichi_msm.errors import DivergedError, writing
 from taichi_msm.files import ResultWriter
 from taichi_msm.notes import notes
 from taichi_msm.plan import Plan, digest, read_plan
@@ -104,7 +104,9 @@ def run(
     elif estimate_error:
         estimate = accuracy.estimate_error(scene, device, partial(progress, "pilot"))
     watch.lap("pilot")
-    plan = Plan(given, scene, tuple(overrides), estimate, arch, digest(texture), versions())
+    with writing(directory):
+        here = str(Path.cwd())
+    plan = Plan(given, scene, tuple(overrides), estimate, here, arch, digest(texture), versions())
     with ResultWriter(Path(directory), scene, plan.as_json()) as writer:
         return _carry_out(plan, writer, device, texture, watch, progress)
 
@@ -135,7 +137,7 @@ def resume(
     """
     watch = Stopwatch(started)
     plan = read_plan(Path(directory))
-    texture = load_texture(plan.scene) if plan.scene.draws else None
+    texture = plan.load_texture()
     plan.require_same(digest(texture), versions())
     device = runtime.start(plan.arch, threads)
     watch.lap("startup")

@@ -153,6 +153,18 @@ def test_a_run_that_finds_the_disk_full_goes_on_when_it_is_not(
     assert results(folder / "parts") == results(folder / "whole")
 
 
+def test_a_run_is_resumed_from_another_directory(
+    folder: Path, device: Device, pool: Pool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    made = load_scene("scene.yaml", ["time.duration=0.2", "output=[png]"])
+    run(made, "whole", threads=device.threads)
+    interrupted(made, "parts", device)
+    (folder / "elsewhere").mkdir()
+    monkeypatch.chdir(folder / "elsewhere")
+    assert resume("../parts", threads=device.threads)["scene"]["image"] == "speckle.png"
+    assert results(folder / "parts") == results(folder / "whole")
+
+
 def test_a_new_run_begins_anew(folder: Path, device: Device, pool: Pool) -> None:
     made = load_scene("scene.yaml", ["time.duration=0.2", "output=[trajectory]"])
     interrupted(made, "parts", device)
