@@ -41,6 +41,9 @@ def test_pinhole_looks_at_its_target_with_its_angle() -> None:
     at, depth = pixel(made, list(edge))
     np.testing.assert_allclose(at, [50, 0], atol=1e-12)
     assert depth == pytest.approx(distance)
+    # Pixels are square: as far to the right, as many of them.
+    edge = np.add([0.05, 0.1, 0], right * distance * np.tan(np.radians(25)))
+    np.testing.assert_allclose(pixel(made, list(edge))[0], [80, 30], atol=1e-12)
 
 
 def test_right_is_right_and_up_is_up() -> None:
