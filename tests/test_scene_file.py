@@ -78,6 +78,11 @@ def test_a_scene_and_its_defaults(load: Load) -> None:
     assert scene.render.camera == "top"
 
 
+def test_frames_are_counted_in_spite_of_rounding(load: Load) -> None:
+    assert 0.29 * 100 < 29
+    assert load(GOOD.replace("duration: 0.4", "duration: 0.29\n  frames_per_second: 100")).time.frames == 29
+
+
 WRONG_KEYS = {
     "unknown, with a near one": (
         GOOD.replace("shear", "shaer"),
