@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 from contextlib import closing, suppress
+from functools import partial
 from typing import Any
 
 import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from taichi_msm.accuracy import Estimate, Pilots, choose_step, estimate_error, longest, order
+from taichi_msm import accuracy
+from taichi_msm.accuracy import Estimate, Pilots, choose_step, estimate_error, longest, order, refinement
 from taichi_msm.errors import SceneError
 from taichi_msm.notes import notes
 from taichi_msm.runtime import Device
@@ -98,6 +100,45 @@ def test_an_estimate_is_near_the_error(kind: str, difference: str, pool: Pool, d
     if not misses and difference == "central":
         # The next power of h is (w h)^2 / 24 of the error at most, w h <= 1; and twice that for the kinks of the load.
         assert estimate.error == pytest.approx(error, rel=1 / 12)
+
+
+class Falling:
+    """A stand-in for Dynamics, of every displacement of which h^p is wrong and no more."""
+
+    def __init__(self, p: int, made: Scene, device: Device) -> None:
+        self.p = p
+        self.restart(made)
+
+    def restart(self, made: Scene) -> None:
+        self.h = step(made)
+
+    def advance(self, steps: int, pause: object) -> None:
+        pass
+
+    def displacement(self) -> NDArray[np.float64]:
+        return np.array([[[1 + self.h**self.p, 0, 0]]])
+
+    def close(self) -> None:
+        pass
+
+
+@pytest.mark.parametrize(
+    ("difference", "release", "p"), [("central", 0.2, 2), ("backward", 0.2, 1), ("central", 0.1 * 2**0.5, 1)]
+)
+def test_an_error_that_is_a_power_of_the_step_is_told_exactly(
+    difference: str, release: float, p: int, monkeypatch: pytest.MonkeyPatch, device: Device
+) -> None:
+    monkeypatch.setattr(accuracy, "Dynamics", partial(Falling, p))
+    probe = {**SOFT_PRESS, "load": [[0, 0], [0.1, 100], [release, 100], [release, 0]]}
+    made = scene(probes=[probe], time={"step": 0.005, "damping_difference": difference})
+    # In numbers near 1 the error, 2.5e-5 or more, is rounded by 1e-11 of itself.
+    assert estimate_error(made, device).error == pytest.approx(0.005**p, rel=1e-9)
+
+
+def test_how_much_finer_the_other_pilot_is() -> None:
+    assert refinement(scene(**SCENES["release"])) == 2
+    assert refinement(scene(**SCENES["between"])) == 16, "a jump is missed"
+    assert refinement(scene(damping=3.0, time={"step": 0.0025})) == 8, "g h is 7.5"
 
 
 def test_rounding_is_part_of_the_estimate(pool: Pool, device: Device) -> None:
@@ -200,6 +241,8 @@ def test_a_load_shorter_than_a_step_has_no_estimate_until_steps_are_shorter(
     made = scene(probes=[{**SOFT_PRESS, "load": [[start, 0], [start, 100], [end, 100], [end, 0]]}])
     assert estimate_error(made, device).error == np.inf
     assert "three keys of a load" in "".join(notes(made, 1.0, 1.0, None))
+    nearly = with_steps(made, int(2 * 0.04 / (end - start)) - 1)
+    assert "three keys of a load" in "".join(notes(nearly, 1.0, 1.0, None))
     fine = with_steps(made, int(2 * 0.04 / (end - start)) + 1)
     assert "three keys of a load" not in "".join(notes(fine, 1.0, 1.0, None))
 
