@@ -11,13 +11,13 @@ import pytest
 
 from taichi_msm import DivergedError, Simulation
 from taichi_msm.diagnosis import Diagnosis
-from taichi_msm.divergence import Course, Saved
+from taichi_msm.divergence import Course, Saved, farthest_displacement
 from taichi_msm.dynamics import State
 from taichi_msm.runtime import Device
 from taichi_msm.scene import Scene
 from taichi_msm.stability import stable_step, steps_per_frame, with_steps
 from tests.pool import Pool
-from tests.scenes import scene
+from tests.scenes import SHEET, scene
 
 # Pressed for three frames.
 PRESS = {"force": [0, 300, -1000], "load": [[0, 100], [0.12, 100], [0.12, 0]], "falloff": 20}
@@ -147,3 +147,11 @@ def test_a_machine_that_makes_errors_is_told_of(device: Device, pool: Pool) -> N
     with Simulation(made, threads=device.threads) as simulation:
         simulation.advance(made.time.frames)
         np.testing.assert_array_equal(simulation.positions(), resumed)
+
+
+def test_how_far_a_point_may_be() -> None:
+    # 0.05 N on 1 g is 50 m/s^2; the sheet is 0.4 m long.
+    probes = [{"force": [0, 0, 0.05], "falloff": 0, "offset": 0}]
+    assert farthest_displacement(scene(probes=probes), 3.0) == pytest.approx(10 * 0.4)
+    free = scene(sheet={**SHEET, "fixed": "none"}, probes=probes)
+    assert farthest_displacement(free, 3.0) == pytest.approx(10 * 0.4 + 50 * 3.0**2 / 2)
