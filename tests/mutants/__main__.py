@@ -1,0 +1,120 @@
+"""Make one mistake at a time in a copy of the project, and see that a test fails.
+
+python -m tests.mutants              all of them
+python -m tests.mutants bgr          some of them, by name
+python -m tests.mutants --write      and renew the table in docs/trust.md
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+import re
+import shutil
+import subprocess
+import sys
+import time
+from collections.abc import Iterable
+from pathlib import Path
+from tempfile import TemporaryDirectory
+
+from tests.mutants import ROOT, Mutant, mutants, table, write
+
+# What the tests of mutants need of the project.
+COPIED = ("pyproject.toml", "scenes", "taichi_msm", "tests")
+
+# Longer than all the tests of all mutants take together [s].
+TIMEOUT = 1800.0
+
+PYTEST = [sys.executable, "-m", "pytest", "-x", "-q", "--color=no", "-p", "no:cacheprovider"]
+PASSED, FAILED = 0, 1
+
+
+class NoVerdictError(Exception):
+    """The tests neither passed nor failed."""
+
+
+def first_failure(files: Iterable[str], mutant: Mutant | None = None) -> str | None:
+    """Run files of tests in a copy of the project, with one mistake or none.
+
+    Returns:
+        The test that failed; None where all passed.
+
+    Raises:
+        NoVerdictError: when the tests cannot be run to an end.
+    """
+    with TemporaryDirectory() as directory:
+        # Resolved, as pytest tells its root: a temporary directory may be behind a link.
+        copy = Path(directory).resolve()
+        for name in COPIED:
+            original = ROOT / name
+            if original.is_dir():
+                shutil.copytree(original, copy / name, ignore=shutil.ignore_patterns("__pycache__"))
+            else:
+                shutil.copy(original, copy)
+        if mutant:
+            mutant.path(copy).write_text(mutant.source(), encoding="utf-8")
+        try:
+            done = subprocess.run(
+                [*PYTEST, "-p", "tests.mutants.own_package", *(f"tests/{file}" for file in files)],
+                cwd=copy,
+                # Also for processes that a test starts elsewhere.
+                env={**os.environ, "PYTHONPATH": str(copy)},
+                capture_output=True,
+                text=True,
+                timeout=TIMEOUT,
+            )
+        except subprocess.TimeoutExpired:
+            raise NoVerdictError(f"no end within {TIMEOUT:g} s") from None
+    failure = re.search(r"^(?:FAILED|ERROR) (\S+?::\w+)", done.stdout, flags=re.MULTILINE)
+    if done.returncode == FAILED and failure:
+        return failure[1]
+    if done.returncode == PASSED:
+        return None
+    raise NoVerdictError(f"pytest ended with {done.returncode}\n{done.stdout}{done.stderr}")
+
+
+def hunt(chosen: list[Mutant]) -> dict[str, str]:
+    """Find the test that kills each mutant, by its name; those that survive are left out."""
+
+    def say(text: str) -> None:
+        print(f"{time.monotonic() - start:5.0f} s  {text}", file=sys.stderr, flush=True)
+
+    start = time.monotonic()
+    if broken := first_failure(dict.fromkeys(file for mutant in chosen for file in mutant.tests)):
+        raise NoVerdictError(f"{broken} fails without any mutant")
+    say("without a mutant all of these tests pass")
+    killers = {}
+    for mutant in chosen:
+        if killer := first_failure(mutant.tests, mutant):
+            killers[mutant.name] = killer
+        say(f"{mutant.name}: {f'killed by {killer}' if killer else 'SURVIVED'}")
+    say(f"{len(killers)} of {len(chosen)} killed")
+    return killers
+
+
+def main(arguments: list[str]) -> int:
+    """Run the mutants that the command line names."""
+    known = {mutant.name: mutant for mutant in mutants()}
+    parser = argparse.ArgumentParser(prog="python -m tests.mutants", description="See that tests notice mistakes.")
+    parser.add_argument("names", nargs="*", metavar="NAME", help="all, or some of: " + ", ".join(known))
+    parser.add_argument("--write", action="store_true", help="renew the table in docs/trust.md")
+    options = parser.parse_args(arguments)
+    if unknown := [name for name in options.names if name not in known]:
+        parser.error("no such mutant: " + ", ".join(unknown))
+    chosen = [known[name] for name in options.names or known]
+    try:
+        killers = hunt(chosen)
+    except NoVerdictError as error:
+        print(error, file=sys.stderr)
+        return 1
+    print(table(killers), end="")
+    if len(killers) < len(chosen):
+        return 1
+    if options.write:
+        write(killers)
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main(sys.argv[1:]))
