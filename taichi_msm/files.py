@@ -112,13 +112,17 @@ class ResultWriter:
         with writing(self._directory):
             return self._checkpoint.load()
 
-    def finish(self) -> None:
-        """Wait until every frame is encoded and close the files."""
+    def finish(self, *, hurry: bool = False) -> None:
+        """Wait until every frame is encoded and close the files.
+
+        Args:
+            hurry: give up frames that are not being encoded yet.
+        """
         if self._finished:
             return
         with writing(self._directory):
             if self._encoder:
-                report = self._encoder.finish()
+                report = self._encoder.finish(hurry=hurry)
                 self._frames, self._encode_seconds = report.frames, report.seconds
             if "trajectory" in self._scene.output:
                 write_trajectory(

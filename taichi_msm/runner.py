@@ -190,6 +190,7 @@ def _carry_out(
                 # What went wrong within this frame is found when it is resumed.
                 with suppress(DivergedError):
                     writer.save(simulation.save())
+            writer.finish(hurry=True)
             # Frames that were there before are no new results.
             if writer.frames <= resumed:
                 raise

@@ -269,7 +269,7 @@ def test_a_signal_keeps_the_frames_so_far(number: signal.Signals, code: int, sma
     )
     staged = small / "long" / ".partial" / "new" / "frames"
     for _ in range(600):
-        if staged.exists() and len(list(staged.iterdir())) > 3:
+        if staged.exists() and len(list(staged.iterdir())) > 8:
             break
         time.sleep(0.05)
     if number == signal.SIGTERM:

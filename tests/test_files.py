@@ -197,6 +197,27 @@ def test_an_interrupted_hand_over_leaves_whole_frames(
     assert files(tmp_path / "interrupted") == files(tmp_path / "whole")
 
 
+@pytest.mark.skipif(sys.platform == "win32", reason="no such signal")
+def test_in_a_hurry_frames_are_given_up_and_those_left_are_whole(tmp_path: Path) -> None:
+    made = small_scene(size=[1500, 1000])
+    large = [speckle(1000, 1500, frame) for frame in range(7)]
+    with ResultWriter(tmp_path, made) as writer:
+        for frame, shown in enumerate(large):
+            writer.add(position(frame), shown)
+        writer.finish(hurry=True)
+        writer.publish({})
+        frames = writer.frames
+    assert 0 < frames < 7
+    assert sorted(path.name for path in (tmp_path / "frames").iterdir()) == [f"000{n}.png" for n in range(frames)]
+    for frame in range(frames):
+        with Image.open(tmp_path / "frames" / f"000{frame}.png") as image:
+            np.testing.assert_array_equal(np.asarray(image), large[frame])
+    with Image.open(tmp_path / "animation.gif") as image:
+        assert getattr(image, "n_frames", 1) == frames
+    with np.load(tmp_path / "trajectory.npz") as trajectory:
+        assert len(trajectory["position"]) == frames
+
+
 @pytest.mark.skipif(sys.platform == "win32", reason="no sessions")
 def test_ctrl_c_does_not_reach_the_encoder(tmp_path: Path) -> None:
     with ResultWriter(tmp_path, small_scene()) as writer:
