@@ -21,7 +21,7 @@ MAX_STEPS = 10**12
 POINT_BYTES = 36  # a mass point, as it is seen, and its normal
 SAMPLE_BYTES = 12  # depth and colour of one sample of the picture
 PIXEL_BYTES = 3 * 12  # colours of one pixel, from sums to bytes
-TEXEL_BYTES = 4
+PICTURE_PIXEL_BYTES = 20  # of the file, while it is decoded and converted; its texture takes less
 
 # Bytes of a pixel in a file.
 PIXEL_FILE_BYTES = {"png": 2, "gif": 1}
@@ -141,9 +141,10 @@ def _number_bytes(scene: Scene) -> int:
 def _drawing_bytes(scene: Scene) -> int:
     rows, cols = scene.sheet.points
     width, height = scene.render.size
-    texture_width, texture_height = texture.texture_size(scene) or (0, 0)
+    # The whole picture is decoded, whatever the region.
+    picture = math.prod(texture.texture_size(scene.model_copy(update={"region": None})) or (0,))
     frame = width * height * (scene.render.supersample**2 * SAMPLE_BYTES + PIXEL_BYTES)
-    return rows * cols * POINT_BYTES + frame + texture_width * texture_height * TEXEL_BYTES
+    return rows * cols * POINT_BYTES + frame + picture * PICTURE_PIXEL_BYTES
 
 
 def _step_problems(scene: Scene) -> Iterator[Problem]:

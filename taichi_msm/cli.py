@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from taichi_msm import __version__
-from taichi_msm.errors import DeviceError, FilesError, SceneError
+from taichi_msm.errors import DeviceError, FilesError, SceneError, printable
 from taichi_msm.interruption import Interruption
 
 if TYPE_CHECKING:
@@ -246,7 +246,7 @@ def study(
         print_json({"directory": str(directory), **as_record(found), "outputs": outputs})
     else:
         print_summary(found, Console())
-        click.echo(f"{directory}: {', '.join(outputs)}")
+        click.echo(printable(f"{directory}: {', '.join(outputs)}"))
     return EXIT_CODES.get(found.status, interruption.code)
 
 
@@ -308,9 +308,9 @@ def print_json(value: Any) -> None:
 
 
 def complain(lines: Sequence[str]) -> None:
-    """Print errors on stderr, one a line."""
+    """Print errors on stderr, one a line, whatever characters the user's names hold."""
     for line in lines:
-        click.echo(line, err=True)
+        click.echo(printable(line), err=True)
 
 
 def main(arguments: Sequence[str] | None = None) -> int:

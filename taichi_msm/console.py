@@ -8,6 +8,8 @@ from pathlib import Path
 from types import TracebackType
 from typing import TYPE_CHECKING, Any
 
+from taichi_msm.errors import printable
+
 if TYPE_CHECKING:
     from rich.progress import Progress as Bar
 
@@ -64,7 +66,7 @@ def summary(record: Mapping[str, Any], directory: Path) -> str:
     times = record["timings"]
     stages = ", ".join(f"{stage} {seconds:.2f}" for stage, seconds in times.items() if stage != "total")
     lines = [
-        f"{directory}: {record['frames']} frames, {record['steps']} steps of {record['step']:.4g} s, "
+        f"{printable(str(directory))}: {record['frames']} frames, {record['steps']} steps of {record['step']:.4g} s, "
         f"largest displacement {record['max_displacement']:.4g} m",
         *record["notes"],
         f"{times['total']:.2f} s: {stages}{' (encode overlaps)' if times['encode'] > 0 else ''}",

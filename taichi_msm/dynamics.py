@@ -193,30 +193,24 @@ class Dynamics:
         Returns:
             x - X [m], shape (rows, cols, 3), in the scene's precision.
         """
-        return self._read(moving=False).displacement
+        return self._read(differences=False)
 
     def state(self) -> State:
         """Read all that the next steps depend on, and measure the sheet."""
-        found = self._read(moving=True)
-        return State(self.steps_done, found.displacement, found.difference)
+        return State(self.steps_done, self._read(differences=False), self._read(differences=True))
 
-    def _read(self, *, moving: bool) -> Readings:
+    def _read(self, *, differences: bool) -> NDArray[Any]:
+        """Read displacements or differences, and measure the sheet."""
         s, sheet = self.structure, self.scene.sheet
-        shape = (s.rows, s.cols, 3)
-        found = Readings(
-            np.empty(shape, self._real),
-            moving,
-            np.empty(shape if moving else (1, 1, 3), self._real),
-            np.empty((s.rows, MEASURES), self._real),
-        )
+        out, measures = np.empty((s.rows, s.cols, 3), self._real), np.empty((s.rows, MEASURES), self._real)
         dx, dy = spacing(sheet)
-        self._sheet.read((dx, dy), found)
-        self.shortest_spring = math.sqrt(max(0.0, 1.0 + float(found.measures[:, 0].min())))
-        along, down, diagonal, motion = found.measures[:, 1:].sum(axis=0, dtype=np.float64)
+        self._sheet.read((dx, dy), Readings(differences, out, measures))
+        self.shortest_spring = math.sqrt(max(0.0, 1.0 + float(measures[:, 0].min())))
+        along, down, diagonal, motion = measures[:, 1:].sum(axis=0, dtype=np.float64)
         springs, h = self.scene.springs, step(self.scene)
         stretching = springs.structural * (along * dx**2 + down * dy**2) + springs.shear * diagonal * (dx**2 + dy**2)
         self.energy = float(stretching + sheet.mass * motion / h**2) / 2
-        return found
+        return out
 
     def close(self) -> None:
         """Free the fields."""

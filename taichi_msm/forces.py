@@ -75,15 +75,13 @@ class Readings(NamedTuple):
     """What is read of a sheet, in the order of the kernel's arguments.
 
     Attributes:
-        displacement: u, shape (rows, cols, 3).
-        moving: whether the differences are wanted too.
-        difference: d, shape (rows, cols, 3); any shape where they are not wanted.
-        measures: of every row of points, shape (rows, MEASURES).
+        differences: whether d is wanted, and not u.
+        out: filled with it, shape (rows, cols, 3).
+        measures: filled with those of every row of points, shape (rows, MEASURES).
     """
 
-    displacement: NDArray[Any]
-    moving: bool
-    difference: NDArray[Any]
+    differences: bool
+    out: NDArray[Any]
     measures: NDArray[Any]
 
 

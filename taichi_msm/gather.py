@@ -130,9 +130,8 @@ def _kernels(s: Structure, fields: _Fields) -> tuple[Any, Any]:
         now: ti.i32,
         dx: real,
         dy: real,
-        displacement: ti.types.ndarray(dtype=real, ndim=3),
-        moving: ti.i32,
-        difference: ti.types.ndarray(dtype=real, ndim=3),
+        differences: ti.i32,
+        out: ti.types.ndarray(dtype=real, ndim=3),
         measures: ti.types.ndarray(dtype=real, ndim=2),
     ):
         for i in range(rows):
@@ -145,11 +144,9 @@ def _kernels(s: Structure, fields: _Fields) -> tuple[Any, Any]:
                 found[2] += down[0]
                 found[3] += diagonal[0]
                 for c in ti.static(range(3)):
-                    displacement[i, b - 1, c] = u[c][p, b][0]
                     change = d[c][i, b][0]
                     found[4] += change * change
-                    if moving:
-                        difference[i, b - 1, c] = change
+                    out[i, b - 1, c] = ti.select(differences, change, u[c][p, b][0])
             for m in ti.static(range(MEASURES)):
                 measures[i, m] = found[m]
 

@@ -283,9 +283,8 @@ def _kernels(s: Structure, fields: _Fields) -> tuple[Any, Any]:
     def read(
         dx: real,
         dy: real,
-        displacement: ti.types.ndarray(dtype=real, ndim=3),
-        moving: ti.i32,
-        difference: ti.types.ndarray(dtype=real, ndim=3),
+        differences: ti.i32,
+        out: ti.types.ndarray(dtype=real, ndim=3),
         measures: ti.types.ndarray(dtype=real, ndim=2),
     ):
         ti.loop_config(serialize=workers == 1)
@@ -301,14 +300,12 @@ def _kernels(s: Structure, fields: _Fields) -> tuple[Any, Any]:
                     down += below
                     diagonal += across
                     for c in ti.static(range(3)):
-                        motion += d[c][i, b] * d[c][i, b]
-                    for lane in ti.static(range(lanes)):
-                        j = lane * strip + b - 1
-                        if j < cols:
-                            for c in ti.static(range(3)):
-                                displacement[i, j, c] = u[c][i, b][lane]
-                                if moving:
-                                    difference[i, j, c] = d[c][i, b][lane]
+                        change = d[c][i, b]
+                        motion += change * change
+                        wanted = ti.select(differences, change, u[c][i, b])
+                        for lane in ti.static(range(lanes)):
+                            if lane * strip + b <= cols:
+                                out[i, lane * strip + b - 1, c] = wanted[lane]
                 measures[i, 0] = least.min()
                 for m, part in ti.static(enumerate((along, down, diagonal, motion))):
                     measures[i, m + 1] = part.sum()

@@ -96,11 +96,13 @@ def test_a_run_that_is_interrupted_goes_on_to_the_same_bits(
     steps = []
     for after in range(4, 40, 4):
         assert record["status"] == "interrupted"
-        with np.load(checkpoint_in(Path("parts")) / STATE) as state:
+        with np.load(checkpoint_in(folder / "parts") / STATE) as state:
             steps.append(int(state["steps"]))
         before = published(folder / "parts")
         try:
-            record = resume("parts", threads=device.threads, progress=Stop(after))
+            # From another directory: what the plan names is found all the same.
+            monkeypatch.chdir(folder / "whole")
+            record = resume("../parts", threads=device.threads, progress=Stop(after))
         except KeyboardInterrupt:
             assert published(folder / "parts") == before, "no frame more, and nothing lost"
         if record["status"] == "complete":
@@ -129,7 +131,7 @@ def test_the_error_estimated_at_the_start_is_kept(folder: Path, device: Device, 
 def test_a_run_that_finds_the_disk_full_goes_on_when_it_is_not(
     folder: Path, device: Device, pool: Pool, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    made = load_scene("scene.yaml", ["time.duration=0.2"])
+    made = load_scene("scene.yaml", ["time.duration=0.2", "output=[trajectory]"])
     run(made, "whole", threads=device.threads)
     run(made, "parts", threads=device.threads, overrides=["earlier"])
     earlier = files(folder / "parts")
@@ -150,18 +152,6 @@ def test_a_run_that_finds_the_disk_full_goes_on_when_it_is_not(
     assert {name: left[name] for name in earlier} == earlier
     assert sorted(set(left) - set(earlier)) == [f".partial/checkpoint/{name}" for name in (PLAN, POSITIONS, STATE)]
     assert 0 < resume("parts", threads=device.threads)["resumed"] <= 6
-    assert results(folder / "parts") == results(folder / "whole")
-
-
-def test_a_run_is_resumed_from_another_directory(
-    folder: Path, device: Device, pool: Pool, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    made = load_scene("scene.yaml", ["time.duration=0.2", "output=[png]"])
-    run(made, "whole", threads=device.threads)
-    interrupted(made, "parts", device)
-    (folder / "elsewhere").mkdir()
-    monkeypatch.chdir(folder / "elsewhere")
-    assert resume("../parts", threads=device.threads)["scene"]["image"] == "speckle.png"
     assert results(folder / "parts") == results(folder / "whole")
 
 
@@ -231,9 +221,11 @@ def killed(arguments: list[str], seconds: float) -> bool:
 @pytest.mark.skipif(sys.platform == "win32", reason="kills with SIGKILL")
 @pytest.mark.parametrize("kills", [5, pytest.param(50, marks=pytest.mark.slow)])
 def test_a_run_that_is_killed_at_any_moment_goes_on_to_the_same_bits(kills: int, folder: Path) -> None:
-    start = time.perf_counter()
-    assert not killed(["scene.yaml", "--out", "whole"], 100)
-    whole = time.perf_counter() - start
+    for _ in range(2):
+        # The second time kernels are compiled, as they are for those that are killed.
+        start = time.perf_counter()
+        assert not killed(["scene.yaml", "--out", "whole"], 100)
+        whole = time.perf_counter() - start
     random = np.random.default_rng(kills)
     done = 0
     while done < kills:
@@ -241,8 +233,8 @@ def test_a_run_that_is_killed_at_any_moment_goes_on_to_the_same_bits(kills: int,
         going = True
         while going:
             begun = (checkpoint_in(folder / "parts") / PLAN).exists()
-            # A run that was killed twice is left to end.
-            seconds = whole * random.uniform(0.3, 1.1) if done < kills else 100
+            # Mostly while it works, which it begins after half of the time, and else at its start or end.
+            seconds = whole * random.uniform(0.4, 1.1) if done < kills else 100
             going = killed(["--resume", "parts"] if begun else ["scene.yaml", "--out", "parts"], seconds)
             done += going
             if going:
