@@ -79,13 +79,7 @@ def run(
 ) -> int:
     """Simulate SCENE, draw its frames and write them."""
     if resume is not None:
-        for option in context.command.params:
-            if option.name not in RESUMABLE and was_given(context, option):
-                name = option.opts[0] if isinstance(option, click.Option) else "SCENE"
-                raise click.UsageError(f"--resume goes on with a run as it was begun; leave out {name}")
-        directory = result_directory(resume, option="--resume")
-        if not going_on(directory):
-            raise click.BadParameter(f"there is no unfinished run in {directory}", param_hint="--resume")
+        directory = unfinished(context, resume)
     elif scene is None:
         raise click.MissingParameter(param_hint="'SCENE'", param_type="argument")
     else:
@@ -98,23 +92,22 @@ def run(
     from taichi_msm.console import Progress, summary
 
     interruption = Interruption()
-    with Progress(quiet=quiet or as_json) as bar, resumable(directory):
+    with Progress(quiet=quiet or as_json) as bar, resumable(directory), naming(str(scene or resume)):
         progress = interruptible(bar, interruption)
         try:
-            if scene is None:
+            if resume is not None:
                 record = runner.resume(directory, threads=threads, started=STARTED, progress=progress)
             else:
-                with naming(scene):
-                    record = runner.run(
-                        loaded,
-                        directory,
-                        arch=arch,
-                        threads=threads,
-                        overrides=[*overrides, *([f"image={image}"] if image is not None else [])],
-                        estimate_error=estimate_error,
-                        started=STARTED,
-                        progress=progress,
-                    )
+                record = runner.run(
+                    loaded,
+                    directory,
+                    arch=arch,
+                    threads=threads,
+                    overrides=[*overrides, *([f"image={image}"] if image is not None else [])],
+                    estimate_error=estimate_error,
+                    started=STARTED,
+                    progress=progress,
+                )
         except KeyboardInterrupt:
             complain([f"interrupted; nothing was written{going_on(directory)}"])
             return interruption.code
@@ -250,9 +243,16 @@ def study(
     return EXIT_CODES.get(found.status, interruption.code)
 
 
-def was_given(context: click.Context, parameter: click.Parameter) -> bool:
-    """Tell whether a parameter was typed."""
-    return context.get_parameter_source(str(parameter.name)) is click.core.ParameterSource.COMMANDLINE
+def unfinished(context: click.Context, directory: str) -> Path:
+    """Make sure that there is a run to resume in a directory, and that no other scene or settings were typed."""
+    for option in context.command.params:
+        typed = context.get_parameter_source(str(option.name)) is click.core.ParameterSource.COMMANDLINE
+        if typed and option.name not in RESUMABLE:
+            name = option.opts[0] if isinstance(option, click.Option) else "SCENE"
+            raise click.UsageError(f"--resume goes on with a run as it was begun; leave out {name}")
+    if not going_on(result_directory(directory, option="--resume")):
+        raise click.BadParameter(f"there is no unfinished run in {directory}", param_hint="--resume")
+    return Path(directory)
 
 
 def result_directory(out: str | None, default: str = "", option: str = "--out") -> Path:

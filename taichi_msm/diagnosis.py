@@ -25,11 +25,11 @@ class Diagnosis:
 
     Attributes:
         message: the time, the step, the point, the key that most likely did it and the remedy.
-        good: where the run was when it was fine for the last time.
+        good: where the run was when it was fine for the last time; None: nothing is known but the start.
     """
 
     message: str
-    good: Saved
+    good: Saved | None
 
 
 def diagnose(dynamics: Dynamics, start: Saved | None, pause: Pause) -> Diagnosis:
@@ -44,15 +44,16 @@ def diagnose(dynamics: Dynamics, start: Saved | None, pause: Pause) -> Diagnosis
     state, course = start or (None, Course())
     per_frame, watch = steps_per_frame(scene), Watch(scene, course)
     dynamics.restart(scene, state)
-    wrong = ""
-    while not wrong and dynamics.steps_done < bad:
-        low = dynamics.state()
+    low, wrong = dynamics.state(), ""
+    while low.steps < bad:
         dynamics.advance(min(bad, (watch.course.frame + 1) * per_frame) - low.steps, pause)
         wrong = watch.follow(dynamics, dynamics.displacement())
+        if wrong:
+            break
+        low = dynamics.state()
     if not wrong:
         said = "but not when it was repeated: this machine makes errors; go on with --resume"
-        message = f"diverged before {bad * step(scene):.6g} s, step {bad}, {said}"
-        return Diagnosis(message, Saved(low, watch.course))
+        return Diagnosis(f"diverged before {bad * step(scene):.6g} s, step {bad}, {said}", start)
     high = dynamics.steps_done
     while high - low.steps > 1:
         dynamics.restart(scene, low)

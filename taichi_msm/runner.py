@@ -199,7 +199,9 @@ def _carry_out(
             ending = {"status": "diverged", "error": str(error), "dump": None}
             with suppress(KeyboardInterrupt):
                 found = simulation.diagnose(writer.load(), partial(progress, "diagnosis", writer.frames, frames))
-                ending |= {"error": found.message, "dump": str(writer.save(found.good))}
+                ending["error"] = found.message
+                if found.good:
+                    ending["dump"] = str(writer.save(found.good))
         progress("write", writer.frames, frames)
         writer.finish()
         record = {**ending, **_facts(plan, simulation.course), "frames": writer.frames, "resumed": resumed}

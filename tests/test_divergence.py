@@ -112,6 +112,7 @@ def test_a_force_that_is_too_strong_is_named(device: Device, pool: Pool) -> None
     )
     # The step named is the first: one less is fine, and it is not.
     bad = int(re.findall(r"step (\d+)", found.message)[0])
+    assert found.good
     assert found.good.state.steps == bad - 1
     assert np.isfinite(found.good.state.displacement).all()
     with Simulation(made, threads=device.threads) as simulation:
@@ -140,6 +141,8 @@ def test_a_machine_that_makes_errors_is_told_of(device: Device, pool: Pool) -> N
     made = pressed()
     found = diagnosed(made, device, flip)
     assert found.message.endswith("but not when it was repeated: this machine makes errors; go on with --resume")
+    assert found.good
+    assert found.good.course.frame == 1, "where it was saved"
     with Simulation(made, threads=device.threads) as simulation:
         simulation.go_on(found.good)
         simulation.advance(made.time.frames - simulation.frame)
