@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 from typing import Any
 
@@ -129,6 +130,27 @@ def test_large_sheets_are_cut_into_bands(device: Device) -> None:
         assert structure(made, device).workers == workers
         assert structure(made, device, cores=1).workers == 1
         assert_like_twin(made, device)
+
+
+def test_a_launch_ends_soon(pool: Pool, device: Device, monkeypatch: pytest.MonkeyPatch) -> None:
+    """And between two launches the sheet can be stopped, and go on."""
+    made = scene()
+    dynamics = pool.lend(made, device)
+    dynamics.advance(100)
+    whole = dynamics.displacement()
+    dynamics.restart(made)
+    monkeypatch.setattr("taichi_msm.dynamics.POINT_STEPS_PER_LAUNCH", 12 * math.prod(made.sheet.points))
+
+    def stop() -> None:
+        if dynamics.steps_done == 36:
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        dynamics.advance(100, stop)
+    assert dynamics.steps_done == 36
+    dynamics.advance(64)
+    assert dynamics.displacement().tobytes() == whole.tobytes()
+    dynamics.close()
 
 
 def test_a_frame_of_a_small_sheet_is_one_launch(device: Device) -> None:
