@@ -88,6 +88,25 @@ def test_no_fault_is_found_where_there_is_none(precision: str, active: str, devi
             assert simulation.course.peak > 1e-3
 
 
+def test_springs_that_begin_to_pull_from_afar_give_energy(device: Device) -> None:
+    """Twice within a frame, each for a quarter of their period, and between them the sheet flies to the other side."""
+    on, off = [(0.01, 0), (0.01, 1)], [(0.017, 1), (0.017, 0)]
+    load = [*on, *off, *((t + 0.027, percent) for t, percent in [*on, *off])]
+    made = scene(
+        sheet={**SHEET, "points": [2, 2], "fixed": "none"},
+        springs={"structural": 1, "virtual": 50},
+        damping=0,
+        probes=[{"force": [0, 0, 1e-9], "load": load}],
+        time={"duration": 0.2, "frames_per_second": 5},
+    )
+    away = np.full((2, 2, 3), [0, 0, 0.02])
+    held = 50 / 2 * 0.02**2 * 4
+    with Simulation(made, threads=device.threads) as simulation:
+        simulation.go_on(Saved(State(0, away, np.zeros_like(away)), Course(reach=0.04)))
+        simulation.advance()
+        assert simulation.course.energy > 15 * held
+
+
 def diagnosed(made: Scene, device: Device, fault: Callable[[Simulation], None] = lambda _: None) -> Diagnosis:
     """What is found about a run that diverges."""
     with Simulation(made, threads=device.threads) as simulation:
