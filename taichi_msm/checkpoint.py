@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+import shutil
 import time
 import zipfile
 from collections.abc import Mapping
@@ -16,7 +17,7 @@ from numpy.typing import DTypeLike, NDArray
 
 from taichi_msm.divergence import Course, Saved
 from taichi_msm.dynamics import State
-from taichi_msm.errors import FilesError
+from taichi_msm.errors import DamagedError
 
 PLAN, POSITIONS, STATE = "plan.json", "positions", "state.npz"
 
@@ -58,7 +59,9 @@ class Checkpoint:
         return self._file
 
     def begin(self, plan: Mapping[str, Any]) -> None:
-        """Begin without a frame; the plan is what another process must know, in JSON."""
+        """Begin without a frame, in the place of any other run; the plan is what a process must know, in JSON."""
+        if self._folder.exists():
+            shutil.rmtree(self._folder)
         self._folder.mkdir()
         # Without a buffer, so that what was written stays when the process is killed.
         self._file = (self._folder / POSITIONS).open("x+b", buffering=0)
@@ -70,7 +73,7 @@ class Checkpoint:
         """Go on from what was saved last; None: from the beginning.
 
         Raises:
-            FilesError: when the files do not belong together.
+            DamagedError: when the files do not belong together.
             OSError: when they cannot be read.
         """
         self._file = (self._folder / POSITIONS).open("r+b", buffering=0)
@@ -120,7 +123,7 @@ class Checkpoint:
         """Read what was saved last; None: nothing was.
 
         Raises:
-            FilesError: when it cannot be read.
+            DamagedError: when it cannot be read.
         """
         try:
             with (self._folder / STATE).open("rb") as file, np.load(file, allow_pickle=False) as found:
@@ -128,8 +131,8 @@ class Checkpoint:
                 course = Course(**{key: found[key].item() for key in asdict(Course())})
         except FileNotFoundError:
             return None
-        except (OSError, ValueError, KeyError, zipfile.BadZipFile) as error:
-            raise self._damaged(STATE) from error
+        except (OSError, ValueError, KeyError, zipfile.BadZipFile):
+            raise self._damaged(STATE) from None
         if state.displacement.shape != self._shape or state.difference.shape != self._shape:
             raise self._damaged(STATE)
         return Saved(state, course)
@@ -139,5 +142,5 @@ class Checkpoint:
         if self._file is not None:
             self._file.close()
 
-    def _damaged(self, name: str) -> FilesError:
-        return FilesError(f"{self._folder / name} is damaged; run the scene again from the start")
+    def _damaged(self, name: str) -> DamagedError:
+        return DamagedError(f"{self._folder / name} is damaged; run the scene again")

@@ -277,7 +277,8 @@ def resumable(directory: Path) -> Iterator[None]:
     try:
         yield
     except FilesError as error:
-        raise FilesError(f"{error}{going_on(directory)}") from None
+        # What cannot be written now may be written later; what is damaged, or locked, is not helped by trying again.
+        raise FilesError(f"{error}{going_on(directory) if isinstance(error.__cause__, OSError) else ''}") from None
 
 
 @contextmanager

@@ -55,6 +55,10 @@ class FilesError(MsmError):
     """Reading or writing failed; the message names the path and the remedy."""
 
 
+class DamagedError(FilesError):
+    """What an unfinished run left cannot be used."""
+
+
 def printable(text: str) -> str:
     """Write what would break a line, steer a terminal or be no character as its escape."""
     return "".join(c if c.isprintable() else c.encode("unicode_escape").decode() for c in text)

@@ -25,8 +25,8 @@ from taichi_msm.trajectory import write_trajectory
 class ResultWriter:
     """Writes the frames of a run as they come, and puts all in place at the end.
 
-    Within the with statement the files grow out of sight. Left without `publish` they go; but of a run with a plan,
-    once it has a frame, the checkpoint stays until its results are published as complete.
+    Within the with statement the files grow out of sight. Left without `publish` they go; but once a run with a plan
+    has a frame, its checkpoint takes the place of any earlier one, and stays until results are published as complete.
 
     Args:
         directory: where the results go; made where it does not exist. Files there that no run writes stay.
@@ -50,7 +50,7 @@ class ResultWriter:
         self._scene = scene
         self._plan = plan
         self._resumes = resumes
-        self._publication = Publication(directory, keep=resumes)
+        self._publication = Publication(directory)
         self._precision = np.float32 if scene.time.precision == "f32" else np.float64
         self._checkpoint = Checkpoint(
             self._publication.checkpoint, scene.sheet.points, self._precision, stores=bool(scene.output)
@@ -90,6 +90,9 @@ class ResultWriter:
         """
         with writing(self._directory):
             # In this order, whatever is interrupted, there are at least as many positions as pictures.
+            if self.stored == 0:
+                self._publication.keep = False
+                self._checkpoint.begin(self._plan or {})
             if self._frames == self.stored:
                 self._checkpoint.add(position)
                 self._publication.keep = self._plan is not None
@@ -124,7 +127,7 @@ class ResultWriter:
             if self._encoder:
                 report = self._encoder.finish(hurry=hurry)
                 self._frames, self._encode_seconds = report.frames, report.seconds
-            if "trajectory" in self._scene.output:
+            if "trajectory" in self._scene.output and self._frames:
                 write_trajectory(
                     self._publication.staged / TRAJECTORY,
                     self._checkpoint.positions,
@@ -174,8 +177,6 @@ class ResultWriter:
             opened.callback(self._checkpoint.close)
             if self._resumes:
                 self.saved = self._checkpoint.go_on()
-            else:
-                self._checkpoint.begin(self._plan or {})
             self._frames = 0 if scene.draws else self.stored
             self._open = opened.pop_all()
         return self

@@ -15,7 +15,7 @@ from pydantic import ValidationError
 
 from taichi_msm.accuracy import Estimate
 from taichi_msm.checkpoint import PLAN
-from taichi_msm.errors import FilesError
+from taichi_msm.errors import DamagedError, FilesError
 from taichi_msm.publication import checkpoint_in
 from taichi_msm.scene import Scene
 from taichi_msm.texture import load_texture
@@ -70,12 +70,19 @@ class Plan:
         if others:
             raise FilesError(f"the run was begun with {', '.join(others)}; take these, or run the scene again")
 
+    def gives_the_bits_of(self, other: Plan) -> bool:
+        """Tell whether the results are the same, so that either run can go on with the other."""
+        renamed = other.scene.model_copy(update={"image": self.scene.image})
+        mine, its = (self.arch, self.picture, self.versions), (other.arch, other.picture, other.versions)
+        return self.scene == renamed and mine == its
+
 
 def read_plan(directory: Path) -> Plan:
     """Read the plan of the unfinished run into a directory.
 
     Raises:
-        FilesError: when there is none, or it is damaged.
+        FilesError: when there is none.
+        DamagedError: when it cannot be understood.
     """
     path = checkpoint_in(directory) / PLAN
     try:
@@ -86,9 +93,9 @@ def read_plan(directory: Path) -> Plan:
     except (FileNotFoundError, NotADirectoryError):
         raise FilesError(f"{directory}: there is no unfinished run to go on with") from None
     except OSError as error:
-        raise FilesError(f"{path}: {(error.strerror or str(error)).lower()}") from error
-    except (ValueError, KeyError, TypeError, ValidationError) as error:
-        raise FilesError(f"{path} is damaged; run the scene again") from error
+        raise FilesError(f"{path}: {(error.strerror or str(error)).lower()}") from None
+    except (ValueError, KeyError, TypeError, ValidationError):
+        raise DamagedError(f"{path} is damaged; run the scene again") from None
 
 
 def digest(picture: NDArray[np.uint8] | None) -> str:

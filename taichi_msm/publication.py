@@ -58,7 +58,6 @@ class Publication:
 
     Args:
         directory: where the results go; made where it does not exist.
-        keep: whether the checkpoint that is there is to stay.
 
     Raises:
         FilesError: on entering, when another process publishes there.
@@ -66,12 +65,12 @@ class Publication:
 
     Attributes:
         staged: the directory to write the new files in, under their final names.
-        checkpoint: where an unfinished run keeps what it needs to go on.
+        checkpoint: where an unfinished run, this one or an earlier, keeps what it needs to go on.
         keep: whether it stays when the with statement is left.
     """
 
-    def __init__(self, directory: Path, *, keep: bool = False) -> None:
-        self.keep = keep
+    def __init__(self, directory: Path) -> None:
+        self.keep = True
         self.checkpoint = checkpoint_in(directory)
         self.staged = directory / STAGING / "new"
         self._directory = directory

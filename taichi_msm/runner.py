@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from taichi_msm import __version__, accuracy, budget, runtime
 from taichi_msm.accuracy import Estimate
 from taichi_msm.divergence import Course
-from taichi_msm.errors import DivergedError, writing
+from taichi_msm.errors import DamagedError, DivergedError, FilesError, writing
 from taichi_msm.files import ResultWriter
 from taichi_msm.notes import notes
 from taichi_msm.plan import Plan, digest, read_plan
@@ -71,6 +71,8 @@ def run(
 ) -> dict[str, Any]:
     """Simulate a scene and write its results: whole or not at all.
 
+    An unfinished run of the same scene into the same directory is gone on with: the results have the same bits.
+
     Args:
         scene: what `load_scene` returned.
         directory: where frames/, animation.gif, trajectory.npz and run.json go.
@@ -107,8 +109,18 @@ def run(
     with writing(directory):
         here = str(Path.cwd())
     plan = Plan(given, scene, tuple(overrides), estimate, here, arch, digest(texture), versions())
-    with ResultWriter(Path(directory), scene, plan.as_json()) as writer:
-        return _carry_out(plan, writer, device, texture, watch, progress)
+    if _is_begun(plan, Path(directory)):
+        with suppress(DamagedError):
+            return _carry_out(plan, Path(directory), device, texture, watch, progress, resumes=True)
+    return _carry_out(plan, Path(directory), device, texture, watch, progress, resumes=False)
+
+
+def _is_begun(plan: Plan, directory: Path) -> bool:
+    """Tell whether the unfinished run into a directory, if there is one, gives the bits of this one."""
+    try:
+        return plan.gives_the_bits_of(read_plan(directory))
+    except FilesError:
+        return False
 
 
 def resume(
@@ -141,22 +153,22 @@ def resume(
     plan.require_same(digest(texture), versions())
     device = runtime.start(plan.arch, threads)
     watch.lap("startup")
-    with ResultWriter(Path(directory), plan.scene, plan.as_json(), resumes=True) as writer:
-        return _carry_out(plan, writer, device, texture, watch, progress)
+    return _carry_out(plan, Path(directory), device, texture, watch, progress, resumes=True)
 
 
 def _carry_out(
     plan: Plan,
-    writer: ResultWriter,
+    directory: Path,
     device: Device,
     texture: NDArray[np.uint8] | None,
     watch: Stopwatch,
     progress: Progress,
+    *,
+    resumes: bool,
 ) -> dict[str, Any]:
-    """Simulate and draw what the results lack."""
+    """Simulate and draw, from the beginning or what the unfinished run in the directory lacks."""
     scene = plan.scene
     frames = scene.time.frames + 1
-    resumed = writer.stored
     ending: dict[str, Any] = {"status": "complete"}
 
     def pause() -> None:
@@ -167,8 +179,13 @@ def _carry_out(
         watch.lap("hand over")
 
     progress("compile", 0, frames)
-    # The encoder starts up while kernels are compiled.
-    with Simulation(scene, device.arch, device.threads, texture, free_cores(scene)) as simulation:
+    cores = free_cores(scene)
+    # In this order, so that the encoder starts up while kernels are compiled.
+    with (
+        ResultWriter(directory, scene, plan.as_json(), resumes=resumes) as writer,
+        Simulation(scene, device.arch, device.threads, texture, cores) as simulation,
+    ):
+        resumed = writer.stored
         watch.lap("startup")
         try:
             simulation.compile(partial(progress, "compile", 0, frames))

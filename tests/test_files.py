@@ -117,13 +117,6 @@ def test_a_run_without_outputs_writes_its_record(tmp_path: Path) -> None:
     assert [path.name for path in tmp_path.iterdir()] == ["run.json"]
 
 
-def test_a_run_that_ended_before_its_first_frame(tmp_path: Path) -> None:
-    assert write(tmp_path, 0, small_scene()) == ["trajectory.npz", "run.json"]
-    with np.load(tmp_path / "trajectory.npz") as trajectory:
-        assert trajectory["position"].shape == (0, ROWS, COLS, 3)
-        assert trajectory["time"].shape == (0,)
-
-
 @pytest.mark.parametrize(("precision", "dtype"), [("f32", np.float32), ("f64", np.float64)])
 def test_the_trajectory_comes_back(tmp_path: Path, precision: str, dtype: type[np.floating[Any]]) -> None:
     write(tmp_path, 6, small_scene("trajectory", precision=precision))

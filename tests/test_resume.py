@@ -155,14 +155,31 @@ def test_a_run_that_finds_the_disk_full_goes_on_when_it_is_not(
     assert results(folder / "parts") == results(folder / "whole")
 
 
-def test_a_new_run_begins_anew(folder: Path, device: Device, pool: Pool) -> None:
+def test_the_same_run_typed_again_goes_on(folder: Path, device: Device, pool: Pool) -> None:
+    """Who did not see that a run was unfinished loses nothing of it."""
     made = load_scene("scene.yaml", ["time.duration=0.2", "output=[trajectory]"])
-    interrupted(made, "parts", device)
-    assert checkpoint_in(Path("parts")).exists()
-    assert run(made, "parts", threads=device.threads)["resumed"] == 0
+    run(made, "whole", threads=device.threads)
+    left = interrupted(made, "parts", device)
+    assert run(made, "parts", threads=device.threads)["resumed"] == left["frames"]
+    assert results(folder / "parts") == results(folder / "whole")
     assert not (folder / "parts" / ".partial").exists()
     with pytest.raises(FilesError, match="parts: there is no unfinished run to go on with"):
         resume("parts", threads=device.threads)
+
+
+@pytest.mark.parametrize("change", ["damping=0.02", "sheet.points=[9,12]"])
+def test_another_run_begins_anew_and_keeps_what_was_there_until_it_has_a_frame(
+    change: str, folder: Path, device: Device, pool: Pool
+) -> None:
+    settings = ["time.duration=0.2", "output=[trajectory]"]
+    interrupted(load_scene("scene.yaml", settings), "parts", device)
+    before = files(folder / "parts")
+    other = load_scene("scene.yaml", [*settings, change])
+    with pytest.raises(KeyboardInterrupt):
+        run(other, "parts", threads=device.threads, progress=Stop(0))
+    assert files(folder / "parts") == before
+    assert run(other, "parts", threads=device.threads)["resumed"] == 0
+    assert not (folder / "parts" / ".partial").exists()
 
 
 @pytest.mark.parametrize(
@@ -179,13 +196,16 @@ def test_a_new_run_begins_anew(folder: Path, device: Device, pool: Pool) -> None
 def test_what_is_damaged_is_not_gone_on_with(
     name: str, damage: Callable[[bytes], bytes], folder: Path, device: Device, pool: Pool
 ) -> None:
-    interrupted(load_scene("scene.yaml", ["time.duration=0.2", "output=[trajectory]"]), "parts", device)
+    made = load_scene("scene.yaml", ["time.duration=0.2", "output=[trajectory]"])
+    interrupted(made, "parts", device)
     path = checkpoint_in(Path("parts")) / name
     path.write_bytes(damage(path.read_bytes()))
     before = files(folder / "parts")
     with pytest.raises(FilesError, match=rf"^parts/.partial/checkpoint/{name} is damaged; run the scene again"):
         resume("parts", threads=device.threads)
     assert files(folder / "parts") == before
+    # The scene itself is run as if nothing were there, or what there is were another's.
+    assert run(made, "parts", threads=device.threads)["resumed"] == 0
 
 
 def test_another_picture_or_version_is_not_gone_on_with(
