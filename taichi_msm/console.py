@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import sys
+import time
 from collections.abc import Mapping
 from pathlib import Path
 from types import TracebackType
@@ -27,11 +28,17 @@ STAGES = {
 }
 
 
+# Without a terminal a line is written so often [s].
+LINE_EVERY = 60.0
+
+
 class Progress:
-    """A progress bar on stderr; silent where quiet or where stderr is not a terminal."""
+    """Progress on stderr: a bar on a terminal, else a line a minute; or silence."""
 
     def __init__(self, quiet: bool) -> None:
+        self._quiet = quiet
         self._bar = None if quiet or not sys.stderr.isatty() else _bar()
+        self._next_line = time.monotonic() + LINE_EVERY
         if self._bar is not None:
             self._task = self._bar.add_task(STAGES["start"], total=None)
 
@@ -39,6 +46,10 @@ class Progress:
         """Show the stage and the frames done."""
         if self._bar is not None:
             self._bar.update(self._task, description=STAGES[stage], completed=done, total=total)
+        elif not self._quiet and time.monotonic() >= self._next_line:
+            self._next_line = time.monotonic() + LINE_EVERY
+            sys.stderr.write(f"{STAGES[stage]}: {done} of {total}\n")
+            sys.stderr.flush()
 
     def __enter__(self) -> Progress:
         if self._bar is not None:
@@ -54,11 +65,11 @@ class Progress:
 
 def _bar() -> Bar:
     from rich.console import Console
-    from rich.progress import BarColumn, MofNCompleteColumn, TextColumn, TimeElapsedColumn
+    from rich.progress import BarColumn, MofNCompleteColumn, TextColumn, TimeElapsedColumn, TimeRemainingColumn
     from rich.progress import Progress as Bar
 
-    columns = TextColumn("{task.description:24}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn()
-    return Bar(*columns, console=Console(stderr=True), transient=True)
+    columns = TextColumn("{task.description:24}"), BarColumn(), MofNCompleteColumn()
+    return Bar(*columns, TimeElapsedColumn(), TimeRemainingColumn(), console=Console(stderr=True), transient=True)
 
 
 def summary(record: Mapping[str, Any], directory: Path) -> str:

@@ -16,7 +16,7 @@ import pytest
 import yaml
 from PIL import Image
 
-from taichi_msm import reference
+from taichi_msm import console, reference
 from taichi_msm.cli import main
 from taichi_msm.scene_file import load_scene
 from tests.scenes import speckle
@@ -444,6 +444,17 @@ def test_wrong_input_is_one_clear_text(
 ) -> None:
     assert call(capsys, *arguments) == (2, "", error)
     assert sorted(path.name for path in small.iterdir()) == ["small.yaml", "speckle.png"], "nothing is left behind"
+
+
+def test_a_log_shows_that_a_long_run_is_alive(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(console, "LINE_EVERY", 0.0)
+    with console.Progress(quiet=False) as progress:
+        progress.update("frames", 12, 31)
+    with console.Progress(quiet=True) as progress:
+        progress.update("frames", 13, 31)
+    assert capsys.readouterr().err == "simulating and drawing: 12 of 31\n"
 
 
 @pytest.mark.parametrize(
