@@ -7,6 +7,7 @@ import math
 import shutil
 import time
 import zipfile
+import zlib
 from collections.abc import Mapping
 from dataclasses import asdict
 from pathlib import Path
@@ -18,8 +19,9 @@ from numpy.typing import DTypeLike, NDArray
 from taichi_msm.divergence import Course, Saved
 from taichi_msm.dynamics import State
 from taichi_msm.errors import DamagedError
+from taichi_msm.publication import PLAN
 
-PLAN, POSITIONS, STATE = "plan.json", "positions", "state.npz"
+POSITIONS, STATE = "positions", "state.npz"
 
 # Saving the state may take this share of the time.
 SHARE = 0.02
@@ -76,7 +78,10 @@ class Checkpoint:
             DamagedError: when the files do not belong together.
             OSError: when they cannot be read.
         """
-        self._file = (self._folder / POSITIONS).open("r+b", buffering=0)
+        try:
+            self._file = (self._folder / POSITIONS).open("r+b", buffering=0)
+        except FileNotFoundError:
+            raise self._damaged(POSITIONS) from None
         saved = self.load()
         self.frames = 0 if saved is None else saved.course.frame + 1
         size = self.frames * self._frame_bytes
@@ -131,7 +136,7 @@ class Checkpoint:
                 course = Course(**{key: found[key].item() for key in asdict(Course())})
         except FileNotFoundError:
             return None
-        except (OSError, ValueError, KeyError, zipfile.BadZipFile):
+        except (OSError, ValueError, KeyError, TypeError, EOFError, RuntimeError, zipfile.BadZipFile, zlib.error):
             raise self._damaged(STATE) from None
         if state.displacement.shape != self._shape or state.difference.shape != self._shape:
             raise self._damaged(STATE)

@@ -109,7 +109,10 @@ def run(
                     progress=progress,
                 )
         except KeyboardInterrupt:
-            complain([f"interrupted; nothing was written{going_on(directory)}"])
+            said = f"interrupted; nothing was written{going_on(directory)}"
+            complain([said])
+            if as_json:
+                print_json({"status": "interrupted", "errors": [said]})
             return interruption.code
     if as_json:
         print_json({"directory": str(directory), **record})
@@ -229,7 +232,10 @@ def study(
             progress=interruptible(bar, interruption),
         )
     if not found.stepping:
-        complain(["interrupted; nothing was written"])
+        said = "interrupted; nothing was written"
+        complain([said])
+        if as_json:
+            print_json({"status": "interrupted", "errors": [said]})
         return interruption.code
     if found.status == "interrupted" and (directory / RECORD).exists():
         # An earlier study is not to be lost for a part of another.
@@ -264,9 +270,9 @@ def result_directory(out: str | None, default: str = "", option: str = "--out") 
 
 def going_on(directory: Path) -> str:
     """Say how to go on with the unfinished run into a directory; nothing where there is none."""
-    from taichi_msm.publication import checkpoint_in
+    from taichi_msm.publication import is_unfinished
 
-    if not checkpoint_in(directory).exists():
+    if not is_unfinished(directory):
         return ""
     return f"; go on with: taichi-msm run --resume {shlex.quote(str(directory))}"
 

@@ -59,10 +59,13 @@ class Saved(NamedTuple):
     course: Course
 
 
-def free_acceleration(scene: Scene) -> float:
-    """Bound the acceleration that the probes give a sheet that nothing holds [m/s^2]; 0 if a point is fixed."""
-    if scene.sheet.fixed not in ("none", ()):
-        return 0.0
+def _is_held(scene: Scene) -> bool:
+    """Tell whether springs lead from every point to one that is fixed; those of shear may leave every other one out."""
+    return scene.sheet.fixed not in ("none", ()) and scene.springs.structural > 0
+
+
+def _free_acceleration(scene: Scene) -> float:
+    """Bound the acceleration that the probes give a point that nothing holds [m/s^2]."""
     forces = (
         math.hypot(*probe.force) * max(abs(percent) for _, percent in probe.load) / 100 * math.exp(-probe.offset)
         for probe in scene.probes
@@ -72,7 +75,13 @@ def free_acceleration(scene: Scene) -> float:
 
 def farthest_displacement(scene: Scene, time: float) -> float:
     """Bound how far a point may be from rest after some time [m]; farther, the simulation has gone wrong."""
-    return MOST_SHEET_SIZES * max(scene.sheet.size) + free_acceleration(scene) * time**2 / 2
+    most = MOST_SHEET_SIZES * max(scene.sheet.size)
+    if _is_held(scene):
+        return most
+    if scene.springs.virtual > 0 and scene.springs.virtual_active == "loaded":
+        # They may pull a point from afar and let it go when it is fast.
+        return math.inf
+    return most + _free_acceleration(scene) * time * time / 2
 
 
 class Watch:
@@ -101,6 +110,7 @@ class Watch:
         self._shares = np.array([_share(grip, scene) for grip in grips(scene)])
         limit = stable_step(scene)
         self._swing = SWING / max(1e-9, 1 - (step(scene) / limit) ** 2)
+        self._least = _underflow(scene)
 
     def follow(self, dynamics: Dynamics, displacement: NDArray[np.floating]) -> str:
         """Judge a frame that was reached and, if it is fine, take note of it; the arguments are those of `judge`."""
@@ -150,7 +160,10 @@ class Watch:
         root = math.sqrt(course.energy + active * virtual * course.reach * course.reach)
         root += push * (end - begin) / math.sqrt(2 * mass)
         reach = course.reach + (end - begin) * root * math.sqrt(2 / mass)
-        return self._swing * (root * root + activations * virtual * reach * reach) + ROUNDING * course.peak
+        for _ in range(activations):
+            root = math.sqrt(root * root + virtual * reach * reach)
+            reach += (end - begin) * root * math.sqrt(2 / mass)
+        return self._swing * root * root + ROUNDING * course.peak + self._least
 
 
 class Farthest(NamedTuple):
@@ -177,6 +190,14 @@ def farthest(displacement: NDArray[np.floating]) -> Farthest:
         return Farthest(
             row, column, float(np.linalg.norm(displacement[row, column].astype(float))), math.sqrt(square.sum())
         )
+
+
+def _underflow(scene: Scene) -> float:
+    """Tell the energy below which the squares that it is summed from have no digits [J]."""
+    tiny = float(np.finfo(np.float32 if scene.time.precision == "f32" else np.float64).tiny)
+    dx, dy = spacing(scene.sheet)
+    stiffness = scene.springs.structural + scene.springs.shear
+    return math.prod(scene.sheet.points) * tiny * (scene.sheet.mass / step(scene) ** 2 + stiffness * (dx**2 + dy**2))
 
 
 def _share(grip: Grip, scene: Scene) -> float:

@@ -16,7 +16,7 @@ import time
 from collections import deque
 from collections.abc import Callable, Iterator
 from concurrent.futures import CancelledError, Future, ThreadPoolExecutor
-from contextlib import suppress
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
 from threading import Event
@@ -86,15 +86,16 @@ class Encoder:
     """
 
     def __init__(self, job: Job, inherit: tuple[int, ...] = ()) -> None:
-        self._process = subprocess.Popen(
-            [sys.executable, "-c", _CHILD.format(path=sys.path)],
-            stdin=subprocess.PIPE,
-            stdout=subprocess.PIPE,
-            pass_fds=inherit,
-            # Ctrl-C is for us alone: the pictures so far are still to be finished, as they are after a SIGTERM.
-            start_new_session=True,
-            creationflags=getattr(subprocess, "CREATE_NEW_PROCESS_GROUP", 0),
-        )
+        with _hurry_held_back():
+            self._process = subprocess.Popen(
+                [sys.executable, "-c", _CHILD.format(path=sys.path)],
+                stdin=subprocess.PIPE,
+                stdout=subprocess.PIPE,
+                pass_fds=inherit,
+                # Ctrl-C is for us alone: the pictures so far are still to be finished, as they are after a SIGTERM.
+                start_new_session=True,
+                creationflags=getattr(subprocess, "CREATE_NEW_PROCESS_GROUP", 0),
+            )
         assert self._process.stdin
         assert self._process.stdout
         self._pictures = self._process.stdin
@@ -143,6 +144,19 @@ class Encoder:
         self._process.wait()
 
 
+@contextmanager
+def _hurry_held_back() -> Iterator[None]:
+    """Start a process that gets its SIGINT when it is ready for it."""
+    if not hasattr(signal, "pthread_sigmask"):
+        yield
+        return
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+    try:
+        yield
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, before)
+
+
 def main() -> None:
     """Be the process: read a job and its pictures from stdin, report on stdout."""
     answer: Report | Exception
@@ -150,6 +164,8 @@ def main() -> None:
     # Who ends all processes of a service ends this one too; our pictures end when who asked for them does.
     signal.signal(signal.SIGTERM, signal.SIG_IGN)
     signal.signal(signal.SIGINT, lambda number, frame: hurry.set())
+    if hasattr(signal, "pthread_sigmask"):
+        signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGINT})
     try:
         answer = encode(pickle.load(sys.stdin.buffer), sys.stdin.buffer, hurry)
     except OSError as error:
@@ -174,6 +190,7 @@ def encode(job: Job, source: BinaryIO, hurry: Event) -> Report:
     """
     width, height = job.size
     depth = max(1, min(WAITING, WAITING_BYTES // (3 * width * height)))
+    parent = os.getppid()
     frames = 0
     seconds = 0.0
     pending: deque[Future[float]] = deque()
@@ -194,6 +211,8 @@ def encode(job: Job, source: BinaryIO, hurry: Event) -> Report:
                 frames += 1
             if hurry.is_set():
                 break
+            _leave_orphaned(parent)
+        _leave_orphaned(parent)
         if hurry.is_set():
             stills.shutdown(cancel_futures=True)
             reel.shutdown(cancel_futures=True)
@@ -206,6 +225,12 @@ def encode(job: Job, source: BinaryIO, hurry: Event) -> Report:
             path.unlink()
     seconds += _seconds(film.close)
     return Report(frames, seconds)
+
+
+def _leave_orphaned(parent: int) -> None:
+    """End here if who asked was killed: its directory is to be free for another run."""
+    if os.getppid() != parent:
+        os._exit(1)
 
 
 class _Film:

@@ -41,6 +41,7 @@ class Interruption:
     def _request(self, number: int, _frame: FrameType | None) -> None:
         self.code = _code(number)
         if self._requested:
+            os.write(2, b"interrupted twice; ended at once\n")
             os._exit(self.code)
         self._requested = True
 

@@ -162,7 +162,9 @@ class Envelope:
             The largest force at each grip's control point [N], shape (grips,); whether the virtual springs act at any
             time; and how often they begin to.
         """
-        first, last = self._times.searchsorted(begin, "left"), self._times.searchsorted(end, "right")
+        # A key that is at one of them but for rounding counts there, as it does for the steps.
+        first = self._times.searchsorted(begin * (1 - 2 * SNAP), "left")
+        last = self._times.searchsorted(end * (1 + 2 * SNAP), "right")
         forces = [self._at(begin), self._at(end), *self._left[first:last], *self._right[first:last]]
         active = self._active[max(0, first - 1) : last].any()
         return np.max(forces, axis=0), bool(active), int(self._begins[first:last].sum())

@@ -14,9 +14,8 @@ from numpy.typing import NDArray
 from pydantic import ValidationError
 
 from taichi_msm.accuracy import Estimate
-from taichi_msm.checkpoint import PLAN
 from taichi_msm.errors import DamagedError, FilesError
-from taichi_msm.publication import checkpoint_in
+from taichi_msm.publication import PLAN, checkpoint_in
 from taichi_msm.scene import Scene
 from taichi_msm.texture import load_texture
 
@@ -87,6 +86,8 @@ def read_plan(directory: Path) -> Plan:
     path = checkpoint_in(directory) / PLAN
     try:
         found = json.loads(path.read_text(encoding="utf-8"))
+        if not (isinstance(found["folder"], str) and isinstance(found["versions"], dict)):
+            raise TypeError
         estimate = None if found["estimate"] is None else Estimate(**found["estimate"])
         scenes = {key: Scene.model_validate(found[key]) for key in ("given", "scene")}
         return Plan(**{**found, **scenes, "overrides": tuple(found["overrides"]), "estimate": estimate})
@@ -94,7 +95,7 @@ def read_plan(directory: Path) -> Plan:
         raise FilesError(f"{directory}: there is no unfinished run to go on with") from None
     except OSError as error:
         raise FilesError(f"{path}: {(error.strerror or str(error)).lower()}") from None
-    except (ValueError, KeyError, TypeError, ValidationError):
+    except (ValueError, KeyError, TypeError, RecursionError, ValidationError):
         raise DamagedError(f"{path} is damaged; run the scene again") from None
 
 

@@ -32,10 +32,21 @@ RECORD = "run.json"
 
 STAGING = ".partial"
 
+# What makes a checkpoint one: a run's plan.
+PLAN = "plan.json"
+
 
 def checkpoint_in(directory: Path) -> Path:
     """Tell where an unfinished run into a directory keeps what it needs to go on."""
     return directory / STAGING / "checkpoint"
+
+
+def is_unfinished(directory: Path) -> bool:
+    """Tell whether there is a run into a directory to go on with."""
+    try:
+        return (checkpoint_in(directory) / PLAN).exists()
+    except OSError:
+        return False
 
 
 def frame_name(number: int) -> str:
@@ -141,6 +152,8 @@ class Publication:
             if path == self.checkpoint and self.keep:
                 continue
             if path.is_dir():
+                # First of all, so that a part of a checkpoint is none.
+                (path / PLAN).unlink(missing_ok=True)
                 shutil.rmtree(path)
             elif path != self._lock_path:
                 path.unlink()

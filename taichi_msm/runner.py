@@ -203,7 +203,8 @@ def _carry_out(
                 watch.lap("render")
                 writer.add(position, picture)
         except KeyboardInterrupt:
-            if simulation.steps > 0 and writer.stored:
+            # Who interrupts elsewhere than in `progress` may do so before the last frame is stored.
+            if simulation.steps > 0 and simulation.frame < writer.stored:
                 # What went wrong within this frame is found when it is resumed.
                 with suppress(DivergedError):
                     writer.save(simulation.save())

@@ -88,6 +88,55 @@ def test_no_fault_is_found_where_there_is_none(precision: str, active: str, devi
             assert simulation.course.peak > 1e-3
 
 
+PLAIN = {"falloff": 0, "offset": 0}
+
+# Sound, each with something that a bound could leave out.
+SOUND = {
+    "flies free, as nothing joins it to the border": scene(
+        springs={"virtual": 0.5},
+        damping=0,
+        probes=[{**PLAIN, "force": [0, 0, 0.5], "load": [[0, 0], [0.2, 100], [0.2, 0]]}],
+        time={"duration": 2.0},
+    ),
+    "virtual springs begin twice in a frame, each time farther away": scene(
+        sheet={"points": [5, 5], "size": [1, 1], "mass": 1},
+        springs={"virtual": 1600},
+        damping=0,
+        probes=[
+            {**PLAIN, "force": [0, 0, 1e-3], "load": [[9.98, 0], [9.98, 100], [9.99, 100], [9.99, 0]]},
+            {
+                **PLAIN,
+                "force": [0, 0, 1e-30],
+                "load": [
+                    [t + start, on] for start in (13.5, 18) for t, on in ((0, 0), (0, 9), (0.0395, 9), (0.0395, 0))
+                ],
+            },
+        ],
+        time={"duration": 20, "frames_per_second": 0.1, "step": 0.0005},
+    ),
+    "is let go at a frame, but for rounding": scene(
+        springs={"structural": 1},
+        damping=0,
+        probes=[{**PLAIN, "force": [0.01, 0, 0], "load": [[0, 0], [1 / 30 - 1e-16, 100], [1 / 30 - 1e-16, 0]]}],
+        time={"duration": 1, "frames_per_second": 30},
+    ),
+    "moves by less than f32 can square": scene(
+        sheet={"points": [9, 9], "size": [1e10, 1e10], "mass": 1},
+        springs={"structural": 1},
+        damping=0,
+        probes=[{**PLAIN, "force": [1e-13, 0, 0], "load": [[0, 100], [3, 100], [3, 0]]}],
+        time={"duration": 100, "frames_per_second": 1, "precision": "f32"},
+    ),
+}
+
+
+@pytest.mark.parametrize("name", SOUND)
+def test_what_is_sound_is_let_pass(name: str, device: Device, pool: Pool) -> None:
+    with Simulation(SOUND[name], threads=device.threads) as simulation:
+        simulation.advance(SOUND[name].time.frames)
+        assert simulation.course.peak > 0
+
+
 def test_springs_that_begin_to_pull_from_afar_give_energy(device: Device) -> None:
     """Twice within a frame, each for a quarter of their period, and between them the sheet flies to the other side."""
     on, off = [(0.01, 0), (0.01, 1)], [(0.017, 1), (0.017, 0)]
@@ -175,5 +224,8 @@ def test_how_far_a_point_may_be() -> None:
     # 0.05 N on 1 g is 50 m/s^2; the sheet is 0.4 m long.
     probes = [{"force": [0, 0, 0.05], "falloff": 0, "offset": 0}]
     assert farthest_displacement(scene(probes=probes), 3.0) == pytest.approx(10 * 0.4)
-    free = scene(sheet={**SHEET, "fixed": "none"}, probes=probes)
-    assert farthest_displacement(free, 3.0) == pytest.approx(10 * 0.4 + 50 * 3.0**2 / 2)
+    loose = {"sheet": {**SHEET, "fixed": "none"}, "springs": {"structural": 20}}, {"springs": {"shear": 20}}
+    for sections in loose:
+        flying = farthest_displacement(scene(probes=probes, **sections), 3.0)
+        assert flying == pytest.approx(10 * 0.4 + 50 * 3.0**2 / 2)
+    assert farthest_displacement(scene(probes=probes, springs={"virtual": 1}), 3.0) == math.inf

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import errno
+import io
 import json
 import os
 import shutil
@@ -19,8 +20,8 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from taichi_msm import FilesError, dynamics, resume, run, runner
-from taichi_msm.checkpoint import PLAN, POSITIONS, STATE, Checkpoint
-from taichi_msm.publication import checkpoint_in
+from taichi_msm.checkpoint import POSITIONS, STATE, Checkpoint
+from taichi_msm.publication import PLAN, checkpoint_in
 from taichi_msm.runtime import Device
 from taichi_msm.scene import Scene
 from taichi_msm.scene_file import load_scene
@@ -182,6 +183,13 @@ def test_another_run_begins_anew_and_keeps_what_was_there_until_it_has_a_frame(
     assert not (folder / "parts" / ".partial").exists()
 
 
+def array() -> bytes:
+    """A file of one array, where one of several should be."""
+    file = io.BytesIO()
+    np.save(file, np.zeros(3))
+    return file.getvalue()
+
+
 @pytest.mark.parametrize(
     ("name", "damage"),
     [
@@ -189,7 +197,10 @@ def test_another_run_begins_anew_and_keeps_what_was_there_until_it_has_a_frame(
         (PLAN, lambda data: b"[]"),
         (PLAN, lambda data: data.replace(b'"rows"', b'"sheep"').replace(b'"points"', b'"sheep"')),
         (STATE, lambda data: data[: len(data) // 2]),
+        (PLAN, lambda data: b"[" * 100_000),
         (STATE, lambda data: b"nothing like it"),
+        (STATE, lambda data: b""),
+        (STATE, lambda data: array()),
         (POSITIONS, lambda data: data[:-500]),
     ],
 )
