@@ -82,7 +82,7 @@ def test_the_plain_layout_of_a_gpu_gives_the_same(device: Device) -> None:
     assert simulate(made, device, layout).tobytes() == simulate(made, device).tobytes()
 
 
-@pytest.mark.parametrize("fixed", ["border", ["top"]])
+@pytest.mark.parametrize("fixed", [pytest.param("border", marks=pytest.mark.slow), ["top"]])
 def test_bands_and_passes_do_not_change_the_bits(fixed: Any, device: Device) -> None:
     made = scene(sheet={**SHEET, "points": [21, 19], "fixed": fixed}, time={"precision": "f32", "duration": 0.12})
     whole = structure(made, device)
