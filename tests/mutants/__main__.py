@@ -26,7 +26,7 @@ COPIED = ("pyproject.toml", "scenes", "taichi_msm", "tests")
 # Longer than all the tests of all mutants take together [s].
 TIMEOUT = 1800.0
 
-PYTEST = [sys.executable, "-m", "pytest", "-x", "-q", "--color=no", "-p", "no:cacheprovider"]
+PYTEST = [sys.executable, "-m", "pytest", "-x", "-q", "--color=no", "-n", "0", "-p", "no:cacheprovider"]
 PASSED, FAILED = 0, 1
 
 
