@@ -109,10 +109,7 @@ def run(
                     progress=progress,
                 )
         except KeyboardInterrupt:
-            said = f"interrupted; nothing was written{going_on(directory)}"
-            complain([said])
-            if as_json:
-                print_json({"status": "interrupted", "errors": [said]})
+            report("interrupted", [f"interrupted; nothing was written{going_on(directory)}"], as_json)
             return interruption.code
     if as_json:
         print_json({"directory": str(directory), **record})
@@ -232,10 +229,7 @@ def study(
             progress=interruptible(bar, interruption),
         )
     if not found.stepping:
-        said = "interrupted; nothing was written"
-        complain([said])
-        if as_json:
-            print_json({"status": "interrupted", "errors": [said]})
+        report("interrupted", ["interrupted; nothing was written"], as_json)
         return interruption.code
     if found.status == "interrupted" and (directory / RECORD).exists():
         # An earlier study is not to be lost for a part of another.
@@ -320,6 +314,13 @@ def complain(lines: Sequence[str]) -> None:
         click.echo(printable(line), err=True)
 
 
+def report(status: str, lines: Sequence[str], as_json: bool) -> None:
+    """Say why there are no results."""
+    complain(lines)
+    if as_json:
+        print_json({"status": status, "errors": list(lines)})
+
+
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command line.
 
@@ -332,9 +333,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     words = list(sys.argv[1:] if arguments is None else arguments)
 
     def fail(code: int, lines: Sequence[str]) -> int:
-        complain(lines)
-        if "--json" in words:
-            print_json({"status": "error", "errors": list(lines)})
+        report("error", lines, "--json" in words)
         return code
 
     try:

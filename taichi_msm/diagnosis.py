@@ -10,7 +10,7 @@ import numpy as np
 
 from taichi_msm.divergence import Course, Saved, Watch, farthest
 from taichi_msm.dynamics import Dynamics, Pause
-from taichi_msm.lattice import rest_positions
+from taichi_msm.lattice import axes
 from taichi_msm.loads import control_points
 from taichi_msm.scene import Scene
 from taichi_msm.stability import step, steps_per_frame, with_steps
@@ -114,7 +114,8 @@ def _goes_well(dynamics: Dynamics, scene: Scene, frames: int, pause: Pause) -> b
 
 def _strongest_probe(scene: Scene, point: tuple[int, int]) -> tuple[int, float]:
     """Find the probe that pushes a point hardest at any time, and how hard [N]."""
-    rest = rest_positions(scene.sheet)[point][:2]
+    x, y = axes(scene.sheet)
+    rest = np.array([x[point[1]], y[point[0], 0]])
 
     def force(index: int) -> float:
         probe = scene.probes[index]

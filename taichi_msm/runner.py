@@ -208,8 +208,9 @@ def _carry_out(
                 # What went wrong within this frame is found when it is resumed.
                 with suppress(DivergedError):
                     writer.save(simulation.save())
-            writer.finish(hurry=True)
-            # Frames that were there before are no new results.
+            # Frames that were there before are no new results; in a hurry, new ones may be given up.
+            if writer.frames > resumed:
+                writer.finish(hurry=True)
             if writer.frames <= resumed:
                 raise
             ending = {"status": "interrupted"}
