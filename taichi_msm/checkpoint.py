@@ -16,7 +16,7 @@ from typing import Any, BinaryIO
 import numpy as np
 from numpy.typing import DTypeLike, NDArray
 
-from taichi_msm.divergence import Course, Saved
+from taichi_msm.course import Course, Saved
 from taichi_msm.dynamics import State
 from taichi_msm.errors import DamagedError
 from taichi_msm.publication import PLAN

@@ -8,7 +8,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from taichi_msm.divergence import Course, Saved, Watch, farthest
+from taichi_msm.course import Course, Saved
+from taichi_msm.divergence import Watch, farthest
 from taichi_msm.dynamics import Dynamics, Pause
 from taichi_msm.lattice import axes
 from taichi_msm.loads import control_points

@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from taichi_msm.dynamics import Dynamics, State
+from taichi_msm.course import Course
+from taichi_msm.dynamics import Dynamics
 from taichi_msm.lattice import axes, spacing
 from taichi_msm.loads import Envelope, Grip, decay, grips
 from taichi_msm.scene import Scene
@@ -24,39 +24,6 @@ SWING = 4.0
 
 # What rounding may make of the largest energy there was.
 ROUNDING = 1e-9
-
-
-@dataclass(frozen=True)
-class Course:
-    """What is known of a run at a frame, besides where the points are.
-
-    Attributes:
-        frame: its number.
-        max_displacement: largest displacement of any frame so far [m].
-        shortest_spring: smallest length of a spring over its rest length at any frame so far.
-        energy: of motion and springs, without the virtual ones, at this frame [J].
-        reach: root of the sum of all squared displacements at this frame [m].
-        peak: largest energy of any frame so far [J].
-    """
-
-    frame: int = 0
-    max_displacement: float = 0.0
-    shortest_spring: float = 1.0
-    energy: float = 0.0
-    reach: float = 0.0
-    peak: float = 0.0
-
-
-class Saved(NamedTuple):
-    """Where a run was.
-
-    Attributes:
-        state: at some step.
-        course: of the last frame up to it.
-    """
-
-    state: State
-    course: Course
 
 
 def _is_held(scene: Scene) -> bool:

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from taichi_msm.checkpoint import Checkpoint
-from taichi_msm.divergence import Saved
+from taichi_msm.course import Saved
 from taichi_msm.encoding import Encoder, Job
 from taichi_msm.errors import writing
 from taichi_msm.gif import Picture

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from taichi_msm import __version__, accuracy, budget, runtime
 from taichi_msm.accuracy import Estimate
-from taichi_msm.divergence import Course
+from taichi_msm.course import Course
 from taichi_msm.errors import DamagedError, DivergedError, FilesError, writing
 from taichi_msm.files import ResultWriter
 from taichi_msm.notes import notes

@@ -11,8 +11,9 @@ from numpy.typing import NDArray
 from taichi_msm import runtime
 from taichi_msm.accuracy import choose_step
 from taichi_msm.camera import View
+from taichi_msm.course import Course, Saved
 from taichi_msm.diagnosis import Diagnosis, diagnose
-from taichi_msm.divergence import Course, Saved, Watch
+from taichi_msm.divergence import Watch
 from taichi_msm.dynamics import Dynamics, Pause
 from taichi_msm.errors import DivergedError, MsmError
 from taichi_msm.lattice import axes

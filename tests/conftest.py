@@ -5,9 +5,11 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
+from PIL import Image
 
 from taichi_msm import accuracy, runtime, simulation
 from tests.pool import Pool
+from tests.scenes import SMALL, speckle
 
 
 @pytest.fixture(scope="session")
@@ -41,3 +43,12 @@ def pool(sheets: Pool, monkeypatch: pytest.MonkeyPatch) -> Pool:
     monkeypatch.setattr(accuracy, "Dynamics", sheets.lend)
     monkeypatch.setattr(simulation, "Dynamics", sheets.lend)
     return sheets
+
+
+@pytest.fixture
+def small(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """A directory to work in, with small.yaml and its picture."""
+    Image.fromarray(speckle(30, 40)).save(tmp_path / "speckle.png")
+    (tmp_path / "small.yaml").write_text(SMALL)
+    monkeypatch.chdir(tmp_path)
+    return tmp_path

@@ -14,6 +14,21 @@ SPRINGS = {"structural": 20, "shear": 10, "virtual": 0.5}
 PRESS = {"force": [0, 3000, -10000], "load": [[0, 0], [0.1, 100], [0.2, 100], [0.2, 0]], "falloff": 20}
 
 
+# A scene as its file has it, with a picture beside it.
+SMALL = """\
+image: speckle.png
+sheet: {points: [9, 11], size: [0.3, 0.4], mass: 1.0e-3}
+springs: {structural: 20, shear: 10, virtual: 0.5}
+damping: 0.01
+probes:
+  - force: [0, 300, -1000]
+    load: [[0, 0], [0.1, 100], [0.2, 100], [0.2, 0]]
+    falloff: 20
+time: {duration: 0.4, frames_per_second: 10}
+render: {size: [40, 30], refine: 1}
+"""
+
+
 def scene(**sections: Any) -> Scene:
     """A small scene in f64 that simulates only; sections given replace its own, keys of time are added."""
     return Scene.model_validate(

@@ -19,29 +19,7 @@ from PIL import Image
 from taichi_msm import console, reference
 from taichi_msm.cli import main
 from taichi_msm.scene_file import load_scene
-from tests.scenes import speckle
-
-SMALL = """\
-image: speckle.png
-sheet: {points: [9, 11], size: [0.3, 0.4], mass: 1.0e-3}
-springs: {structural: 20, shear: 10, virtual: 0.5}
-damping: 0.01
-probes:
-  - force: [0, 300, -1000]
-    load: [[0, 0], [0.1, 100], [0.2, 100], [0.2, 0]]
-    falloff: 20
-time: {duration: 0.4, frames_per_second: 10}
-render: {size: [40, 30], refine: 1}
-"""
-
-
-@pytest.fixture
-def small(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """A directory to work in, with small.yaml and its picture."""
-    Image.fromarray(speckle(30, 40)).save(tmp_path / "speckle.png")
-    (tmp_path / "small.yaml").write_text(SMALL)
-    monkeypatch.chdir(tmp_path)
-    return tmp_path
+from tests.scenes import SMALL, speckle
 
 
 def program(*arguments: str, **options: Any) -> subprocess.CompletedProcess[str]:

@@ -10,8 +10,9 @@ import numpy as np
 import pytest
 
 from taichi_msm import DivergedError, Simulation
+from taichi_msm.course import Course, Saved
 from taichi_msm.diagnosis import Diagnosis
-from taichi_msm.divergence import Course, Saved, farthest_displacement
+from taichi_msm.divergence import farthest_displacement
 from taichi_msm.dynamics import State
 from taichi_msm.runtime import Device
 from taichi_msm.scene import Scene

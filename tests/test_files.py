@@ -21,6 +21,7 @@ from taichi_msm.encoding import Encoder
 from taichi_msm.errors import FilesError
 from taichi_msm.files import ResultWriter
 from taichi_msm.scene import Scene
+from tests.outputs import files
 from tests.scenes import scene, speckle
 
 ROWS, COLS = 3, 4
@@ -67,10 +68,6 @@ def write(directory: Path, frames: int, scene: Scene) -> list[str]:
         names = writer.publish({"frames": frames})
         assert writer.frames == frames
     return names
-
-
-def files(directory: Path) -> dict[str, bytes]:
-    return {str(p.relative_to(directory)): p.read_bytes() for p in directory.rglob("*") if p.is_file()}
 
 
 def test_all_results_of_a_run(tmp_path: Path) -> None:

@@ -25,37 +25,23 @@ from taichi_msm.publication import PLAN, checkpoint_in
 from taichi_msm.runtime import Device
 from taichi_msm.scene import Scene
 from taichi_msm.scene_file import load_scene
+from tests.outputs import files, results
 from tests.pool import Pool
 from tests.scenes import speckle
-from tests.test_files import files
 
-SCENE = """\
-image: speckle.png
-sheet: {points: [9, 11], size: [0.3, 0.4], mass: 1.0e-3}
-springs: {structural: 20, shear: 10, virtual: 0.5}
-damping: 0.01
-probes:
-  - at: [[0, 0.2, 0.5], [2, 0.8, 0.5]]
-    force: [0, 300, -1000]
-    load: [[0, 0], [0.1, 100], [1.5, 100], [1.5, 0]]
-    falloff: 20
-time: {duration: 2, frames_per_second: 50, step: 2.0e-5}
-render: {size: [40, 30], refine: 1}
-"""
+# Pressed while the tool moves, in many steps a frame.
+SETTINGS = (
+    "probes.0.at=[[0, 0.2, 0.5], [2, 0.8, 0.5]]",
+    "probes.0.load=[[0, 0], [0.1, 100], [1.5, 100], [1.5, 0]]",
+    "time.duration=2",
+    "time.frames_per_second=50",
+    "time.step=2.0e-5",
+)
 
 
-@pytest.fixture
-def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """A directory to work in, with scene.yaml and its picture."""
-    Image.fromarray(speckle(30, 40)).save(tmp_path / "speckle.png")
-    (tmp_path / "scene.yaml").write_text(SCENE)
-    monkeypatch.chdir(tmp_path)
-    return tmp_path
-
-
-def results(directory: Path) -> dict[str, bytes]:
-    """All files but the record, which tells the time."""
-    return {name: data for name, data in files(directory).items() if name != "run.json"}
+def dragged(*overrides: str) -> Scene:
+    """The small scene with these settings and others."""
+    return load_scene("small.yaml", [*SETTINGS, *overrides])
 
 
 def published(directory: Path) -> dict[str, bytes]:
@@ -87,40 +73,38 @@ def interrupted(made: Scene, directory: str, device: Device, after: int = 12) ->
     "output", ["png, gif, trajectory", pytest.param("gif", marks=pytest.mark.slow), "trajectory", ""]
 )
 def test_a_run_that_is_interrupted_goes_on_to_the_same_bits(
-    output: str, folder: Path, device: Device, pool: Pool, monkeypatch: pytest.MonkeyPatch
+    output: str, small: Path, device: Device, pool: Pool, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Again and again, at a frame's end and within one, and while earlier frames are drawn anew."""
     monkeypatch.setattr(dynamics, "MAX_STEPS_PER_LAUNCH", 300)
-    made = load_scene("scene.yaml", ["time.duration=0.12", f"output=[{output}]"])
+    made = dragged("time.duration=0.12", f"output=[{output}]")
     whole = run(made, "whole", threads=device.threads)
     record = run(made, "parts", threads=device.threads, progress=Stop(5))
     steps = []
     for after in range(4, 40, 4):
         assert record["status"] == "interrupted"
-        with np.load(checkpoint_in(folder / "parts") / STATE) as state:
+        with np.load(checkpoint_in(small / "parts") / STATE) as state:
             steps.append(int(state["steps"]))
-        before = published(folder / "parts")
+        before = published(small / "parts")
         try:
             # From another directory: what the plan names is found all the same.
-            monkeypatch.chdir(folder / "whole")
+            monkeypatch.chdir(small / "whole")
             record = resume("../parts", threads=device.threads, progress=Stop(after))
         except KeyboardInterrupt:
-            assert published(folder / "parts") == before, "no frame more, and nothing lost"
+            assert published(small / "parts") == before, "no frame more, and nothing lost"
         if record["status"] == "complete":
             break
     assert record["status"] == "complete"
     assert steps == sorted(steps)
     assert any(step % 1000 for step in steps), "within a frame"
-    assert results(folder / "parts") == results(folder / "whole")
+    assert results(small / "parts") == results(small / "whole")
     for key in ("steps", "frames", "max_displacement", "shortest_spring", "notes", "outputs", "scene", "overrides"):
         assert record[key] == whole[key]
-    assert not (folder / "parts" / ".partial").exists()
+    assert not (small / "parts" / ".partial").exists()
 
 
-def test_the_error_estimated_at_the_start_is_kept(folder: Path, device: Device, pool: Pool) -> None:
-    made = load_scene(
-        "scene.yaml", ["time.step=auto", "time.tolerance=0.01", "time.duration=0.2", "output=[trajectory]"]
-    )
+def test_the_error_estimated_at_the_start_is_kept(small: Path, device: Device, pool: Pool) -> None:
+    made = dragged("time.step=auto", "time.tolerance=0.01", "time.duration=0.2", "output=[trajectory]")
     record = interrupted(made, "parts", device)
     again = resume("parts", threads=device.threads)
     assert again["status"] == "complete"
@@ -130,12 +114,12 @@ def test_the_error_estimated_at_the_start_is_kept(folder: Path, device: Device, 
 
 
 def test_a_run_that_finds_the_disk_full_goes_on_when_it_is_not(
-    folder: Path, device: Device, pool: Pool, monkeypatch: pytest.MonkeyPatch
+    small: Path, device: Device, pool: Pool, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    made = load_scene("scene.yaml", ["time.duration=0.2", "output=[trajectory]"])
+    made = dragged("time.duration=0.2", "output=[trajectory]")
     run(made, "whole", threads=device.threads)
     run(made, "parts", threads=device.threads, overrides=["earlier"])
-    earlier = files(folder / "parts")
+    earlier = files(small / "parts")
     add = Checkpoint.add
 
     def full(checkpoint: Checkpoint, position: NDArray[Any]) -> None:
@@ -149,38 +133,38 @@ def test_a_run_that_finds_the_disk_full_goes_on_when_it_is_not(
         patch.setattr(Checkpoint, "add", full)
         with pytest.raises(FilesError, match="No space left on device; free some space or choose another --out"):
             run(made, "parts", threads=device.threads)
-    left = files(folder / "parts")
+    left = files(small / "parts")
     assert {name: left[name] for name in earlier} == earlier
     assert sorted(set(left) - set(earlier)) == [f".partial/checkpoint/{name}" for name in (PLAN, POSITIONS, STATE)]
     assert 0 < resume("parts", threads=device.threads)["resumed"] <= 6
-    assert results(folder / "parts") == results(folder / "whole")
+    assert results(small / "parts") == results(small / "whole")
 
 
-def test_the_same_run_typed_again_goes_on(folder: Path, device: Device, pool: Pool) -> None:
+def test_the_same_run_typed_again_goes_on(small: Path, device: Device, pool: Pool) -> None:
     """Who did not see that a run was unfinished loses nothing of it."""
-    made = load_scene("scene.yaml", ["time.duration=0.2", "output=[trajectory]"])
+    made = dragged("time.duration=0.2", "output=[trajectory]")
     run(made, "whole", threads=device.threads)
     left = interrupted(made, "parts", device)
     assert run(made, "parts", threads=device.threads)["resumed"] == left["frames"]
-    assert results(folder / "parts") == results(folder / "whole")
-    assert not (folder / "parts" / ".partial").exists()
+    assert results(small / "parts") == results(small / "whole")
+    assert not (small / "parts" / ".partial").exists()
     with pytest.raises(FilesError, match="parts: there is no unfinished run to go on with"):
         resume("parts", threads=device.threads)
 
 
 @pytest.mark.parametrize("change", ["damping=0.02", "sheet.points=[9,12]"])
 def test_another_run_begins_anew_and_keeps_what_was_there_until_it_has_a_frame(
-    change: str, folder: Path, device: Device, pool: Pool
+    change: str, small: Path, device: Device, pool: Pool
 ) -> None:
     settings = ["time.duration=0.2", "output=[trajectory]"]
-    interrupted(load_scene("scene.yaml", settings), "parts", device)
-    before = files(folder / "parts")
-    other = load_scene("scene.yaml", [*settings, change])
+    interrupted(dragged(*settings), "parts", device)
+    before = files(small / "parts")
+    other = dragged(*settings, change)
     with pytest.raises(KeyboardInterrupt):
         run(other, "parts", threads=device.threads, progress=Stop(0))
-    assert files(folder / "parts") == before
+    assert files(small / "parts") == before
     assert run(other, "parts", threads=device.threads)["resumed"] == 0
-    assert not (folder / "parts" / ".partial").exists()
+    assert not (small / "parts" / ".partial").exists()
 
 
 def array() -> bytes:
@@ -205,34 +189,34 @@ def array() -> bytes:
     ],
 )
 def test_what_is_damaged_is_not_gone_on_with(
-    name: str, damage: Callable[[bytes], bytes], folder: Path, device: Device, pool: Pool
+    name: str, damage: Callable[[bytes], bytes], small: Path, device: Device, pool: Pool
 ) -> None:
-    made = load_scene("scene.yaml", ["time.duration=0.2", "output=[trajectory]"])
+    made = dragged("time.duration=0.2", "output=[trajectory]")
     interrupted(made, "parts", device)
     path = checkpoint_in(Path("parts")) / name
     path.write_bytes(damage(path.read_bytes()))
-    before = files(folder / "parts")
+    before = files(small / "parts")
     with pytest.raises(FilesError, match=rf"^parts/.partial/checkpoint/{name} is damaged; run the scene again"):
         resume("parts", threads=device.threads)
-    assert files(folder / "parts") == before
+    assert files(small / "parts") == before
     # The scene itself is run as if nothing were there, or what there is were another's.
     assert run(made, "parts", threads=device.threads)["resumed"] == 0
 
 
 def test_another_picture_or_version_is_not_gone_on_with(
-    folder: Path, device: Device, pool: Pool, monkeypatch: pytest.MonkeyPatch
+    small: Path, device: Device, pool: Pool, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    interrupted(load_scene("scene.yaml", ["time.duration=0.2"]), "parts", device)
-    before = files(folder / "parts")
+    interrupted(dragged("time.duration=0.2"), "parts", device)
+    before = files(small / "parts")
     others = {**runner.versions(), "taichi": "1.7.99"}
     with monkeypatch.context() as patch:
         patch.setattr(runner, "versions", lambda: others)
         with pytest.raises(FilesError, match=r"^the run was begun with taichi 1\.7\.\d; take these, or run the scene"):
             resume("parts", threads=device.threads)
-    Image.fromarray(speckle(30, 40, 1)).save(folder / "speckle.png")
+    Image.fromarray(speckle(30, 40, 1)).save(small / "speckle.png")
     with pytest.raises(FilesError, match=r"^speckle\.png is another picture than when the run began; run the scene"):
         resume("parts", threads=device.threads)
-    assert files(folder / "parts") == before
+    assert files(small / "parts") == before
 
 
 def killed(arguments: list[str], seconds: float) -> bool:
@@ -251,27 +235,28 @@ def killed(arguments: list[str], seconds: float) -> bool:
 
 @pytest.mark.skipif(sys.platform == "win32", reason="kills with SIGKILL")
 @pytest.mark.parametrize("kills", [5, pytest.param(50, marks=pytest.mark.slow)])
-def test_a_run_that_is_killed_at_any_moment_goes_on_to_the_same_bits(kills: int, folder: Path) -> None:
+def test_a_run_that_is_killed_at_any_moment_goes_on_to_the_same_bits(kills: int, small: Path) -> None:
+    begin = ["small.yaml", *(word for setting in SETTINGS for word in ("--set", setting)), "--out"]
     for _ in range(2):
         # The second time kernels are compiled, as they are for those that are killed.
         start = time.perf_counter()
-        assert not killed(["scene.yaml", "--out", "whole"], 100)
+        assert not killed([*begin, "whole"], 100)
         whole = time.perf_counter() - start
     random = np.random.default_rng(kills)
     done = 0
     while done < kills:
-        shutil.rmtree(folder / "parts", ignore_errors=True)
+        shutil.rmtree(small / "parts", ignore_errors=True)
         going = True
         while going:
-            begun = (checkpoint_in(folder / "parts") / PLAN).exists()
+            begun = (checkpoint_in(small / "parts") / PLAN).exists()
             # Mostly while it works, which it begins after half of the time, and else at its start or end.
             seconds = whole * random.uniform(0.4, 1.1) if done < kills else 100
-            going = killed(["--resume", "parts"] if begun else ["scene.yaml", "--out", "parts"], seconds)
+            going = killed(["--resume", "parts"] if begun else [*begin, "parts"], seconds)
             done += going
             if going:
-                assert_readable(folder / "parts")
-        assert results(folder / "parts") == results(folder / "whole")
-        assert not (folder / "parts" / ".partial").exists()
+                assert_readable(small / "parts")
+        assert results(small / "parts") == results(small / "whole")
+        assert not (small / "parts" / ".partial").exists()
 
 
 def assert_readable(directory: Path) -> None:

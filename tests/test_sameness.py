@@ -11,6 +11,8 @@ from pathlib import Path
 
 import pytest
 
+from tests.outputs import results
+
 # Large enough for two workers to step it.
 SETTINGS = ("sheet.points=[95,95]", "time.duration=0.08", "render.size=[64,48]", "render.refine=1")
 
@@ -86,12 +88,6 @@ def runs(tmp_path_factory: pytest.TempPathFactory, root: Path) -> Runs:
         [sys.executable, "-c", TWICE, scene, *NAMES[2:], *SETTINGS], cwd=folder / "here", env=kept, check=True
     )
     return Runs(folder, printed)
-
-
-def results(directory: Path) -> dict[str, bytes]:
-    """Read what a run wrote but for its record, which holds times."""
-    files = (path for path in directory.rglob("*") if path.is_file() and path.name != "run.json")
-    return {str(path.relative_to(directory)): path.read_bytes() for path in files}
 
 
 @pytest.mark.parametrize(

@@ -459,12 +459,12 @@ def test_the_first_thousand_faults_are_enough() -> None:
     assert len(yaml_reader.read("- *a\n" * 2000).faults) == yaml_reader.MAX_FAULTS
 
 
-def test_a_huge_file_is_not_read(load: Load) -> None:
+@pytest.mark.usefixtures("load")
+def test_a_huge_file_is_not_read() -> None:
     with Path("huge.yaml").open("wb") as file:
         file.truncate(10**10)
     with pytest.raises(SceneError, match=r"^huge\.yaml: larger than 1 MiB; a scene is smaller$"):
         load_scene("huge.yaml")
-    assert load is not None
 
 
 def test_no_object_is_made_of_a_tag(load: Load) -> None:
