@@ -63,10 +63,48 @@ def problems(scene: Scene) -> Iterator[Problem]:
         )
 
 
+def pinhole(scene: Scene) -> Camera:
+    """Give the scene's camera as a pinhole; for the orthographic one from straight above, the sheet as large."""
+    camera = scene.render.camera
+    if isinstance(camera, Camera):
+        return camera
+    if camera == "oblique":
+        return _oblique(scene)
+    half_height = scene.render.size[1] / 2 / _top_scale(scene)
+    return Camera(eye=(0.0, 0.0, half_height / math.tan(math.radians(OBLIQUE_FOV) / 2)), fov=OBLIQUE_FOV)
+
+
+def turned(camera: Camera, right: float, up: float) -> Camera:
+    """Carry a camera around its target.
+
+    Args:
+        camera: where it was.
+        right: angle about the sheet's normal [rad].
+        up: angle about the camera's own horizontal axis, over the sheet [rad].
+    """
+    across, _, toward = _axes(camera)
+    turn = _rotation(np.array([0.0, 0.0, 1.0]), right) @ _rotation(across, -up)
+    eye = np.array(camera.target) + turn @ np.subtract(camera.eye, camera.target)
+    above = turn @ np.cross(toward, across)
+    return camera.model_copy(update={"eye": tuple(eye.tolist()), "up": tuple(above.tolist())})
+
+
+def _rotation(axis: Array, angle: float) -> Array:
+    """Rotate about a unit vector: Rodrigues' formula."""
+    x, y, z = axis
+    cross = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
+    return np.eye(3) + math.sin(angle) * cross + (1 - math.cos(angle)) * cross @ cross
+
+
+def _top_scale(scene: Scene) -> float:
+    """Give the pixels of a metre that fit the rest rectangle into the picture."""
+    (height, width), (columns, lines) = scene.sheet.size, scene.render.size
+    return min(columns / width, lines / height)
+
+
 def _top(scene: Scene) -> View:
     """Look straight down, the rest rectangle fitted into the picture at one scale and centred."""
-    (height, width), (columns, lines) = scene.sheet.size, scene.render.size
-    scale = min(columns / width, lines / height)
+    (columns, lines), scale = scene.render.size, _top_scale(scene)
     matrix = np.array([[scale, 0, 0, columns / 2], [0, -scale, 0, lines / 2], [0, 0, 0, 1], [0, 0, -1, 0]], dtype=float)
     return View(matrix, np.array([0.0, 0.0, 1.0]), 0.0)
 

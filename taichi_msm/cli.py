@@ -12,6 +12,7 @@ import shlex
 import sys
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -241,6 +242,78 @@ def study(
         print_summary(found, Console())
         click.echo(printable(f"{directory}: {', '.join(outputs)}"))
     return EXIT_CODES.get(found.status, interruption.code)
+
+
+@program.command()
+@scene_argument
+@click.option("--out", metavar="DIR", help="Where goes what you save.  [default: output/<name of the scene file>-live]")
+@image_option
+@set_option
+@arch_option
+@threads_option
+@click.option("--play", is_flag=True, help="Let the scene's probes do what the scene says, too.")
+@click.option("--record", metavar="FILE.gif", help="Without a window: film the session.")
+@click.option("--seconds", type=click.FloatRange(min=0, max=3600, min_open=True), metavar="N", help="How long to film.")
+@click.option("--script", metavar="EVENTS", help="What happens in the film: a YAML file of events.")
+def view(
+    scene: str,
+    out: str | None,
+    image: str | None,
+    overrides: tuple[str, ...],
+    arch: str,
+    threads: int | None,
+    play: bool,
+    record: str | None,
+    seconds: float | None,
+    script: str | None,
+) -> int:
+    """Press the tissue of SCENE with the mouse."""
+    from taichi_msm.scene_file import load_scene
+
+    if (record is None) != (seconds is None):
+        raise click.UsageError("--record FILE.gif and --seconds N go together")
+    if record is None and script is not None:
+        raise click.UsageError("--script is for --record; in the window it is your hand that presses")
+    if record is not None and Path(record).suffix.lower() != ".gif":
+        raise click.BadParameter(f"{record} has no name of a GIF; let it end in .gif", param_hint="--record")
+    loaded = load_scene(scene, overrides, image)
+    directory = result_directory(out, f"{Path(scene).stem}-live")
+
+    from taichi_msm.live.script import load_script, timed
+
+    done = load_script(script) if script is not None else None
+
+    from taichi_msm.console import Progress
+    from taichi_msm.live.album import Album
+    from taichi_msm.live.film import film
+    from taichi_msm.live.session import Session
+    from taichi_msm.live.window import Window, show
+
+    album, interruption = Album(directory, scene), Interruption()
+
+    def begin() -> Session:
+        with Progress(quiet=False) as bar:
+            progress = interruptible(bar, interruption)
+            return Session(loaded, album, arch, threads, play=play, progress=lambda stage: progress(stage, 0, 0))
+
+    try:
+        with naming(scene):
+            if record is None or seconds is None:
+                with Window(f"taichi-msm {scene}", loaded.render.size) as window, begin() as session:
+                    show(session, window, interruption.grant)
+            else:
+                with begin() as session, Progress(quiet=False) as bar:
+                    events = timed(done, session.rate) if done else ()
+                    progress = partial(interruptible(bar, interruption), "film")
+                    complain(film(session, Path(record), seconds, events, progress))
+                click.echo(printable(record))
+    except KeyboardInterrupt:
+        report("interrupted", ["interrupted" if record is None else "interrupted; no film was written"], as_json=False)
+        return interruption.code
+    finally:
+        for path in album.kept:
+            click.echo(printable(str(path)))
+    return DIVERGED if record is not None and session.fault else DONE
 
 
 def unfinished(context: click.Context, directory: str) -> Path:

@@ -25,6 +25,7 @@ STAGES = {
     "drawing": "measuring the drawing",
     "terms": "measuring every term",
     "write": "writing",
+    "film": "filming",
 }
 
 

@@ -40,15 +40,21 @@ def _free_acceleration(scene: Scene) -> float:
     return sum(forces) / scene.sheet.mass
 
 
-def farthest_displacement(scene: Scene, time: float) -> float:
-    """Bound how far a point may be from rest after some time [m]; farther, the simulation has gone wrong."""
+def farthest_displacement(scene: Scene, time: float, acceleration: float | None = None) -> float:
+    """Bound how far a point may be from rest [m]; farther, the simulation has gone wrong.
+
+    Args:
+        scene: what is run.
+        time: since the beginning [s].
+        acceleration: most that the probes have given a point that nothing holds [m/s^2]; None: what the scene's give.
+    """
     most = MOST_SHEET_SIZES * max(scene.sheet.size)
     if _is_held(scene):
         return most
     if scene.springs.virtual > 0 and scene.springs.virtual_active == "loaded":
         # They may pull a point from afar and let it go when it is fast.
         return math.inf
-    return most + _free_acceleration(scene) * time * time / 2
+    return most + (_free_acceleration(scene) if acceleration is None else acceleration) * time * time / 2
 
 
 class Watch:
@@ -74,10 +80,17 @@ class Watch:
         self.course = course or Course()
         self._scene = scene
         self._loads = Envelope(scene)
+        self._acceleration = _free_acceleration(scene)
         self._shares = np.array([_share(grip, scene) for grip in grips(scene)])
         limit = stable_step(scene)
         self._swing = SWING / max(1e-9, 1 - (step(scene) / limit) ** 2)
         self._least = _underflow(scene)
+
+    def steer(self, scene: Scene) -> None:
+        """Expect other loads from here on; their control points move if they did."""
+        self._scene = scene
+        self._loads = Envelope(scene)
+        self._acceleration = max(self._acceleration, _free_acceleration(scene))
 
     def follow(self, dynamics: Dynamics, displacement: NDArray[np.floating]) -> str:
         """Judge a frame that was reached and, if it is fine, take note of it; the arguments are those of `judge`."""
@@ -107,7 +120,7 @@ class Watch:
         begin, end = self.course.frame / self._scene.time.frames_per_second, dynamics.steps_done * step(self._scene)
         point, distance, energy = f"point ({where.row}, {where.column})", where.distance, dynamics.energy
         # Written so that NaN is found as well: it is not below anything.
-        if not distance <= farthest_displacement(self._scene, end):
+        if not distance <= farthest_displacement(self._scene, end, self._acceleration):
             size = max(self._scene.sheet.size)
             return f"{point} is {distance:g} m from its rest position, and the sheet is {size:g} m long"
         most = self._most_energy(begin, end)

@@ -38,7 +38,7 @@ from taichi_msm.lattice import axes, fixed_points, spacing
 from taichi_msm.loads import decay, grips, schedule
 from taichi_msm.runtime import Device, available_threads
 from taichi_msm.scene import Scene
-from taichi_msm.stability import step
+from taichi_msm.stability import step, steps_per_frame
 from taichi_msm.sweep import Sweep
 
 # Lanes of a 256-bit vector.
@@ -162,6 +162,22 @@ class Dynamics:
             raise ValueError("this scene needs another kernel; make another Dynamics")
         self.scene = scene
         self._begin(state)
+
+    def steer(self, scene: Scene) -> None:
+        """Go on from here with other loads.
+
+        Args:
+            scene: the scene with other keys of loads and control points; those of control points that stand, and all
+                numbers else, are the same.
+
+        Raises:
+            ValueError: when it needs another kernel.
+        """
+        if tuple(grip.moves for grip in grips(scene)) != self.structure.grips:
+            raise ValueError("these probes need another kernel; make another Dynamics")
+        self.scene = scene
+        # Who steers does so again in a frame.
+        self._first_tabled, self._loads = self.steps_done, self._table(self.steps_done, steps_per_frame(scene))
 
     def advance(self, steps: int, pause: Pause = lambda: None) -> None:
         """Take a number of steps.

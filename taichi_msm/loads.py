@@ -109,8 +109,8 @@ def decay(grip: Grip, scene: Scene) -> Array:
 
 def _between(times: Array, values: Array, t: Array, after: NDArray[np.intp], before: float | Array) -> Array:
     """Interpolate between the keys after[n] - 1 and after[n]; `before` the first key, the last value after the last."""
-    low = np.clip(after - 1, 0, len(times) - 1)
-    high = np.clip(after, 0, len(times) - 1)
+    low = np.maximum(after - 1, 0)
+    high = np.minimum(after, len(times) - 1)
     span = times[high] - times[low]
     share = np.divide(t - times[low], span, out=np.zeros_like(t), where=span > 0)
     shape = (-1,) + (1,) * (values.ndim - 1)
@@ -256,9 +256,12 @@ def _both_sides(scene: Scene, t: Array) -> tuple[Array, Schedule, Schedule]:
 
 
 def _snap(t: Array, keys: Array) -> Array:
-    """Move every time that is on a key but for rounding onto the key."""
-    for key in keys[np.isfinite(keys)]:
-        t = np.where(np.abs(t - key) <= SNAP * abs(key), key, t)
+    """Move every time that is on a key but for rounding onto the key; the keys are in order."""
+    keys = keys[np.isfinite(keys)]
+    after = keys.searchsorted(t)
+    for index in (np.maximum(after - 1, 0), np.minimum(after, len(keys) - 1)) if keys.size else ():
+        key = keys[index]
+        t = np.where(np.abs(t - key) <= SNAP * np.abs(key), key, t)
     return t
 
 

@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import Any
 
 from taichi_msm.errors import DeviceError
+from taichi_msm.silence import silenced
 
 __all__ = [
     "ARCHS",
@@ -20,6 +21,7 @@ __all__ = [
     "Device",
     "FieldTree",
     "available_threads",
+    "open_window",
     "quick_compilation",
     "start",
     "started",
@@ -127,6 +129,27 @@ def start(arch: str = "cpu", threads: int | None = None) -> Device:
             f"start another process for {wanted.arch} with {wanted.threads}"
         )
     return _device
+
+
+def open_window(title: str, size: tuple[int, int]) -> Any:
+    """Open Taichi's window, which needs no GPU; pixels are written to its `img`, one number each, rows from the top.
+
+    Args:
+        title: of the window.
+        size: width, height [px].
+
+    Raises:
+        DeviceError: when there is no display.
+    """
+    try:
+        with silenced(1, 2):
+            window = ti.GUI(title, res=size, fast_gui=True)
+    except RuntimeError:
+        raise DeviceError(
+            "there is no display to open a window on; set DISPLAY, or film without one: --record FILE.gif --seconds N"
+        ) from None
+    window.fps_limit = None
+    return window
 
 
 @contextlib.contextmanager

@@ -22,6 +22,21 @@ MAX_BYTES = 2**20
 # Nobody reads further, and a broken file of the greatest size has tens of thousands.
 MAX_LINES = 100
 
+
+class Kind(NamedTuple):
+    """What a file should be.
+
+    Attributes:
+        name: what it is called.
+        needs: the keys that it must have.
+    """
+
+    name: str
+    needs: str
+
+
+_SCENE = Kind("scene", "sheet, springs and time")
+
 _NO_KEY = Problem((), "expected KEY=VALUE, such as sheet.points=[61,61]")
 _NO_PATH = Problem((), "expected a key such as sheet.points")
 _INDEX = re.compile("[0-9]{1,9}")
@@ -46,7 +61,7 @@ def load_scene(
     Raises:
         SceneError: all problems of the scene, one line each, in the order in which they stand.
     """
-    draft = _Draft(str(path), _read_file(str(path)))
+    draft = Draft(str(path), read_file(str(path), _SCENE))
     for override in _parse_overrides(overrides):
         draft.override(override)
     if image is None:
@@ -133,11 +148,15 @@ class _Place(NamedTuple):
     name: str
 
 
-class _Draft:
-    """A scene as given so far.
+class Draft:
+    """A file as given so far.
+
+    Args:
+        name: the file's.
+        document: what it says.
 
     Attributes:
-        data: what the scene says.
+        data: what it says, with its overrides.
         found: what is wrong with it, and where.
     """
 
@@ -228,36 +247,40 @@ def _is_below(path: Path, folder: Path) -> bool:
         return True
 
 
-def _read_file(name: str) -> Document:
-    """Read the file, whatever it says, as long as it is a mapping."""
-    text = _read_text(name)
+def read_file(name: str, kind: Kind) -> Document:
+    """Read a file, whatever it says, as long as it is a mapping.
+
+    Raises:
+        SceneError: when it is none, or cannot be read.
+    """
+    text = _read_text(name, kind)
     try:
         document = read(text)
     except UnreadableError as error:
         raise _error(f"{name}:{error.mark.line}:{error.mark.column}", str(error)) from None
     if document.data is None:
-        raise _error(f"{name}:1:1", "no keys; a scene needs at least sheet, springs and time")
+        raise _error(f"{name}:1:1", f"no keys; a {kind.name} needs at least {kind.needs}")
     if not isinstance(document.data, dict):
-        raise _error(f"{name}:1:1", f"{flow(document.data)} is not a scene; expected keys such as sheet and time")
+        raise _error(f"{name}:1:1", f"{flow(document.data)} is not a {kind.name}; expected keys such as {kind.needs}")
     return document
 
 
-def _read_text(name: str) -> str:
+def _read_text(name: str, kind: Kind) -> str:
     path = Path(name)
     try:
         mode = path.stat().st_mode
         if not stat.S_ISREG(mode):
             # Opening a pipe would wait for its other end.
-            kind = "a directory" if stat.S_ISDIR(mode) else "not a regular file"
-            raise _error(name, f"{kind}; name a scene file")
+            found = "a directory" if stat.S_ISDIR(mode) else "not a regular file"
+            raise _error(name, f"{found}; name a {kind.name} file")
         with path.open("rb") as file:
             raw = file.read(MAX_BYTES + 1).removeprefix(codecs.BOM_UTF8)
     except ValueError:
-        raise _error(name, "not a path; name a scene file") from None
+        raise _error(name, f"not a path; name a {kind.name} file") from None
     except OSError as error:
         raise _error(name, (error.strerror or str(error)).lower()) from None
     if len(raw) > MAX_BYTES:
-        raise _error(name, f"larger than {MAX_BYTES // 2**20} MiB; a scene is smaller")
+        raise _error(name, f"larger than {MAX_BYTES // 2**20} MiB; a {kind.name} is smaller")
     try:
         return raw.decode()
     except UnicodeDecodeError as error:

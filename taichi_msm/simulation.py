@@ -17,7 +17,7 @@ from taichi_msm.divergence import Watch
 from taichi_msm.dynamics import Dynamics, Pause
 from taichi_msm.errors import DivergedError, MsmError
 from taichi_msm.lattice import axes
-from taichi_msm.scene import Scene
+from taichi_msm.scene import Probe, Scene
 from taichi_msm.stability import step, steps_per_frame
 from taichi_msm.texture import load_texture
 
@@ -103,6 +103,22 @@ class Simulation:
             end = (self.frame + 1) * steps_per_frame(self.scene)
             self._dynamics.advance(end - self.steps, pause)
             self._position = self._read()
+
+    def steer(self, probes: tuple[Probe, ...]) -> None:
+        """Let other loads act from here on.
+
+        Args:
+            probes: the scene's with other keys, each of whose control points moves or stands as it did.
+
+        Raises:
+            MsmError: when the simulation is closed.
+            ValueError: when the kernel was not compiled for them.
+        """
+        self._require_open()
+        scene = self.scene.model_copy(update={"probes": probes})
+        self._dynamics.steer(scene)
+        self._watch.steer(scene)
+        self.scene = scene
 
     def save(self) -> Saved:
         """Give all that is needed to go on from here in another simulation.

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import stat
 import warnings
 from collections.abc import Iterator
@@ -12,6 +11,7 @@ from typing import TYPE_CHECKING
 
 from taichi_msm.errors import Problem, SceneError
 from taichi_msm.scene import Scene
+from taichi_msm.silence import silenced
 
 if TYPE_CHECKING:
     import numpy as np
@@ -115,7 +115,8 @@ def _open(path: str) -> Iterator[Image.Image]:
     from PIL import Image, UnidentifiedImageError
 
     _require_file(path)
-    with _silence(), warnings.catch_warnings():
+    # What libtiff and Pillow's log say of a broken picture the error says that is raised.
+    with silenced(2), warnings.catch_warnings():
         warnings.simplefilter("ignore")
         warnings.simplefilter("error", Image.DecompressionBombWarning)
         try:
@@ -132,24 +133,6 @@ def _open(path: str) -> Iterator[Image.Image]:
             raise _PictureError(f"{path} has more than {limit} million pixels; scale it down") from None
         except Exception as error:
             raise _PictureError(f"{path} cannot be decoded ({error}); save it anew") from None
-
-
-@contextmanager
-def _silence() -> Iterator[None]:
-    """Keep from stderr what libtiff and Pillow's log say of a broken picture: the error that is raised says it."""
-    try:
-        stderr = os.dup(2)
-    except OSError:
-        # It is closed.
-        yield
-        return
-    try:
-        with Path(os.devnull).open("wb") as nowhere:
-            os.dup2(nowhere.fileno(), 2)
-        yield
-    finally:
-        os.dup2(stderr, 2)
-        os.close(stderr)
 
 
 def _require_file(path: str) -> None:

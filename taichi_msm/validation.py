@@ -8,7 +8,7 @@ from collections.abc import Callable, Iterable, Iterator, Sequence
 from difflib import get_close_matches
 from functools import cache
 from types import UnionType
-from typing import Any, NamedTuple, Union, get_args, get_origin
+from typing import Any, NamedTuple, TypeVar, Union, get_args, get_origin
 
 from pydantic import ValidationError
 
@@ -20,6 +20,8 @@ MAX_SHOWN = 60
 
 # Nobody reads further, and a broken file of the greatest size has tens of thousands.
 MAX_FAULTS = 1000
+
+Model = TypeVar("Model", bound=Section)
 
 # What one section cannot know: these see the whole scene.
 CHECKS: tuple[Callable[[Scene], Iterable[Problem]], ...] = (
@@ -51,7 +53,7 @@ def validate(data: dict[str, Any]) -> tuple[Scene | None, list[Problem]]:
     problems: list[Problem] = []
     # Pydantic asks for the picture once the sections are faultless, and CHECKS run once it has that too.
     for _ in range(3):
-        scene, found = _parse(data)
+        scene, found = parse(Scene, data)
         problems += found
         if scene is not None:
             problems += [problem for check in CHECKS for problem in check(scene)]
@@ -80,12 +82,16 @@ def _spare(data: dict[str, Any], problems: list[Problem]) -> dict[str, Any]:
     }
 
 
-def _parse(data: dict[str, Any]) -> tuple[Scene | None, list[Problem]]:
-    """Check each section by itself."""
+def parse(model: type[Model], data: dict[str, Any]) -> tuple[Model | None, list[Problem]]:
+    """Check each section of a file by itself.
+
+    Returns:
+        What the file says, None if there is any problem; and the problems.
+    """
     try:
-        return Scene.model_validate(data), []
+        return model.model_validate(data), []
     except ValidationError as error:
-        faults = [_fault(one) for one in error.errors(include_url=False, include_input=False)[:MAX_FAULTS]]
+        faults = [_fault(one, model) for one in error.errors(include_url=False, include_input=False)[:MAX_FAULTS]]
         settled = _drop_short(_choose_kinds(faults))
         return None, [Problem(fault.path, _message(fault, data)) for fault in settled]
 
@@ -122,9 +128,8 @@ class _Key(NamedTuple):
     has_choice: bool
 
 
-def _fault(error: Any) -> _Fault:
+def _fault(error: Any, section: type[Section]) -> _Fault:
     """Follow an error's location through the models, past pydantic's names for the kinds of a value."""
-    section: type[Section] = Scene
     path: Path = ()
     expects, choice, branch = "", None, ""
     parts = iter(error["loc"])

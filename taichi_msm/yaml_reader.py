@@ -168,9 +168,9 @@ class _Reader:
         """Refuse what a scene has no use for."""
         self._nodes += 1
         if self._nodes > MAX_NODES:
-            raise UnreadableError(_mark(event.start_mark), f"more than {MAX_NODES} values; a scene is smaller")
+            raise UnreadableError(_mark(event.start_mark), f"more than {MAX_NODES} values; write fewer")
         if len(path) > MAX_DEPTH:
-            raise UnreadableError(_mark(event.start_mark), f"nested more than {MAX_DEPTH} deep; a scene is flatter")
+            raise UnreadableError(_mark(event.start_mark), f"nested more than {MAX_DEPTH} deep; write it flatter")
         if isinstance(event, yaml.AliasEvent):
             self._refuse(event, path, f"alias *{event.anchor} is not allowed; write the value out")
             return

@@ -8,6 +8,7 @@ import pytest
 from PIL import Image
 
 from taichi_msm import accuracy, runtime, simulation
+from taichi_msm.live import session
 from tests.pool import Pool
 from tests.scenes import SMALL, speckle
 
@@ -39,9 +40,10 @@ def sheets() -> Iterator[Pool]:
 
 @pytest.fixture
 def pool(sheets: Pool, monkeypatch: pytest.MonkeyPatch) -> Pool:
-    """Compiled sheets, which pilot runs and simulations use too."""
+    """Compiled sheets and drawings, which pilot runs, simulations and sessions use too."""
     monkeypatch.setattr(accuracy, "Dynamics", sheets.lend)
     monkeypatch.setattr(simulation, "Dynamics", sheets.lend)
+    monkeypatch.setattr(session, "Drawing", sheets.lend_drawing)
     return sheets
 
 

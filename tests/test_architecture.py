@@ -13,7 +13,7 @@ PACKAGE = Path(__file__).parent.parent / "taichi_msm"
 
 # A module imports from earlier lines only.
 ORDER = [
-    {"errors", "look", "interruption"},
+    {"errors", "look", "interruption", "silence"},
     {"scene"},
     {"lattice", "camera", "texture"},
     {"stability"},
@@ -29,7 +29,7 @@ ORDER = [
     {"simulation", "notes", "plan"},
     {"files"},
     {"runner", "console"},
-    {"study"},
+    {"study", "live"},
     {"cli"},
     {"__main__", "__init__"},
 ]

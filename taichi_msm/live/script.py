@@ -1,0 +1,129 @@
+"""A script of events: what a person would do, from a YAML file."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from itertools import pairwise
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+from pydantic import Field, field_validator, model_validator
+from pydantic_core import PydanticCustomError
+
+from taichi_msm.errors import SceneError
+from taichi_msm.live.events import KEYS, Drag, Event, Key, Percent, Press, Release, Turn
+from taichi_msm.scene import REFUSED, NotNegative, Number, Section, key
+from taichi_msm.scene_file import Draft, Kind, read_file
+from taichi_msm.validation import parse
+
+Pair = tuple[Number, Number]
+
+# What every kind of entry needs beside its time.
+NEEDS = {"press": "at", "pull": "at", "drag": "at", "release": "", "turn": "by", "percent": "to", "key": "name"}
+
+# Of these, a longer one is spread over the frames that it takes.
+LASTING = ("drag", "turn")
+
+# A script ends when it ends.
+PRESSABLE = tuple(name for name in KEYS if name != "q")
+
+_SCRIPT = Kind("script", "events")
+
+
+class Entry(Section):
+    """One thing that is done."""
+
+    t: NotNegative = key(means="when, or when it begins [s]", expects="a number, 0 or more, in seconds")
+    do: Literal["press", "pull", "drag", "release", "turn", "percent", "key"] = key(
+        means="what is done", expects="press, pull, drag, release, turn, percent or key"
+    )
+    at: Pair | None = key(None, means="the pixel", expects="[x, y] in pixels from the top left")
+    by: Pair | None = key(None, means="how far the picture is turned", expects="[right, down] in pixels")
+    to: Annotated[NotNegative, Field(le=100)] | None = key(
+        None, means="percent of the full force", expects="a number from 0 to 100"
+    )
+    name: str | None = key(None, means="a key of the window", expects="the name of a key")
+    seconds: NotNegative = key(0.0, means="how long it takes [s]", expects="a number, 0 or more, in seconds")
+
+    @model_validator(mode="after")
+    def _complete(self) -> Entry:
+        for name in ("at", "by", "to", "name"):
+            given, needed = getattr(self, name) is not None, NEEDS[self.do] == name
+            if given and not needed:
+                raise PydanticCustomError(REFUSED, "{do} takes none; remove it", {"key": name, "do": self.do})
+            if needed and not given:
+                raise PydanticCustomError(REFUSED, "missing; {do} needs it", {"key": name, "do": self.do})
+        if self.name is not None and self.name not in PRESSABLE:
+            said = "there is no key {name} here; expected one of: {keys}"
+            raise PydanticCustomError(REFUSED, said, {"key": "name", "name": self.name, "keys": ", ".join(PRESSABLE)})
+        if self.seconds > 0 and self.do not in LASTING:
+            raise PydanticCustomError(REFUSED, "{do} takes no time; remove it", {"key": "seconds", "do": self.do})
+        return self
+
+
+class Script(Section):
+    """The file."""
+
+    events: tuple[Entry, ...] = key(means="what is done, in order", expects="a list of mappings with t and do")
+
+    @field_validator("events", mode="after")
+    @classmethod
+    def _in_order(cls, events: tuple[Entry, ...]) -> tuple[Entry, ...]:
+        for n, (before, entry) in enumerate(pairwise(events), 1):
+            if entry.t < before.t + before.seconds:
+                raise PydanticCustomError(
+                    REFUSED,
+                    "begins at {t} s, before the one above ends at {end} s; let them follow each other",
+                    {"key": n, "t": f"{entry.t:g}", "end": f"{before.t + before.seconds:g}"},
+                )
+        return events
+
+
+def load_script(path: str | Path) -> Script:
+    """Read a script.
+
+    Raises:
+        SceneError: all that is wrong with it, one line each, in the order in which it stands.
+    """
+    draft = Draft(str(path), read_file(str(path), _SCRIPT))
+    script, problems = parse(Script, draft.data)
+    draft.report(problems)
+    if script is None or draft.found:
+        raise SceneError(draft.lines())
+    return script
+
+
+def timed(script: Script, rate: float) -> Iterator[tuple[int, Event]]:
+    """Give the events, each with the frame before which it happens.
+
+    Args:
+        script: what is done.
+        rate: frames per second.
+    """
+    pointer = (0.0, 0.0)
+    for entry in script.events:
+        first = round(entry.t * rate)
+        frames = max(1, round(entry.seconds * rate))
+        for n in range(1, frames + 1):
+            share, frame = n / frames, first + n - 1
+            if entry.do == "drag" and entry.at:
+                x, y = (start + share * (end - start) for start, end in zip(pointer, entry.at, strict=True))
+                yield frame, Drag(x, y)
+            elif entry.do == "turn" and entry.by:
+                yield frame, Turn(entry.by[0] / frames, entry.by[1] / frames)
+            else:
+                yield frame, _event(entry)
+        pointer = entry.at or pointer
+
+
+def _event(entry: Entry) -> Event:
+    """Turn an entry that takes no time into its event."""
+    done: Any = {
+        "press": lambda: Press(*entry.at, pull=False),  # type: ignore[misc]
+        "pull": lambda: Press(*entry.at, pull=True),  # type: ignore[misc]
+        "release": Release,
+        "percent": lambda: Percent(entry.to or 0.0),
+        "key": lambda: Key(str(entry.name)),
+    }[entry.do]
+    event: Event = done()
+    return event

@@ -1,0 +1,409 @@
+"""A session: events in, the state of the tissue and its picture out. It knows no window and no clock."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from types import TracebackType
+
+import numpy as np
+from numpy.typing import NDArray
+
+from taichi_msm import runtime
+from taichi_msm.accuracy import choose_step
+from taichi_msm.camera import View, pinhole, turned, view
+from taichi_msm.drawing import Drawing
+from taichi_msm.errors import DivergedError, SceneError
+from taichi_msm.gif import Picture
+from taichi_msm.lattice import rest_positions
+from taichi_msm.live import overlay
+from taichi_msm.live.album import Album, Film
+from taichi_msm.live.events import KEYS, NOTCH, POINTER, Drag, Event, Harder, Key, Percent, Press, Release, Turn
+from taichi_msm.live.picking import on_rest_plane, pick
+from taichi_msm.live.tool import Place, Tool
+from taichi_msm.scene import MAX_PROBES, Camera, Scene
+from taichi_msm.simulation import Simulation
+from taichi_msm.stability import steps_per_frame, with_time
+from taichi_msm.texture import load_texture
+
+# A session has as many frames a second as a screen shows, as whole parts of the scene's.
+MOST_FRAMES = 60.0
+
+# A displacement of less than this share of the sheet is none that is shown.
+AT_REST = 1e-6
+
+# Between figures.
+SEPARATOR = "  ·  "
+
+# A notice is shown for so long [s].
+NOTICE = 3.0
+
+# The time of stepping is averaged over about so many frames.
+AVERAGED = 20
+
+
+def with_live_frames(scene: Scene) -> tuple[Scene, int]:
+    """Cut the frames of a scene into as many as a screen shows; a given step stays.
+
+    Returns:
+        The scene, and how many of its frames make one of the given scene's.
+    """
+    parts = max(1, int(MOST_FRAMES / scene.time.frames_per_second * (1 + 1e-9)))
+    if scene.time.step != "auto":
+        while steps_per_frame(scene) % parts:
+            parts -= 1
+    return with_time(scene, frames_per_second=scene.time.frames_per_second * parts), parts
+
+
+class Session:
+    """A person with a tool at the tissue of a scene. Usable in a with statement, which keeps a film that is on.
+
+    The tool has the force, the falloff and the offset of the scene's first probe.
+
+    Args:
+        scene: a checked scene with a picture.
+        album: where is kept what the person wants to.
+        arch: cpu or cuda.
+        threads: number of CPU threads; None takes every core.
+        play: whether the scene's probes do what the scene says, besides.
+        progress: called with the stage before each, often; what it raises stops here.
+
+    Raises:
+        SceneError: when the scene has no picture or no probe, or no place for one more.
+        DeviceError: when the arch is not there.
+
+    Attributes:
+        scene: with the frames and the step of the session.
+        parts: how many of its frames make one of the given scene's.
+        paused: whether time stands still.
+        fault: why the tissue moves no more; nothing if it does.
+        seconds_a_frame: how long the steps of a frame take [s].
+    """
+
+    def __init__(
+        self,
+        scene: Scene,
+        album: Album,
+        arch: str = "cpu",
+        threads: int | None = None,
+        *,
+        play: bool = False,
+        progress: Callable[[str], None] = lambda stage: None,
+    ) -> None:
+        _require_usable(scene, play=play)
+        progress("start")
+        device = runtime.start(arch, threads)
+        self._texture = load_texture(scene)
+        given = scene
+        scene, self.parts = with_live_frames(scene)
+        if scene.time.tolerance is not None:
+            scene, _ = choose_step(scene, device, lambda done, total: progress("pilot"))
+        rate = scene.time.frames_per_second
+        self._album = album
+        self._film: Film | None = None
+        self._film_rate = given.time.frames_per_second
+        self._filmed_from = 0
+        self._others = scene.probes if play else ()
+        self._tool = Tool(scene.probes[0], rate)
+        self.scene = scene.model_copy(update={"probes": (*self._others, self._tool.recorded(0))})
+        self._rest = rest_positions(scene.sheet)
+        self._lit, self._wireframe = scene.render.shading == "headlight", scene.render.wireframe
+        self._drawings: dict[tuple[bool, bool], Drawing] = {}
+        self._camera: str | Camera = scene.render.camera
+        self._view = view(scene)
+        self._press_at: tuple[Place, NDArray[np.float64] | None] | None = None
+        self._figures, self._keys = True, False
+        self._once = False
+        self._beats = 0
+        self._notice, self._notice_until = "", 0
+        self.fault = ""
+        self.paused = False
+        self.seconds_a_frame = 0.0
+        progress("compile")
+        # The pictures are drawn here.
+        self._simulation = Simulation(self.scene.model_copy(update={"output": ()}), arch, threads)
+        self._simulation.compile(lambda: progress("compile"))
+        self._beginning = self._simulation.save()
+        self._drawing()
+
+    @property
+    def rate(self) -> float:
+        """Frames per second of the session."""
+        return self.scene.time.frames_per_second
+
+    @property
+    def frame(self) -> int:
+        """Frames simulated since the tissue was at rest."""
+        return self._simulation.frame
+
+    @property
+    def tool(self) -> Tool:
+        """The tool, to be looked at."""
+        return self._tool
+
+    @property
+    def view(self) -> View:
+        """The camera."""
+        return self._view
+
+    def positions(self) -> NDArray[np.floating]:
+        """Positions of the points [m], shape (rows, cols, 3)."""
+        return self._simulation.positions()
+
+    def displacement(self) -> float:
+        """Tell how far the tissue at the tool is from rest [m]."""
+        across, down = self._tool.place
+        return float(np.linalg.norm(_between(self.positions() - self._rest, across, down)))
+
+    def recorded(self) -> Scene:
+        """Give what was done as a scene; its run has the same bits."""
+        frames = max(1, self.frame)
+        time = self.scene.time.model_copy(update={"duration": frames / self.rate, "tolerance": None})
+        render = self.scene.render.model_copy(
+            update={
+                "camera": self._camera,
+                "shading": "headlight" if self._lit else "none",
+                "wireframe": self._wireframe,
+            }
+        )
+        probes = (*self._others, self._tool.recorded(frames))
+        return self.scene.model_copy(update={"probes": probes, "time": time, "render": render})
+
+    def handle(self, event: Event) -> None:
+        """Do what an event asks for; what it does to the tissue is seen in the next frame.
+
+        Raises:
+            FilesError: when something to be kept cannot be written.
+        """
+        match event:
+            case Press(x, y, pull):
+                self._press(x, y, -1 if pull else 1)
+            case Drag(x, y):
+                self._drag(x, y)
+            case Release():
+                self._press_at = None
+                if self._tool.held:
+                    self._tool.release()
+            case Turn(right, down):
+                angle = np.pi / self.scene.render.size[1]
+                self._look(turned(self._pinhole(), -right * angle, down * angle))
+            case Percent(percent):
+                self._tool.strength = min(100.0, max(0.0, percent))
+            case Harder(percent):
+                self.handle(Percent(self._tool.strength + percent))
+            case Key(name):
+                self._do(name)
+
+    def advance(self) -> None:
+        """Let a frame's time pass: the tissue moves, unless it is paused."""
+        self._beats += 1
+        if (self.paused and not self._once) or self.fault:
+            return
+        self._once = False
+        begun = time.perf_counter()
+        try:
+            self._simulation.steer((*self._others, self._tool.follow(self.frame)))
+            self._simulation.advance()
+        except DivergedError as error:
+            self.fault = str(error)
+        spent = time.perf_counter() - begun
+        share = 1 / AVERAGED if self.seconds_a_frame else 1.0
+        self.seconds_a_frame += share * (spent - self.seconds_a_frame)
+
+    def picture(self, pace: str = "") -> Picture:
+        """Draw the tissue and what is written over it; a film that is on takes it.
+
+        Args:
+            pace: what is to be said of the speed of the pictures.
+
+        Returns:
+            Colours, shape (height, width, 3).
+        """
+        picture = self._written(self._drawing().draw(self.positions(), self._view), pace)
+        if self._film is not None:
+            # Where the pictures are too slow for the film one stays for several.
+            while self._film.pictures * self.parts <= self._beats - self._filmed_from:
+                self._film.add(picture)
+        return picture
+
+    def say(self, notice: str) -> None:
+        """Show a notice for some time."""
+        self._notice, self._notice_until = notice, self._beats + round(NOTICE * self.rate)
+
+    @property
+    def notice(self) -> str:
+        """What the person should know now."""
+        return self.fault or (self._notice if self._beats < self._notice_until else "")
+
+    def close(self) -> None:
+        """Keep the film that is on, and free the memory."""
+        self._simulation.close()
+        for drawing in self._drawings.values():
+            drawing.close()
+        self._drawings.clear()
+        if self._film is not None:
+            film, self._film = self._film, None
+            self._album.keep_film(film)
+
+    def __enter__(self) -> Session:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.close()
+
+    def _press(self, x: float, y: float, direction: int) -> None:
+        place = pick(self.positions(), self.scene.render.refine, self._view, (x, y))
+        if place is None:
+            self.say(f"no tissue at pixel {x:g}, {y:g}")
+            return
+        self._press_at = place, on_rest_plane(self._view, (x, y))
+        self._tool.press(place, direction)
+
+    def _drag(self, x: float, y: float) -> None:
+        """Move the control point as far over the sheet at rest as the pointer went.
+
+        Where the sheet is now is no guide: it gives way under the tool, and the pointer would run after itself.
+        """
+        if self._press_at is None:
+            return
+        ((across, down), begun), here = self._press_at, on_rest_plane(self._view, (x, y))
+        if begun is None or here is None:
+            return
+        (right, up), (height, width) = here - begun, self.scene.sheet.size
+        self._tool.move((across + right / width, down - up / height))
+
+    def _do(self, key: str) -> None:
+        match key:
+            case "up":
+                self.handle(Harder(NOTCH))
+            case "down":
+                self.handle(Harder(-NOTCH))
+            case "c":
+                self._look(self.scene.render.camera)
+            case "t":
+                self._look("top")
+            case "o":
+                self._look("oblique")
+            case "m":
+                self._wireframe = not self._wireframe
+            case "l":
+                self._lit = not self._lit
+            case "space":
+                self.paused = not self.paused
+            case ".":
+                self._once = self.paused
+            case "r":
+                self._simulation.go_on(self._beginning)
+                self._tool.rest()
+                self._press_at = None
+                self.fault = ""
+            case "p":
+                self.say(f"saved {self._album.keep_picture(self._written(self._drawn(), ''))}")
+            case "g":
+                self._start_or_stop_film()
+            case "w":
+                self.say(f"saved {self._album.keep_scene(self.recorded())}")
+            case "i":
+                self._figures = not self._figures
+            case "h":
+                self._keys = not self._keys
+
+    def _start_or_stop_film(self) -> None:
+        if self._film is None:
+            render = self.scene.render
+            self._film = self._album.film(render.size, self._film_rate, render.background)
+            self._filmed_from = self._beats
+        else:
+            film, self._film = self._film, None
+            self.say(f"saved {self._album.keep_film(film)}")
+
+    def _look(self, camera: str | Camera) -> None:
+        self._camera = camera
+        self._view = view(self._seen_by(camera))
+
+    def _seen_by(self, camera: str | Camera) -> Scene:
+        return self.scene.model_copy(update={"render": self.scene.render.model_copy(update={"camera": camera})})
+
+    def _pinhole(self) -> Camera:
+        return pinhole(self._seen_by(self._camera))
+
+    @property
+    def compiled(self) -> bool:
+        """Whether the next picture needs no other kernel than those there are."""
+        return (self._lit, self._wireframe) in self._drawings
+
+    def _drawing(self) -> Drawing:
+        """Give the kernel that draws as is wanted now; it is compiled when it is first wanted."""
+        wanted = self._lit, self._wireframe
+        if not self.compiled:
+            shading = "headlight" if self._lit else "none"
+            render = self.scene.render.model_copy(update={"shading": shading, "wireframe": self._wireframe})
+            drawing = Drawing(self.scene.model_copy(update={"render": render}), self._texture)
+            drawing.draw(self.positions(), self._view)
+            self._drawings[wanted] = drawing
+        return self._drawings[wanted]
+
+    def _drawn(self) -> Picture:
+        return self._drawing().draw(self.positions(), self._view)
+
+    def _written(self, picture: Picture, pace: str) -> Picture:
+        above: list[str] = []
+        tool = None
+        if self._figures:
+            above += self._figure_lines(pace)
+            if self._tool.percent != 0:
+                tool = self._seen_at_tool()
+        table = POINTER | KEYS if self._keys else None
+        return overlay.write(picture, above, self.notice, table=table, tool=tool, pulls=self._tool.percent < 0)
+
+    def _figure_lines(self, pace: str) -> list[str]:
+        tool, speed = self._tool, ""
+        if self.seconds_a_frame > 0:
+            speed = f"{1 / self.rate / self.seconds_a_frame:.0f} x real time"
+        state = [word for word, on in (("paused", self.paused), ("film", self._film is not None)) if on]
+        does = "pull" if tool.percent < 0 else "push"
+        percent = f"{does} {abs(tool.percent):.0f} %" if tool.percent else f"tool {tool.strength:.0f} %"
+        moved = self.displacement()
+        # Less is what f32 makes of places.
+        moved = moved if moved > AT_REST * max(self.scene.sheet.size) else 0.0
+        lines = [percent, _length(moved)], [pace, speed, *state]
+        return [SEPARATOR.join(part for part in line if part) for line in lines]
+
+    def _seen_at_tool(self) -> tuple[float, float] | None:
+        """Find the pixel where the control point is now."""
+        point = _between(self.positions(), *self._tool.place)
+        x, y, w, _ = self._view.matrix @ [*point, 1.0]
+        return (x / w, y / w) if w > self._view.near else None
+
+
+def _require_usable(scene: Scene, *, play: bool) -> None:
+    problems = []
+    if scene.image is None:
+        problems.append("image: none; a session shows one, name it here or with --image")
+    if not scene.probes:
+        problems.append("probes: none; the tool takes its force from the first one, add it")
+    if play and len(scene.probes) == MAX_PROBES:
+        problems.append(f"probes: {MAX_PROBES} leave no place for the tool; remove one, or leave out --play")
+    if problems:
+        raise SceneError(problems)
+
+
+def _between(values: NDArray[np.floating], across: float, down: float) -> NDArray[np.float64]:
+    """Interpolate what points have, shape (rows, cols, 3), bilinearly at a place on the sheet."""
+    rows, cols = values.shape[:2]
+    y, x = down * (rows - 1), across * (cols - 1)
+    i, j = min(int(y), rows - 2), min(int(x), cols - 2)
+    t, s = y - i, x - j
+    corners = values[i : i + 2, j : j + 2].astype(np.float64)
+    rows_between: NDArray[np.float64] = corners[0] + t * (corners[1] - corners[0])
+    return rows_between[0] + s * (rows_between[1] - rows_between[0])
+
+
+def _length(metres: float) -> str:
+    """Write a length in a unit in which it is legible."""
+    for unit, size in (("m", 1.0), ("mm", 1e-3), ("µm", 1e-6)):
+        if metres >= size:
+            return f"{metres / size:.3g} {unit}"
+    return f"{metres:.2g} m" if metres else "0 mm"

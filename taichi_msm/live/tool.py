@@ -1,0 +1,139 @@
+"""The tool in a person's hand, as the probe of a scene: every frame adds the keys that a run needs to repeat it."""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Sequence
+from typing import TypeVar
+
+from taichi_msm.scene import Probe
+
+# A hand needs some time to press: from nothing to the full force [s]. It lets go at once.
+RISE = 0.2
+
+# Digits of a control point's fractions: a millionth of the sheet.
+DIGITS = 6
+
+# The last keys of a list decide over the frame to come and the jump at its beginning.
+LATEST = 4
+
+Place = tuple[float, float]
+Key = TypeVar("Key", bound=tuple[float, ...])
+
+
+class Tool:
+    """Presses at one place at a time.
+
+    What is asked for takes effect from the next frame on, of which one sees at most one press or release; so the force
+    jumps at frames only, and is 0 in at least one frame before it acts elsewhere.
+
+    Args:
+        probe: whose force, falloff and offset it has.
+        rate: frames per second.
+
+    Attributes:
+        strength: percent of the full force that is pressed with.
+        percent: of the full force that acts now, below 0 when pulling.
+        place: the control point now, as fractions of the sheet.
+    """
+
+    def __init__(self, probe: Probe, rate: float) -> None:
+        self.strength = 100.0
+        self._probe = probe
+        self._rate = rate
+        self.rest()
+
+    def rest(self) -> None:
+        """Forget all that was done."""
+        self.percent = 0.0
+        self.place: Place = (0.5, 0.5)
+        self._goal = self.place
+        self._pressing = 0
+        # Presses, with their place and 1 to push or -1 to pull, and releases.
+        self._asked: deque[tuple[Place, int] | None] = deque()
+        self._load: list[tuple[float, float]] = [(0.0, 0.0)]
+        self._at: list[tuple[float, float, float]] = [(0.0, *self.place)]
+
+    @property
+    def held(self) -> bool:
+        """Whether it presses or will, unless it is released."""
+        return self._asked[-1] is not None if self._asked else self._pressing != 0
+
+    def press(self, place: Place, direction: int) -> None:
+        """Press, 1, or pull, -1, at a place; what it does elsewhere it lets go."""
+        if self.held:
+            self.release()
+        self._asked.append((_rounded(place), direction))
+
+    def move(self, place: Place) -> None:
+        """Move to another place, along a line within a frame."""
+        place = _rounded(place)
+        if self._asked and self._asked[-1] is not None:
+            self._asked[-1] = (place, self._asked[-1][1])
+        else:
+            self._goal = place
+
+    def release(self) -> None:
+        """Let go."""
+        self._asked.append(None)
+
+    def follow(self, frame: int) -> Probe:
+        """Do what was asked for, from a frame to the next one.
+
+        Returns:
+            The probe, with the keys that decide over this time.
+        """
+        begin, end = frame / self._rate, (frame + 1) / self._rate
+        if self._asked:
+            asked = self._asked.popleft()
+            if asked is None:
+                self._pressing = 0
+            else:
+                self._goal, self._pressing = asked
+                self.place = self._goal
+                self._put_at(begin)
+        if self._pressing == 0 and self.percent != 0:
+            self.percent = 0.0
+            self._load.append((begin, 0.0))
+        if self._pressing != 0:
+            self.percent = self._nearer(self._pressing * self.strength)
+            self.place = self._goal
+            self._put_at(end)
+        _extend(self._load, (end, self.percent))
+        return self._as_probe(self._load[-LATEST:], self._at[-LATEST:], end)
+
+    def recorded(self, frame: int) -> Probe:
+        """Give the probe with all keys up to a frame."""
+        return self._as_probe(self._load, self._at, frame / self._rate)
+
+    def _nearer(self, goal: float) -> float:
+        """Come as near to a percentage as a hand can within a frame."""
+        most = 100 / (RISE * self._rate)
+        return goal if abs(goal - self.percent) <= most else self.percent + (most if goal > self.percent else -most)
+
+    def _put_at(self, time: float) -> None:
+        key = (time, *self.place)
+        if self._at[-1][0] == time:
+            self._at.pop()
+        _extend(self._at, key)
+
+    def _as_probe(
+        self, load: Sequence[tuple[float, float]], at: Sequence[tuple[float, float, float]], end: float
+    ) -> Probe:
+        """Make a probe whose control point moves, also where it stands: the kernel is made for one that does."""
+        if len(at) == 1:
+            at = [*at, (max(end, 1 / self._rate), *at[0][1:])]
+        return self._probe.model_copy(update={"load": tuple(load), "at": tuple(at)})
+
+
+def _extend(keys: list[Key], key: Key) -> None:
+    """Add a key; of more than two in a row that differ in time alone those in between go, which changes no bit."""
+    if len(keys) > 1 and keys[-1][1:] == keys[-2][1:] == key[1:]:
+        keys.pop()
+    keys.append(key)
+
+
+def _rounded(place: Place) -> Place:
+    """Keep a place on the sheet, in as many digits as its file has."""
+    across, down = (round(min(1.0, max(0.0, fraction)), DIGITS) for fraction in place)
+    return across, down

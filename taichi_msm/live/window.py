@@ -1,0 +1,119 @@
+"""The window: the pointer and the keys become events, pictures become visible, and nothing else."""
+
+from __future__ import annotations
+
+import sys
+import time
+from collections.abc import Callable, Iterator
+from types import TracebackType
+from typing import Any
+
+import numpy as np
+
+from taichi_msm.errors import FilesError
+from taichi_msm.gif import Picture
+from taichi_msm.live import overlay
+from taichi_msm.live.events import NOTCH, Drag, Event, Harder, Key, Press, Release, Turn
+from taichi_msm.live.pace import Pace
+from taichi_msm.live.session import Session
+from taichi_msm.runtime import open_window, ti
+
+# What the keyboard calls keys that have no letter.
+NAMES = {" ": "space", "Up": "up", "Down": "down", "Escape": "q", "=": "up", "-": "down"}
+
+QUIT = Key("q")
+
+
+class Window:
+    """A window with a picture. Usable in a with statement, which closes it.
+
+    Args:
+        title: of the window.
+        size: width, height of the picture [px].
+
+    Raises:
+        DeviceError: when there is no display.
+    """
+
+    def __init__(self, title: str, size: tuple[int, int]) -> None:
+        self._gui = open_window(title, size)
+        # What is written here is shown: rows from the top, blue, green, red and nothing; on a Mac red comes first.
+        self._shown = self._gui.img.view(np.uint8).reshape(size[1], size[0], 4)
+        self._shown[..., 3] = 255
+        self._channels = slice(None) if sys.platform == "darwin" else slice(None, None, -1)
+        self._turning: tuple[float, float] | None = None
+        self._pressing = False
+
+    def show(self, picture: Picture) -> None:
+        """Show a picture, shape (height, width, 3)."""
+        self._shown[..., :3] = picture[..., self._channels]
+        self._gui.show()
+
+    def say(self, text: str) -> None:
+        """Write over what is shown."""
+        self.show(overlay.write(np.ascontiguousarray(self._shown[..., :3][..., self._channels]), [], text))
+
+    def events(self) -> Iterator[Event]:
+        """Give what was done since the last call, up to now."""
+        # A window learns of it when it is shown.
+        self._gui.show()
+        for event in self._gui.get_events():
+            yield from self._understood(event)
+
+    def __enter__(self) -> Window:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self._gui.close()
+
+    def _understood(self, event: Any) -> Iterator[Event]:
+        height, width = self._shown.shape[:2]
+        x, y = event.pos[0] * width, height - 1 - event.pos[1] * height
+        pressed, released = event.type == ti.GUI.PRESS, event.type == ti.GUI.RELEASE
+        if event.key == ti.GUI.EXIT:
+            yield QUIT
+        elif event.key == ti.GUI.LMB:
+            self._pressing = pressed
+            yield Press(x, y, "Shift" in event.modifier) if pressed else Release()
+        elif event.key == ti.GUI.RMB:
+            self._turning = (x, y) if pressed else None
+        elif event.key == ti.GUI.WHEEL:
+            yield Harder(NOTCH if event.delta[1] > 0 else -NOTCH)
+        elif event.key == ti.GUI.MOVE:
+            if self._pressing:
+                yield Drag(x, y)
+            if self._turning is not None:
+                yield Turn(x - self._turning[0], y - self._turning[1])
+                self._turning = (x, y)
+        elif pressed and not released:
+            yield Key(NAMES.get(event.key, event.key))
+
+
+def show(session: Session, window: Window, pause: Callable[[], None]) -> None:
+    """Show a session until the person has enough of it.
+
+    Args:
+        session: the session.
+        window: where.
+        pause: called before every picture; what it raises ends the session.
+    """
+    pace = Pace(session.rate, time.perf_counter)
+    session.say("h: the keys")
+    while True:
+        pause()
+        time.sleep(pace.wait())
+        for event in window.events():
+            if event == QUIT:
+                return
+            try:
+                session.handle(event)
+            except FilesError as error:
+                # What was done until now is not to be lost for a full disk.
+                session.say(str(error))
+        for _ in pace.due():
+            session.advance()
+        if not session.compiled:
+            window.say("compiling the kernel that draws it")
+        window.show(session.picture(pace.said()))

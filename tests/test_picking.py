@@ -1,0 +1,136 @@
+"""From the picture back to the sheet: what is picked at a pixel is what is drawn there."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from taichi_msm import reference
+from taichi_msm.camera import pinhole, turned, view
+from taichi_msm.drawing import Drawing
+from taichi_msm.lattice import rest_positions
+from taichi_msm.live.picking import on_rest_plane, pick
+from taichi_msm.runtime import Device
+from taichi_msm.scene import Scene
+from tests.scenes import scene
+
+SIZE = (96, 80)
+POINTS = (7, 9)
+NEAR_EYE = {"eye": [0.05, -0.16, 0.05], "target": [0, 0, 0], "fov": 70}
+
+
+def place_texture() -> NDArray[np.uint8]:
+    """A picture whose colours tell the place: red the column of 256, green the row, and blue that it is the sheet."""
+    texture = np.full((256, 256, 3), 255, np.uint8)
+    texture[..., 0], texture[..., 1] = np.arange(256), np.arange(256)[:, None]
+    return texture
+
+
+def sheet(camera: Any, refine: int = 2) -> Scene:
+    return scene(
+        sheet={"points": list(POINTS), "size": [0.3, 0.4], "mass": 1e-3},
+        render={"size": list(SIZE), "refine": refine, "camera": camera, "shading": "none"},
+    )
+
+
+def folded() -> NDArray[np.float64]:
+    """A sheet whose right third lies over the middle, rough enough that every quad is twisted."""
+    position = rest_positions(sheet("top").sheet)
+    right = position[..., 0] > 0.05
+    position[..., 2] += np.where(right, 0.06, 0) + np.random.default_rng(3).uniform(-0.006, 0.006, POINTS)
+    position[..., 0] = np.where(right, 0.1 - position[..., 0], position[..., 0])
+    return position
+
+
+@pytest.mark.parametrize("refine", [0, 2])
+@pytest.mark.parametrize("camera", ["top", "oblique", NEAR_EYE], ids=["top", "oblique", "near"])
+def test_what_is_picked_is_what_is_drawn(camera: Any, refine: int, device: Device) -> None:
+    # Near the eye, some of the sheet is behind the camera.
+    shown, position = sheet(camera, refine), folded()
+    drawing = Drawing(shown, place_texture())
+    picture = drawing.draw(position).astype(int)
+    drawing.close()
+    pixels = [(x, y) for y in range(0, SIZE[1], 3) for x in range(0, SIZE[0], 3)]
+    covered, missed = 0, 0
+    for x, y in pixels:
+        place = pick(position, refine, view(shown), (x, y))
+        column, row, blue = picture[y, x]
+        if (place is None) != (blue == 0):
+            missed += 1
+        elif place is not None:
+            covered += 1
+            # Half a level by rounding, and what f32 makes of a place.
+            assert place[0] * 256 - 0.5 == pytest.approx(column, abs=0.6 + 0.02 * (column in (0, 255)) * 25)
+            assert place[1] * 256 - 0.5 == pytest.approx(row, abs=0.6 + 0.02 * (row in (0, 255)) * 25)
+    assert covered > 0.15 * len(pixels)
+    assert missed <= 2, "outlines are exact but for the pixels that rounding decides"
+
+
+def test_the_nearer_layer_is_picked() -> None:
+    shown, position = sheet("top"), folded()
+    # Pixel of x = 0: the right third, turned over, lies above the middle.
+    place = pick(position, 2, view(shown), (SIZE[0] // 2 - 6, SIZE[1] // 2))
+    assert place is not None
+    assert place[0] > 0.6
+
+
+def test_beside_the_sheet_nothing_is_picked() -> None:
+    shown = sheet("oblique")
+    assert pick(rest_positions(shown.sheet), 2, view(shown), (1, 1)) is None
+    assert pick(rest_positions(shown.sheet), 2, view(shown), (-1000, 5000)) is None
+
+
+@pytest.mark.parametrize("camera", ["top", "oblique", NEAR_EYE], ids=["top", "oblique", "near"])
+def test_on_the_rest_plane_is_where_the_sheet_at_rest_is_picked(camera: Any) -> None:
+    shown = sheet(camera)
+    height, width = shown.sheet.size
+    found = 0
+    for pixel in [(30, 40), (48, 44), (60.5, 50.25)]:
+        place, point = pick(rest_positions(shown.sheet), 2, view(shown), pixel), on_rest_plane(view(shown), pixel)
+        if place is not None:
+            found += 1
+            assert point == pytest.approx([(place[0] - 0.5) * width, (0.5 - place[1]) * height], abs=1e-12)
+    assert found >= 2
+
+
+def test_above_the_horizon_there_is_no_rest_plane() -> None:
+    camera = {"eye": [0, -1, 0.1], "target": [0, 0, 0.1], "up": [0, 0, 1], "fov": 60}
+    assert on_rest_plane(view(sheet(camera)), (48, 10)) is None
+    assert on_rest_plane(view(sheet(camera)), (48, 39.5)) is None, "the line of sight never gets there"
+    assert on_rest_plane(view(sheet(camera)), (48, 70)) is not None
+
+
+def test_a_camera_turned_keeps_its_target_and_distance() -> None:
+    camera = pinhole(sheet("oblique"))
+    moved = turned(camera, 0.4, -0.2)
+    apart = np.subtract(camera.eye, camera.target)
+    assert np.linalg.norm(np.subtract(moved.eye, moved.target)) == pytest.approx(np.linalg.norm(apart))
+    assert moved.target == camera.target
+    back = turned(turned(camera, 0.4, 0), -0.4, 0)
+    assert back.eye == pytest.approx(camera.eye)
+    # Over the sheet: higher.
+    assert turned(camera, 0, 0.2).eye[2] > camera.eye[2]
+    # About the normal: as high as it was, and counter-clockwise seen from above.
+    assert turned(camera, 0.2, 0).eye[2] == pytest.approx(camera.eye[2])
+    assert turned(camera, 0.2, 0).eye[0] > camera.eye[0]
+
+
+def test_the_pinhole_above_shows_the_sheet_as_large_as_from_the_top() -> None:
+    shown = sheet("top")
+    above = shown.model_copy(update={"render": shown.render.model_copy(update={"camera": pinhole(shown)})})
+    rest = rest_positions(shown.sheet)
+    for camera in (shown, above):
+        x, y, w, _ = view(camera).matrix @ [*rest[0, 0], 1]
+        assert (x / w, y / w) == pytest.approx((0.0, 4.0)), camera.render.camera
+
+
+def test_the_twin_draws_what_is_picked() -> None:
+    shown, position = sheet("oblique"), folded()
+    picture = reference.draw(shown, position, place_texture())
+    for x, y in [(40, 40), (50, 30), (30, 60)]:
+        place = pick(position, 2, view(shown), (x, y))
+        assert place is not None
+        assert np.abs(np.array(place) * 256 - 0.5 - picture[y, x, :2]).max() <= 0.51

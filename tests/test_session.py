@@ -1,0 +1,357 @@
+"""A session: events in, tissue and picture out; and what it writes, run repeats to the bit."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from taichi_msm import load_scene, run
+from taichi_msm.errors import FilesError, SceneError
+from taichi_msm.lattice import rest_positions
+from taichi_msm.live.album import Album
+from taichi_msm.live.events import KEYS, Drag, Event, Harder, Key, Percent, Press, Release, Turn
+from taichi_msm.live.session import Session, with_live_frames
+from taichi_msm.loads import schedule
+from taichi_msm.runtime import Device
+from taichi_msm.stability import steps_per_frame
+from tests.pool import Pool
+
+# small.yaml with a force that dimples it as tissue, and a camera that sees it tilted.
+TILTED = {
+    "sheet.points": [25, 25],
+    "sheet.size": [0.3, 0.3],
+    "render.size": [120, 100],
+    "render.camera": "oblique",
+    "probes.0.force": [0, 0, -2000],
+    "probes.0.falloff": 60,
+    "time.frames_per_second": 25,
+}
+
+# What f32 makes of places [m].
+AT_REST = 3e-8
+
+Begin = Callable[..., Session]
+
+
+@pytest.fixture
+def begin(small: Path, pool: Pool, device: Device) -> Iterator[Begin]:
+    """Begin a session with small.yaml; what it keeps goes to ./album."""
+    with ExitStack() as stack:
+
+        def begin(overrides: dict[str, Any] | None = None, **options: Any) -> Session:
+            scene = load_scene("small.yaml", overrides or {})
+            return stack.enter_context(Session(scene, Album(Path("album"), "small.yaml"), threads=2, **options))
+
+        yield begin
+
+
+def advance(session: Session, frames: int) -> list[np.ndarray]:
+    """Let some frames pass; the positions after each."""
+    found = []
+    for _ in range(frames):
+        session.advance()
+        found.append(session.positions().copy())
+    return found
+
+
+def displacement(session: Session) -> np.ndarray:
+    return np.linalg.norm(session.positions() - rest_positions(session.scene.sheet), axis=-1)
+
+
+def pixel_of(session: Session, row: int, col: int) -> tuple[float, float]:
+    """The pixel at which a mass point is seen now."""
+    x, y, w, _ = session.view.matrix @ [*session.positions()[row, col].astype(float), 1]
+    return round(x / w - 0.5), round(y / w - 0.5)
+
+
+def test_a_press_at_a_pixel_dimples_what_is_seen_there(begin: Begin) -> None:
+    session = begin(TILTED)
+    rows, cols = session.scene.sheet.points
+    for row, col in [(8, 6), (12, 12), (17, 18)]:
+        # The second and third time the sheet still swings.
+        pixel = pixel_of(session, row, col)
+        session.handle(Press(*pixel))
+        advance(session, 12)
+        cell = np.array(session.tool.place) * [cols - 1, rows - 1]
+        assert cell == pytest.approx([col, row], abs=0.25), "a pixel is a fifth of a cell wide"
+        assert (-session.positions()[..., 2]).argmax() == row * cols + col
+        assert session.displacement() == pytest.approx(displacement(session)[row, col], rel=0.1)
+        session.handle(Release())
+        advance(session, 10)
+
+
+def test_a_drag_moves_the_control_point_with_the_pointer(begin: Begin) -> None:
+    session = begin(TILTED)
+    session.handle(Press(*pixel_of(session, 12, 6)))
+    there = pixel_of(session, 10, 16)
+    advance(session, 10)
+    session.handle(Drag(*there))
+    session.advance()
+    assert np.array(session.tool.place) * 24 == pytest.approx([16, 10], abs=0.4)
+    session.handle(Release())
+    session.handle(Drag(10, 10))
+    session.advance()
+    assert np.array(session.tool.place) * 24 == pytest.approx([16, 10], abs=0.4), "the tool is not there any more"
+
+
+@pytest.mark.parametrize(
+    ("overrides", "play"),
+    [
+        ({}, False),
+        ({"time.precision": "f64", "springs.virtual_active": "always"}, True),
+        ({"time.step": 0.0025, "sheet.fixed": "none"}, False),
+    ],
+    ids=["f32", "f64 beside the scene's probes", "free, given step"],
+)
+def test_run_repeats_a_session_to_the_bit(overrides: dict[str, Any], play: bool, begin: Begin) -> None:
+    session = begin({**TILTED, "render.size": [40, 30], **overrides}, play=play)
+    rng = np.random.default_rng(4)
+    found = [session.positions().copy()]
+    events: dict[int, list[Event]] = {
+        2: [Press(20, 12)],
+        9: [Drag(23, 14)],
+        11: [Drag(25, 15), Percent(40)],
+        16: [Release(), Press(14, 16, pull=True)],
+        17: [Turn(5, -3)],
+        30: [Release()],
+        33: [Press(22, 11), Release()],
+        36: [Press(22, 18), Key("space"), Key("m")],
+        38: [Key("space"), Harder(15)],
+    }
+    for beat in range(50):
+        for event in events.get(beat, []):
+            session.handle(event)
+        before = session.frame
+        session.advance()
+        if session.frame > before:
+            found.append(session.positions().copy())
+        if rng.random() < 0.1:
+            session.picture()
+    assert session.frame == 48, "paused for two"
+    session.handle(Key("w"))
+    written = Path("album/session-1.yaml")
+    assert session.notice == f"saved {written}"
+    record = run(load_scene(written, {"output": ["trajectory"]}), "again", threads=2)
+    assert record["status"] == "complete"
+    again = np.load("again/trajectory.npz")["position"]
+    assert len(again) == len(found) == 49
+    assert np.abs(np.array(found) - found[0]).max() > 0.003
+    np.testing.assert_array_equal(again, np.array(found))
+    # Seen as it was seen at the end.
+    assert load_scene(written).render.wireframe
+    assert load_scene(written).render.camera.eye == session.recorded().render.camera.eye  # type: ignore[union-attr]
+
+
+def test_virtual_springs_vanish_when_the_tool_is_released(begin: Begin) -> None:
+    session = begin({**TILTED, "springs.virtual": 500.0})
+    session.handle(Press(60, 50))
+    advance(session, 15)
+    session.handle(Release())
+    advance(session, 1)
+    recorded = session.recorded()
+    count = steps_per_frame(recorded)
+    active = schedule(recorded, 0, 16 * count).active
+    assert (active[: 15 * count] == 1).all()
+    assert active[15 * count] == 0.5, "the mean at the instant of the release"
+    assert (active[15 * count + 1 :] == 0).all()
+
+
+def test_time_stands_still_when_paused_and_goes_on_frame_by_frame(begin: Begin) -> None:
+    session = begin(TILTED)
+    session.handle(Press(60, 50))
+    advance(session, 3)
+    session.handle(Key("space"))
+    assert (np.diff(advance(session, 3), axis=0) == 0).all()
+    session.handle(Key("."))
+    advance(session, 3)
+    assert session.frame == 4
+    session.handle(Key("space"))
+    session.handle(Key("."))
+    advance(session, 2)
+    assert session.frame == 6, "going on, a frame is a frame"
+
+
+def test_reset_begins_anew(begin: Begin) -> None:
+    session = begin(TILTED)
+    session.handle(Press(60, 50))
+    first = advance(session, 5)
+    session.handle(Key("r"))
+    assert (displacement(session) < AT_REST).all()
+    assert (session.frame, session.tool.percent) == (0, 0)
+    session.handle(Press(60, 50))
+    np.testing.assert_array_equal(advance(session, 5), first)
+    assert session.recorded().time.duration == pytest.approx(5 / session.rate)
+
+
+def test_percent_by_wheel_and_keys_stays_between_nothing_and_all(begin: Begin) -> None:
+    session = begin()
+    events: list[tuple[Event, float]] = [
+        (Harder(5), 100),
+        (Harder(-30), 70),
+        (Key("up"), 75),
+        (Key("down"), 70),
+        (Percent(3), 3),
+        (Key("down"), 0),
+    ]
+    for event, expected in events:
+        session.handle(event)
+        assert session.tool.strength == expected
+
+
+def test_every_key_changes_what_it_says(begin: Begin) -> None:
+    session = begin(TILTED)
+    session.handle(Press(60, 50))
+    advance(session, 8)
+    session.paused = True
+    plain = session.picture()
+    for key in ("t", "m", "l", "i", "h"):
+        session.handle(Key(key))
+        changed = session.picture()
+        assert (changed != plain).any(), key
+        session.handle(Key("c" if key == "t" else key))
+        np.testing.assert_array_equal(session.picture(), plain, err_msg=f"{key} and back")
+    session.handle(Turn(20, 0))
+    assert (session.picture() != plain).any()
+    session.handle(Key("o"))
+    np.testing.assert_array_equal(session.picture(), plain, err_msg="the scene's camera is the oblique one")
+    session.handle(Key("no such key"))
+    np.testing.assert_array_equal(session.picture(), plain)
+    assert set("upowntcmlripgwh. ") >= {key for key in KEYS if len(key) == 1} - {"q"}
+
+
+def test_turning_follows_the_pointer(begin: Begin) -> None:
+    session = begin(TILTED)
+    # The side near the eye goes with the pointer.
+    near = pixel_of(session, 20, 12)
+    session.handle(Turn(10, 0))
+    assert pixel_of(session, 20, 12)[0] > near[0] + 2
+    before = session.view.toward[2]
+    session.handle(Turn(0, 10))
+    assert session.view.toward[2] > before, "pushed down, the sheet shows more of its face"
+
+
+def test_a_press_beside_the_sheet_says_so(begin: Begin) -> None:
+    session = begin(TILTED)
+    session.handle(Press(2, 2))
+    assert session.notice == "no tissue at pixel 2, 2"
+    advance(session, 4)
+    assert (displacement(session) < AT_REST).all()
+    assert not session.tool.held
+    advance(session, 200)
+    assert session.notice == ""
+
+
+def test_what_is_kept_has_a_name_of_its_own(begin: Begin) -> None:
+    session = begin(TILTED)
+    for _ in range(2):
+        session.handle(Key("p"))
+        session.handle(Key("g"))
+        for _ in range(5):
+            session.advance()
+            session.picture()
+        session.handle(Key("g"))
+        session.handle(Key("w"))
+    kept = sorted(path.name for path in Path("album").iterdir())
+    assert kept == [
+        *("film-1.gif", "film-2.gif", "picture-1.png", "picture-2.png", "session-1.yaml", "session-2.yaml"),
+        "speckle.png",
+    ]
+    with Image.open("album/picture-1.png") as image:
+        assert image.size == (120, 100)
+    assert load_scene("album/session-2.yaml").time.duration == pytest.approx(10 / session.rate)
+
+
+def test_another_picture_of_the_same_name_stays(begin: Begin) -> None:
+    Path("album").mkdir()
+    Path("album/speckle.png").write_bytes(b"mine")
+    session = begin()
+    session.handle(Key("w"))
+    assert Path("album/speckle.png").read_bytes() == b"mine"
+    assert load_scene("album/session-1.yaml").image == "album/speckle-2.png"
+
+
+def test_a_film_shows_as_much_time_as_went_by(begin: Begin) -> None:
+    session = begin({**TILTED, "time.frames_per_second": 10})
+    assert (session.rate, session.parts) == (60, 6)
+    session.handle(Key("g"))
+    for _ in range(6):
+        # Slower than the film: every picture is of two of its frames.
+        for _ in range(12):
+            session.advance()
+        session.handle(Harder(-5))
+        session.picture()
+    session.close()
+    with Image.open("album/film-1.gif") as film:
+        total = 0
+        for n in range(film.n_frames):
+            film.seek(n)
+            total += film.info["duration"]
+    assert total == 1300, "from the first picture, 1.2 s to the last one, and that one's tenth"
+
+
+def test_what_cannot_be_kept_is_told_and_nothing_is_lost(begin: Begin) -> None:
+    Path("album").write_text("no folder")
+    session = begin(TILTED)
+    session.handle(Press(60, 50))
+    advance(session, 5)
+    for key in "pgw":
+        with pytest.raises(FilesError, match=r"^album.*: cannot write: .*; choose another --out$"):
+            session.handle(Key(key))
+    advance(session, 5)
+    assert session.frame == 10
+
+
+def test_a_session_that_diverged_says_so_and_can_be_reset(begin: Begin) -> None:
+    session = begin({**TILTED, "probes.0.force": [0, 0, -1e12], "sheet.mass": 1e-3})
+    session.handle(Press(60, 50))
+    advance(session, 10)
+    assert session.fault.startswith("diverged before ")
+    assert session.notice == session.fault
+    frame = session.frame
+    advance(session, 3)
+    assert session.frame == frame
+    session.handle(Key("w"))
+    session.handle(Key("r"))
+    assert session.fault == ""
+    assert np.isfinite(advance(session, 3)).all()
+
+
+@pytest.mark.parametrize(
+    ("rate", "step", "parts"),
+    [(25, "auto", 2), (30, "auto", 2), (60, "auto", 1), (10, "auto", 6), (120, "auto", 1), (24, "auto", 2)],
+)
+def test_a_session_has_as_many_frames_as_a_screen_shows(rate: float, step: Any, parts: int, small: Path) -> None:
+    scene = load_scene("small.yaml", {"time.frames_per_second": rate, "time.duration": 1, "time.step": step})
+    live, found = with_live_frames(scene)
+    assert (live.time.frames_per_second, found) == (rate * parts, parts)
+
+
+def test_a_given_step_stays(small: Path) -> None:
+    scene = load_scene("small.yaml", {"time.frames_per_second": 20, "time.duration": 1, "time.step": 0.002})
+    live, parts = with_live_frames(scene)
+    assert parts == 1, "25 steps a frame cannot be cut into three frames, nor two"
+    assert steps_per_frame(live) == 25
+
+
+@pytest.mark.parametrize(
+    ("overrides", "play", "expected"),
+    [
+        ({"probes": []}, False, "probes: none; the tool takes its force from the first one, add it"),
+        ({"image": None, "output": []}, False, "image: none; a session shows one, name it here or with --image"),
+        (
+            {"probes": [{"force": [0, 0, -1]}] * 16},
+            True,
+            "probes: 16 leave no place for the tool; remove one, or leave out --play",
+        ),
+    ],
+)
+def test_scenes_that_nobody_can_press(overrides: dict[str, Any], play: bool, expected: str, begin: Begin) -> None:
+    with pytest.raises(SceneError) as caught:
+        begin(overrides, play=play)
+    assert caught.value.lines == (expected,)

@@ -1,0 +1,135 @@
+"""The tool in the hand: what it does from frame to frame is what its record says, to the bit."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from taichi_msm.live.tool import RISE, Tool
+from taichi_msm.loads import Schedule, schedule
+from taichi_msm.scene import Probe, Scene
+from taichi_msm.stability import steps_per_frame
+from tests.scenes import scene
+
+RATE = 50.0
+
+
+def tool() -> Tool:
+    return Tool(scene().probes[0], RATE)
+
+
+def with_probe(probe: Probe, frames: int) -> Scene:
+    base = scene(time={"frames_per_second": RATE, "duration": frames / RATE})
+    return base.model_copy(update={"probes": (probe,)})
+
+
+def steps(probe: Probe) -> int:
+    return steps_per_frame(with_probe(probe, 1))
+
+
+def loads(probe: Probe, frame: int) -> Schedule:
+    """The loads at the steps of a frame."""
+    return schedule(with_probe(probe, 1), frame * steps(probe), steps(probe))
+
+
+def percents(hand: Tool, first: int, count: int) -> list[float]:
+    found = []
+    for frame in range(first, first + count):
+        hand.follow(frame)
+        found.append(hand.percent)
+    return found
+
+
+@pytest.mark.parametrize("seed", range(6))
+def test_every_frame_has_the_loads_of_the_record(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    hand, frames, seen = tool(), 120, []
+    for frame in range(frames):
+        for _ in range(rng.integers(0, 3)):
+            what = rng.integers(0, 5)
+            place = (float(rng.uniform(-0.2, 1.2)), float(rng.uniform(-0.2, 1.2)))
+            if what == 0:
+                hand.press(place, int(rng.choice([-1, 1])))
+            elif what == 1:
+                hand.release()
+            elif what == 2:
+                hand.strength = float(rng.integers(0, 101))
+            else:
+                hand.move(place)
+        seen.append(hand.follow(frame))
+    record = hand.recorded(frames)
+    for frame, probe in enumerate(seen):
+        now, then = loads(probe, frame), loads(record, frame)
+        np.testing.assert_array_equal(now.strength, then.strength)
+        np.testing.assert_array_equal(now.active, then.active)
+        # Where it does not press, it is no matter at what.
+        pressing = then.strength.any(axis=(1, 2))
+        np.testing.assert_array_equal(now.point[pressing], then.point[pressing])
+
+
+def test_a_hand_takes_time_to_press_and_none_to_let_go() -> None:
+    hand = tool()
+    hand.press((0.4, 0.6), 1)
+    rise = percents(hand, 0, 12)
+    assert rise[:10] == pytest.approx(list(np.arange(1, 11) * 100 / (RISE * RATE)))
+    assert rise[10:] == [100.0, 100.0]
+    hand.release()
+    assert percents(hand, 12, 2) == [0.0, 0.0]
+    load = hand.recorded(14).load
+    assert (12 / RATE, 100.0) in load
+    assert (12 / RATE, 0.0) in load
+    assert len(load) == 1 + 10 + 3, "what does not change needs no keys"
+
+
+def test_pulling_is_pressing_with_a_force_turned_around() -> None:
+    hand = tool()
+    hand.press((0.4, 0.6), -1)
+    assert percents(hand, 0, 10)[-1] == -100
+
+
+def test_a_click_shorter_than_a_frame_presses_for_one() -> None:
+    hand = tool()
+    hand.press((0.4, 0.6), 1)
+    hand.release()
+    assert percents(hand, 0, 3) == pytest.approx([10, 0, 0])
+
+
+def test_pressing_elsewhere_at_once_lets_go_for_a_frame() -> None:
+    hand = tool()
+    hand.press((0.2, 0.2), 1)
+    percents(hand, 0, 5)
+    hand.press((0.8, 0.8), 1)
+    assert percents(hand, 5, 2) == pytest.approx([0, 10])
+    at = np.array(hand.recorded(7).at)
+    assert (np.diff(at[:, 0]) > 0).all(), "a control point that jumps would need a kernel of its own"
+    assert hand.place == (0.8, 0.8)
+
+
+def test_the_control_point_stays_on_the_sheet() -> None:
+    hand = tool()
+    hand.press((-0.5, 1.5), 1)
+    hand.follow(0)
+    assert hand.place == (0.0, 1.0)
+
+
+def test_it_moves_along_a_line_within_a_frame() -> None:
+    hand = tool()
+    hand.press((0.2, 0.2), 1)
+    hand.follow(0)
+    hand.move((0.4, 0.2))
+    probe = hand.follow(1)
+    points = loads(probe, 1).point[:, 0, 0]
+    width = 0.4
+    assert points[0] == pytest.approx((0.2 - 0.5) * width)
+    assert (np.diff(points) > 0).all()
+    assert points[-1] < (0.4 - 0.5) * width
+
+
+def test_what_was_asked_for_is_forgotten_at_rest() -> None:
+    hand = tool()
+    hand.press((0.2, 0.2), 1)
+    hand.follow(0)
+    hand.rest()
+    assert not hand.held
+    assert percents(hand, 0, 2) == [0, 0]
+    assert hand.recorded(2).load == ((0.0, 0.0), (2 / RATE, 0.0))
