@@ -303,7 +303,7 @@ def view(
                     show(session, window, interruption.grant)
             else:
                 with begin() as session, Progress(quiet=False) as bar:
-                    events = timed(done, session.rate) if done else ()
+                    events = timed(done, session.rate, loaded.render.size) if done else ()
                     progress = partial(interruptible(bar, interruption), "film")
                     complain(film(session, Path(record), seconds, events, progress))
                 click.echo(printable(record))

@@ -5,14 +5,14 @@ from __future__ import annotations
 from collections.abc import Iterator
 from itertools import pairwise
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Literal
 
 from pydantic import Field, field_validator, model_validator
 from pydantic_core import PydanticCustomError
 
 from taichi_msm.errors import SceneError
 from taichi_msm.live.events import KEYS, Drag, Event, Key, Percent, Press, Release, Turn
-from taichi_msm.scene import REFUSED, NotNegative, Number, Section, key
+from taichi_msm.scene import MAX_PIXELS, REFUSED, NotNegative, Number, Pixels, Section, key
 from taichi_msm.scene_file import Draft, Kind, read_file
 from taichi_msm.validation import parse
 
@@ -64,6 +64,11 @@ class Entry(Section):
 class Script(Section):
     """The file."""
 
+    size: tuple[Pixels, Pixels] | None = key(
+        None,
+        means="width, height of the picture that the pixels are of [px]; others are scaled; default: the session's",
+        expects=f"two whole numbers, 1 to {MAX_PIXELS}: [width, height] in pixels",
+    )
     events: tuple[Entry, ...] = key(means="what is done, in order", expects="a list of mappings with t and do")
 
     @field_validator("events", mode="after")
@@ -93,37 +98,36 @@ def load_script(path: str | Path) -> Script:
     return script
 
 
-def timed(script: Script, rate: float) -> Iterator[tuple[int, Event]]:
+def timed(script: Script, rate: float, size: tuple[int, int]) -> Iterator[tuple[int, Event]]:
     """Give the events, each with the frame before which it happens.
 
     Args:
         script: what is done.
         rate: frames per second.
+        size: width, height of the picture that is shown [px].
     """
+    scale = [shown / meant for shown, meant in zip(size, script.size or size, strict=True)]
     pointer = (0.0, 0.0)
     for entry in script.events:
         first = round(entry.t * rate)
         frames = max(1, round(entry.seconds * rate))
+        x, y = ((n + 0.5) * factor - 0.5 for n, factor in zip(entry.at or pointer, scale, strict=True))
+        begin_x, begin_y = pointer
         for n in range(1, frames + 1):
             share, frame = n / frames, first + n - 1
-            if entry.do == "drag" and entry.at:
-                x, y = (start + share * (end - start) for start, end in zip(pointer, entry.at, strict=True))
-                yield frame, Drag(x, y)
-            elif entry.do == "turn" and entry.by:
-                yield frame, Turn(entry.by[0] / frames, entry.by[1] / frames)
-            else:
-                yield frame, _event(entry)
-        pointer = entry.at or pointer
-
-
-def _event(entry: Entry) -> Event:
-    """Turn an entry that takes no time into its event."""
-    done: Any = {
-        "press": lambda: Press(*entry.at, pull=False),  # type: ignore[misc]
-        "pull": lambda: Press(*entry.at, pull=True),  # type: ignore[misc]
-        "release": Release,
-        "percent": lambda: Percent(entry.to or 0.0),
-        "key": lambda: Key(str(entry.name)),
-    }[entry.do]
-    event: Event = done()
-    return event
+            match entry.do:
+                case "press" | "pull":
+                    yield frame, Press(x, y, entry.do == "pull")
+                case "drag":
+                    yield frame, Drag(begin_x + share * (x - begin_x), begin_y + share * (y - begin_y))
+                case "release":
+                    yield frame, Release()
+                case "turn":
+                    right, down = entry.by or (0.0, 0.0)
+                    yield frame, Turn(right * scale[0] / frames, down * scale[1] / frames)
+                case "percent":
+                    yield frame, Percent(entry.to or 0.0)
+                case "key":
+                    yield frame, Key(entry.name or "")
+        if entry.at:
+            pointer = x, y

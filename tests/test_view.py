@@ -1,0 +1,324 @@
+"""`taichi-msm view`: scripts, films, errors; and the window, where there is an X server to be had."""
+
+from __future__ import annotations
+
+import os
+import shutil
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from taichi_msm import load_scene
+from taichi_msm.cli import main
+from taichi_msm.errors import SceneError
+from taichi_msm.live.events import Drag, Key, Percent, Press, Release, Turn
+from taichi_msm.live.pace import LONGEST, Pace
+from taichi_msm.live.script import load_script, timed
+
+SCRIPT = """\
+events:
+  - {t: 0.1, do: press, at: [20, 15]}
+  - {t: 0.3, do: drag, at: [26, 15], seconds: 0.2}
+  - {t: 0.6, do: release}
+  - {t: 0.7, do: key, name: w}
+"""
+
+
+def view(*arguments: str, **environment: str) -> subprocess.CompletedProcess[str]:
+    return subprocess.run(
+        [sys.executable, "-m", "taichi_msm", "view", *arguments, "--threads", "2"],
+        capture_output=True,
+        text=True,
+        check=False,
+        env=os.environ | environment,
+    )
+
+
+def test_a_script_is_done_and_filmed(small: Path) -> None:
+    Path("script.yaml").write_text(SCRIPT)
+    done = view("small.yaml", "--record", "films/live.gif", "--seconds", "1", "--script", "script.yaml")
+    assert (done.returncode, done.stderr) == (0, "saved output/small-live/session-1.yaml\n")
+    assert done.stdout == "films/live.gif\noutput/small-live/session-1.yaml\n"
+    assert [path.name for path in Path("films").iterdir()] == ["live.gif"], "and nothing is left beside it"
+    with Image.open("films/live.gif") as film:
+        assert film.size == (40, 30)
+        total = 0
+        for n in range(film.n_frames):
+            film.seek(n)
+            total += film.info["duration"]
+    assert total == 1100, "the first picture, and ten more a second"
+    probe = load_scene("output/small-live/session-1.yaml").probes[0]
+    times, percent = np.array(probe.load).T
+    assert (times[np.flatnonzero(percent)[0] - 1], times[-1]) == (0.1, pytest.approx(0.7))
+    assert percent.max() == 100
+
+
+@pytest.mark.parametrize(
+    ("arguments", "expected"),
+    [
+        (["--record", "a.gif"], "taichi-msm: --record FILE.gif and --seconds N go together (see taichi-msm --help)"),
+        (["--seconds", "2"], "taichi-msm: --record FILE.gif and --seconds N go together (see taichi-msm --help)"),
+        (
+            ["--script", "a.yaml"],
+            "taichi-msm: --script is for --record; in the window it is your hand that presses (see taichi-msm --help)",
+        ),
+        (
+            ["--record", "a.png", "--seconds", "1"],
+            "taichi-msm: Invalid value for --record: a.png has no name of a GIF; let it end in .gif "
+            "(see taichi-msm --help)",
+        ),
+        (
+            ["--record", "a.gif", "--seconds", "0"],
+            "taichi-msm: Invalid value for '--seconds': 0.0 is not in the range 0<x<=3600. (see taichi-msm --help)",
+        ),
+        (["--record", "a.gif", "--seconds", "1", "--script", "no.yaml"], "no.yaml: no such file or directory"),
+        (
+            ["--record", "a.gif", "--seconds", "1", "--set", "probes=[]"],
+            "small.yaml: probes: none; the tool takes its force from the first one, add it",
+        ),
+    ],
+)
+def test_what_view_refuses(
+    arguments: list[str], expected: str, small: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main(["view", "small.yaml", *arguments]) == 2
+    said = capsys.readouterr()
+    assert (said.out, said.err) == ("", expected + "\n")
+    assert sorted(path.name for path in small.iterdir()) == ["small.yaml", "speckle.png"]
+
+
+@pytest.mark.parametrize(
+    ("text", "expected"),
+    [
+        ("", ["s.yaml:1:1: no keys; a script needs at least events"]),
+        ("- a", ['s.yaml:1:1: ["a"] is not a script; expected keys such as events']),
+        ("events: 3", ["s.yaml:1:1: events: 3 is not allowed; expected a list of mappings with t and do"]),
+        (
+            "events:\n  - {do: press, at: [1, 2]}",
+            ["s.yaml:2:5: events.0.t: missing; expected a number, 0 or more, in seconds"],
+        ),
+        (
+            "events:\n  - {t: 1, do: pres}",
+            [
+                's.yaml:2:12: events.0.do: "pres" is not allowed; '
+                "expected press, pull, drag, release, turn, percent or key"
+            ],
+        ),
+        ("events:\n  - {t: 1, do: press}", ["s.yaml:2:5: events.0.at: missing; press needs it"]),
+        ("events:\n  - {t: 1, do: release, at: [1, 2]}", ["s.yaml:2:25: events.0.at: release takes none; remove it"]),
+        (
+            "events:\n  - {t: 1, do: press, at: [1, 2], seconds: 1}",
+            ["s.yaml:2:35: events.0.seconds: press takes no time; remove it"],
+        ),
+        (
+            "events:\n  - {t: 1, do: key, name: q}",
+            [
+                "s.yaml:2:21: events.0.name: there is no key q here; expected one of: up, down, c, t, o, m, l, space, "
+                "., r, p, g, w, i, h"
+            ],
+        ),
+        (
+            "events:\n  - {t: 1, do: turn, by: [1, 2], seconds: 2}\n  - {t: 2, do: release}",
+            ["s.yaml:3:5: events.1: begins at 2 s, before the one above ends at 3 s; let them follow each other"],
+        ),
+        (
+            "events:\n  - {t: 1, do: percent, to: 101}\nfoo: 1",
+            [
+                "s.yaml:2:25: events.0.to: 101 is not allowed; expected a number from 0 to 100",
+                "s.yaml:3:1: foo: unknown key; allowed: size, events",
+            ],
+        ),
+    ],
+)
+def test_what_is_wrong_with_a_script(
+    text: str, expected: list[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    Path("s.yaml").write_text(text)
+    with pytest.raises(SceneError) as caught:
+        load_script("s.yaml")
+    assert list(caught.value.lines) == expected
+
+
+def test_events_of_a_script(tmp_path: Path) -> None:
+    (tmp_path / "s.yaml").write_text(
+        """\
+size: [100, 50]
+events:
+  - {t: 0.1, do: pull, at: [9.5, 19.5]}
+  - {t: 0.2, do: drag, at: [29.5, 39.5], seconds: 0.2}
+  - {t: 0.4, do: release}
+  - {t: 0.5, do: turn, by: [10, 4], seconds: 0.2}
+  - {t: 0.7, do: percent, to: 40}
+  - {t: 0.7, do: key, name: m}
+"""
+    )
+    assert list(timed(load_script(tmp_path / "s.yaml"), 10.0, (200, 100))) == [
+        (1, Press(19.5, 39.5, pull=True)),
+        (2, Drag(39.5, 59.5)),
+        (3, Drag(59.5, 79.5)),
+        (4, Release()),
+        (5, Turn(10.0, 4.0)),
+        (6, Turn(10.0, 4.0)),
+        (7, Percent(40)),
+        (7, Key("m")),
+    ]
+
+
+def test_without_a_display_it_says_what_to_do(small: Path) -> None:
+    for display in ("", ":54321"):
+        done = view("small.yaml", DISPLAY=display)
+        expected = (
+            "there is no display to open a window on; set DISPLAY, or film without one: --record FILE.gif --seconds N"
+        )
+        assert (done.returncode, done.stdout, done.stderr) == (2, "", expected + "\n")
+
+
+def test_an_interrupted_film_leaves_the_one_that_was_there(small: Path) -> None:
+    Path("live.gif").write_bytes(b"before")
+    process = subprocess.Popen(
+        [sys.executable, "-m", "taichi_msm", "view", "small.yaml", "--record", "live.gif", "--seconds", "3600"],
+        stderr=subprocess.PIPE,
+        text=True,
+    )
+    while not list(small.glob(".film-*")):
+        time.sleep(0.05)
+        assert process.poll() is None
+    process.send_signal(signal.SIGINT)
+    assert process.communicate(timeout=60)[1] == "interrupted; no film was written\n"
+    assert process.returncode == 130
+    assert Path("live.gif").read_bytes() == b"before"
+    assert sorted(path.name for path in small.iterdir()) == ["live.gif", "small.yaml", "speckle.png"]
+
+
+def test_a_film_that_cannot_be_written(small: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    Path("films").write_text("no folder")
+    done = view("small.yaml", "--record", "films/live.gif", "--seconds", "1")
+    assert done.returncode == 4
+    assert done.stderr.startswith("films/live.gif: cannot write: ")
+    assert done.stderr.count("\n") == 1
+
+
+class Clock:
+    """A clock that goes when it is told to."""
+
+    def __init__(self) -> None:
+        self.now = 0.0
+
+    def __call__(self) -> float:
+        return self.now
+
+
+def shown(clock: Clock, stepping: float, drawing: float, seconds: float) -> tuple[int, str]:
+    """Let a machine that needs so long for a frame and a picture work for some time; the frames, and what is said."""
+    pace, frames = Pace(50.0, clock), 0
+    while clock.now < seconds:
+        clock.now += pace.wait()
+        for _ in pace.due():
+            clock.now += stepping
+            frames += 1
+        clock.now += drawing
+    return frames, pace.said()
+
+
+@pytest.mark.parametrize(
+    ("stepping", "drawing", "frames", "said"),
+    [
+        (0.002, 0.01, 500, "50 pictures/s"),
+        # Pictures are slow: several frames for each, and time goes as it should.
+        (0.002, 0.07, 500, "13 pictures/s"),
+        # Stepping is slow: no picture waits for more than it must, and time goes slower.
+        (0.05, 0.01, 190, "9 pictures/s  ·  too slow: time goes at 0.36"),
+    ],
+    ids=["fast", "slow pictures", "slow steps"],
+)
+def test_time_goes_as_fast_as_it_does_outside(stepping: float, drawing: float, frames: int, said: str) -> None:
+    found, words = shown(Clock(), stepping, drawing, 10.0)
+    assert found == pytest.approx(frames, rel=0.03)
+    assert words == said
+
+
+def test_what_was_missed_is_not_made_up_for() -> None:
+    clock = Clock()
+    pace = Pace(50.0, clock)
+    clock.now = 60.0
+    assert len(list(pace.due())) <= LONGEST * 50 + 1
+
+
+@pytest.fixture
+def screen(tmp_path: Path) -> Iterator[str]:
+    """An X server of its own without a screen."""
+    read, write = os.pipe()
+    with subprocess.Popen(
+        ["Xvfb", "-displayfd", str(write), "-screen", "0", "800x600x24"], pass_fds=[write], stderr=subprocess.DEVNULL
+    ) as server:
+        os.close(write)
+        with os.fdopen(read) as answer:
+            number = answer.readline().strip()
+        try:
+            yield f":{number}"
+        finally:
+            server.terminate()
+
+
+@pytest.mark.skipif(not (shutil.which("Xvfb") and shutil.which("xdotool")), reason="needs Xvfb and xdotool")
+def test_the_window(small: Path, screen: str) -> None:
+    environment = os.environ | {"DISPLAY": screen}
+
+    def hand(*words: str) -> None:
+        subprocess.run(["xdotool", *words], env=environment, check=True)
+
+    size = ["--set", "render.size=[320,240]", "--set", "render.camera=oblique"]
+    with subprocess.Popen(
+        [sys.executable, "-m", "taichi_msm", "view", "small.yaml", "--threads", "2", "--out", "kept", *size],
+        env=environment,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+    ) as process:
+
+        def kept(name: str) -> Path:
+            """Press the key that keeps something until it is there: the window listens when all is compiled."""
+            path = Path("kept") / name
+            for n in range(300):
+                # Without a window manager keys go to the window into which the pointer moved.
+                hand("mousemove", "160", str(119 + n % 2), "key", {"picture": "p", "session": "w"}[name.split("-")[0]])
+                time.sleep(0.1)
+                if path.exists():
+                    return path
+                if process.poll() is not None:
+                    break
+            process.kill()
+            raise AssertionError(f"there is no {path}: {process.communicate()}")
+
+        with Image.open(kept("picture-1.png")) as image:
+            before = np.array(image).astype(int)
+        hand("mousemove", "160", "120", "mousedown", "1")
+        time.sleep(0.5)
+        hand("mousemove", "200", "120")
+        time.sleep(0.5)
+        hand("mouseup", "1", "click", "5", "keydown", "shift", "mousedown", "1")
+        time.sleep(0.5)
+        hand("mouseup", "1", "keyup", "shift", "mousedown", "3", "mousemove", "230", "140", "mouseup", "3")
+        shown = load_scene(kept("session-1.yaml"))
+        numbers = [int(path.stem.split("-")[1]) for path in Path("kept").glob("picture-*.png")]
+        with Image.open(kept(f"picture-{max(numbers) + 1}.png")) as image:
+            after = np.array(image).astype(int)
+        hand("key", "Escape")
+        out, err = process.communicate(timeout=60)
+    assert (process.returncode, err) == (0, "")
+    assert out.splitlines()[-1].startswith("kept/picture-")
+    percent = np.array(shown.probes[0].load)[:, 1]
+    assert percent.max() == 100
+    assert percent.min() == -95, "a notch of the wheel less, and pulling"
+    across = np.array(shown.probes[0].at)[:, 1]
+    assert np.ptp(across[1:]) > 0.05, "dragged to the right"
+    assert shown.render.camera not in ("top", "oblique"), "turned"
+    assert np.abs(after - before).max() > 50
