@@ -16,6 +16,10 @@ import skimage
 from PIL import Image
 
 from taichi_msm import Simulation, load_scene, run
+from taichi_msm.live.album import Album
+from taichi_msm.live.film import film
+from taichi_msm.live.script import load_script, timed
+from taichi_msm.live.session import Session
 
 ROOT = Path(__file__).parent.parent
 SCENES = ROOT / "scenes"
@@ -51,6 +55,15 @@ def animation(name: str, size: int, *overrides: str, image: Path | None = None) 
         shutil.copy(Path(directory) / "animation.gif", IMAGES / f"{name}.gif")
 
 
+def live(name: str, size: int, rate: float, seconds: float) -> None:
+    """Keep a film of a live session with the scene press, which its script presses."""
+    settings = {"render.size": [size, size], "render.supersample": 2, "time.frames_per_second": rate}
+    scene = load_scene(SCENES / "press.yaml", settings)
+    script = load_script(SCENES / "scripts" / "press.yaml")
+    with tempfile.TemporaryDirectory() as directory, Session(scene, Album(Path(directory), "press.yaml")) as session:
+        film(session, IMAGES / f"{name}.gif", seconds, timed(script, session.rate, scene.render.size))
+
+
 def strip(pictures: list[Image.Image], gap: int = 6) -> Image.Image:
     """Put pictures side by side on white."""
     width, height = pictures[0].size
@@ -65,6 +78,7 @@ def main() -> None:
     IMAGES.mkdir(exist_ok=True)
     animation("press", 340)
     animation("retina", 320, "render.camera={eye: [0, 0.28, 0.36], target: [0, 0.045, 0], fov: 42}", image=RETINA)
+    live("live", 300, 10, 4.8)
     strip(frames(SCENES / "figure-3.yaml", STAGES, (400, 250))).save(IMAGES / "figure-3.png", optimize=True)
     stills = [frames(SCENES / f"{name}.yaml", (moment,), (400, 400))[0] for name, moment in MOMENTS.items()]
     strip(stills).save(IMAGES / "scenes.jpg", quality=90)

@@ -1,4 +1,4 @@
-"""Write the table of the scene's keys into the README, from the JSON Schema.
+"""Write the tables of the scene's keys and of the window's keys into the README, from the program's own words.
 
 python docs/make_key_table.py
 """
@@ -10,11 +10,11 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
+from taichi_msm.live.events import KEYS, POINTER
 from taichi_msm.scene_file import schema
 
 README = Path(__file__).parent.parent / "README.md"
-START = "<!-- keys: made by docs/make_key_table.py -->\n"
-END = "<!-- end of keys -->\n"
+MARKS = "<!-- {}: made by docs/make_key_table.py -->\n", "<!-- end of {} -->\n"
 
 
 def rows(section: dict[str, Any], definitions: dict[str, Any], prefix: str = "") -> Iterator[str]:
@@ -37,18 +37,24 @@ def _references(key: dict[str, Any]) -> Iterator[str]:
             yield place["$ref"].rsplit("/", 1)[-1]
 
 
-def table() -> str:
-    """Give the whole table."""
+def tables() -> dict[str, str]:
+    """Give both tables by the names of their places."""
     whole = schema()
-    head = "| key | meaning | value | default |\n|---|---|---|---|\n"
-    return head + "\n".join(rows(whole, whole["$defs"])) + "\n"
+    keys = "| key | meaning | value | default |\n|---|---|---|---|\n" + "\n".join(rows(whole, whole["$defs"])) + "\n"
+    hands = "".join(f"| {name} | {does} |\n" for name, does in POINTER.items())
+    hands += "".join(f"| `{name}` | {does} |\n" for name, does in KEYS.items())
+    return {"keys": keys, "hands": "| | |\n|---|---|\n" + hands}
 
 
 def main() -> None:
     """Replace what is between the marks."""
-    before, rest = README.read_text(encoding="utf-8").split(START)
-    _, after = rest.split(END)
-    README.write_text(before + START + table() + END + after, encoding="utf-8")
+    text = README.read_text(encoding="utf-8")
+    for name, table in tables().items():
+        start, end = (mark.format(name) for mark in MARKS)
+        before, rest = text.split(start)
+        _, after = rest.split(end)
+        text = before + start + table + end + after
+    README.write_text(text, encoding="utf-8")
 
 
 if __name__ == "__main__":

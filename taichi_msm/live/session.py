@@ -349,14 +349,13 @@ class Session:
         return self._drawing().draw(self.positions(), self._view)
 
     def _written(self, picture: Picture, pace: str) -> Picture:
-        above: list[str] = []
-        tool = None
-        if self._figures:
-            above += self._figure_lines(pace)
-            if self._tool.percent != 0:
-                tool = self._seen_at_tool()
-        table = POINTER | KEYS if self._keys else None
-        return overlay.write(picture, above, self.notice, table=table, tool=tool, pulls=self._tool.percent < 0)
+        """Write over a picture what is to be seen; returns it."""
+        pulls = self._tool.percent < 0
+        if self._figures and self._tool.percent != 0 and (tool := self._seen_at_tool()):
+            overlay.mark(picture, tool, pulls=pulls)
+        above = self._figure_lines(pace) if self._figures else []
+        overlay.write(picture, above, self.notice, POINTER | KEYS if self._keys else None)
+        return picture
 
     def _figure_lines(self, pace: str) -> list[str]:
         tool, speed = self._tool, ""
