@@ -19,7 +19,8 @@ from tests.scenes import scene
 
 SIZE = (96, 80)
 POINTS = (7, 9)
-NEAR_EYE = {"eye": [0.05, -0.16, 0.05], "target": [0, 0, 0], "fov": 70}
+# Amid the sheet, of which half is behind it, and as wide as to see above the horizon.
+NEAR_EYE = {"eye": [0.02, -0.02, 0.05], "target": [0, 0.15, 0.02], "up": [0, 0, 1], "fov": 90}
 
 
 def place_texture() -> NDArray[np.uint8]:
@@ -48,7 +49,6 @@ def folded() -> NDArray[np.float64]:
 @pytest.mark.parametrize("refine", [0, 2])
 @pytest.mark.parametrize("camera", ["top", "oblique", NEAR_EYE], ids=["top", "oblique", "near"])
 def test_what_is_picked_is_what_is_drawn(camera: Any, refine: int, device: Device) -> None:
-    # Near the eye, some of the sheet is behind the camera.
     shown, position = sheet(camera, refine), folded()
     drawing = Drawing(shown, place_texture())
     picture = drawing.draw(position).astype(int)

@@ -74,7 +74,8 @@ def test_a_press_at_a_pixel_dimples_what_is_seen_there(begin: Begin) -> None:
     session = begin(TILTED)
     rows, cols = session.scene.sheet.points
     for row, col in [(8, 6), (12, 12), (17, 18)]:
-        # The second and third time the sheet still swings.
+        # The second and third time the sheet still swings, and the camera is elsewhere.
+        session.handle(Turn(col - 6, 0))
         pixel = pixel_of(session, row, col)
         session.handle(Press(*pixel))
         advance(session, 12)
@@ -146,6 +147,15 @@ def test_run_repeats_a_session_to_the_bit(overrides: dict[str, Any], play: bool,
     # Seen as it was seen at the end.
     assert load_scene(written).render.wireframe
     assert load_scene(written).render.camera.eye == session.recorded().render.camera.eye  # type: ignore[union-attr]
+
+
+def test_pulling_lifts_what_pushing_presses_down(begin: Begin) -> None:
+    session = begin(TILTED)
+    for pull, sign in [(False, -1), (True, 1)]:
+        session.handle(Press(*pixel_of(session, 12, 12), pull=pull))
+        advance(session, 10)
+        assert session.positions()[12, 12, 2] * sign > 0.003
+        session.handle(Key("r"))
 
 
 def test_virtual_springs_vanish_when_the_tool_is_released(begin: Begin) -> None:
