@@ -8,7 +8,7 @@ import pytest
 from PIL import Image
 
 from taichi_msm import accuracy, runtime, simulation
-from taichi_msm.live import session
+from taichi_msm.live import stage
 from tests.pool import Pool
 from tests.scenes import SMALL, speckle
 
@@ -43,7 +43,7 @@ def pool(sheets: Pool, monkeypatch: pytest.MonkeyPatch) -> Pool:
     """Compiled sheets and drawings, which pilot runs, simulations and sessions use too."""
     monkeypatch.setattr(accuracy, "Dynamics", sheets.lend)
     monkeypatch.setattr(simulation, "Dynamics", sheets.lend)
-    monkeypatch.setattr(session, "Drawing", sheets.lend_drawing)
+    monkeypatch.setattr(stage, "Drawing", sheets.lend_drawing)
     return sheets
 
 

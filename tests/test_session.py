@@ -66,7 +66,7 @@ def displacement(session: Session) -> np.ndarray:
 
 def pixel_of(session: Session, row: int, col: int) -> tuple[float, float]:
     """The pixel at which a mass point is seen now."""
-    x, y, w, _ = session.view.matrix @ [*session.positions()[row, col].astype(float), 1]
+    x, y, w, _ = session.stage.view.matrix @ [*session.positions()[row, col].astype(float), 1]
     return round(x / w - 0.5), round(y / w - 0.5)
 
 
@@ -241,9 +241,9 @@ def test_turning_follows_the_pointer(begin: Begin) -> None:
     near = pixel_of(session, 20, 12)
     session.handle(Turn(10, 0))
     assert pixel_of(session, 20, 12)[0] > near[0] + 2
-    before = session.view.toward[2]
+    before = session.stage.view.toward[2]
     session.handle(Turn(0, 10))
-    assert session.view.toward[2] > before, "pushed down, the sheet shows more of its face"
+    assert session.stage.view.toward[2] > before, "pushed down, the sheet shows more of its face"
 
 
 def test_a_press_beside_the_sheet_says_so(begin: Begin) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import textwrap
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from functools import cache
@@ -14,6 +15,9 @@ from taichi_msm.gif import Picture
 # Heights of letters [px]: this share of the picture's, within limits.
 LETTER = 1 / 34
 SMALLEST, LARGEST = 12, 22
+
+# A letter is so wide, as a share of its height, in most texts at most.
+LETTER_WIDTH = 0.56
 
 TEXT = (255, 255, 255)
 SHADE = (0, 0, 0)
@@ -30,10 +34,10 @@ def write(picture: Picture, above: Sequence[str], below: str = "", table: Mappin
     Args:
         picture: colours, shape (height, width, 3); changed.
         above: lines for its top left corner.
-        below: a line for its bottom left corner.
+        below: a text for its bottom left corner, in as many lines as it needs.
         table: two columns, under the first lines.
     """
-    height = picture.shape[0]
+    height, width = picture.shape[:2]
     size = int(min(LARGEST, max(SMALLEST, height * LETTER)))
     line = round(1.35 * size)
     margin = line // 2
@@ -42,8 +46,8 @@ def write(picture: Picture, above: Sequence[str], below: str = "", table: Mappin
     for n, (name, meaning) in enumerate((table or {}).items()):
         y = 2 * margin + (len(above) + n) * line
         texts += [(margin, y, name), (right, y, meaning)]
-    if below:
-        texts.append((margin, height - line - margin, below))
+    lines = textwrap.wrap(below, max(1, int((width - 2 * margin) / (LETTER_WIDTH * size))))
+    texts += [(margin, height - margin - (len(lines) - n) * line, text) for n, text in enumerate(lines)]
     for x, y, text in texts:
         with _part(picture, (x, y, x + _length(text, size) + 2, y + line)) as draw:
             # A shadow, and no outline, which would fill the spaces between small words.

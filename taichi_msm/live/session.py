@@ -11,17 +11,16 @@ from numpy.typing import NDArray
 
 from taichi_msm import runtime
 from taichi_msm.accuracy import choose_step
-from taichi_msm.camera import View, pinhole, turned, view
-from taichi_msm.drawing import Drawing
-from taichi_msm.errors import DivergedError, SceneError
+from taichi_msm.errors import DivergedError, FilesError, SceneError
 from taichi_msm.gif import Picture
 from taichi_msm.lattice import rest_positions
 from taichi_msm.live import overlay
 from taichi_msm.live.album import Album, Film
 from taichi_msm.live.events import KEYS, NOTCH, POINTER, Drag, Event, Harder, Key, Percent, Press, Release, Turn
 from taichi_msm.live.picking import on_rest_plane, pick
+from taichi_msm.live.stage import Stage
 from taichi_msm.live.tool import Place, Tool
-from taichi_msm.scene import MAX_PROBES, Camera, Scene
+from taichi_msm.scene import MAX_PROBES, Scene
 from taichi_msm.simulation import Simulation
 from taichi_msm.stability import steps_per_frame, with_time
 from taichi_msm.texture import load_texture
@@ -74,6 +73,8 @@ class Session:
 
     Attributes:
         scene: with the frames and the step of the session.
+        tool: the tool in the hand.
+        stage: how the tissue is looked at.
         parts: how many of its frames make one of the given scene's.
         paused: whether time stands still.
         fault: why the tissue moves no more; nothing if it does.
@@ -93,8 +94,7 @@ class Session:
         _require_usable(scene, play=play)
         progress("start")
         device = runtime.start(arch, threads)
-        self._texture = load_texture(scene)
-        given = scene
+        given, texture = scene, load_texture(scene)
         scene, self.parts = with_live_frames(scene)
         if scene.time.tolerance is not None:
             scene, _ = choose_step(scene, device, lambda done, total: progress("pilot"))
@@ -104,13 +104,10 @@ class Session:
         self._film_rate = given.time.frames_per_second
         self._filmed_from = 0
         self._others = scene.probes if play else ()
-        self._tool = Tool(scene.probes[0], rate)
-        self.scene = scene.model_copy(update={"probes": (*self._others, self._tool.recorded(0))})
+        self.tool = Tool(scene.probes[0], rate)
+        self.scene = scene.model_copy(update={"probes": (*self._others, self.tool.recorded(0))})
         self._rest = rest_positions(scene.sheet)
-        self._lit, self._wireframe = scene.render.shading == "headlight", scene.render.wireframe
-        self._drawings: dict[tuple[bool, bool], Drawing] = {}
-        self._camera: str | Camera = scene.render.camera
-        self._view = view(scene)
+        self.stage = Stage(scene, texture)
         self._press_at: tuple[Place, NDArray[np.float64] | None] | None = None
         self._figures, self._keys = True, False
         self._once = False
@@ -124,7 +121,7 @@ class Session:
         self._simulation = Simulation(self.scene.model_copy(update={"output": ()}), arch, threads)
         self._simulation.compile(lambda: progress("compile"))
         self._beginning = self._simulation.save()
-        self._drawing()
+        self.stage.draw(self.positions())
 
     @property
     def rate(self) -> float:
@@ -136,38 +133,22 @@ class Session:
         """Frames simulated since the tissue was at rest."""
         return self._simulation.frame
 
-    @property
-    def tool(self) -> Tool:
-        """The tool, to be looked at."""
-        return self._tool
-
-    @property
-    def view(self) -> View:
-        """The camera."""
-        return self._view
-
     def positions(self) -> NDArray[np.floating]:
         """Positions of the points [m], shape (rows, cols, 3)."""
         return self._simulation.positions()
 
     def displacement(self) -> float:
         """Tell how far the tissue at the tool is from rest [m]."""
-        across, down = self._tool.place
-        return float(np.linalg.norm(_between(self.positions() - self._rest, across, down)))
+        across, down = self.tool.place
+        moved = _between(self.positions(), across, down) - _between(self._rest, across, down)
+        return float(np.linalg.norm(moved))
 
     def recorded(self) -> Scene:
         """Give what was done as a scene; its run has the same bits."""
         frames = max(1, self.frame)
         time = self.scene.time.model_copy(update={"duration": frames / self.rate, "tolerance": None})
-        render = self.scene.render.model_copy(
-            update={
-                "camera": self._camera,
-                "shading": "headlight" if self._lit else "none",
-                "wireframe": self._wireframe,
-            }
-        )
-        probes = (*self._others, self._tool.recorded(frames))
-        return self.scene.model_copy(update={"probes": probes, "time": time, "render": render})
+        probes = (*self._others, self.tool.recorded(frames))
+        return self.scene.model_copy(update={"probes": probes, "time": time, "render": self.stage.render})
 
     def handle(self, event: Event) -> None:
         """Do what an event asks for; what it does to the tissue is seen in the next frame.
@@ -182,15 +163,14 @@ class Session:
                 self._drag(x, y)
             case Release():
                 self._press_at = None
-                if self._tool.held:
-                    self._tool.release()
+                if self.tool.held:
+                    self.tool.release()
             case Turn(right, down):
-                angle = np.pi / self.scene.render.size[1]
-                self._look(turned(self._pinhole(), -right * angle, down * angle))
+                self.stage.turn(right, down)
             case Percent(percent):
-                self._tool.strength = min(100.0, max(0.0, percent))
+                self.tool.strength = min(100.0, max(0.0, percent))
             case Harder(percent):
-                self.handle(Percent(self._tool.strength + percent))
+                self.handle(Percent(self.tool.strength + percent))
             case Key(name):
                 self._do(name)
 
@@ -202,7 +182,7 @@ class Session:
         self._once = False
         begun = time.perf_counter()
         try:
-            self._simulation.steer((*self._others, self._tool.follow(self.frame)))
+            self._simulation.steer((*self._others, self.tool.follow(self.frame)))
             self._simulation.advance()
         except DivergedError as error:
             self.fault = str(error)
@@ -211,7 +191,7 @@ class Session:
         self.seconds_a_frame += share * (spent - self.seconds_a_frame)
 
     def picture(self, pace: str = "") -> Picture:
-        """Draw the tissue and what is written over it; a film that is on takes it.
+        """Draw the tissue and what is written over it; a film that is on takes it, or ends where it cannot.
 
         Args:
             pace: what is to be said of the speed of the pictures.
@@ -219,11 +199,16 @@ class Session:
         Returns:
             Colours, shape (height, width, 3).
         """
-        picture = self._written(self._drawing().draw(self.positions(), self._view), pace)
+        picture = self._written(pace)
         if self._film is not None:
             # Where the pictures are too slow for the film one stays for several.
-            while self._film.pictures * self.parts <= self._beats - self._filmed_from:
-                self._film.add(picture)
+            try:
+                while self._film.pictures * self.parts <= self._beats - self._filmed_from:
+                    self._film.add(picture)
+            except FilesError as error:
+                film, self._film = self._film, None
+                film.abort()
+                self.say(str(error))
         return picture
 
     def say(self, notice: str) -> None:
@@ -238,9 +223,7 @@ class Session:
     def close(self) -> None:
         """Keep the film that is on, and free the memory."""
         self._simulation.close()
-        for drawing in self._drawings.values():
-            drawing.close()
-        self._drawings.clear()
+        self.stage.close()
         if self._film is not None:
             film, self._film = self._film, None
             self._album.keep_film(film)
@@ -254,12 +237,12 @@ class Session:
         self.close()
 
     def _press(self, x: float, y: float, direction: int) -> None:
-        place = pick(self.positions(), self.scene.render.refine, self._view, (x, y))
+        place = pick(self.positions(), self.scene.render.refine, self.stage.view, (x, y))
         if place is None:
             self.say(f"no tissue at pixel {x:g}, {y:g}")
             return
-        self._press_at = place, on_rest_plane(self._view, (x, y))
-        self._tool.press(place, direction)
+        self._press_at = place, on_rest_plane(self.stage.view, (x, y))
+        self.tool.press(place, direction)
 
     def _drag(self, x: float, y: float) -> None:
         """Move the control point as far over the sheet at rest as the pointer went.
@@ -268,11 +251,11 @@ class Session:
         """
         if self._press_at is None:
             return
-        ((across, down), begun), here = self._press_at, on_rest_plane(self._view, (x, y))
+        ((across, down), begun), here = self._press_at, on_rest_plane(self.stage.view, (x, y))
         if begun is None or here is None:
             return
         (right, up), (height, width) = here - begun, self.scene.sheet.size
-        self._tool.move((across + right / width, down - up / height))
+        self.tool.move((across + right / width, down - up / height))
 
     def _do(self, key: str) -> None:
         match key:
@@ -281,26 +264,26 @@ class Session:
             case "down":
                 self.handle(Harder(-NOTCH))
             case "c":
-                self._look(self.scene.render.camera)
+                self.stage.look(self.scene.render.camera)
             case "t":
-                self._look("top")
+                self.stage.look("top")
             case "o":
-                self._look("oblique")
+                self.stage.look("oblique")
             case "m":
-                self._wireframe = not self._wireframe
+                self.stage.mesh()
             case "l":
-                self._lit = not self._lit
+                self.stage.light()
             case "space":
                 self.paused = not self.paused
             case ".":
                 self._once = self.paused
             case "r":
                 self._simulation.go_on(self._beginning)
-                self._tool.rest()
+                self.tool.rest()
                 self._press_at = None
                 self.fault = ""
             case "p":
-                self.say(f"saved {self._album.keep_picture(self._written(self._drawn(), ''))}")
+                self.say(f"saved {self._album.keep_picture(self._written())}")
             case "g":
                 self._start_or_stop_film()
             case "w":
@@ -319,46 +302,19 @@ class Session:
             film, self._film = self._film, None
             self.say(f"saved {self._album.keep_film(film)}")
 
-    def _look(self, camera: str | Camera) -> None:
-        self._camera = camera
-        self._view = view(self._seen_by(camera))
-
-    def _seen_by(self, camera: str | Camera) -> Scene:
-        return self.scene.model_copy(update={"render": self.scene.render.model_copy(update={"camera": camera})})
-
-    def _pinhole(self) -> Camera:
-        return pinhole(self._seen_by(self._camera))
-
-    @property
-    def compiled(self) -> bool:
-        """Whether the next picture needs no other kernel than those there are."""
-        return (self._lit, self._wireframe) in self._drawings
-
-    def _drawing(self) -> Drawing:
-        """Give the kernel that draws as is wanted now; it is compiled when it is first wanted."""
-        wanted = self._lit, self._wireframe
-        if not self.compiled:
-            shading = "headlight" if self._lit else "none"
-            render = self.scene.render.model_copy(update={"shading": shading, "wireframe": self._wireframe})
-            drawing = Drawing(self.scene.model_copy(update={"render": render}), self._texture)
-            drawing.draw(self.positions(), self._view)
-            self._drawings[wanted] = drawing
-        return self._drawings[wanted]
-
-    def _drawn(self) -> Picture:
-        return self._drawing().draw(self.positions(), self._view)
-
-    def _written(self, picture: Picture, pace: str) -> Picture:
-        """Write over a picture what is to be seen; returns it."""
-        pulls = self._tool.percent < 0
-        if self._figures and self._tool.percent != 0 and (tool := self._seen_at_tool()):
-            overlay.mark(picture, tool, pulls=pulls)
+    def _written(self, pace: str = "") -> Picture:
+        """Draw the tissue and write over it what is to be seen."""
+        picture = self.stage.draw(self.positions())
+        if self._figures and self.tool.percent != 0:
+            seen = self.stage.pixel(_between(self.positions(), *self.tool.place))
+            if seen is not None:
+                overlay.mark(picture, seen, pulls=self.tool.percent < 0)
         above = self._figure_lines(pace) if self._figures else []
         overlay.write(picture, above, self.notice, POINTER | KEYS if self._keys else None)
         return picture
 
     def _figure_lines(self, pace: str) -> list[str]:
-        tool, speed = self._tool, ""
+        tool, speed = self.tool, ""
         if self.seconds_a_frame > 0:
             speed = f"{1 / self.rate / self.seconds_a_frame:.0f} x real time"
         state = [word for word, on in (("paused", self.paused), ("film", self._film is not None)) if on]
@@ -369,12 +325,6 @@ class Session:
         moved = moved if moved > AT_REST * max(self.scene.sheet.size) else 0.0
         lines = [percent, _length(moved)], [pace, speed, *state]
         return [SEPARATOR.join(part for part in line if part) for line in lines]
-
-    def _seen_at_tool(self) -> tuple[float, float] | None:
-        """Find the pixel where the control point is now."""
-        point = _between(self.positions(), *self._tool.place)
-        x, y, w, _ = self._view.matrix @ [*point, 1.0]
-        return (x / w, y / w) if w > self._view.near else None
 
 
 def _require_usable(scene: Scene, *, play: bool) -> None:

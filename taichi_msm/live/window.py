@@ -118,6 +118,6 @@ def show(session: Session, window: Window, pause: Callable[[], None]) -> None:
                 session.say(str(error))
         for _ in pace.due():
             session.advance()
-        if not session.compiled:
+        if not session.stage.compiled:
             window.say("compiling the kernel that draws it")
         window.show(session.picture(pace.said()))
