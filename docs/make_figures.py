@@ -59,7 +59,7 @@ def live(name: str, size: int, rate: float, seconds: float) -> None:
     """Keep a film of a live session with the scene press, which its script presses."""
     settings = {"render.size": [size, size], "render.supersample": 2, "time.frames_per_second": rate}
     scene = load_scene(SCENES / "press.yaml", settings)
-    script = load_script(SCENES / "scripts" / "press.yaml")
+    script = load_script(SCENES / "scripts" / "press.yaml", scene.render.size)
     with tempfile.TemporaryDirectory() as directory, Session(scene, Album(Path(directory), "press.yaml")) as session:
         film(session, IMAGES / f"{name}.gif", seconds, timed(script, session.rate, scene.render.size))
 

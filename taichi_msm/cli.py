@@ -7,6 +7,7 @@ import time
 STARTED = time.perf_counter()
 
 import json
+import math
 import os
 import shlex
 import sys
@@ -274,6 +275,8 @@ def view(
         raise click.UsageError("--record FILE.gif and --seconds N go together")
     if record is None and script is not None:
         raise click.UsageError("--script is for --record; in the window it is your hand that presses")
+    if seconds is not None and math.isnan(seconds):
+        raise click.BadParameter("nan is not a number of seconds", param_hint="--seconds")
     if record is not None and Path(record).suffix.lower() != ".gif":
         raise click.BadParameter(f"{record} has no name of a GIF; let it end in .gif", param_hint="--record")
     loaded = load_scene(scene, overrides, image)
@@ -281,7 +284,7 @@ def view(
 
     from taichi_msm.live.script import load_script, timed
 
-    done = load_script(script) if script is not None else None
+    done = load_script(script, loaded.render.size) if script is not None else None
 
     from taichi_msm.console import Progress
     from taichi_msm.live.album import Album
@@ -290,6 +293,7 @@ def view(
     from taichi_msm.live.window import Window, show
 
     album, interruption = Album(directory, scene), Interruption()
+    notices: list[str] = []
 
     def begin() -> Session:
         with Progress(quiet=False) as bar:
@@ -299,18 +303,21 @@ def view(
     try:
         with naming(scene):
             if record is None or seconds is None:
-                with Window(f"taichi-msm {scene}", loaded.render.size) as window, begin() as session:
-                    show(session, window, interruption.grant)
+                with Window(f"taichi-msm {scene}", loaded.render.size) as window:
+                    window.say("one moment: compiling")
+                    with begin() as session:
+                        show(session, window, interruption.grant)
             else:
                 with begin() as session, Progress(quiet=False) as bar:
                     events = timed(done, session.rate, loaded.render.size) if done else ()
                     progress = partial(interruptible(bar, interruption), "film")
-                    complain(film(session, Path(record), seconds, events, progress))
+                    film(session, Path(record), seconds, events, progress, notices.append)
                 click.echo(printable(record))
     except KeyboardInterrupt:
         report("interrupted", ["interrupted" if record is None else "interrupted; no film was written"], as_json=False)
         return interruption.code
     finally:
+        complain(notices)
         for path in album.kept:
             click.echo(printable(str(path)))
     return DIVERGED if record is not None and session.fault else DONE

@@ -65,8 +65,12 @@ def printable(text: str) -> str:
 
 
 @contextmanager
-def writing(directory: object) -> Iterator[None]:
+def writing(place: object, option: str = "--out") -> Iterator[None]:
     """Turn any error of the system into one line with its remedy.
+
+    Args:
+        place: what cannot be written then.
+        option: where another is chosen.
 
     Raises:
         FilesError: in the place of an OSError.
@@ -75,5 +79,5 @@ def writing(directory: object) -> Iterator[None]:
         yield
     except OSError as error:
         full = error.errno in (errno.ENOSPC, getattr(errno, "EDQUOT", None))
-        remedy = "free some space or choose another --out" if full else "choose another --out"
-        raise FilesError(f"{directory}: cannot write: {error.strerror or error}; {remedy}") from error
+        remedy = f"free some space or choose another {option}" if full else f"choose another {option}"
+        raise FilesError(f"{place}: cannot write: {error.strerror or error}; {remedy}") from error

@@ -36,7 +36,7 @@ def test_the_tables_of_keys_are_made_from_the_program(root: Path) -> None:
 
 
 def test_the_shipped_script_is_valid(root: Path) -> None:
-    assert len(load_script(root / "scenes" / "scripts" / "press.yaml").events) > 3
+    assert len(load_script(root / "scenes" / "scripts" / "press.yaml", (512, 512)).events) > 3
 
 
 def test_the_python_shown_runs(root: Path, tmp_path: Path) -> None:

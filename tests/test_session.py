@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import os
+import subprocess
+import time
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack
 from pathlib import Path
@@ -14,6 +17,8 @@ from PIL import Image
 from taichi_msm import load_scene, run
 from taichi_msm.errors import FilesError, SceneError
 from taichi_msm.lattice import rest_positions
+from taichi_msm.live import album
+from taichi_msm.live import session as live_session
 from taichi_msm.live.album import Album
 from taichi_msm.live.events import KEYS, Drag, Event, Harder, Key, Percent, Press, Release, Turn
 from taichi_msm.live.session import Session, with_live_frames
@@ -297,12 +302,117 @@ def test_a_film_shows_as_much_time_as_went_by(begin: Begin) -> None:
         session.handle(Harder(-5))
         session.picture()
     session.close()
+    assert duration("album/film-1.gif") == 1300, "from the first picture, 1.2 s to the last one, and that one's tenth"
+
+
+def test_a_film_begins_when_it_is_begun(begin: Begin) -> None:
+    session = begin({**TILTED, "time.frames_per_second": 10})
+    advance(session, 60)
+    session.handle(Key("g"))
+    for _ in range(4):
+        advance(session, 6)
+        session.picture()
+    session.handle(Key("g"))
+    assert duration("album/film-1.gif") == 500
+
+
+def duration(film: str) -> int:
+    """How long a GIF lasts [ms]."""
+    total = 0
+    with Image.open(film) as image:
+        for n in range(image.n_frames):
+            image.seek(n)
+            total += image.info["duration"]
+    return total
+
+
+def test_a_film_without_a_picture_is_none(begin: Begin) -> None:
+    session = begin(TILTED)
+    session.handle(Key("g"))
+    session.handle(Key("g"))
+    assert session.notice == "the film had no picture yet"
+    assert list(Path("album").iterdir()) == []
+
+
+def test_a_film_that_cannot_go_on_ends_and_the_session_goes_on(begin: Begin) -> None:
+    session = begin(TILTED)
+    session.handle(Key("g"))
+    session.picture()
+    subprocess.run(["pkill", "-KILL", "-P", str(os.getpid())], check=True)
+    for _ in range(20):
+        session.advance()
+        session.picture()
+        if session.notice:
+            break
+        time.sleep(0.05)
+    assert session.notice.startswith("album: cannot write: ")
+    assert list(Path("album").iterdir()) == []
+    session.handle(Key("g"))
+    session.picture()
+    session.handle(Key("g"))
+    assert session.notice == "saved album/film-1.gif"
+
+
+def test_a_film_shows_the_tissue_alone(begin: Begin) -> None:
+    session = begin(TILTED)
+    session.handle(Key("h"))
+    session.handle(Key("g"))
+    shown = session.picture()
+    session.handle(Key("g"))
+    session.handle(Key("p"))
+    with Image.open("album/picture-1.png") as image:
+        alone = np.array(image)
+    assert (shown != alone).any()
     with Image.open("album/film-1.gif") as film:
-        total = 0
-        for n in range(film.n_frames):
-            film.seek(n)
-            total += film.info["duration"]
-    assert total == 1300, "from the first picture, 1.2 s to the last one, and that one's tenth"
+        # As near as 256 colours are.
+        assert np.abs(np.array(film.convert("RGB")).astype(int) - alone).mean() < 8
+    assert np.abs(shown.astype(int) - alone).mean() > 15
+
+
+def test_a_session_too_long_for_a_file_says_so_before(begin: Begin, monkeypatch: pytest.MonkeyPatch) -> None:
+    for module in (live_session, album):
+        monkeypatch.setattr(module, "MAX_NODES", 1100)
+    session = begin(TILTED)
+    session.handle(Press(60, 50))
+    told = []
+    for n in range(402):
+        session.handle(Drag(50 + n % 20, 50))
+        session.advance()
+        told.append(session.notice)
+    assert told[200] == "soon this session will be too long for a scene: write it now (w), then reset it (r)"
+    assert sum(notice != "" for notice in told) <= 160, "once"
+    with pytest.raises(FilesError, match=r"^this session is too long for the file of a scene; reset it, and do less$"):
+        session.handle(Key("w"))
+    assert list(Path("album").iterdir()) == [Path("album/speckle.png")]
+    session.handle(Key("r"))
+    session.handle(Key("w"))
+    assert load_scene("album/session-1.yaml").time.duration == pytest.approx(1 / session.rate)
+
+
+def test_two_albums_of_one_folder_keep_both_films(begin: Begin) -> None:
+    sessions = begin(TILTED), begin(TILTED)
+    for session in sessions:
+        session.handle(Key("g"))
+        session.picture()
+    for session in sessions:
+        session.handle(Key("g"))
+    assert sorted(path.name for path in Path("album").iterdir()) == ["film-1.gif", "film-2.gif"]
+
+
+def test_a_name_of_two_lines_is_one_in_the_comment(small: Path) -> None:
+    keeper = Album(Path("album"), "a\nb: [.yaml")
+    assert load_scene(keeper.keep_scene(load_scene("small.yaml"))).sheet == load_scene("small.yaml").sheet
+
+
+def test_a_sheet_that_nothing_holds_may_fly_after_a_press(begin: Begin) -> None:
+    # It flies on when the force is gone, farther than a sheet that was never pressed could.
+    session = begin({**TILTED, "sheet.fixed": "none", "springs.virtual": 0.0, "probes.0.falloff": 0.0, "damping": 0.0})
+    session.handle(Press(60, 50))
+    advance(session, 15)
+    session.handle(Release())
+    advance(session, 400)
+    assert session.fault == ""
+    assert displacement(session).max() > 10 * 0.3
 
 
 def test_what_cannot_be_kept_is_told_and_nothing_is_lost(begin: Begin) -> None:
@@ -311,7 +421,7 @@ def test_what_cannot_be_kept_is_told_and_nothing_is_lost(begin: Begin) -> None:
     session.handle(Press(60, 50))
     advance(session, 5)
     for key in "pgw":
-        with pytest.raises(FilesError, match=r"^album.*: cannot write: .*; choose another --out$"):
+        with pytest.raises(FilesError, match=r"^album: cannot write: .*; choose another --out$"):
             session.handle(Key(key))
     advance(session, 5)
     assert session.frame == 10
@@ -327,6 +437,8 @@ def test_a_session_that_diverged_says_so_and_can_be_reset(begin: Begin) -> None:
     advance(session, 3)
     assert session.frame == frame
     session.handle(Key("w"))
+    again = run(load_scene("album/session-1.yaml", {"output": []}), "again", threads=2)
+    assert again["status"] == "diverged", "what goes wrong goes wrong again"
     session.handle(Key("r"))
     assert session.fault == ""
     assert np.isfinite(advance(session, 3)).all()

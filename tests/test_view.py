@@ -10,6 +10,8 @@ import sys
 import time
 from collections.abc import Iterator
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -18,9 +20,11 @@ from PIL import Image
 from taichi_msm import load_scene
 from taichi_msm.cli import main
 from taichi_msm.errors import SceneError
-from taichi_msm.live.events import Drag, Key, Percent, Press, Release, Turn
+from taichi_msm.live.events import Drag, Harder, Key, Percent, Press, Release, Turn
 from taichi_msm.live.pace import LONGEST, Pace
 from taichi_msm.live.script import load_script, timed
+from taichi_msm.live.window import QUIT, Hand
+from taichi_msm.runtime import ti
 
 SCRIPT = """\
 events:
@@ -44,7 +48,7 @@ def view(*arguments: str, **environment: str) -> subprocess.CompletedProcess[str
 def test_a_script_is_done_and_filmed(small: Path) -> None:
     Path("script.yaml").write_text(SCRIPT)
     done = view("small.yaml", "--record", "films/live.gif", "--seconds", "1", "--script", "script.yaml")
-    assert (done.returncode, done.stderr) == (0, "saved output/small-live/session-1.yaml\n")
+    assert (done.returncode, done.stderr) == (0, "0.7 s: saved output/small-live/session-1.yaml\n")
     assert done.stdout == "films/live.gif\noutput/small-live/session-1.yaml\n"
     assert [path.name for path in Path("films").iterdir()] == ["live.gif"], "and nothing is left beside it"
     with Image.open("films/live.gif") as film:
@@ -78,6 +82,10 @@ def test_a_script_is_done_and_filmed(small: Path) -> None:
             ["--record", "a.gif", "--seconds", "0"],
             "taichi-msm: Invalid value for '--seconds': 0.0 is not in the range 0<x<=3600. (see taichi-msm --help)",
         ),
+        (
+            ["--record", "a.gif", "--seconds", "nan"],
+            "taichi-msm: Invalid value for --seconds: nan is not a number of seconds (see taichi-msm --help)",
+        ),
         (["--record", "a.gif", "--seconds", "1", "--script", "no.yaml"], "no.yaml: no such file or directory"),
         (
             ["--record", "a.gif", "--seconds", "1", "--set", "probes=[]"],
@@ -102,7 +110,7 @@ def test_what_view_refuses(
         ("events: 3", ["s.yaml:1:1: events: 3 is not allowed; expected a list of mappings with t and do"]),
         (
             "events:\n  - {do: press, at: [1, 2]}",
-            ["s.yaml:2:5: events.0.t: missing; expected a number, 0 or more, in seconds"],
+            ["s.yaml:2:5: events.0.t: missing; expected a number from 0 to 3600, in seconds"],
         ),
         (
             "events:\n  - {t: 1, do: pres}",
@@ -113,6 +121,29 @@ def test_what_view_refuses(
         ),
         ("events:\n  - {t: 1, do: press}", ["s.yaml:2:5: events.0.at: missing; press needs it"]),
         ("events:\n  - {t: 1, do: release, at: [1, 2]}", ["s.yaml:2:25: events.0.at: release takes none; remove it"]),
+        (
+            "events:\n  - {t: 1, do: drag, at: [1, 2]}",
+            ["s.yaml:2:5: events.0: drag when nothing is pressed; put a press or a pull before it"],
+        ),
+        (
+            "events:\n  - {t: 1, do: press, at: [1, 2]}\n  - {t: 2, do: release}\n  - {t: 3, do: release}",
+            ["s.yaml:4:5: events.2: release when nothing is pressed; put a press or a pull before it"],
+        ),
+        (
+            "events:\n  - {t: 1, do: press, at: [39.4, 29.6]}\n  - {t: 2, do: pull, at: [-1, 2]}",
+            [
+                "s.yaml:2:23: events.0.at: [39.4, 29.6] is outside of the picture, which has 40 x 30 pixels",
+                "s.yaml:3:22: events.1.at: [-1, 2] is outside of the picture, which has 40 x 30 pixels",
+            ],
+        ),
+        (
+            "events:\n  - {t: 1.0e+9, do: turn, by: [1, 2], seconds: 1.0e+9}",
+            [
+                "s.yaml:2:6: events.0.t: 1000000000.0 is not allowed; expected a number from 0 to 3600, in seconds",
+                "s.yaml:2:39: events.0.seconds: 1000000000.0 is not allowed; "
+                "expected a number from 0 to 3600, in seconds",
+            ],
+        ),
         (
             "events:\n  - {t: 1, do: press, at: [1, 2], seconds: 1}",
             ["s.yaml:2:35: events.0.seconds: press takes no time; remove it"],
@@ -125,13 +156,13 @@ def test_what_view_refuses(
             ],
         ),
         (
-            "events:\n  - {t: 1, do: turn, by: [1, 2], seconds: 2}\n  - {t: 2, do: release}",
+            "events:\n  - {t: 1, do: turn, by: [1, 2], seconds: 2}\n  - {t: 2, do: key, name: m}",
             ["s.yaml:3:5: events.1: begins at 2 s, before the one above ends at 3 s; let them follow each other"],
         ),
         (
             "events:\n  - {t: 1, do: percent, to: 101}\nfoo: 1",
             [
-                "s.yaml:2:25: events.0.to: 101 is not allowed; expected a number from 0 to 100",
+                "s.yaml:2:25: events.0.to: 101 is not allowed; expected for percent a number from 0 to 100",
                 "s.yaml:3:1: foo: unknown key; allowed: size, events",
             ],
         ),
@@ -143,7 +174,7 @@ def test_what_is_wrong_with_a_script(
     monkeypatch.chdir(tmp_path)
     Path("s.yaml").write_text(text)
     with pytest.raises(SceneError) as caught:
-        load_script("s.yaml")
+        load_script("s.yaml", (40, 30))
     assert list(caught.value.lines) == expected
 
 
@@ -160,7 +191,7 @@ events:
   - {t: 0.7, do: key, name: m}
 """
     )
-    assert list(timed(load_script(tmp_path / "s.yaml"), 10.0, (200, 100))) == [
+    assert list(timed(load_script(tmp_path / "s.yaml", (200, 100)), 10.0, (200, 100))) == [
         (1, Press(19.5, 39.5, pull=True)),
         (2, Drag(39.5, 59.5)),
         (3, Drag(59.5, 79.5)),
@@ -198,12 +229,74 @@ def test_an_interrupted_film_leaves_the_one_that_was_there(small: Path) -> None:
     assert sorted(path.name for path in small.iterdir()) == ["live.gif", "small.yaml", "speckle.png"]
 
 
-def test_a_film_that_cannot_be_written(small: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_film_that_cannot_be_written(small: Path) -> None:
     Path("films").write_text("no folder")
     done = view("small.yaml", "--record", "films/live.gif", "--seconds", "1")
+    assert (done.returncode, done.stderr) == (4, "films: cannot write: File exists; choose another --record\n")
+    Path("folder.gif").mkdir()
+    done = view("small.yaml", "--record", "folder.gif", "--seconds", "1")
+    assert (done.returncode, done.stderr) == (4, "folder.gif: a directory; choose another --record\n")
+
+
+def test_what_goes_wrong_in_a_script_is_told_and_filmed(small: Path) -> None:
+    Path("kept").write_text("no folder")
+    Path("script.yaml").write_text(
+        """\
+events:
+  - {t: 0.1, do: press, at: [0, 0]}
+  - {t: 0.2, do: key, name: p}
+  - {t: 5, do: release}
+"""
+    )
+    size = ["--set", "render.camera=oblique"]
+    done = view(
+        "small.yaml", "--record", "a.gif", "--seconds", "0.5", "--script", "script.yaml", "--out", "kept", *size
+    )
     assert done.returncode == 4
-    assert done.stderr.startswith("films/live.gif: cannot write: ")
-    assert done.stderr.count("\n") == 1
+    assert done.stderr.splitlines() == [
+        "the film ends at 0.5 s, before 1 of the script's events",
+        "0.1 s: no tissue at pixel 0, 0",
+        "kept: cannot write: File exists; choose another --out",
+    ]
+    with Image.open("a.gif") as film:
+        assert film.n_frames >= 1
+
+
+def event(kind: Any, key: str, x: float = 0, y: float = 0, shift: bool = False, wheel: int = 0) -> SimpleNamespace:
+    """What ti.GUI tells of a window of 400 x 300 pixels, of pixel (x, y) from its top left."""
+    at = x / 400, (299 - y) / 300
+    return SimpleNamespace(type=kind, key=key, pos=at, modifier=["Shift"] if shift else [], delta=(0, wheel))
+
+
+def test_what_the_hand_does() -> None:
+    press, release, motion = ti.GUI.PRESS, ti.GUI.RELEASE, ti.GUI.MOTION
+    hand = Hand((400, 300))
+
+    def understood(*told: SimpleNamespace) -> list[Any]:
+        return list(hand.events(told))
+
+    assert understood(event(press, "LMB", 0, 0)) == [Press(0, 0)]
+    assert understood(event(motion, "Motion", 399, 299)) == [Drag(399, 299)]
+    assert understood(event(release, "LMB", 20, 30), event(motion, "Motion", 30, 30)) == [Release()]
+    assert understood(event(press, "LMB", 200, 149, shift=True)) == [Press(200, 149, pull=True)]
+    understood(event(release, "LMB"))
+    one, other = understood(
+        event(press, "RMB", 100, 99),
+        event(motion, "Motion", 110, 99),
+        event(motion, "Motion", 115, 89),
+        event(release, "RMB", 115, 89),
+        event(motion, "Motion", 300, 10),
+    )
+    assert (one, other) == (pytest.approx(Turn(10, 0)), pytest.approx(Turn(5, -10)))
+    assert understood(event(motion, "Wheel", wheel=120), event(release, "Button4")) == [Harder(5)]
+    assert understood(event(motion, "Wheel", wheel=-120)) == [Harder(-5)]
+    for key, name in [(" ", "space"), ("m", "m"), ("=", "up"), ("KP_Add", "up"), ("Down", "down"), ("Escape", "q")]:
+        assert understood(event(press, key), event(release, key)) == [Key(name)]
+    held = [event(press, "p"), *[event(kind, "p") for kind in (release, press)] * 5]
+    assert understood(*held) == [Key("p")]
+    held = [event(press, "Up"), *[event(kind, "Up") for kind in (release, press)] * 5]
+    assert understood(*held) == [Key("up")] * 6
+    assert understood(event(press, "WMClose")) == [QUIT]
 
 
 class Clock:
@@ -235,7 +328,7 @@ def shown(clock: Clock, stepping: float, drawing: float, seconds: float) -> tupl
         # Pictures are slow: several frames for each, and time goes as it should.
         (0.002, 0.07, 500, "13 pictures/s"),
         # Stepping is slow: no picture waits for more than it must, and time goes slower.
-        (0.05, 0.01, 190, "9 pictures/s  ·  too slow: time goes at 0.36"),
+        (0.05, 0.01, 190, "9 pictures/s  ·  too slow: time goes at 0.36 of real time"),
     ],
     ids=["fast", "slow pictures", "slow steps"],
 )

@@ -10,60 +10,70 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from types import TracebackType
+from typing import Any
 
 import yaml
 from PIL import Image
 
 from taichi_msm.encoding import Encoder, Job
-from taichi_msm.errors import FilesError, SceneError, writing
+from taichi_msm.errors import FilesError, printable, writing
 from taichi_msm.gif import Picture
 from taichi_msm.publication import ANIMATION
 from taichi_msm.scene import Scene
-from taichi_msm.scene_file import load_scene
+from taichi_msm.scene_file import MAX_BYTES
+from taichi_msm.yaml_reader import MAX_NODES
+
+# The C emitter is ten times faster; a PyYAML that was built without it writes the same text.
+_DUMPER: Any = getattr(yaml, "CSafeDumper", yaml.SafeDumper)
+
+# A scene has no more values besides the keys of its probes.
+VALUES_BESIDES = 1000
 
 
 class Film:
-    """A GIF, encoded in a process of its own. Left with an exception, or without a picture, it leaves no file.
+    """A GIF that is encoded in a process of its own, out of sight; gone when it is left, if nobody took it.
 
     Args:
-        path: the file; one that is there is replaced at the end.
+        folder: near which it is encoded; made where it does not exist.
         size: width, height of the pictures [px].
         rate: pictures per second.
         background: a colour that is kept exactly.
+        option: where another folder is chosen.
+
+    Raises:
+        FilesError: here and in `add` and `encoded`, when it cannot be written.
     """
 
-    def __init__(self, path: Path, size: tuple[int, int], rate: float, background: tuple[int, int, int]) -> None:
-        self.path = path
+    def __init__(
+        self,
+        folder: Path,
+        size: tuple[int, int],
+        rate: float,
+        background: tuple[int, int, int],
+        option: str = "--out",
+    ) -> None:
         self.pictures = 0
-        with writing(path):
-            path.parent.mkdir(parents=True, exist_ok=True)
-            self._folder = Path(tempfile.mkdtemp(prefix=".film-", dir=path.parent))
+        self._place = folder, option
+        with writing(*self._place):
+            folder.mkdir(parents=True, exist_ok=True)
+            self._hidden = Path(tempfile.mkdtemp(prefix=".film-", dir=folder))
             try:
-                self._encoder = Encoder(Job(self._folder, size, rate, png=False, gif=True, background=background))
+                self._encoder = Encoder(Job(self._hidden, size, rate, png=False, gif=True, background=background))
             except OSError:
-                shutil.rmtree(self._folder, ignore_errors=True)
+                shutil.rmtree(self._hidden, ignore_errors=True)
                 raise
 
     def add(self, picture: Picture) -> None:
         """Add the next picture, shape (height, width, 3)."""
-        with writing(self.path):
+        with writing(*self._place):
             self._encoder.add(picture)
         self.pictures += 1
 
-    def finish(self) -> None:
-        """Put the film in its place."""
-        try:
-            with writing(self.path):
-                self._encoder.finish()
-                if self.pictures:
-                    (self._folder / ANIMATION).replace(self.path)
-        finally:
-            shutil.rmtree(self._folder, ignore_errors=True)
-
-    def abort(self) -> None:
-        """Give it up."""
-        self._encoder.abort()
-        shutil.rmtree(self._folder, ignore_errors=True)
+    def encoded(self) -> Path:
+        """Wait for the last picture; returns the file, which is to be moved to its place. There must be a picture."""
+        with writing(*self._place):
+            self._encoder.finish()
+        return self._hidden / ANIMATION
 
     def __enter__(self) -> Film:
         return self
@@ -71,10 +81,8 @@ class Film:
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        if kind is None:
-            self.finish()
-        else:
-            self.abort()
+        self._encoder.abort()
+        shutil.rmtree(self._hidden, ignore_errors=True)
 
 
 class Album:
@@ -99,59 +107,41 @@ class Album:
         Raises:
             FilesError: here and below, when the folder cannot be written.
         """
-        with self._new("picture", ".png") as (path, draft):
+        with _draft(self.folder) as draft:
             Image.fromarray(picture).save(draft, "PNG")
-        return self._note(path)
+            return self._place(draft, "picture", ".png")
 
     def keep_scene(self, scene: Scene) -> Path:
         """Save a scene, and beside it a copy of its picture, which a scene file needs near itself; returns its file."""
-        with writing(self.folder):
-            self.folder.mkdir(parents=True, exist_ok=True)
-            image = None if scene.image is None else self._copied(Path(scene.image))
-        scene = scene.model_copy(update={"image": image and str(image)})
-        data = scene.model_dump(mode="json", exclude_none=True) | ({"image": image.name} if image else {})
-        text = yaml.safe_dump(data, sort_keys=False, default_flow_style=None, width=120, allow_unicode=True)
-        with self._new("session", ".yaml") as (path, draft):
-            draft.write_text(f"# What was done in a live session of {self._name}; run repeats it.\n{text}", "utf-8")
-            try:
-                same = load_scene(draft) == scene
-            except SceneError as error:
-                raise FilesError(f"{path}: this session is no scene that run takes: {error.lines[0]}") from None
-            assert same, "the file says what the session is"
-        return self._note(path)
+        data = scene.model_dump(mode="json", exclude_none=True)
+        with _draft(self.folder) as draft:
+            if scene.image is not None:
+                data["image"] = self._copied(Path(scene.image)).name
+            text = yaml.dump(
+                data, Dumper=_DUMPER, sort_keys=False, default_flow_style=None, width=120, allow_unicode=True
+            )
+            text = f"# What was done in a live session of {printable(self._name)}; run repeats it.\n{text}"
+            if len(text.encode()) > MAX_BYTES or values(scene) + VALUES_BESIDES > MAX_NODES:
+                raise FilesError("this session is too long for the file of a scene; reset it, and do less")
+            draft.write_text(text, "utf-8")
+            return self._place(draft, "session", ".yaml")
 
     def film(self, size: tuple[int, int], rate: float, background: tuple[int, int, int]) -> Film:
         """Begin a film."""
-        return Film(self._free("film", ".gif"), size, rate, background)
+        return Film(self.folder, size, rate, background)
 
     def keep_film(self, film: Film) -> Path:
-        """End a film; returns its file."""
-        film.finish()
-        return self._note(film.path)
+        """Save a film that has a picture, and end it; returns its file."""
+        with film, writing(self.folder):
+            return self._place(film.encoded(), "film", ".gif")
 
-    def _note(self, path: Path) -> Path:
+    def _place(self, draft: Path, stem: str, suffix: str) -> Path:
+        """Give a file the next name that no other has."""
+        number = 1
+        while not _named(draft, path := self.folder / f"{stem}-{number}{suffix}"):
+            number += 1
         self.kept.append(path)
         return path
-
-    def _free(self, stem: str, suffix: str) -> Path:
-        """Find the next name that no file has."""
-        number = 1
-        while (path := self.folder / f"{stem}-{number}{suffix}").exists():
-            number += 1
-        return path
-
-    @contextmanager
-    def _new(self, stem: str, suffix: str) -> Iterator[tuple[Path, Path]]:
-        """Make a new file: its name, and where it is written before it has it."""
-        with writing(self.folder):
-            self.folder.mkdir(parents=True, exist_ok=True)
-            path = self._free(stem, suffix)
-            draft = path.with_name(f".{os.getpid()}-{path.name}")
-            try:
-                yield path, draft
-                draft.replace(path)
-            finally:
-                draft.unlink(missing_ok=True)
 
     def _copied(self, image: Path) -> Path:
         """Have a copy of a picture in the folder, under its own name if that is free."""
@@ -160,10 +150,39 @@ class Album:
             number += 1
             copy = self.folder / f"{image.stem}-{number}{image.suffix}"
         if not copy.exists():
-            draft = copy.with_name(f".{os.getpid()}-{copy.name}")
-            try:
+            with _draft(self.folder) as draft:
                 shutil.copyfile(image, draft)
                 draft.replace(copy)
-            finally:
-                draft.unlink(missing_ok=True)
         return copy
+
+
+@contextmanager
+def _draft(folder: Path) -> Iterator[Path]:
+    """Give a name out of sight to write a file under; it is gone in the end."""
+    draft = folder / f".draft-{os.getpid()}"
+    with writing(folder):
+        folder.mkdir(parents=True, exist_ok=True)
+        try:
+            yield draft
+        finally:
+            draft.unlink(missing_ok=True)
+
+
+def values(scene: Scene) -> int:
+    """Count the values that the keys of a scene's probes are in its file, which may have `MAX_NODES`."""
+    return sum(4 * len(probe.at) + 3 * len(probe.load) for probe in scene.probes)
+
+
+def _named(draft: Path, path: Path) -> bool:
+    """Give a file a name, unless another has it."""
+    try:
+        # Unlike a rename, a link takes no other file's place.
+        os.link(draft, path)
+    except FileExistsError:
+        return False
+    except OSError:
+        # A file system without links.
+        if path.exists():
+            return False
+        draft.replace(path)
+    return True

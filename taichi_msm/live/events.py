@@ -56,8 +56,8 @@ NOTCH = 5.0
 
 # What the pointer does.
 POINTER = {
-    "left button": "press; dragged, the tool moves with it",
-    "shift + left button": "pull",
+    "left button": "press with the scene's force; dragged, the tool moves",
+    "shift + left button": "the opposite force: pull, where the scene's pushes",
     "wheel": f"press harder or less hard, by {NOTCH:g} % of the full force",
     "right button": "dragged, turn the picture",
 }
@@ -73,9 +73,9 @@ KEYS = {
     "l": "light on and off",
     "space": "pause, and go on",
     ".": "one frame further, when paused",
-    "r": "reset: tissue at rest, nothing done",
-    "p": "save the picture as PNG",
-    "g": "start and stop a film, a GIF",
+    "r": "reset: tissue at rest, and what was done forgotten",
+    "p": "save the tissue as PNG",
+    "g": "start and stop a film of the tissue, a GIF",
     "w": "write what was done as a scene, which run repeats",
     "i": "the figures on and off",
     "h": "the keys on and off",

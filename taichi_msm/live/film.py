@@ -6,9 +6,12 @@ from collections import defaultdict
 from collections.abc import Callable, Iterable
 from pathlib import Path
 
+from taichi_msm.errors import FilesError, writing
 from taichi_msm.live.album import Film
 from taichi_msm.live.events import Event
 from taichi_msm.live.session import Session
+
+OPTION = "--record"
 
 
 def film(
@@ -17,39 +20,55 @@ def film(
     seconds: float,
     events: Iterable[tuple[int, Event]] = (),
     progress: Callable[[int, int], None] = lambda done, total: None,
-) -> list[str]:
+    say: Callable[[str], None] = lambda notice: None,
+) -> None:
     """Let a session go on for some time and film it.
 
     Args:
         session: the session.
-        path: the GIF.
+        path: the GIF; one that is there is replaced when the film is whole.
         seconds: how long.
         events: each with the frame of the session before which it happens.
         progress: called with the frames done and the frames in all, often; what it raises stops here.
-
-    Returns:
-        What the person should know, in order.
+        say: called with what the person should know.
 
     Raises:
-        FilesError: when a file cannot be written.
+        FilesError: when the film cannot be written, or, when it is, what an event was to keep could not.
     """
-    happens: dict[int, list[Event]] = defaultdict(list)
-    for frame, event in events:
-        happens[frame].append(event)
-    notices: list[str] = []
+    if path.is_dir():
+        raise FilesError(f"{path}: a directory; choose another {OPTION}")
     frames = round(seconds * session.rate)
+    happens: dict[int, list[Event]] = defaultdict(list)
+    late = 0
+    for frame, event in events:
+        if frame <= frames:
+            happens[frame].append(event)
+        else:
+            late += 1
+    if late:
+        say(f"the film ends at {seconds:g} s, before {late} of the script's events")
+    failures: list[FilesError] = []
+    notice = ""
     render = session.scene.render
-    with Film(path, render.size, session.rate / session.parts, render.background) as reel:
+    with Film(path.parent, render.size, session.rate / session.parts, render.background, OPTION) as reel:
         for frame in range(frames + 1):
             progress(frame, frames)
             for event in happens[frame]:
-                session.handle(event)
-            if session.notice and session.notice not in notices[-1:]:
-                notices.append(session.notice)
+                try:
+                    session.handle(event)
+                except FilesError as error:
+                    failures.append(error)
+                if session.notice not in ("", notice):
+                    say(f"{frame / session.rate:g} s: {session.notice}")
+                notice = session.notice
             if frame % session.parts == 0:
                 reel.add(session.picture())
             if session.fault:
+                say(session.fault)
                 break
             if frame < frames:
                 session.advance()
-    return notices
+        with writing(path, OPTION):
+            reel.encoded().replace(path)
+    if failures:
+        raise failures[0]

@@ -55,4 +55,4 @@ class Pace:
         shown = f"{(len(self._pictures) - 1) / seconds:.0f} pictures/s"
         # What the last picture shows is not counted, as its time is not over.
         speed = sum(count for _, count in list(self._pictures)[:-1]) / self._rate / seconds
-        return shown if speed >= SLOW else f"{shown}  ·  too slow: time goes at {speed:.2f}"
+        return shown if speed >= SLOW else f"{shown}  ·  too slow: time goes at {speed:.2f} of real time"

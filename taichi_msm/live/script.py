@@ -10,13 +10,17 @@ from typing import Annotated, Literal
 from pydantic import Field, field_validator, model_validator
 from pydantic_core import PydanticCustomError
 
-from taichi_msm.errors import SceneError
+from taichi_msm.errors import Problem, SceneError
 from taichi_msm.live.events import KEYS, Drag, Event, Key, Percent, Press, Release, Turn
 from taichi_msm.scene import MAX_PIXELS, REFUSED, NotNegative, Number, Pixels, Section, key
 from taichi_msm.scene_file import Draft, Kind, read_file
 from taichi_msm.validation import parse
 
+LONGEST = 3600.0
+
 Pair = tuple[Number, Number]
+Seconds = Annotated[NotNegative, Field(le=LONGEST)]
+SECONDS = f"a number from 0 to {LONGEST:g}, in seconds"
 
 # What every kind of entry needs beside its time.
 NEEDS = {"press": "at", "pull": "at", "drag": "at", "release": "", "turn": "by", "percent": "to", "key": "name"}
@@ -33,17 +37,19 @@ _SCRIPT = Kind("script", "events")
 class Entry(Section):
     """One thing that is done."""
 
-    t: NotNegative = key(means="when, or when it begins [s]", expects="a number, 0 or more, in seconds")
+    t: Seconds = key(means="when, or when it begins [s]", expects=SECONDS)
     do: Literal["press", "pull", "drag", "release", "turn", "percent", "key"] = key(
         means="what is done", expects="press, pull, drag, release, turn, percent or key"
     )
-    at: Pair | None = key(None, means="the pixel", expects="[x, y] in pixels from the top left")
-    by: Pair | None = key(None, means="how far the picture is turned", expects="[right, down] in pixels")
-    to: Annotated[NotNegative, Field(le=100)] | None = key(
-        None, means="percent of the full force", expects="a number from 0 to 100"
+    at: Pair | None = key(
+        None, means="the pixel", expects="for press, pull and drag [x, y] in pixels from the top left"
     )
-    name: str | None = key(None, means="a key of the window", expects="the name of a key")
-    seconds: NotNegative = key(0.0, means="how long it takes [s]", expects="a number, 0 or more, in seconds")
+    by: Pair | None = key(None, means="how far the picture is turned", expects="for turn [right, down] in pixels")
+    to: Annotated[NotNegative, Field(le=100)] | None = key(
+        None, means="percent of the full force", expects="for percent a number from 0 to 100"
+    )
+    name: str | None = key(None, means="a key of the window", expects="for key the name of one")
+    seconds: Seconds = key(0.0, means="how long it takes [s]", expects=SECONDS)
 
     @model_validator(mode="after")
     def _complete(self) -> Entry:
@@ -73,6 +79,17 @@ class Script(Section):
 
     @field_validator("events", mode="after")
     @classmethod
+    def _on_something(cls, events: tuple[Entry, ...]) -> tuple[Entry, ...]:
+        presses = False
+        for n, entry in enumerate(events):
+            if entry.do in ("drag", "release") and not presses:
+                said = "{do} when nothing is pressed; put a press or a pull before it"
+                raise PydanticCustomError(REFUSED, said, {"key": n, "do": entry.do})
+            presses = entry.do in ("press", "pull") or (presses and entry.do != "release")
+        return events
+
+    @field_validator("events", mode="after")
+    @classmethod
     def _in_order(cls, events: tuple[Entry, ...]) -> tuple[Entry, ...]:
         for n, (before, entry) in enumerate(pairwise(events), 1):
             if entry.t < before.t + before.seconds:
@@ -84,8 +101,12 @@ class Script(Section):
         return events
 
 
-def load_script(path: str | Path) -> Script:
+def load_script(path: str | Path, size: tuple[int, int]) -> Script:
     """Read a script.
+
+    Args:
+        path: the file.
+        size: width, height of the picture that is shown [px].
 
     Raises:
         SceneError: all that is wrong with it, one line each, in the order in which it stands.
@@ -93,9 +114,21 @@ def load_script(path: str | Path) -> Script:
     draft = Draft(str(path), read_file(str(path), _SCRIPT))
     script, problems = parse(Script, draft.data)
     draft.report(problems)
+    draft.report(_outside(script, size) if script is not None else ())
     if script is None or draft.found:
         raise SceneError(draft.lines())
     return script
+
+
+def _outside(script: Script, size: tuple[int, int]) -> Iterator[Problem]:
+    """Find what is pressed outside of the picture."""
+    width, height = script.size or size
+    for n, entry in enumerate(script.events):
+        if entry.do in ("press", "pull") and entry.at is not None:
+            x, y = entry.at
+            if not (-0.5 <= x < width - 0.5 and -0.5 <= y < height - 0.5):
+                said = f"[{x:g}, {y:g}] is outside of the picture, which has {width} x {height} pixels"
+                yield Problem(("events", n, "at"), said)
 
 
 def timed(script: Script, rate: float, size: tuple[int, int]) -> Iterator[tuple[int, Event]]:

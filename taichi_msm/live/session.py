@@ -15,7 +15,7 @@ from taichi_msm.errors import DivergedError, FilesError, SceneError
 from taichi_msm.gif import Picture
 from taichi_msm.lattice import rest_positions
 from taichi_msm.live import overlay
-from taichi_msm.live.album import Album, Film
+from taichi_msm.live.album import Album, Film, values
 from taichi_msm.live.events import KEYS, NOTCH, POINTER, Drag, Event, Harder, Key, Percent, Press, Release, Turn
 from taichi_msm.live.picking import on_rest_plane, pick
 from taichi_msm.live.stage import Stage
@@ -24,6 +24,7 @@ from taichi_msm.scene import MAX_PROBES, Scene
 from taichi_msm.simulation import Simulation
 from taichi_msm.stability import steps_per_frame, with_time
 from taichi_msm.texture import load_texture
+from taichi_msm.yaml_reader import MAX_NODES
 
 # A session has as many frames a second as a screen shows, as whole parts of the scene's.
 MOST_FRAMES = 60.0
@@ -36,6 +37,10 @@ SEPARATOR = "  ·  "
 
 # A notice is shown for so long [s].
 NOTICE = 3.0
+
+# What is recorded is looked at every so many frames; it is nearly too long at this share of what it may be.
+CHECKED = 200
+NEARLY = 0.75
 
 # The time of stepping is averaged over about so many frames.
 AVERAGED = 20
@@ -113,6 +118,7 @@ class Session:
         self._once = False
         self._beats = 0
         self._notice, self._notice_until = "", 0
+        self._warned = False
         self.fault = ""
         self.paused = False
         self.seconds_a_frame = 0.0
@@ -145,7 +151,8 @@ class Session:
 
     def recorded(self) -> Scene:
         """Give what was done as a scene; its run has the same bits."""
-        frames = max(1, self.frame)
+        # What went wrong within a frame goes wrong again.
+        frames = max(1, self.frame + bool(self.fault))
         time = self.scene.time.model_copy(update={"duration": frames / self.rate, "tolerance": None})
         probes = (*self._others, self.tool.recorded(frames))
         return self.scene.model_copy(update={"probes": probes, "time": time, "render": self.stage.render})
@@ -180,6 +187,7 @@ class Session:
         if (self.paused and not self._once) or self.fault:
             return
         self._once = False
+        self._warn_of_length()
         begun = time.perf_counter()
         try:
             self._simulation.steer((*self._others, self.tool.follow(self.frame)))
@@ -191,7 +199,7 @@ class Session:
         self.seconds_a_frame += share * (spent - self.seconds_a_frame)
 
     def picture(self, pace: str = "") -> Picture:
-        """Draw the tissue and what is written over it; a film that is on takes it, or ends where it cannot.
+        """Draw the tissue and what is written over it. A film that is on takes the tissue alone, or ends if it cannot.
 
         Args:
             pace: what is to be said of the speed of the pictures.
@@ -199,16 +207,15 @@ class Session:
         Returns:
             Colours, shape (height, width, 3).
         """
-        picture = self._written(pace)
+        picture = self.stage.draw(self.positions())
+        if self.tool.percent != 0:
+            seen = self.stage.pixel(_between(self.positions(), *self.tool.place))
+            if seen is not None:
+                overlay.mark(picture, seen, pulls=self._pulls)
         if self._film is not None:
-            # Where the pictures are too slow for the film one stays for several.
-            try:
-                while self._film.pictures * self.parts <= self._beats - self._filmed_from:
-                    self._film.add(picture)
-            except FilesError as error:
-                film, self._film = self._film, None
-                film.abort()
-                self.say(str(error))
+            self._expose(self._film, picture)
+        above = self._figure_lines(pace) if self._figures else ["paused"] if self.paused else []
+        overlay.write(picture, above, self.notice, POINTER | KEYS if self._keys else None)
         return picture
 
     def say(self, notice: str) -> None:
@@ -224,9 +231,7 @@ class Session:
         """Keep the film that is on, and free the memory."""
         self._simulation.close()
         self.stage.close()
-        if self._film is not None:
-            film, self._film = self._film, None
-            self._album.keep_film(film)
+        self._end_film()
 
     def __enter__(self) -> Session:
         return self
@@ -236,11 +241,18 @@ class Session:
     ) -> None:
         self.close()
 
+    def _warn_of_length(self) -> None:
+        """Say once that soon there will be more than a scene file may hold."""
+        if self.frame % CHECKED == 0 and not self._warned and values(self.recorded()) > NEARLY * MAX_NODES:
+            self._warned = True
+            self.say("soon this session will be too long for a scene: write it now (w), then reset it (r)")
+
     def _press(self, x: float, y: float, direction: int) -> None:
         place = pick(self.positions(), self.scene.render.refine, self.stage.view, (x, y))
         if place is None:
             self.say(f"no tissue at pixel {x:g}, {y:g}")
             return
+        self._notice_until = 0
         self._press_at = place, on_rest_plane(self.stage.view, (x, y))
         self.tool.press(place, direction)
 
@@ -281,9 +293,10 @@ class Session:
                 self._simulation.go_on(self._beginning)
                 self.tool.rest()
                 self._press_at = None
+                self._warned = False
                 self.fault = ""
             case "p":
-                self.say(f"saved {self._album.keep_picture(self._written())}")
+                self.say(f"saved {self._album.keep_picture(self.stage.draw(self.positions()))}")
             case "g":
                 self._start_or_stop_film()
             case "w":
@@ -299,26 +312,38 @@ class Session:
             self._film = self._album.film(render.size, self._film_rate, render.background)
             self._filmed_from = self._beats
         else:
-            film, self._film = self._film, None
-            self.say(f"saved {self._album.keep_film(film)}")
+            self._end_film()
 
-    def _written(self, pace: str = "") -> Picture:
-        """Draw the tissue and write over it what is to be seen."""
-        picture = self.stage.draw(self.positions())
-        if self._figures and self.tool.percent != 0:
-            seen = self.stage.pixel(_between(self.positions(), *self.tool.place))
-            if seen is not None:
-                overlay.mark(picture, seen, pulls=self.tool.percent < 0)
-        above = self._figure_lines(pace) if self._figures else []
-        overlay.write(picture, above, self.notice, POINTER | KEYS if self._keys else None)
-        return picture
+    def _end_film(self) -> None:
+        """Keep the film that is on, if it has a picture."""
+        film, self._film = self._film, None
+        if film is not None and film.pictures > 0:
+            self.say(f"saved {self._album.keep_film(film)}")
+        elif film is not None:
+            with film:
+                self.say("the film had no picture yet")
+
+    def _expose(self, film: Film, picture: Picture) -> None:
+        """Film a picture; where the pictures are too slow for the film one stays for several."""
+        try:
+            while film.pictures * self.parts <= self._beats - self._filmed_from:
+                film.add(picture)
+        except FilesError as error:
+            self._film = None
+            with film:
+                self.say(str(error))
+
+    @property
+    def _pulls(self) -> bool:
+        """Whether the tool pulls out of the sheet, where scenes may have a force that does."""
+        return self.tool.percent * self.scene.probes[-1].force[2] > 0
 
     def _figure_lines(self, pace: str) -> list[str]:
         tool, speed = self.tool, ""
         if self.seconds_a_frame > 0:
-            speed = f"{1 / self.rate / self.seconds_a_frame:.0f} x real time"
+            speed = f"steps {1 / self.rate / self.seconds_a_frame:.0f} x real time"
         state = [word for word, on in (("paused", self.paused), ("film", self._film is not None)) if on]
-        does = "pull" if tool.percent < 0 else "push"
+        does = "pull" if self._pulls else "push"
         percent = f"{does} {abs(tool.percent):.0f} %" if tool.percent else f"tool {tool.strength:.0f} %"
         moved = self.displacement()
         # Less is what f32 makes of places.

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import sys
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from types import TracebackType
 from typing import Any
 
@@ -19,7 +19,11 @@ from taichi_msm.live.session import Session
 from taichi_msm.runtime import open_window, ti
 
 # What the keyboard calls keys that have no letter.
-NAMES = {" ": "space", "Up": "up", "Down": "down", "Escape": "q", "=": "up", "-": "down"}
+NAMES = {" ": "space", "Escape": "q"}
+NAMES |= dict.fromkeys(("Up", "=", "+", "KP_Add"), "up") | dict.fromkeys(("Down", "-", "KP_Subtract"), "down")
+
+# Held down they go on; of all other keys the keyboard's repetition is none.
+REPEATED = ("up", "down")
 
 QUIT = Key("q")
 
@@ -41,8 +45,7 @@ class Window:
         self._shown = self._gui.img.view(np.uint8).reshape(size[1], size[0], 4)
         self._shown[..., 3] = 255
         self._places = (0, 1, 2) if sys.platform == "darwin" else (2, 1, 0)
-        self._turning: tuple[float, float] | None = None
-        self._pressing = False
+        self._hand = Hand(size)
 
     def show(self, picture: Picture) -> None:
         """Show a picture, shape (height, width, 3)."""
@@ -54,15 +57,14 @@ class Window:
     def say(self, text: str) -> None:
         """Write over what is shown."""
         picture = self._shown[..., self._places]
-        overlay.write(picture, [], text)
+        overlay.announce(picture, text)
         self.show(picture)
 
     def events(self) -> Iterator[Event]:
         """Give what was done since the last call, up to now."""
         # A window learns of it when it is shown.
         self._gui.show()
-        for event in self._gui.get_events():
-            yield from self._understood(event)
+        yield from self._hand.events(self._gui.get_events())
 
     def __enter__(self) -> Window:
         return self
@@ -72,10 +74,34 @@ class Window:
     ) -> None:
         self._gui.close()
 
+
+class Hand:
+    """Understands what a window tells of the pointer and the keyboard.
+
+    Args:
+        size: width, height of the picture [px].
+    """
+
+    def __init__(self, size: tuple[int, int]) -> None:
+        self._size = size
+        self._pressing = False
+        self._turning: tuple[float, float] | None = None
+
+    def events(self, told: Iterable[Any]) -> Iterator[Event]:
+        """Turn what a window tells at a time, in events of `ti.GUI`, into ours."""
+        before = None
+        for event in told:
+            # A key that is held down is released and pressed at the same time, again and again.
+            repeated = before is not None and before.type == ti.GUI.RELEASE and before.key == event.key
+            before = event
+            for understood in self._understood(event):
+                if not (repeated and isinstance(understood, Key) and understood.name not in REPEATED):
+                    yield understood
+
     def _understood(self, event: Any) -> Iterator[Event]:
-        height, width = self._shown.shape[:2]
+        width, height = self._size
         x, y = event.pos[0] * width, height - 1 - event.pos[1] * height
-        pressed, released = event.type == ti.GUI.PRESS, event.type == ti.GUI.RELEASE
+        pressed = event.type == ti.GUI.PRESS
         if event.key == ti.GUI.EXIT:
             yield QUIT
         elif event.key == ti.GUI.LMB:
@@ -91,7 +117,7 @@ class Window:
             if self._turning is not None:
                 yield Turn(x - self._turning[0], y - self._turning[1])
                 self._turning = (x, y)
-        elif pressed and not released:
+        elif pressed:
             yield Key(NAMES.get(event.key, event.key))
 
 
@@ -119,5 +145,5 @@ def show(session: Session, window: Window, pause: Callable[[], None]) -> None:
         for _ in pace.due():
             session.advance()
         if not session.stage.compiled:
-            window.say("compiling the kernel that draws it")
+            window.say("one moment: compiling")
         window.show(session.picture(pace.said()))
