@@ -409,6 +409,8 @@ def test_a_sheet_that_nothing_holds_may_fly_after_a_press(begin: Begin) -> None:
     session = begin({**TILTED, "sheet.fixed": "none", "springs.virtual": 0.0, "probes.0.falloff": 0.0, "damping": 0.0})
     session.handle(Press(60, 50))
     advance(session, 15)
+    session.handle(Percent(1))
+    advance(session, 20)
     session.handle(Release())
     advance(session, 400)
     assert session.fault == ""
