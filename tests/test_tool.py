@@ -43,7 +43,8 @@ def percents(hand: Tool, first: int, count: int) -> list[float]:
 @pytest.mark.parametrize("seed", range(6))
 def test_every_frame_has_the_loads_of_the_record(seed: int) -> None:
     rng = np.random.default_rng(seed)
-    hand, frames, seen = tool(), 120, []
+    hand, frames = tool(), 120
+    seen: list[Probe] = []
     for frame in range(frames):
         for _ in range(rng.integers(0, 3)):
             what = rng.integers(0, 5)
@@ -56,7 +57,7 @@ def test_every_frame_has_the_loads_of_the_record(seed: int) -> None:
                 hand.strength = float(rng.integers(0, 101))
             else:
                 hand.move(place)
-        seen.append(hand.follow(frame))
+        seen.append(hand.follow(frame) or seen[-1])
     record = hand.recorded(frames)
     for frame, probe in enumerate(seen):
         now, then = loads(probe, frame), loads(record, frame)
@@ -118,6 +119,7 @@ def test_it_moves_along_a_line_within_a_frame() -> None:
     hand.follow(0)
     hand.move((0.4, 0.2))
     probe = hand.follow(1)
+    assert probe is not None
     points = loads(probe, 1).point[:, 0, 0]
     width = 0.4
     assert points[0] == pytest.approx((0.2 - 0.5) * width)
@@ -133,3 +135,14 @@ def test_what_was_asked_for_is_forgotten_at_rest() -> None:
     assert not hand.held
     assert percents(hand, 0, 2) == [0, 0]
     assert hand.recorded(2).load == ((0.0, 0.0), (2 / RATE, 0.0))
+
+
+def test_what_stays_as_it_is_is_not_told_again() -> None:
+    hand = tool()
+    assert hand.follow(0) is not None, "the one who is told may have an older probe"
+    assert hand.follow(1) is None
+    hand.press((0.2, 0.2), 1)
+    told = [hand.follow(frame) is not None for frame in range(2, 20)]
+    assert told == [True] * 10 + [False] * 8
+    hand.rest()
+    assert hand.follow(0) is not None

@@ -190,7 +190,8 @@ class Session:
         self._warn_of_length()
         begun = time.perf_counter()
         try:
-            self._simulation.steer((*self._others, self.tool.follow(self.frame)))
+            if probe := self.tool.follow(self.frame):
+                self._simulation.steer((*self._others, probe))
             self._simulation.advance()
         except DivergedError as error:
             self.fault = str(error)

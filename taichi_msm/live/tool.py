@@ -51,6 +51,8 @@ class Tool:
         self._pressing = 0
         # Presses, with their place and 1 to push or -1 to pull, and releases.
         self._asked: deque[tuple[Place, int] | None] = deque()
+        # What the probe that was given last holds on to, if there was one.
+        self._given: tuple[float, Place] | None = None
         self._load: list[tuple[float, float]] = [(0.0, 0.0)]
         self._at: list[tuple[float, float, float]] = [(0.0, *self.place)]
 
@@ -77,11 +79,11 @@ class Tool:
         """Let go."""
         self._asked.append(None)
 
-    def follow(self, frame: int) -> Probe:
+    def follow(self, frame: int) -> Probe | None:
         """Do what was asked for, from a frame to the next one.
 
         Returns:
-            The probe, with the keys that decide over this time.
+            The probe, with the keys that decide over this time; None where the last values of the one before do.
         """
         begin, end = frame / self._rate, (frame + 1) / self._rate
         if self._asked:
@@ -100,6 +102,9 @@ class Tool:
             self.place = self._goal
             self._put_at(end)
         _extend(self._load, (end, self.percent))
+        if self._given == (self.percent, self.place):
+            return None
+        self._given = self.percent, self.place
         return self._as_probe(self._load[-LATEST:], self._at[-LATEST:], end)
 
     def recorded(self, frame: int) -> Probe:
