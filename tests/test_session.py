@@ -100,6 +100,12 @@ def test_a_drag_moves_the_control_point_with_the_pointer(begin: Begin) -> None:
     session.handle(Drag(*there))
     session.advance()
     assert np.array(session.tool.place) * 24 == pytest.approx([16, 10], abs=0.4)
+    session.handle(Turn(12, 4))
+    session.handle(Drag(there[0], there[1]))
+    session.advance()
+    assert np.array(session.tool.place) * 24 == pytest.approx([16, 10], abs=0.4), (
+        "the camera moved, and not the pointer"
+    )
     session.handle(Release())
     session.handle(Drag(10, 10))
     session.advance()

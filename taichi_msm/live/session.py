@@ -20,7 +20,7 @@ from taichi_msm.live.events import KEYS, NOTCH, POINTER, Drag, Event, Harder, Ke
 from taichi_msm.live.picking import on_rest_plane, pick
 from taichi_msm.live.stage import Stage
 from taichi_msm.live.tool import Place, Tool
-from taichi_msm.scene import MAX_PROBES, Scene
+from taichi_msm.scene import MAX_PROBES, Camera, Scene
 from taichi_msm.simulation import Simulation
 from taichi_msm.stability import steps_per_frame, with_time
 from taichi_msm.texture import load_texture
@@ -113,7 +113,9 @@ class Session:
         self.scene = scene.model_copy(update={"probes": (*self._others, self.tool.recorded(0))})
         self._rest = rest_positions(scene.sheet)
         self.stage = Stage(scene, texture)
-        self._press_at: tuple[Place, NDArray[np.float64] | None] | None = None
+        # A place of the tool, and the point on the plane at rest that was under the pointer then.
+        self._held: tuple[Place, NDArray[np.float64] | None] | None = None
+        self._pointer = (0.0, 0.0)
         self._figures, self._keys = True, False
         self._once = False
         self._beats = 0
@@ -169,11 +171,12 @@ class Session:
             case Drag(x, y):
                 self._drag(x, y)
             case Release():
-                self._press_at = None
+                self._held = None
                 if self.tool.held:
                     self.tool.release()
             case Turn(right, down):
                 self.stage.turn(right, down)
+                self._hold_on()
             case Percent(percent):
                 self.tool.strength = min(100.0, max(0.0, percent))
             case Harder(percent):
@@ -254,21 +257,32 @@ class Session:
             self.say(f"no tissue at pixel {x:g}, {y:g}")
             return
         self._notice_until = 0
-        self._press_at = place, on_rest_plane(self.stage.view, (x, y))
         self.tool.press(place, direction)
+        self._pointer = x, y
+        self._held = place, on_rest_plane(self.stage.view, (x, y))
 
     def _drag(self, x: float, y: float) -> None:
         """Move the control point as far over the sheet at rest as the pointer went.
 
         Where the sheet is now is no guide: it gives way under the tool, and the pointer would run after itself.
         """
-        if self._press_at is None:
+        if self._held is None:
             return
-        ((across, down), begun), here = self._press_at, on_rest_plane(self.stage.view, (x, y))
+        self._pointer = x, y
+        ((across, down), begun), here = self._held, on_rest_plane(self.stage.view, (x, y))
         if begun is None or here is None:
             return
         (right, up), (height, width) = here - begun, self.scene.sheet.size
         self.tool.move((across + right / width, down - up / height))
+
+    def _look(self, camera: str | Camera) -> None:
+        self.stage.look(camera)
+        self._hold_on()
+
+    def _hold_on(self) -> None:
+        """Keep the tool where it is under a camera that moved; a drag goes on from there."""
+        if self._held is not None:
+            self._held = self.tool.place, on_rest_plane(self.stage.view, self._pointer)
 
     def _do(self, key: str) -> None:
         match key:
@@ -277,11 +291,11 @@ class Session:
             case "down":
                 self.handle(Harder(-NOTCH))
             case "c":
-                self.stage.look(self.scene.render.camera)
+                self._look(self.scene.render.camera)
             case "t":
-                self.stage.look("top")
+                self._look("top")
             case "o":
-                self.stage.look("oblique")
+                self._look("oblique")
             case "m":
                 self.stage.mesh()
             case "l":
@@ -293,7 +307,7 @@ class Session:
             case "r":
                 self._simulation.go_on(self._beginning)
                 self.tool.rest()
-                self._press_at = None
+                self._held = None
                 self._warned = False
                 self.fault = ""
             case "p":
