@@ -190,7 +190,7 @@ class Session:
         if (self.paused and not self._once) or self.fault:
             return
         self._once = False
-        self._warn_of_length()
+        self._warn_oflength()
         begun = time.perf_counter()
         try:
             if probe := self.tool.follow(self.frame):
@@ -245,7 +245,7 @@ class Session:
     ) -> None:
         self.close()
 
-    def _warn_of_length(self) -> None:
+    def _warn_oflength(self) -> None:
         """Say once that soon there will be more than a scene file may hold."""
         if self.frame % CHECKED == 0 and not self._warned and values(self.recorded()) > NEARLY * MAX_NODES:
             self._warned = True
@@ -363,7 +363,7 @@ class Session:
         moved = self.displacement()
         # Less is what f32 makes of places.
         moved = moved if moved > AT_REST * max(self.scene.sheet.size) else 0.0
-        lines = [percent, _length(moved)], [pace, speed, *state]
+        lines = [percent, length(moved)], [pace, speed, *state]
         return [SEPARATOR.join(part for part in line if part) for line in lines]
 
 
@@ -390,9 +390,8 @@ def _between(values: NDArray[np.floating], across: float, down: float) -> NDArra
     return rows_between[0] + s * (rows_between[1] - rows_between[0])
 
 
-def _length(metres: float) -> str:
+def length(metres: float) -> str:
     """Write a length in a unit in which it is legible."""
-    for unit, size in (("m", 1.0), ("mm", 1e-3), ("µm", 1e-6)):
-        if metres >= size:
-            return f"{metres / size:.3g} {unit}"
-    return f"{metres:.2g} m" if metres else "0 mm"
+    if metres == 0 or 1e-6 <= metres < 1:
+        return f"{1e3 * metres:.3g} mm"
+    return f"{metres:.3g} m"
