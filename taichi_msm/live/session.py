@@ -190,7 +190,7 @@ class Session:
         if (self.paused and not self._once) or self.fault:
             return
         self._once = False
-        self._warn_oflength()
+        self._warn_of_length()
         begun = time.perf_counter()
         try:
             if probe := self.tool.follow(self.frame):
@@ -245,7 +245,7 @@ class Session:
     ) -> None:
         self.close()
 
-    def _warn_oflength(self) -> None:
+    def _warn_of_length(self) -> None:
         """Say once that soon there will be more than a scene file may hold."""
         if self.frame % CHECKED == 0 and not self._warned and values(self.recorded()) > NEARLY * MAX_NODES:
             self._warned = True
