@@ -32,13 +32,13 @@ def pick(position: NDArray[np.floating], refine: int, view: View, pixel: Pixel) 
         Fractions of the sheet's width from its left and of its height from its top; None where no surface is.
     """
     rows, cols = position.shape[:2]
-    corner = _seen(position, view, pixel)
-    corners = np.stack([corner[:-1, :-1], corner[:-1, 1:], corner[1:, :-1], corner[1:, 1:]], axis=-2)
+    matrix = _seen_from(view, pixel)
     found: list[Seen] = []
-    cells = np.argwhere(_around_zero(corners))
+    cells = np.argwhere(_may_show(position, matrix))
     for first in range(0, len(cells), CELLS):
         i, j = cells[first : first + CELLS].T
-        found += _in_cells(corners[i, j], i, j, refine, view.near)
+        corners = np.stack([position[i + down, j + right] for down in (0, 1) for right in (0, 1)], axis=1)
+        found += _in_cells(corners @ matrix[:, :3].T + matrix[:, 3], i, j, refine, view.near)
     if not found:
         return None
     _, (across, down) = min(found)
@@ -51,22 +51,34 @@ def on_rest_plane(view: View, pixel: Pixel) -> Array | None:
     Returns:
         x and y [m]; None where it does not meet it in front of the camera.
     """
-    a, b = (view.matrix[row] - (pixel[row] + 0.5) * view.matrix[2] for row in (0, 1))
-    planar = np.array([a[:2], b[:2]])
+    matrix = _seen_from(view, pixel)
+    planar = matrix[:2, :2]
     size = np.linalg.norm(planar, axis=1).prod()
     if not abs(np.linalg.det(planar)) > 1e-9 * size:
         return None
-    point = np.linalg.solve(planar, [-a[3], -b[3]])
-    ahead = view.matrix[2] @ [*point, 0, 1] > view.near
-    return point if ahead else None
+    point = np.linalg.solve(planar, -matrix[:2, 3])
+    return point if matrix[2] @ [*point, 0, 1] > view.near else None
 
 
-def _seen(position: NDArray[np.floating], view: View, pixel: Pixel) -> Array:
-    """Give (a, b, w, depth) of every mass point, shape (rows, cols, 4)."""
-    seen = position @ view.matrix[:, :3].T + view.matrix[:, 3]
+def _seen_from(view: View, pixel: Pixel) -> Array:
+    """Give the matrix that makes (a, b, w, depth) of a point, shape (4, 4)."""
+    matrix = view.matrix.copy()
     for row in (0, 1):
-        seen[..., row] -= (pixel[row] + 0.5) * seen[..., 2]
-    return seen
+        matrix[row] -= (pixel[row] + 0.5) * matrix[2]
+    return matrix
+
+
+def _may_show(position: NDArray[np.floating], matrix: Array) -> NDArray[np.bool_]:
+    """Mark the cells in which a and b can both be 0, given the matrix that makes (a, b, w, depth) of a point."""
+    rows, cols = position.shape[:2]
+    marked = np.ones((rows - 1, cols - 1), dtype=bool)
+    for row in matrix[:2]:
+        # One number of every point at a time: all of a large sheet at once are no longer in the cache.
+        value = position @ row[:3] + row[3]
+        for side in (value <= 0, value >= 0):
+            pairs = side[:-1] | side[1:]
+            marked &= pairs[:, :-1] | pairs[:, 1:]
+    return marked
 
 
 def _around_zero(corners: Array) -> NDArray[np.bool_]:
