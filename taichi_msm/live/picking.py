@@ -56,7 +56,7 @@ def on_rest_plane(view: View, pixel: Pixel) -> Array | None:
     size = np.linalg.norm(planar, axis=1).prod()
     if not abs(np.linalg.det(planar)) > 1e-9 * size:
         return None
-    point = np.linalg.solve(planar, -matrix[:2, 3])
+    point: Array = np.linalg.solve(planar, -matrix[:2, 3])
     return point if matrix[2] @ [*point, 0, 1] > view.near else None
 
 
