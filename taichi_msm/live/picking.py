@@ -45,7 +45,7 @@ def pick(position: NDArray[np.floating], refine: int, view: View, pixel: Pixel) 
     return across / (cols - 1), down / (rows - 1)
 
 
-def on_rest_plane(view: View, pixel: Pixel) -> Array | None:
+def on_rest_plane(view: View, pixel: Pixel) -> NDArray[np.floating] | None:
     """Find where the line of sight through the centre of a pixel meets the plane of the sheet at rest.
 
     Returns:
@@ -56,7 +56,7 @@ def on_rest_plane(view: View, pixel: Pixel) -> Array | None:
     size = np.linalg.norm(planar, axis=1).prod()
     if not abs(np.linalg.det(planar)) > 1e-9 * size:
         return None
-    point: Array = np.linalg.solve(planar, -matrix[:2, 3])
+    point = np.linalg.solve(planar, -matrix[:2, 3])
     return point if matrix[2] @ [*point, 0, 1] > view.near else None
 
 

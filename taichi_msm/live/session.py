@@ -114,7 +114,7 @@ class Session:
         self._rest = rest_positions(scene.sheet)
         self.stage = Stage(scene, texture)
         # A place of the tool, and the point on the plane at rest that was under the pointer then.
-        self._held: tuple[Place, NDArray[np.float64] | None] | None = None
+        self._held: tuple[Place, NDArray[np.floating] | None] | None = None
         self._pointer = (0.0, 0.0)
         self._figures, self._keys = True, False
         self._once = False
