@@ -21,6 +21,7 @@ from taichi_msm.live import album
 from taichi_msm.live import session as live_session
 from taichi_msm.live.album import Album
 from taichi_msm.live.events import KEYS, Drag, Event, Harder, Key, Percent, Press, Release, Turn
+from taichi_msm.live.film import film
 from taichi_msm.live.session import Session, with_live_frames
 from taichi_msm.loads import schedule
 from taichi_msm.runtime import Device
@@ -92,6 +93,21 @@ def test_a_press_at_a_pixel_dimples_what_is_seen_there(begin: Begin) -> None:
         advance(session, 10)
 
 
+def test_a_camera_that_moves_takes_nothing_of_a_drag(begin: Begin) -> None:
+    places = []
+    for turn in (0.0, 1e-6):
+        session = begin(TILTED)
+        session.paused = True
+        session.handle(Press(*pixel_of(session, 12, 6)))
+        for n in range(8):
+            session.handle(Drag(pixel_of(session, 12, 6)[0] + 4 * n, 50))
+            session.handle(Turn(turn, 0))
+        session.paused = False
+        advance(session, 2)
+        places.append(session.tool.place)
+    assert places[1] == pytest.approx(places[0], abs=2e-5)
+
+
 def test_a_drag_moves_the_control_point_with_the_pointer(begin: Begin) -> None:
     session = begin(TILTED)
     session.handle(Press(*pixel_of(session, 12, 6)))
@@ -101,6 +117,8 @@ def test_a_drag_moves_the_control_point_with_the_pointer(begin: Begin) -> None:
     session.advance()
     assert np.array(session.tool.place) * 24 == pytest.approx([16, 10], abs=0.4)
     session.handle(Turn(12, 4))
+    session.handle(Drag(there[0], there[1]))
+    session.handle(Turn(-6, 4))
     session.handle(Drag(there[0], there[1]))
     session.advance()
     assert np.array(session.tool.place) * 24 == pytest.approx([16, 10], abs=0.4), (
@@ -203,6 +221,8 @@ def test_reset_begins_anew(begin: Begin) -> None:
     session.handle(Press(60, 50))
     first = advance(session, 5)
     session.handle(Key("r"))
+    session.handle(Drag(70, 50))
+    assert session.tool.goal == (0.5, 0.5), "nothing is held any more"
     assert (displacement(session) < AT_REST).all()
     assert (session.frame, session.tool.percent) == (0, 0)
     session.handle(Press(60, 50))
@@ -264,6 +284,9 @@ def test_a_press_beside_the_sheet_says_so(begin: Begin) -> None:
     advance(session, 4)
     assert (displacement(session) < AT_REST).all()
     assert not session.tool.held
+    session.handle(Press(60, 50))
+    assert session.notice == "", "what was said is no longer so"
+    session.handle(Press(2, 2))
     advance(session, 200)
     assert session.notice == ""
 
@@ -395,6 +418,14 @@ def test_a_session_too_long_for_a_file_says_so_before(begin: Begin, monkeypatch:
     assert load_scene("album/session-1.yaml").time.duration == pytest.approx(1 / session.rate)
 
 
+def test_a_film_ends_where_the_session_diverges(begin: Begin) -> None:
+    session = begin({**TILTED, "probes.0.force": [0, 0, -1e12]})
+    said: list[str] = []
+    film(session, Path("a.gif"), 2.0, [(2, Press(60, 50)), (90, Key("w"))], say=said.append)
+    assert said == [f"{session.fault}; 1 of the script's events come after that"]
+    assert duration("a.gif") < 500
+
+
 def test_two_albums_of_one_folder_keep_both_films(begin: Begin) -> None:
     sessions = begin(TILTED), begin(TILTED)
     for session in sessions:
@@ -445,6 +476,7 @@ def test_a_session_that_diverged_says_so_and_can_be_reset(begin: Begin) -> None:
     advance(session, 3)
     assert session.frame == frame
     session.handle(Key("w"))
+    assert session.notice == "saved album/session-1.yaml"
     again = run(load_scene("album/session-1.yaml", {"output": []}), "again", threads=2)
     assert again["status"] == "diverged", "what goes wrong goes wrong again"
     session.handle(Key("r"))

@@ -106,6 +106,29 @@ def test_pressing_elsewhere_at_once_lets_go_for_a_frame() -> None:
     assert hand.place == (0.8, 0.8)
 
 
+def test_clicks_while_time_stands_still_are_one() -> None:
+    hand = tool()
+    for n in range(50):
+        hand.press((n / 100, 0.123456), 1)
+        hand.release()
+    assert hand.goal == (0.49, 0.123456)
+    assert percents(hand, 0, 4) == pytest.approx([10, 0, 0, 0])
+    assert hand.place == (0.49, 0.123456)
+
+
+def test_what_it_is_asked_for_last_is_its_goal() -> None:
+    hand = tool()
+    hand.press((0.2, 0.2), 1)
+    assert hand.goal == (0.2, 0.2)
+    hand.follow(0)
+    hand.move((0.3, 0.2))
+    assert (hand.goal, hand.place) == ((0.3, 0.2), (0.2, 0.2))
+    hand.press((0.7, 0.2), 1)
+    assert hand.goal == (0.7, 0.2)
+    hand.move((0.8, 0.2))
+    assert hand.goal == (0.8, 0.2)
+
+
 def test_the_control_point_stays_on_the_sheet() -> None:
     hand = tool()
     hand.press((-0.5, 1.5), 1)

@@ -151,8 +151,8 @@ def test_what_view_refuses(
         (
             "events:\n  - {t: 1, do: key, name: q}",
             [
-                "s.yaml:2:21: events.0.name: there is no key q here; expected one of: up, down, c, t, o, m, l, space, "
-                "., r, p, g, w, i, h"
+                "s.yaml:2:21: events.0.name: there is no key 'q' here; expected one of: up, down, c, t, o, m, "
+                "l, space, ., r, p, g, w, i, h"
             ],
         ),
         (
@@ -350,7 +350,10 @@ def screen(tmp_path: Path) -> Iterator[str]:
     """An X server of its own without a screen."""
     read, write = os.pipe()
     with subprocess.Popen(
-        ["Xvfb", "-displayfd", str(write), "-screen", "0", "800x600x24"], pass_fds=[write], stderr=subprocess.DEVNULL
+        # It would begin anew, and let nobody in meanwhile, whenever its last client goes.
+        ["Xvfb", "-noreset", "-displayfd", str(write), "-screen", "0", "800x600x24"],
+        pass_fds=[write],
+        stderr=subprocess.DEVNULL,
     ) as server:
         os.close(write)
         with os.fdopen(read) as answer:

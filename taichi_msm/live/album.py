@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import filecmp
 import os
+import secrets
 import shutil
 import tempfile
 from collections.abc import Iterator
@@ -146,10 +147,12 @@ class Album:
     def _copied(self, image: Path) -> Path:
         """Have a copy of a picture in the folder, under its own name if that is free."""
         copy, number = self.folder / image.name, 1
-        while copy.exists() and not filecmp.cmp(image, copy, shallow=False):
+        if not image.is_file():
+            raise FilesError(f"{image}: is gone; put the picture back, the scene needs a copy of it")
+        while os.path.lexists(copy) and not (copy.exists() and filecmp.cmp(image, copy, shallow=False)):
             number += 1
             copy = self.folder / f"{image.stem}-{number}{image.suffix}"
-        if not copy.exists():
+        if not os.path.lexists(copy):
             with _draft(self.folder) as draft:
                 shutil.copyfile(image, draft)
                 draft.replace(copy)
@@ -159,7 +162,8 @@ class Album:
 @contextmanager
 def _draft(folder: Path) -> Iterator[Path]:
     """Give a name out of sight to write a file under; it is gone in the end."""
-    draft = folder / f".draft-{os.getpid()}"
+    # No two processes ever have one name: a draft may be another name of what was kept by one that was killed.
+    draft = folder / f".draft-{secrets.token_hex(8)}"
     with writing(folder):
         folder.mkdir(parents=True, exist_ok=True)
         try:

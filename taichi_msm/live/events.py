@@ -75,7 +75,7 @@ KEYS = {
     ".": "one frame further, when paused",
     "r": "reset: tissue at rest, and what was done forgotten",
     "p": "save the tissue as PNG",
-    "g": "start and stop a film of the tissue, a GIF",
+    "g": "start and stop a film, a GIF",
     "w": "write what was done as a scene, which run repeats",
     "i": "the figures on and off",
     "h": "the keys on and off",

@@ -63,11 +63,12 @@ def film(
                 notice = session.notice
             if frame % session.parts == 0:
                 reel.add(session.picture())
-            if session.fault:
-                say(session.fault)
-                break
             if frame < frames:
                 session.advance()
+            if session.fault:
+                undone = sum(len(happens[later]) for later in range(frame + 1, frames + 1))
+                say(session.fault + (f"; {undone} of the script's events come after that" if undone else ""))
+                break
         with writing(path, OPTION):
             reel.encoded().replace(path)
     if failures:

@@ -60,7 +60,7 @@ class Entry(Section):
             if needed and not given:
                 raise PydanticCustomError(REFUSED, "missing; {do} needs it", {"key": name, "do": self.do})
         if self.name is not None and self.name not in PRESSABLE:
-            said = "there is no key {name} here; expected one of: {keys}"
+            said = "there is no key '{name}' here; expected one of: {keys}"
             raise PydanticCustomError(REFUSED, said, {"key": "name", "name": self.name, "keys": ", ".join(PRESSABLE)})
         if self.seconds > 0 and self.do not in LASTING:
             raise PydanticCustomError(REFUSED, "{do} takes no time; remove it", {"key": "seconds", "do": self.do})

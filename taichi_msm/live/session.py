@@ -203,7 +203,7 @@ class Session:
         self.seconds_a_frame += share * (spent - self.seconds_a_frame)
 
     def picture(self, pace: str = "") -> Picture:
-        """Draw the tissue and what is written over it. A film that is on takes the tissue alone, or ends if it cannot.
+        """Draw the tissue and what is written over it. A film that is on takes it without text, or ends if it cannot.
 
         Args:
             pace: what is to be said of the speed of the pictures.
@@ -229,7 +229,7 @@ class Session:
     @property
     def notice(self) -> str:
         """What the person should know now."""
-        return self.fault or (self._notice if self._beats < self._notice_until else "")
+        return self._notice if self._beats < self._notice_until else self.fault
 
     def close(self) -> None:
         """Keep the film that is on, and free the memory."""
@@ -282,7 +282,7 @@ class Session:
     def _hold_on(self) -> None:
         """Keep the tool where it is under a camera that moved; a drag goes on from there."""
         if self._held is not None:
-            self._held = self.tool.place, on_rest_plane(self.stage.view, self._pointer)
+            self._held = self.tool.goal, on_rest_plane(self.stage.view, self._pointer)
 
     def _do(self, key: str) -> None:
         match key:
@@ -301,10 +301,11 @@ class Session:
             case "l":
                 self.stage.light()
             case "space":
-                self.paused = not self.paused
+                self.paused, self._once = not self.paused, False
             case ".":
                 self._once = self.paused
             case "r":
+                self._once = False
                 self._simulation.go_on(self._beginning)
                 self.tool.rest()
                 self._held = None

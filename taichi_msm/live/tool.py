@@ -57,12 +57,22 @@ class Tool:
         self._at: list[tuple[float, float, float]] = [(0.0, *self.place)]
 
     @property
+    def goal(self) -> Place:
+        """Where it will be when all that was asked for is done."""
+        press = next((asked for asked in reversed(self._asked) if asked is not None), None)
+        return self._goal if press is None else press[0]
+
+    @property
     def held(self) -> bool:
         """Whether it presses or will, unless it is released."""
         return self._asked[-1] is not None if self._asked else self._pressing != 0
 
     def press(self, place: Place, direction: int) -> None:
         """Press, 1, or pull, -1, at a place; what it does elsewhere it lets go."""
+        if len(self._asked) > 1 and self._asked[-1] is None:
+            # A click that nobody has seen yet, as when time stands still, is none.
+            self._asked.pop()
+            self._asked.pop()
         if self.held:
             self.release()
         self._asked.append((_rounded(place), direction))
