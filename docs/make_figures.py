@@ -17,7 +17,7 @@ from PIL import Image
 
 from taichi_msm import Simulation, load_scene, run
 from taichi_msm.live.album import Album
-from taichi_msm.live.film import film
+from taichi_msm.live.record import record
 from taichi_msm.live.script import load_script, timed
 from taichi_msm.live.session import Session
 
@@ -61,7 +61,7 @@ def live(name: str, size: int, rate: float, seconds: float) -> None:
     scene = load_scene(SCENES / "press.yaml", settings)
     script = load_script(SCENES / "scripts" / "press.yaml", scene.render.size)
     with tempfile.TemporaryDirectory() as directory, Session(scene, Album(Path(directory), "press.yaml")) as session:
-        film(session, IMAGES / f"{name}.gif", seconds, timed(script, session.rate, scene.render.size))
+        record(session, IMAGES / f"{name}.gif", seconds, timed(script, session.rate, scene.render.size))
 
 
 def strip(pictures: list[Image.Image], gap: int = 6) -> Image.Image:

@@ -287,8 +287,8 @@ def view(
     done = load_script(script, loaded.render.size) if script is not None else None
 
     from taichi_msm.console import Progress
+    from taichi_msm.live import record as recording
     from taichi_msm.live.album import Album
-    from taichi_msm.live.film import film
     from taichi_msm.live.session import Session
     from taichi_msm.live.window import Window, show
 
@@ -311,7 +311,7 @@ def view(
                 with begin() as session, Progress(quiet=False) as bar:
                     events = timed(done, session.rate, loaded.render.size) if done else ()
                     progress = partial(interruptible(bar, interruption), "film")
-                    film(session, Path(record), seconds, events, progress, notices.append)
+                    recording.record(session, Path(record), seconds, events, progress, notices.append)
                 click.echo(printable(record))
     except KeyboardInterrupt:
         report("interrupted", ["interrupted" if record is None else "interrupted; no film was written"], as_json=False)

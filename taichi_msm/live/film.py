@@ -1,75 +1,68 @@
-"""A session without a window: a script is done, and a film taken of it."""
+"""A film of a session, encoded beside it, that is whole or not there."""
 
 from __future__ import annotations
 
-from collections import defaultdict
-from collections.abc import Callable, Iterable
+import shutil
+import tempfile
 from pathlib import Path
+from types import TracebackType
 
-from taichi_msm.errors import FilesError, writing
-from taichi_msm.live.album import Film
-from taichi_msm.live.events import Event
-from taichi_msm.live.session import Session
-
-OPTION = "--record"
+from taichi_msm.encoding import Encoder, Job
+from taichi_msm.errors import writing
+from taichi_msm.gif import Picture
+from taichi_msm.publication import ANIMATION
 
 
-def film(
-    session: Session,
-    path: Path,
-    seconds: float,
-    events: Iterable[tuple[int, Event]] = (),
-    progress: Callable[[int, int], None] = lambda done, total: None,
-    say: Callable[[str], None] = lambda notice: None,
-) -> None:
-    """Let a session go on for some time and film it.
+class Film:
+    """A GIF that is encoded in a process of its own, out of sight; gone when it is left, if nobody took it.
 
     Args:
-        session: the session.
-        path: the GIF; one that is there is replaced when the film is whole.
-        seconds: how long.
-        events: each with the frame of the session before which it happens.
-        progress: called with the frames done and the frames in all, often; what it raises stops here.
-        say: called with what the person should know.
+        folder: near which it is encoded; made where it does not exist.
+        size: width, height of the pictures [px].
+        rate: pictures per second.
+        background: a colour that is kept exactly.
+        option: where another folder is chosen.
 
     Raises:
-        FilesError: when the film cannot be written, or, when it is, what an event was to keep could not.
+        FilesError: here and in `add` and `encoded`, when it cannot be written.
     """
-    if path.is_dir():
-        raise FilesError(f"{path}: a directory; choose another {OPTION}")
-    frames = round(seconds * session.rate)
-    happens: dict[int, list[Event]] = defaultdict(list)
-    late = 0
-    for frame, event in events:
-        if frame <= frames:
-            happens[frame].append(event)
-        else:
-            late += 1
-    if late:
-        say(f"the film ends at {seconds:g} s, before {late} of the script's events")
-    failures: list[FilesError] = []
-    notice = ""
-    render = session.scene.render
-    with Film(path.parent, render.size, session.rate / session.parts, render.background, OPTION) as reel:
-        for frame in range(frames + 1):
-            progress(frame, frames)
-            for event in happens[frame]:
-                try:
-                    session.handle(event)
-                except FilesError as error:
-                    failures.append(error)
-                if session.notice not in ("", notice):
-                    say(f"{frame / session.rate:g} s: {session.notice}")
-                notice = session.notice
-            if frame % session.parts == 0:
-                reel.add(session.picture())
-            if frame < frames:
-                session.advance()
-            if session.fault:
-                undone = sum(len(happens[later]) for later in range(frame + 1, frames + 1))
-                say(session.fault + (f"; {undone} of the script's events come after that" if undone else ""))
-                break
-        with writing(path, OPTION):
-            reel.encoded().replace(path)
-    if failures:
-        raise failures[0]
+
+    def __init__(
+        self,
+        folder: Path,
+        size: tuple[int, int],
+        rate: float,
+        background: tuple[int, int, int],
+        option: str = "--out",
+    ) -> None:
+        self.pictures = 0
+        self._place = folder, option
+        with writing(*self._place):
+            folder.mkdir(parents=True, exist_ok=True)
+            self._hidden = Path(tempfile.mkdtemp(prefix=".film-", dir=folder))
+            try:
+                self._encoder = Encoder(Job(self._hidden, size, rate, png=False, gif=True, background=background))
+            except OSError:
+                shutil.rmtree(self._hidden, ignore_errors=True)
+                raise
+
+    def add(self, picture: Picture) -> None:
+        """Add the next picture, shape (height, width, 3)."""
+        with writing(*self._place):
+            self._encoder.add(picture)
+        self.pictures += 1
+
+    def encoded(self) -> Path:
+        """Wait for the last picture; returns the file, which is to be moved to its place. There must be a picture."""
+        with writing(*self._place):
+            self._encoder.finish()
+        return self._hidden / ANIMATION
+
+    def __enter__(self) -> Film:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self._encoder.abort()
+        shutil.rmtree(self._hidden, ignore_errors=True)

@@ -140,12 +140,13 @@ def timed(script: Script, rate: float, size: tuple[int, int]) -> Iterator[tuple[
         size: width, height of the picture that is shown [px].
     """
     scale = [shown / meant for shown, meant in zip(size, script.size or size, strict=True)]
-    pointer = (0.0, 0.0)
+    x = y = 0.0
     for entry in script.events:
         first = round(entry.t * rate)
         frames = max(1, round(entry.seconds * rate))
-        x, y = ((n + 0.5) * factor - 0.5 for n, factor in zip(entry.at or pointer, scale, strict=True))
-        begin_x, begin_y = pointer
+        begin_x, begin_y = x, y
+        if entry.at:
+            x, y = ((n + 0.5) * factor - 0.5 for n, factor in zip(entry.at, scale, strict=True))
         for n in range(1, frames + 1):
             share, frame = n / frames, first + n - 1
             match entry.do:
@@ -162,5 +163,3 @@ def timed(script: Script, rate: float, size: tuple[int, int]) -> Iterator[tuple[
                     yield frame, Percent(entry.to or 0.0)
                 case "key":
                     yield frame, Key(entry.name or "")
-        if entry.at:
-            pointer = x, y

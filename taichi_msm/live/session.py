@@ -15,8 +15,9 @@ from taichi_msm.errors import DivergedError, FilesError, SceneError
 from taichi_msm.gif import Picture
 from taichi_msm.lattice import rest_positions
 from taichi_msm.live import overlay
-from taichi_msm.live.album import Album, Film, values
+from taichi_msm.live.album import Album, values
 from taichi_msm.live.events import KEYS, NOTCH, POINTER, Drag, Event, Harder, Key, Percent, Press, Release, Turn
+from taichi_msm.live.film import Film
 from taichi_msm.live.picking import on_rest_plane, pick
 from taichi_msm.live.stage import Stage
 from taichi_msm.live.tool import Place, Tool
