@@ -1,75 +1,80 @@
-"""What an unfinished run leaves for another process to go on with: its plan, its frames and its last state."""
+"""What an unfinished run leaves for another process to go on with: its plan, its frames and its last state.
+
+Every part has a checksum, which is looked at before the part is used: the plan a SHA-256 of its own, the positions
+one for every frame, the arrays of the state the CRC-32 of their archive.
+"""
 
 from __future__ import annotations
 
-import json
+import hashlib
 import math
-import shutil
+import os
 import time
 import zipfile
-import zlib
-from collections.abc import Mapping
-from dataclasses import asdict
-from pathlib import Path
+from collections.abc import Iterator, Mapping
+from contextlib import ExitStack
+from dataclasses import asdict, fields
 from typing import Any, BinaryIO
 
 import numpy as np
-from numpy.typing import DTypeLike, NDArray
+from numpy.typing import NDArray
 
 from taichi_msm.course import Course, Saved
 from taichi_msm.dynamics import State
 from taichi_msm.errors import DamagedError
-from taichi_msm.publication import PLAN
-
-POSITIONS, STATE = "positions", "state.npz"
+from taichi_msm.folder import Folder, write_all
+from taichi_msm.npz import read_array, write_array
+from taichi_msm.publication import CHECKPOINT, CHECKPOINT_TREE, DRAFT, PLAN, POSITIONS, STATE
+from taichi_msm.scene import Scene
+from taichi_msm.sealed import seal
+from taichi_msm.stability import steps_per_frame
 
 # Saving the state may take this share of the time.
 SHARE = 0.02
+
+DIGEST_BYTES = 32
 
 
 class Checkpoint:
     """A folder from which a run can go on, whenever its process is killed.
 
     Args:
-        folder: where it is.
-        points: rows, cols.
-        precision: type of the positions.
-        stores: whether positions are wanted at all.
+        staging: the folder that it is in.
+        scene: what is run; where it has no output, positions are not kept.
 
     Attributes:
         frames: number of frames that were added.
+        precision: type of the positions.
     """
 
-    def __init__(self, folder: Path, points: tuple[int, int], precision: DTypeLike, *, stores: bool = True) -> None:
+    def __init__(self, staging: Folder, scene: Scene) -> None:
         self.frames = 0
-        self._folder = folder
-        self._shape = (*points, 3)
-        self._precision = np.dtype(precision)
-        self._frame_bytes = stores * math.prod(self._shape) * self._precision.itemsize
-        self._file: BinaryIO | None = None
+        self._staging = staging
+        self._scene = scene
+        self._shape = (*scene.sheet.points, 3)
+        self.precision = np.dtype(np.float32 if scene.time.precision == "f32" else np.float64)
+        self._frame_bytes = math.prod(self._shape) * self.precision.itemsize
+        self._record_bytes = (DIGEST_BYTES + self._frame_bytes) if scene.output else 0
         self._due = 0.0
+        self._open = ExitStack()
+        self._folder: Folder | None = None
+        self._positions: BinaryIO | None = None
 
     @property
     def due(self) -> bool:
         """Whether it is time to save again."""
         return time.perf_counter() >= self._due
 
-    @property
-    def positions(self) -> BinaryIO:
-        """The positions of all frames, one after another."""
-        assert self._file is not None, "begin or go_on comes first"
-        return self._file
-
     def begin(self, plan: Mapping[str, Any]) -> None:
         """Begin without a frame, in the place of any other run; the plan is what a process must know, in JSON."""
-        if self._folder.exists():
-            shutil.rmtree(self._folder)
-        self._folder.mkdir()
+        with self._staging.folder(CHECKPOINT, create=True) as folder:
+            # First of all, so that a part of a checkpoint is none.
+            folder.remove(PLAN)
+            folder.clear(CHECKPOINT_TREE)
+        folder = self._enter()
         # Without a buffer, so that what was written stays when the process is killed.
-        self._file = (self._folder / POSITIONS).open("x+b", buffering=0)
-        draft = self._folder / "draft"
-        draft.write_text(json.dumps(plan), encoding="utf-8")
-        draft.replace(self._folder / PLAN)
+        self._positions = self._open.enter_context(folder.create(POSITIONS, buffering=0))
+        folder.write(PLAN, seal(plan), DRAFT)
 
     def go_on(self) -> Saved | None:
         """Go on from what was saved last; None: from the beginning.
@@ -78,74 +83,131 @@ class Checkpoint:
             DamagedError: when the files do not belong together.
             OSError: when they cannot be read.
         """
+        folder = self._enter()
         try:
-            self._file = (self._folder / POSITIONS).open("r+b", buffering=0)
+            self._positions = self._open.enter_context(folder.open(POSITIONS, write=True))
         except FileNotFoundError:
             raise self._damaged(POSITIONS) from None
         saved = self.load()
-        self.frames = 0 if saved is None else saved.course.frame + 1
-        size = self.frames * self._frame_bytes
-        if (self._folder / POSITIONS).stat().st_size < size:
+        frames = 0 if saved is None else saved.course.frame + 1
+        if os.fstat(self._positions.fileno()).st_size < frames * self._record_bytes:
             raise self._damaged(POSITIONS)
-        self.positions.truncate(size)
-        self.positions.seek(size)
+        self.frames = frames
         return saved
 
     def add(self, position: NDArray[Any]) -> None:
         """Add the positions of the next frame [m], shape (rows, cols, 3)."""
-        if self._frame_bytes:
-            rest = np.ascontiguousarray(position, self._precision).data.cast("B")
-            while rest:
-                rest = rest[self.positions.write(rest) :]
+        if self._record_bytes:
+            assert self._positions is not None, "begin or go_on comes first"
+            data = np.ascontiguousarray(position, self.precision).data.cast("B")
+            self._positions.seek(self.frames * self._record_bytes)
+            write_all(self._positions, _digest(self.frames, data))
+            write_all(self._positions, data)
         self.frames += 1
 
     def position(self, frame: int) -> NDArray[Any]:
-        """Read the positions of a frame [m], shape (rows, cols, 3)."""
-        start, count = frame * self._frame_bytes, math.prod(self._shape)
-        found = np.fromfile(self._folder / POSITIONS, self._precision, count, offset=start)
-        return found.reshape(self._shape)
+        """Read the positions of a frame.
 
-    def save(self, saved: Saved) -> Path:
+        Returns:
+            Positions [m], shape (rows, cols, 3).
+
+        Raises:
+            DamagedError: when they are not as they were written.
+        """
+        assert self._positions is not None, "begin or go_on comes first"
+        record = np.empty(self._record_bytes, np.uint8)
+        self._positions.seek(frame * self._record_bytes)
+        rest = record.data
+        while rest and (count := self._positions.readinto(rest)):  # type: ignore[attr-defined]
+            rest = rest[count:]
+        data = record[DIGEST_BYTES:]
+        found = data.view(self.precision).reshape(self._shape)
+        # Anybody may have written it.
+        if rest or record[:DIGEST_BYTES].tobytes() != _digest(frame, data.data) or not np.isfinite(found).all():
+            raise self._damaged(POSITIONS)
+        return found
+
+    def positions(self, frames: int) -> Iterator[memoryview]:
+        """Read the bytes of the positions of the first frames, one after another; raises what `position` does."""
+        for frame in range(frames):
+            yield self.position(frame).data.cast("B")
+
+    def save(self, saved: Saved) -> str:
         """Keep where the run is, in the place of what was saved before; its frames have been added.
 
         Returns:
-            The file that has it, with the arrays of `State` and the numbers of `Course` by their names.
+            The path of the file that has it, with the arrays of `State` and the numbers of `Course` by their names.
         """
         start = time.perf_counter()
-        draft = self._folder / "draft"
+        folder = self._entered
+        folder.remove(DRAFT)
         try:
-            with draft.open("wb") as file:
-                np.savez(file, **saved.state._asdict(), **asdict(saved.course))
-            draft.replace(self._folder / STATE)
+            with folder.create(DRAFT) as file, zipfile.ZipFile(file, "w", zipfile.ZIP_STORED) as archive:
+                for name, array in _arrays(saved).items():
+                    write_array(archive, name, array.dtype, array.shape, [np.ascontiguousarray(array).data.cast("B")])
+            folder.replace(DRAFT, folder, STATE)
         except OSError:
-            draft.unlink(missing_ok=True)
+            folder.remove(DRAFT)
             raise
         now = time.perf_counter()
         self._due = now + (now - start) / SHARE
-        return self._folder / STATE
+        return str(folder.path / STATE)
 
     def load(self) -> Saved | None:
         """Read what was saved last; None: nothing was.
 
         Raises:
-            DamagedError: when it cannot be read.
+            DamagedError: when it cannot be that of a run of the scene.
         """
+        like = _arrays(Saved(State(0, np.empty(0), np.empty(0)), Course()))
+        sheet = self.precision, self._shape
+        kinds = {name: sheet if array.size == 0 else (array.dtype, ()) for name, array in like.items()}
         try:
-            with (self._folder / STATE).open("rb") as file, np.load(file, allow_pickle=False) as found:
-                state = State(int(found["steps"]), found["displacement"], found["difference"])
-                course = Course(**{key: found[key].item() for key in asdict(Course())})
+            with self._entered.open(STATE) as file, zipfile.ZipFile(file) as archive:
+                found = {name: read_array(archive, name, *kind) for name, kind in kinds.items()}
         except FileNotFoundError:
             return None
-        except (OSError, ValueError, KeyError, TypeError, EOFError, RuntimeError, zipfile.BadZipFile, zlib.error):
+        # A forged archive makes zipfile raise nearly anything.
+        except Exception:
             raise self._damaged(STATE) from None
-        if state.displacement.shape != self._shape or state.difference.shape != self._shape:
+        course = Course(**{field.name: found[field.name].item() for field in fields(Course)})
+        saved = Saved(State(int(found["steps"]), found["displacement"], found["difference"]), course)
+        every = steps_per_frame(self._scene)
+        # Anybody may have written it.
+        if not (
+            course.frame <= self._scene.time.frames
+            and course.frame * every <= saved.state.steps <= (course.frame + 1) * every
+            and all(np.isfinite(array).all() for array in found.values())
+            and all(value >= 0 for value in asdict(course).values())
+        ):
             raise self._damaged(STATE)
-        return Saved(state, course)
+        return saved
 
     def close(self) -> None:
-        """Close the positions."""
-        if self._file is not None:
-            self._file.close()
+        """Close its files."""
+        self._open.close()
+
+    @property
+    def _entered(self) -> Folder:
+        assert self._folder is not None, "begin or go_on comes first"
+        return self._folder
+
+    def _enter(self) -> Folder:
+        self.close()
+        self._folder = self._open.enter_context(self._staging.folder(CHECKPOINT))
+        return self._folder
 
     def _damaged(self, name: str) -> DamagedError:
-        return DamagedError(f"{self._folder / name} is damaged; run the scene again")
+        return DamagedError(f"{self._staging.path / CHECKPOINT / name} is damaged; run the scene again")
+
+
+def _arrays(saved: Saved) -> dict[str, NDArray[Any]]:
+    """Give the arrays of a state and the numbers of a course by their names."""
+    return {name: np.asarray(value) for name, value in (saved.state._asdict() | asdict(saved.course)).items()}
+
+
+def _digest(frame: int, data: memoryview) -> bytes:
+    """Tell the positions of a frame from any others, and from those of another frame."""
+    digest = hashlib.sha256(frame.to_bytes(8, "little"))
+    digest.update(data)
+    return digest.digest()

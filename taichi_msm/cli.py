@@ -136,7 +136,7 @@ def check(scene: str, image: str | None, overrides: tuple[str, ...], as_json: bo
 
     loaded = load_scene(scene, overrides, image)
     with naming(scene):
-        budget.require_disk(loaded, result_directory(None, Path(scene).stem))
+        budget.require_disk(loaded, Path("output"))
     need = budget.estimate(loaded)
     limit = stability.stable_step(loaded)
     facts = {
@@ -235,7 +235,7 @@ def study(
         return interruption.code
     if found.status == "interrupted" and (directory / RECORD).exists():
         # An earlier study is not to be lost for a part of another.
-        directory /= "interrupted"
+        directory = without_link(directory / "interrupted", "--out")
     outputs = write_report(found, directory)
     if as_json:
         print_json({"directory": str(directory), **as_record(found), "outputs": outputs})
@@ -339,7 +339,18 @@ def result_directory(out: str | None, default: str = "", option: str = "--out") 
     """Choose where results go."""
     if out == "":
         raise click.BadParameter("is empty; name a directory", param_hint=option)
-    return Path(out) if out is not None else Path("output") / default
+    if out is not None:
+        return Path(out)
+    if default in (".", ".."):
+        raise click.BadParameter(f"the scene's name gives the folder output/{default}; name another", param_hint=option)
+    return without_link(without_link(Path("output"), option) / default, option)
+
+
+def without_link(folder: Path, option: str) -> Path:
+    """Make sure that a folder that nobody named, as it may have come with the scene, does not lead elsewhere."""
+    if folder.is_symlink():
+        raise FilesError(f"{folder}: a symbolic link; name the folder that it leads to by {option}")
+    return folder
 
 
 def going_on(directory: Path) -> str:

@@ -18,6 +18,7 @@ STAGES = {
     "start": "starting Taichi",
     "pilot": "pilot runs",
     "compile": "compiling the kernels",
+    "check": "checking the frames done",
     "frames": "simulating and drawing",
     "diagnosis": "finding out why it diverged",
     "stepping": "measuring the stepping",

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import os
 import pickle
+import select
 import signal
 import subprocess
 import sys
@@ -18,15 +19,16 @@ from collections.abc import Callable, Iterator
 from concurrent.futures import CancelledError, Future, ThreadPoolExecutor
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
-from pathlib import Path
 from threading import Event
 from typing import BinaryIO
 
 import numpy as np
 from PIL import Image
 
+from taichi_msm.errors import FilesError
+from taichi_msm.folder import Folder
 from taichi_msm.gif import GifWriter, Palette, Picture, shades
-from taichi_msm.publication import ANIMATION, frame_name
+from taichi_msm.publication import ANIMATION, FRAMES, frame_file
 
 # Level 1 takes a fifth of the time of the default (18 against 93 ms) for 10 % more bytes.
 COMPRESS_LEVEL = 1
@@ -34,6 +36,9 @@ COMPRESS_LEVEL = 1
 # Pictures that wait in memory, at most: so many, or so many bytes of them.
 WAITING = 4
 WAITING_BYTES = 256 << 20
+
+# While nothing can be handed over, who waits is asked so often whether to go on waiting [s].
+PATIENCE = 0.1
 
 # Our path, so that the child finds this package where we did. It must not run the caller's main module, as
 # multiprocessing would: a script that calls us need not be guarded against its own import.
@@ -45,7 +50,7 @@ class Job:
     """What to encode.
 
     Attributes:
-        directory: where frames/ and animation.gif go.
+        folder: where frames/ and animation.gif go.
         size: width, height of the pictures [px].
         rate: frames per second.
         png: whether each picture is written.
@@ -53,7 +58,7 @@ class Job:
         background: a colour that the animation keeps exactly.
     """
 
-    directory: Path
+    folder: Folder
     size: tuple[int, int]
     rate: float
     png: bool
@@ -89,9 +94,11 @@ class Encoder:
         with _hurry_held_back():
             self._process = subprocess.Popen(
                 [sys.executable, "-c", _CHILD.format(path=sys.path)],
+                bufsize=0,
                 stdin=subprocess.PIPE,
                 stdout=subprocess.PIPE,
-                pass_fds=inherit,
+                # The folder has the same descriptor there.
+                pass_fds=(*inherit, *([] if job.folder.descriptor is None else [job.folder.descriptor])),
                 # Ctrl-C is for us alone: the pictures so far are still to be finished, as they are after a SIGTERM.
                 start_new_session=True,
                 creationflags=getattr(subprocess, "CREATE_NEW_PROCESS_GROUP", 0),
@@ -102,12 +109,24 @@ class Encoder:
         self._answer = self._process.stdout
         self._report: Report | None = None
         pickle.dump(job, self._pictures)
+        if os.name != "nt":  # where pipes always block
+            os.set_blocking(self._pictures.fileno(), False)
 
-    def add(self, picture: Picture) -> None:
-        """Hand over the next picture, shape (height, width, 3); waits while too many are not encoded yet."""
+    def add(self, picture: Picture, pause: Callable[[], None] = lambda: None) -> None:
+        """Hand over the next picture; waits while too many are not encoded yet.
+
+        Args:
+            picture: colours, shape (height, width, 3).
+            pause: called some times a second while it waits; what it raises gives the picture up.
+        """
+        rest = np.ascontiguousarray(picture).data.cast("B")
         try:
-            self._pictures.write(np.ascontiguousarray(picture).data)
-            self._pictures.flush()
+            while rest:
+                count = self._pictures.write(rest)
+                # The process may be stopped, for all that we know.
+                if count is None and not select.select([], [self._pictures], [], PATIENCE)[1]:
+                    pause()
+                rest = rest[count or 0 :]
         except BrokenPipeError:
             self.finish()  # raises what ended the process
             raise
@@ -120,8 +139,9 @@ class Encoder:
         """
         if self._report is None:
             if hurry:
-                with suppress(ValueError, OSError):  # a system without the signal, or a process that has ended
+                with suppress(ValueError, OSError, AttributeError):  # a system without them, or an ended process
                     self._process.send_signal(signal.SIGINT)
+                    self._process.send_signal(signal.SIGCONT)
             with suppress(BrokenPipeError):
                 self._pictures.close()
             with self._answer:
@@ -168,7 +188,7 @@ def main() -> None:
         signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGINT})
     try:
         answer = encode(pickle.load(sys.stdin.buffer), sys.stdin.buffer, hurry)
-    except OSError as error:
+    except (OSError, FilesError) as error:
         answer = error
     except Exception as error:
         # Not every exception can be pickled.
@@ -203,9 +223,10 @@ def encode(job: Job, source: BinaryIO, hurry: Event) -> Report:
 
     with ThreadPoolExecutor(min(depth, os.cpu_count() or 1)) as stills, ThreadPoolExecutor(1) as reel:
         for picture in _pictures(source, job.size):
-            path = job.directory / frame_name(begun)
+            if job.png and begun == 0:
+                folder = job.folder.folder(FRAMES, create=True)
+            still = stills.submit(_seconds, _write_png, picture, folder, begun) if job.png else None
             begun += 1
-            still = stills.submit(_seconds, _write_png, picture, path) if job.png else None
             pending.append(reel.submit(shoot, picture, still))
             while len(pending) > depth and not hurry.is_set():
                 seconds += pending.popleft().result()
@@ -221,8 +242,8 @@ def encode(job: Job, source: BinaryIO, hurry: Event) -> Report:
             for task in pending:
                 seconds += task.result()
                 frames += 1
-    for number in range(frames, begun):
-        (job.directory / frame_name(number)).unlink(missing_ok=True)
+    for number in range(frames, begun) if job.png else ():
+        folder.remove(frame_file(number))
     seconds += _seconds(film.close)
     return Report(frames, seconds)
 
@@ -243,7 +264,7 @@ class _Film:
     def add(self, picture: Picture) -> None:
         if self._gif is None:
             palette = Palette(shades(picture), self._job.background)
-            self._gif = GifWriter(self._job.directory / ANIMATION, self._job.size, self._job.rate, palette)
+            self._gif = GifWriter(self._job.folder.create(ANIMATION), self._job.size, self._job.rate, palette)
         self._gif.add(picture)
 
     def close(self) -> None:
@@ -261,9 +282,9 @@ def _pictures(source: BinaryIO, size: tuple[int, int]) -> Iterator[Picture]:
         yield np.frombuffer(data, np.uint8).reshape(height, width, 3)
 
 
-def _write_png(picture: Picture, path: Path) -> None:
-    path.parent.mkdir(exist_ok=True)
-    Image.fromarray(picture).save(path, "PNG", compress_level=COMPRESS_LEVEL)
+def _write_png(picture: Picture, folder: Folder, number: int) -> None:
+    with folder.create(frame_file(number)) as file:
+        Image.fromarray(picture).save(file, "PNG", compress_level=COMPRESS_LEVEL)
 
 
 def _seconds(work: Callable[..., None], *args: object) -> float:

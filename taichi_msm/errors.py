@@ -55,6 +55,15 @@ class FilesError(MsmError):
     """Reading or writing failed; the message names the path and the remedy."""
 
 
+class ForeignError(FilesError):
+    """Something that no run has put there is in the way; nothing of it was touched."""
+
+    @classmethod
+    def at(cls, path: object, found: str) -> ForeignError:
+        """Say what was found where."""
+        return cls(f"{path}: {found} that no run has put there; move it away or choose another folder")
+
+
 class DamagedError(FilesError):
     """What an unfinished run left cannot be used."""
 

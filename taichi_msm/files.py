@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from contextlib import ExitStack
 from pathlib import Path
 from types import TracebackType
 from typing import Any
 
-import numpy as np
 from numpy.typing import NDArray
 
 from taichi_msm.checkpoint import Checkpoint
@@ -17,7 +16,7 @@ from taichi_msm.course import Saved
 from taichi_msm.encoding import Encoder, Job
 from taichi_msm.errors import writing
 from taichi_msm.gif import Picture
-from taichi_msm.publication import ANIMATION, FRAMES, RECORD, TRAJECTORY, Publication
+from taichi_msm.publication import ANIMATION, FRAMES, RECORD, TRAJECTORY, Publication, result_names
 from taichi_msm.scene import Scene
 from taichi_msm.trajectory import write_trajectory
 
@@ -35,8 +34,8 @@ class ResultWriter:
         resumes: whether this run is to go on from its checkpoint in the directory.
 
     Raises:
-        FilesError: on entering and in every method, when the directory cannot be written, or another run
-            writes there.
+        FilesError: on entering and in every method, when the directory cannot be written, another run writes there,
+            or something is in the way that no run has put there.
 
     Attributes:
         saved: where the run is to go on; None: at rest.
@@ -50,11 +49,8 @@ class ResultWriter:
         self._scene = scene
         self._plan = plan
         self._resumes = resumes
-        self._publication = Publication(directory)
-        self._precision = np.float32 if scene.time.precision == "f32" else np.float64
-        self._checkpoint = Checkpoint(
-            self._publication.checkpoint, scene.sheet.points, self._precision, stores=bool(scene.output)
-        )
+        self._publication = Publication(directory, self._names(scene.time.frames + 1))
+        self._checkpoint: Checkpoint
         self._encoder: Encoder | None = None
         self._open = ExitStack()
         self._frames = 0
@@ -81,12 +77,13 @@ class ResultWriter:
         with writing(self._directory):
             return self._checkpoint.position(frame)
 
-    def add(self, position: NDArray[Any], picture: Picture | None) -> None:
+    def add(self, position: NDArray[Any], picture: Picture | None, pause: Callable[[], None] = lambda: None) -> None:
         """Add the next frame.
 
         Args:
             position: positions [m], shape (rows, cols, 3).
             picture: colours, shape (height, width, 3); None where none is wanted.
+            pause: called some times a second while the encoder takes no more; what it raises gives the picture up.
         """
         with writing(self._directory):
             # In this order, whatever is interrupted, there are at least as many positions as pictures.
@@ -97,7 +94,7 @@ class ResultWriter:
                 self._checkpoint.add(position)
                 self._publication.keep = self._plan is not None
             if self._encoder and picture is not None:
-                self._encoder.add(picture)
+                self._encoder.add(picture, pause)
             self._frames += 1
 
     @property
@@ -105,7 +102,7 @@ class ResultWriter:
         """Whether it is time to save where the run is."""
         return self.stored > 0 and self._checkpoint.due
 
-    def save(self, saved: Saved) -> Path:
+    def save(self, saved: Saved) -> str:
         """Keep where the run is, in case it ends here; gives the file that has it."""
         with writing(self._directory):
             return self._checkpoint.save(saved)
@@ -127,45 +124,57 @@ class ResultWriter:
             if self._encoder:
                 report = self._encoder.finish(hurry=hurry)
                 self._frames, self._encode_seconds = report.frames, report.seconds
-            if "trajectory" in self._scene.output and self._frames:
-                write_trajectory(
-                    self._publication.staged / TRAJECTORY,
-                    self._checkpoint.positions,
-                    self._frames,
-                    self._scene.sheet.points,
-                    self._precision,
-                    self._scene.time.frames_per_second,
-                )
+            if TRAJECTORY in self._outputs(self._frames):
+                scene = self._scene
+                with self._publication.staged.create(TRAJECTORY) as file:
+                    write_trajectory(
+                        file,
+                        self._checkpoint.positions(self._frames),
+                        self._frames,
+                        scene.sheet.points,
+                        self._checkpoint.precision,
+                        scene.time.frames_per_second,
+                    )
         self._finished = True
 
-    def publish(self, record: Mapping[str, Any]) -> list[str]:
+    def publish(self, record: Mapping[str, Any]) -> dict[str, Any]:
         """Write run.json and put the results in the place of earlier ones.
 
         Args:
-            record: what run.json holds, besides the "outputs" that are returned.
+            record: what run.json holds, besides the number of "frames" and the names of "outputs", itself the last.
 
         Returns:
-            The names of what was written, run.json the last.
+            What it holds.
         """
         self.finish()
         with writing(self._directory):
-            staged = self._publication.staged
-            outputs = [name for name in (FRAMES, ANIMATION, TRAJECTORY) if (staged / name).exists()]
-            outputs.append(RECORD)
-            text = json.dumps({**record, "outputs": outputs}, indent=2, ensure_ascii=False, allow_nan=False)
-            # A file name that is not UTF-8 has surrogates, whose backslash form is their JSON form.
-            (staged / RECORD).write_text(text + "\n", encoding="utf-8", errors="backslashreplace")
-            self._publication.publish()
+            # The next run into the directory knows our files by these.
+            facts = {**record, "frames": self._frames, "outputs": self._outputs(self._frames)}
+            text = json.dumps(facts, indent=2, ensure_ascii=False, allow_nan=False)
+            with self._publication.staged.create(RECORD) as file:
+                # A file name that is not UTF-8 has surrogates, whose backslash form is their JSON form.
+                file.write((text + "\n").encode("utf-8", "backslashreplace"))
+            self._publication.publish(self._names(self._frames))
             self._publication.keep &= record.get("status") != "complete"
-        return outputs
+        return facts
+
+    def _outputs(self, frames: int) -> list[str]:
+        """List what results of so many frames consist of, the record last."""
+        kinds = {"png": FRAMES, "gif": ANIMATION, "trajectory": TRAJECTORY} if frames else {}
+        return [*(name for kind, name in kinds.items() if kind in self._scene.output), RECORD]
+
+    def _names(self, frames: int) -> list[str]:
+        """List the files of results of so many frames."""
+        return result_names(self._outputs(frames), frames)
 
     def __enter__(self) -> ResultWriter:
         scene = self._scene
         with writing(self._directory), ExitStack() as opened:
             opened.enter_context(self._publication)
+            self._checkpoint = Checkpoint(self._publication.staging, scene)
             if scene.draws:
                 job = Job(
-                    directory=self._publication.staged,
+                    folder=self._publication.staged,
                     size=scene.render.size,
                     rate=scene.time.frames_per_second,
                     png="png" in scene.output,

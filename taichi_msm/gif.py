@@ -10,9 +10,8 @@ from __future__ import annotations
 import math
 import struct
 from collections import deque
-from pathlib import Path
 from types import TracebackType
-from typing import NamedTuple
+from typing import BinaryIO, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -100,13 +99,13 @@ class GifWriter:
     before makes room. A frame equal to the one before is left out too, and that one lasts longer.
 
     Args:
-        path: the file to write.
+        file: open for writing; it is closed in the end.
         size: width, height [px].
         rate: frames per second.
         palette: the colours of all frames.
     """
 
-    def __init__(self, path: Path, size: tuple[int, int], rate: float, palette: Palette) -> None:
+    def __init__(self, file: BinaryIO, size: tuple[int, int], rate: float, palette: Palette) -> None:
         self._rate = rate
         self._palette = palette
         self._frames = 0
@@ -114,7 +113,7 @@ class GifWriter:
         # Two at most: the second may turn out to be the last and too short, and then the first makes room.
         self._waiting: deque[_Shown] = deque()
         self._screen: Picture | None = None
-        self._file = path.open("wb")
+        self._file = file
         self._file.write(b"GIF89a" + struct.pack("<HHBBB", *size, 0xF7, 0, 0) + palette.table.tobytes())
         self._file.write(b"\x21\xff\x0bNETSCAPE2.0\x03\x01\x00\x00\x00")
 

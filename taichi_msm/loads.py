@@ -7,7 +7,7 @@ falls on a release stays of order 2.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from fractions import Fraction
 from typing import NamedTuple
 
@@ -30,25 +30,25 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class Grip:
-    """One probe between two jumps of its control point; a probe that never jumps is one grip.
+    """A place at which a probe acts; a probe whose control point jumps has one before every jump and one after it.
 
     Attributes:
         probe: index of the probe in the scene.
         times: keys of the control point [s], shape (n,); one key stands still.
         points: control point at those keys, x and y at rest [m], shape (n, 2).
-        start: the grip holds from here [s] ...
-        end: ... to here [s].
+        jumps: times at which the control point jumps [s].
+        before: whether it acts only at a jump, where that begins; else where the jump ends, and at all other times.
     """
 
     probe: int
     times: Array
     points: Array
-    start: float = -math.inf
-    end: float = math.inf
+    jumps: Array
+    before: bool
 
     @property
     def moves(self) -> bool:
-        """Whether the control point moves while the grip holds."""
+        """Whether the control point moves."""
         return len(self.times) > 1
 
 
@@ -76,23 +76,17 @@ def control_points(probe: Probe, sheet: Sheet) -> tuple[Array, Array]:
 
 
 def grips(scene: Scene) -> tuple[Grip, ...]:
-    """Cut every probe at the jumps of its control point.
+    """List the grips of all probes.
 
-    The force at a jump is the mean of its limits, not the force at the mean of two places; two grips of which one
-    ends where the other begins give just that.
+    The force at a jump of a control point is the mean of its limits, not the force at the mean of two places: half of
+    it acts at each.
     """
-    parts = []
+    found = []
     for index, probe in enumerate(scene.probes):
         times, points = control_points(probe, scene.sheet)
-        cuts = [n for n in range(1, len(times)) if times[n] == times[n - 1]]
-        for first, last in zip([0, *cuts], [*cuts, len(times)], strict=True):
-            part = Grip(index, times[first:last], points[first:last])
-            if first > 0:
-                part = replace(part, start=float(times[first]))
-            if last < len(times):
-                part = replace(part, end=float(times[last]))
-            parts.append(part)
-    return tuple(parts)
+        jumps = times[1:][(times[1:] == times[:-1]) & (points[1:] != points[:-1]).any(axis=1)]
+        found += [Grip(index, times, points, jumps, before) for before in ((True, False) if jumps.size else (False,))]
+    return tuple(found)
 
 
 def decay(grip: Grip, scene: Scene) -> Array:
@@ -242,24 +236,25 @@ def _both_sides(scene: Scene, t: Array) -> tuple[Array, Schedule, Schedule]:
         pressing[:] = True
 
     parts = grips(scene)
+    for part in parts:
+        t = _snap(t, part.times)
     strength = np.zeros((2, count, len(parts), 3))
     point = np.zeros((count, len(parts), 2))
     for n, part in enumerate(parts):
-        t = _snap(t, np.array([part.start, part.end]))
-        holds = (part.start < t) & (t <= part.end), (part.start <= t) & (t < part.end)
-        for side in (0, 1):
-            share = percent[part.probe, side] * holds[side] / 100
+        jumps = np.isin(t, part.jumps)
+        for side, acts in enumerate((jumps, np.False_) if part.before else (~jumps, np.True_)):
+            share = percent[part.probe, side] * acts / 100
             strength[side, :, n] = np.multiply.outer(share, scene.probes[part.probe].force)
-        point[:, n] = _between(part.times, part.points, t, _limits(part.times, t)[1], part.points[0])
+        limit = _limits(part.times, t)[0 if part.before else 1]
+        point[:, n] = _between(part.times, part.points, t, limit, part.points[0])
     active = pressing * 1.0
     return t, Schedule(strength[0], point, active[0]), Schedule(strength[1], point, active[1])
 
 
 def _snap(t: Array, keys: Array) -> Array:
     """Move every time that is on a key but for rounding onto the key; the keys are in order."""
-    keys = keys[np.isfinite(keys)]
     after = keys.searchsorted(t)
-    for index in (np.maximum(after - 1, 0), np.minimum(after, len(keys) - 1)) if keys.size else ():
+    for index in (np.maximum(after - 1, 0), np.minimum(after, len(keys) - 1)):
         key = keys[index]
         t = np.where(np.abs(t - key) <= SNAP * np.abs(key), key, t)
     return t

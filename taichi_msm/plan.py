@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import hashlib
-import json
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -11,13 +10,18 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import ValidationError
+from pydantic import TypeAdapter
 
+from taichi_msm import camera, stability
 from taichi_msm.accuracy import Estimate
 from taichi_msm.errors import DamagedError, FilesError
-from taichi_msm.publication import PLAN, checkpoint_in
+from taichi_msm.publication import CHECKPOINT, PLAN, STAGING, open_checkpoint
 from taichi_msm.scene import Scene
+from taichi_msm.sealed import unseal
 from taichi_msm.texture import load_texture
+
+# A plan holds its scene twice, each of which a file of 1 MiB may have described.
+MAX_BYTES = 1 << 26
 
 
 @dataclass(frozen=True)
@@ -76,6 +80,9 @@ class Plan:
         return self.scene == renamed and mine == its
 
 
+_PLAN = TypeAdapter(Plan)
+
+
 def read_plan(directory: Path) -> Plan:
     """Read the plan of the unfinished run into a directory.
 
@@ -83,20 +90,21 @@ def read_plan(directory: Path) -> Plan:
         FilesError: when there is none.
         DamagedError: when it cannot be understood.
     """
-    path = checkpoint_in(directory) / PLAN
+    path = directory / STAGING / CHECKPOINT / PLAN
     try:
-        found = json.loads(path.read_text(encoding="utf-8"))
-        if not (isinstance(found["folder"], str) and isinstance(found["versions"], dict)):
-            raise TypeError
-        estimate = None if found["estimate"] is None else Estimate(**found["estimate"])
-        scenes = {key: Scene.model_validate(found[key]) for key in ("given", "scene")}
-        return Plan(**{**found, **scenes, "overrides": tuple(found["overrides"]), "estimate": estimate})
+        with open_checkpoint(directory) as folder, folder.open(PLAN) as file:
+            data = file.read(MAX_BYTES + 1)
+        plan = _PLAN.validate_python(unseal(data))
     except (FileNotFoundError, NotADirectoryError):
         raise FilesError(f"{directory}: there is no unfinished run to go on with") from None
     except OSError as error:
         raise FilesError(f"{path}: {(error.strerror or str(error)).lower()}") from None
-    except (ValueError, KeyError, TypeError, RecursionError, ValidationError):
+    except ValueError:  # pydantic's too
         raise DamagedError(f"{path} is damaged; run the scene again") from None
+    # Anybody may have written it.
+    if [*stability.problems(plan.scene), *camera.problems(plan.scene)]:
+        raise DamagedError(f"{path} is of no scene that can be run; run another")
+    return plan
 
 
 def digest(picture: NDArray[np.uint8] | None) -> str:

@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from taichi_msm import __version__, accuracy, budget, runtime
 from taichi_msm.accuracy import Estimate
 from taichi_msm.course import Course
-from taichi_msm.errors import DamagedError, DivergedError, FilesError, writing
+from taichi_msm.errors import DamagedError, DivergedError, FilesError, SceneError, writing
 from taichi_msm.files import ResultWriter
 from taichi_msm.notes import notes
 from taichi_msm.plan import Plan, digest, read_plan
@@ -149,6 +149,8 @@ def resume(
     """
     watch = Stopwatch(started)
     plan = read_plan(Path(directory))
+    if too_large := [str(problem) for problem in budget.problems(plan.scene)]:
+        raise SceneError(too_large)
     texture = plan.load_texture()
     plan.require_same(digest(texture), versions())
     device = runtime.start(plan.arch, threads)
@@ -186,6 +188,9 @@ def _carry_out(
         Simulation(scene, device.arch, device.threads, texture, cores) as simulation,
     ):
         resumed = writer.stored
+        for frame in range(resumed if scene.output else 0):
+            progress("check", frame, resumed)
+            writer.position(frame)  # finds damage before anything is made of it
         watch.lap("startup")
         try:
             simulation.compile(partial(progress, "compile", 0, frames))
@@ -201,7 +206,7 @@ def _carry_out(
                 position = writer.position(frame) if frame < resumed else simulation.positions()
                 picture = simulation.draw(positions=position) if scene.draws else None
                 watch.lap("render")
-                writer.add(position, picture)
+                writer.add(position, picture, partial(progress, "frames", frame, frames))
         except KeyboardInterrupt:
             # Who interrupts elsewhere than in `progress` may do so before the last frame is stored.
             if simulation.steps > 0 and simulation.frame < writer.stored:
@@ -220,17 +225,16 @@ def _carry_out(
                 found = simulation.diagnose(writer.load(), partial(progress, "diagnosis", writer.frames, frames))
                 ending["error"] = found.message
                 if found.good:
-                    ending["dump"] = str(writer.save(found.good))
+                    ending["dump"] = writer.save(found.good)
         progress("write", writer.frames, frames)
         writer.finish()
-        record = {**ending, **_facts(plan, simulation.course), "frames": writer.frames, "resumed": resumed}
+        record = {**ending, **_facts(plan, simulation.course), "resumed": resumed}
         pilot = ["pilot"] if plan.estimate is not None and "pilot" in watch.seconds else []
         stages = ["startup", *pilot, "compile", "simulate", "render"]
         seconds = {stage: watch.seconds.get(stage, 0.0) for stage in stages}
         record["timings"] = {**seconds, "encode": writer.encode_seconds, "total": watch.total()}
         record |= {"arch": device.arch, "threads": device.threads, "versions": plan.versions}
-        outputs = writer.publish(record)
-    return {**record, "outputs": outputs}
+        return writer.publish(record)
 
 
 def _facts(plan: Plan, course: Course) -> dict[str, Any]:

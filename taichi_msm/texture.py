@@ -6,6 +6,7 @@ import stat
 import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager
+from mmap import ACCESS_READ, mmap
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -23,6 +24,13 @@ FORMATS = ("PNG", "JPEG", "WEBP", "BMP", "TIFF")
 # The pixels, by Pillow's names, whose colours are certain; 32-bit and floating-point greys have any range.
 _MODES_16_BIT = ("I;16", "I;16L", "I;16B", "I;16N")
 _MODES = ("1", "L", "LA", "P", "PA", "RGB", "RGBA", "RGBa", "RGBX", "CMYK", "YCbCr", *_MODES_16_BIT)
+
+# The longest side of a JPEG. Pillow needs memory and time for every row, and a picture of one column has many.
+MAX_SIDE = 65535
+
+# Every scan of a progressive JPEG goes over all pixels. Encoders make some ten; a few seconds' work may be more.
+USUAL_SCANS = 16
+SCANNED_PIXELS = 2 * 10**8
 
 _ORIENTATION = 0x0112
 _LYING = (5, 6, 7, 8)
@@ -121,6 +129,14 @@ def _open(path: str) -> Iterator[Image.Image]:
         warnings.simplefilter("error", Image.DecompressionBombWarning)
         try:
             with Image.open(path, formats=FORMATS) as image:
+                if max(image.size) > MAX_SIDE:
+                    said = f"has {image.width} x {image.height} pixels; a side may have {MAX_SIDE}, cut it"
+                    raise _PictureError(f"{path} {said}")
+                if "progressive" in image.info:
+                    scans = _scans(path)
+                    most = max(USUAL_SCANS, SCANNED_PIXELS // (image.width * image.height))
+                    if scans > most:
+                        raise _PictureError(f"{path} has {scans} scans, of which {most} are allowed; save it anew")
                 if image.mode not in _MODES:
                     raise _PictureError(f"{path} has pixels of kind {image.mode}; save it as 8-bit RGB")
                 yield image
@@ -133,6 +149,24 @@ def _open(path: str) -> Iterator[Image.Image]:
             raise _PictureError(f"{path} has more than {limit} million pixels; scale it down") from None
         except Exception as error:
             raise _PictureError(f"{path} cannot be decoded ({error}); save it anew") from None
+
+
+def _scans(path: str) -> int:
+    """Count the scans of a JPEG, as far as it is one."""
+    with Path(path).open("rb") as file, mmap(file.fileno(), 0, access=ACCESS_READ) as data:
+        return _count_scans(data)
+
+
+def _count_scans(data: mmap) -> int:
+    place, scans = 2, 0
+    while (place := data.find(b"\xff", place)) >= 0 and (marker := data[place + 1 : place + 2]) not in (b"", b"\xd9"):
+        # Stuffed and padding bytes and restarts have no length; they occur within the data of a scan.
+        if marker in b"\x00\x01\xff" or b"\xd0" <= marker <= b"\xd8":
+            place += 1 if marker == b"\xff" else 2
+            continue
+        scans += marker == b"\xda"
+        place += 2 + int.from_bytes(data[place + 2 : place + 4], "big")
+    return scans
 
 
 def _require_file(path: str) -> None:

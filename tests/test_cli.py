@@ -237,8 +237,12 @@ def test_a_simulation_that_runs_away_stops_with_3(small: Path) -> None:
     assert np.isfinite(np.load(small / "wild" / "trajectory.npz")["position"]).all()
 
 
-@pytest.mark.parametrize(("number", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)])
-def test_a_signal_keeps_the_frames_so_far(number: signal.Signals, code: int, small: Path) -> None:
+@pytest.mark.parametrize(
+    ("number", "code", "stopped"),
+    [(signal.SIGINT, 130, False), (signal.SIGTERM, 143, False), (signal.SIGTERM, 143, True)],
+)
+def test_a_signal_keeps_the_frames_so_far(number: signal.Signals, code: int, stopped: bool, small: Path) -> None:
+    """Also while the encoder, stopped by somebody, takes no more pictures."""
     settings = ["--set", "time.duration=2000", "--set", "render.size=[400,300]", "--set", "output=[png, trajectory]"]
     process = subprocess.Popen(
         [sys.executable, "-m", "taichi_msm", "run", "small.yaml", "--out", "long", *settings],
@@ -250,7 +254,11 @@ def test_a_signal_keeps_the_frames_so_far(number: signal.Signals, code: int, sma
         if staged.exists() and len(list(staged.iterdir())) > 8:
             break
         time.sleep(0.05)
-    if number == signal.SIGTERM:
+    if stopped:
+        for child in children(process.pid):
+            os.kill(child, signal.SIGSTOP)
+        time.sleep(0.5)
+    elif number == signal.SIGTERM:
         # A service's processes all get it, the encoder too.
         for child in children(process.pid):
             os.kill(child, number)
@@ -279,7 +287,8 @@ def children(process: int) -> list[int]:
 def test_a_signal_before_the_first_frame_changes_nothing(number: signal.Signals, delay: float, small: Path) -> None:
     # A large picture, so that no frame is done in the time.
     (small / "kept").mkdir()
-    (small / "kept" / "run.json").write_text("earlier")
+    earlier = '{"outputs": ["run.json"], "frames": 0}'
+    (small / "kept" / "run.json").write_text(earlier)
     settings = ["--set", "render.size=[2048,2048]", "--set", "render.supersample=4", "--set", "output=[png]"]
     process = subprocess.Popen(
         [sys.executable, "-m", "taichi_msm", "run", "small.yaml", "--out", "kept", *settings],
@@ -291,7 +300,7 @@ def test_a_signal_before_the_first_frame_changes_nothing(number: signal.Signals,
     _, error = process.communicate(timeout=60)
     assert (process.returncode, error) == (128 + number, "interrupted; nothing was written\n")
     assert [path.name for path in (small / "kept").iterdir()] == ["run.json"]
-    assert (small / "kept" / "run.json").read_text() == "earlier"
+    assert (small / "kept" / "run.json").read_text() == earlier
 
 
 def test_without_a_place_for_compiled_kernels(small: Path) -> None:

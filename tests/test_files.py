@@ -20,6 +20,7 @@ from PIL import Image
 from taichi_msm.encoding import Encoder
 from taichi_msm.errors import FilesError
 from taichi_msm.files import ResultWriter
+from taichi_msm.folder import Folder
 from taichi_msm.scene import Scene
 from tests.outputs import files
 from tests.scenes import scene, speckle
@@ -65,7 +66,7 @@ def write(directory: Path, frames: int, scene: Scene) -> list[str]:
     with ResultWriter(directory, scene) as writer:
         for frame in range(frames):
             writer.add(position(frame), picture(frame) if scene.draws else None)
-        names = writer.publish({"frames": frames})
+        names: list[str] = writer.publish({})["outputs"]
         assert writer.frames == frames
     return names
 
@@ -182,7 +183,7 @@ def test_an_interrupted_hand_over_leaves_whole_frames(
                 writer.add(position(1), picture(1))
         writer.finish()
         assert writer.frames == frames
-        writer.publish({"frames": frames})
+        writer.publish({})
     write(tmp_path / "whole", frames, small_scene())
     assert files(tmp_path / "interrupted") == files(tmp_path / "whole")
 
@@ -249,14 +250,14 @@ def full_disk(*_: object, **__: object) -> None:
     raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
 
 
-@pytest.mark.parametrize("target", ["write_text", "replace"])
+@pytest.mark.parametrize("target", ["create", "write"])
 def test_a_full_disk_is_one_line_and_changes_nothing(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, target: str
 ) -> None:
-    """When the record is written, or the marker."""
+    """When the positions are written, or the marker."""
     write(tmp_path, 3, small_scene())
     before = files(tmp_path)
-    monkeypatch.setattr(Path, target, full_disk)
+    monkeypatch.setattr(Folder, target, full_disk)
     with pytest.raises(FilesError) as told:
         write(tmp_path, 2, small_scene())
     assert str(told.value) == (
@@ -324,8 +325,10 @@ def test_what_stops_the_encoder_is_told(tmp_path: Path) -> None:
     def block(_: ResultWriter) -> None:
         (tmp_path / ".partial" / "new" / "frames").write_text("in the way")
 
-    assert refused(tmp_path, block) == f"{tmp_path}: cannot write: File exists; choose another --out"
-    assert list(tmp_path.iterdir()) == []
+    assert refused(tmp_path, block) == (
+        f"{tmp_path}/.partial/new/frames: a file that no run has put there; move it away or choose another folder"
+    )
+    assert (tmp_path / ".partial" / "new" / "frames").read_text() == "in the way"
 
 
 def test_an_encoder_that_is_killed_is_told(tmp_path: Path) -> None:
@@ -353,6 +356,7 @@ def test_the_record_is_strict_json(tmp_path: Path) -> None:
         writer.publish({"image": "Schleimhaut-Ä.png", "odd": "\udcff.png"})
     text = (tmp_path / "run.json").read_bytes().decode()
     assert text == (
-        '{\n  "image": "Schleimhaut-Ä.png",\n  "odd": "\\udcff.png",\n  "outputs": [\n    "run.json"\n  ]\n}\n'
+        '{\n  "image": "Schleimhaut-Ä.png",\n  "odd": "\\udcff.png",\n  "frames": 0,\n'
+        '  "outputs": [\n    "run.json"\n  ]\n}\n'
     )
     assert json.loads(text)["odd"] == "\udcff.png"

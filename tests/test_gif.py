@@ -31,7 +31,7 @@ def grey(number: int) -> Picture:
 
 def write(path: Path, pictures: list[Picture], rate: float, palette: Palette) -> None:
     height, width, _ = pictures[0].shape if pictures else (HEIGHT, WIDTH, 3)
-    with GifWriter(path, (width, height), rate, palette) as gif:
+    with GifWriter(path.open("wb"), (width, height), rate, palette) as gif:
         for picture in pictures:
             gif.add(picture)
 

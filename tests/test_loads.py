@@ -5,9 +5,18 @@ from typing import Any
 import numpy as np
 import pytest
 
-from taichi_msm.loads import grips, jumps, key_times, meets_jumps, schedule, shortest_ramp, steps_to_meet_jumps
+from taichi_msm.loads import (
+    grips,
+    jumps,
+    key_times,
+    loads_at,
+    meets_jumps,
+    schedule,
+    shortest_ramp,
+    steps_to_meet_jumps,
+)
 from taichi_msm.stability import with_steps
-from tests.scenes import SPRINGS, scene
+from tests.scenes import PRESS, SPRINGS, scene
 
 # 25 frames a second in 4 steps of 0.01 s.
 STEPS = {"duration": 1.0, "step": 0.01}
@@ -95,11 +104,28 @@ def test_a_control_point_moves_between_its_keys_and_is_held_outside() -> None:
 def test_a_jump_of_the_control_point_shares_the_force_between_both_places(keys: list[list[float]]) -> None:
     probe = {"force": [0, 0, 8], "at": keys, "load": [[0, 100], [0.02, 100], [0.02, 50]]}
     made = scene(springs=SOFT, probes=[probe], time=STEPS)
-    assert [grip.moves for grip in grips(made)] == [len(keys) > 2, False]
+    assert [grip.before for grip in grips(made)] == [True, False]
     strength = schedule(made, 0, 5).strength[..., 2]
-    np.testing.assert_allclose(strength.T, [[8, 8, 4, 0, 0], [0, 0, 2, 4, 4]])
+    np.testing.assert_allclose(strength.T, [[0, 0, 4, 0, 0], [8, 8, 2, 4, 4]])
     point = schedule(made, 0, 5).point
     np.testing.assert_allclose(point[2], [[-0.2, 0.15], [0.2, -0.15]])
+    np.testing.assert_allclose(point[[0, 1, 3, 4], 1], [[-0.2, 0.15], [-0.2, 0.15], [0.2, -0.15], [0.2, -0.15]])
+
+
+def test_a_control_point_that_jumps_a_thousand_times_has_two_places() -> None:
+    """However many jumps, a step has no more forces to add up."""
+    at = [[n / 1000, *place] for n in range(1000) for place in ([n % 7 / 7, 0.5], [n % 5 / 5, 0.25])]
+    made = scene(springs=SOFT, probes=[{"force": [0, 0, 8], "at": at}, PRESS], time=STEPS)
+    assert [(grip.probe, grip.before, grip.moves) for grip in grips(made)] == [
+        (0, True, True),
+        (0, False, True),
+        (1, False, False),
+    ]
+    # On the jump at 0.01 s, and between this and the next.
+    loads = loads_at(made, np.array([0.01, 0.0104, 0.011]))
+    np.testing.assert_allclose(loads.strength[:, :2, 2], [[4, 4], [0, 8], [4, 4]])
+    expected = [[(10 % 7 / 7 - 0.5) * 0.4, 0], [(10 % 5 / 5 - 0.5) * 0.4, 0.075]]
+    np.testing.assert_allclose(loads.point[0, :2], expected, atol=1e-15)
 
 
 def test_keys_and_jumps() -> None:

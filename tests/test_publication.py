@@ -1,24 +1,27 @@
 from __future__ import annotations
 
+import json
 import os
 import subprocess
 import sys
+from collections.abc import Collection
 from pathlib import Path
 
 import pytest
 
-from taichi_msm.errors import FilesError
-from taichi_msm.publication import Publication, results
+from taichi_msm.errors import FilesError, ForeignError
+from taichi_msm.publication import Publication, is_result
+from taichi_msm.sealed import seal
 
 OLD = ["frames/0000.png", "frames/0001.png", "frames/0002.png", "animation.gif", "run.json"]
-NEW = ["frames/0000.png", "frames/0001.png", "frames/10000.png", "trajectory.npz", "run.json"]
+NEW = ["frames/0000.png", "frames/0001.png", "frames/0003.png", "trajectory.npz", "run.json"]
 FOREIGN = ["notes.txt", "frames/notes.txt", "frames/0000 copy.png", "frames/12.png", "a/frames/0000.png"]
 
 # Publishes files and dies before the n-th operation on a path; ends well where there are fewer.
 MORTAL = """
 import os, signal, sys
 from pathlib import Path
-from taichi_msm.publication import Publication
+from tests.test_publication import publish
 
 left = int(sys.argv[1])
 
@@ -31,24 +34,32 @@ def mortal(operation):
         return operation(*args, **kwargs)
     return call
 
-for name in ("mkdir", "write_text", "replace", "unlink", "rmdir"):
-    setattr(Path, name, mortal(getattr(Path, name)))
-with Publication(Path(sys.argv[2])) as publication:
-    for name in sys.argv[3:]:
-        (publication.staged / name).parent.mkdir(exist_ok=True)
-        (publication.staged / name).write_text("new")
-    publication.publish()
+for name in ("open", "mkdir", "replace", "unlink", "rmdir"):
+    setattr(os, name, mortal(getattr(os, name)))
+publish(Path(sys.argv[2]), sys.argv[3:])
 """
 
 
-def write(directory: Path, names: list[str], text: str) -> None:
+def write(directory: Path, names: Collection[str], text: str) -> None:
+    """Write files, and in the record what there is."""
+    outputs = sorted({"frames" if "/" in name else name for name in names})
     for name in names:
         (directory / name).parent.mkdir(parents=True, exist_ok=True)
-        (directory / name).write_text(text)
+        record = {"outputs": outputs, "frames": 100, "text": text}
+        (directory / name).write_text(json.dumps(record) if name == "run.json" else text)
+
+
+def publish(directory: Path, names: Collection[str]) -> None:
+    with Publication(directory, names) as publication:
+        write(publication.staged.path, names, "new")
+        publication.publish(names)
 
 
 def contents(directory: Path) -> dict[str, str]:
-    return {name: (directory / name).read_text() for name in sorted(results(directory))}
+    """The results, the record by its text."""
+    paths = {str(path.relative_to(directory)): path for path in sorted(directory.rglob("*"))}
+    found = {name: path.read_text() for name, path in paths.items() if is_result(name)}
+    return {name: json.loads(text)["text"] if name == "run.json" else text for name, text in found.items()}
 
 
 def expected(names: list[str], text: str) -> dict[str, str]:
@@ -71,9 +82,9 @@ def assert_tidy(directory: Path) -> None:
 
 def test_new_results_take_the_place_of_all_old_ones(directory: Path) -> None:
     with Publication(directory) as publication:
-        write(publication.staged, NEW, "new")
+        write(publication.staged.path, NEW, "new")
         assert contents(directory) == expected(OLD, "old")
-        publication.publish()
+        publication.publish(NEW)
         assert contents(directory) == expected(NEW, "new")
     assert contents(directory) == expected(NEW, "new")
     assert_tidy(directory)
@@ -81,7 +92,7 @@ def test_new_results_take_the_place_of_all_old_ones(directory: Path) -> None:
 
 def test_leaving_without_publishing_changes_nothing(directory: Path) -> None:
     with Publication(directory) as publication:
-        write(publication.staged, NEW, "new")
+        write(publication.staged.path, NEW, "new")
     assert contents(directory) == expected(OLD, "old")
     assert_tidy(directory)
 
@@ -101,9 +112,9 @@ def test_an_empty_directory_of_the_user_stays(tmp_path: Path) -> None:
 
 def test_frames_that_are_not_wanted_go_with_their_directory(tmp_path: Path) -> None:
     write(tmp_path, OLD, "old")
-    with Publication(tmp_path) as publication:
-        write(publication.staged, ["run.json"], "new")
-        publication.publish()
+    with Publication(tmp_path, ["run.json"]) as publication:
+        write(publication.staged.path, ["run.json"], "new")
+        publication.publish(["run.json"])
     assert [path.name for path in tmp_path.iterdir()] == ["run.json"]
 
 
@@ -113,15 +124,17 @@ def test_killed_at_any_moment_the_results_are_all_old_or_all_new(directory: Path
     for moment in range(100):
         write(directory, OLD, "old")
         (directory / "trajectory.npz").unlink(missing_ok=True)
-        (directory / "frames/10000.png").unlink(missing_ok=True)
+        (directory / "frames/0003.png").unlink(missing_ok=True)
         command = [sys.executable, "-c", MORTAL, str(moment), str(directory), *NEW]
         status = subprocess.run(command, cwd=root, check=False).returncode
         if status == 0:
             break
         assert status < 0
-        if not (directory / ".partial" / "complete").exists() and outcomes[-1:] != ["new"]:
-            # Before the marker the old results are whole without the help of a next run.
-            assert contents(directory) == expected(OLD, "old")
+        if (directory / "run.json").exists():
+            # Where there is a record, results are whole without the help of a next run.
+            assert contents(directory) in (expected(OLD, "old"), expected(NEW, "new"))
+        else:
+            assert (directory / ".partial" / "complete").exists()
         with Publication(directory):
             pass
         found = contents(directory)
@@ -138,11 +151,11 @@ def test_killed_at_any_moment_the_results_are_all_old_or_all_new(directory: Path
 @pytest.mark.skipif(sys.platform == "win32", reason="no lock")
 def test_a_second_run_is_refused_until_the_first_ends(directory: Path) -> None:
     with Publication(directory) as first:
-        write(first.staged, NEW, "new")
+        write(first.staged.path, NEW, "new")
         with pytest.raises(FilesError) as refused, Publication(directory):
             pass
         assert str(refused.value) == f"{directory}: another run is writing there; choose another --out"
-        first.publish()
+        first.publish(NEW)
     assert contents(directory) == expected(NEW, "new")
     with Publication(directory):
         pass
@@ -172,15 +185,49 @@ def test_the_lock_of_a_directory_that_was_removed_is_no_lock(directory: Path, mo
 
 
 def test_what_a_killed_run_left_is_cleared(directory: Path) -> None:
-    write(directory / ".partial", ["lock", "draft", "new/frames/0000.png", "old/junk/file"], "stale")
+    write(directory / ".partial", ["lock", "draft", "new/frames/0000.png"], "stale")
     with Publication(directory) as publication:
-        assert list(publication.staged.iterdir()) == []
+        assert list(publication.staged.entries()) == []
     assert contents(directory) == expected(OLD, "old")
     assert_tidy(directory)
 
 
-def test_frames_in_the_way_are_found_before_the_run(tmp_path: Path) -> None:
-    (tmp_path / "frames").write_text("mine")
-    with pytest.raises(PermissionError, match="frames"), Publication(tmp_path):
+def test_a_staged_file_that_is_taken_away_is_missed(directory: Path) -> None:
+    with Publication(directory, NEW) as publication:
+        write(publication.staged.path, NEW, "new")
+        (publication.staged.path / "frames" / "0001.png").unlink()
+        with pytest.raises(FilesError, match=r"new/frames/0001\.png was taken away while the run worked; run it again"):
+            publication.publish(NEW)
+    assert contents(directory) == expected(OLD, "old")
+    assert_tidy(directory)
+
+
+def test_a_damaged_marker_publishes_nothing(directory: Path) -> None:
+    """Neither does one whose names lead elsewhere."""
+    (directory.parent / "payload").write_text("mine")
+    write(directory / ".partial" / "new", NEW, "new")
+    whole = seal({"names": NEW, "earlier": OLD})
+    for damaged in (whole.replace(b"0001", b"0002"), whole + b" ", b"", b"../payload"):
+        (directory / ".partial" / "complete").write_bytes(damaged)
+        with (
+            pytest.raises(FilesError, match=r"/complete is damaged; remove .*/\.partial and run"),
+            Publication(directory),
+        ):
+            pass
+        assert contents(directory) == expected(OLD, "old")
+    (directory / ".partial" / "complete").write_bytes(seal({"names": ["../payload"], "earlier": ["../payload"]}))
+    with Publication(directory):
         pass
-    assert [path.name for path in tmp_path.iterdir()] == ["frames"]
+    assert contents(directory) == expected(OLD, "old")
+    assert (directory.parent / "payload").read_text() == "mine"
+
+
+def test_what_no_run_has_written_is_neither_replaced_nor_removed(directory: Path) -> None:
+    """Files with names like ours, which the record does not list."""
+    write(directory, ["frames/0100.png"], "mine")
+    publish(directory, NEW)
+    assert contents(directory) == {**expected(NEW, "new"), "frames/0100.png": "mine"}
+    (directory / "animation.gif").write_text("mine")
+    with pytest.raises(ForeignError, match=r"/animation\.gif: a file that no run has put there; move it away"):
+        publish(directory, OLD)
+    assert contents(directory) == {**expected(NEW, "new"), "frames/0100.png": "mine", "animation.gif": "mine"}

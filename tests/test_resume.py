@@ -20,8 +20,8 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from taichi_msm import FilesError, dynamics, resume, run, runner
-from taichi_msm.checkpoint import POSITIONS, STATE, Checkpoint
-from taichi_msm.publication import PLAN, checkpoint_in
+from taichi_msm.checkpoint import Checkpoint
+from taichi_msm.publication import PLAN, POSITIONS, STATE
 from taichi_msm.runtime import Device
 from taichi_msm.scene import Scene
 from taichi_msm.scene_file import load_scene
@@ -42,6 +42,10 @@ SETTINGS = (
 def dragged(*overrides: str) -> Scene:
     """The small scene with these settings and others."""
     return load_scene("small.yaml", [*SETTINGS, *overrides])
+
+
+def checkpoint_in(directory: Path) -> Path:
+    return directory / ".partial" / "checkpoint"
 
 
 def published(directory: Path) -> dict[str, bytes]:
@@ -125,7 +129,8 @@ def test_a_run_that_finds_the_disk_full_goes_on_when_it_is_not(
     def full(checkpoint: Checkpoint, position: NDArray[Any]) -> None:
         if checkpoint.frames == 6:
             # Half of the positions fit.
-            checkpoint.positions.write(position.tobytes()[:500])
+            assert checkpoint._positions
+            checkpoint._positions.write(position.tobytes()[:500])
             raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
         add(checkpoint, position)
 

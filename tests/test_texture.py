@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import io
 import os
 import warnings
 from pathlib import Path
@@ -13,6 +14,7 @@ from PIL import Image
 from taichi_msm.errors import SceneError
 from taichi_msm.scene import Scene
 from taichi_msm.texture import load_texture, problems, texture_size
+from tests.scenes import speckle
 
 BACKGROUND = (10, 20, 30)
 ORIENTATION = 0x0112
@@ -300,6 +302,37 @@ def test_broken_pictures_bring_up_no_other_error() -> None:
             except SceneError:
                 refused += 1
     assert refused > 50
+
+
+def test_a_jpeg_of_too_many_scans(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Each goes over all pixels; those of a preview in the file, and what follows its end, do not count."""
+    monkeypatch.chdir(tmp_path)
+    file = io.BytesIO()
+    preview = Image.Exif()
+    preview[0x9286] = b"\xff\xda" * 40
+    Image.fromarray(speckle(300, 500)).save(file, "JPEG", progressive=True, exif=preview)
+    whole = file.getvalue()
+    last = whole[whole.rfind(b"\xff\xc4", 0, whole.rfind(b"\xff\xda")) : -2]
+    made = scene(image="a.jpg")
+    for copies, refused in ((0, False), (1300, False), (1400, True)):
+        Path("a.jpg").write_bytes(whole[:-2] + copies * last + b"\xff\xd9" + b"\xff\xda" * 4000)
+        found = [str(problem) for problem in problems(made)]
+        assert found == (
+            [f"image: a.jpg has {copies + 10} scans, of which 1333 are allowed; save it anew"] if refused else []
+        )
+    with pytest.raises(SceneError, match="has 1410 scans"):
+        load_texture(made)
+
+
+def test_a_picture_of_too_many_rows(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Pillow needs 24 bytes a row besides the pixels: a column of 89 million took 3 GB and 12 s."""
+    monkeypatch.chdir(tmp_path)
+    for size in ((1, 65536), (65536, 1)):
+        Image.new("L", size).save("a.png")
+        expected = f"image: a.png has {size[0]} x {size[1]} pixels; a side may have 65535, cut it"
+        assert [str(problem) for problem in problems(scene(image="a.png"))] == [expected]
+    Image.new("L", (1, 65535)).save("a.png")
+    assert load_texture(scene(image="a.png")).shape == (65535, 1, 3)
 
 
 def test_a_picture_of_too_many_pixels(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -9,6 +9,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable, Iterator
+from itertools import islice
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -20,7 +21,9 @@ from PIL import Image
 from taichi_msm import load_scene
 from taichi_msm.cli import main
 from taichi_msm.errors import SceneError
+from taichi_msm.folder import Folder
 from taichi_msm.live.events import Drag, Harder, Key, Percent, Press, Release, Turn
+from taichi_msm.live.film import Film
 from taichi_msm.live.pace import LONGEST, Pace
 from taichi_msm.live.script import load_script, timed
 from taichi_msm.live.window import QUIT, Hand
@@ -227,10 +230,32 @@ def test_an_interrupted_film_leaves_the_one_that_was_there(small: Path) -> None:
     assert sorted(path.name for path in small.iterdir()) == ["live.gif", "small.yaml", "speckle.png"]
 
 
+@pytest.mark.skipif(sys.platform == "win32", reason="no lock")
+def test_what_a_killed_film_left_is_cleared_by_the_next(tmp_path: Path) -> None:
+    """But nothing of a film that is still made, and nothing of anybody else."""
+    for name in (".film-" + 16 * "a", ".film-" + 16 * "b", ".film-" + 16 * "c", ".film-mine"):
+        (tmp_path / name).mkdir()
+        (tmp_path / name / "lock").touch()
+        (tmp_path / name / "animation.gif").write_text("half")
+    (tmp_path / (".film-" + 16 * "b") / "notes.txt").write_text("mine")
+    living = Folder.at(tmp_path / (".film-" + 16 * "c"))
+    with living, living.lock("lock"), Film(tmp_path, (4, 3), 10.0, (0, 0, 0)):
+        assert len(list(tmp_path.iterdir())) == 4
+    assert sorted(path.name for path in tmp_path.iterdir()) == [".film-" + 16 * "b", ".film-" + 16 * "c", ".film-mine"]
+
+
+def test_a_script_is_taken_event_by_event(tmp_path: Path) -> None:
+    """An hour at a million frames a second has 3.6e9 of them."""
+    text = "events: [{t: 0, do: press, at: [1, 1]}, {t: 1, do: drag, at: [9, 9], seconds: 3599}]"
+    (tmp_path / "s.yaml").write_text(text)
+    events = timed(load_script(tmp_path / "s.yaml", (20, 20)), 1e6, (20, 20))
+    assert [frame for frame, _ in islice(events, 3)] == [0, 1_000_000, 1_000_001]
+
+
 def test_a_film_that_cannot_be_written(small: Path) -> None:
     Path("films").write_text("no folder")
     done = view("small.yaml", "--record", "films/live.gif", "--seconds", "1")
-    assert (done.returncode, done.stderr) == (4, "films: cannot write: File exists; choose another --record\n")
+    assert (done.returncode, done.stderr) == (4, "films: cannot write: Not a directory; choose another --record\n")
     Path("folder.gif").mkdir()
     done = view("small.yaml", "--record", "folder.gif", "--seconds", "1")
     assert (done.returncode, done.stderr) == (4, "folder.gif: a directory; choose another --record\n")
@@ -252,8 +277,8 @@ events:
     )
     assert done.returncode == 4
     assert done.stderr.splitlines() == [
-        "the film ends at 0.5 s, before 1 of the script's events",
         "0.1 s: no tissue at pixel 0, 0",
+        "the film ends at 0.5 s, before some of the script's events",
         "kept: cannot write: File exists; choose another --out",
     ]
     with Image.open("a.gif") as film:

@@ -2,15 +2,22 @@
 
 from __future__ import annotations
 
-import shutil
-import tempfile
+import re
+import secrets
+from collections.abc import Callable
+from contextlib import ExitStack, suppress
 from pathlib import Path
 from types import TracebackType
 
 from taichi_msm.encoding import Encoder, Job
-from taichi_msm.errors import writing
+from taichi_msm.errors import FilesError, writing
+from taichi_msm.folder import FOLDER, HAS_LOCKS, Folder, Tree
 from taichi_msm.gif import Picture
 from taichi_msm.publication import ANIMATION
+
+# A film is encoded in a hidden folder, which is locked as long as the film lives.
+HIDDEN, LOCK = r"\.film-[0-9a-f]{16}", "lock"
+TREE: Tree = {LOCK: None, re.escape(ANIMATION): None}
 
 
 class Film:
@@ -37,26 +44,29 @@ class Film:
     ) -> None:
         self.pictures = 0
         self._place = folder, option
-        with writing(*self._place):
-            folder.mkdir(parents=True, exist_ok=True)
-            self._hidden = Path(tempfile.mkdtemp(prefix=".film-", dir=folder))
-            try:
-                self._encoder = Encoder(Job(self._hidden, size, rate, png=False, gif=True, background=background))
-            except OSError:
-                shutil.rmtree(self._hidden, ignore_errors=True)
-                raise
+        with writing(*self._place), ExitStack() as opened:
+            near = opened.enter_context(Folder.at(folder, create=True))
+            clear_abandoned(near)
+            name = f".film-{secrets.token_hex(8)}"
+            self._hidden = opened.enter_context(near.folder(name, create=True))
+            opened.callback(_remove, near, name)
+            lock = [opened.enter_context(self._hidden.lock(LOCK)).fileno()] if HAS_LOCKS else []
+            job = Job(self._hidden, size, rate, png=False, gif=True, background=background)
+            self._encoder = Encoder(job, inherit=tuple(lock))
+            opened.callback(self._encoder.abort)
+            self._open = opened.pop_all()
 
-    def add(self, picture: Picture) -> None:
-        """Add the next picture, shape (height, width, 3)."""
+    def add(self, picture: Picture, pause: Callable[[], None] = lambda: None) -> None:
+        """Add the next picture, shape (height, width, 3); `pause` as for `Encoder.add`."""
         with writing(*self._place):
-            self._encoder.add(picture)
+            self._encoder.add(picture, pause)
         self.pictures += 1
 
     def encoded(self) -> Path:
         """Wait for the last picture; returns the file, which is to be moved to its place. There must be a picture."""
         with writing(*self._place):
             self._encoder.finish()
-        return self._hidden / ANIMATION
+        return self._hidden.path / ANIMATION
 
     def __enter__(self) -> Film:
         return self
@@ -64,5 +74,25 @@ class Film:
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        self._encoder.abort()
-        shutil.rmtree(self._hidden, ignore_errors=True)
+        self._open.close()
+
+
+def clear_abandoned(folder: Folder) -> None:
+    """Remove what films have left whose processes were killed."""
+    if not HAS_LOCKS:
+        return
+    for name, kind in folder.entries():
+        if kind == FOLDER and re.fullmatch(HIDDEN, name):
+            # Another's, or one that is being made, stays.
+            with suppress(OSError, FilesError), folder.folder(name) as hidden:
+                hidden.require_only(TREE)
+                if hidden.kind(LOCK) is not None:
+                    hidden.lock(LOCK).close()
+                    _remove(folder, name)
+
+
+def _remove(folder: Folder, name: str) -> None:
+    """Remove a film's hidden folder, as far as it can be."""
+    with suppress(OSError, FilesError), folder.folder(name) as hidden:
+        hidden.clear(TREE)
+        folder.remove_folder(name)

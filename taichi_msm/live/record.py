@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections import defaultdict
 from collections.abc import Callable, Iterable
+from functools import partial
 from pathlib import Path
 
 from taichi_msm.errors import FilesError, writing
@@ -28,7 +28,7 @@ def record(
         session: the session.
         path: the GIF; one that is there is replaced when the film is whole.
         seconds: how long.
-        events: each with the frame of the session before which it happens.
+        events: each with the frame of the session before which it happens, in order; taken one after another.
         progress: called with the frames done and the frames in all, often; what it raises stops here.
         say: called with what the person should know.
 
@@ -38,37 +38,32 @@ def record(
     if path.is_dir():
         raise FilesError(f"{path}: a directory; choose another {OPTION}")
     frames = round(seconds * session.rate)
-    happens: dict[int, list[Event]] = defaultdict(list)
-    late = 0
-    for frame, event in events:
-        if frame <= frames:
-            happens[frame].append(event)
-        else:
-            late += 1
-    if late:
-        say(f"the film ends at {seconds:g} s, before {late} of the script's events")
+    left = iter(events)
+    upcoming = next(left, None)
     failures: list[FilesError] = []
     notice = ""
     render = session.scene.render
     with Film(path.parent, render.size, session.rate / session.parts, render.background, OPTION) as reel:
         for frame in range(frames + 1):
             progress(frame, frames)
-            for event in happens[frame]:
+            while upcoming is not None and upcoming[0] <= frame:
                 try:
-                    session.handle(event)
+                    session.handle(upcoming[1])
                 except FilesError as error:
                     failures.append(error)
                 if session.notice not in ("", notice):
                     say(f"{frame / session.rate:g} s: {session.notice}")
                 notice = session.notice
+                upcoming = next(left, None)
             if frame % session.parts == 0:
-                reel.add(session.picture())
+                reel.add(session.picture(), partial(progress, frame, frames))
             if frame < frames:
                 session.advance()
             if session.fault:
-                undone = sum(len(happens[later]) for later in range(frame + 1, frames + 1))
-                say(session.fault + (f"; {undone} of the script's events come after that" if undone else ""))
+                say(session.fault)
                 break
+        if upcoming is not None:
+            say(f"the film ends at {frame / session.rate:g} s, before some of the script's events")
         with writing(path, OPTION):
             reel.encoded().replace(path)
     if failures:

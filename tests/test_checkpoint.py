@@ -1,0 +1,208 @@
+"""What is damaged, or made up, passes for nothing."""
+
+from __future__ import annotations
+
+import io
+import math
+import zipfile
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from taichi_msm.checkpoint import Checkpoint
+from taichi_msm.course import Course, Saved
+from taichi_msm.dynamics import State
+from taichi_msm.errors import DamagedError
+from taichi_msm.folder import Folder
+from taichi_msm.plan import Plan, read_plan
+from taichi_msm.publication import PLAN, POSITIONS, STATE
+from taichi_msm.scene import Scene
+from taichi_msm.sealed import seal, unseal
+from tests.scenes import scene
+
+FRAMES = 3
+EVERY = 17  # steps a frame
+
+
+def small_scene() -> Scene:
+    return scene(sheet={"points": [2, 3], "size": [0.3, 0.4], "mass": 1e-3}, output=["trajectory"])
+
+
+def position(frame: int) -> Any:
+    return np.random.default_rng(frame).normal(size=(2, 3, 3))
+
+
+def plan() -> Plan:
+    made = small_scene()
+    return Plan(made, made, (), None, "/", "cpu", "", {"taichi": "1.7"})
+
+
+def state(**changes: Any) -> Saved:
+    """The state of a run at its third frame."""
+    steps = {"steps": EVERY * (FRAMES - 1), "displacement": position(8), "difference": position(9)}
+    course = Course(frame=FRAMES - 1, energy=1.0, peak=2.0, reach=3.0)
+    kept = {key: changes.pop(key) for key in list(changes) if key in steps}
+    return Saved(State(**{**steps, **kept}), Course(**{**vars(course), **changes}))
+
+
+@pytest.fixture
+def out(tmp_path: Path) -> Path:
+    """A directory with a checkpoint."""
+    (tmp_path / ".partial").mkdir()
+    with Folder.at(tmp_path / ".partial") as staging:
+        checkpoint = Checkpoint(staging, small_scene())
+        checkpoint.begin(plan().as_json())
+        for frame in range(FRAMES):
+            checkpoint.add(position(frame))
+        checkpoint.save(state())
+        checkpoint.close()
+    return tmp_path
+
+
+def read(out: Path) -> list[Any]:
+    """All that is used of a checkpoint when a run goes on."""
+    with Folder.at(out / ".partial") as staging:
+        checkpoint = Checkpoint(staging, small_scene())
+        try:
+            saved = checkpoint.go_on()
+            assert saved is not None
+            positions = [checkpoint.position(frame).tolist() for frame in range(checkpoint.frames)]
+        finally:
+            checkpoint.close()
+    return [
+        read_plan(out).as_json(),
+        positions,
+        saved.state.steps,
+        saved.state.displacement.tolist(),
+        saved.state.difference.tolist(),
+        saved.course,
+    ]
+
+
+@pytest.mark.parametrize(("name", "harmless"), [(PLAN, 0.0), (POSITIONS, 0.0), (STATE, 0.25)])
+def test_a_flipped_bit_is_found(name: str, harmless: float, out: Path) -> None:
+    """In every byte. Of a zip file, some say nothing that is used, such as its dates."""
+    path = out / ".partial" / "checkpoint" / name
+    whole, before = path.read_bytes(), read(out)
+    assert before[1] == [position(frame).tolist() for frame in range(FRAMES)]
+    passed = 0
+    for n in range(len(whole)):
+        damaged = bytearray(whole)
+        damaged[n] ^= 1 << n % 8
+        path.write_bytes(damaged)
+        try:
+            assert read(out) == before
+        except DamagedError:
+            continue
+        passed += 1
+    assert passed <= harmless * len(whole)
+    # Cut off anywhere.
+    for n in range(0, len(whole), 7):
+        path.write_bytes(whole[:n])
+        with pytest.raises(DamagedError):
+            read(out)
+
+
+def repacked(path: Path, change: Callable[[dict[str, Any]], object]) -> None:
+    """Write the arrays of a state anew, with all checksums right."""
+    with np.load(path) as found:
+        arrays = dict(found)
+    change(arrays)
+    with path.open("wb") as file:
+        np.savez(file, **arrays)
+
+
+FORGED: dict[str, Callable[[dict[str, Any]], object]] = {
+    "dtype": lambda a: a.update(displacement=a["displacement"].astype(np.float32)),
+    "objects": lambda a: a.update(difference=a["difference"].astype(object)),
+    "another byte order": lambda a: a.update(difference=a["difference"].astype(">f8")),
+    "a shape": lambda a: a.update(displacement=a["displacement"].reshape(3, 2, 3)),
+    "steps before the frame": lambda a: a.update(steps=np.int64(1)),
+    "steps after the frame": lambda a: a.update(steps=np.int64(10**9)),
+    "steps below 0": lambda a: a.update(steps=np.int64(-1)),
+    "steps in parts": lambda a: a.update(steps=a["steps"] + 0.5),
+    "a frame that is not stored": lambda a: a.update(frame=np.int64(3), steps=np.int64(3 * EVERY)),
+    "a frame after the end": lambda a: a.update(frame=np.int64(99), steps=np.int64(99 * EVERY)),
+    "a frame below 0": lambda a: a.update(frame=np.int64(-1), steps=np.int64(-EVERY)),
+    "displacement not a number": lambda a: a["displacement"].__setitem__((0, 0, 0), math.nan),
+    "difference infinite": lambda a: a["difference"].__setitem__((0, 0, 0), math.inf),
+    "energy not a number": lambda a: a.update(energy=np.float64(math.nan)),
+    "energy below 0": lambda a: a.update(energy=np.float64(-1)),
+    "no energy": lambda a: a.pop("energy"),
+}
+
+
+@pytest.mark.parametrize("case", FORGED)
+def test_a_forged_state_is_refused(case: str, out: Path) -> None:
+    path = out / ".partial" / "checkpoint" / STATE
+    repacked(path, lambda arrays: None)
+    read(out)
+    repacked(path, FORGED[case])
+    with pytest.raises(DamagedError, match="is damaged; run the scene again"):
+        read(out)
+
+
+def test_an_array_that_claims_to_be_huge_takes_no_memory(out: Path) -> None:
+    path = out / ".partial" / "checkpoint" / STATE
+    with zipfile.ZipFile(path) as found:
+        entries = {name: found.read(name) for name in found.namelist()}
+    header = io.BytesIO()
+    np.lib.format.write_array_header_1_0(header, {"descr": "<f8", "fortran_order": False, "shape": (10**5, 10**5, 3)})
+    entries["displacement.npy"] = header.getvalue()
+    with zipfile.ZipFile(path, "w") as made:
+        for name, data in entries.items():
+            made.writestr(name, data)
+    with pytest.raises(DamagedError):
+        read(out)
+
+
+def test_positions_that_are_no_numbers_are_refused(out: Path) -> None:
+    """With a checksum that is right."""
+    with Folder.at(out / ".partial") as staging:
+        checkpoint = Checkpoint(staging, small_scene())
+        checkpoint.go_on()
+        checkpoint.frames = 1
+        checkpoint.add(np.full((2, 3, 3), math.nan))
+        checkpoint.close()
+    with pytest.raises(DamagedError):
+        read(out)
+
+
+def test_frames_that_are_exchanged_are_found(out: Path) -> None:
+    path = out / ".partial" / "checkpoint" / POSITIONS
+    data = path.read_bytes()
+    size = len(data) // FRAMES
+    path.write_bytes(data[size : 2 * size] + data[:size] + data[2 * size :])
+    with pytest.raises(DamagedError):
+        read(out)
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        {"folder": 3},
+        {"versions": ["taichi"]},
+        {"versions": {"taichi": 1}},
+        {"overrides": "a=1"},
+        {"estimate": {"error": 1}},
+        {"estimate": {"steps_per_frame": "x", "error": [], "rounding": 0, "in_f64": 0, "order": 2}},
+        {"arch": None},
+        {"picture": {}},
+        {"given": {}},
+        {"scene": {**small_scene().model_dump(mode="json"), "output": ["exe"]}},
+        {"scene": {**small_scene().model_dump(mode="json"), "time": {"duration": 0.4, "step": 0.2}}},
+    ],
+)
+def test_a_forged_plan_is_refused(change: dict[str, Any], out: Path) -> None:
+    path = out / ".partial" / "checkpoint" / PLAN
+    path.write_bytes(seal({**plan().as_json(), **change}))
+    with pytest.raises(DamagedError, match=r"plan\.json is"):
+        read_plan(out)
+
+
+def test_what_is_sealed_comes_back() -> None:
+    value = {"a": [1, 2.5, math.inf, "é\udcff", None, True], "b": {}}
+    assert unseal(seal(value)) == value

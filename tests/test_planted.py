@@ -1,0 +1,223 @@
+"""Folders that somebody else has prepared: nothing of theirs, or beyond, is read, changed or removed."""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+import stat
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from taichi_msm.errors import FilesError
+from taichi_msm.files import ResultWriter
+from taichi_msm.plan import read_plan
+from taichi_msm.publication import PLAN, is_unfinished
+from taichi_msm.scene import Scene
+from tests.scenes import scene, speckle
+
+pytestmark = pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="needs links and pipes")
+
+# Everything that a run might reach beyond its folder.
+TREASURE = ["notes.txt", "0000.png", "plan.json", "positions", "state.npz", "run.json", "lock", "new/a.txt", "draft"]
+
+Plant = Callable[[Path, Path], None]
+
+
+def small_scene() -> Scene:
+    sheet = {"points": [3, 4], "size": [0.3, 0.4], "mass": 1e-3}
+    return scene(image="texture.png", sheet=sheet, render={"size": [8, 6]}, output=["png", "trajectory"])
+
+
+def write(directory: Path, *, resumes: bool = False) -> None:
+    """Run into a directory, without simulating."""
+    made = small_scene()
+    with ResultWriter(directory, made, {}, resumes=resumes) as writer:
+        for frame in range(made.time.frames + 1):
+            writer.add(np.zeros((3, 4, 3)), speckle(6, 8, frame))
+        writer.publish({"status": "complete"})
+
+
+def snapshot(folder: Path) -> dict[str, tuple[int, bytes]]:
+    """Everything in a folder and below: kind, and what is in it or where it leads."""
+    found = {}
+    for path in sorted(folder.rglob("*")):
+        kind = stat.S_IFMT(path.lstat().st_mode)
+        data = path.read_bytes() if stat.S_ISREG(kind) else b""
+        found[str(path.relative_to(folder))] = kind, os.fsencode(path.readlink()) if path.is_symlink() else data
+    return found
+
+
+def link(name: str, target: str = "") -> Plant:
+    """Plant a symbolic link to the treasure, or to a file in it."""
+
+    def plant(out: Path, treasure: Path) -> None:
+        (out / name).parent.mkdir(parents=True, exist_ok=True)
+        (out / name).symlink_to(treasure / target if not target.startswith("/") else target)
+
+    return plant
+
+
+def pipe(name: str) -> Plant:
+    def plant(out: Path, treasure: Path) -> None:
+        (out / name).parent.mkdir(parents=True, exist_ok=True)
+        os.mkfifo(out / name)
+
+    return plant
+
+
+def device(name: str) -> Plant:
+    def plant(out: Path, treasure: Path) -> None:
+        (out / name).parent.mkdir(parents=True, exist_ok=True)
+        try:
+            os.mknod(out / name, 0o600 | stat.S_IFCHR, Path("/dev/zero").stat().st_rdev)
+        except (OSError, AttributeError):
+            pytest.skip("needs the right to make devices")
+
+    return plant
+
+
+def file(name: str, text: str = "mine") -> Plant:
+    def plant(out: Path, treasure: Path) -> None:
+        (out / name).parent.mkdir(parents=True, exist_ok=True)
+        (out / name).write_text(text)
+
+    return plant
+
+
+def folder(name: str) -> Plant:
+    return lambda out, treasure: (out / name).mkdir(parents=True)
+
+
+PLANTED = {
+    "the staging folder leads elsewhere": (link(".partial"), ".partial: a symbolic link"),
+    "the staging folder is the user's": (file(".partial/notes.txt"), ".partial/notes.txt: a file"),
+    "the staging folder is a file": (file(".partial"), ".partial: a file"),
+    "the lock leads elsewhere": (link(".partial/lock", "lock"), ".partial/lock: a symbolic link"),
+    "the lock never ends": (link(".partial/lock", "/dev/zero"), ".partial/lock: a symbolic link"),
+    "the lock is a pipe": (pipe(".partial/lock"), ".partial/lock: a pipe or a device"),
+    "the lock is a device": (device(".partial/lock"), ".partial/lock: a pipe or a device"),
+    "the marker is a pipe": (pipe(".partial/complete"), ".partial/complete: a pipe or a device"),
+    "the marker leads elsewhere": (link(".partial/complete", "notes.txt"), ".partial/complete: a symbolic link"),
+    "the marker names what is elsewhere": (
+        file(".partial/complete", "../../treasure/notes.txt\nrun.json"),
+        ".partial/complete is damaged",
+    ),
+    "the new results lead elsewhere": (link(".partial/new"), ".partial/new: a symbolic link"),
+    "the new frames lead elsewhere": (link(".partial/new/frames"), ".partial/new/frames: a symbolic link"),
+    "unknown link beside them": (link(".partial/x"), ".partial/x: a symbolic link"),
+    "the checkpoint leads elsewhere": (link(".partial/checkpoint"), ".partial/checkpoint: a symbolic link"),
+    "the plan leads elsewhere": (link(".partial/checkpoint/plan.json", "plan.json"), "plan.json: a symbolic link"),
+    "the plan is a pipe": (pipe(".partial/checkpoint/plan.json"), "checkpoint/plan.json: a pipe or a device"),
+    "the plan is a device": (device(".partial/checkpoint/plan.json"), "checkpoint/plan.json: a pipe or a device"),
+    "the positions lead elsewhere": (
+        link(".partial/checkpoint/positions", "positions"),
+        "checkpoint/positions: a symbolic link",
+    ),
+    "the draft leads elsewhere": (link(".partial/checkpoint/draft", "draft"), "checkpoint/draft: a symbolic link"),
+    "the state is a folder": (folder(".partial/checkpoint/state.npz"), "checkpoint/state.npz: a folder"),
+    "the frames lead elsewhere": (link("frames"), "frames: a symbolic link"),
+    "the frames are a file": (file("frames"), "frames: a file"),
+    "a frame leads elsewhere": (link("frames/0000.png", "0000.png"), "frames/0000.png: a symbolic link"),
+    "a frame is a folder": (folder("frames/0003.png"), "frames/0003.png: a folder"),
+    "a frame is the user's": (file("frames/0003.png"), "frames/0003.png: a file"),
+    "the trajectory is the user's": (file("trajectory.npz"), "trajectory.npz: a file"),
+    "the trajectory is a pipe": (pipe("trajectory.npz"), "trajectory.npz: a pipe or a device"),
+    "the record leads elsewhere": (link("run.json", "run.json"), "run.json: a symbolic link"),
+    "the record is a folder": (folder("run.json"), "run.json: a folder"),
+    "the record is another program's": (file("run.json", '{"a": 1}'), "run.json: a file"),
+    "the record is no list": (file("run.json", "[1e999]"), "run.json: a file"),
+    "the record lies": (
+        file("run.json", json.dumps({"outputs": ["frames", "run.json", "../treasure/notes.txt"], "frames": 1e9})),
+        "",
+    ),
+}
+
+
+@pytest.fixture
+def treasure(tmp_path: Path) -> Path:
+    for name in TREASURE:
+        file(name, "precious")(tmp_path / "treasure", tmp_path)
+    (tmp_path / "out").mkdir()
+    return tmp_path / "treasure"
+
+
+@pytest.mark.parametrize("case", PLANTED)
+def test_what_no_run_has_put_there_is_left_alone(case: str, treasure: Path) -> None:
+    plant, message = PLANTED[case]
+    out = treasure.parent / "out"
+    plant(out, treasure)
+    precious, before = snapshot(treasure), snapshot(out)
+    if not message:
+        write(out)
+        assert snapshot(treasure) == precious
+        return
+    for attempt in (write, lambda out: write(out, resumes=True)):
+        with pytest.raises(FilesError) as refused:
+            attempt(out)
+        assert message in str(refused.value)
+        assert (snapshot(treasure), snapshot(out)) == (precious, before)
+
+
+@pytest.mark.parametrize("case", [case for case in PLANTED if "plan" in case or "checkpoint" in case])
+def test_a_planted_plan_is_not_read(case: str, treasure: Path) -> None:
+    out = treasure.parent / "out"
+    PLANTED[case][0](out, treasure)
+    assert not is_unfinished(out)
+    with pytest.raises(FilesError):
+        read_plan(out)
+
+
+@pytest.mark.parametrize("name", ["positions", "plan.json", "state.npz"])
+def test_a_checkpoint_whose_file_has_another_name(name: str, treasure: Path) -> None:
+    """A hard link to what is elsewhere is not written to."""
+    checkpoint = treasure.parent / "out" / ".partial" / "checkpoint"
+    checkpoint.mkdir(parents=True)
+    os.link(treasure / name, checkpoint / name)
+    precious = snapshot(treasure)
+    with pytest.raises(FilesError):
+        write(treasure.parent / "out", resumes=True)
+    assert snapshot(treasure) == precious
+    write(treasure.parent / "out")
+    assert snapshot(treasure) == precious
+
+
+def test_a_folder_exchanged_for_a_link_meanwhile(treasure: Path) -> None:
+    """What is open stays where it is: nothing that follows goes elsewhere."""
+    out, aside = treasure.parent / "out", treasure.parent / "aside"
+    precious, made = snapshot(treasure), small_scene()
+    with ResultWriter(out, made, {}) as writer:
+        writer.add(np.zeros((3, 4, 3)), speckle(6, 8, 0))
+        shutil.move(out / ".partial", aside)
+        (out / ".partial").symlink_to(treasure)
+        (out / "frames").symlink_to(treasure)
+        for frame in range(1, made.time.frames + 1):
+            writer.add(np.zeros((3, 4, 3)), speckle(6, 8, frame))
+        with pytest.raises(FilesError, match="frames: a symbolic link"):
+            writer.publish({"status": "complete"})
+    assert snapshot(treasure) == precious
+
+
+def test_the_default_folder_is_not_reached_by_a_link(treasure: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Who names a folder may name a link; what came with a scene may not choose for them."""
+    from taichi_msm.cli import result_directory
+
+    monkeypatch.chdir(treasure.parent)
+    Path("output").mkdir()
+    assert result_directory(None, "press") == Path("output/press")
+    Path("output/press").symlink_to(treasure)
+    with pytest.raises(FilesError, match=r"^output/press: a symbolic link; name the folder that it leads to by --out"):
+        result_directory(None, "press")
+    shutil.rmtree("output")
+    Path("output").symlink_to(treasure)
+    with pytest.raises(FilesError, match=r"^output: a symbolic link"):
+        result_directory(None, "press")
+    assert result_directory("output/press", "press") == Path("output/press")
+
+
+def test_a_plan_alone_is_enough_to_be_unfinished(tmp_path: Path) -> None:
+    file(f".partial/checkpoint/{PLAN}")(tmp_path, tmp_path)
+    assert is_unfinished(tmp_path)
