@@ -3,12 +3,13 @@
 import io
 import sys
 
-from taichi_msm import interruption
+from taichi_msm import interruption, outlets
 
 
 def main() -> int:
     """Run the command line of the process."""
     interruption.leave_at_once()
+    outlets.open_missing()
     if isinstance(sys.stdout, io.TextIOWrapper):
         # A file name need not be text; errors, on stderr, are printed this way already.
         sys.stdout.reconfigure(errors="backslashreplace")

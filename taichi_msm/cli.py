@@ -22,6 +22,7 @@ import click
 from taichi_msm import __version__
 from taichi_msm.errors import DeviceError, FilesError, SceneError, printable
 from taichi_msm.interruption import Interruption
+from taichi_msm.outlets import mute, tell
 
 if TYPE_CHECKING:
     from taichi_msm.console import Progress
@@ -118,7 +119,7 @@ def run(
     if record["status"] != "complete":
         said = f"{scene or resume}: {record.get('error', 'interrupted')}; frames in {directory}: {record['frames']}"
         then = f"; last good state: {record['dump']}" if record.get("dump") else going_on(directory)
-        complain([said + then])
+        tell([said + then])
     elif not quiet and not as_json:
         click.echo(summary(record, directory))
     return EXIT_CODES.get(record["status"], interruption.code)
@@ -317,7 +318,7 @@ def view(
         report("interrupted", ["interrupted" if record is None else "interrupted; no film was written"], as_json=False)
         return interruption.code
     finally:
-        complain(notices)
+        tell(notices)
         for path in album.kept:
             click.echo(printable(str(path)))
     return DIVERGED if record is not None and session.fault else DONE
@@ -399,15 +400,9 @@ def print_json(value: Any) -> None:
     click.echo(json.dumps(value, indent=2, allow_nan=False))
 
 
-def complain(lines: Sequence[str]) -> None:
-    """Print errors on stderr, one a line, whatever characters the user's names hold."""
-    for line in lines:
-        click.echo(printable(line), err=True)
-
-
 def report(status: str, lines: Sequence[str], as_json: bool) -> None:
     """Say why there are no results."""
-    complain(lines)
+    tell(lines)
     if as_json:
         print_json({"status": status, "errors": list(lines)})
 
@@ -422,37 +417,45 @@ def main(arguments: Sequence[str] | None = None) -> int:
         The exit code: 0 done, 1 a bug, 2 wrong scene or arguments, 3 diverged, 4 files, 130 Ctrl-C, 143 SIGTERM.
     """
     words = list(sys.argv[1:] if arguments is None else arguments)
-
-    def fail(code: int, lines: Sequence[str]) -> int:
-        report("error", lines, "--json" in words)
-        return code
-
     try:
-        return int(program.main(words, prog_name="taichi-msm", standalone_mode=False) or DONE)
+        code, lines = _run(words)
+        if lines:
+            report("error", lines, "--json" in words)
+        return code
+    except OSError as error:
+        # Nobody reads stdout any more, or its disk is full.
+        mute(sys.stdout)
+        if not isinstance(error, BrokenPipeError):
+            tell([f"taichi-msm: cannot read or write: {error.strerror or error}"])
+        return FILES
+
+
+def _run(words: list[str]) -> tuple[int, Sequence[str]]:
+    """Run a command; gives the exit code and what is to be said of a failure."""
+    try:
+        Path.cwd()
+    except OSError:
+        return FILES, ["taichi-msm: the current folder is gone; change to another"]
+    try:
+        return int(program.main(words, prog_name="taichi-msm", standalone_mode=False) or DONE), ()
+    except SystemExit:
+        # How click ends where nobody reads stdout any more.
+        raise BrokenPipeError from None
     except SceneError as error:
-        return fail(WRONG_INPUT, error.lines)
+        return WRONG_INPUT, error.lines
     except DeviceError as error:
-        return fail(WRONG_INPUT, [str(error)])
+        return WRONG_INPUT, [str(error)]
     except FilesError as error:
-        return fail(FILES, [str(error)])
+        return FILES, [str(error)]
     except click.exceptions.NoArgsIsHelpError as error:
         click.echo(error.format_message())
-        return WRONG_INPUT
+        return WRONG_INPUT, ()
     except click.ClickException as error:
-        return fail(WRONG_INPUT, [f"taichi-msm: {error.format_message()} (see taichi-msm --help)"])
-    except OSError as error:
-        # Nobody reads stdout any more, or its disk is full; the interpreter is not to try again when it ends.
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-        if not isinstance(error, BrokenPipeError):
-            complain([f"taichi-msm: cannot read or write: {error.strerror or error}"])
-        return FILES
+        return WRONG_INPUT, [f"taichi-msm: {error.format_message()} (see taichi-msm --help)"]
+    except OSError:
+        raise
     except Exception as error:
         if os.environ.get("TAICHI_MSM_TRACEBACK"):
             raise
-        return fail(
-            BUG,
-            [
-                f"taichi-msm: a bug: {type(error).__name__}: {' '.join(str(error).split())}; "
-                "please report it with what TAICHI_MSM_TRACEBACK=1 prints"
-            ],
-        )
+        said = f"a bug: {type(error).__name__}: {' '.join(str(error).split())}"
+        return BUG, [f"taichi-msm: {said}; please report it with what TAICHI_MSM_TRACEBACK=1 prints"]

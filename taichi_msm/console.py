@@ -10,6 +10,7 @@ from types import TracebackType
 from typing import TYPE_CHECKING, Any
 
 from taichi_msm.errors import printable
+from taichi_msm.outlets import tell
 
 if TYPE_CHECKING:
     from rich.progress import Progress as Bar
@@ -50,8 +51,7 @@ class Progress:
             self._bar.update(self._task, description=STAGES[stage], completed=done, total=total)
         elif not self._quiet and time.monotonic() >= self._next_line:
             self._next_line = time.monotonic() + LINE_EVERY
-            sys.stderr.write(f"{STAGES[stage]}: {done} of {total}\n")
-            sys.stderr.flush()
+            tell([f"{STAGES[stage]}: {done} of {total}"])
 
     def __enter__(self) -> Progress:
         if self._bar is not None:

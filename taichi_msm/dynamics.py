@@ -277,7 +277,7 @@ class Dynamics:
         grip[..., 3:5] = loads.point
         for n, part in enumerate(parts):
             grip[:, n, 5:] = scene.probes[part.probe].falloff, scene.probes[part.probe].offset
-        return table.astype(self._real)
+        return self._as_real(table)
 
     def _place(self, state: State | None) -> None:
         """Put the sheet where it begins and write what no step changes: who moves, the edges, the decay of grips."""
@@ -303,4 +303,9 @@ class Dynamics:
         s = self.structure
         column = np.arange(s.lanes) * s.strip + np.arange(-1, s.strip + 1)[:, None]
         inside = (column >= 0) & (column < s.cols)
-        return np.take(values.astype(self._real), column * inside, axis=1) * inside.astype(self._real)
+        return np.take(self._as_real(values), column * inside, axis=1) * inside.astype(self._real)
+
+    def _as_real(self, values: NDArray[Any]) -> NDArray[Any]:
+        """Round to the scene's precision; what is too large for it is infinite, and found when the sheet is read."""
+        with np.errstate(over="ignore"):
+            return values.astype(self._real)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import errno
 import io
 import os
 import tempfile
@@ -28,6 +29,12 @@ __all__ = [
     "ti",
 ]
 
+if not os.environ.get("HOME"):
+    # Without one Taichi aborts the process.
+    os.environ.pop("HOME", None)
+    _home = os.path.expanduser("~")  # noqa: PTH111  # Path.home raises where there is none
+    os.environ["HOME"] = _home if _home != "~" else tempfile.gettempdir()
+
 # No banner on stdout, which may be JSON, and no call home.
 os.environ.setdefault("ENABLE_TAICHI_HEADER_PRINT", "0")
 os.environ.setdefault("TI_SKIP_VERSION_CHECK", "ON")
@@ -45,6 +52,12 @@ ARCHS = ("cpu", "cuda")
 # A lock on Taichi's cache that is older than this was left by a process that was killed [s].
 STALE_LOCK = 60.0
 
+
+# What the kernels of a run may take in the cache: files, and bytes.
+CACHE_FILES, CACHE_BYTES = 64, 1 << 24
+
+# Taichi takes 1 GiB of addresses at once, and its libraries as much again.
+ADDRESS_SPACE = 1900 << 20
 
 # Taichi gives a CPU thread at least this many iterations of a parallel loop: make_cpu_multithreaded_range_for.cpp.
 ITERATIONS_PER_THREAD = 512
@@ -170,6 +183,7 @@ def _cache() -> dict[str, Any]:
         folder.mkdir(parents=True, exist_ok=True)
         with tempfile.TemporaryFile(dir=folder):
             pass
+        _require_room(folder)
     except OSError:
         # Taichi crashes at the end of a process whose folder it cannot write, even where it is not to.
         os.environ.pop("TI_OFFLINE_CACHE_FILE_PATH", None)
@@ -180,6 +194,29 @@ def _cache() -> dict[str, Any]:
         if time.time() - lock.stat().st_mtime > STALE_LOCK:
             lock.unlink()
     return {}
+
+
+def _require_room(folder: Path) -> None:
+    """Raise OSError where the files of a run's kernels may not fit."""
+    if hasattr(os, "statvfs"):
+        free = os.statvfs(folder)
+        # Some file systems have as many files as one wants, and say that it is none.
+        if (free.f_files > 0 and free.f_favail < CACHE_FILES) or free.f_bavail * free.f_frsize < CACHE_BYTES:
+            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+
+def _require_address_space() -> None:
+    """Raise DeviceError where Taichi would not get the memory that it takes at once."""
+    try:
+        import resource
+    except ImportError:  # Windows
+        return
+    limit = resource.getrlimit(resource.RLIMIT_AS)[0]
+    if limit != resource.RLIM_INFINITY and limit < ADDRESS_SPACE:
+        raise DeviceError(
+            f"Taichi needs {ADDRESS_SPACE >> 20} MiB of address space, and this process may have {limit >> 20} MiB; "
+            "raise its limit (ulimit -v)"
+        )
 
 
 def _threads() -> list[int]:
@@ -201,6 +238,7 @@ def _pin(pool: list[int]) -> None:
 
 
 def _initialise(device: Device) -> None:
+    _require_address_space()
     cache = _cache()
     before = _threads()
     try:
@@ -220,6 +258,7 @@ def _initialise(device: Device) -> None:
                 log_level=ti.ERROR,
             )
     except Exception as error:
-        raise DeviceError(f"--arch {device.arch}: not available on this machine; take --arch cpu") from error
+        said = "take --arch cpu" if device.arch != "cpu" else f"Taichi says: {' '.join(str(error).split())}"
+        raise DeviceError(f"--arch {device.arch}: not available on this machine; {said}") from error
     # The pool is the last that Taichi starts.
     _pin([thread for thread in _threads() if thread not in before][-device.threads :])

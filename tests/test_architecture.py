@@ -13,8 +13,8 @@ PACKAGE = Path(__file__).parent.parent / "taichi_msm"
 
 # A module imports from earlier lines only.
 ORDER = [
-    {"errors", "look", "interruption", "silence"},
-    {"scene"},
+    {"errors", "look", "interruption", "silence", "sealed", "npz"},
+    {"scene", "folder", "outlets"},
     {"lattice", "camera", "texture"},
     {"stability"},
     {"loads", "budget", "yaml_reader"},
