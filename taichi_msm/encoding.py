@@ -119,7 +119,7 @@ class Encoder:
             picture: colours, shape (height, width, 3).
             pause: called some times a second while it waits; what it raises gives the picture up.
         """
-        rest = np.ascontiguousarray(picture).data.cast("B")
+        rest = np.ascontiguousarray(picture).reshape(-1).data
         try:
             while rest:
                 count = self._pictures.write(rest)

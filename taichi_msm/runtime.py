@@ -4,16 +4,19 @@ from __future__ import annotations
 
 import contextlib
 import errno
+import gc
 import io
 import os
 import tempfile
+import threading
 import time
+import weakref
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from taichi_msm.errors import DeviceError
+from taichi_msm.errors import DeviceError, MsmError
 from taichi_msm.silence import silenced
 
 __all__ = [
@@ -24,6 +27,7 @@ __all__ = [
     "available_threads",
     "open_window",
     "quick_compilation",
+    "require_here",
     "start",
     "started",
     "ti",
@@ -32,8 +36,8 @@ __all__ = [
 if not os.environ.get("HOME"):
     # Without one Taichi aborts the process.
     os.environ.pop("HOME", None)
-    _home = os.path.expanduser("~")  # noqa: PTH111  # Path.home raises where there is none
-    os.environ["HOME"] = _home if _home != "~" else tempfile.gettempdir()
+    _folder = os.path.expanduser("~")  # noqa: PTH111  # Path.home raises where there is none
+    os.environ["HOME"] = _folder if _folder != "~" else tempfile.gettempdir()
 
 # No banner on stdout, which may be JSON, and no call home.
 os.environ.setdefault("ENABLE_TAICHI_HEADER_PRINT", "0")
@@ -77,11 +81,27 @@ class Device:
 
 
 class FieldTree:
-    """Fields that are allocated together and can be freed: a Taichi process has room for 512 such trees."""
+    """Fields that are allocated together and can be freed; those of one that is dropped are, some time later.
+
+    Raises:
+        MsmError: when there are as many as Taichi has room for.
+    """
 
     def __init__(self) -> None:
+        require_here()
+        if len(_trees) == MOST_TREES:
+            # They may be in circles of objects that nobody holds.
+            gc.collect()
+        while _dropped:
+            _destroy(_dropped.pop())
+        if len(_trees) == MOST_TREES:
+            raise MsmError(
+                f"{MOST_TREES} sheets and pictures are open, and Taichi has room for no more; close simulations that "
+                "you no longer need, or use each in a with statement"
+            )
         self._builder = ti.FieldsBuilder()
         self._tree: Any = None
+        self._drop: weakref.finalize[Any, Any] | None = None
 
     def place(self, field: Any, *shape: int) -> Any:
         """Give a field its shape; returns the field."""
@@ -91,17 +111,32 @@ class FieldTree:
     def allocate(self) -> None:
         """Make the memory of all fields placed, filled with zeros."""
         self._tree = self._builder.finalize()
+        _trees.add(self._tree)
         # Taichi looks at new fields before the next kernel, and crashes if they are freed by then.
         ti.lang.impl.get_runtime().materialize()
+        # Objects are dropped at any time, such as within a launch: the next allocation frees them.
+        self._drop = weakref.finalize(self, _dropped.append, self._tree)
 
     def close(self) -> None:
         """Free the memory. Kernels that use it must not be called again."""
-        if self._tree is not None:
-            self._tree.destroy()
-            self._tree = None
+        if self._drop is not None and self._drop.detach() is not None:
+            _destroy(self._tree)
 
+
+# Taichi has a table of 512, and reads beyond its end.
+MOST_TREES = 500
+
+_trees: set[Any] = set()
+_dropped: list[Any] = []
 
 _device: Device | None = None
+# The process and the thread that started Taichi.
+_home = (0, 0)
+
+
+def _destroy(tree: Any) -> None:
+    _trees.remove(tree)
+    tree.destroy()
 
 
 def available_threads() -> int:
@@ -128,20 +163,39 @@ def start(arch: str = "cpu", threads: int | None = None) -> Device:
 
     Raises:
         DeviceError: when the arch is not supported or not there, or Taichi already runs otherwise.
+        MsmError: as for `require_here`.
     """
-    global _device
+    global _device, _home
+    if _device is not None:
+        require_here()
     if arch not in ARCHS:
         raise DeviceError(f"--arch {arch}: not supported; take one of: {', '.join(ARCHS)}")
     wanted = Device(arch, available_threads() if threads is None else threads)
     if _device is None:
         _initialise(wanted)
-        _device = wanted
+        _device, _home = wanted, (os.getpid(), threading.get_ident())
     elif wanted != _device:
         raise DeviceError(
             f"Taichi already runs on {_device.arch} with {_device.threads} threads in this process; "
             f"start another process for {wanted.arch} with {wanted.threads}"
         )
     return _device
+
+
+def require_here() -> None:
+    """Make sure that Taichi works where it is called.
+
+    Raises:
+        MsmError: in a process that was forked from the one that started it, or in another of its threads.
+    """
+    process, thread = _home
+    if process != os.getpid():
+        raise MsmError(
+            "Taichi was started before this process was forked from another, and would hang here; start processes by "
+            "multiprocessing's 'spawn' or 'forkserver'"
+        )
+    if thread != threading.get_ident():
+        raise MsmError("Taichi works in the thread that started it; simulate and draw there")
 
 
 def open_window(title: str, size: tuple[int, int]) -> Any:

@@ -37,6 +37,8 @@ class Simulation:
             that has no core holds all of them up.
 
     Raises:
+        MsmError: here and in all methods, in another thread than that of the first simulation, or in a process that
+            was forked after it; and here when some 250 simulations have been left open.
         DeviceError: when the arch is not there, or Taichi already runs on another one in this process.
         SceneError: when no step meets the scene's tolerance.
 
@@ -186,6 +188,7 @@ class Simulation:
 
     def close(self) -> None:
         """Free the memory of the fields. `positions` still gives the last frame."""
+        runtime.require_here()
         self._closed = True
         self._dynamics.close()
         if self._drawing is not None:
@@ -203,6 +206,7 @@ class Simulation:
         # The kernels would write to memory that is freed.
         if self._closed:
             raise MsmError("this simulation is closed; make another")
+        runtime.require_here()
 
     def _drawn(self) -> Drawing:
         if self._drawing is None:

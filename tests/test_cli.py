@@ -19,6 +19,7 @@ from PIL import Image
 from taichi_msm import console, reference
 from taichi_msm.cli import main
 from taichi_msm.scene_file import load_scene
+from tests.outputs import files
 from tests.scenes import SMALL, speckle
 
 
@@ -462,6 +463,19 @@ def test_scenes_of_any_name(stem: str, small: Path, capsys: pytest.CaptureFixtur
     shown = "\\udcff" if stem == "\udcff" else stem
     error = f"{shown}.yaml:3:27: springs.shaer: unknown key; did you mean 'shear'?\n"
     assert call(capsys, "check", "--", f"{stem}.yaml") == (2, "", error)
+
+
+@pytest.mark.parametrize(("name", "folder"), [("...yaml", ".."), ("..yaml", ".")])
+def test_a_name_that_is_no_folder_of_its_own_is_refused(
+    name: str, folder: str, small: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Results would replace those of the folder above."""
+    (small / name).write_bytes((small / "small.yaml").read_bytes())
+    before = files(small)
+    code, _, error = call(capsys, "run", name)
+    said = f"Invalid value for --out: the scene's name gives the folder output/{folder}; name another"
+    assert (code, error) == (2, f"taichi-msm: {said} (see taichi-msm --help)\n")
+    assert files(small) == before
 
 
 def test_a_locale_without_letters(small: Path) -> None:

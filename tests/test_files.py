@@ -170,7 +170,7 @@ def test_an_interrupted_hand_over_leaves_whole_frames(
 ) -> None:
     """Ctrl-C may come when the positions of a frame, but not all rows of its picture, are handed over."""
 
-    def interrupted(encoder: Encoder, picture: NDArray[np.uint8]) -> None:
+    def interrupted(encoder: Encoder, picture: NDArray[np.uint8], pause: Callable[[], None]) -> None:
         add(encoder, picture[:rows])
         raise KeyboardInterrupt
 

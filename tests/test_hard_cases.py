@@ -215,9 +215,11 @@ def test_jumping_is_one_tool_let_go_and_another_taken(pool: Pool, device: Device
     (at, *first), (_, *second) = np.array(probe.at).tolist()
     before = tuple(key for key in probe.load if key[0] <= at)
     after = tuple(key for key in probe.load if key[0] > at)
+    # Of two keys, as the control point of a tool that may move; of one that stands, NumPy evaluates the decay.
+    one, two = (((0.0, *place), (at, *place)) for place in (first, second))
     tools = (
-        probe.model_copy(update={"at": tuple(first), "load": (*before, (at, 100.0), (at, 0.0))}),
-        probe.model_copy(update={"at": tuple(second), "load": ((at, 0.0), (at, 100.0), *after)}),
+        probe.model_copy(update={"at": one, "load": (*before, (at, 100.0), (at, 0.0))}),
+        probe.model_copy(update={"at": two, "load": ((at, 0.0), (at, 100.0), *after)}),
     )
     u = motion(scene, pool, device)
     assert u.tobytes() == motion(scene.model_copy(update={"probes": tools}), pool, device).tobytes()

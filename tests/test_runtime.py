@@ -74,6 +74,83 @@ def test_fields_may_be_freed_before_any_kernel_runs() -> None:
     subprocess.run([sys.executable, "-c", script], cwd=Path(__file__).parent.parent, check=True)
 
 
+# More sheets than Taichi has room for, dropped and kept; then one simulation in another thread and another process.
+MANY = """
+import gc, os, threading
+from taichi_msm import MsmError, Simulation, runtime
+from taichi_msm.runtime import FieldTree, ti
+from tests.scenes import scene
+
+runtime.start()
+
+class Sheet(FieldTree):
+    def __init__(self):
+        super().__init__()
+        self.value = self.place(ti.field(ti.f32), 4)
+        self.itself = self
+        self.allocate()
+
+gc.disable()
+for _ in range(1100):
+    Sheet()
+print("dropped")
+kept = []
+try:
+    for _ in range(1100):
+        kept.append(Sheet())
+except MsmError as error:
+    print(len(kept), error)
+kept[0].close()
+kept[0].close()
+Sheet()
+kept.clear()
+gc.collect()
+Sheet()
+
+Simulation(scene()).advance()
+gc.collect()
+print(len(runtime._dropped) - 1, "to be freed")
+
+simulation = Simulation(scene())
+simulation.advance()
+def attempt(work):
+    try:
+        work()
+    except MsmError as error:
+        print(error, flush=True)
+for work in (simulation.advance, simulation.draw, simulation.close, lambda: Simulation(scene())):
+    thread = threading.Thread(target=attempt, args=[work])
+    thread.start()
+    thread.join()
+child = os.fork()
+if child == 0:
+    attempt(simulation.advance)
+    attempt(lambda: Simulation(scene()))
+    os._exit(0)
+assert os.waitpid(child, 0)[1] == 0
+simulation.advance()
+print(simulation.frame)
+"""
+
+
+@pytest.mark.skipif(not hasattr(os, "fork"), reason="forks")
+def test_what_taichi_cannot_bear_is_one_clear_error(tmp_path: Path, root: Path) -> None:
+    """Too many sheets, other threads and forked processes: it would crash, fail with text of its own, or hang."""
+    script = tmp_path / "many.py"
+    script.write_text(MANY)
+    environment = {**os.environ, "PYTHONPATH": str(root)}
+    done = subprocess.run(
+        [sys.executable, str(script)], capture_output=True, text=True, timeout=60, check=True, env=environment
+    )
+    thread = "Taichi works in the thread that started it; simulate and draw there"
+    fork = "Taichi was started before this process was forked from another, and would hang here; start processes by "
+    fork += "multiprocessing's 'spawn' or 'forkserver'"
+    many = "500 500 sheets and pictures are open, and Taichi has room for no more; close simulations that you no "
+    many += "longer need, or use each in a with statement"
+    assert done.stdout.splitlines() == ["dropped", many, "1 to be freed", *4 * [thread], *2 * [fork], "2"]
+    assert done.stderr == ""
+
+
 @pytest.mark.usefixtures("device")
 def test_pictures_are_compiled_quickly_and_steps_are_not(monkeypatch: pytest.MonkeyPatch) -> None:
     config = runtime.ti.lang.impl.current_cfg()
