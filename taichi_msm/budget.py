@@ -189,7 +189,8 @@ def _free_disk(directory: Path) -> int:
 
 
 def _gib(size: int) -> str:
-    return f"{size / 2**30:.3g} GiB"
+    unit, name = next(((unit, name) for unit, name in ((2**30, "GiB"), (2**20, "MiB")) if size >= unit), (2**10, "KiB"))
+    return f"{size / unit:.3g} {name}"
 
 
 def _free_memory(meminfo: Path) -> int:

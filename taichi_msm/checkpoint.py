@@ -57,6 +57,8 @@ class Checkpoint:
         self._record_bytes = (DIGEST_BYTES + self._frame_bytes) if scene.output else 0
         self._due = 0.0
         self._open = ExitStack()
+        # What ties the parts of a checkpoint to its plan.
+        self._key = b""
         self._folder: Folder | None = None
         self._positions: BinaryIO | None = None
 
@@ -74,7 +76,9 @@ class Checkpoint:
         folder = self._enter()
         # Without a buffer, so that what was written stays when the process is killed.
         self._positions = self._open.enter_context(folder.create(POSITIONS, buffering=0))
-        folder.write(PLAN, seal(plan), DRAFT)
+        sealed = seal(plan)
+        self._key = _digest(sealed)
+        folder.write(PLAN, sealed, DRAFT)
 
     def go_on(self) -> Saved | None:
         """Go on from what was saved last; None: from the beginning.
@@ -85,9 +89,11 @@ class Checkpoint:
         """
         folder = self._enter()
         try:
+            with folder.open(PLAN) as file:
+                self._key = _digest(file.read())
             self._positions = self._open.enter_context(folder.open(POSITIONS, write=True))
-        except FileNotFoundError:
-            raise self._damaged(POSITIONS) from None
+        except FileNotFoundError as error:
+            raise self._damaged(str(error.filename)) from None
         saved = self.load()
         frames = 0 if saved is None else saved.course.frame + 1
         if os.fstat(self._positions.fileno()).st_size < frames * self._record_bytes:
@@ -101,7 +107,7 @@ class Checkpoint:
             assert self._positions is not None, "begin or go_on comes first"
             data = np.ascontiguousarray(position, self.precision).data.cast("B")
             self._positions.seek(self.frames * self._record_bytes)
-            write_all(self._positions, _digest(self.frames, data))
+            write_all(self._positions, self._digest(self.frames, data))
             write_all(self._positions, data)
         self.frames += 1
 
@@ -123,7 +129,7 @@ class Checkpoint:
         data = record[DIGEST_BYTES:]
         found = data.view(self.precision).reshape(self._shape)
         # Anybody may have written it.
-        if rest or record[:DIGEST_BYTES].tobytes() != _digest(frame, data.data) or not np.isfinite(found).all():
+        if rest or record[:DIGEST_BYTES].tobytes() != self._digest(frame, data.data) or not np.isfinite(found).all():
             raise self._damaged(POSITIONS)
         return found
 
@@ -143,7 +149,7 @@ class Checkpoint:
         folder.remove(DRAFT)
         try:
             with folder.create(DRAFT) as file, zipfile.ZipFile(file, "w", zipfile.ZIP_STORED) as archive:
-                for name, array in _arrays(saved).items():
+                for name, array in self._arrays(saved).items():
                     write_array(archive, name, array.dtype, array.shape, [np.ascontiguousarray(array).data.cast("B")])
             folder.replace(DRAFT, folder, STATE)
         except OSError:
@@ -159,9 +165,9 @@ class Checkpoint:
         Raises:
             DamagedError: when it cannot be that of a run of the scene.
         """
-        like = _arrays(Saved(State(0, np.empty(0), np.empty(0)), Course()))
+        like = self._arrays(Saved(State(0, np.empty(0), np.empty(0)), Course()))
         sheet = self.precision, self._shape
-        kinds = {name: sheet if array.size == 0 else (array.dtype, ()) for name, array in like.items()}
+        kinds = {name: sheet if array.size == 0 else (array.dtype, array.shape) for name, array in like.items()}
         try:
             with self._entered.open(STATE) as file, zipfile.ZipFile(file) as archive:
                 found = {name: read_array(archive, name, *kind) for name, kind in kinds.items()}
@@ -179,6 +185,7 @@ class Checkpoint:
             and course.frame * every <= saved.state.steps <= (course.frame + 1) * every
             and all(np.isfinite(array).all() for array in found.values())
             and all(value >= 0 for value in asdict(course).values())
+            and found["plan"].tobytes() == self._key
         ):
             raise self._damaged(STATE)
         return saved
@@ -197,17 +204,21 @@ class Checkpoint:
         self._folder = self._open.enter_context(self._staging.folder(CHECKPOINT))
         return self._folder
 
+    def _arrays(self, saved: Saved) -> dict[str, NDArray[Any]]:
+        """Give the arrays of a state and the numbers of a course by their names, and the plan's digest."""
+        named = {**saved.state._asdict(), **asdict(saved.course), "plan": np.frombuffer(self._key, np.uint8)}
+        return {name: np.asarray(value) for name, value in named.items()}
+
+    def _digest(self, frame: int, data: memoryview) -> bytes:
+        """Tell the positions of a frame from any others, and from those of another frame or run."""
+        return _digest(self._key, frame.to_bytes(8, "little"), data)
+
     def _damaged(self, name: str) -> DamagedError:
         return DamagedError(f"{self._staging.path / CHECKPOINT / name} is damaged; run the scene again")
 
 
-def _arrays(saved: Saved) -> dict[str, NDArray[Any]]:
-    """Give the arrays of a state and the numbers of a course by their names."""
-    return {name: np.asarray(value) for name, value in (saved.state._asdict() | asdict(saved.course)).items()}
-
-
-def _digest(frame: int, data: memoryview) -> bytes:
-    """Tell the positions of a frame from any others, and from those of another frame."""
-    digest = hashlib.sha256(frame.to_bytes(8, "little"))
-    digest.update(data)
+def _digest(*parts: bytes | memoryview) -> bytes:
+    digest = hashlib.sha256()
+    for part in parts:
+        digest.update(part)
     return digest.digest()

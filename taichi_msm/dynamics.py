@@ -30,25 +30,23 @@ from taichi_msm.forces import (
     HAS_RIGHT,
     MEASURES,
     MOVES,
+    Code,
     Readings,
     Structure,
 )
 from taichi_msm.gather import STEPS_PER_LAUNCH, Gather
 from taichi_msm.lattice import axes, fixed_points, spacing
 from taichi_msm.loads import decay, grips, schedule
-from taichi_msm.runtime import Device, available_threads
+from taichi_msm.runtime import Device, available_threads, lanes
 from taichi_msm.scene import Scene
 from taichi_msm.stability import step, steps_per_frame
 from taichi_msm.sweep import Sweep
-
-# Lanes of a 256-bit vector.
-LANES = {"f32": 8, "f64": 4}
 
 # Below this many points a worker costs more in waiting for the others than it saves.
 POINTS_PER_WORKER = 450
 
 # What a band may take of a core's cache, and the most steps of one sweep.
-CACHE = 1 << 18
+CACHE = 3 << 17
 MOST_DEPTH = 8
 
 # Numbers that a sweep keeps for a point: displacement, difference, forces for the row ahead.
@@ -97,21 +95,18 @@ def structure(scene: Scene, device: Device, cores: int | None = None) -> Structu
         workers = max(1, min(cores, rows * cols // POINTS_PER_WORKER, (rows - sum(fixed_rows)) // 2))
     else:
         workers = 0
-    return Structure(
-        rows=rows,
-        cols=cols,
+    code = Code(
         precision=precision,
-        lanes=LANES[precision] if workers else 1,
-        workers=workers,
-        depth=_depth(rows // workers, cols * NUMBERS_PER_POINT * BYTES[precision]) if workers else 1,
+        lanes=lanes(precision),
         structural=scene.springs.structural > 0,
         shear=scene.springs.shear > 0,
-        fixed_rows=fixed_rows,
         open_edges=not (all(fixed_rows) and fixed[:, [0, -1]].all()),
         virtual=scene.springs.virtual > 0 and (scene.springs.virtual_active == "always" or bool(scene.probes)),
         damped=scene.damping > 0,
         grips=tuple(grip.moves for grip in grips(scene)),
     )
+    depth = _depth(rows // workers, cols * NUMBERS_PER_POINT * BYTES[precision]) if workers else 1
+    return Structure(rows, cols, workers, depth, fixed_rows, code)
 
 
 def _depth(rows: int, row_bytes: int) -> int:
@@ -142,25 +137,20 @@ class Dynamics:
         self.scene = scene
         self._device = device
         self._cores = cores
-        self.structure = layout or structure(scene, device, cores)
+        self._layout = layout
         self.launches = 0
-        self._real = np.dtype(np.float32 if self.structure.precision == "f32" else np.float64)
-        self._sheet: Sweep | Gather = (Sweep if self.structure.workers else Gather)(self.structure)
-        self._begin(None)
+        self._sheet: Sweep | Gather | None = None
+        self.restart(scene)
 
     def restart(self, scene: Scene, state: State | None = None) -> None:
-        """Begin again with other numbers, such as another step; nothing is compiled.
+        """Begin again, with the same scene or another; nothing is compiled where only numbers differ.
 
         Args:
-            scene: a checked scene that differs in numbers only: points, precision and the terms used are the same.
-            state: where to begin, as `state` gave it with the same step; None: at rest.
-
-        Raises:
-            ValueError: when it needs another kernel.
+            scene: a checked scene.
+            state: where to begin, as `state` gave it with the same points and step; None: at rest.
         """
-        if structure(scene, self._device, self._cores) != structure(self.scene, self._device, self._cores):
-            raise ValueError("this scene needs another kernel; make another Dynamics")
         self.scene = scene
+        self.structure = self._layout or structure(scene, self._device, self._cores)
         self._begin(state)
 
     def steer(self, scene: Scene) -> None:
@@ -173,7 +163,7 @@ class Dynamics:
         Raises:
             ValueError: when it needs another kernel.
         """
-        if tuple(grip.moves for grip in grips(scene)) != self.structure.grips:
+        if tuple(grip.moves for grip in grips(scene)) != self.structure.code.grips:
             raise ValueError("these probes need another kernel; make another Dynamics")
         self.scene = scene
         # Who steers does so again in a frame.
@@ -193,14 +183,14 @@ class Dynamics:
         end = self.steps_done + steps
         while self.steps_done < end:
             count = min(most, end - self.steps_done)
-            self._sheet.advance(count, self._arguments, self._next_loads(count))
+            self._moving.advance(count, self._arguments, self._next_loads(count))
             self.steps_done += count
             self.launches += 1
             pause()
 
     def compile(self) -> None:
         """Compile the step and the read-out without moving anything."""
-        self._sheet.advance(0, self._arguments, self._loads)
+        self._moving.advance(0, self._arguments, self._loads)
         self.displacement()
 
     def displacement(self) -> NDArray[Any]:
@@ -220,7 +210,7 @@ class Dynamics:
         s, sheet = self.structure, self.scene.sheet
         out, measures = np.empty((s.rows, s.cols, 3), self._real), np.empty((s.rows, MEASURES), self._real)
         dx, dy = spacing(sheet)
-        self._sheet.read((dx, dy), Readings(differences, out, measures))
+        self._moving.read((dx, dy), Readings(differences, out, measures))
         self.shortest_spring = math.sqrt(max(0.0, 1.0 + float(measures[:, 0].min())))
         along, down, diagonal, motion = measures[:, 1:].sum(axis=0, dtype=np.float64)
         springs, h = self.scene.springs, step(self.scene)
@@ -229,11 +219,17 @@ class Dynamics:
         return out
 
     def close(self) -> None:
-        """Free the fields."""
-        self._sheet.close()
+        """Free the memory."""
+        self._sheet = None
+
+    @property
+    def _moving(self) -> Sweep | Gather:
+        assert self._sheet is not None, "it is closed"
+        return self._sheet
 
     def _begin(self, state: State | None) -> None:
         """Put the sheet at rest, or where it was."""
+        self._real = np.dtype(np.float32 if self.structure.code.precision == "f32" else np.float64)
         self.steps_done = 0 if state is None else state.steps
         self.shortest_spring = 1.0
         self.energy = 0.0
@@ -265,7 +261,7 @@ class Dynamics:
         g = scene.damping / scene.sheet.mass
         loads = schedule(scene, first, count)
         parts = grips(scene)
-        table = np.empty((count, self.structure.load_columns))
+        table = np.empty((count, self.structure.code.load_columns))
         table[:, 0] = h * h / scene.sheet.mass
         if scene.time.damping_difference == "central":
             table[:, 0] /= 1 + g * h / 2
@@ -277,10 +273,12 @@ class Dynamics:
         grip[..., 3:5] = loads.point
         for n, part in enumerate(parts):
             grip[:, n, 5:] = scene.probes[part.probe].falloff, scene.probes[part.probe].offset
-        return self._as_real(table)
+        # What is too large for f32 is infinite, and found when the sheet is read.
+        with np.errstate(over="ignore"):
+            return table.astype(self._real)
 
     def _place(self, state: State | None) -> None:
-        """Put the sheet where it begins and write what no step changes: who moves, the edges, the decay of grips."""
+        """Put the sheet where it begins."""
         s, scene = self.structure, self.scene
         moves = ~fixed_points(scene.sheet)
         column = np.arange(s.cols)
@@ -290,22 +288,7 @@ class Dynamics:
         by_column[ACROSS] = axes(scene.sheet)[0]
         by_column[HAS_LEFT] = column > 0
         by_column[HAS_RIGHT] = column < s.cols - 1
-        standing = [grip for grip in grips(scene) if not grip.moves]
-        decays = np.zeros((max(1, len(standing)), s.rows, s.strip + 2, s.lanes), self._real)
-        for out, grip in zip(decays, standing, strict=False):
-            out[:] = self._in_lanes(decay(grip, scene))
-        nothing = np.zeros((1, 1, 3), self._real)
-        start = (False, nothing, nothing) if state is None else (True, state.displacement, state.difference)
-        self._sheet.start(self._in_lanes(by_column), decays, *start)
-
-    def _in_lanes(self, values: NDArray[Any]) -> NDArray[Any]:
-        """Lay columns out in strips with their halo: (rows, cols) -> (rows, strip + 2, lanes); 0 where is none."""
-        s = self.structure
-        column = np.arange(s.lanes) * s.strip + np.arange(-1, s.strip + 1)[:, None]
-        inside = (column >= 0) & (column < s.cols)
-        return np.take(self._as_real(values), column * inside, axis=1) * inside.astype(self._real)
-
-    def _as_real(self, values: NDArray[Any]) -> NDArray[Any]:
-        """Round to the scene's precision; what is too large for it is infinite, and found when the sheet is read."""
-        with np.errstate(over="ignore"):
-            return values.astype(self._real)
+        decays = np.array([decay(grip, scene) for grip in grips(scene) if not grip.moves])
+        self._sheet = None  # Its memory is free before there is another.
+        kind = Sweep if s.workers else Gather
+        self._sheet = kind(s, by_column, decays, None if state is None else (state.displacement, state.difference))

@@ -107,6 +107,7 @@ class Encoder:
         assert self._process.stdout
         self._pictures = self._process.stdin
         self._answer = self._process.stdout
+        self._answered = b""
         self._report: Report | None = None
         pickle.dump(job, self._pictures)
         if os.name != "nt":  # where pipes always block
@@ -131,10 +132,12 @@ class Encoder:
             self.finish()  # raises what ended the process
             raise
 
-    def finish(self, *, hurry: bool = False) -> Report:
+    def finish(self, pause: Callable[[], None] = lambda: None, *, hurry: bool = False) -> Report:
         """Wait until all pictures are encoded.
 
         Args:
+            pause: called some times a second while it waits; what it raises stops the waiting, and this can be called
+                again.
             hurry: give up those that are not being encoded yet.
         """
         if self._report is None:
@@ -144,16 +147,24 @@ class Encoder:
                     self._process.send_signal(signal.SIGCONT)
             with suppress(BrokenPipeError):
                 self._pictures.close()
-            with self._answer:
-                answer = self._answer.read()
+            while part := self._read_answer(pause):
+                self._answered += part
+            self._answer.close()
             code = self._process.wait()
-            result = pickle.loads(answer) if answer else None
+            result = pickle.loads(self._answered) if self._answered else None
             if isinstance(result, Exception):
                 raise result
             if not isinstance(result, Report):
                 raise ChildProcessError(f"the encoder ended with exit code {code}")
             self._report = result
         return self._report
+
+    def _read_answer(self, pause: Callable[[], None]) -> bytes:
+        """Wait for the next part of the answer; nothing is left after an empty one."""
+        if os.name != "nt":  # where pipes cannot be waited for
+            while not select.select([self._answer], [], [], PATIENCE)[0]:
+                pause()
+        return self._answer.read(1 << 16)
 
     def abort(self) -> None:
         """End the process at once."""

@@ -112,17 +112,19 @@ class ResultWriter:
         with writing(self._directory):
             return self._checkpoint.load()
 
-    def finish(self, *, hurry: bool = False) -> None:
+    def finish(self, pause: Callable[[], None] = lambda: None, *, hurry: bool = False) -> None:
         """Wait until every frame is encoded and close the files.
 
         Args:
+            pause: called some times a second while it waits; what it raises stops the waiting, and this can be called
+                again.
             hurry: give up frames that are not being encoded yet.
         """
         if self._finished:
             return
         with writing(self._directory):
             if self._encoder:
-                report = self._encoder.finish(hurry=hurry)
+                report = self._encoder.finish(pause, hurry=hurry)
                 self._frames, self._encode_seconds = report.frames, report.seconds
             if TRAJECTORY in self._outputs(self._frames):
                 scene = self._scene

@@ -68,6 +68,14 @@ class Folder:
         except FileNotFoundError:
             return None
 
+    def identity(self, name: str) -> list[int] | None:
+        """Tell a file from any other that may come under its name: number, size, time of change; None for nothing."""
+        try:
+            status = os.stat(self._entry(name), dir_fd=self.descriptor, follow_symlinks=False)
+        except FileNotFoundError:
+            return None
+        return [status.st_ino, status.st_size, status.st_mtime_ns]
+
     def is_writable(self, name: str) -> bool:
         """Tell whether an entry may be written to."""
         return os.access(self._entry(name), os.W_OK, dir_fd=self.descriptor)

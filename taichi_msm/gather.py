@@ -5,113 +5,143 @@ The layout is the plain one: one lane, an entry a column, around the sheet a hal
 
 # No `from __future__ import annotations` here: Taichi reads the annotations of a kernel.
 
-from typing import Any
+from collections.abc import Callable
+from functools import cache
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from taichi_msm.forces import (
+    HAS_LEFT,
+    HAS_RIGHT,
     MEASURES,
+    MOVES,
+    Code,
     Readings,
-    SheetFields,
+    SheetArrays,
     Structure,
     point_step,
     spring_forces,
-    start_kernel,
     strains,
 )
-from taichi_msm.runtime import ti
+from taichi_msm.runtime import our_compilation, ti
 
 # A launch is a chain of this many kernels, one a step.
 STEPS_PER_LAUNCH = 8
 
 
-class _Fields(SheetFields):
-    """The fields of a sheet whose points gather."""
+class Kernels(NamedTuple):
+    """The kernels of one code."""
 
-    def __init__(self, s: Structure) -> None:
-        super().__init__(s, 2 * (s.rows + 2))
-        self.allocate()
+    advance: Callable[..., None]
+    read: Callable[..., None]
 
 
 class Gather:
-    """The state of a sheet in the memory of a GPU, and its kernels. Methods are those of `sweep.Sweep`."""
+    """The state of a sheet in the memory of a GPU, and its kernels; its arguments are those of `sweep.Sweep`."""
 
-    def __init__(self, s: Structure) -> None:
-        # Which of the two buffers holds u_n.
+    def __init__(
+        self,
+        s: Structure,
+        by_column: NDArray[Any],
+        decay: NDArray[Any],
+        state: tuple[NDArray[Any], NDArray[Any]] | None,
+    ) -> None:
+        self._s = s
+        self._kernels = _kernels(s.code)
+        # Which of the two buffers holds u_n, each within a halo of a row above and below.
         self._now = 0
-        self._fields = _Fields(s)
-        self._advance, self._read = _kernels(s, self._fields)
-        self._start = start_kernel(s, self._fields)
-        # Both buffers hold the sheet, each within its halo.
-        halved = np.pad(np.arange(s.rows, dtype=np.int32), 1, constant_values=-1)
-        self._source = np.concatenate([halved, halved])
+        buffer = np.pad(np.arange(s.rows, dtype=np.int32), 1, constant_values=-1)
+        self._arrays = SheetArrays(s, np.concatenate([buffer, buffer]), by_column, decay, state)
 
     def advance(self, count: int, numbers: tuple[float, ...], table: NDArray[Any]) -> None:
         """Take at most STEPS_PER_LAUNCH steps."""
-        self._advance(self._now, count, *numbers, table)
+        arrays = *self._arrays.u, *self._arrays.d, self._arrays.by_column, self._arrays.decay
+        with our_compilation():
+            self._kernels.advance(self._now, count, self._s.rows, self._s.cols, *numbers, table, *arrays)
         self._now = (self._now + count) % 2
 
     def read(self, spacing: tuple[float, float], out: Readings) -> None:
         """Copy what is asked for, and measure every row."""
-        self._read(self._now, *spacing, *out)
-
-    def start(self, by_column: NDArray[Any], decay: NDArray[Any], *state: Any) -> None:
-        """Put the sheet where it begins."""
-        self._start(by_column, decay, self._source, *state)
-
-    def close(self) -> None:
-        """Free the fields."""
-        self._fields.close()
+        s, arrays = self._s, self._arrays
+        with our_compilation():
+            self._kernels.read(self._now, s.rows, s.cols, *spacing, *out, *arrays.u, *arrays.d, arrays.by_column)
 
 
-def _kernels(s: Structure, fields: _Fields) -> tuple[Any, Any]:
-    """Compile the step and the read-out for one structure."""
-    real = getattr(ti, s.precision)
-    rows, cols = s.rows, s.cols
-    structural_springs, shear_springs, columns = s.structural, s.shear, s.load_columns
-    u, d = fields.displacement, fields.difference
-    along, ahead = spring_forces(s, fields)
-    move = point_step(s, fields)
-    strain = strains(s, fields)
+@cache
+def _kernels(code: Code) -> Kernels:
+    """Make the kernels of one code; each is compiled when it is first launched."""
+    real, vector, columns = code.real, code.vector, code.load_columns
+    structural_springs, shear_springs, open_edges = code.structural, code.shear, code.open_edges
+    along, ahead = spring_forces(code)
+    move = point_step(code)
+    strain = strains(code)
 
     @ti.func
-    def by_row(p, q, b, there, dx, up, structural, shear):
+    def apart(u: ti.template(), here, there):
+        return u[0][there] - u[0][here], u[1][there] - u[1][here], u[2][there] - u[2][here]
+
+    @ti.func
+    def by_row(u: ti.template(), by_column: ti.template(), width, p, q, b, there, dx, up, structural, shear):
         """Force on entry b of row p by the row q, which is up above: summed as a sweep does."""
-        force_x, force_y, force_z = ti.Vector.zero(real, 1), ti.Vector.zero(real, 1), ti.Vector.zero(real, 1)
+        force_x, force_y, force_z = vector(0), vector(0), vector(0)
         for right in ti.static((-1, 0, 1)):
             if ti.static(structural_springs if right == 0 else shear_springs):
-                stiffness = shear
-                if ti.static(right == 0):
-                    stiffness = structural
-                x, y, z = ahead(p, q, b, right, dx, up, stiffness, there)
+                stiffness, length, exists = structural, ti.abs(up), vector(1)
+                if ti.static(right != 0):
+                    stiffness, length = shear, ti.sqrt(dx * dx + up * up)
+                if ti.static(right != 0 and open_edges):
+                    exists = by_column[ti.static(HAS_LEFT if right < 0 else HAS_RIGHT) * width + b]
+                x, y, z = apart(u, p * width + b, q * width + b + right)
+                x, y, z = ahead(x, y, z, right, dx, up, length, stiffness, exists * there)
                 force_x += x
                 force_y += y
                 force_z += z
         return force_x, force_y, force_z
 
     @ti.func
-    def step(now, i, b, n, keep, dx, dy, structural, shear, top, loads: ti.template()):
+    def by_right(u: ti.template(), by_column: ti.template(), width, p, b, dx, structural):
+        """Force on entry b of row p by its right neighbour."""
+        exists = vector(1)
+        if ti.static(open_edges):
+            exists = by_column[HAS_RIGHT * width + b]
+        x, y, z = apart(u, p * width + b, p * width + b + 1)
+        return along(x, y, z, dx, structural, exists)
+
+    @ti.func
+    def step(
+        u: ti.template(), d: ti.template(), by_column: ti.template(), decay: ti.template(), loads: ti.template(),
+        now, rows, width, i, b, n, keep, dx, dy, structural, shear, top,
+    ):  # fmt: skip
         """Step point (i, b - 1): now is the buffer of u_n, n the row of the table."""
         p = now * (rows + 2) + i + 1
-        force_x, force_y, force_z = by_row(p, p + 1, b, ti.cast(i < rows - 1, real), dx, -dy, structural, shear)
-        x, y, z = by_row(p, p - 1, b, ti.cast(i > 0, real), dx, dy, structural, shear)
+        below, above = ti.cast(i < rows - 1, real), ti.cast(i > 0, real)
+        force_x, force_y, force_z = by_row(u, by_column, width, p, p + 1, b, below, dx, -dy, structural, shear)
+        x, y, z = by_row(u, by_column, width, p, p - 1, b, above, dx, dy, structural, shear)
         force_x += x
         force_y += y
         force_z += z
         if ti.static(structural_springs):
-            right_x, right_y, right_z = along(p, b, dx, structural)
-            left_x, left_y, left_z = along(p, b - 1, dx, structural)
+            right_x, right_y, right_z = by_right(u, by_column, width, p, b, dx, structural)
+            left_x, left_y, left_z = by_right(u, by_column, width, p, b - 1, dx, structural)
             force_x += right_x - left_x
             force_y += right_y - left_y
             force_z += right_z - left_z
         row = [loads[n, c] for c in ti.static(range(columns))]
-        move(p, (1 - now) * (rows + 2) + i + 1, i, b, force_x, force_y, force_z, keep, dy, top, row)
+        kind = ti.select(i == rows - 1, MOVES + 2, ti.select(i == 0, MOVES, MOVES + 1))
+        move(
+            u, d, by_column, decay, rows, width, (1 - now) * (rows + 2) + i + 1, i, b, kind,
+            u[0][p * width + b], u[1][p * width + b], u[2][p * width + b],
+            force_x, force_y, force_z, keep, dy, top, row,
+        )  # fmt: skip
 
     @ti.kernel
     def advance(
         now: ti.i32,
         count: ti.i32,
+        rows: ti.i32,
+        cols: ti.i32,
         keep: real,
         dx: real,
         dy: real,
@@ -119,35 +149,60 @@ def _kernels(s: Structure, fields: _Fields) -> tuple[Any, Any]:
         shear: real,
         top: real,
         loads: ti.types.ndarray(dtype=real, ndim=2),
+        u_x: ti.types.ndarray(dtype=vector, ndim=1),
+        u_y: ti.types.ndarray(dtype=vector, ndim=1),
+        u_z: ti.types.ndarray(dtype=vector, ndim=1),
+        d_x: ti.types.ndarray(dtype=vector, ndim=1),
+        d_y: ti.types.ndarray(dtype=vector, ndim=1),
+        d_z: ti.types.ndarray(dtype=vector, ndim=1),
+        by_column: ti.types.ndarray(dtype=vector, ndim=1),
+        decay: ti.types.ndarray(dtype=vector, ndim=1),
     ):
         for n in ti.static(range(STEPS_PER_LAUNCH)):
             for i, b in ti.ndrange(rows, (1, cols + 1)):
                 if n < count:
-                    step((now + n) % 2, i, b, n, keep, dx, dy, structural, shear, top, loads)
+                    u = ti.static((u_x, u_y, u_z))
+                    d = ti.static((d_x, d_y, d_z))
+                    step(
+                        u, d, by_column, decay, loads, (now + n) % 2, rows, cols + 2, i, b, n,
+                        keep, dx, dy, structural, shear, top,
+                    )  # fmt: skip
 
     @ti.kernel
     def read(
         now: ti.i32,
+        rows: ti.i32,
+        cols: ti.i32,
         dx: real,
         dy: real,
         differences: ti.i32,
         out: ti.types.ndarray(dtype=real, ndim=3),
         measures: ti.types.ndarray(dtype=real, ndim=2),
+        u_x: ti.types.ndarray(dtype=vector, ndim=1),
+        u_y: ti.types.ndarray(dtype=vector, ndim=1),
+        u_z: ti.types.ndarray(dtype=vector, ndim=1),
+        d_x: ti.types.ndarray(dtype=vector, ndim=1),
+        d_y: ti.types.ndarray(dtype=vector, ndim=1),
+        d_z: ti.types.ndarray(dtype=vector, ndim=1),
+        by_column: ti.types.ndarray(dtype=vector, ndim=1),
     ):
         for i in range(rows):
+            u = ti.static((u_x, u_y, u_z))
+            d = ti.static((d_x, d_y, d_z))
+            width = cols + 2
             p = now * (rows + 2) + i + 1
             found = ti.Vector.zero(real, MEASURES)
             for b in range(1, cols + 1):
-                least, along, down, diagonal = strain(p, p + 1, b, dx, dy, i < rows - 1)
+                least, along, down, diagonal = strain(u, by_column, width, p, p + 1, b, dx, dy, i < rows - 1)
                 found[0] = ti.min(found[0], least[0])
                 found[1] += along[0]
                 found[2] += down[0]
                 found[3] += diagonal[0]
                 for c in ti.static(range(3)):
-                    change = d[c][i, b][0]
+                    change = d[c][i * width + b][0]
                     found[4] += change * change
-                    out[i, b - 1, c] = ti.select(differences, change, u[c][p, b][0])
+                    out[i, b - 1, c] = ti.select(differences, change, u[c][p * width + b][0])
             for m in ti.static(range(MEASURES)):
                 measures[i, m] = found[m]
 
-    return advance, read
+    return Kernels(advance, read)

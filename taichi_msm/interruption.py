@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import os
 import signal
+from contextlib import suppress
 from types import FrameType
 
 SIGNALS = (signal.SIGINT, signal.SIGTERM)
@@ -41,8 +42,7 @@ class Interruption:
     def _request(self, number: int, _frame: FrameType | None) -> None:
         self.code = _code(number)
         if self._requested:
-            os.write(2, b"interrupted twice; ended at once\n")
-            os._exit(self.code)
+            _end(self.code, b"interrupted twice; ended at once\n")
         self._requested = True
 
 
@@ -53,8 +53,13 @@ def leave_at_once() -> None:
 
 
 def _leave(number: int, _frame: FrameType | None) -> None:
-    os.write(2, b"interrupted; nothing was written\n")
-    os._exit(_code(number))
+    _end(_code(number), b"interrupted; nothing was written\n")
+
+
+def _end(code: int, message: bytes) -> None:
+    with suppress(OSError):  # nobody can read it
+        os.write(2, message)
+    os._exit(code)
 
 
 def _code(number: int) -> int:

@@ -16,6 +16,7 @@ from taichi_msm import camera, stability
 from taichi_msm.accuracy import Estimate
 from taichi_msm.errors import DamagedError, FilesError
 from taichi_msm.publication import CHECKPOINT, PLAN, STAGING, open_checkpoint
+from taichi_msm.runtime import ARCHS
 from taichi_msm.scene import Scene
 from taichi_msm.sealed import unseal
 from taichi_msm.texture import load_texture
@@ -102,7 +103,9 @@ def read_plan(directory: Path) -> Plan:
     except ValueError:  # pydantic's too
         raise DamagedError(f"{path} is damaged; run the scene again") from None
     # Anybody may have written it.
-    if [*stability.problems(plan.scene), *camera.problems(plan.scene)]:
+    numbers = () if plan.estimate is None else asdict(plan.estimate).values()
+    possible = plan.arch in ARCHS and all(number >= 0 for number in numbers)
+    if not possible or [*stability.problems(plan.scene), *camera.problems(plan.scene)]:
         raise DamagedError(f"{path} is of no scene that can be run; run another")
     return plan
 

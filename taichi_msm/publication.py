@@ -40,6 +40,9 @@ CHECKPOINT_TREE: Tree = dict.fromkeys((PLAN, POSITIONS, re.escape(STATE), DRAFT)
 NEW_TREE: Tree = {FRAMES: {r"[0-9]{4,}\.png": None}, **dict.fromkeys((ANIMATION, TRAJECTORY, RECORD))}
 STAGING_TREE: Tree = {**dict.fromkeys((LOCK, MARKER, DRAFT)), NEW: NEW_TREE, CHECKPOINT: CHECKPOINT_TREE}
 
+# How often a directory is tried that other runs are leaving; after that it is itself gone.
+ATTEMPTS = 100
+
 # A record of so many frames that no disk holds them is smaller [bytes].
 MAX_RECORD = 1 << 28
 
@@ -128,7 +131,11 @@ class Publication:
                     raise FilesError(f"{self.staged.path / name} was taken away while the run worked; run it again")
         earlier = self._earlier()
         self._require_free(names, earlier)
-        self.staging.write(MARKER, seal({"names": sorted(names), "earlier": sorted(earlier)}), DRAFT)
+        with ExitStack() as opened:
+            here = _Files(self._here, opened)
+            # So that nobody can make up a marker by which the user's files would go.
+            known = {name: here.identity(name) for name in sorted(earlier)}
+        self.staging.write(MARKER, seal({"names": sorted(names), "earlier": known}), DRAFT)
         self._complete()
 
     def __enter__(self) -> Publication:
@@ -188,10 +195,11 @@ class Publication:
             with self.staging.open(MARKER) as file:
                 marker = unseal(file.read(MAX_RECORD))
             # Anybody may have written it.
-            names, earlier = ([name for name in marker[key] if is_result(name)] for key in ("names", "earlier"))
+            names = [name for name in marker["names"] if is_result(name)]
+            known = {name: identity for name, identity in marker["earlier"].items() if is_result(name)}
         except FileNotFoundError:
             return
-        except (ValueError, KeyError, TypeError):
+        except (ValueError, KeyError, TypeError, AttributeError):
             message = f"{self.staging.path / MARKER} is damaged; remove {self.staging.path} and run the scene again"
             raise DamagedError(message) from None
         if self.staging.kind(NEW) is None:
@@ -202,6 +210,7 @@ class Publication:
             left = [name for name in names if staged.kind(name) is not None]
             if RECORD not in left:
                 return  # It comes last, so all is done.
+            earlier = [name for name, identity in known.items() if here.identity(name) == identity]
             self._require_free(left, earlier)
             here.remove(RECORD)
             for name in left:
@@ -225,7 +234,7 @@ class Publication:
 
     def _acquire(self, opened: ExitStack) -> None:
         """Make the staging directory and lock it. The lock dies with the processes that hold it."""
-        while True:
+        for _ in range(ATTEMPTS):
             # A run that ends just now may remove what we open, or have removed it when we have its lock.
             with suppress(FileNotFoundError), ExitStack() as tried:
                 self.staging = tried.enter_context(self._here.folder(STAGING, create=True))
@@ -241,6 +250,7 @@ class Publication:
                     tried.callback(self._remove_lock)
                 opened.push(tried.pop_all())
                 return
+        raise FileNotFoundError(errno.ENOENT, os.strerror(errno.ENOENT))
 
     def _remove_lock(self) -> None:
         with suppress(OSError, FilesError):
@@ -278,6 +288,11 @@ class _Files:
         """Say what is there."""
         folder, _, file = name.rpartition("/")
         return self._folders[folder].kind(file) if self.has_folder(folder) else None
+
+    def identity(self, name: str) -> list[int] | None:
+        """Tell a file from any other that may come in its place."""
+        folder, _, file = name.rpartition("/")
+        return self._folders[folder].identity(file) if self.has_folder(folder) else None
 
     def remove(self, name: str) -> None:
         """Remove a file, if it is there."""

@@ -207,6 +207,7 @@ def _carry_out(
                 picture = simulation.draw(positions=position) if scene.draws else None
                 watch.lap("render")
                 writer.add(position, picture, partial(progress, "frames", frame, frames))
+            writer.finish(partial(progress, "frames", frames, frames))
         except KeyboardInterrupt:
             # Who interrupts elsewhere than in `progress` may do so before the last frame is stored.
             if simulation.steps > 0 and simulation.frame < writer.stored:

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import contextlib
 import errno
-import gc
 import io
 import os
 import tempfile
 import threading
 import time
 import weakref
+from collections import defaultdict
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -23,10 +23,11 @@ __all__ = [
     "ARCHS",
     "ITERATIONS_PER_THREAD",
     "Device",
-    "FieldTree",
+    "Memory",
     "available_threads",
+    "lanes",
     "open_window",
-    "quick_compilation",
+    "our_compilation",
     "require_here",
     "start",
     "started",
@@ -43,19 +44,21 @@ if not os.environ.get("HOME"):
 os.environ.setdefault("ENABLE_TAICHI_HEADER_PRINT", "0")
 os.environ.setdefault("TI_SKIP_VERSION_CHECK", "ON")
 
+import numpy as np
 import taichi as ti
 from taichi.lang.ast.ast_transformer_utils import ASTTransformerContext
 
-if "TAICHI_MSM_TRACEBACK" not in os.environ:
-    # For every node of a kernel Taichi prepares the source line that an error in it would show: a third of a warm
-    # compilation. Only who changes a kernel misses it.
-    ASTTransformerContext.get_pos_info = lambda self, node: ""
+_core: Any = getattr(np, "_core", None) or np.core  # NumPy 2, or 1
+_features: dict[str, bool] = _core._multiarray_umath.__cpu_features__
 
 ARCHS = ("cpu", "cuda")
 
 # A lock on Taichi's cache that is older than this was left by a process that was killed [s].
 STALE_LOCK = 60.0
 
+
+# The widest vectors of a processor, by what NumPy calls them.
+VECTOR_BITS = {"AVX512F": 512, "AVX2": 256}
 
 # What the kernels of a run may take in the cache: files, and bytes.
 CACHE_FILES, CACHE_BYTES = 64, 1 << 24
@@ -80,63 +83,44 @@ class Device:
     threads: int
 
 
-class FieldTree:
-    """Fields that are allocated together and can be freed; those of one that is dropped are, some time later.
-
-    Raises:
-        MsmError: when there are as many as Taichi has room for.
-    """
+class Memory:
+    """Arrays of Taichi's. When this is dropped they are used again, as Taichi frees none on a CPU."""
 
     def __init__(self) -> None:
-        require_here()
-        if len(_trees) == MOST_TREES:
-            # They may be in circles of objects that nobody holds.
-            gc.collect()
-        while _dropped:
-            _destroy(_dropped.pop())
-        if len(_trees) == MOST_TREES:
-            raise MsmError(
-                f"{MOST_TREES} sheets and pictures are open, and Taichi has room for no more; close simulations that "
-                "you no longer need, or use each in a with statement"
-            )
-        self._builder = ti.FieldsBuilder()
-        self._tree: Any = None
-        self._drop: weakref.finalize[Any, Any] | None = None
+        self._taken: list[tuple[tuple[str, int], Any]] = []
+        weakref.finalize(self, _give_back, self._taken)
 
-    def place(self, field: Any, *shape: int) -> Any:
-        """Give a field its shape; returns the field."""
-        self._builder.dense((ti.i, ti.ij, ti.ijk)[len(shape) - 1], shape).place(field)
-        return field
+    def array(self, precision: str, lanes: int, length: int) -> Any:
+        """Take a one-dimensional array, or a longer one, of whatever was in it.
 
-    def allocate(self) -> None:
-        """Make the memory of all fields placed, filled with zeros."""
-        self._tree = self._builder.finalize()
-        _trees.add(self._tree)
-        # Taichi looks at new fields before the next kernel, and crashes if they are freed by then.
-        ti.lang.impl.get_runtime().materialize()
-        # Objects are dropped at any time, such as within a launch: the next allocation frees them.
-        self._drop = weakref.finalize(self, _dropped.append, self._tree)
-
-    def close(self) -> None:
-        """Free the memory. Kernels that use it must not be called again."""
-        if self._drop is not None and self._drop.detach() is not None:
-            _destroy(self._tree)
+        Args:
+            precision: f32 or f64.
+            lanes: numbers of a vector; 0: plain numbers.
+            length: of the array, at least.
+        """
+        kind = precision, lanes
+        fitting = [array for array in _free[kind] if array.shape[0] >= length]
+        if fitting:
+            array = min(fitting, key=lambda one: one.shape[0])
+            _free[kind] = [one for one in _free[kind] if one is not array]
+        else:
+            real = getattr(ti, precision)
+            array = ti.ndarray(ti.types.vector(lanes, real) if lanes else real, length)
+        self._taken.append((kind, array))
+        return array
 
 
-# Taichi has a table of 512, and reads beyond its end.
-MOST_TREES = 500
+_free: dict[tuple[str, int], list[Any]] = defaultdict(list)
 
-_trees: set[Any] = set()
-_dropped: list[Any] = []
+
+def _give_back(taken: list[tuple[tuple[str, int], Any]]) -> None:
+    for kind, array in taken:
+        _free[kind].append(array)
+
 
 _device: Device | None = None
 # The process and the thread that started Taichi.
 _home = (0, 0)
-
-
-def _destroy(tree: Any) -> None:
-    _trees.remove(tree)
-    tree.destroy()
 
 
 def available_threads() -> int:
@@ -146,6 +130,18 @@ def available_threads() -> int:
         quota, period = Path("/sys/fs/cgroup/cpu.max").read_text().split()
         cores = min(cores, max(1, int(quota) // int(period)))
     return cores
+
+
+def lanes(precision: str) -> int:
+    """Tell how many numbers a vector register of the processor holds; one on a GPU, where every point is a thread.
+
+    Args:
+        precision: f32 or f64.
+    """
+    if started().arch != "cpu":
+        return 1
+    wide = next((bits for feature, bits in VECTOR_BITS.items() if _features.get(feature)), 128)
+    return wide // (32 if precision == "f32" else 64)
 
 
 def started() -> Device:
@@ -220,14 +216,38 @@ def open_window(title: str, size: tuple[int, int]) -> Any:
 
 
 @contextlib.contextmanager
-def quick_compilation() -> Iterator[None]:
-    """Launch a kernel, always the same way, whose compilation leaves to LLVM what Taichi would optimise before it."""
-    config = ti.lang.impl.current_cfg()
-    found, config.advanced_optimization = config.advanced_optimization, False
+def our_compilation(*, optimised: bool = True, vectors: bool = True) -> Iterator[None]:
+    """Launch kernels of this package, which are compiled otherwise than a user's own in the same process.
+
+    Every operation rounds as IEEE 754 says, so that the bits of a result do not depend on threads, lanes or the
+    compiler's mood; on a CPU vectors stay vectors (docs/decisions/0010); and Taichi's optimisation of control flow,
+    which takes half of the time of compiling for what LLVM does again, is left out.
+
+    Args:
+        optimised: False leaves all to LLVM that Taichi would optimise before it. A kernel is launched always alike.
+        vectors: whether they stay vectors.
+    """
+    config, found = ti.lang.impl.current_cfg(), {}
+    wanted = {
+        "fast_math": False,
+        "cfg_optimization": False,
+        "advanced_optimization": optimised,
+        "real_matrix_scalarize": started().arch != "cpu" or not vectors,
+    }
+    for name, value in wanted.items():
+        found[name] = getattr(config, name)
+        setattr(config, name, value)
+    position = ASTTransformerContext.get_pos_info
+    if "TAICHI_MSM_TRACEBACK" not in os.environ:
+        # For every node of a kernel Taichi prepares the source line that an error in it would show: a third of a warm
+        # compilation. Only who changes a kernel misses it.
+        ASTTransformerContext.get_pos_info = lambda self, node: ""
     try:
         yield
     finally:
-        config.advanced_optimization = found
+        ASTTransformerContext.get_pos_info = position
+        for name, value in found.items():
+            setattr(config, name, value)
 
 
 def _cache() -> dict[str, Any]:
@@ -305,8 +325,6 @@ def _initialise(device: Device) -> None:
                 cpu_max_num_threads=device.threads,
                 enable_fallback=False,
                 **cache,
-                fast_math=False,
-                cfg_optimization=False,
                 # No warning of loops over the samples of a pixel.
                 unrolling_limit=0,
                 log_level=ti.ERROR,

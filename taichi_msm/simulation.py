@@ -38,7 +38,7 @@ class Simulation:
 
     Raises:
         MsmError: here and in all methods, in another thread than that of the first simulation, or in a process that
-            was forked after it; and here when some 250 simulations have been left open.
+            was forked after it.
         DeviceError: when the arch is not there, or Taichi already runs on another one in this process.
         SceneError: when no step meets the scene's tolerance.
 
@@ -191,8 +191,7 @@ class Simulation:
         runtime.require_here()
         self._closed = True
         self._dynamics.close()
-        if self._drawing is not None:
-            self._drawing.close()
+        self._drawing = None
 
     def __enter__(self) -> Simulation:
         return self

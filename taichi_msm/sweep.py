@@ -15,19 +15,38 @@ Bands. Every worker has a band of rows. Neighbours sweep away from their common 
 there at the same time. There each needs the other's row as it was before the step: both put it, after every step, into
 one of two copies, and wait for the other's. The order in which forces are added does not depend on the way of a sweep;
 so the bits of a result do not depend on the number of workers.
+
+Company. A worker that waits spins, for some time at most: its partner may have no core, as another program has it. Then
+it writes down where it is and ends, which gives its core away, and another launch goes on from there. Where that
+happens again and again, a single worker takes over for some time.
 """
 
 # No `from __future__ import annotations` here: Taichi reads the annotations of a kernel.
 
-from typing import Any
+import time
+from collections.abc import Callable
+from functools import cache
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from taichi_msm.forces import BYTES, Readings, SheetFields, Structure, point_step, spring_forces, start_kernel, strains
-from taichi_msm.runtime import ITERATIONS_PER_THREAD, ti
+from taichi_msm.forces import (
+    BYTES,
+    HAS_LEFT,
+    HAS_RIGHT,
+    MOVES,
+    Code,
+    Readings,
+    SheetArrays,
+    Structure,
+    point_step,
+    spring_forces,
+    strains,
+)
+from taichi_msm.runtime import ITERATIONS_PER_THREAD, our_compilation, ti
 
-# Integers between the progress counters of two workers, so that each has a cache line of its own.
+# Integers between the counters of two workers, so that each has a cache line of its own.
 COUNTER_STRIDE = 16
 
 # Bytes of a page.
@@ -36,63 +55,79 @@ PAGE = 4096
 # The borders of a band: where its worker begins and where it ends.
 BEGIN, END = 0, 1
 
+# A worker looks so often whether its partner is there: some 0.2 ms.
+PATIENCE = 40_000
 
-class _Fields(SheetFields):
-    """The fields of a sheet that is swept."""
+# A launch in which workers gave up more often than this had company.
+FEW_LAUNCHES = 1
 
-    def __init__(self, s: Structure) -> None:
-        # Below the sheet's rows, for every worker and border, the two copies.
-        super().__init__(s, s.rows + 4 * s.workers)
-        # For every worker and step of a pass the forces of the row behind, with the sign of the force on that row.
-        self.behind = [self.vector(s.workers * _slots(s), s.strip + 2) for _ in range(3)]
-        # The number of steps that each border of each worker has done.
-        self.done = self.place(ti.field(ti.i64), 2 * s.workers * COUNTER_STRIDE)
-        self.allocate()
+# Then a single worker steps for some time [s], the longer the more often it happens.
+SHORTEST_REST, LONGEST_REST = 0.002, 1.0
 
-
-def _slots(s: Structure) -> int:
-    """Rows of `behind` that a worker has: its steps, then a page, over which one core's prefetcher does not reach."""
-    row_bytes = (s.strip + 2) * s.lanes * BYTES[s.precision]
-    return s.depth - (-PAGE // row_bytes)
+# Where a worker is: pass, round and step of the round.
+PLACE = 3
 
 
-def _source(s: Structure) -> NDArray[np.int32]:
-    """Tell which row of the sheet every stored row holds: below the sheet's own, the copies at the bands' borders."""
-    rows = list(range(s.rows))
-    first, end = _stepped(s)
-    for worker in range(s.workers):
-        low, high = (first + (end - first) * n // s.workers for n in (worker, worker + 1))
-        borders = (low, high - 1) if worker % 2 else (high - 1, low)
-        rows += [row for row in borders for _ in range(2)]
-    return np.array(rows, np.int32)
+class Kernels(NamedTuple):
+    """The kernels of one code."""
 
-
-def _stepped(s: Structure) -> tuple[int, int]:
-    """Give the first row that is stepped and the one after the last."""
-    return int(s.fixed_rows[0]), s.rows - int(s.fixed_rows[1])
+    advance_alone: Callable[..., None]
+    advance_together: Callable[..., None]
+    read_alone: Callable[..., None]
+    read_together: Callable[..., None]
+    copy: Callable[..., None]
 
 
 class Sweep:
-    """The state of a sheet in the memory of a CPU, and its kernels."""
+    """The state of a sheet in the memory of a CPU, and its kernels.
 
-    def __init__(self, s: Structure) -> None:
-        # Of this sheet, also before it was put at rest: the workers' counters go on.
+    Args:
+        s: how it lies in memory.
+        by_column: what the array of that name holds, shape (6, cols).
+        decay: likewise, shape (standing grips, rows, cols).
+        state: displacements and differences to begin with, each of shape (rows, cols, 3); None: at rest.
+    """
+
+    def __init__(
+        self,
+        s: Structure,
+        by_column: NDArray[Any],
+        decay: NDArray[Any],
+        state: tuple[NDArray[Any], NDArray[Any]] | None,
+    ) -> None:
+        self._s = s
+        self._kernels = _kernels(s.code)
         self._steps = 0
-        self._fields = _Fields(s)
-        self._advance, self._read = _kernels(s, self._fields)
-        self._start = start_kernel(s, self._fields)
-        self._source = _source(s)
+        self._rest, self._rests_until = SHORTEST_REST, 0.0
+        self._first_row, self._end_row = int(s.fixed_rows[0]), s.rows - int(s.fixed_rows[1])
+        # Below the sheet's rows, for every worker and border, the two copies.
+        self._borders = self._border_rows()
+        stored = np.concatenate([np.arange(s.rows, dtype=np.int32), self._borders])
+        self._arrays = SheetArrays(s, stored, by_column, decay, state)
+        # Rows of `behind` that a worker has: its steps, then a page, over which one core's prefetcher does not reach.
+        self._slots = s.depth - (-PAGE // (s.width * s.code.lanes * BYTES[s.code.precision]))
+        # For every worker and step of a pass the forces of the row behind, with the sign of the force on that row.
+        self._behind = [self._arrays.rows(s.workers * self._slots) for _ in range(3)]
+        # The number of steps that each border of each worker has done.
+        self._done = np.zeros(2 * s.workers * COUNTER_STRIDE, np.int64)
 
     def advance(self, count: int, numbers: tuple[float, ...], table: NDArray[Any]) -> None:
-        """Take a number of steps in one launch.
+        """Take a number of steps.
 
         Args:
             count: how many.
             numbers: keep, dx, dy, stiffness of structural and shear springs, y of the first row.
             table: of the loads, shape (count, columns).
         """
-        self._advance(self._steps, count, *numbers, table)
-        self._steps += count
+        done = 0
+        if self._s.workers > 1 and time.perf_counter() >= self._rests_until:
+            done = self._advance_together(count, numbers, table)
+        if done < count:
+            self._launch(self._kernels.advance_alone, 1, done, count - done, numbers, table, np.array([0, -1, 0]))
+            if self._s.workers > 1:
+                with our_compilation():
+                    self._kernels.copy(*self._arrays.u, self._borders, self._s.rows, self._s.width)
+                self._done[:] = self._steps
 
     def read(self, spacing: tuple[float, float], out: Readings) -> None:
         """Copy what is asked for, and measure every row.
@@ -101,130 +136,230 @@ class Sweep:
             spacing: dx and dy.
             out: what is filled.
         """
-        self._read(*spacing, *out)
+        s, arrays = self._s, self._arrays
+        read = self._kernels.read_together if s.workers > 1 else self._kernels.read_alone
+        with our_compilation():
+            read(*arrays.u, *arrays.d, arrays.by_column, s.rows, s.cols, s.strip, *spacing, *out)
 
-    def start(self, by_column: NDArray[Any], decay: NDArray[Any], *state: Any) -> None:
-        """Put the sheet where it begins; the arguments are those of `forces.start_kernel`, without the stored rows."""
-        self._start(by_column, decay, self._source, *state)
+    def _advance_together(self, count: int, numbers: tuple[float, ...], table: NDArray[Any]) -> int:
+        """Take steps with all workers; gives how many, which are fewer when there is company."""
+        s, wanted = self._s, count
+        places = np.tile(np.array([0, -1, 0]), s.workers)
+        first = self._steps
+        for launches in range(1, 10**9):
+            self._steps = first
+            self._launch(self._kernels.advance_together, s.workers, 0, count, numbers, table, places)
+            passes, rounds = places[::PLACE], places[1::PLACE]
+            if (passes * s.depth >= count).all():
+                break
+            if launches == FEW_LAUNCHES:
+                # Meet at the end of the pass that the first of them is in.
+                count = min(count, int((passes + (rounds >= 0)).max()) * s.depth)
+                self._rests_until = time.perf_counter() + self._rest
+                self._rest = min(4 * self._rest, LONGEST_REST)
+        if count == wanted:
+            self._rest = max(self._rest / 2, SHORTEST_REST)
+        return count
 
-    def close(self) -> None:
-        """Free the fields."""
-        self._fields.close()
+    def _launch(
+        self,
+        kernel: Callable[..., None],
+        workers: int,
+        done: int,
+        count: int,
+        numbers: tuple[float, ...],
+        table: NDArray[Any],
+        places: NDArray[np.int64],
+    ) -> None:
+        s, arrays = self._s, self._arrays
+        with our_compilation():
+            kernel(
+                self._steps, count, workers, s.depth, self._slots, s.rows, s.strip, self._first_row, self._end_row,
+                PATIENCE, *numbers, table[done:],
+                *arrays.u, *arrays.d, *self._behind, arrays.by_column, arrays.decay, self._done, places,
+            )  # fmt: skip
+        self._steps += count
+
+    def _border_rows(self) -> NDArray[np.int32]:
+        """Tell which row of the sheet every copy at a border of a band is of."""
+        rows: list[int] = []
+        first, end, workers = self._first_row, self._end_row, self._s.workers
+        for worker in range(workers):
+            low, high = (first + (end - first) * n // workers for n in (worker, worker + 1))
+            borders = (low, high - 1) if worker % 2 else (high - 1, low)
+            rows += [row for row in borders for _ in range(2)]
+        return np.array(rows, np.int32)
 
 
-def _kernels(s: Structure, fields: _Fields) -> tuple[Any, Any]:
-    """Compile the step and the read-out for one structure."""
-    real = getattr(ti, s.precision)
-    rows, cols, lanes, strip, workers, depth = s.rows, s.cols, s.lanes, s.strip, s.workers, s.depth
-    structural_springs, shear_springs, columns = s.structural, s.shear, s.load_columns
-    slots = _slots(s)
-    first_row, end_row = _stepped(s)
-    u, d, behind, done = fields.displacement, fields.difference, fields.behind, fields.done
-    along, ahead = spring_forces(s, fields)
-    move = point_step(s, fields)
-    strain = strains(s, fields)
+@cache
+def _kernels(code: Code) -> Kernels:
+    """Make the kernels of one code; each is compiled when it is first launched."""
+    return Kernels(
+        _advance(code, parallel=False),
+        _advance(code, parallel=True),
+        _read(code, parallel=False),
+        _read(code, parallel=True),
+        _copy(code),
+    )
+
+
+def _advance(code: Code, *, parallel: bool) -> Callable[..., None]:
+    """Make the kernel that takes steps, by one worker or several."""
+    real, vector, lanes, columns = code.real, code.vector, code.lanes, code.load_columns
+    structural_springs, shear_springs, open_edges = code.structural, code.shear, code.open_edges
+    along, ahead = spring_forces(code)
+    move = point_step(code)
 
     @ti.func
-    def sweep_row(p, q, there, i, slot, n, moving, keep, dx, dy, structural, shear, top, up, loads: ti.template()):
+    def sweep_row(
+        u: ti.template(), d: ti.template(), behind: ti.template(), by_column: ti.template(), decay: ti.template(),
+        loads: ti.template(), rows, strip, p, q, there, i, kind, slot, n, moving,
+        keep, dx, dy, structural, shear, top, up,
+    ):  # fmt: skip
         """Sweep row i of the sheet, stored in row p, with row q ahead, which is up above; it is stepped if it moves."""
-        zero = ti.Vector.zero(real, lanes)
+        width = strip + 2
+        diagonal = ti.sqrt(dx * dx + dy * dy)
+        # Displacements of the entry, in its row and in the row ahead, of the one before it and the one after it.
+        here_x, here_y, here_z = u[0][p * width + 0], u[1][p * width + 0], u[2][p * width + 0]
+        next_x, next_y, next_z = u[0][p * width + 1], u[1][p * width + 1], u[2][p * width + 1]
+        before_x, before_y, before_z = u[0][q * width + 0], u[1][q * width + 0], u[2][q * width + 0]
+        beside_x, beside_y, beside_z = u[0][q * width + 1], u[1][q * width + 1], u[2][q * width + 1]
         # Force by the left neighbour, but for its sign.
-        left_x, left_y, left_z = zero, zero, zero
+        left_x, left_y, left_z = vector(0), vector(0), vector(0)
         # Forces for the row ahead: for the entry before this one, this one and the next one.
-        last_x, last_y, last_z = zero, zero, zero
-        here_x, here_y, here_z = zero, zero, zero
-        next_x, next_y, next_z = zero, zero, zero
+        last_x, last_y, last_z = vector(0), vector(0), vector(0)
+        this_x, this_y, this_z = vector(0), vector(0), vector(0)
+        coming_x, coming_y, coming_z = vector(0), vector(0), vector(0)
+        has_left, has_right = vector(1), vector(1)
+        if ti.static(open_edges):
+            has_right = by_column[HAS_RIGHT * width + 0]
         if ti.static(structural_springs):
-            x, y, z = along(p, 0, dx, structural)
+            x, y, z = along(next_x - here_x, next_y - here_y, next_z - here_z, dx, structural, has_right)
             left_x, left_y, left_z = x, y, z
         if ti.static(shear_springs):
-            x, y, z = ahead(p, q, 0, 1, dx, up, shear, there)
-            next_x, next_y, next_z = x, y, z
-        # Read once: the stores to the fields could change the table, for all that the compiler knows.
+            x, y, z = ahead(
+                beside_x - here_x, beside_y - here_y, beside_z - here_z, 1, dx, up, diagonal, shear, has_right * there
+            )
+            coming_x, coming_y, coming_z = x, y, z
+        # Read once: the stores to the arrays could change the table, for all that the compiler knows.
         now = [loads[n, c] for c in ti.static(range(columns))]
         for b in range(1, strip + 1):
-            force_x, force_y, force_z = zero, zero, zero
-            last_x, last_y, last_z = here_x, here_y, here_z
             here_x, here_y, here_z = next_x, next_y, next_z
+            next_x, next_y, next_z = u[0][p * width + b + 1], u[1][p * width + b + 1], u[2][p * width + b + 1]
+            after_x, after_y, after_z = u[0][q * width + b + 1], u[1][q * width + b + 1], u[2][q * width + b + 1]
+            force_x, force_y, force_z = vector(0), vector(0), vector(0)
+            last_x, last_y, last_z = this_x, this_y, this_z
+            this_x, this_y, this_z = coming_x, coming_y, coming_z
+            if ti.static(open_edges):
+                has_left, has_right = by_column[HAS_LEFT * width + b], by_column[HAS_RIGHT * width + b]
             if ti.static(shear_springs):
-                x, y, z = ahead(p, q, b, -1, dx, up, shear, there)
+                x, y, z = ahead(
+                    before_x - here_x, before_y - here_y, before_z - here_z,
+                    -1, dx, up, diagonal, shear, has_left * there,
+                )  # fmt: skip
                 force_x, force_y, force_z = x, y, z
                 last_x += x
                 last_y += y
                 last_z += z
             if ti.static(structural_springs):
-                x, y, z = ahead(p, q, b, 0, dx, up, structural, there)
+                x, y, z = ahead(
+                    beside_x - here_x, beside_y - here_y, beside_z - here_z,
+                    0, dx, up, ti.abs(up), structural, there,
+                )  # fmt: skip
                 force_x += x
                 force_y += y
                 force_z += z
-                here_x += x
-                here_y += y
-                here_z += z
+                this_x += x
+                this_y += y
+                this_z += z
             if ti.static(shear_springs):
-                x, y, z = ahead(p, q, b, 1, dx, up, shear, there)
+                x, y, z = ahead(
+                    after_x - here_x, after_y - here_y, after_z - here_z, 1, dx, up, diagonal, shear, has_right * there
+                )
                 force_x += x
                 force_y += y
                 force_z += z
-                next_x, next_y, next_z = x, y, z
-            force_x -= behind[0][slot, b]
-            force_y -= behind[1][slot, b]
-            force_z -= behind[2][slot, b]
+                coming_x, coming_y, coming_z = x, y, z
+            force_x = force_x - behind[0][slot * width + b]
+            force_y = force_y - behind[1][slot * width + b]
+            force_z = force_z - behind[2][slot * width + b]
             if ti.static(structural_springs):
-                x, y, z = along(p, b, dx, structural)
+                x, y, z = along(next_x - here_x, next_y - here_y, next_z - here_z, dx, structural, has_right)
                 force_x += x - left_x
                 force_y += y - left_y
                 force_z += z - left_z
                 left_x, left_y, left_z = x, y, z
             # What was there has been read when b was one less.
-            behind[0][slot, b - 1] = last_x
-            behind[1][slot, b - 1] = last_y
-            behind[2][slot, b - 1] = last_z
+            behind[0][slot * width + b - 1] = last_x
+            behind[1][slot * width + b - 1] = last_y
+            behind[2][slot * width + b - 1] = last_z
             if moving:
-                move(p, p, i, b, force_x, force_y, force_z, keep, dy, top, now)
+                move(
+                    u, d, by_column, decay, rows, width, p, i, b, kind, here_x, here_y, here_z,
+                    force_x, force_y, force_z, keep, dy, top, now,
+                )  # fmt: skip
+            before_x, before_y, before_z = beside_x, beside_y, beside_z
+            beside_x, beside_y, beside_z = after_x, after_y, after_z
         if ti.static(shear_springs):
-            x, y, z = ahead(p, q, strip + 1, -1, dx, up, shear, there)
-            here_x += x
-            here_y += y
-            here_z += z
-        behind[0][slot, strip] = here_x
-        behind[1][slot, strip] = here_y
-        behind[2][slot, strip] = here_z
+            if ti.static(open_edges):
+                has_left = by_column[HAS_LEFT * width + strip + 1]
+            x, y, z = ahead(
+                before_x - next_x, before_y - next_y, before_z - next_z, -1, dx, up, diagonal, shear, has_left * there
+            )
+            this_x += x
+            this_y += y
+            this_z += z
+        behind[0][slot * width + strip] = this_x
+        behind[1][slot * width + strip] = this_y
+        behind[2][slot * width + strip] = this_z
 
     @ti.func
-    def join_strips(p):
+    def join_strips(u: ti.template(), p, strip):
         """Fill the halo of row p: beside the first column of a strip is the last one of the strip before."""
+        width = strip + 2
         for c in ti.static(range(3)):
-            last = u[c][p, strip]
-            first = u[c][p, 1]
-            for lane in ti.static(range(lanes)):
-                u[c][p, 0][lane] = last[(lane - 1) % lanes]
-                u[c][p, strip + 1][lane] = first[(lane + 1) % lanes]
+            last = u[c][p * width + strip]
+            first = u[c][p * width + 1]
+            u[c][p * width + 0] = vector([last[(lane - 1) % lanes] for lane in ti.static(range(lanes))])
+            u[c][p * width + strip + 1] = vector([first[(lane + 1) % lanes] for lane in ti.static(range(lanes))])
 
     @ti.func
-    def copy_row(worker, border, n):
+    def copy_row(rows, worker, border, n):
         """Where a worker keeps the row at a border after n steps."""
         return rows + 4 * worker + 2 * border + ti.cast(n % 2, ti.i32)
 
     @ti.func
-    def wait(worker, border, n):
-        """Wait until a worker has taken n steps at a border; gives the row where the result is."""
-        while ti.atomic_add(done[(2 * worker + border) * COUNTER_STRIDE], 0) < n:
-            pass
-        return copy_row(worker, border, n)
+    def has_come(done: ti.template(), worker, border, n, patience):
+        """Wait until a worker has taken n steps at a border, but not for long; tells whether it has."""
+        steps = ti.atomic_add(done[(2 * worker + border) * COUNTER_STRIDE], 0)
+        looks = 0
+        while steps < n and looks < patience:
+            steps = ti.atomic_add(done[(2 * worker + border) * COUNTER_STRIDE], 0)
+            looks += 1
+        return steps >= n
 
     @ti.func
-    def publish(worker, border, i, n):
+    def publish(u: ti.template(), done: ti.template(), rows, strip, worker, border, i, n):
         """Let the neighbour at a border have row i after n steps."""
-        copy = copy_row(worker, border, n)
-        for b in range(strip + 2):
+        width = strip + 2
+        copy = copy_row(rows, worker, border, n)
+        for b in range(width):
             for c in ti.static(range(3)):
-                u[c][copy, b] = u[c][i, b]
+                u[c][copy * width + b] = u[c][i * width + b]
         ti.atomic_add(done[(2 * worker + border) * COUNTER_STRIDE], 1)
 
     @ti.kernel
     def advance(
         first: ti.i64,
         count: ti.i32,
+        workers: ti.i32,
+        depth: ti.i32,
+        slots: ti.i32,
+        rows: ti.i32,
+        strip: ti.i32,
+        first_row: ti.i32,
+        end_row: ti.i32,
+        patience: ti.i32,
         keep: real,
         dx: real,
         dy: real,
@@ -232,11 +367,28 @@ def _kernels(s: Structure, fields: _Fields) -> tuple[Any, Any]:
         shear: real,
         top: real,
         loads: ti.types.ndarray(dtype=real, ndim=2),
+        u_x: ti.types.ndarray(dtype=vector, ndim=1),
+        u_y: ti.types.ndarray(dtype=vector, ndim=1),
+        u_z: ti.types.ndarray(dtype=vector, ndim=1),
+        d_x: ti.types.ndarray(dtype=vector, ndim=1),
+        d_y: ti.types.ndarray(dtype=vector, ndim=1),
+        d_z: ti.types.ndarray(dtype=vector, ndim=1),
+        behind_x: ti.types.ndarray(dtype=vector, ndim=1),
+        behind_y: ti.types.ndarray(dtype=vector, ndim=1),
+        behind_z: ti.types.ndarray(dtype=vector, ndim=1),
+        by_column: ti.types.ndarray(dtype=vector, ndim=1),
+        decay: ti.types.ndarray(dtype=vector, ndim=1),
+        done: ti.types.ndarray(dtype=ti.i64, ndim=1),
+        places: ti.types.ndarray(dtype=ti.i64, ndim=1),
     ):
-        ti.loop_config(serialize=workers == 1)
+        ti.loop_config(serialize=not parallel)
         for index in range(workers * ITERATIONS_PER_THREAD):
             # One worker a thread.
             if index % ITERATIONS_PER_THREAD == 0:
+                u = ti.static((u_x, u_y, u_z))
+                d = ti.static((d_x, d_y, d_z))
+                behind = ti.static((behind_x, behind_y, behind_z))
+                width = strip + 2
                 worker = index // ITERATIONS_PER_THREAD
                 low = first_row + (end_row - first_row) * worker // workers
                 high = first_row + (end_row - first_row) * (worker + 1) // workers
@@ -244,11 +396,15 @@ def _kernels(s: Structure, fields: _Fields) -> tuple[Any, Any]:
                 begin = ti.select(way > 0, low, high - 1)
                 neighbour = worker - way
                 far_neighbour = worker + way
-                for turn in range((count + depth - 1) // depth):
+                turn = ti.cast(places[PLACE * worker], ti.i32)
+                k = ti.cast(places[PLACE * worker + 1], ti.i32)
+                step = ti.cast(places[PLACE * worker + 2], ti.i32)
+                goes = True
+                while goes and turn * depth < count:
                     steps = ti.min(depth, count - turn * depth)
                     # Row -1 is the one behind the band, which gives its forces and stays.
-                    for k in range(-1, high - low + steps - 1):
-                        for step in range(ti.max(0, k - (high - low) + 1), ti.min(steps, k + 2)):
+                    while goes and k < high - low + steps - 1:
+                        while goes and step < ti.min(steps, k + 2):
                             row = k - step
                             n = turn * depth + step
                             slot = worker * slots + step
@@ -256,53 +412,88 @@ def _kernels(s: Structure, fields: _Fields) -> tuple[Any, Any]:
                             p = i
                             q = i + way
                             there = ti.cast(0 <= q < rows, real)
-                            if ti.static(workers > 1):
+                            if ti.static(parallel):
                                 if row == -1 and 0 <= neighbour < workers:
-                                    p = wait(neighbour, BEGIN, first + n)
+                                    goes = has_come(done, neighbour, BEGIN, first + n, patience)
+                                    p = copy_row(rows, neighbour, BEGIN, first + n)
                                 if row == high - low - 1 and 0 <= far_neighbour < workers:
-                                    q = wait(far_neighbour, END, first + n)
-                            q = ti.select(there > 0, q, i)
-                            if 0 <= i < rows:
-                                sweep_row(
-                                    p, q, there, i, slot, n, row >= 0,
-                                    keep, dx, dy, structural, shear, top, -way * dy, loads,
-                                )  # fmt: skip
-                            else:
-                                for b in range(1, strip + 1):
-                                    for c in ti.static(range(3)):
-                                        behind[c][slot, b] = ti.Vector.zero(real, lanes)
-                            if row >= 0:
-                                join_strips(i)
-                            if ti.static(workers > 1):
-                                if row == 0:
-                                    publish(worker, BEGIN, i, first + n + 1)
-                                if row == high - low - 1:
-                                    publish(worker, END, i, first + n + 1)
+                                    goes = has_come(done, far_neighbour, END, first + n, patience)
+                                    q = copy_row(rows, far_neighbour, END, first + n)
+                            if goes:
+                                q = ti.select(there > 0, q, i)
+                                if 0 <= i < rows:
+                                    kind = ti.select(i == rows - 1, MOVES + 2, ti.select(i == 0, MOVES, MOVES + 1))
+                                    sweep_row(
+                                        u, d, behind, by_column, decay, loads, rows, strip, p, q, there, i, kind, slot,
+                                        n, row >= 0, keep, dx, dy, structural, shear, top, -way * dy,
+                                    )  # fmt: skip
+                                else:
+                                    for b in range(1, strip + 1):
+                                        for c in ti.static(range(3)):
+                                            behind[c][slot * width + b] = vector(0)
+                                if row >= 0:
+                                    join_strips(u, i, strip)
+                                if ti.static(parallel):
+                                    if row == 0:
+                                        publish(u, done, rows, strip, worker, BEGIN, i, first + n + 1)
+                                    if row == high - low - 1:
+                                        publish(u, done, rows, strip, worker, END, i, first + n + 1)
+                                step += 1
+                        if goes:
+                            k += 1
+                            step = ti.max(0, k - (high - low) + 1)
+                    if goes:
+                        turn += 1
+                        k = -1
+                        step = 0
+                places[PLACE * worker] = turn
+                places[PLACE * worker + 1] = k
+                places[PLACE * worker + 2] = step
+
+    return advance
+
+
+def _read(code: Code, *, parallel: bool) -> Callable[..., None]:
+    """Make the kernel that reads a sheet out, and measures it, by one thread or several."""
+    real, vector, lanes = code.real, code.vector, code.lanes
+    strain = strains(code)
 
     @ti.kernel
     def read(
+        u_x: ti.types.ndarray(dtype=vector, ndim=1),
+        u_y: ti.types.ndarray(dtype=vector, ndim=1),
+        u_z: ti.types.ndarray(dtype=vector, ndim=1),
+        d_x: ti.types.ndarray(dtype=vector, ndim=1),
+        d_y: ti.types.ndarray(dtype=vector, ndim=1),
+        d_z: ti.types.ndarray(dtype=vector, ndim=1),
+        by_column: ti.types.ndarray(dtype=vector, ndim=1),
+        rows: ti.i32,
+        cols: ti.i32,
+        strip: ti.i32,
         dx: real,
         dy: real,
         differences: ti.i32,
         out: ti.types.ndarray(dtype=real, ndim=3),
         measures: ti.types.ndarray(dtype=real, ndim=2),
     ):
-        ti.loop_config(serialize=workers == 1)
+        ti.loop_config(serialize=not parallel)
         for index in range(rows * ITERATIONS_PER_THREAD):
             if index % ITERATIONS_PER_THREAD == 0:
+                u = ti.static((u_x, u_y, u_z))
+                d = ti.static((d_x, d_y, d_z))
+                width = strip + 2
                 i = index // ITERATIONS_PER_THREAD
-                zero = ti.Vector.zero(real, lanes)
-                least, along, down, diagonal, motion = zero, zero, zero, zero, zero
+                least, along, down, diagonal, motion = vector(0), vector(0), vector(0), vector(0), vector(0)
                 for b in range(1, strip + 1):
-                    shortest, right, below, across = strain(i, i + 1, b, dx, dy, i < rows - 1)
+                    shortest, right, below, across = strain(u, by_column, width, i, i + 1, b, dx, dy, i < rows - 1)
                     least = ti.min(least, shortest)
                     along += right
                     down += below
                     diagonal += across
                     for c in ti.static(range(3)):
-                        change = d[c][i, b]
+                        change = d[c][i * width + b]
                         motion += change * change
-                        wanted = ti.select(differences, change, u[c][i, b])
+                        wanted = ti.select(differences, change, u[c][i * width + b])
                         for lane in ti.static(range(lanes)):
                             if lane * strip + b <= cols:
                                 out[i, lane * strip + b - 1, c] = wanted[lane]
@@ -310,4 +501,24 @@ def _kernels(s: Structure, fields: _Fields) -> tuple[Any, Any]:
                 for m, part in ti.static(enumerate((along, down, diagonal, motion))):
                     measures[i, m + 1] = part.sum()
 
-    return advance, read
+    return read
+
+
+def _copy(code: Code) -> Callable[..., None]:
+    """Make the kernel that renews the copies of the rows at the borders of bands."""
+    vector = code.vector
+
+    @ti.kernel
+    def copy(
+        u_x: ti.types.ndarray(dtype=vector, ndim=1),
+        u_y: ti.types.ndarray(dtype=vector, ndim=1),
+        u_z: ti.types.ndarray(dtype=vector, ndim=1),
+        borders: ti.types.ndarray(dtype=ti.i32, ndim=1),
+        rows: ti.i32,
+        width: ti.i32,
+    ):
+        for n, b in ti.ndrange(borders.shape[0], width):
+            for u in ti.static((u_x, u_y, u_z)):
+                u[(rows + n) * width + b] = u[borders[n] * width + b]
+
+    return copy

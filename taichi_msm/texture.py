@@ -28,7 +28,7 @@ _MODES = ("1", "L", "LA", "P", "PA", "RGB", "RGBA", "RGBa", "RGBX", "CMYK", "YCb
 # The longest side of a JPEG. Pillow needs memory and time for every row, and a picture of one column has many.
 MAX_SIDE = 65535
 
-# Every scan of a progressive JPEG goes over all pixels. Encoders make some ten; a few seconds' work may be more.
+# Every scan of a JPEG goes over all pixels. Encoders make some ten; a few seconds' work may be more.
 USUAL_SCANS = 16
 SCANNED_PIXELS = 2 * 10**8
 
@@ -132,7 +132,7 @@ def _open(path: str) -> Iterator[Image.Image]:
                 if max(image.size) > MAX_SIDE:
                     said = f"has {image.width} x {image.height} pixels; a side may have {MAX_SIDE}, cut it"
                     raise _PictureError(f"{path} {said}")
-                if "progressive" in image.info:
+                if image.format in ("JPEG", "MPO"):
                     scans = _scans(path)
                     most = max(USUAL_SCANS, SCANNED_PIXELS // (image.width * image.height))
                     if scans > most:

@@ -1,15 +1,12 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
 from PIL import Image
 
-from taichi_msm import accuracy, runtime, simulation
-from taichi_msm.live import stage
-from tests.pool import Pool
+from taichi_msm import runtime
 from tests.scenes import SMALL, speckle
 
 
@@ -28,23 +25,6 @@ def root() -> Path:
 def own_kernel_cache(tmp_path_factory: pytest.TempPathFactory) -> None:
     """Kernels compiled by the tests, also in child processes, come from this tree and no earlier one."""
     os.environ["TI_OFFLINE_CACHE_FILE_PATH"] = str(tmp_path_factory.mktemp("ticache"))
-
-
-@pytest.fixture(scope="session")
-def sheets() -> Iterator[Pool]:
-    """Compiled sheets for all tests."""
-    sheets = Pool()
-    yield sheets
-    sheets.close()
-
-
-@pytest.fixture
-def pool(sheets: Pool, monkeypatch: pytest.MonkeyPatch) -> Pool:
-    """Compiled sheets and drawings, which pilot runs, simulations and sessions use too."""
-    monkeypatch.setattr(accuracy, "Dynamics", sheets.lend)
-    monkeypatch.setattr(simulation, "Dynamics", sheets.lend)
-    monkeypatch.setattr(stage, "Drawing", sheets.lend_drawing)
-    return sheets
 
 
 @pytest.fixture

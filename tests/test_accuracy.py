@@ -12,13 +12,13 @@ from numpy.typing import NDArray
 
 from taichi_msm import accuracy
 from taichi_msm.accuracy import Estimate, Pilots, choose_step, estimate_error, longest, order, refinement
+from taichi_msm.dynamics import Dynamics
 from taichi_msm.errors import SceneError
 from taichi_msm.notes import notes
 from taichi_msm.runtime import Device
 from taichi_msm.scene import Scene
 from taichi_msm.simulation import Simulation
 from taichi_msm.stability import stable_step, step, steps_per_frame, with_steps, with_time
-from tests.pool import Pool
 from tests.scenes import PRESS, SHEET, SPRINGS, scene
 
 SOFT_PRESS = {**PRESS, "force": [0, 300, -1000]}
@@ -45,11 +45,11 @@ SCENES: dict[str, Any] = {
 }
 
 
-def frames(made: Scene, pool: Pool, device: Device, cut: int | None = None) -> NDArray[np.float64]:
+def frames(made: Scene, device: Device, cut: int | None = None) -> NDArray[np.float64]:
     """Displacements of every frame."""
     if cut is not None:
         made = with_steps(made, cut)
-    dynamics = pool.lend(made, device)
+    dynamics = Dynamics(made, device)
     found = []
     for _ in range(made.time.frames):
         dynamics.advance(steps_per_frame(made))
@@ -58,24 +58,22 @@ def frames(made: Scene, pool: Pool, device: Device, cut: int | None = None) -> N
     return np.array(found)
 
 
-def true_error(made: Scene, pool: Pool, device: Device, fine: int) -> float:
+def true_error(made: Scene, device: Device, fine: int) -> float:
     """Error of the scene's step, by a float64 run with so many times more steps, whose own error is 1 % of it."""
     exact = with_time(with_steps(made, fine * steps_per_frame(made)), precision="f64")
-    reference = frames(exact, pool, device)
-    return longest(frames(made, pool, device) - reference) / longest(reference)
+    reference = frames(exact, device)
+    return longest(frames(made, device) - reference) / longest(reference)
 
 
 @pytest.mark.parametrize(("precision", "tolerance"), [("f32", 5e-4), pytest.param("f64", 5e-5, marks=pytest.mark.slow)])
 @pytest.mark.parametrize("kind", SCENES)
-def test_the_step_chosen_is_right_and_the_largest(
-    kind: str, precision: str, tolerance: float, pool: Pool, device: Device
-) -> None:
+def test_the_step_chosen_is_right_and_the_largest(kind: str, precision: str, tolerance: float, device: Device) -> None:
     sections = SCENES[kind]
     made = scene(**sections | {"time": {"precision": precision, "tolerance": tolerance, **sections.get("time", {})}})
     chosen, estimate = choose_step(made, device)
     assert estimate.error <= tolerance
     # A release between steps is of order 1, and 64 times finer is needed to know it.
-    error = true_error(chosen, pool, device, fine=64 if kind == "between" else 12)
+    error = true_error(chosen, device, fine=64 if kind == "between" else 12)
     assert error <= 1.5 * tolerance, estimate
     assert estimate.steps_per_frame == steps_per_frame(chosen) >= steps_per_frame(made)
     if kind != "between" and steps_per_frame(chosen) > steps_per_frame(made):
@@ -86,13 +84,13 @@ def test_the_step_chosen_is_right_and_the_largest(
 
 @pytest.mark.parametrize("difference", ["central", "backward"])
 @pytest.mark.parametrize("kind", SCENES)
-def test_an_estimate_is_near_the_error(kind: str, difference: str, pool: Pool, device: Device) -> None:
+def test_an_estimate_is_near_the_error(kind: str, difference: str, device: Device) -> None:
     sections = SCENES[kind]
     made = scene(**sections | {"time": {"damping_difference": difference, **sections.get("time", {})}})
     estimate = estimate_error(made, device)
     exact = with_time(made, damping_difference="central")
-    reference = frames(exact, pool, device, cut=64 * steps_per_frame(made))
-    error = longest(frames(made, pool, device) - reference) / longest(reference)
+    reference = frames(exact, device, cut=64 * steps_per_frame(made))
+    error = longest(frames(made, device) - reference) / longest(reference)
     # Where the step misses a jump by d the error is d plus the rest, and the difference of both pilots a quarter of a
     # step plus 3/4 of the rest, which counts twice. Where it does not, Richardson is exact but for the next order.
     misses = kind in ("stiff", "between")
@@ -141,28 +139,28 @@ def test_how_much_finer_the_other_pilot_is() -> None:
     assert refinement(scene(damping=3.0, time={"step": 0.0025})) == 8, "g h is 7.5"
 
 
-def test_rounding_is_part_of_the_estimate(pool: Pool, device: Device) -> None:
+def test_rounding_is_part_of_the_estimate(device: Device) -> None:
     made = with_steps(scene(probes=[SOFT_PRESS], damping=0.02, time={"precision": "f32"}), 2000)
     estimate = estimate_error(made, device)
-    exact = frames(with_time(made, precision="f64"), pool, device)
-    rounding = longest(frames(made, pool, device) - exact) / longest(exact)
+    exact = frames(with_time(made, precision="f64"), device)
+    rounding = longest(frames(made, device) - exact) / longest(exact)
     assert estimate.rounding == pytest.approx(rounding, rel=1e-3)
     assert estimate.rounding > estimate.error / 2
     # The whole error, the rounding in it, by an exact solution: 20 times finer than a step that is far below rounding.
-    truth = frames(with_time(made, precision="f64"), pool, device, cut=10000)
-    error = longest(frames(made, pool, device) - truth) / longest(truth)
+    truth = frames(with_time(made, precision="f64"), device, cut=10000)
+    error = longest(frames(made, device) - truth) / longest(truth)
     assert estimate.error == pytest.approx(error, rel=0.02)
     assert estimate.error > 1.5 * estimate.in_f64
     assert estimate_error(with_time(made, precision="f64"), device).rounding == 0
 
 
-def test_what_f32_cannot_reach_names_f64(pool: Pool, device: Device) -> None:
+def test_what_f32_cannot_reach_names_f64(device: Device) -> None:
     made = scene(probes=[SOFT_PRESS], damping=0.02, time={"precision": "f32", "tolerance": 1e-8})
     with pytest.raises(SceneError, match=r"^time.tolerance: 1e-08 is out of reach of f32, .* take time.precision: f64"):
         choose_step(made, device)
 
 
-def test_a_motion_that_does_not_converge_is_refused(pool: Pool, device: Device) -> None:
+def test_a_motion_that_does_not_converge_is_refused(device: Device) -> None:
     # Pushed in along the sheet without damping, the points collide and scatter.
     probe = {"force": [3e5, 1e5, -1e4], "falloff": 20}
     made = scene(probes=[probe], damping=0, time={"duration": 2.0, "tolerance": 1e-3})
@@ -170,18 +168,18 @@ def test_a_motion_that_does_not_converge_is_refused(pool: Pool, device: Device) 
         choose_step(made, device)
 
 
-def test_a_sheet_that_does_not_move_has_no_error(pool: Pool, device: Device) -> None:
+def test_a_sheet_that_does_not_move_has_no_error(device: Device) -> None:
     made = scene(probes=[], time={"tolerance": 1e-6})
     assert choose_step(made, device)[1] == Estimate(steps_per_frame(made), 0.0, 0.0, 0.0, 2)
 
 
-def test_a_simulation_meets_the_tolerance_by_itself(pool: Pool, device: Device) -> None:
+def test_a_simulation_meets_the_tolerance_by_itself(device: Device) -> None:
     made = scene(probes=[SOFT_PRESS], damping=0.02, time={"tolerance": 2e-4})
     with Simulation(made, threads=2) as simulation:
         assert step(simulation.scene) < step(made) <= stable_step(made) / 2
 
 
-def test_progress_may_interrupt(pool: Pool, device: Device) -> None:
+def test_progress_may_interrupt(device: Device) -> None:
     def stop(done: int, total: int) -> None:
         assert total == 10
         if done == 3:
@@ -217,26 +215,24 @@ def test_order(expected: int, sections: dict[str, Any]) -> None:
 
 
 @pytest.mark.parametrize("damping", [3.0, 20.0])
-def test_damping_within_a_step_is_known_or_not_told(damping: float, pool: Pool, device: Device) -> None:
+def test_damping_within_a_step_is_known_or_not_told(damping: float, device: Device) -> None:
     # g h = 7 and 47. A load that is there at once makes velocities change their sign at every step, at h and at h / 2.
     made = scene(probes=[{**SOFT_PRESS, "load": [[0, 100]]}], damping=damping)
     estimate = estimate_error(made, device)
-    reference = frames(made, pool, device, cut=128 * steps_per_frame(made))
-    error = longest(frames(made, pool, device) - reference) / longest(reference)
+    reference = frames(made, device, cut=128 * steps_per_frame(made))
+    error = longest(frames(made, device) - reference) / longest(reference)
     assert error / 1.5 < estimate.error < 1.5 * error
     assert "velocities change their sign" in "".join(notes(made, 1.0, 1.0, None))
 
 
-def test_damping_within_a_hundredth_of_a_step_has_no_estimate(pool: Pool, device: Device) -> None:
+def test_damping_within_a_hundredth_of_a_step_has_no_estimate(device: Device) -> None:
     made = scene(probes=[{**SOFT_PRESS, "load": [[0, 100]]}], damping=100.0)
     assert estimate_error(made, device).error == np.inf
     assert next(notes(made, 1.0, 1.0, estimate_error(made, device))).startswith("error not known")
 
 
 @pytest.mark.parametrize("pulse", [[0.2005, 0.2006], [0.2, 0.2 + 1e-9], [0.2021, 0.2032]])
-def test_a_load_shorter_than_a_step_has_no_estimate_until_steps_are_shorter(
-    pulse: list[float], pool: Pool, device: Device
-) -> None:
+def test_a_load_shorter_than_a_step_has_no_estimate_until_steps_are_shorter(pulse: list[float], device: Device) -> None:
     start, end = pulse
     made = scene(probes=[{**SOFT_PRESS, "load": [[start, 0], [start, 100], [end, 100], [end, 0]]}])
     assert estimate_error(made, device).error == np.inf
@@ -255,12 +251,12 @@ def test_a_scene_that_is_all_right_has_no_notes() -> None:
     assert len(list(notes(scene(), 0.0, 0.49, None))) == 2
 
 
-def test_positions_written_in_f32_have_the_digits_of_the_sheet(pool: Pool, device: Device) -> None:
+def test_positions_written_in_f32_have_the_digits_of_the_sheet(device: Device) -> None:
     # Points move by some 4 um on a sheet of 0.4 m, whose positions f32 rounds by up to 2^-27 m: half a unit at 0.2 m.
     faint = {"probes": [{**SOFT_PRESS, "force": [0, 0, -0.5]}], "time": {"precision": "f32"}}
     written = scene(**faint, output=["trajectory"])
     estimate = estimate_error(written, device)
-    twin = frames(with_time(written, precision="f64"), pool, device)
+    twin = frames(with_time(written, precision="f64"), device)
     assert 0.3 * 2**-27 < estimate.rounding * longest(twin) < 3**0.5 * 2**-27
     assert estimate_error(scene(**faint), device).rounding < 1e-5
     with pytest.raises(SceneError, match="out of reach of f32"):
@@ -272,7 +268,7 @@ def test_positions_written_in_f32_have_the_digits_of_the_sheet(pool: Pool, devic
             assert found.error <= share * estimate.rounding
 
 
-def test_a_step_that_meets_the_jump_is_taken_where_it_is_the_cheaper(device: Device, pool: Pool) -> None:
+def test_a_step_that_meets_the_jump_is_taken_where_it_is_the_cheaper(device: Device) -> None:
     # A release at 3.25 frames is met by 12 steps a frame; 9 would be stable at half the limit.
     probe = {**SOFT_PRESS, "load": [[0, 100], [0.13, 100], [0.13, 0]]}
     sections: dict[str, Any] = {"probes": [probe], "damping": 0.05}
@@ -286,7 +282,7 @@ def test_a_step_that_meets_the_jump_is_taken_where_it_is_the_cheaper(device: Dev
     assert "0.00333333333333 s meets every jump" in "".join(notes(with_steps(scene(**sections), 9), 1.0, 1.0, None))
 
 
-def test_the_error_in_f64_is_that_of_the_step(device: Device, pool: Pool) -> None:
+def test_the_error_in_f64_is_that_of_the_step(device: Device) -> None:
     made = with_steps(scene(probes=[SOFT_PRESS], damping=0.02, time={"precision": "f32"}), 2000)
     single, double = estimate_error(made, device), estimate_error(with_time(made, precision="f64"), device)
     assert single.in_f64 == pytest.approx(double.error, rel=1e-9)
@@ -299,7 +295,7 @@ def test_the_error_in_f64_is_that_of_the_step(device: Device, pool: Pool) -> Non
 
 @pytest.mark.parametrize("ends", [(0.0044889, 0.0121111), pytest.param((0.0067778, 0.0164444), marks=pytest.mark.slow)])
 def test_a_press_and_release_that_are_missed_alike_do_not_hide_each_other(
-    ends: tuple[float, float], device: Device, pool: Pool
+    ends: tuple[float, float], device: Device
 ) -> None:
     # Both are moved by parts of a step that the difference of h and h / 2 may not show.
     on, off = ends
@@ -311,6 +307,6 @@ def test_a_press_and_release_that_are_missed_alike_do_not_hide_each_other(
     )
     for tolerance in (1e-2, 3e-3):
         chosen, estimate = choose_step(with_time(made, tolerance=tolerance), device)
-        truth = frames(made, pool, device, cut=200_000)
-        error = longest(frames(chosen, pool, device) - truth) / longest(truth)
+        truth = frames(made, device, cut=200_000)
+        error = longest(frames(chosen, device) - truth) / longest(truth)
         assert error <= 1.5 * tolerance, estimate

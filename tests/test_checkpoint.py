@@ -159,6 +159,34 @@ def test_an_array_that_claims_to_be_huge_takes_no_memory(out: Path) -> None:
         read(out)
 
 
+def test_a_compressed_array_takes_no_memory(out: Path) -> None:
+    """A few bytes of bzip2 may be gigabytes, whatever the archive says of them."""
+    path = out / ".partial" / "checkpoint" / STATE
+    with zipfile.ZipFile(path) as whole:
+        entries = {name: whole.read(name) for name in whole.namelist()}
+    with zipfile.ZipFile(path, "w", zipfile.ZIP_BZIP2) as made:
+        for name, data in entries.items():
+            made.writestr(name, data)
+    with pytest.raises(DamagedError):
+        read(out)
+
+
+@pytest.mark.parametrize("name", [POSITIONS, STATE])
+def test_parts_of_another_run_are_refused(name: str, out: Path, tmp_path: Path) -> None:
+    """Of the same sheet, and whole."""
+    with Folder.at(tmp_path / ".partial") as staging:
+        other = Checkpoint(staging, small_scene())
+        part = (out / ".partial" / "checkpoint" / name).read_bytes()
+        other.begin({**plan().as_json(), "folder": "/elsewhere"})
+        for frame in range(FRAMES):
+            other.add(position(frame))
+        other.save(state())
+        other.close()
+    (out / ".partial" / "checkpoint" / name).write_bytes(part)
+    with pytest.raises(DamagedError):
+        read(out)
+
+
 def test_positions_that_are_no_numbers_are_refused(out: Path) -> None:
     """With a checksum that is right."""
     with Folder.at(out / ".partial") as staging:
@@ -190,6 +218,9 @@ def test_frames_that_are_exchanged_are_found(out: Path) -> None:
         {"estimate": {"error": 1}},
         {"estimate": {"steps_per_frame": "x", "error": [], "rounding": 0, "in_f64": 0, "order": 2}},
         {"arch": None},
+        {"arch": "toaster"},
+        {"estimate": {"steps_per_frame": 1, "error": -math.inf, "rounding": 0, "in_f64": 0, "order": 2}},
+        {"estimate": {"steps_per_frame": 1, "error": math.nan, "rounding": 0, "in_f64": 0, "order": 2}},
         {"picture": {}},
         {"given": {}},
         {"scene": {**small_scene().model_dump(mode="json"), "output": ["exe"]}},

@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from taichi_msm.dynamics import Dynamics
 from taichi_msm.runtime import Device
 from taichi_msm.stability import steps_per_frame
-from tests.pool import Pool
 from tests.scenes import scene
 
 FRAME = 0.04
@@ -19,7 +19,7 @@ SMOOTH = [[0.005 * n, 50 - 50 * float(np.cos(np.pi * n / 40))] for n in range(81
 RELEASE = [[0, 0], [0.2, 100], [0.24, 100], [0.24, 0]]
 
 
-def final(pool: Pool, device: Device, load: Any, cut: int, difference: str) -> NDArray[Any]:
+def final(device: Device, load: Any, cut: int, difference: str) -> NDArray[Any]:
     """Displacements at 0.4 s, with frames cut into so many steps."""
     made = scene(
         springs={"structural": 20, "shear": 10, "virtual": 5},
@@ -27,7 +27,7 @@ def final(pool: Pool, device: Device, load: Any, cut: int, difference: str) -> N
         probes=[{"force": [0, 100, -300], "load": load, "falloff": 20, "at": [0.4, 0.6]}],
         time={"duration": 0.4, "step": FRAME / cut, "damping_difference": difference},
     )
-    dynamics = pool.lend(made, device)
+    dynamics = Dynamics(made, device)
     dynamics.advance(made.time.frames * steps_per_frame(made))
     displacement = dynamics.displacement()
     dynamics.close()
@@ -44,13 +44,13 @@ def final(pool: Pool, device: Device, load: Any, cut: int, difference: str) -> N
     ],
     ids=["smooth-central", "release-central", "smooth-backward", "release-backward"],
 )
-def test_order(load: Any, difference: str, order: int, bound: float, pool: Pool, device: Device) -> None:
+def test_order(load: Any, difference: str, order: int, bound: float, device: Device) -> None:
     # Richardson's extrapolation of central differences is of order 4: at 1/16 of the finest step measured its error
     # is below theirs by more than 10^4.
-    coarse, fine = (final(pool, device, load, cut, "central") for cut in (10240, 20480))
+    coarse, fine = (final(device, load, cut, "central") for cut in (10240, 20480))
     exact = (4 * fine - coarse) / 3
     cuts = [80, 160, 320, 640, 1280]
-    errors = [np.abs(final(pool, device, load, cut, difference) - exact).max() / np.abs(exact).max() for cut in cuts]
+    errors = [np.abs(final(device, load, cut, difference) - exact).max() / np.abs(exact).max() for cut in cuts]
     slope = np.polyfit(np.log(cuts), np.log(errors), 1)[0]
     assert abs(-slope - order) < 0.1, errors
     assert errors[0] < bound

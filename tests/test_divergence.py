@@ -17,7 +17,6 @@ from taichi_msm.dynamics import State
 from taichi_msm.runtime import Device
 from taichi_msm.scene import Scene
 from taichi_msm.stability import stable_step, steps_per_frame, with_steps
-from tests.pool import Pool
 from tests.scenes import SHEET, scene
 
 # Pressed for three frames.
@@ -55,7 +54,7 @@ def with_fault(saved: Saved, part: str, change: float, random: np.random.Generat
 
 
 @pytest.mark.parametrize("name", FAULTS)
-def test_faults_are_found_within_a_frame(name: str, device: Device, pool: Pool) -> None:
+def test_faults_are_found_within_a_frame(name: str, device: Device) -> None:
     """Put in at 40 places, found at 40."""
     made = pressed()
     part, change, frames = FAULTS[name]
@@ -73,7 +72,7 @@ def test_faults_are_found_within_a_frame(name: str, device: Device, pool: Pool) 
 
 @pytest.mark.parametrize("active", ["loaded", "always"])
 @pytest.mark.parametrize("precision", ["f32", "f64"])
-def test_no_fault_is_found_where_there_is_none(precision: str, active: str, device: Device, pool: Pool) -> None:
+def test_no_fault_is_found_where_there_is_none(precision: str, active: str, device: Device) -> None:
     """Also near the limit of the step, where the energy swings, and where virtual springs begin to pull from afar."""
     loads = [100, 100, 0, 0, -100, -100, 0, 0, 1, 0]
     jumps = list(zip([0, 0.1, 0.1, 0.14, 0.14, 0.2, 0.2, 0.3, 0.3, 0.7], loads, strict=True))
@@ -132,7 +131,7 @@ SOUND = {
 
 
 @pytest.mark.parametrize("name", SOUND)
-def test_what_is_sound_is_let_pass(name: str, device: Device, pool: Pool) -> None:
+def test_what_is_sound_is_let_pass(name: str, device: Device) -> None:
     with Simulation(SOUND[name], threads=device.threads) as simulation:
         simulation.advance(SOUND[name].time.frames)
         assert simulation.course.peak > 0
@@ -168,7 +167,7 @@ def diagnosed(made: Scene, device: Device, fault: Callable[[Simulation], None] =
         return simulation.diagnose(start)
 
 
-def test_a_force_that_is_too_strong_is_named(device: Device, pool: Pool) -> None:
+def test_a_force_that_is_too_strong_is_named(device: Device) -> None:
     weak = {"force": [0, 0, 1], "at": [0.2, 0.2]}
     torn = {"force": [0, 0, -1], "load": [[0, 0], [0.1, 100], [0.1, 1e9]], "falloff": 20}
     made = pressed(probes=[weak, torn])
@@ -190,7 +189,7 @@ def test_a_force_that_is_too_strong_is_named(device: Device, pool: Pool) -> None
             simulation.advance()
 
 
-def test_a_step_that_is_too_long_is_named(device: Device, pool: Pool) -> None:
+def test_a_step_that_is_too_long_is_named(device: Device) -> None:
     """It counts a blow that is over in a thousandth of a second as if it lasted for a whole step."""
     blow = [[0, 0], [0.0995, 0], [0.1, 100], [0.1005, 0]]
     made = pressed("f64", probes=[{"force": [0, 0, -3e7], "load": blow, "falloff": 20}])
@@ -202,7 +201,7 @@ def test_a_step_that_is_too_long_is_named(device: Device, pool: Pool) -> None:
         simulation.advance(3)
 
 
-def test_a_machine_that_makes_errors_is_told_of(device: Device, pool: Pool) -> None:
+def test_a_machine_that_makes_errors_is_told_of(device: Device) -> None:
     def flip(simulation: Simulation) -> None:
         simulation.advance(3)
         simulation.go_on(with_fault(simulation.save(), "displacement", np.nan, np.random.default_rng(1)))

@@ -216,6 +216,25 @@ def test_ctrl_c_does_not_reach_the_encoder(tmp_path: Path) -> None:
         assert os.getsid(writer._encoder._process.pid) != os.getsid(0)
 
 
+@pytest.mark.skipif(sys.platform == "win32", reason="no such signal")
+def test_who_waits_for_a_stopped_encoder_can_stop_waiting(tmp_path: Path) -> None:
+    """And then has it finish what it has."""
+
+    def stop() -> None:
+        raise KeyboardInterrupt
+
+    with ResultWriter(tmp_path, small_scene()) as writer:
+        assert writer._encoder
+        os.kill(writer._encoder._process.pid, signal.SIGSTOP)
+        for frame in range(3):
+            writer.add(position(frame), picture(frame))
+        with pytest.raises(KeyboardInterrupt):
+            writer.finish(stop)
+        writer.finish(hurry=True)
+        writer.publish({})
+        assert writer.frames <= 3
+
+
 def test_the_time_spent_encoding_is_told(tmp_path: Path) -> None:
     with ResultWriter(tmp_path, small_scene()) as writer:
         writer.add(position(0), picture(0))

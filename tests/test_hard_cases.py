@@ -16,13 +16,13 @@ from numpy.typing import NDArray
 from taichi_msm import lattice, reference
 from taichi_msm.accuracy import estimate_error
 from taichi_msm.divergence import MOST_SHEET_SIZES
+from taichi_msm.dynamics import Dynamics
 from taichi_msm.loads import meets_jumps
 from taichi_msm.runtime import Device
 from taichi_msm.scene import Scene
 from taichi_msm.scene_file import load_scene
 from taichi_msm.simulation import Simulation
 from taichi_msm.stability import stable_step, step, steps_per_frame, with_steps
-from tests.pool import Pool
 
 Array = NDArray[np.float64]
 
@@ -53,9 +53,9 @@ def in_double(scene: Scene) -> Scene:
     return changed(scene, time={"precision": "f64"})
 
 
-def motion(scene: Scene, pool: Pool, device: Device) -> Array:
+def motion(scene: Scene, device: Device) -> Array:
     """Displacements of every frame but that at rest, shape (F, rows, cols, 3)."""
-    dynamics = pool.lend(scene, device)
+    dynamics = Dynamics(scene, device)
     frames = []
     for _ in range(scene.time.frames):
         dynamics.advance(steps_per_frame(scene))
@@ -68,12 +68,12 @@ def longest(vectors: Array) -> float:
     return float(np.linalg.norm(vectors, axis=-1).max())
 
 
-def truth(scene: Scene, cut: int, pool: Pool, device: Device) -> tuple[Array, float]:
+def truth(scene: Scene, cut: int, device: Device) -> tuple[Array, float]:
     """Extrapolate runs in float64 at 8 and 16 times so many steps a frame, and say how far they are apart.
 
     The extrapolation's own error is of order 4: far below a third of this doubt, which is the error of the finer run.
     """
-    coarse, fine = (motion(with_steps(in_double(scene), n * cut), pool, device) for n in (8, 16))
+    coarse, fine = (motion(with_steps(in_double(scene), n * cut), device) for n in (8, 16))
     exact = fine + (fine - coarse) / 3
     return exact, longest(fine - coarse) / longest(exact)
 
@@ -104,10 +104,10 @@ def test_the_cases_are_as_hard_as_they_say(root: Path) -> None:
 
 
 @pytest.mark.parametrize("name", SHORT)
-def test_the_error_is_small_and_known(name: str, pool: Pool, device: Device) -> None:
+def test_the_error_is_small_and_known(name: str, device: Device) -> None:
     scene = hard(name)
-    exact, doubt = truth(on_steps(scene), MISSED.get(name, steps_per_frame(scene)), pool, device)
-    error = longest(motion(scene, pool, device) - exact) / longest(exact)
+    exact, doubt = truth(on_steps(scene), MISSED.get(name, steps_per_frame(scene)), device)
+    error = longest(motion(scene, device) - exact) / longest(exact)
     estimate = estimate_error(scene, device)
     assert estimate.order == (1 if name in MISSED else 2)
     # At order 2 the runs at 8 and 16 times the steps differ by (1/64 - 1/256) of the error at once: 1/85.
@@ -121,9 +121,9 @@ def test_the_error_is_small_and_known(name: str, pool: Pool, device: Device) -> 
 
 
 @pytest.mark.parametrize("name", SHORT)
-def test_only_the_pinch_is_noted(name: str, pool: Pool, device: Device) -> None:
+def test_only_the_pinch_is_noted(name: str, device: Device) -> None:
     scene = hard(name)
-    largest = longest(motion(scene, pool, device))
+    largest = longest(motion(scene, device))
     with Simulation(scene, device.arch, device.threads) as run:
         run.advance(scene.time.frames)
         assert (run.course.shortest_spring < 0.5) == (name == "pinch")
@@ -133,11 +133,11 @@ def test_only_the_pinch_is_noted(name: str, pool: Pool, device: Device) -> None:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", SHORT)
-def test_the_kernel_is_like_the_twin(name: str, pool: Pool, device: Device) -> None:
+def test_the_kernel_is_like_the_twin(name: str, device: Device) -> None:
     scene = in_double(hard(name))
     steps = min(scene.time.frames * steps_per_frame(scene), TWIN_STEPS_OF_POINTS // math.prod(scene.sheet.points))
     twin = next(u for n, u in enumerate(reference.displacements(scene)) if n == steps)
-    dynamics = pool.lend(scene, device)
+    dynamics = Dynamics(scene, device)
     dynamics.advance(steps)
     difference = longest(dynamics.displacement() - twin)
     dynamics.close()
@@ -151,7 +151,7 @@ def test_the_kernel_is_like_the_twin(name: str, pool: Pool, device: Device) -> N
     ("name", "metres", "seconds"),
     [("micrometre", 2.0**20, 1.0), ("kilometre", 2.0**-10, 1.0), ("light", 1.0, 2.0**15), ("heavy", 1.0, 2.0**-5)],
 )
-def test_other_units_give_the_same_bits(name: str, metres: float, seconds: float, pool: Pool, device: Device) -> None:
+def test_other_units_give_the_same_bits(name: str, metres: float, seconds: float, device: Device) -> None:
     # Lengths and times in units that are powers of 2, with stiffness in N/m as it is, round in the same way: mass goes
     # with the time squared, damping with the time, force with the length. Nothing may under- or overflow, or be
     # compared with a number that has a unit.
@@ -173,15 +173,15 @@ def test_other_units_give_the_same_bits(name: str, metres: float, seconds: float
             "probes": (probe.model_copy(update={"force": (0.0, 0.0, here), "falloff": there, "load": load}),),
         }
     )
-    plain, scaled = motion(scene, pool, device), motion(other, pool, device)
+    plain, scaled = motion(scene, device), motion(other, device)
     assert plain.any()
     assert (scaled / metres).tobytes() == plain.tobytes()
 
 
 @pytest.mark.parametrize("name", ["on_point", "between_points"])
-def test_a_load_on_the_axes_keeps_the_sheet_symmetric(name: str, pool: Pool, device: Device) -> None:
+def test_a_load_on_the_axes_keeps_the_sheet_symmetric(name: str, device: Device) -> None:
     scene = hard(name)
-    u = motion(scene, pool, device)
+    u = motion(scene, device)
     # Forces are summed in another order on the other side: a rounding a step, at worst all to one side.
     tolerance = F32 * scene.time.frames * steps_per_frame(scene) * longest(u)
     assert longest(u - u[:, :, ::-1] * [-1, 1, 1]) <= tolerance, "left and right"
@@ -191,7 +191,7 @@ def test_a_load_on_the_axes_keeps_the_sheet_symmetric(name: str, pool: Pool, dev
     assert np.linalg.norm(first[tuple(middle)]) >= longest(first) - tolerance, "deepest where it is pressed"
 
 
-def test_adrift_moves_its_centre_of_mass_as_one_body(pool: Pool, device: Device) -> None:
+def test_adrift_moves_its_centre_of_mass_as_one_body(device: Device) -> None:
     # Springs between points cancel. Steps of a constant force from rest are exact, u_n = n^2 h^2 a / 2, and so is
     # the release, where half the force acts for one step: only rounding is left, all to one side at worst.
     scene = hard("adrift")
@@ -203,13 +203,13 @@ def test_adrift_moves_its_centre_of_mass_as_one_body(pool: Pool, device: Device)
     pushed = np.minimum(t, probe.load[-1][0])
     way = a * pushed**2 / 2 + a * pushed * (t - pushed)
     assert way[-1] > MOST_SHEET_SIZES * max(scene.sheet.size), "would be taken for diverged if something held it"
-    centre = motion(scene, pool, device).mean(axis=(1, 2))
+    centre = motion(scene, device).mean(axis=(1, 2))
     rounding = F32 * scene.time.frames * steps_per_frame(scene) * way[-1]
     np.testing.assert_allclose(centre[:, 0], way, rtol=0, atol=rounding)
     np.testing.assert_allclose(centre[:, 1:], 0, rtol=0, atol=rounding)
 
 
-def test_jumping_is_one_tool_let_go_and_another_taken(pool: Pool, device: Device) -> None:
+def test_jumping_is_one_tool_let_go_and_another_taken(device: Device) -> None:
     scene = hard("jumping")
     (probe,) = scene.probes
     (at, *first), (_, *second) = np.array(probe.at).tolist()
@@ -221,8 +221,8 @@ def test_jumping_is_one_tool_let_go_and_another_taken(pool: Pool, device: Device
         probe.model_copy(update={"at": one, "load": (*before, (at, 100.0), (at, 0.0))}),
         probe.model_copy(update={"at": two, "load": ((at, 0.0), (at, 100.0), *after)}),
     )
-    u = motion(scene, pool, device)
-    assert u.tobytes() == motion(scene.model_copy(update={"probes": tools}), pool, device).tobytes()
+    u = motion(scene, device)
+    assert u.tobytes() == motion(scene.model_copy(update={"probes": tools}), device).tobytes()
 
 
 def shadow_energy(scene: Scene, before: Array, after: Array) -> float:
@@ -250,12 +250,12 @@ def shadow_energy(scene: Scene, before: Array, after: Array) -> float:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", sorted(LONG))
-def test_a_million_steps_keep_the_energy(name: str, pool: Pool, device: Device) -> None:
+def test_a_million_steps_keep_the_energy(name: str, device: Device) -> None:
     scene = hard(name)
     steps = steps_per_frame(scene)
     assert scene.time.frames * steps == 10**6
     assert step(scene) / stable_step(scene) == pytest.approx({"limit": 0.99, "undamped": 0.495}[name], rel=1e-4)
-    dynamics = pool.lend(scene, device)
+    dynamics = Dynamics(scene, device)
     energy, reach = [], []
     for _ in range(scene.time.frames):
         dynamics.advance(steps - 1)

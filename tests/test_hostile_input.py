@@ -20,13 +20,13 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from PIL import Image
 
+from taichi_msm.dynamics import Dynamics
 from taichi_msm.errors import SceneError
 from taichi_msm.runtime import Device
 from taichi_msm.scene import Scene
 from taichi_msm.scene_file import load_scene
 from taichi_msm.texture import load_texture, texture_size
 from tests.mutation import damaged_picture, damaged_text
-from tests.pool import Pool
 from tests.scenes import SHEET, SPRINGS, speckle
 
 resource: Any = pytest.importorskip("resource")
@@ -221,9 +221,9 @@ QUIET = settings(
 
 @settings(QUIET, max_examples=VALID)
 @given(rng=st.randoms(use_true_random=True))
-def test_a_scene_that_keeps_every_rule_runs(rng: random.Random, here: Path, sheets: Pool, device: Device) -> None:
+def test_a_scene_that_keeps_every_rule_runs(rng: random.Random, here: Path, device: Device) -> None:
     Path("valid.yaml").write_text(write(valid_scene(rng)))
-    dynamics = sheets.lend(load_scene("valid.yaml"), device)
+    dynamics = Dynamics(load_scene("valid.yaml"), device)
     dynamics.advance(3)
     displacement = dynamics.displacement()
     dynamics.close()

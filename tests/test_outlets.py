@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import os
 import shlex
+import signal
 import subprocess
 import sys
+import time
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -64,6 +66,15 @@ def test_results_that_nobody_can_read_are_4(command: str, here: Path) -> None:
     if command != RUN:
         assert shell(f"msm {command} | true").returncode in (code, CODES[command])
         assert shell(f"msm {command} >&-").returncode == CODES[command]
+
+
+@pytest.mark.parametrize("delay", [0.1, 0.3, 0.6])
+def test_a_signal_is_heard_though_nobody_can_read_of_it(delay: float, here: Path) -> None:
+    command = [sys.executable, "-m", "taichi_msm", "run", "small.yaml", "--set", "render.size=[2048,2048]"]
+    with Path("/dev/full").open("w") as full, subprocess.Popen(command, stdout=full, stderr=full) as process:
+        time.sleep(delay)
+        process.terminate()
+        assert process.wait(timeout=30) == 143 or (delay < 0.2 and process.returncode == -signal.SIGTERM)
 
 
 def test_results_into_a_pipe_that_nobody_reads(here: Path) -> None:

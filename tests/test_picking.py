@@ -50,9 +50,7 @@ def folded() -> NDArray[np.float64]:
 @pytest.mark.parametrize("camera", ["top", "oblique", NEAR_EYE], ids=["top", "oblique", "near"])
 def test_what_is_picked_is_what_is_drawn(camera: Any, refine: int, device: Device) -> None:
     shown, position = sheet(camera, refine), folded()
-    drawing = Drawing(shown, place_texture())
-    picture = drawing.draw(position).astype(int)
-    drawing.close()
+    picture = Drawing(shown, place_texture()).draw(position).astype(int)
     pixels = [(x, y) for y in range(0, SIZE[1], 3) for x in range(0, SIZE[0], 3)]
     covered, missed = 0, 0
     for x, y in pixels:

@@ -2,6 +2,7 @@ from __future__ import annotations
 
 import json
 import os
+import shutil
 import subprocess
 import sys
 from collections.abc import Collection
@@ -10,6 +11,7 @@ from pathlib import Path
 import pytest
 
 from taichi_msm.errors import FilesError, ForeignError
+from taichi_msm.folder import Folder, Tree
 from taichi_msm.publication import Publication, is_result
 from taichi_msm.sealed import seal
 
@@ -206,7 +208,7 @@ def test_a_damaged_marker_publishes_nothing(directory: Path) -> None:
     """Neither does one whose names lead elsewhere."""
     (directory.parent / "payload").write_text("mine")
     write(directory / ".partial" / "new", NEW, "new")
-    whole = seal({"names": NEW, "earlier": OLD})
+    whole = seal({"names": NEW, "earlier": {}})
     for damaged in (whole.replace(b"0001", b"0002"), whole + b" ", b"", b"../payload"):
         (directory / ".partial" / "complete").write_bytes(damaged)
         with (
@@ -215,11 +217,42 @@ def test_a_damaged_marker_publishes_nothing(directory: Path) -> None:
         ):
             pass
         assert contents(directory) == expected(OLD, "old")
-    (directory / ".partial" / "complete").write_bytes(seal({"names": ["../payload"], "earlier": ["../payload"]}))
+    (directory / ".partial" / "complete").write_bytes(seal({"names": ["../payload"], "earlier": {"../payload": [1]}}))
     with Publication(directory):
         pass
     assert contents(directory) == expected(OLD, "old")
     assert (directory.parent / "payload").read_text() == "mine"
+
+
+def test_a_marker_that_was_made_up_takes_no_file_of_the_user(tmp_path: Path) -> None:
+    """It may name them, but it cannot know them."""
+    mine = ["animation.gif", "trajectory.npz", "frames/0000.png"]
+    write(tmp_path, mine, "mine")
+    write(tmp_path / ".partial" / "new", ["run.json"], "new")
+    known = {name: [1, 4, 0] for name in mine}
+    (tmp_path / ".partial" / "complete").write_bytes(seal({"names": ["run.json"], "earlier": known}))
+    with Publication(tmp_path):
+        pass
+    assert contents(tmp_path) == {**expected(mine, "mine"), "run.json": "new"}
+    write(tmp_path / ".partial" / "new", ["animation.gif", "run.json"], "newer")
+    (tmp_path / ".partial" / "complete").write_bytes(seal({"names": ["animation.gif", "run.json"], "earlier": known}))
+    with pytest.raises(ForeignError, match=r"/animation\.gif: a file that no run has put there"), Publication(tmp_path):
+        pass
+    assert contents(tmp_path) == {**expected(mine, "mine"), "run.json": "new"}
+
+
+def test_a_directory_that_is_removed_when_it_was_opened_is_no_endless_loop(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    require_only = Folder.require_only
+
+    def remove(folder: Folder, tree: Tree) -> None:
+        require_only(folder, tree)
+        shutil.rmtree(tmp_path / "out", ignore_errors=True)
+
+    monkeypatch.setattr(Folder, "require_only", remove)
+    with pytest.raises(FileNotFoundError), Publication(tmp_path / "out"):
+        pass
 
 
 def test_what_no_run_has_written_is_neither_replaced_nor_removed(directory: Path) -> None:

@@ -26,7 +26,6 @@ from taichi_msm.runtime import Device
 from taichi_msm.scene import Scene
 from taichi_msm.scene_file import load_scene
 from tests.outputs import files, results
-from tests.pool import Pool
 from tests.scenes import speckle
 
 # Pressed while the tool moves, in many steps a frame.
@@ -77,7 +76,7 @@ def interrupted(made: Scene, directory: str, device: Device, after: int = 12) ->
     "output", ["png, gif, trajectory", pytest.param("gif", marks=pytest.mark.slow), "trajectory", ""]
 )
 def test_a_run_that_is_interrupted_goes_on_to_the_same_bits(
-    output: str, small: Path, device: Device, pool: Pool, monkeypatch: pytest.MonkeyPatch
+    output: str, small: Path, device: Device, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Again and again, at a frame's end and within one, and while earlier frames are drawn anew."""
     monkeypatch.setattr(dynamics, "MAX_STEPS_PER_LAUNCH", 300)
@@ -107,7 +106,7 @@ def test_a_run_that_is_interrupted_goes_on_to_the_same_bits(
     assert not (small / "parts" / ".partial").exists()
 
 
-def test_the_error_estimated_at_the_start_is_kept(small: Path, device: Device, pool: Pool) -> None:
+def test_the_error_estimated_at_the_start_is_kept(small: Path, device: Device) -> None:
     made = dragged("time.step=auto", "time.tolerance=0.01", "time.duration=0.2", "output=[trajectory]")
     record = interrupted(made, "parts", device)
     again = resume("parts", threads=device.threads)
@@ -118,7 +117,7 @@ def test_the_error_estimated_at_the_start_is_kept(small: Path, device: Device, p
 
 
 def test_a_run_that_finds_the_disk_full_goes_on_when_it_is_not(
-    small: Path, device: Device, pool: Pool, monkeypatch: pytest.MonkeyPatch
+    small: Path, device: Device, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     made = dragged("time.duration=0.2", "output=[trajectory]")
     run(made, "whole", threads=device.threads)
@@ -145,7 +144,7 @@ def test_a_run_that_finds_the_disk_full_goes_on_when_it_is_not(
     assert results(small / "parts") == results(small / "whole")
 
 
-def test_the_same_run_typed_again_goes_on(small: Path, device: Device, pool: Pool) -> None:
+def test_the_same_run_typed_again_goes_on(small: Path, device: Device) -> None:
     """Who did not see that a run was unfinished loses nothing of it."""
     made = dragged("time.duration=0.2", "output=[trajectory]")
     run(made, "whole", threads=device.threads)
@@ -159,7 +158,7 @@ def test_the_same_run_typed_again_goes_on(small: Path, device: Device, pool: Poo
 
 @pytest.mark.parametrize("change", ["damping=0.02", "sheet.points=[9,12]"])
 def test_another_run_begins_anew_and_keeps_what_was_there_until_it_has_a_frame(
-    change: str, small: Path, device: Device, pool: Pool
+    change: str, small: Path, device: Device
 ) -> None:
     settings = ["time.duration=0.2", "output=[trajectory]"]
     interrupted(dragged(*settings), "parts", device)
@@ -194,7 +193,7 @@ def array() -> bytes:
     ],
 )
 def test_what_is_damaged_is_not_gone_on_with(
-    name: str, damage: Callable[[bytes], bytes], small: Path, device: Device, pool: Pool
+    name: str, damage: Callable[[bytes], bytes], small: Path, device: Device
 ) -> None:
     made = dragged("time.duration=0.2", "output=[trajectory]")
     interrupted(made, "parts", device)
@@ -209,7 +208,7 @@ def test_what_is_damaged_is_not_gone_on_with(
 
 
 def test_another_picture_or_version_is_not_gone_on_with(
-    small: Path, device: Device, pool: Pool, monkeypatch: pytest.MonkeyPatch
+    small: Path, device: Device, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     interrupted(dragged("time.duration=0.2"), "parts", device)
     before = files(small / "parts")

@@ -13,8 +13,9 @@ import pytest
 
 from taichi_msm import runtime
 from taichi_msm.drawing import Drawing
+from taichi_msm.dynamics import Dynamics
 from taichi_msm.lattice import rest_positions
-from tests.scenes import scene, speckle
+from tests.scenes import SHEET, scene, speckle
 
 # Start, make every thread of the pool work, and tell of each thread its processor time [ticks] and its cores.
 WORK = """
@@ -66,50 +67,34 @@ def test_the_threads_that_are_pinned_are_those_that_work(tmp_path: Path) -> None
     assert all(on == cores for main, ticks, on in threads if [main, ticks, on] not in workers)
 
 
-def test_fields_may_be_freed_before_any_kernel_runs() -> None:
-    """In a process of its own, where none has run."""
-    script = "from taichi_msm import runtime; from taichi_msm.drawing import Drawing; from taichi_msm.dynamics import "
-    script += "Dynamics; from tests.scenes import *; device = runtime.start(); "
-    script += "Drawing(scene(), speckle(8, 8)).close(); Dynamics(scene(), device).advance(1)"
-    subprocess.run([sys.executable, "-c", script], cwd=Path(__file__).parent.parent, check=True)
+def test_a_process_may_have_many_sheets_and_gets_their_memory_back(device: runtime.Device) -> None:
+    """More than Taichi's 512 trees of fields."""
+
+    def resident() -> int:
+        return int(Path("/proc/self/statm").read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE")
+
+    made = scene(sheet={**SHEET, "points": [60, 60]}, render={"size": [64, 64]})
+    texture = speckle(8, 8)
+    sheets: list[Any] = []
+    sizes = []
+    for _ in range(3):
+        for _ in range(200):
+            sheets.append(Dynamics(made, device))
+            sheets.append(Drawing(made, texture))
+        sheets[-2].advance(1)
+        sheets[-1].draw(rest_positions(made.sheet))
+        sheets.clear()
+        if Path("/proc/self/statm").exists():
+            sizes.append(resident())
+    # Nothing stays of the last 400; Python's own pools may grow by a little.
+    assert not sizes or sizes[2] - sizes[1] < 4 * 2**20
 
 
-# More sheets than Taichi has room for, dropped and kept; then one simulation in another thread and another process.
-MANY = """
-import gc, os, threading
-from taichi_msm import MsmError, Simulation, runtime
-from taichi_msm.runtime import FieldTree, ti
+# One simulation in another thread and another process.
+ELSEWHERE = """
+import os, threading
+from taichi_msm import MsmError, Simulation
 from tests.scenes import scene
-
-runtime.start()
-
-class Sheet(FieldTree):
-    def __init__(self):
-        super().__init__()
-        self.value = self.place(ti.field(ti.f32), 4)
-        self.itself = self
-        self.allocate()
-
-gc.disable()
-for _ in range(1100):
-    Sheet()
-print("dropped")
-kept = []
-try:
-    for _ in range(1100):
-        kept.append(Sheet())
-except MsmError as error:
-    print(len(kept), error)
-kept[0].close()
-kept[0].close()
-Sheet()
-kept.clear()
-gc.collect()
-Sheet()
-
-Simulation(scene()).advance()
-gc.collect()
-print(len(runtime._dropped) - 1, "to be freed")
 
 simulation = Simulation(scene())
 simulation.advance()
@@ -134,10 +119,10 @@ print(simulation.frame)
 
 
 @pytest.mark.skipif(not hasattr(os, "fork"), reason="forks")
-def test_what_taichi_cannot_bear_is_one_clear_error(tmp_path: Path, root: Path) -> None:
-    """Too many sheets, other threads and forked processes: it would crash, fail with text of its own, or hang."""
-    script = tmp_path / "many.py"
-    script.write_text(MANY)
+def test_other_threads_and_forked_processes_are_refused(tmp_path: Path, root: Path) -> None:
+    """Taichi would fail with text of its own, or hang."""
+    script = tmp_path / "elsewhere.py"
+    script.write_text(ELSEWHERE)
     environment = {**os.environ, "PYTHONPATH": str(root)}
     done = subprocess.run(
         [sys.executable, str(script)], capture_output=True, text=True, timeout=60, check=True, env=environment
@@ -145,9 +130,7 @@ def test_what_taichi_cannot_bear_is_one_clear_error(tmp_path: Path, root: Path) 
     thread = "Taichi works in the thread that started it; simulate and draw there"
     fork = "Taichi was started before this process was forked from another, and would hang here; start processes by "
     fork += "multiprocessing's 'spawn' or 'forkserver'"
-    many = "500 500 sheets and pictures are open, and Taichi has room for no more; close simulations that you no "
-    many += "longer need, or use each in a with statement"
-    assert done.stdout.splitlines() == ["dropped", many, "1 to be freed", *4 * [thread], *2 * [fork], "2"]
+    assert done.stdout.splitlines() == [*4 * [thread], *2 * [fork], "2"]
     assert done.stderr == ""
 
 
@@ -165,5 +148,4 @@ def test_pictures_are_compiled_quickly_and_steps_are_not(monkeypatch: pytest.Mon
     monkeypatch.setattr(drawing, "_draw", draw)
     with pytest.raises(KeyboardInterrupt):
         drawing.draw(rest_positions(made.sheet))
-    drawing.close()
     assert [*seen, config.advanced_optimization] == [False, True]

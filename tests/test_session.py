@@ -28,7 +28,6 @@ from taichi_msm.loads import schedule
 from taichi_msm.runtime import Device
 from taichi_msm.stability import steps_per_frame
 from tests.outputs import duration
-from tests.pool import Pool
 
 # small.yaml with a force that dimples it as tissue, and a camera that sees it tilted.
 TILTED = {
@@ -48,7 +47,7 @@ Begin = Callable[..., Session]
 
 
 @pytest.fixture
-def begin(small: Path, pool: Pool, device: Device) -> Iterator[Begin]:
+def begin(small: Path, device: Device) -> Iterator[Begin]:
     """Begin a session with small.yaml; what it keeps goes to ./album."""
     with ExitStack() as stack:
 

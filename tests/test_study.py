@@ -147,7 +147,7 @@ def test_dop853_gives_up_in_time() -> None:
 
 def test_terms_are_left_out_of_the_kernel(device: Device) -> None:
     made = scene(probes=[PRESS, PRESS])
-    shapes = {name: structure(variant, device) for name, variant in variants(made)}
+    shapes = {name: structure(variant, device).code for name, variant in variants(made)}
     assert list(shapes) == [
         "",
         "springs.structural",

@@ -322,6 +322,12 @@ def test_a_jpeg_of_too_many_scans(tmp_path: Path, monkeypatch: pytest.MonkeyPatc
         )
     with pytest.raises(SceneError, match="has 1410 scans"):
         load_texture(made)
+    # A baseline one has scans too.
+    file = io.BytesIO()
+    Image.fromarray(speckle(300, 500)).save(file, "JPEG")
+    whole = file.getvalue()
+    Path("a.jpg").write_bytes(whole[:-2] + 1400 * whole[whole.rfind(b"\xff\xda") : -2] + b"\xff\xd9")
+    assert ["1401 scans" in str(problem) for problem in problems(made)] == [True]
 
 
 def test_a_picture_of_too_many_rows(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -62,10 +62,10 @@ class Film:
             self._encoder.add(picture, pause)
         self.pictures += 1
 
-    def encoded(self) -> Path:
+    def encoded(self, pause: Callable[[], None] = lambda: None) -> Path:
         """Wait for the last picture; returns the file, which is to be moved to its place. There must be a picture."""
         with writing(*self._place):
-            self._encoder.finish()
+            self._encoder.finish(pause)
         return self._hidden.path / ANIMATION
 
     def __enter__(self) -> Film:

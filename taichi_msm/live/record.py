@@ -65,6 +65,6 @@ def record(
         if upcoming is not None:
             say(f"the film ends at {frame / session.rate:g} s, before some of the script's events")
         with writing(path, OPTION):
-            reel.encoded().replace(path)
+            reel.encoded(partial(progress, frames, frames)).replace(path)
     if failures:
         raise failures[0]

@@ -77,8 +77,6 @@ class Stage:
 
     def close(self) -> None:
         """Free the memory."""
-        for drawing in self._drawings.values():
-            drawing.close()
         self._drawings.clear()
 
     def _change(self, **changes: Any) -> None:

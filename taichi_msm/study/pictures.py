@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Callable
-from contextlib import ExitStack
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -78,27 +77,25 @@ class PictureStudy:
         memory = budget.available_memory() // 2
         if not self._draw_truth(memory):
             return
-        with ExitStack() as opened:
-            drawings = []
-            for number, (refine, supersample) in enumerate(self._settings):
-                self._progress(number, len(self._settings) * ROUNDS)
-                scene = _with_render(self._scene, refine=refine, supersample=supersample)
-                memory -= budget.estimate(scene).drawing_bytes
-                if memory < 0:
-                    self.notes.append(
-                        f"drawing was not measured from refine {refine}, supersample {supersample} on: memory"
-                    )
-                    break
-                drawing = Drawing(scene, self._texture)
-                opened.callback(drawing.close)
-                drawings.append(drawing)
-                self._trials.append(_Trial(refine, supersample, drawing.draw(self._position)))
-            for round_ in range(ROUNDS):
-                for number, (drawing, trial) in enumerate(zip(drawings, self._trials, strict=True)):
-                    self._progress(round_ * len(drawings) + number, len(drawings) * ROUNDS)
-                    start = time.perf_counter()
-                    drawing.draw(self._position)
-                    trial.samples.append(time.perf_counter() - start)
+        drawings = []
+        for number, (refine, supersample) in enumerate(self._settings):
+            self._progress(number, len(self._settings) * ROUNDS)
+            scene = _with_render(self._scene, refine=refine, supersample=supersample)
+            memory -= budget.estimate(scene).drawing_bytes
+            if memory < 0:
+                self.notes.append(
+                    f"drawing was not measured from refine {refine}, supersample {supersample} on: memory"
+                )
+                break
+            drawing = Drawing(scene, self._texture)
+            drawings.append(drawing)
+            self._trials.append(_Trial(refine, supersample, drawing.draw(self._position)))
+        for round_ in range(ROUNDS):
+            for number, (drawing, trial) in enumerate(zip(drawings, self._trials, strict=True)):
+                self._progress(round_ * len(drawings) + number, len(drawings) * ROUNDS)
+                start = time.perf_counter()
+                drawing.draw(self._position)
+                trial.samples.append(time.perf_counter() - start)
 
     def points(self) -> list[Drawn]:
         """Give what is known so far."""
@@ -109,9 +106,7 @@ class PictureStudy:
         if budget.estimate(scene).drawing_bytes > memory:
             self.notes.append("drawing was not measured: there is no memory for a picture fine enough to judge by")
             return False
-        drawing = Drawing(scene, self._texture)
-        self._truth = drawing.draw(self._position)
-        drawing.close()
+        self._truth = Drawing(scene, self._texture).draw(self._position)
         return True
 
     def _point(self, trial: _Trial) -> Drawn:
