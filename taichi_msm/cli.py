@@ -42,7 +42,9 @@ set_option = click.option(
     multiple=True,
     help="Override a key of the scene by its dotted path, e.g. sheet.points=[61,61]; list items by index.",
 )
-arch_option = click.option("--arch", metavar="cpu|cuda", default="cpu", show_default=True, help="Where to compute.")
+arch_option = click.option(
+    "--arch", metavar="cpu|cuda|vulkan", default="cpu", show_default=True, help="Where to compute."
+)
 threads_option = click.option(
     "--threads", type=click.IntRange(min=1), metavar="N", help="CPU threads.  [default: every core]"
 )

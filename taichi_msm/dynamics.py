@@ -21,6 +21,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from taichi_msm.errors import DeviceError
 from taichi_msm.forces import (
     ACROSS,
     BYTES,
@@ -84,6 +85,9 @@ def structure(scene: Scene, device: Device, cores: int | None = None) -> Structu
         scene: a checked scene.
         device: what `runtime.start` returned.
         cores: how many cores are free for it; None: all.
+
+    Raises:
+        DeviceError: when the device cannot do what the scene needs.
     """
     rows, cols = scene.sheet.points
     fixed = fixed_points(scene.sheet)
@@ -105,6 +109,11 @@ def structure(scene: Scene, device: Device, cores: int | None = None) -> Structu
         damped=scene.damping > 0,
         grips=tuple(grip.moves for grip in grips(scene)),
     )
+    if device.arch == "vulkan" and precision == "f64" and any(code.grips):
+        raise DeviceError(
+            "--arch vulkan: has no exp in f64, which control points that move need; take time.precision: f32 without a "
+            "tolerance or an estimate of the error, or --arch cpu"
+        )
     depth = _depth(rows // workers, cols * NUMBERS_PER_POINT * BYTES[precision]) if workers else 1
     return Structure(rows, cols, workers, depth, fixed_rows, code)
 

@@ -35,7 +35,7 @@ class Plan:
         overrides: what made the scene, beside its file.
         estimate: of the error of the step, if it was wanted.
         folder: the current directory, from which the scene's picture is found.
-        arch: cpu or cuda.
+        arch: cpu, cuda or vulkan.
         picture: the digest of the picture on the sheet.
         versions: what the results depend on besides.
     """

@@ -76,7 +76,7 @@ def run(
     Args:
         scene: what `load_scene` returned.
         directory: where frames/, animation.gif, trajectory.npz and run.json go.
-        arch: cpu or cuda.
+        arch: cpu, cuda or vulkan.
         threads: number of CPU threads; None takes every core.
         overrides: the overrides that made the scene, for the record.
         estimate_error: whether to estimate the error of the step; a tolerance in the scene does in any case.
@@ -234,7 +234,8 @@ def _carry_out(
         stages = ["startup", *pilot, "compile", "simulate", "render"]
         seconds = {stage: watch.seconds.get(stage, 0.0) for stage in stages}
         record["timings"] = {**seconds, "encode": writer.encode_seconds, "total": watch.total()}
-        record |= {"arch": device.arch, "threads": device.threads, "versions": plan.versions}
+        record |= {"arch": device.arch, "threads": device.threads, "lanes": simulation.lanes}
+        record |= {"workers": simulation.workers, "versions": plan.versions}
         return writer.publish(record)
 
 

@@ -51,7 +51,7 @@ from taichi.lang.ast.ast_transformer_utils import ASTTransformerContext
 _core: Any = getattr(np, "_core", None) or np.core  # NumPy 2, or 1
 _features: dict[str, bool] = _core._multiarray_umath.__cpu_features__
 
-ARCHS = ("cpu", "cuda")
+ARCHS = ("cpu", "cuda", "vulkan")
 
 # A lock on Taichi's cache that is older than this was left by a process that was killed [s].
 STALE_LOCK = 60.0
@@ -75,7 +75,7 @@ class Device:
     """Where kernels run.
 
     Attributes:
-        arch: cpu or cuda.
+        arch: cpu, cuda or vulkan.
         threads: number of CPU threads.
     """
 
@@ -154,7 +154,7 @@ def start(arch: str = "cpu", threads: int | None = None) -> Device:
     """Start Taichi, once in a process.
 
     Args:
-        arch: cpu or cuda.
+        arch: cpu, cuda or vulkan.
         threads: number of CPU threads; None takes every core.
 
     Raises:
@@ -216,7 +216,7 @@ def open_window(title: str, size: tuple[int, int]) -> Any:
 
 
 @contextlib.contextmanager
-def our_compilation(*, optimised: bool = True, vectors: bool = True) -> Iterator[None]:
+def our_compilation(*, optimised: bool = True) -> Iterator[None]:
     """Launch kernels of this package, which are compiled otherwise than a user's own in the same process.
 
     Every operation rounds as IEEE 754 says, so that the bits of a result do not depend on threads, lanes or the
@@ -225,14 +225,13 @@ def our_compilation(*, optimised: bool = True, vectors: bool = True) -> Iterator
 
     Args:
         optimised: False leaves all to LLVM that Taichi would optimise before it. A kernel is launched always alike.
-        vectors: whether they stay vectors.
     """
     config, found = ti.lang.impl.current_cfg(), {}
     wanted = {
         "fast_math": False,
         "cfg_optimization": False,
         "advanced_optimization": optimised,
-        "real_matrix_scalarize": started().arch != "cpu" or not vectors,
+        "real_matrix_scalarize": started().arch != "cpu",
     }
     for name, value in wanted.items():
         found[name] = getattr(config, name)
@@ -319,7 +318,8 @@ def _initialise(device: Device) -> None:
         # Taichi prints the arch and, where a driver is missing, its search for it. Without fast_math every operation
         # rounds as IEEE 754 says, so that the bits of a result do not depend on threads, lanes or the compiler's mood.
         # Taichi's optimisation of control flow takes half of the time of compiling, for what LLVM does again.
-        with contextlib.redirect_stdout(io.StringIO()):
+        # What Taichi prints of a GPU that is not there is said by our error.
+        with contextlib.redirect_stdout(io.StringIO()), silenced(*(() if device.arch == "cpu" else (2,))):
             ti.init(
                 arch=getattr(ti, device.arch),
                 cpu_max_num_threads=device.threads,

@@ -30,7 +30,7 @@ class Simulation:
 
     Args:
         scene: what `load_scene` returned; where it has a tolerance, pilot runs choose the step first.
-        arch: cpu or cuda.
+        arch: cpu, cuda or vulkan.
         threads: number of CPU threads; None takes every core.
         texture: the picture on the sheet, shape (height, width, 3); None: the scene's own, read when it is drawn.
         cores: how many cores are free for stepping; None: all. Its threads wait for each other by spinning, and one
@@ -79,6 +79,16 @@ class Simulation:
     def steps(self) -> int:
         """Number of steps taken so far."""
         return self._dynamics.steps_done
+
+    @property
+    def lanes(self) -> int:
+        """Numbers of a vector that the steps are taken in; 1 on a GPU."""
+        return self._dynamics.structure.code.lanes
+
+    @property
+    def workers(self) -> int:
+        """Threads that share the steps, unless other programs need the cores; 0 on a GPU."""
+        return self._dynamics.structure.workers
 
     @property
     def course(self) -> Course:

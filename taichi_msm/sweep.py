@@ -119,10 +119,9 @@ class Sweep:
             numbers: keep, dx, dy, stiffness of structural and shear springs, y of the first row.
             table: of the loads, shape (count, columns).
         """
-        done = 0
-        if self._s.workers > 1 and time.perf_counter() >= self._rests_until:
-            done = self._advance_together(count, numbers, table)
-        if done < count:
+        together = self._s.workers > 1 and time.perf_counter() >= self._rests_until
+        done = self._advance_together(count, numbers, table) if together else 0
+        if not together or done < count:
             self._launch(self._kernels.advance_alone, 1, done, count - done, numbers, table, np.array([0, -1, 0]))
             if self._s.workers > 1:
                 with our_compilation():

@@ -422,8 +422,8 @@ def call(capsys: pytest.CaptureFixture[str], *arguments: str) -> tuple[int, str,
             "taichi-msm: Invalid value for '--threads': 0 is not in the range x>=1. (see taichi-msm --help)\n",
         ),
         (
-            ["run", "small.yaml", "--arch", "vulkan"],
-            "--arch vulkan: not supported; take one of: cpu, cuda\n",
+            ["run", "small.yaml", "--arch", "metal"],
+            "--arch metal: not supported; take one of: cpu, cuda, vulkan\n",
         ),
     ],
 )
