@@ -15,7 +15,7 @@ from benchmarks.parts import PIXELS, REFINE
 from benchmarks.process import ROOT
 from benchmarks.stepping.measure import TOLERANCE
 from taichi_msm import load_scene
-from taichi_msm.runtime import Device, available_threads
+from taichi_msm.runtime import Device, available_threads, vector_bits
 from taichi_msm.stability import steps_per_frame
 from taichi_msm.study import measure
 from taichi_msm.study.result import Timing
@@ -46,6 +46,7 @@ def machine() -> Results:
     return {
         "cpu": found["cpu"],
         "threads": found["threads"],
+        "vectors": vector_bits(),
         "caches": _caches(),
         "python": found["versions"]["python"],
         "versions": ", ".join(f"{name} {version}" for name, version in versions.items()),

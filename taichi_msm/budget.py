@@ -19,7 +19,7 @@ MAX_STEPS = 10**12
 
 # Bytes of the parts of a drawing.
 POINT_BYTES = 36  # a mass point, as it is seen, and its normal
-SAMPLE_BYTES = 12  # depth and colour of one sample of the picture
+SAMPLE_BYTES = 16  # depth and colour of one sample of the picture
 PIXEL_BYTES = 3 * 12  # colours of one pixel, from sums to bytes
 PICTURE_PIXEL_BYTES = 20  # of the file, while it is decoded and converted; its texture takes less
 

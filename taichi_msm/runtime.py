@@ -32,6 +32,7 @@ __all__ = [
     "start",
     "started",
     "ti",
+    "vector_bits",
 ]
 
 if not os.environ.get("HOME"):
@@ -140,8 +141,12 @@ def lanes(precision: str) -> int:
     """
     if started().arch != "cpu":
         return 1
-    wide = next((bits for feature, bits in VECTOR_BITS.items() if _features.get(feature)), 128)
-    return wide // (32 if precision == "f32" else 64)
+    return vector_bits() // (32 if precision == "f32" else 64)
+
+
+def vector_bits() -> int:
+    """Tell how wide the processor's vectors are."""
+    return next((bits for feature, bits in VECTOR_BITS.items() if _features.get(feature)), 128)
 
 
 def started() -> Device:

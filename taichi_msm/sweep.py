@@ -17,8 +17,8 @@ one of two copies, and wait for the other's. The order in which forces are added
 so the bits of a result do not depend on the number of workers.
 
 Company. A worker that waits spins, for some time at most: its partner may have no core, as another program has it. Then
-it writes down where it is and ends, which gives its core away, and another launch goes on from there. Where that
-happens again and again, a single worker takes over for some time.
+it writes down where it is and ends, which gives its core away, and another launch goes on from there, until all
+have taken the same steps. Then a single worker takes over for some time.
 """
 
 # No `from __future__ import annotations` here: Taichi reads the annotations of a kernel.
@@ -58,10 +58,7 @@ BEGIN, END = 0, 1
 # A worker looks so often whether its partner is there: some 0.2 ms.
 PATIENCE = 40_000
 
-# A launch in which workers gave up more often than this had company.
-FEW_LAUNCHES = 1
-
-# Then a single worker steps for some time [s], the longer the more often it happens.
+# After a launch in which one gave up a single worker steps for some time [s], the longer the more often it happens.
 SHORTEST_REST, LONGEST_REST = 0.002, 1.0
 
 # Where a worker is: pass, round and step of the round.
@@ -142,22 +139,22 @@ class Sweep:
 
     def _advance_together(self, count: int, numbers: tuple[float, ...], table: NDArray[Any]) -> int:
         """Take steps with all workers; gives how many, which are fewer when there is company."""
-        s, wanted = self._s, count
+        s = self._s
         places = np.tile(np.array([0, -1, 0]), s.workers)
         first = self._steps
-        for launches in range(1, 10**9):
+        self._launch(self._kernels.advance_together, s.workers, 0, count, numbers, table, places)
+        passes, rounds = places[::PLACE], places[1::PLACE]
+        if (passes * s.depth >= count).all():
+            self._rest = max(self._rest / 2, SHORTEST_REST)
+            return count
+        self._rests_until = time.perf_counter() + self._rest
+        self._rest = min(4 * self._rest, LONGEST_REST)
+        # All meet at the end of the pass that the first of them is in.
+        count = min(count, int((passes + (rounds >= 0)).max()) * s.depth)
+        while not (passes * s.depth >= count).all():
             self._steps = first
             self._launch(self._kernels.advance_together, s.workers, 0, count, numbers, table, places)
-            passes, rounds = places[::PLACE], places[1::PLACE]
-            if (passes * s.depth >= count).all():
-                break
-            if launches == FEW_LAUNCHES:
-                # Meet at the end of the pass that the first of them is in.
-                count = min(count, int((passes + (rounds >= 0)).max()) * s.depth)
-                self._rests_until = time.perf_counter() + self._rest
-                self._rest = min(4 * self._rest, LONGEST_REST)
-        if count == wanted:
-            self._rest = max(self._rest / 2, SHORTEST_REST)
+        self._steps = first + count
         return count
 
     def _launch(
