@@ -81,7 +81,7 @@ def summary(record: Mapping[str, Any], directory: Path) -> str:
     lines = [
         f"{printable(str(directory))}: {record['frames']} frames, {record['steps']} steps of {record['step']:.4g} s, "
         f"largest displacement {record['max_displacement']:.4g} m",
-        *([f"the first {record['resumed']} frames were done by an earlier run"] if record["resumed"] else []),
+        *([f"the first {record['resumed']} frames were simulated by an earlier run"] if record["resumed"] else []),
         *record["notes"],
         f"{times['total']:.2f} s: {stages}{' (encode overlaps)' if times['encode'] > 0 else ''}",
     ]

@@ -199,7 +199,7 @@ class Dynamics:
 
     def compile(self) -> None:
         """Compile the step and the read-out without moving anything."""
-        self._moving.advance(0, self._arguments, self._loads)
+        self._moving.compile(self._arguments, self._loads)
         self.displacement()
 
     def displacement(self) -> NDArray[Any]:

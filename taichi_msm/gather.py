@@ -62,6 +62,10 @@ class Gather:
             self._kernels.advance(self._now, count, self._s.rows, self._s.cols, *numbers, table, *arrays)
         self._now = (self._now + count) % 2
 
+    def compile(self, numbers: tuple[float, ...], table: NDArray[Any]) -> None:
+        """Compile the steps without taking one."""
+        self.advance(0, numbers, table)
+
     def read(self, spacing: tuple[float, float], out: Readings) -> None:
         """Copy what is asked for, and measure every row."""
         s, arrays = self._s, self._arrays

@@ -119,11 +119,14 @@ class Sweep:
         together = self._s.workers > 1 and time.perf_counter() >= self._rests_until
         done = self._advance_together(count, numbers, table) if together else 0
         if not together or done < count:
-            self._launch(self._kernels.advance_alone, 1, done, count - done, numbers, table, np.array([0, -1, 0]))
-            if self._s.workers > 1:
-                with our_compilation():
-                    self._kernels.copy(*self._arrays.u, self._borders, self._s.rows, self._s.width)
-                self._done[:] = self._steps
+            self._advance_alone(done, count, numbers, table)
+
+    def compile(self, numbers: tuple[float, ...], table: NDArray[Any]) -> None:
+        """Compile all that steps may need, without taking one."""
+        self._rests_until = 0.0
+        self.advance(0, numbers, table)
+        if self._s.workers > 1:
+            self._advance_alone(0, 0, numbers, table)
 
     def read(self, spacing: tuple[float, float], out: Readings) -> None:
         """Copy what is asked for, and measure every row.
@@ -136,6 +139,14 @@ class Sweep:
         read = self._kernels.read_together if s.workers > 1 else self._kernels.read_alone
         with our_compilation():
             read(*arrays.u, *arrays.d, arrays.by_column, s.rows, s.cols, s.strip, *spacing, *out)
+
+    def _advance_alone(self, done: int, count: int, numbers: tuple[float, ...], table: NDArray[Any]) -> None:
+        """Take the steps after those that are done with a single worker."""
+        self._launch(self._kernels.advance_alone, 1, done, count - done, numbers, table, np.array([0, -1, 0]))
+        if self._s.workers > 1:
+            with our_compilation():
+                self._kernels.copy(*self._arrays.u, self._borders, self._s.rows, self._s.width)
+            self._done[:] = self._steps
 
     def _advance_together(self, count: int, numbers: tuple[float, ...], table: NDArray[Any]) -> int:
         """Take steps with all workers; gives how many, which are fewer when there is company."""
