@@ -19,7 +19,7 @@ MAX_STEPS = 10**12
 
 # Bytes of the parts of a drawing.
 POINT_BYTES = 36  # a mass point, as it is seen, and its normal
-SAMPLE_BYTES = 16  # depth and colour of one sample of the picture
+DEPTH_BYTES, COLOUR_BYTES = 4, 4  # of a sample of the picture; where samples are averaged it has three colours
 PIXEL_BYTES = 3 * 12  # colours of one pixel, from sums to bytes
 PICTURE_PIXEL_BYTES = 20  # of the file, while it is decoded and converted; its texture takes less
 
@@ -128,7 +128,7 @@ def require_disk(scene: Scene, directory: Path) -> None:
     ]
     size, key, name = max(parts)
     said = (
-        f"{budget.frames} frames need {_gib(needed)} on disk, {_gib(size)} of it for {name}, but {_gib(free)} is free "
+        f"{budget.frames} frames need {_in_words(needed)} on disk, {_in_words(size)} of it for {name}, but {_in_words(free)} is free "
         f"for {directory}; take less, fewer time.frames_per_second, less output or another --out"
     )
     raise SceneError([f"{key}: {said}"])
@@ -143,7 +143,9 @@ def _drawing_bytes(scene: Scene) -> int:
     width, height = scene.render.size
     # The whole picture is decoded, whatever the region.
     picture = math.prod(texture.texture_size(scene.model_copy(update={"region": None})) or (0,))
-    frame = width * height * (scene.render.supersample**2 * SAMPLE_BYTES + PIXEL_BYTES)
+    factor = scene.render.supersample
+    sample = DEPTH_BYTES + (COLOUR_BYTES if factor == 1 else 3 * COLOUR_BYTES)
+    frame = width * height * (factor**2 * sample + PIXEL_BYTES)
     return rows * cols * POINT_BYTES + frame + picture * PICTURE_PIXEL_BYTES
 
 
@@ -173,8 +175,8 @@ def _memory_problems(scene: Scene) -> Iterator[Problem]:
     size, key, name = max(parts)
     yield Problem(
         key,
-        f"the scene needs {_gib(budget.memory_bytes)} of memory, {_gib(size)} of it for {name}, "
-        f"but {_gib(available)} is free; take less",
+        f"the scene needs {_in_words(budget.memory_bytes)} of memory, {_in_words(size)} of it for {name}, "
+        f"but {_in_words(available)} is free; take less",
     )
 
 
@@ -188,7 +190,7 @@ def _free_disk(directory: Path) -> int:
     return sys.maxsize
 
 
-def _gib(size: int) -> str:
+def _in_words(size: int) -> str:
     unit, name = next(((unit, name) for unit, name in ((2**30, "GiB"), (2**20, "MiB")) if size >= unit), (2**10, "KiB"))
     return f"{size / unit:.3g} {name}"
 

@@ -52,7 +52,7 @@ def test_simulation() -> None:
 def test_drawing(tmp_path: Path) -> None:
     render = {"size": [50, 60], "refine": 2, "supersample": 3}
     need = estimate(scene(render=render, output=["gif"]))
-    assert need.drawing_bytes == 1200 * 36 + 50 * 60 * (9 * 12 + 36)
+    assert need.drawing_bytes == 1200 * 36 + 50 * 60 * (9 * 16 + 36)
     assert need.memory_bytes == need.simulation_bytes + need.drawing_bytes
 
     Image.new("RGB", (70, 80)).save(tmp_path / "a.png")
@@ -93,12 +93,12 @@ def test_an_ordinary_scene_has_no_problems() -> None:
         (
             {"sheet": {"points": [4096, 4096], "size": [1, 1], "mass": 1}},
             "sheet.points: the scene needs 1.31 GiB of memory, 1.31 GiB of it for 4096 x 4096 points, "
-            "but 0.5 GiB is free; take less",
+            "but 512 MiB is free; take less",
         ),
         (
             {"render": {"refine": 0, "size": [8192, 4096]}},
-            "render.size: the scene needs 1.5 GiB of memory, 1.5 GiB of it for frames of 8192 x 4096 "
-            "pixels and their texture, but 0.5 GiB is free; take less",
+            "render.size: the scene needs 1.38 GiB of memory, 1.38 GiB of it for frames of 8192 x 4096 "
+            "pixels and their texture, but 512 MiB is free; take less",
         ),
     ],
     ids=["points", "picture"],
@@ -201,8 +201,8 @@ def test_results_that_do_not_fit_on_the_disk_are_refused(tmp_path: Path, monkeyp
     with pytest.raises(SceneError) as told:
         require_disk(made, below)
     assert str(told.value) == (
-        "sheet.points: 21 frames need 0.000734 GiB on disk, 0.000617 GiB of it for positions of 30 x 40 points, but "
-        f"0.000734 GiB is free for {below}; take less, fewer time.frames_per_second, less output or another --out"
+        "sheet.points: 21 frames need 770 KiB on disk, 647 KiB of it for positions of 30 x 40 points, but "
+        f"770 KiB is free for {below}; take less, fewer time.frames_per_second, less output or another --out"
     )
     with pytest.raises(
         SceneError, match=r"^render.size: 21 frames need .* of it for pictures of 500 x 600 pixels, but"
