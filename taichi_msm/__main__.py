@@ -8,8 +8,8 @@ from taichi_msm import interruption, outlets
 
 def main() -> int:
     """Run the command line of the process."""
-    interruption.leave_at_once()
     outlets.open_missing()
+    interruption.leave_at_once()
     if isinstance(sys.stdout, io.TextIOWrapper):
         # A file name need not be text; errors, on stderr, are printed this way already.
         sys.stdout.reconfigure(errors="backslashreplace")

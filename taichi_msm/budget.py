@@ -128,8 +128,9 @@ def require_disk(scene: Scene, directory: Path) -> None:
     ]
     size, key, name = max(parts)
     said = (
-        f"{budget.frames} frames need {_in_words(needed)} on disk, {_in_words(size)} of it for {name}, but {_in_words(free)} is free "
-        f"for {directory}; take less, fewer time.frames_per_second, less output or another --out"
+        f"{budget.frames} frames need {_in_words(needed)} on disk, {_in_words(size)} of it for {name}, but "
+        f"{_in_words(free)} is free for {directory}; take less, fewer time.frames_per_second, less output or "
+        "another --out"
     )
     raise SceneError([f"{key}: {said}"])
 

@@ -13,6 +13,9 @@ from types import FrameType
 
 SIGNALS = (signal.SIGINT, signal.SIGTERM)
 
+# Where stderr is, also while libraries are kept from writing there.
+_outlet = 2
+
 
 class Interruption:
     """Remembers that the program was asked to stop; asked twice, it ends the process at once.
@@ -48,6 +51,8 @@ class Interruption:
 
 def leave_at_once() -> None:
     """End the process at a signal, as long as there is nothing to keep."""
+    global _outlet
+    _outlet = os.dup(2)
     for number in SIGNALS:
         signal.signal(number, _leave)
 
@@ -58,7 +63,7 @@ def _leave(number: int, _frame: FrameType | None) -> None:
 
 def _end(code: int, message: bytes) -> None:
     with suppress(OSError):  # nobody can read it
-        os.write(2, message)
+        os.write(_outlet, message)
     os._exit(code)
 
 
