@@ -181,7 +181,7 @@ class Pilots:
         return (rest + displacement).astype(np.float32) - rest
 
     def close(self) -> None:
-        """Free the fields."""
+        """Free the memory."""
         self._open.close()
 
 

@@ -33,6 +33,7 @@ from taichi_msm.forces import (
     MOVES,
     Code,
     Readings,
+    Start,
     Structure,
 )
 from taichi_msm.gather import STEPS_PER_LAUNCH, Gather
@@ -300,4 +301,5 @@ class Dynamics:
         decays = np.array([decay(grip, scene) for grip in grips(scene) if not grip.moves])
         self._sheet = None  # Its memory is free before there is another.
         kind = Sweep if s.workers else Gather
-        self._sheet = kind(s, by_column, decays, None if state is None else (state.displacement, state.difference))
+        begun = None if state is None else (state.displacement, state.difference)
+        self._sheet = kind(s, Start(by_column, decays, begun))

@@ -109,6 +109,20 @@ class Structure:
         return self.strip + 2
 
 
+class Start(NamedTuple):
+    """What the arrays of a sheet hold at the start.
+
+    Attributes:
+        by_column: of the array of that name, shape (6, cols).
+        decay: likewise, shape (standing grips, rows, cols).
+        state: displacements and differences, each of shape (rows, cols, 3); None: at rest.
+    """
+
+    by_column: NDArray[Any]
+    decay: NDArray[Any]
+    state: tuple[NDArray[Any], NDArray[Any]] | None
+
+
 class Readings(NamedTuple):
     """What is read of a sheet, in the order of the kernel's arguments.
 
@@ -171,19 +185,11 @@ class SheetArrays:
     Args:
         s: the structure.
         stored: of every stored row of displacements the row of the sheet that it holds, or -1 for none.
-        by_column: what the array of that name holds, shape (6, cols).
-        decay: likewise, shape (standing grips, rows, cols).
-        state: displacements and differences to begin with, each of shape (rows, cols, 3); None: at rest.
+        start: what the arrays hold at the start.
     """
 
-    def __init__(
-        self,
-        s: Structure,
-        stored: NDArray[np.int32],
-        by_column: NDArray[Any],
-        decay: NDArray[Any],
-        state: tuple[NDArray[Any], NDArray[Any]] | None,
-    ) -> None:
+    def __init__(self, s: Structure, stored: NDArray[np.int32], start: Start) -> None:
+        by_column, decay, state = start
         self._s = s
         self._memory = Memory()
         self._fill, clear = _filling(s.code)

@@ -20,6 +20,7 @@ from taichi_msm.forces import (
     Code,
     Readings,
     SheetArrays,
+    Start,
     Structure,
     point_step,
     spring_forces,
@@ -41,19 +42,13 @@ class Kernels(NamedTuple):
 class Gather:
     """The state of a sheet in the memory of a GPU, and its kernels; its arguments are those of `sweep.Sweep`."""
 
-    def __init__(
-        self,
-        s: Structure,
-        by_column: NDArray[Any],
-        decay: NDArray[Any],
-        state: tuple[NDArray[Any], NDArray[Any]] | None,
-    ) -> None:
+    def __init__(self, s: Structure, start: Start) -> None:
         self._s = s
         self._kernels = _kernels(s.code)
         # Which of the two buffers holds u_n, each within a halo of a row above and below.
         self._now = 0
         buffer = np.pad(np.arange(s.rows, dtype=np.int32), 1, constant_values=-1)
-        self._arrays = SheetArrays(s, np.concatenate([buffer, buffer]), by_column, decay, state)
+        self._arrays = SheetArrays(s, np.concatenate([buffer, buffer]), start)
 
     def advance(self, count: int, numbers: tuple[float, ...], table: NDArray[Any]) -> None:
         """Take at most STEPS_PER_LAUNCH steps."""

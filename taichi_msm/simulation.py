@@ -197,7 +197,7 @@ class Simulation:
             self.draw()
 
     def close(self) -> None:
-        """Free the memory of the fields. `positions` still gives the last frame."""
+        """Free the memory. `positions` still gives the last frame."""
         runtime.require_here()
         self._closed = True
         self._dynamics.close()

@@ -39,6 +39,7 @@ from taichi_msm.forces import (
     Code,
     Readings,
     SheetArrays,
+    Start,
     Structure,
     point_step,
     spring_forces,
@@ -80,18 +81,10 @@ class Sweep:
 
     Args:
         s: how it lies in memory.
-        by_column: what the array of that name holds, shape (6, cols).
-        decay: likewise, shape (standing grips, rows, cols).
-        state: displacements and differences to begin with, each of shape (rows, cols, 3); None: at rest.
+        start: what its arrays hold at the start.
     """
 
-    def __init__(
-        self,
-        s: Structure,
-        by_column: NDArray[Any],
-        decay: NDArray[Any],
-        state: tuple[NDArray[Any], NDArray[Any]] | None,
-    ) -> None:
+    def __init__(self, s: Structure, start: Start) -> None:
         self._s = s
         self._kernels = _kernels(s.code)
         self._steps = 0
@@ -100,7 +93,7 @@ class Sweep:
         # Below the sheet's rows, for every worker and border, the two copies.
         self._borders = self._border_rows()
         stored = np.concatenate([np.arange(s.rows, dtype=np.int32), self._borders])
-        self._arrays = SheetArrays(s, stored, by_column, decay, state)
+        self._arrays = SheetArrays(s, stored, start)
         # Rows of `behind` that a worker has: its steps, then a page, over which one core's prefetcher does not reach.
         self._slots = s.depth - (-PAGE // (s.width * s.code.lanes * BYTES[s.code.precision]))
         # For every worker and step of a pass the forces of the row behind, with the sign of the force on that row.

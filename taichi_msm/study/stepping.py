@@ -115,7 +115,7 @@ class SteppingStudy:
         return error >= MARGIN * self.reference.error
 
     def close(self) -> None:
-        """Free the fields."""
+        """Free the memory."""
         self._open.close()
 
     def _series(self, difference: str) -> Iterator[int]:
