@@ -19,7 +19,8 @@ MAX_STEPS = 10**12
 
 # Bytes of the parts of a drawing.
 POINT_BYTES = 36  # a mass point, as it is seen, and its normal
-DEPTH_BYTES, COLOUR_BYTES = 4, 4  # of a sample of the picture; where samples are averaged it has three colours
+SAMPLE_BYTES = 32  # what is kept of a sample at most
+BAND_ROWS = 16  # rows of samples that a thread keeps at a time
 PIXEL_BYTES = 3 * 12  # colours of one pixel, from sums to bytes
 PICTURE_PIXEL_BYTES = 20  # of the file, while it is decoded and converted; its texture takes less
 
@@ -145,9 +146,9 @@ def _drawing_bytes(scene: Scene) -> int:
     # The whole picture is decoded, whatever the region.
     picture = math.prod(texture.texture_size(scene.model_copy(update={"region": None})) or (0,))
     factor = scene.render.supersample
-    sample = DEPTH_BYTES + (COLOUR_BYTES if factor == 1 else 3 * COLOUR_BYTES)
-    frame = width * height * (factor**2 * sample + PIXEL_BYTES)
-    return rows * cols * POINT_BYTES + frame + picture * PICTURE_PIXEL_BYTES
+    band_rows = min(height * factor, BAND_ROWS * (os.cpu_count() or 1))
+    samples = band_rows * width * factor * SAMPLE_BYTES
+    return rows * cols * POINT_BYTES + samples + width * height * PIXEL_BYTES + picture * PICTURE_PIXEL_BYTES
 
 
 def _step_problems(scene: Scene) -> Iterator[Problem]:

@@ -49,10 +49,11 @@ def test_simulation() -> None:
     assert estimate(piloted).simulation_bytes == 1200 * (4 + 8 + 8) * 21
 
 
-def test_drawing(tmp_path: Path) -> None:
+def test_drawing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(os, "cpu_count", lambda: 2)
     render = {"size": [50, 60], "refine": 2, "supersample": 3}
     need = estimate(scene(render=render, output=["gif"]))
-    assert need.drawing_bytes == 1200 * 36 + 50 * 60 * (9 * 16 + 36)
+    assert need.drawing_bytes == 1200 * 36 + 2 * 16 * 150 * 32 + 50 * 60 * 36
     assert need.memory_bytes == need.simulation_bytes + need.drawing_bytes
 
     Image.new("RGB", (70, 80)).save(tmp_path / "a.png")
@@ -97,7 +98,7 @@ def test_an_ordinary_scene_has_no_problems() -> None:
         ),
         (
             {"render": {"refine": 0, "size": [8192, 4096]}},
-            "render.size: the scene needs 1.38 GiB of memory, 1.38 GiB of it for frames of 8192 x 4096 "
+            "render.size: the scene needs 1.13 GiB of memory, 1.13 GiB of it for frames of 8192 x 4096 "
             "pixels and their texture, but 512 MiB is free; take less",
         ),
     ],
@@ -107,6 +108,7 @@ def test_what_takes_most_of_the_memory_is_named(
     monkeypatch: pytest.MonkeyPatch, keys: dict[str, Any], fault: str
 ) -> None:
     output = ["gif"] if "render" in keys else []
+    monkeypatch.setattr(os, "cpu_count", lambda: 2)
     monkeypatch.setattr(budget, "available_memory", lambda: 2**29)
     assert faults(scene(output=output, **keys)) == [fault]
 

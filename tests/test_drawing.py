@@ -9,7 +9,6 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from taichi_msm import drawing as drawing_module
 from taichi_msm import reference
 from taichi_msm.camera import view
 from taichi_msm.drawing import Drawing, structure
@@ -64,12 +63,18 @@ def test_picture_is_like_the_twin(render: dict[str, Any], device: Device) -> Non
     assert (apart == 1).mean() < 0.01
 
 
-def test_the_form_for_a_gpu_draws_the_same(device: Device, monkeypatch: pytest.MonkeyPatch) -> None:
-    made, texture = drawable(), speckle(50, 70)
-    expected = draw(made, dented(made), texture)
-    monkeypatch.setattr(drawing_module, "BAND_ROWS", 1)
-    alone = Drawing(made, texture, replace(structure(made), lanes=1))
-    assert (alone.draw(dented(made)) == expected).all()
+@pytest.mark.parametrize("lanes", [1, 4, 8])
+def test_the_shape_of_a_tile_does_not_change_the_bits(lanes: int, device: Device) -> None:
+    # One lane is the form for GPUs; 31 x 57 pixels are whole tiles of no shape.
+    renders: list[dict[str, Any]] = [
+        {"size": [31, 57], "wireframe": True},
+        {"supersample": 3, "camera": "oblique"},
+    ]
+    for render in renders:
+        made, texture = drawable(**render), speckle(50, 70)
+        expected = draw(made, dented(made), texture)
+        alone = Drawing(made, texture, replace(structure(made), lanes=lanes))
+        assert (alone.draw(dented(made)) == expected).all()
 
 
 @pytest.mark.parametrize("size", [(17, 13), (64, 64), (331, 331), (1021, 509)])
