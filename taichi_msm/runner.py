@@ -234,7 +234,7 @@ def _carry_out(
         stages = ["startup", *pilot, "compile", "simulate", "render"]
         seconds = {stage: watch.seconds.get(stage, 0.0) for stage in stages}
         record["timings"] = {**seconds, "encode": writer.encode_seconds, "total": watch.total()}
-        record |= {"arch": device.arch, "threads": device.threads, "lanes": simulation.lanes}
+        record |= {"arch": device.arch, "device": device.name, "threads": device.threads, "lanes": simulation.lanes}
         record |= {"workers": simulation.workers, "versions": plan.versions}
         return writer.publish(record)
 

@@ -6,13 +6,15 @@ import contextlib
 import errno
 import io
 import os
+import platform
+import re
 import tempfile
 import threading
 import time
 import weakref
 from collections import defaultdict
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -28,6 +30,7 @@ __all__ = [
     "lanes",
     "open_window",
     "our_compilation",
+    "processor",
     "require_here",
     "start",
     "started",
@@ -67,6 +70,9 @@ CACHE_FILES, CACHE_BYTES = 64, 1 << 24
 # Taichi takes 1 GiB of addresses at once, and its libraries as much again.
 ADDRESS_SPACE = 1900 << 20
 
+# How Taichi names a GPU in its log.
+GPU_NAME = re.compile(r'Vulkan Device "(.+)" supports|CUDA device \[id=\d+\]: (.+)')
+
 # Taichi gives a CPU thread at least this many iterations of a parallel loop: make_cpu_multithreaded_range_for.cpp.
 ITERATIONS_PER_THREAD = 512
 
@@ -78,10 +84,12 @@ class Device:
     Attributes:
         arch: cpu, cuda or vulkan.
         threads: number of CPU threads.
+        name: of the processor or the GPU; "" where the system does not tell.
     """
 
     arch: str
     threads: int
+    name: str = field(default="", compare=False)
 
 
 class Memory:
@@ -133,6 +141,15 @@ def available_threads() -> int:
     return cores
 
 
+def processor() -> str:
+    """Name the processor."""
+    with contextlib.suppress(OSError):
+        for line in Path("/proc/cpuinfo").read_text(encoding="utf-8").splitlines():
+            if line.startswith("model name"):
+                return line.split(":", 1)[1].strip()
+    return platform.processor() or platform.machine()
+
+
 def lanes(precision: str) -> int:
     """Tell how many numbers a vector register of the processor holds; one on a GPU, where every point is a thread.
 
@@ -173,8 +190,8 @@ def start(arch: str = "cpu", threads: int | None = None) -> Device:
         raise DeviceError(f"--arch {arch}: not supported; take one of: {', '.join(ARCHS)}")
     wanted = Device(arch, available_threads() if threads is None else threads)
     if _device is None:
-        _initialise(wanted)
-        _device, _home = wanted, (os.getpid(), threading.get_ident())
+        _device = replace(wanted, name=_initialise(wanted))
+        _home = os.getpid(), threading.get_ident()
     elif wanted != _device:
         raise DeviceError(
             f"Taichi already runs on {_device.arch} with {_device.threads} threads in this process; "
@@ -315,27 +332,33 @@ def _pin(pool: list[int]) -> None:
                 os.sched_setaffinity(thread, {core})
 
 
-def _initialise(device: Device) -> None:
+def _initialise(device: Device) -> str:
+    """Start Taichi, and name what it runs on."""
     _require_address_space()
     cache = _cache()
     before = _threads()
+    on_cpu = device.arch == "cpu"
     try:
-        # Taichi prints the arch and, where a driver is missing, its search for it. Without fast_math every operation
-        # rounds as IEEE 754 says, so that the bits of a result do not depend on threads, lanes or the compiler's mood.
-        # Taichi's optimisation of control flow takes half of the time of compiling, for what LLVM does again.
-        # What Taichi prints of a GPU that is not there is said by our error.
-        with contextlib.redirect_stdout(io.StringIO()), silenced(*(() if device.arch == "cpu" else (2,))):
-            ti.init(
-                arch=getattr(ti, device.arch),
-                cpu_max_num_threads=device.threads,
-                enable_fallback=False,
-                **cache,
-                # No warning of loops over the samples of a pixel.
-                unrolling_limit=0,
-                log_level=ti.ERROR,
-            )
+        # Taichi prints the arch and, where a driver is missing, its search for it, which our error says in a line. What
+        # it tells of a GPU that is there is the only way to its name.
+        with tempfile.NamedTemporaryFile("r", errors="replace") as told:
+            with contextlib.redirect_stdout(io.StringIO()), silenced(*(() if on_cpu else (2,)), into=told.name):
+                ti.init(
+                    arch=getattr(ti, device.arch),
+                    cpu_max_num_threads=device.threads,
+                    enable_fallback=False,
+                    **cache,
+                    # No warning of loops over the samples of a pixel.
+                    unrolling_limit=0,
+                    log_level=ti.ERROR if on_cpu else ti.TRACE,
+                )
+                ti.set_logging_level(ti.ERROR)
+            named = GPU_NAME.search(told.read())
     except Exception as error:
-        said = "take --arch cpu" if device.arch != "cpu" else f"Taichi says: {' '.join(str(error).split())}"
+        said = f"Taichi says: {' '.join(str(error).split())}" if on_cpu else "take --arch cpu"
         raise DeviceError(f"--arch {device.arch}: not available on this machine; {said}") from error
     # The pool is the last that Taichi starts.
     _pin([thread for thread in _threads() if thread not in before][-device.threads :])
+    if on_cpu:
+        return processor()
+    return next(filter(None, named.groups())) if named else ""

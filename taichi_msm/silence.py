@@ -9,13 +9,14 @@ from pathlib import Path
 
 
 @contextmanager
-def silenced(*descriptors: int) -> Iterator[None]:
+def silenced(*descriptors: int, into: str = os.devnull) -> Iterator[None]:
     """Send what is written to some file descriptors nowhere, in a with block.
 
     Args:
         descriptors: 1 for stdout, 2 for stderr; one that is closed stays so.
+        into: a file that takes it instead.
     """
-    with Path(os.devnull).open("wb") as nowhere:
+    with Path(into).open("wb") as nowhere:
         kept = {descriptor: copy for descriptor in descriptors if (copy := _copy(descriptor)) is not None}
         for descriptor in kept:
             os.dup2(nowhere.fileno(), descriptor)

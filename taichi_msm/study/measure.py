@@ -3,13 +3,11 @@
 from __future__ import annotations
 
 import os
-import platform
 import time
 from collections.abc import Callable
 from contextlib import closing
 from dataclasses import dataclass
 from functools import partial
-from pathlib import Path
 from typing import Any
 
 from taichi_msm import budget, runtime
@@ -119,21 +117,12 @@ def study(
 def machine(device: Device) -> dict[str, Any]:
     """Describe where the study ran."""
     return {
-        "cpu": _cpu(),
+        "cpu": runtime.processor(),
         "cores": os.cpu_count(),
         "arch": device.arch,
         "threads": device.threads,
         "versions": versions(),
     }
-
-
-def _cpu() -> str:
-    """Name the processor."""
-    try:
-        lines = Path("/proc/cpuinfo").read_text(encoding="utf-8").splitlines()
-        return next(line.split(":", 1)[1].strip() for line in lines if line.startswith("model name"))
-    except (OSError, StopIteration):
-        return platform.processor() or platform.machine()
 
 
 def _require_memory(scene: Scene) -> None:
