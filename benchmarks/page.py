@@ -2,16 +2,15 @@
 
 from __future__ import annotations
 
-import shutil
 import subprocess
 from collections.abc import Callable
 from importlib import metadata
 from pathlib import Path
 from typing import Any
 
-from benchmarks import bounds, whole_run
+from benchmarks import bounds, native, whole_run
 from benchmarks.drawing.measure import WANTED
-from benchmarks.parts import PIXELS, REFINE
+from benchmarks.parts import NARROW, PIXELS, READY, REFINE
 from benchmarks.process import ROOT
 from benchmarks.stepping.measure import TOLERANCE
 from taichi_msm import load_scene
@@ -22,7 +21,6 @@ from taichi_msm.study.result import Timing
 from taichi_msm.study.table import duration, number, timing
 
 TEMPLATE = ROOT / "docs" / "performance.template"
-OURS = "taichi_msm"
 NOT_MEASURED = "(not measured yet)"
 
 # Whose versions the page names, where they are installed.
@@ -41,12 +39,14 @@ def machine() -> Results:
             versions[package] = metadata.version(package)
         except metadata.PackageNotFoundError:
             continue
-    if shutil.which("g++"):
-        versions["g++"] = subprocess.run(["g++", "-dumpfullversion"], capture_output=True, text=True).stdout.strip()
+    if compiler := native.compiler():
+        command = [compiler, "-dumpfullversion", "-dumpversion"]
+        versions[compiler] = subprocess.run(command, capture_output=True, text=True).stdout.strip()
     return {
         "cpu": found["cpu"],
         "threads": found["threads"],
         "vectors": vector_bits(),
+        "compiler": " ".join([native.compiler(), *native.options()]),
         "caches": _caches(),
         "python": found["versions"]["python"],
         "versions": ", ".join(f"{name} {version}" for name, version in versions.items()),
@@ -68,6 +68,10 @@ def tables(results: Results) -> dict[str, str]:
     makers: dict[str, tuple[str, Callable[[], str]]] = {
         "stepping_table": ("stepping", lambda: stepping_table(results["stepping"])),
         "ratio_table": ("stepping", lambda: ratio_table(results["stepping"])),
+        "width_table": ("widths", lambda: width_table(results["widths"])),
+        "narrow_step_table": ("narrow", lambda: narrow_step_table(results["narrow"])),
+        "narrow_picture_table": ("narrow", lambda: narrow_picture_table(results["narrow"])),
+        "remap_ratios": ("drawing", lambda: remap_ratios(results["drawing"])),
         "lit_table": ("drawing", lambda: drawing_table(results["drawing"]["lit"])),
         "flat_table": ("drawing", lambda: drawing_table(results["drawing"]["flat"])),
         "whole_run_table": ("whole_run", lambda: whole_run_table(results["whole_run"])),
@@ -77,7 +81,15 @@ def tables(results: Results) -> dict[str, str]:
         "step_bound_table": ("bounds", lambda: step_bound_table(results)),
         "drawing_bound_table": ("bounds", lambda: drawing_bound_table(results)),
     }
-    return {name: make() if part in results else NOT_MEASURED for name, (part, make) in makers.items()}
+    made = {name: make() if part in results else NOT_MEASURED for name, (part, make) in makers.items()}
+    where = f"{results['machine']['cpu']}, {results['machine']['vectors']} bits"
+    narrow = f"{results['machine']['cpu']}, {NARROW} bits"
+    return {name: _on(narrow if name.startswith("narrow") else where, text) for name, text in made.items()}
+
+
+def _on(where: str, text: str) -> str:
+    """Name the processor and the width of its vectors in the head of a table."""
+    return text.replace("| ", f"| {where}: ", 1) if text.startswith("| ") else text
 
 
 def page(results: Results) -> str:
@@ -146,6 +158,47 @@ def ratio_table(measured: dict[str, list[Entry]]) -> str:
             if index
         ],
     )
+
+
+def width_table(found: dict[str, dict[str, dict[str, int]]]) -> str:
+    """Show how many packed operations of each width the code of every peer has."""
+    return table(
+        ["packed operations in the code of a step", "512 bits", "256 bits", "128 bits"],
+        [
+            [f"{name}, of {bits} bits", *(str(counts[width]) for width in ("512", "256", "128"))]
+            for bits, peers in found.items()
+            for name, counts in peers.items()
+        ],
+    )
+
+
+def narrow_step_table(found: Results) -> str:
+    """Show the time of a step with narrower vectors than the processor has."""
+    if not found:
+        return f"(this processor has none wider than {NARROW} bits: the tables above are of these)"
+    return size_table(found["stepping"])
+
+
+def narrow_picture_table(found: Results) -> str:
+    """Show the time of a picture with narrower vectors than the processor has."""
+    if not found:
+        return ""
+    rows = [
+        [f"{name}, {kind}", *(_cell(entries[index]) for entries in by_pixels.values())]
+        for kind, by_pixels in found["drawing"].items()
+        for index, name in enumerate(entry["name"] for entry in next(iter(by_pixels.values())))
+    ]
+    head = table(["time of a picture", *(f"{n} × {n}" for n in found["drawing"]["lit"])], rows)
+    return f"{head}\n\nOur lit picture takes {remap_ratios(found['drawing'])} times as long as `{READY}`."
+
+
+def remap_ratios(measured: dict[str, dict[str, list[Entry]]]) -> str:
+    """Say how many times as long as cv2.remap with ready maps a lit picture takes, for every size."""
+    ratios = []
+    for pixels, lit in measured["lit"].items():
+        ready = next(entry for entry in measured["flat"][pixels] if entry["name"] == READY)
+        ratios.append(f"{_ratio(lit[0], ready)} ({pixels} × {pixels})")
+    return " and ".join(ratios)
 
 
 def drawing_table(measured: dict[str, list[Entry]]) -> str:

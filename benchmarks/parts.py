@@ -2,17 +2,23 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from typing import Any
 
-from benchmarks import bounds, whole_run
+from benchmarks import bounds, instructions, whole_run
 from benchmarks.drawing import FLAT, LIT
 from benchmarks.race import Progress, race
 from benchmarks.stepping import FASTEST, PEERS
-from taichi_msm.runtime import available_threads
+from taichi_msm.runtime import available_threads, vector_bits
 
 STEPPING, DRAWING = "benchmarks.stepping.measure", "benchmarks.drawing.measure"
+
+# The width of the vectors of AVX2.
+NARROW = 256
+
+# This program, and the least that a picture costs anyone.
+OURS, READY = "taichi_msm", "cv2.remap, maps ready"
 
 # The picture of the drawing's scaling, and the sheets whose steps are timed with every number of threads.
 PIXELS, REFINE = 512, 10
@@ -61,36 +67,33 @@ def _race(*arguments: Any, **work: Any) -> Entries:
 
 def stepping(effort: Effort, progress: Progress) -> dict[str, Entries]:
     """Step beside all peers."""
-    return {
-        str(n): _race(STEPPING, PEERS, effort.rounds, prefixed(progress, f"{n} x {n}"), points=n) for n in effort.points
-    }
+    return _step(PEERS, effort.points, effort, progress)
 
 
 def drawing(effort: Effort, progress: Progress) -> dict[str, dict[str, Entries]]:
     """Draw beside all peers, lit and flat."""
+    return _draw_beside({"lit": LIT, "flat": FLAT}, effort, progress)
+
+
+def narrow(effort: Effort, progress: Progress) -> dict[str, Any]:
+    """Step and draw beside the fastest peers with vectors of 256 bits, where the processor has wider ones."""
+    if vector_bits() <= NARROW:
+        return {}
+    beside = {"lit": {OURS: LIT[OURS]}, "flat": {name: FLAT[name] for name in (OURS, READY)}}
     return {
-        kind: {
-            str(pixels): _race(
-                DRAWING,
-                peers,
-                effort.rounds,
-                prefixed(progress, f"{kind} {pixels} px"),
-                pixels=pixels,
-                refine=REFINE,
-                lit=kind == "lit",
-            )
-            for pixels in effort.pixels
-        }
-        for kind, peers in (("lit", LIT), ("flat", FLAT))
+        "stepping": _step(FASTEST, effort.sizes, effort, progress, bits=NARROW),
+        "drawing": _draw_beside(beside, effort, progress, bits=NARROW),
     }
 
 
 def size(effort: Effort, progress: Progress) -> dict[str, Entries]:
     """Step sheets of every size."""
-    return {
-        str(n): _race(STEPPING, FASTEST, effort.rounds, prefixed(progress, f"{n} x {n}"), points=n)
-        for n in effort.sizes
-    }
+    return _step(FASTEST, effort.sizes, effort, progress)
+
+
+def widths(progress: Progress) -> dict[str, dict[str, dict[str, int]]]:
+    """Count the vector instructions of the fastest peers."""
+    return instructions.measure(FASTEST, sorted({NARROW, vector_bits()}, reverse=True), progress)
 
 
 def refine(effort: Effort, progress: Progress) -> dict[str, Entries]:
@@ -130,9 +133,41 @@ def thread_counts() -> list[int]:
     return sorted({most, *(1 << k for k in range(most.bit_length()) if 1 << k < most)})
 
 
+def _step(
+    peers: Mapping[str, str], points: Sequence[int], effort: Effort, progress: Progress, **work: Any
+) -> dict[str, Entries]:
+    """Time steps of several sizes."""
+    return {
+        str(n): _race(STEPPING, peers, effort.rounds, prefixed(progress, f"{n} x {n}"), points=n, **work)
+        for n in points
+    }
+
+
+def _draw_beside(
+    beside: Mapping[str, Mapping[str, str]], effort: Effort, progress: Progress, **work: Any
+) -> dict[str, dict[str, Entries]]:
+    """Time pictures of several sizes, lit and flat."""
+    return {
+        kind: {
+            str(pixels): _race(
+                DRAWING,
+                peers,
+                effort.rounds,
+                prefixed(progress, f"{kind} {pixels} px"),
+                pixels=pixels,
+                refine=REFINE,
+                lit=kind == "lit",
+                **work,
+            )
+            for pixels in effort.pixels
+        }
+        for kind, peers in beside.items()
+    }
+
+
 def _draw(effort: Effort, progress: Progress, **work: Any) -> Entries:
     """Time this program's drawing."""
-    return _race(DRAWING, {"taichi_msm": LIT["taichi_msm"]}, effort.rounds, progress, **work)
+    return _race(DRAWING, {OURS: LIT[OURS]}, effort.rounds, progress, **work)
 
 
 def prefixed(progress: Progress, prefix: str) -> Progress:
@@ -148,5 +183,7 @@ PARTS: dict[str, Callable[[Effort, Progress], Any]] = {
     "refine": refine,
     "resolution": resolution,
     "threads": threads,
+    "narrow": narrow,
+    "widths": lambda effort, progress: widths(progress),
     "bounds": lambda effort, progress: bounds.measure(effort.sizes, effort.rounds, progress),
 }

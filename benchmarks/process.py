@@ -9,6 +9,8 @@ import sys
 from pathlib import Path
 from typing import Any
 
+from taichi_msm import runtime
+
 ROOT = Path(__file__).parent.parent
 
 # What a run makes; ignored by git. Compiled kernels and the answers to compare with are kept for one run only.
@@ -17,6 +19,12 @@ CACHE = OUTPUT / "cache"
 
 # A measurement that takes longer is given up [s].
 PATIENCE = 900.0
+
+# Where a measurement is told the width of vectors that peers may take; without it, they take the processor's.
+NARROW = "BENCHMARK_VECTOR_BITS"
+
+# A processor with AVX2 and FMA and without AVX-512, as GCC and LLVM call it.
+AVX2 = "x86-64-v3"
 
 
 class UnavailableError(Exception):
@@ -32,18 +40,20 @@ def call(task: str, **arguments: Any) -> Any:
 
     Args:
         task: "module:function"; what it takes and gives is JSON.
-        arguments: of the function; `threads` also sizes the pools that look into the environment.
+        arguments: of the function; `threads` also sizes the pools that look into the environment. `bits`, which is
+            not passed on, is the width of vectors that peers may take; None: the processor's.
 
     Raises:
         UnavailableError: when what it needs is not installed.
         FailedError: when it ends with another error or takes too long.
     """
+    bits = arguments.pop("bits", None)
     command = [sys.executable, "-m", "benchmarks.child", task, json.dumps(arguments)]
     try:
         done = subprocess.run(
             command,
             cwd=ROOT,
-            env=_environment(arguments.get("threads")),
+            env=_environment(arguments.get("threads"), bits),
             capture_output=True,
             text=True,
             check=False,
@@ -61,7 +71,12 @@ def call(task: str, **arguments: Any) -> Any:
     return answer["returned"]
 
 
-def _environment(threads: int | None) -> dict[str, str]:
+def vector_bits() -> int:
+    """Tell how wide vectors may be in this process."""
+    return int(os.environ.get(NARROW) or runtime.vector_bits())
+
+
+def _environment(threads: int | None, bits: int | None) -> dict[str, str]:
     environment = {
         **os.environ,
         "JAX_PLATFORMS": "cpu",
@@ -72,4 +87,12 @@ def _environment(threads: int | None) -> dict[str, str]:
     if threads is not None:
         pools = ("OMP_NUM_THREADS", "NUMBA_NUM_THREADS", "OPENBLAS_NUM_THREADS", "LP_NUM_THREADS")
         environment |= dict.fromkeys(pools, str(threads))
+    if bits is not None and bits < runtime.vector_bits():
+        environment |= {
+            NARROW: str(bits),
+            "NUMBA_CPU_NAME": AVX2,
+            "NUMBA_CPU_FEATURES": "+avx2,+fma",
+            "NUMBA_CACHE_DIR": str(CACHE / "numba-256"),
+            "OPENCV_CPU_DISABLE": "AVX512_SKX,AVX512_COMMON,AVX512_ICL",
+        }
     return environment

@@ -92,7 +92,7 @@ def test_a_measurement_is_a_process_of_its_own() -> None:
 
 def test_a_peer_without_its_compiler_is_skipped_with_its_word(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("PATH", "")
-    with pytest.raises(process.UnavailableError, match=r"g\+\+ is not installed"):
+    with pytest.raises(process.UnavailableError, match="is installed"):
         process.call("benchmarks.stepping.measure:check", peer=PEERS["C++, OpenMP"], points=5)
 
 

@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 from benchmarks.drawing.problem import Artist, Problem
+from benchmarks.process import vector_bits
 from taichi_msm import runtime
-from taichi_msm.drawing import Drawing
+from taichi_msm.drawing import Drawing, structure
 
 
 def prepare(problem: Problem, threads: int | None) -> Artist:
     """Set up the drawing."""
     runtime.start("cpu", threads)
-    return Drawing(problem.scene, problem.texture)
+    code = replace(structure(problem.scene), lanes=vector_bits() // 32)
+    return Drawing(problem.scene, problem.texture, code)

@@ -2,11 +2,16 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
+from benchmarks.process import vector_bits
 from benchmarks.stepping.problem import Problem, Stepper
 from taichi_msm import runtime
-from taichi_msm.dynamics import Dynamics
+from taichi_msm.dynamics import Dynamics, structure
 
 
 def prepare(problem: Problem, threads: int | None) -> Stepper:
     """Set up the sheet at rest."""
-    return Dynamics(problem.scene, runtime.start("cpu", threads))
+    device = runtime.start("cpu", threads)
+    layout = structure(problem.scene, device)
+    return Dynamics(problem.scene, device, replace(layout, code=replace(layout.code, lanes=vector_bits() // 32)))
