@@ -81,7 +81,7 @@ def estimate(scene: Scene) -> Budget:
         steps=scene.time.frames * stability.steps_per_frame(scene),
         frames=frames,
         simulation_bytes=points * sheets * numbers,
-        drawing_bytes=_drawing_bytes(scene) if scene.draws else 0,
+        drawing_bytes=drawing_bytes(scene) if scene.draws else 0,
         picture_bytes=frames * sum(pixels * PIXEL_FILE_BYTES.get(kind, 0) for kind in set(scene.output)),
         trajectory_bytes=positions if "trajectory" in scene.output else 0,
         # Two of the states with which a run can go on, and all its positions.
@@ -140,11 +140,12 @@ def _number_bytes(scene: Scene) -> int:
     return 4 if scene.time.precision == "f32" else 8
 
 
-def _drawing_bytes(scene: Scene) -> int:
+def drawing_bytes(scene: Scene) -> int:
+    """Estimate the memory for drawing a frame [bytes], whether the scene's output asks for it or not."""
     rows, cols = scene.sheet.points
     width, height = scene.render.size
     # The whole picture is decoded, whatever the region.
-    picture = math.prod(texture.texture_size(scene.model_copy(update={"region": None})) or (0,))
+    picture = math.prod(texture.image_size(scene) or (0,))
     factor = scene.render.supersample
     band_rows = min(height * factor, BAND_ROWS * (os.cpu_count() or 1))
     samples = band_rows * width * factor * SAMPLE_BYTES

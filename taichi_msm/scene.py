@@ -2,10 +2,16 @@
 
 from __future__ import annotations
 
-from typing import Annotated, Any, Literal
+from collections.abc import Mapping
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
-from pydantic import BaseModel, ConfigDict, Field, StrictBool, field_validator, model_validator
+from pydantic import BaseModel, ConfigDict, Field, StrictBool, ValidationError, field_validator, model_validator
 from pydantic_core import PydanticCustomError
+from typing_extensions import Self
+
+from taichi_msm import faults
+from taichi_msm.errors import SceneError
+from taichi_msm.faults import LARGEST, REFUSED, SMALLEST
 
 MAX_POINTS = 4096
 MAX_PROBES = 16
@@ -18,17 +24,9 @@ MAX_PATH = 4096
 # Times that differ by less than this fraction of a frame are one instant: 0.1 s x 30 /s is 3 frames.
 WHOLE = 1e-6
 
-# Beyond these sizes squares and quotients of two numbers leave floating point.
-LARGEST = 1e30
-SMALLEST = 1e-30
-
 # Below, rounding in f64 is no longer small beside the error; above, an error is no error of something.
 SMALLEST_TOLERANCE = 1e-10
 LARGEST_TOLERANCE = 0.5
-
-# The type of the errors raised here: their message is for the user as it is, and their context may name the
-# `key` (or item) below the validated value that is at fault.
-REFUSED = "refused"
 
 Number = Annotated[float, Field(strict=True, allow_inf_nan=False, ge=-LARGEST, le=LARGEST)]
 Positive = Annotated[float, Field(strict=True, allow_inf_nan=False, ge=SMALLEST, le=LARGEST)]
@@ -49,10 +47,35 @@ def key(default: Any = ..., *, means: str, expects: str) -> Any:
     return Field(default, description=means, json_schema_extra={"expects": expects})
 
 
-class Section(BaseModel):
-    """A section of the scene: immutable, and strict about its keys."""
+if TYPE_CHECKING:
+    from pydantic._internal._model_construction import ModelMetaclass
+else:
+    ModelMetaclass = type(BaseModel)
+
+
+class _Checked(ModelMetaclass):
+    """Makes sections; pydantic itself makes those inside others without it, and collects their faults."""
+
+    def __call__(cls: type[BaseModel], /, **keys: Any) -> Any:  # type: ignore[misc]  # noqa: N805
+        try:
+            return super().__call__(**keys)  # type: ignore[misc]
+        except ValidationError as error:
+            raise SceneError([str(problem) for problem in faults.problems(error, cls, keys)]) from None
+
+
+class Section(BaseModel, metaclass=_Checked):
+    """A section of the scene: immutable, and strict about its keys.
+
+    Raises:
+        SceneError: when a key is unknown, missing or wrong, here and in `model_copy`.
+    """
 
     model_config = ConfigDict(frozen=True, extra="forbid", validate_default=True)
+
+    def model_copy(self, *, update: Mapping[str, Any] | None = None, deep: bool = False) -> Self:
+        """Copy the section, with other values for some keys."""
+        del deep  # Nothing in it can be changed.
+        return type(self)(**{**{name: getattr(self, name) for name in type(self).model_fields}, **(update or {})})
 
 
 class Sheet(Section):

@@ -13,8 +13,9 @@ from typing import Any, NamedTuple
 
 from taichi_msm.errors import Path as Key
 from taichi_msm.errors import Problem, SceneError
+from taichi_msm.faults import cut, flow
 from taichi_msm.scene import MAX_PATH, Scene
-from taichi_msm.validation import cut, flow, validate
+from taichi_msm.validation import validate
 from taichi_msm.yaml_reader import MAX_DEPTH, Document, Mark, UnreadableError, mark_at, read
 
 MAX_BYTES = 2**20

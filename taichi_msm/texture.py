@@ -70,8 +70,11 @@ def load_texture(scene: Scene) -> NDArray[np.uint8]:
 
 def texture_size(scene: Scene) -> tuple[int, int] | None:
     """Tell the texture's width and height [px] without decoding it; None if there is no usable picture."""
-    if scene.region is not None:
-        return scene.region[2:]
+    return image_size(scene) if scene.region is None else scene.region[2:]
+
+
+def image_size(scene: Scene) -> tuple[int, int] | None:
+    """Tell the whole picture's width and height [px] without decoding it; None if there is no usable picture."""
     try:
         return None if scene.image is None else _size(scene.image)
     except _PictureError:

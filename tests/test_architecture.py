@@ -14,6 +14,7 @@ PACKAGE = Path(__file__).parent.parent / "taichi_msm"
 # A module imports from earlier lines only.
 ORDER = [
     {"errors", "look", "interruption", "silence", "sealed", "npz"},
+    {"faults"},
     {"scene", "folder", "outlets"},
     {"lattice", "camera", "texture"},
     {"stability"},

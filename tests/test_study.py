@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from pydantic import BaseModel
 
 from taichi_msm import reference
 from taichi_msm.dynamics import structure
@@ -190,7 +191,7 @@ def test_pictures_are_judged_by_a_finer_one(device: Device, monkeypatch: pytest.
     assert psnr[3, 4] > max(psnr[0, 4], psnr[3, 1]) > psnr[0, 1]
     assert points[3, 4].largest_error < points[0, 1].largest_error
     # By the twin.
-    fine = made.model_copy(update={"render": made.render.model_copy(update=pictures.FINEST)})
+    fine = made.model_copy(update={"render": BaseModel.model_copy(made.render, update=pictures.FINEST)})
     own = made.model_copy(update={"render": made.render.model_copy(update={"refine": 0})})
     apart = reference.draw(fine, position, speckle(20, 30)).astype(float) - reference.draw(
         own, position, speckle(20, 30)

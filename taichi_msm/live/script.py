@@ -11,8 +11,9 @@ from pydantic import Field, field_validator, model_validator
 from pydantic_core import PydanticCustomError
 
 from taichi_msm.errors import Problem, SceneError
+from taichi_msm.faults import REFUSED
 from taichi_msm.live.events import KEYS, Drag, Event, Key, Percent, Press, Release, Turn
-from taichi_msm.scene import MAX_PIXELS, REFUSED, NotNegative, Number, Pixels, Section, key
+from taichi_msm.scene import MAX_PIXELS, NotNegative, Number, Pixels, Section, key
 from taichi_msm.scene_file import Draft, Kind, read_file
 from taichi_msm.validation import parse
 

@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from pydantic import BaseModel
 
 from taichi_msm import budget
 from taichi_msm.drawing import Drawing
@@ -81,7 +82,7 @@ class PictureStudy:
         for number, (refine, supersample) in enumerate(self._settings):
             self._progress(number, len(self._settings) * ROUNDS)
             scene = _with_render(self._scene, refine=refine, supersample=supersample)
-            memory -= budget.estimate(scene).drawing_bytes
+            memory -= budget.drawing_bytes(scene)
             if memory < 0:
                 self.notes.append(
                     f"drawing was not measured from refine {refine}, supersample {supersample} on: memory"
@@ -103,7 +104,7 @@ class PictureStudy:
 
     def _draw_truth(self, memory: int) -> bool:
         scene = _with_render(self._scene, **FINEST)
-        if budget.estimate(scene).drawing_bytes > memory:
+        if budget.drawing_bytes(scene) > memory:
             self.notes.append("drawing was not measured: there is no memory for a picture fine enough to judge by")
             return False
         self._truth = Drawing(scene, self._texture).draw(self._position)
@@ -127,5 +128,5 @@ def psnr(picture: Picture, truth: Picture) -> float | None:
 
 
 def _with_render(scene: Scene, **changes: int) -> Scene:
-    # Beyond what a scene may ask for, as there is no check.
-    return scene.model_copy(update={"render": scene.render.model_copy(update=changes), "output": ("png",)})
+    # The truth is drawn beyond what a scene may ask for, so this is not checked.
+    return scene.model_copy(update={"render": BaseModel.model_copy(scene.render, update=changes)})
