@@ -8,34 +8,46 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from taichi_msm.errors import DeviceError, DivergedError, FilesError, MsmError, SceneError
+    from taichi_msm.errors import ArgumentError, DeviceError, DivergedError, FilesError, MsmError, SceneError
     from taichi_msm.runner import resume, run
-    from taichi_msm.scene import Scene
+    from taichi_msm.scene import Camera, Probe, Render, Scene, Sheet, Springs, Time
     from taichi_msm.scene_file import load_scene
     from taichi_msm.simulation import Simulation
+    from taichi_msm.surface import Surface
 
 __version__ = "0.1.0"
 
+_HOMES = {
+    **dict.fromkeys(
+        ("ArgumentError", "DeviceError", "DivergedError", "FilesError", "MsmError", "SceneError"), "errors"
+    ),
+    **dict.fromkeys(("Camera", "Probe", "Render", "Scene", "Sheet", "Springs", "Time"), "scene"),
+    "Simulation": "simulation",
+    "Surface": "surface",
+    "load_scene": "scene_file",
+    **dict.fromkeys(("resume", "run"), "runner"),
+}
+
 __all__ = [
+    "ArgumentError",
+    "Camera",
     "DeviceError",
     "DivergedError",
     "FilesError",
     "MsmError",
+    "Probe",
+    "Render",
     "Scene",
     "SceneError",
+    "Sheet",
     "Simulation",
+    "Springs",
+    "Surface",
+    "Time",
     "load_scene",
     "resume",
     "run",
 ]
-
-_HOMES = {
-    **dict.fromkeys(("DeviceError", "DivergedError", "FilesError", "MsmError", "SceneError"), "errors"),
-    "Scene": "scene",
-    "Simulation": "simulation",
-    "load_scene": "scene_file",
-    **dict.fromkeys(("resume", "run"), "runner"),
-}
 
 
 def __getattr__(name: str) -> Any:

@@ -9,7 +9,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from taichi_msm.errors import Problem
+from taichi_msm.errors import Problem, SceneError
 from taichi_msm.scene import Camera, Scene
 
 Array = NDArray[np.float64]
@@ -39,7 +39,13 @@ class View(NamedTuple):
 
 
 def view(scene: Scene) -> View:
-    """Set up the scene's camera."""
+    """Set up the scene's camera.
+
+    Raises:
+        SceneError: when it sees nothing.
+    """
+    if blind := [str(problem) for problem in problems(scene)]:
+        raise SceneError(blind)
     camera = scene.render.camera
     if camera == "top":
         return _top(scene)

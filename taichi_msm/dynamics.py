@@ -21,7 +21,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from taichi_msm.errors import DeviceError
+from taichi_msm.errors import ArgumentError, DeviceError
 from taichi_msm.forces import (
     ACROSS,
     BYTES,
@@ -167,14 +167,19 @@ class Dynamics:
         """Go on from here with other loads.
 
         Args:
-            scene: the scene with other keys of loads and control points; those of control points that stand, and all
-                numbers else, are the same.
+            scene: the scene with other probes, of which each moves, jumps or stands as it did.
 
         Raises:
-            ValueError: when it needs another kernel.
+            ArgumentError: when it needs another kernel.
         """
-        if tuple(grip.moves for grip in grips(scene)) != self.structure.code.grips:
-            raise ValueError("these probes need another kernel; make another Dynamics")
+        moves = tuple(grip.moves for grip in grips(scene))
+        if moves != self.structure.code.grips:
+            raise ArgumentError(
+                f"probes: the scene's move, jump or stand otherwise (control points that move: "
+                f"{_in_words(self.structure.code.grips)}; now {_in_words(moves)}); restart with a scene that has these"
+            )
+        if _standing(scene) != _standing(self.scene):
+            self._moving.set_decay(_standing_decays(scene))
         self.scene = scene
         # Who steers does so again in a frame.
         self._first_tabled, self._loads = self.steps_done, self._table(self.steps_done, steps_per_frame(scene))
@@ -298,8 +303,22 @@ class Dynamics:
         by_column[ACROSS] = axes(scene.sheet)[0]
         by_column[HAS_LEFT] = column > 0
         by_column[HAS_RIGHT] = column < s.cols - 1
-        decays = np.array([decay(grip, scene) for grip in grips(scene) if not grip.moves])
         self._sheet = None  # Its memory is free before there is another.
         kind = Sweep if s.workers else Gather
         begun = None if state is None else (state.displacement, state.difference)
-        self._sheet = kind(s, Start(by_column, decays, begun))
+        self._sheet = kind(s, Start(by_column, _standing_decays(scene), begun))
+
+
+def _standing(scene: Scene) -> list[tuple[object, ...]]:
+    """List all on which the decays of the grips that stand depend."""
+    probes = [scene.probes[grip.probe] for grip in grips(scene) if not grip.moves]
+    return [(probe.at, probe.falloff, probe.offset) for probe in probes]
+
+
+def _standing_decays(scene: Scene) -> NDArray[np.float64]:
+    """Give the decays of all grips that stand, shape (grips, rows, cols)."""
+    return np.array([decay(grip, scene) for grip in grips(scene) if not grip.moves])
+
+
+def _in_words(moves: tuple[bool, ...]) -> str:
+    return ", ".join("yes" if one else "no" for one in moves) or "none"

@@ -47,8 +47,27 @@ class DeviceError(MsmError):
     """The arch or thread count asked for cannot be had."""
 
 
+class ArgumentError(MsmError, ValueError):
+    """An argument of a call is wrong; the message names it, its value and what it may be."""
+
+
 class DivergedError(MsmError):
-    """The simulation left every bound; the message names the time, the point and the remedy."""
+    """The simulation left every bound; the message names the time, the point and the remedy.
+
+    Attributes:
+        step: number of steps that were taken.
+        time: simulated time then [s].
+        point: row and column of the point that is farthest from rest.
+    """
+
+    def __init__(self, message: str, step: int, time: float, point: tuple[int, int]) -> None:
+        super().__init__(message)
+        self.step = step
+        self.time = time
+        self.point = point
+
+    def __reduce__(self) -> tuple[type[DivergedError], tuple[str, int, float, tuple[int, int]]]:
+        return type(self), (str(self), self.step, self.time, self.point)
 
 
 class FilesError(MsmError):

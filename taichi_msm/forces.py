@@ -199,8 +199,6 @@ class SheetArrays:
         self.decay = self.rows(max(1, len(decay)) * s.rows)
         with our_compilation():
             self._fill(self.by_column, in_lanes(s, by_column))
-            if len(decay):
-                self._fill(self.decay, in_lanes(s, decay))
             for c in range(3):
                 if state is None:
                     clear(self.u[c], len(stored) * s.width)
@@ -209,6 +207,13 @@ class SheetArrays:
                     held = (stored >= 0)[:, None]
                     self._fill(self.u[c], in_lanes(s, np.where(held, state[0][stored, :, c], 0)))
                     self._fill(self.d[c], in_lanes(s, state[1][..., c]))
+        self.set_decay(decay)
+
+    def set_decay(self, decay: NDArray[Any]) -> None:
+        """Put the decays of other standing grips in the place of those that are there, shape (grips, rows, cols)."""
+        if len(decay):
+            with our_compilation():
+                self._fill(self.decay, in_lanes(self._s, decay))
 
     def rows(self, count: int) -> Any:
         """Take an array of so many rows, of whatever was in it."""

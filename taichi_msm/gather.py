@@ -61,6 +61,10 @@ class Gather:
         """Compile the steps without taking one."""
         self.advance(0, numbers, table)
 
+    def set_decay(self, decay: NDArray[Any]) -> None:
+        """Let standing grips act elsewhere, or otherwise; shape (grips, rows, cols)."""
+        self._arrays.set_decay(decay)
+
     def read(self, spacing: tuple[float, float], out: Readings) -> None:
         """Copy what is asked for, and measure every row."""
         s, arrays = self._s, self._arrays

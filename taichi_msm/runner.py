@@ -6,7 +6,7 @@ import math
 import platform
 import sys
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import asdict
 from functools import partial
@@ -29,6 +29,7 @@ from taichi_msm.scene import Scene
 from taichi_msm.simulation import Simulation
 from taichi_msm.stability import stable_step, step, steps_per_frame
 from taichi_msm.texture import load_texture
+from taichi_msm.validation import checked
 
 # Encoding a pixel takes as long as so many steps of a point.
 STEPS_PER_PIXEL = 40
@@ -59,7 +60,7 @@ class Stopwatch:
 
 
 def run(
-    scene: Scene,
+    scene: Scene | Mapping[str, Any],
     directory: str | Path,
     *,
     arch: str = "cpu",
@@ -74,7 +75,7 @@ def run(
     An unfinished run of the same scene into the same directory is gone on with: the results have the same bits.
 
     Args:
-        scene: what `load_scene` returned.
+        scene: what `load_scene` returned, or the same as a mapping.
         directory: where frames/, animation.gif, trajectory.npz and run.json go.
         arch: cpu, cuda or vulkan.
         threads: number of CPU threads; None takes every core.
@@ -89,13 +90,14 @@ def run(
         After the last two, and where the process was killed, `resume` goes on.
 
     Raises:
-        SceneError: when the scene's picture cannot be decoded, no step meets its tolerance, or the disk has no room for
-            the results.
+        SceneError: when the scene cannot be run, its picture cannot be decoded, no step meets its tolerance, or the
+            disk has no room for the results.
         DeviceError: when the arch is not there.
         FilesError: when the results cannot be written.
         KeyboardInterrupt: when interrupted before the first frame; nothing is written then.
     """
     watch = Stopwatch(started)
+    scene = checked(scene)
     budget.require_disk(scene, Path(directory))
     device = runtime.start(arch, threads)
     texture = load_texture(scene) if scene.draws else None
@@ -244,6 +246,7 @@ def _facts(plan: Plan, course: Course) -> dict[str, Any]:
     scene, limit = plan.scene, stable_step(plan.scene)
     return {
         "scene": plan.given.model_dump(mode="json"),
+        "working_directory": plan.folder,
         "overrides": list(plan.overrides),
         "step": step(scene),
         "stable_step": limit if limit < math.inf else None,

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
 from types import TracebackType
 from typing import TYPE_CHECKING, Any
 
@@ -10,26 +11,33 @@ from numpy.typing import NDArray
 
 from taichi_msm import runtime
 from taichi_msm.accuracy import choose_step
-from taichi_msm.camera import View
+from taichi_msm.camera import View, view
 from taichi_msm.course import Course, Saved
 from taichi_msm.diagnosis import Diagnosis, diagnose
-from taichi_msm.divergence import Watch
+from taichi_msm.divergence import Watch, farthest
 from taichi_msm.dynamics import Dynamics, Pause
-from taichi_msm.errors import DivergedError, MsmError
+from taichi_msm.errors import ArgumentError, DivergedError, MsmError
 from taichi_msm.lattice import axes
-from taichi_msm.scene import Probe, Scene
+from taichi_msm.picking import pick
+from taichi_msm.scene import Camera, Probe, Scene
 from taichi_msm.stability import step, steps_per_frame
-from taichi_msm.texture import load_texture
+from taichi_msm.surface import Surface, surface
+from taichi_msm.texture import load_texture, require_texture
+from taichi_msm.validation import checked
 
 if TYPE_CHECKING:
     from taichi_msm.drawing import Drawing
+
+# A camera as a scene has it; None: the scene's own. A `View` is one that was set up already.
+CameraLike = str | Mapping[str, Any] | Camera | View | None
 
 
 class Simulation:
     """A sheet that moves by frames and can be drawn. Usable in a with statement, which frees its memory.
 
     Args:
-        scene: what `load_scene` returned; where it has a tolerance, pilot runs choose the step first.
+        scene: what `load_scene` returned, or the same as a mapping; where it has a tolerance, pilot runs choose the
+            step first.
         arch: cpu, cuda or vulkan.
         threads: number of CPU threads; None takes every core.
         texture: the picture on the sheet, shape (height, width, 3); None: the scene's own, read when it is drawn.
@@ -39,8 +47,9 @@ class Simulation:
     Raises:
         MsmError: here and in all methods, in another thread than that of the first simulation, or in a process that
             was forked after it.
+        ArgumentError: here and in all methods, when an argument is not what it must be.
         DeviceError: when the arch is not there, or Taichi already runs on another one in this process.
-        SceneError: when no step meets the scene's tolerance.
+        SceneError: when the scene cannot be run, or no step meets its tolerance.
 
     Attributes:
         scene: the scene, with the step that was chosen.
@@ -48,12 +57,14 @@ class Simulation:
 
     def __init__(
         self,
-        scene: Scene,
+        scene: Scene | Mapping[str, Any],
         arch: str = "cpu",
         threads: int | None = None,
         texture: NDArray[np.uint8] | None = None,
         cores: int | None = None,
     ) -> None:
+        scene = checked(scene)
+        texture = None if texture is None else require_texture(texture)
         self.device = runtime.start(arch, threads)
         if scene.time.tolerance is not None:
             scene, _ = choose_step(scene, self.device)
@@ -63,6 +74,7 @@ class Simulation:
         self._dynamics = Dynamics(scene, self.device, cores=cores)
         self._position = self._place(self._dynamics.displacement())
         self._texture = texture
+        self._own_texture = texture is None
         self._drawing: Drawing | None = None
 
     @property
@@ -109,28 +121,53 @@ class Simulation:
                 the last frame that was good.
         """
         if not (isinstance(frames, int) and frames >= 0):
-            raise ValueError(f"{frames!r} frames cannot be simulated; take a whole number, 0 or more")
+            raise ArgumentError(f"{frames!r} frames cannot be simulated; take a whole number, 0 or more")
         self._require_open()
         for _ in range(frames):
             end = (self.frame + 1) * steps_per_frame(self.scene)
             self._dynamics.advance(end - self.steps, pause)
             self._position = self._read()
 
-    def steer(self, probes: tuple[Probe, ...]) -> None:
+    def steer(self, probes: Sequence[Probe | Mapping[str, Any]]) -> None:
         """Let other loads act from here on.
 
         Args:
-            probes: the scene's with other keys, each of whose control points moves or stands as it did.
+            probes: the scene's with other numbers, each of whose control points moves, jumps or stands as it did: a
+                tool that is to move later has keys from the start, if only one.
 
         Raises:
             MsmError: when the simulation is closed.
-            ValueError: when the kernel was not compiled for them.
+            ArgumentError: when the kernel was not compiled for them.
+            SceneError: when one of them is no probe.
         """
         self._require_open()
-        scene = self.scene.model_copy(update={"probes": probes})
+        scene = self.scene.model_copy(update={"probes": tuple(probes)})
         self._dynamics.steer(scene)
         self._watch.steer(scene)
         self.scene = scene
+
+    def restart(self, scene: Scene | Mapping[str, Any] | None = None) -> None:
+        """Begin again at rest. With the same terms of the model and the same precision nothing is compiled.
+
+        Args:
+            scene: another one; None: the same.
+
+        Raises:
+            MsmError: when the simulation is closed.
+            SceneError: as for `Simulation`.
+        """
+        self._require_open()
+        if scene is not None:
+            scene = checked(scene)
+            if scene.time.tolerance is not None:
+                scene, _ = choose_step(scene, self.device)
+            if self._own_texture and (scene.image, scene.region) != (self.scene.image, self.scene.region):
+                self._texture = None
+            self.scene = scene
+        self._watch = Watch(self.scene)
+        self._dynamics.restart(self.scene)
+        self._drawing = None
+        self._position = self._place(self._dynamics.displacement())
 
     def save(self) -> Saved:
         """Give all that is needed to go on from here in another simulation.
@@ -159,6 +196,32 @@ class Simulation:
         """
         return self._position
 
+    def velocities(self) -> NDArray[Any]:
+        """Give how fast the points move: the mean over the last step, so half a step before `time`.
+
+        Returns:
+            Velocities [m/s], shape (rows, cols, 3), in the scene's precision; 0 at the start.
+        """
+        self._require_open()
+        return self._dynamics.state().difference / self._position.dtype.type(step(self.scene))
+
+    def surface(self) -> Surface:
+        """Give the refined surface as textured triangles: vertices, triangles, texture coordinates."""
+        return surface(self._position, self.scene.render.refine)
+
+    def pick(self, pixel: tuple[float, float], camera: CameraLike = None) -> tuple[float, float] | None:
+        """Find the material point that is seen at the centre of a pixel.
+
+        Args:
+            pixel: x to the right and y down from the picture's top-left pixel, which is (0, 0).
+            camera: as for `draw`.
+
+        Returns:
+            Fractions of the sheet's width from its left and of its height from its top, as in a probe's `at`;
+            None where no surface is.
+        """
+        return pick(self._position, self.scene.render.refine, self._view(camera), pixel)
+
     def diagnose(self, start: Saved | None = None, pause: Pause = lambda: None) -> Diagnosis:
         """Find out why `advance` said that the simulation diverged; it cannot advance afterwards, but by `go_on`.
 
@@ -169,21 +232,27 @@ class Simulation:
         self._require_open()
         return diagnose(self._dynamics, start, pause)
 
-    def draw(self, camera: View | None = None, positions: NDArray[Any] | None = None) -> NDArray[np.uint8]:
+    def draw(self, camera: CameraLike = None, positions: NDArray[Any] | None = None) -> NDArray[np.uint8]:
         """Draw the sheet as it is now.
 
         Args:
-            camera: another view than the scene's.
+            camera: another than the scene's: "top", "oblique", a `Camera` or its keys.
             positions: other positions of the points [m], such as those of an earlier frame, shape (rows, cols, 3).
 
         Returns:
             Colours, shape (height, width, 3).
 
         Raises:
-            SceneError: when the scene's picture cannot be read.
+            ArgumentError: when the positions are of another shape.
+            SceneError: when the scene's picture cannot be read, or the camera is none.
         """
         self._require_open()
-        return self._drawn().draw(self._position if positions is None else positions, camera)
+        if positions is not None:
+            positions = np.asarray(positions)
+            found, expected = positions.shape, self._position.shape
+            if found != expected or positions.dtype.kind not in "fiu":
+                raise ArgumentError(f"positions: {positions.dtype} of shape {found}; take numbers of shape {expected}")
+        return self._drawn().draw(self._position if positions is None else positions, self._view(camera))
 
     def compile(self, pause: Pause = lambda: None) -> None:
         """Compile now what would be compiled by the first frame.
@@ -217,12 +286,21 @@ class Simulation:
             raise MsmError("this simulation is closed; make another")
         runtime.require_here()
 
+    def _view(self, camera: CameraLike) -> View:
+        if isinstance(camera, View):
+            return camera
+        if camera is None:
+            return view(self.scene)
+        render = self.scene.render.model_copy(update={"camera": camera})
+        return view(self.scene.model_copy(update={"render": render}))
+
     def _drawn(self) -> Drawing:
         if self._drawing is None:
             from taichi_msm.drawing import Drawing
 
-            texture = load_texture(self.scene) if self._texture is None else self._texture
-            self._drawing = Drawing(self.scene, texture)
+            if self._texture is None:
+                self._texture = load_texture(self.scene)
+            self._drawing = Drawing(self.scene, self._texture)
         return self._drawing
 
     def _read(self) -> NDArray[Any]:
@@ -233,7 +311,8 @@ class Simulation:
 
     def _require_good(self, wrong: str) -> None:
         if wrong:
-            raise DivergedError(f"diverged before {self.steps * step(self.scene):g} s, step {self.steps}: {wrong}")
+            time, point = self.steps * step(self.scene), farthest(self._dynamics.displacement())[:2]
+            raise DivergedError(f"diverged before {time:g} s, step {self.steps}: {wrong}", self.steps, time, point)
 
     def _place(self, displacement: NDArray[Any]) -> NDArray[Any]:
         """Turn displacements into positions."""

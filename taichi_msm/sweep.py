@@ -121,6 +121,10 @@ class Sweep:
         if self._s.workers > 1:
             self._advance_alone(0, 0, numbers, table)
 
+    def set_decay(self, decay: NDArray[Any]) -> None:
+        """Let standing grips act elsewhere, or otherwise; shape (grips, rows, cols)."""
+        self._arrays.set_decay(decay)
+
     def read(self, spacing: tuple[float, float], out: Readings) -> None:
         """Copy what is asked for, and measure every row.
 

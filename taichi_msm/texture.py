@@ -8,9 +8,9 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from mmap import ACCESS_READ, mmap
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
-from taichi_msm.errors import Problem, SceneError
+from taichi_msm.errors import ArgumentError, Problem, SceneError
 from taichi_msm.scene import Scene
 from taichi_msm.silence import silenced
 
@@ -25,7 +25,7 @@ FORMATS = ("PNG", "JPEG", "WEBP", "BMP", "TIFF")
 _MODES_16_BIT = ("I;16", "I;16L", "I;16B", "I;16N")
 _MODES = ("1", "L", "LA", "P", "PA", "RGB", "RGBA", "RGBa", "RGBX", "CMYK", "YCbCr", *_MODES_16_BIT)
 
-# The longest side of a JPEG. Pillow needs memory and time for every row, and a picture of one column has many.
+# The longest side of a picture. Pillow needs memory and time for every row, and a picture of one column has many.
 MAX_SIDE = 65535
 
 # Every scan of a JPEG goes over all pixels. Encoders make some ten; a few seconds' work may be more.
@@ -66,6 +66,24 @@ def load_texture(scene: Scene) -> NDArray[np.uint8]:
     if outside:
         raise SceneError(outside)
     return np.array(image.crop((x, y, x + width, y + height)))
+
+
+def require_texture(texture: Any) -> NDArray[np.uint8]:
+    """Make sure that an array can be the picture on the sheet.
+
+    Raises:
+        ArgumentError: when it cannot.
+    """
+    import numpy as np
+
+    found = np.asarray(texture)
+    is_picture = found.dtype == np.uint8 and found.ndim == 3 and found.shape[2] == 3
+    if not (is_picture and min(found.shape) > 0 and max(found.shape) <= MAX_SIDE):
+        raise ArgumentError(
+            f"texture: {found.dtype} of shape {found.shape} is no picture; take uint8 of shape (height, width, 3), "
+            f"up to {MAX_SIDE} a side, such as numpy.asarray(image.convert('RGB'))"
+        )
+    return found
 
 
 def texture_size(scene: Scene) -> tuple[int, int] | None:

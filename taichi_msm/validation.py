@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Mapping
 from typing import Any, TypeVar
 
 from pydantic import ValidationError
 
 from taichi_msm import budget, camera, faults, stability, texture
-from taichi_msm.errors import Problem
+from taichi_msm.errors import ArgumentError, Problem, SceneError
 from taichi_msm.scene import Scene, Section
 
 Model = TypeVar("Model", bound=Section)
@@ -50,6 +50,27 @@ def validate(data: dict[str, Any]) -> tuple[Scene | None, list[Problem]]:
             break
         data = _spare(data, found)
     return (None if problems else scene), problems
+
+
+def checked(scene: Scene | Mapping[str, Any]) -> Scene:
+    """Give a scene of which all but its picture is checked.
+
+    Args:
+        scene: one that may have been made in Python, or its keys.
+
+    Raises:
+        SceneError: with all that is wrong with it.
+    """
+    if isinstance(scene, Scene):
+        problems = [problem for check in CHECKS if check is not texture.problems for problem in check(scene)]
+        made: Scene | None = scene
+    elif isinstance(scene, Mapping):
+        made, problems = validate(dict(scene))
+    else:
+        raise ArgumentError(f"{type(scene).__name__} is no scene; take what load_scene returns, or a mapping")
+    if made is None or problems:
+        raise SceneError([str(problem) for problem in problems])
+    return made
 
 
 def _spare(data: dict[str, Any], problems: list[Problem]) -> dict[str, Any]:

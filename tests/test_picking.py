@@ -12,7 +12,7 @@ from taichi_msm import reference
 from taichi_msm.camera import pinhole, turned, view
 from taichi_msm.drawing import Drawing
 from taichi_msm.lattice import rest_positions
-from taichi_msm.live.picking import on_rest_plane, pick
+from taichi_msm.picking import on_rest_plane, pick
 from taichi_msm.runtime import Device
 from taichi_msm.scene import Scene
 from tests.scenes import scene

@@ -98,7 +98,7 @@ def test_the_encoder_has_a_core_of_its_own_while_it_works(monkeypatch: pytest.Mo
     monkeypatch.setattr(runtime, "available_threads", lambda: 4)
     made = scene(render={"size": [512, 512]}, time={"step": 0.001})
     assert runner.free_cores(made) == 4, "nothing to encode"
-    made = made.model_copy(update={"output": ("gif",)})
+    made = made.model_copy(update={"image": "a.png", "output": ("gif",)})
     assert runner.free_cores(made) == 3
     # 40 steps of 10^6 points a frame take longer than its 512 x 512 pixels.
     large = made.sheet.model_copy(update={"points": (1000, 1000)})

@@ -18,9 +18,9 @@ from taichi_msm.live import overlay
 from taichi_msm.live.album import Album, values
 from taichi_msm.live.events import KEYS, NOTCH, POINTER, Drag, Event, Harder, Key, Percent, Press, Release, Turn
 from taichi_msm.live.film import Film
-from taichi_msm.live.picking import on_rest_plane, pick
 from taichi_msm.live.stage import Stage
 from taichi_msm.live.tool import Place, Tool
+from taichi_msm.picking import on_rest_plane, pick
 from taichi_msm.scene import MAX_PROBES, Camera, Scene
 from taichi_msm.simulation import Simulation
 from taichi_msm.stability import steps_per_frame, with_time

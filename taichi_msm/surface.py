@@ -1,0 +1,54 @@
+"""The refined surface as arrays, for other programs to draw: vertices, triangles and where the picture is on them."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+
+class Surface(NamedTuple):
+    """Textured triangles.
+
+    Attributes:
+        vertices: positions [m], shape (vertices, 3), row after row from the top left.
+        triangles: indices of vertices, shape (triangles, 3), counter-clockwise as seen from above.
+        texture_coordinates: fractions of the picture's width from its left and of its height from its top, shape
+            (vertices, 2).
+    """
+
+    vertices: NDArray[np.floating]
+    triangles: NDArray[np.int32]
+    texture_coordinates: NDArray[np.float64]
+
+
+def surface(position: NDArray[np.floating], refine: int) -> Surface:
+    """Refine the sheet bilinearly (section 2 of the paper), and cut every small quad from top left to bottom right.
+
+    Args:
+        position: positions of the mass points [m], shape (rows, cols, 3).
+        refine: vertices inserted between two neighbours.
+    """
+    vertices = _between(_between(position, refine, 0), refine, 1)
+    rows, cols = vertices.shape[:2]
+    corner = np.arange(rows * cols, dtype=np.int32).reshape(rows, cols)
+    upper_left, upper_right = corner[:-1, :-1], corner[:-1, 1:]
+    lower_left, lower_right = corner[1:, :-1], corner[1:, 1:]
+    lower = np.stack([upper_left, lower_left, lower_right], axis=-1)
+    upper = np.stack([upper_left, lower_right, upper_right], axis=-1)
+    across, down = np.meshgrid(np.linspace(0, 1, cols), np.linspace(0, 1, rows))
+    return Surface(
+        vertices.reshape(-1, 3),
+        np.stack([lower, upper], axis=2).reshape(-1, 3),
+        np.stack([across, down], axis=-1).reshape(-1, 2),
+    )
+
+
+def _between(values: NDArray[np.floating], refine: int, axis: int) -> NDArray[np.floating]:
+    """Insert values between neighbours along an axis; those that were there keep their bits."""
+    parts = refine + 1
+    along = np.moveaxis(values, axis, 0)
+    share = np.arange(parts, dtype=values.dtype).reshape(-1, *(1,) * (along.ndim - 1)) / parts
+    filled = along[:-1, None] + share * (along[1:] - along[:-1])[:, None]
+    return np.moveaxis(np.concatenate([filled.reshape(-1, *along.shape[1:]), along[-1:]]), 0, axis)

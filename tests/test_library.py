@@ -1,0 +1,241 @@
+"""What a caller may get wrong gets one clear error; what is public works."""
+
+from __future__ import annotations
+
+import pickle
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+import taichi_msm
+from taichi_msm import (
+    ArgumentError,
+    Camera,
+    DivergedError,
+    MsmError,
+    Probe,
+    Render,
+    Scene,
+    SceneError,
+    Simulation,
+    load_scene,
+    reference,
+    run,
+)
+from taichi_msm.camera import view
+from taichi_msm.lattice import rest_positions
+from taichi_msm.runtime import Device, processor
+from taichi_msm.stability import stable_step, step, with_time
+from tests.scenes import PRESS, SHEET, scene, speckle
+
+HAND = {"at": [[0, 0.5, 0.5]], "force": [0, 0, -20], "falloff": 20, "offset": 0}
+
+
+@pytest.fixture
+def simulation(device: Device) -> Iterator[Simulation]:
+    made = scene(render={"size": [40, 30], "refine": 1})
+    with Simulation(made, threads=device.threads, texture=speckle(30, 40)) as simulation:
+        yield simulation
+
+
+def test_what_is_exported_is_there_and_nothing_else() -> None:
+    for name in taichi_msm.__all__:
+        assert getattr(taichi_msm, name).__name__ == name
+    assert (Path(taichi_msm.__file__).parent / "py.typed").exists()
+    with pytest.raises(AttributeError):
+        taichi_msm.nothing  # noqa: B018
+
+
+@pytest.mark.parametrize("shape", [(9, 11), (9, 12, 3), (8, 11, 3), (9, 11, 4), (2001, 2001, 3), (0,)])
+def test_positions_of_another_shape_are_refused(shape: tuple[int, ...], simulation: Simulation) -> None:
+    with pytest.raises(ArgumentError, match=r"positions: float64 of shape .*; take numbers of shape \(9, 11, 3\)"):
+        simulation.draw(positions=np.zeros(shape))
+    with pytest.raises(ArgumentError, match="positions: <U1"):
+        simulation.draw(positions=np.full((9, 11, 3), "a"))
+
+
+@pytest.mark.parametrize(
+    "texture",
+    [
+        np.zeros((4, 5), np.uint8),
+        np.zeros((4, 5, 3)),
+        np.zeros((4, 5, 4), np.uint8),
+        np.zeros((0, 5, 3), np.uint8),
+        np.zeros((1, 70000, 3), np.uint8),
+    ],
+    ids=["grey", "float", "alpha", "empty", "long"],
+)
+def test_what_is_no_picture_is_refused(texture: Any, device: Device) -> None:
+    with pytest.raises(ArgumentError, match="is no picture; take uint8 of shape"):
+        Simulation(scene(), threads=device.threads, texture=texture)
+
+
+def test_a_camera_is_given_as_in_a_scene(simulation: Simulation) -> None:
+    keys = {"eye": [0, -0.3, 0.4]}
+    for camera in ("oblique", keys, Camera(eye=(0.0, -0.3, 0.4))):
+        seen = scene(render={"size": [40, 30], "refine": 1, "camera": camera})
+        np.testing.assert_array_equal(simulation.draw(camera), simulation.draw(view(seen)))
+    assert (simulation.draw("oblique") != simulation.draw()).any()
+
+
+@pytest.mark.parametrize(
+    ("camera", "said"),
+    [
+        (3, "camera: 3 is not allowed; expected top, oblique, or"),
+        ("side", 'camera: "side" is not allowed; expected top, oblique, or'),
+        ({"eye": [0, 0]}, r"camera.eye: \[0, 0\] is not allowed; expected three numbers"),
+        ({"eye": [0, 0, 0]}, r"render.camera.eye: \[0.0, 0.0, 0.0\] is also the target; move one of them"),
+    ],
+)
+def test_a_wrong_camera_is_refused(camera: Any, said: str, simulation: Simulation) -> None:
+    with pytest.raises(SceneError, match=said):
+        simulation.draw(camera)
+
+
+@pytest.mark.parametrize("frames", [-1, 1.5, "2", None])
+def test_a_wrong_number_of_frames_is_refused(frames: Any, simulation: Simulation) -> None:
+    with pytest.raises(ArgumentError, match="frames cannot be simulated; take a whole number, 0 or more"):
+        simulation.advance(frames)
+
+
+def test_scenes_made_in_python_are_checked(device: Device, tmp_path: Path) -> None:
+    good = scene()
+    with pytest.raises(SceneError) as caught:
+        Scene(sheet={"points": [3, 3], "size": [1, 1], "mass": 0}, springs={}, time={"duration": 1}, output=(), shaer=1)
+    assert caught.value.lines == (
+        "sheet.mass: 0 is not allowed; expected a number above 0, in kg",
+        "shaer: unknown key; did you mean 'sheet'?",
+    )
+    with pytest.raises(SceneError, match="damping: -1 is not allowed"):
+        good.model_copy(update={"damping": -1})
+    with pytest.raises(SceneError, match="supersample: 9 is not allowed"):
+        Render(supersample=9)
+    with pytest.raises(SceneError, match="force: missing"):
+        Probe()
+    broken = {"sheet": SHEET, "springs": {}, "time": {"duration": -1}, "output": []}
+    unstable = with_time(good, step=0.04)
+    assert stable_step(good) < 0.04
+    for attempt in (lambda made: Simulation(made, threads=device.threads), lambda made: run(made, tmp_path / "out")):
+        with pytest.raises(SceneError, match=r"time\.duration: -1 is not allowed"):
+            attempt(broken)
+        with pytest.raises(SceneError, match=r"time\.step: 0\.04 s is"):
+            attempt(unstable)
+        with pytest.raises(ArgumentError, match="str is no scene; take what load_scene returns"):
+            attempt("scenes/press.yaml")
+    assert not (tmp_path / "out").exists()
+    with Simulation(good.model_dump(), threads=device.threads) as simulation:
+        assert simulation.scene == good
+
+
+def test_a_tool_that_stands_can_be_put_elsewhere(device: Device) -> None:
+    # As if it had been there all the time, and at the same time moved by its keys.
+    there = {**PRESS, "at": [0.25, 0.75], "falloff": 30, "offset": 11}
+    with (
+        Simulation(scene(), threads=device.threads) as steered,
+        Simulation(scene(probes=[there]), threads=device.threads) as expected,
+    ):
+        steered.steer([there])
+        steered.advance(3)
+        expected.advance(3)
+        np.testing.assert_array_equal(steered.positions(), expected.positions())
+
+
+@pytest.mark.parametrize("probes", [[], [PRESS, PRESS], [{**PRESS, "at": [[0, 0.5, 0.5], [1, 0.6, 0.5]]}]])
+def test_what_needs_another_kernel_is_refused(probes: Any, simulation: Simulation) -> None:
+    simulation.advance()
+    before = simulation.scene
+    with pytest.raises(ArgumentError, match="restart with a scene that has these"):
+        simulation.steer(probes)
+    with pytest.raises(SceneError, match=r"probes.0.force: \[1\] is not allowed"):
+        simulation.steer([{"force": [1]}])
+    assert simulation.scene == before
+    simulation.advance()
+
+
+def test_restarted_it_is_a_new_simulation(simulation: Simulation, device: Device) -> None:
+    simulation.advance(3)
+    simulation.restart()
+    assert (simulation.frame, simulation.time, simulation.steps) == (0, 0.0, 0)
+    np.testing.assert_array_equal(simulation.positions(), rest_positions(simulation.scene.sheet))
+    other = scene(sheet={**SHEET, "points": [6, 20]}, render={"size": [20, 25], "camera": "oblique"}, damping=0.02)
+    simulation.restart(other)
+    simulation.advance(2)
+    with Simulation(other, threads=device.threads, texture=speckle(30, 40)) as expected:
+        expected.advance(2)
+        np.testing.assert_array_equal(simulation.positions(), expected.positions())
+        np.testing.assert_array_equal(simulation.draw(), expected.draw())
+    with pytest.raises(SceneError, match=r"time\.step"):
+        simulation.restart(with_time(other, step=0.04))
+    assert simulation.scene == other
+
+
+def test_velocities_are_the_mean_of_the_last_step(simulation: Simulation) -> None:
+    assert not simulation.velocities().any()
+    simulation.advance(2)
+    h = step(simulation.scene)
+    made = with_time(simulation.scene, duration=2 * 0.04, frames_per_second=round(1 / h), step=h)
+    states = list(reference.displacements(made))
+    np.testing.assert_allclose(simulation.velocities(), (states[-1] - states[-2]) / h, atol=1e-12)
+
+
+def test_the_surface_is_what_is_drawn(simulation: Simulation) -> None:
+    simulation.advance(2)
+    vertices, triangles, coordinates = simulation.surface()
+    position = simulation.positions()
+    twin = reference.refine(position.astype(float), 1)
+    np.testing.assert_allclose(vertices, twin.reshape(-1, 3), atol=1e-15)
+    np.testing.assert_array_equal(vertices.reshape(17, 21, 3)[::2, ::2], position)
+    assert triangles.shape == (2 * 16 * 20, 3)
+    assert (triangles.min(), triangles.max()) == (0, 17 * 21 - 1)
+    x, y = coordinates[:, 0], -coordinates[:, 1]
+    p, q, r = triangles.T
+    areas = ((x[q] - x[p]) * (y[r] - y[p]) - (y[q] - y[p]) * (x[r] - x[p])) / 2
+    np.testing.assert_allclose(areas, 1 / len(triangles), rtol=1e-12)
+    first = {tuple(corner) for corner in triangles[:2]}
+    assert first == {(0, 21, 22), (0, 22, 1)}, "cut from top left to bottom right"
+
+
+def test_a_pixel_tells_what_is_seen_there(simulation: Simulation) -> None:
+    assert simulation.pick((9.5, 6.5)) == pytest.approx((0.25, 7 / 30))
+    assert simulation.pick((20, 2), "oblique") != simulation.pick((20, 2))
+    assert simulation.pick((-10, -10)) is None
+    # A tool goes where a pixel is.
+    made = scene(probes=[HAND], render={"size": [40, 30]})
+    simulation.restart(made)
+    place = simulation.pick((29.5, 14.5))
+    assert place is not None
+    simulation.steer([{**HAND, "at": [[0, *place]]}])
+
+
+def test_a_record_says_where_its_picture_and_its_device_are(
+    device: Device, small: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    record = run(load_scene("small.yaml", ["output=[png]"]), "out", threads=device.threads)
+    monkeypatch.chdir("/")
+    image = Path(record["working_directory"]) / record["scene"]["image"]
+    assert image.samefile(small / "speckle.png")
+    assert record["device"] == device.name == processor()
+
+
+def test_a_divergence_says_where_it_is(device: Device) -> None:
+    made = scene(probes=[{"force": [0, 0, 1e12], "falloff": 20, "at": [0.5, 0.5]}])
+    with Simulation(made, threads=device.threads) as simulation, pytest.raises(DivergedError) as caught:
+        simulation.advance(10)
+    error = caught.value
+    assert error.step > 0
+    assert error.time == pytest.approx(error.step * step(made))
+    assert f"point {error.point}" in str(error)
+    again = pickle.loads(pickle.dumps(error))
+    assert (str(again), again.step, again.time, again.point) == (str(error), error.step, error.time, error.point)
+
+
+def test_all_errors_are_ours(simulation: Simulation) -> None:
+    assert issubclass(ArgumentError, MsmError)
+    assert issubclass(ArgumentError, ValueError)
+    simulation.close()
+    for call in (simulation.advance, simulation.draw, simulation.velocities, simulation.restart, simulation.save):
+        with pytest.raises(MsmError, match="this simulation is closed"):
+            call()
