@@ -48,9 +48,16 @@ if not os.environ.get("HOME"):
 os.environ.setdefault("ENABLE_TAICHI_HEADER_PRINT", "0")
 os.environ.setdefault("TI_SKIP_VERSION_CHECK", "ON")
 
+# In a notebook Taichi says on import that it is in one.
+_speaks = "TI_LOG_LEVEL" in os.environ
+os.environ.setdefault("TI_LOG_LEVEL", "error")
+
 import numpy as np
 import taichi as ti
 from taichi.lang.ast.ast_transformer_utils import ASTTransformerContext
+
+if not _speaks:
+    del os.environ["TI_LOG_LEVEL"]
 
 _core: Any = getattr(np, "_core", None) or np.core  # NumPy 2, or 1
 _features: dict[str, bool] = _core._multiarray_umath.__cpu_features__

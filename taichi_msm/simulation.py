@@ -27,6 +27,7 @@ from taichi_msm.validation import checked
 
 if TYPE_CHECKING:
     from taichi_msm.drawing import Drawing
+    from taichi_msm.player import Player
 
 # A camera as a scene has it; None: the scene's own. A `View` is one that was set up already.
 CameraLike = str | Mapping[str, Any] | Camera | View | None
@@ -253,6 +254,35 @@ class Simulation:
             if found != expected or positions.dtype.kind not in "fiu":
                 raise ArgumentError(f"positions: {positions.dtype} of shape {found}; take numbers of shape {expected}")
         return self._drawn().draw(self._position if positions is None else positions, self._view(camera))
+
+    def play(self, frames: int, camera: CameraLike = None) -> Player:
+        """Simulate and draw a number of frames, the present one before them, and give them to look at in a notebook.
+
+        Args:
+            frames: how many, 0 or more.
+            camera: as for `draw`.
+
+        Raises:
+            MsmError: as for `advance` and `draw`.
+        """
+        from taichi_msm.player import Player
+
+        pictures = [self.draw(camera)]
+        for _ in range(frames):
+            self.advance()
+            pictures.append(self.draw(camera))
+        return Player(pictures, self.scene.time.frames_per_second)
+
+    def _repr_html_(self) -> str | None:
+        """Show the sheet as it is now, in a notebook."""
+        if self._closed:
+            return None
+        from taichi_msm.player import captioned
+
+        rows, cols = self.scene.sheet.points
+        largest = 1000 * self.course.max_displacement
+        caption = f"{self.time:g} s, {rows} × {cols} points, largest displacement so far {largest:.1f} mm"
+        return captioned(self.draw(), caption)
 
     def compile(self, pause: Pause = lambda: None) -> None:
         """Compile now what would be compiled by the first frame.

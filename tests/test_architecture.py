@@ -16,7 +16,7 @@ ORDER = [
     {"errors", "look", "interruption", "silence", "sealed", "npz"},
     {"faults"},
     {"scene", "folder", "outlets"},
-    {"lattice", "camera", "texture", "surface"},
+    {"lattice", "camera", "texture", "surface", "player"},
     {"picking"},
     {"stability"},
     {"loads", "budget", "yaml_reader"},

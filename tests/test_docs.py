@@ -2,14 +2,19 @@
 
 from __future__ import annotations
 
+import ast
+import json
 import re
 import subprocess
 import sys
 from pathlib import Path
+from typing import Any
 
 import pytest
 
+from taichi_msm import runtime
 from taichi_msm.live.script import load_script
+from taichi_msm.runtime import Device
 from taichi_msm.scene_file import load_scene
 
 SCENES = ["press", "figure-3", "drag", "grasp", "two-tools"]
@@ -40,12 +45,38 @@ def test_the_shipped_script_is_valid(root: Path) -> None:
 
 
 def test_the_python_shown_runs(root: Path, tmp_path: Path) -> None:
-    (code,) = blocks(root, "python")
+    first, second = blocks(root, "python")
+    shown = "print(position.shape, picture.shape, record['status'])\n"
     (tmp_path / "scenes").symlink_to(root / "scenes")
-    (tmp_path / "example.py").write_text(code + "print(position.shape, picture.shape, record['status'])\n")
+    (tmp_path / "example.py").write_text(first + shown + second + "print(f'{depth:.2f}')\n")
     done = subprocess.run([sys.executable, "example.py"], cwd=tmp_path, check=True, capture_output=True, text=True)
-    assert done.stdout == "(41, 41, 3) (512, 512, 3) complete\n"
+    assert done.stdout == "(41, 41, 3) (512, 512, 3) complete\n0.03\n"
     assert (tmp_path / "output" / "from-python" / "animation.gif").exists()
+
+
+def test_the_notebook_runs(
+    root: Path, device: Device, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(root)
+    monkeypatch.setattr(runtime, "available_threads", lambda: device.threads)
+    notebook = json.loads((root / "docs" / "notebooks" / "closed-loop.ipynb").read_text(encoding="utf-8"))
+    cells = ["".join(cell["source"]) for cell in notebook["cells"] if cell["cell_type"] == "code"]
+    names: dict[str, Any] = {}
+    pages = []
+    for cell in cells:
+        # As a notebook does, show the value of a cell's last line.
+        tree = ast.parse(cell)
+        last = tree.body.pop() if isinstance(tree.body[-1], ast.Expr) else None
+        assert last is None or isinstance(last, ast.Expr)
+        exec(compile(tree, "cell", "exec"), names)
+        if last is not None:
+            value = eval(compile(ast.Expression(last.value), "cell", "eval"), names)
+            pages += [value._repr_html_()] if hasattr(value, "_repr_html_") else []
+    still, film, result = pages
+    assert film.count("data:image/jpeg;base64,") == 17
+    assert "0.6 s, 61 × 61 points" not in still
+    assert "1.6 s, 61 × 61 points" in result
+    assert capsys.readouterr().out.startswith("30.0")
 
 
 @pytest.mark.parametrize("name", SCENES)

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import pickle
+import subprocess
+import sys
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -218,6 +220,13 @@ def test_a_record_says_where_its_picture_and_its_device_are(
     image = Path(record["working_directory"]) / record["scene"]["image"]
     assert image.samefile(small / "speckle.png")
     assert record["device"] == device.name == processor()
+
+
+def test_in_a_notebook_nothing_is_said() -> None:
+    # There stdout is an object of its own.
+    notebook = "import io, sys; sys.stdout = io.StringIO(); import taichi_msm.runtime"
+    done = subprocess.run([sys.executable, "-c", notebook], capture_output=True, text=True, check=True)
+    assert (done.stdout, done.stderr) == ("", "")
 
 
 def test_a_divergence_says_where_it_is(device: Device) -> None:
