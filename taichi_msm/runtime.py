@@ -48,15 +48,14 @@ if not os.environ.get("HOME"):
 os.environ.setdefault("ENABLE_TAICHI_HEADER_PRINT", "0")
 os.environ.setdefault("TI_SKIP_VERSION_CHECK", "ON")
 
-# In a notebook Taichi says on import that it is in one.
-_speaks = "TI_LOG_LEVEL" in os.environ
+# In a notebook Taichi says on import that it is in one. This is for the import alone; ti.init has a level of its own.
 os.environ.setdefault("TI_LOG_LEVEL", "error")
 
 import numpy as np
 import taichi as ti
 from taichi.lang.ast.ast_transformer_utils import ASTTransformerContext
 
-if not _speaks:
+if os.environ["TI_LOG_LEVEL"] == "error":
     del os.environ["TI_LOG_LEVEL"]
 
 _core: Any = getattr(np, "_core", None) or np.core  # NumPy 2, or 1
