@@ -25,7 +25,6 @@ from taichi_msm.divergence import farthest_displacement
 from taichi_msm.dynamics import Dynamics
 from taichi_msm.errors import SceneError
 from taichi_msm.lattice import rest_positions
-from taichi_msm.loads import meets_jumps, shortest_event, steps_to_meet_jumps
 from taichi_msm.runtime import Device
 from taichi_msm.scene import LARGEST_TOLERANCE, Scene
 from taichi_msm.stability import step, steps_per_frame, with_steps, with_time
@@ -36,9 +35,6 @@ CLOSE = 0.75
 # The pilot runs of one search, and how much finer each may be than the one before.
 MOST_PILOTS = 12
 LARGEST_CUT = 8.0
-
-# How much finer the other pilot is where a jump is missed.
-MISSING = 16
 
 # How much finer the other pilot may be; where it must be finer yet, the error is not known.
 FINEST = 64
@@ -53,7 +49,7 @@ class Estimate:
     Attributes:
         steps_per_frame: the step, as a fraction of a frame.
         error: largest error, as a fraction of the largest displacement; infinite where it is not known, because a
-            pilot diverged or the step does not resolve what happens.
+            pilot diverged or the step does not resolve the damping.
         rounding: the part of it that comes from f32, that of the positions in the trajectory included; 0 for f64.
         in_f64: the error of the same step in f64.
         order: of the method in this scene and at this step.
@@ -67,9 +63,8 @@ class Estimate:
 
 
 def order(scene: Scene) -> int:
-    """Tell the order of the method at this step: 1 with backward differences or where it misses a jump, else 2."""
-    central = scene.time.damping_difference == "central" or scene.damping == 0
-    return 2 if central and meets_jumps(scene) else 1
+    """Tell the order of the method: 1 with backward differences of a damping, else 2."""
+    return 2 if scene.time.damping_difference == "central" or scene.damping == 0 else 1
 
 
 def estimate_error(scene: Scene, device: Device, progress: Progress = lambda done, total: None) -> Estimate:
@@ -100,19 +95,17 @@ def choose_step(scene: Scene, device: Device, progress: Progress = lambda done, 
     """
     assert scene.time.tolerance is not None
     with closing(Pilots(scene, device)) as pilots:
-        found = _search(scene.time.tolerance, steps_per_frame(scene), steps_to_meet_jumps(scene), pilots, progress)
+        found = _search(scene.time.tolerance, steps_per_frame(scene), pilots, progress)
     return with_steps(scene, found.steps_per_frame), found
 
 
 def refinement(scene: Scene) -> int:
-    """Tell how much finer the other pilot must be: twice, where steps meet every jump and resolve the damping.
+    """Tell how much finer the other pilot must be: twice, where steps resolve the damping.
 
-    A missed jump is moved by up to half a step, in both pilots: those of a press and its release may be moved so that
-    the difference of h and h / 2 hides both, but hardly that of h and h / 16. And where g h / r > 1, central
-    differences make velocities change their sign at every step, in both pilots alike.
+    Where g h / r > 1, central differences make velocities change their sign at every step, in both pilots alike.
     """
     g = scene.damping / scene.sheet.mass
-    return max(2 if meets_jumps(scene) else MISSING, math.ceil(g * step(scene)))
+    return max(2, math.ceil(g * step(scene)))
 
 
 class Pilots:
@@ -141,7 +134,7 @@ class Pilots:
         """
         scene = with_steps(self._scene, steps)
         finer = refinement(scene)
-        if finer > FINEST or shortest_event(scene) < 2 * step(scene):
+        if finer > FINEST:
             return Estimate(steps, math.inf, 0.0, math.inf, order(scene))
         self._fine.restart(with_steps(self._exact, finer * steps))
         self._coarse.restart(with_steps(self._exact, steps))
@@ -198,7 +191,7 @@ def _above(error: float) -> float:
     return float(f"{math.ceil(1.2 * error / digit) * digit:.3g}")
 
 
-def _search(tolerance: float, least: int, meeting: int, pilots: Pilots, progress: Progress) -> Estimate:
+def _search(tolerance: float, least: int, pilots: Pilots, progress: Progress) -> Estimate:
     """Narrow down the steps a frame between too few and enough."""
     too_few, enough, failures = least - 1, None, []
     steps = least
@@ -213,8 +206,7 @@ def _search(tolerance: float, least: int, meeting: int, pilots: Pilots, progress
                 break
         if enough and (enough.error >= CLOSE * tolerance or enough.steps_per_frame - too_few <= 1):
             return enough
-        steps = _next(found, tolerance, meeting)
-        steps = max(steps, too_few + 1)
+        steps = max(_next(found, tolerance), too_few + 1)
         if enough and steps >= enough.steps_per_frame:
             return enough
     if enough:
@@ -222,7 +214,7 @@ def _search(tolerance: float, least: int, meeting: int, pilots: Pilots, progress
     raise SceneError([_out_of_reach(tolerance, failures)])
 
 
-def _next(found: Estimate, tolerance: float, meeting: int) -> int:
+def _next(found: Estimate, tolerance: float) -> int:
     """Guess the steps a frame that are just enough, from an error that falls as the step to the power of its order."""
     if found.error == math.inf:
         cut = LARGEST_CUT
@@ -231,13 +223,7 @@ def _next(found: Estimate, tolerance: float, meeting: int) -> int:
         allowed = max((1 + CLOSE) / 2 * tolerance - found.rounding, tolerance / 16)
         made = max(found.error - found.rounding, 0.0)
         cut = min((made / allowed) ** (1 / found.order), LARGEST_CUT)
-    steps = max(1, math.ceil(found.steps_per_frame * cut))
-    if meeting == 0:
-        return steps
-    if found.order == 1:
-        # With a step at every jump the method is one of order 2, and the coarsest such step may do.
-        return min(steps, math.ceil((found.steps_per_frame + 1) / meeting) * meeting)
-    return math.ceil(steps / meeting) * meeting
+    return max(1, math.ceil(found.steps_per_frame * cut))
 
 
 def _stuck(failures: list[Estimate]) -> bool:
@@ -256,8 +242,7 @@ def _out_of_reach(tolerance: float, failures: list[Estimate]) -> str:
     if best.error == math.inf:
         return (
             f"time.tolerance: {tolerance:g} is out of reach: with {last.steps_per_frame} steps a frame the error is "
-            "not known yet, as runs diverge or a step is longer than the damping or the load; take a weaker load, "
-            "less damping or keys farther apart"
+            "not known yet, as runs diverge or a step is longer than the damping; take a weaker load or less damping"
         )
     if last.rounding > CLOSE * tolerance:
         return (

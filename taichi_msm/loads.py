@@ -1,14 +1,18 @@
 """The probes in time: how hard each presses, where, and whether the virtual springs exist, step by step.
 
-At a jump the value is the mean of its left and right limits, and at t = 0 the right limit; so a Verlet step that
-falls on a release stays of order 2.
+What enters step n is the average with the hat function of half-width h about t_n,
+
+    percent_n = integral of percent(t) (1 - |t - t_n| / h) dt / h,    at n = 0 twice that over [0, h],
+
+which is what moves a free point as far as the load itself does, so that every load, a jump anywhere included, keeps
+the method of order 2. Where no key lies within the hat it is the value at t_n. The activity of the virtual springs is
+averaged alike.
 """
 
 from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from fractions import Fraction
 from typing import NamedTuple
 
 import numpy as np
@@ -16,40 +20,59 @@ from numpy.typing import NDArray
 
 from taichi_msm.lattice import axes
 from taichi_msm.scene import Probe, Scene, Sheet
-from taichi_msm.stability import steps_per_frame
+from taichi_msm.stability import step, steps_per_frame
 
-# A key is on a step when their times differ by no more than rounding, as a fraction of the time: decimal key times
-# meet binary step times.
-SNAP = 1e-13
+# A key that is nearer than this to an end of the hat, as a fraction of its half-width, is outside: what it would add
+# is less than rounding.
+EDGE = 1e-9
 
-# Jumps that only so fine steps meet are met by none.
-MOST_CUTS = 1000
+# Before all times [s].
+LONG_AGO = -1e300
 
 Array = NDArray[np.float64]
 
 
+class Stay(NamedTuple):
+    """A control point between two jumps.
+
+    Attributes:
+        times: keys [s], shape (n,).
+        points: control point at those keys, x and y at rest [m], shape (n, 2); held outside.
+    """
+
+    times: Array
+    points: Array
+
+
 @dataclass(frozen=True)
 class Grip:
-    """A place at which a probe acts; a probe whose control point jumps has one before every jump and one after it.
+    """A place at which a probe acts; one whose control point jumps acts at several by turns.
+
+    A hat that a jump falls into needs the place before and the one after it. So the stays of the control point are
+    dealt out to two grips, the first, third, ... and the second, fourth, ...; to more where several jumps fall into one
+    hat.
 
     Attributes:
         probe: index of the probe in the scene.
-        times: keys of the control point [s], shape (n,); one key stands still.
-        points: control point at those keys, x and y at rest [m], shape (n, 2).
-        jumps: times at which the control point jumps [s].
-        before: whether it acts only at a jump, where that begins; else where the jump ends, and at all other times.
+        stays: of the control point, all of them.
+        turn: number of the first of its own stays.
+        turns: how many grips the probe has.
     """
 
     probe: int
-    times: Array
-    points: Array
-    jumps: Array
-    before: bool
+    stays: tuple[Stay, ...]
+    turn: int
+    turns: int
 
     @property
     def moves(self) -> bool:
         """Whether the control point moves."""
-        return len(self.times) > 1
+        return len(self.stays) > 1 or len(self.stays[0].times) > 1
+
+    @property
+    def rest(self) -> Array:
+        """The first control point, x and y at rest [m]; of one that stands the only one."""
+        return self.stays[0].points[0]
 
 
 class Schedule(NamedTuple):
@@ -58,7 +81,7 @@ class Schedule(NamedTuple):
     Attributes:
         strength: force at the control point before its decay [N], shape (steps, grips, 3).
         point: control point, x and y at rest [m], shape (steps, grips, 2).
-        active: share of the virtual springs' stiffness, 0, 1 or, where it jumps, 1/2; shape (steps,).
+        active: share of the virtual springs' stiffness, 0 to 1; shape (steps,).
     """
 
     strength: Array
@@ -76,16 +99,18 @@ def control_points(probe: Probe, sheet: Sheet) -> tuple[Array, Array]:
 
 
 def grips(scene: Scene) -> tuple[Grip, ...]:
-    """List the grips of all probes.
-
-    The force at a jump of a control point is the mean of its limits, not the force at the mean of two places: half of
-    it acts at each.
-    """
+    """List the grips of all probes."""
     found = []
     for index, probe in enumerate(scene.probes):
         times, points = control_points(probe, scene.sheet)
-        jumps = times[1:][(times[1:] == times[:-1]) & (points[1:] != points[:-1]).any(axis=1)]
-        found += [Grip(index, times, points, jumps, before) for before in ((True, False) if jumps.size else (False,))]
+        jumps = np.flatnonzero((times[1:] == times[:-1]) & (points[1:] != points[:-1]).any(axis=1)) + 1
+        parts = zip(np.split(times, jumps), np.split(points, jumps), strict=True)
+        stays = tuple(Stay(*part) for part in parts)
+        # As many as there are in the hat that has the most jumps.
+        jumped = times[jumps]
+        within = np.searchsorted(jumped, jumped + 2 * step(scene) * (1 - EDGE), "left") - np.arange(len(jumped))
+        turns = 1 + int(within.max(initial=0))
+        found += [Grip(index, stays, turn, turns) for turn in range(turns)]
     return tuple(found)
 
 
@@ -97,40 +122,56 @@ def decay(grip: Grip, scene: Scene) -> Array:
     """
     probe = scene.probes[grip.probe]
     x, y = axes(scene.sheet)
-    distance = np.hypot(x - grip.points[0, 0], y - grip.points[0, 1])
+    distance = np.hypot(x - grip.rest[0], y - grip.rest[1])
     return np.exp(-probe.falloff * distance - probe.offset)
 
 
-def _between(times: Array, values: Array, t: Array, after: NDArray[np.intp], before: float | Array) -> Array:
-    """Interpolate between the keys after[n] - 1 and after[n]; `before` the first key, the last value after the last."""
-    low = np.maximum(after - 1, 0)
-    high = np.minimum(after, len(times) - 1)
-    span = times[high] - times[low]
-    share = np.divide(t - times[low], span, out=np.zeros_like(t), where=span > 0)
-    shape = (-1,) + (1,) * (values.ndim - 1)
-    value = values[low] + share.reshape(shape) * (values[high] - values[low])
-    return np.where((after == 0).reshape(shape), before, value)
-
-
 def schedule(scene: Scene, first: int, count: int) -> Schedule:
-    """Evaluate the loads at the steps first, ..., first + count - 1.
+    """Average the loads over the steps first, ..., first + count - 1.
 
     The time of step n is n / (frames per second x steps per frame), never a sum of steps.
     """
-    rate = scene.time.frames_per_second * steps_per_frame(scene)
-    return loads_at(scene, np.arange(first, first + count) / rate)
+    t = np.arange(first, first + count) / (scene.time.frames_per_second * steps_per_frame(scene))
+    h, parts = step(scene), grips(scene)
+    strength, point = np.zeros((count, len(parts), 3)), np.zeros((count, len(parts), 2))
+    for index, probe in enumerate(scene.probes):
+        times, percents = np.array(probe.load, dtype=float).T
+        own = [n for n, part in enumerate(parts) if part.probe == index]
+        turns, stays = len(own), parts[own[0]].stays
+        jumps = np.array([stay.times[0] for stay in stays[1:]])
+        line = _Line(times, percents)
+        if turns == 1:
+            shares = line.averages(t, h)[:, None]
+            places = np.zeros((count, 1), np.intp)
+        else:
+            shares, places = _by_turns(line, jumps, turns, t, h)
+        strength[:, own] = np.multiply.outer(shares / 100, probe.force)
+        for n, place in zip(own, places.T, strict=True):
+            for number in np.unique(place):
+                chosen = place == number
+                point[chosen, n] = _held(stays[number], t[chosen])
+    return Schedule(strength, point, _activity(scene).averages(t, h))
 
 
 def loads_at(scene: Scene, t: Array) -> Schedule:
-    """Evaluate the loads at times that increase [s], shape (steps,)."""
-    t, left, right = _both_sides(scene, t)
-    return Schedule(_mean(left.strength, right.strength, t), right.point, _mean(left.active, right.active, t))
+    """Evaluate the loads at times on which no key falls, and not their averages [s], shape (times,)."""
+    parts = grips(scene)
+    strength, point = np.zeros((len(t), len(parts), 3)), np.zeros((len(t), len(parts), 2))
+    for n, part in enumerate(parts):
+        probe = scene.probes[part.probe]
+        line = _Line(*np.array(probe.load, dtype=float).T)
+        jumps = np.array([stay.times[0] for stay in part.stays[1:]])
+        number = jumps.searchsorted(t, "right")
+        acts = number % part.turns == part.turn
+        strength[:, n] = np.multiply.outer(line.values(t) * acts / 100, probe.force)
+        for stay in np.unique(number):
+            point[number == stay, n] = _held(part.stays[stay], t[number == stay])
+    return Schedule(strength, point, _activity(scene).values(t))
 
 
 def key_times(scene: Scene) -> Array:
     """List the times of all keys after 0 and before the end [s], where the loads are not smooth."""
-    times = {time for probe in scene.probes for time, _ in probe.load}
-    times |= {float(time) for grip in grips(scene) for time in grip.times}
+    times = {float(time) for keys in _key_lists(scene) for time in keys}
     return np.array(sorted(time for time in times if 0 < time < scene.time.duration))
 
 
@@ -142,129 +183,143 @@ class Envelope:
     """
 
     def __init__(self, scene: Scene) -> None:
-        keys = np.array(sorted({time for times in _key_lists(scene) for time in times if time > 0} | {0.0}))
-        # After the last key nothing changes.
-        self._times, left, right = _both_sides(scene, np.append(keys, keys[-1] + 1))
-        self._left, self._right = (np.linalg.norm(side.strength, axis=-1) for side in (left, right))
-        self._active = right.active > 0
-        self._begins = left.active < right.active
+        self._h = step(scene)
+        self._lines = [_Line(*np.array(probe.load, dtype=float).T) for probe in scene.probes]
+        self._forces = [math.hypot(*probe.force) / 100 for probe in scene.probes]
+        self._probes = [grip.probe for grip in grips(scene)]
+        self._activity = _activity(scene)
+        self._begins = self._activity.times[self._activity.before < self._activity.after]
 
     def between(self, begin: float, end: float) -> tuple[Array, bool, int]:
-        """Bound what the loads do from one time to another, both included.
+        """Bound what the loads do in the steps from one time to another, both included.
 
         Returns:
             The largest force at each grip's control point [N], shape (grips,); whether the virtual springs act at any
             time; and how often they begin to.
         """
-        # A key that is at one of them but for rounding counts there, as it does for the steps.
-        first = self._times.searchsorted(begin * (1 - 2 * SNAP), "left")
-        last = self._times.searchsorted(end * (1 + 2 * SNAP), "right")
-        forces = [self._at(begin), self._at(end), *self._left[first:last], *self._right[first:last]]
-        active = self._active[max(0, first - 1) : last].any()
-        return np.max(forces, axis=0), bool(active), int(self._begins[first:last].sum())
-
-    def _at(self, t: float) -> Array:
-        """Bound the forces at one time: no force is greater than its limits at the keys before and after."""
-        after = min(int(self._times.searchsorted(t, "right")), len(self._times) - 1)
-        before = after - 1
-        share = min(1.0, (t - self._times[before]) / (self._times[after] - self._times[before]))
-        return (1 - share) * self._right[before] + share * self._left[after]
+        # A step sees what is within its hat.
+        begin, end = begin - self._h, end + self._h
+        most = [force * line.largest(begin, end) for force, line in zip(self._forces, self._lines, strict=True)]
+        begun = self._begins.searchsorted(end, "right") - self._begins.searchsorted(begin, "left")
+        return np.array([most[probe] for probe in self._probes]), self._activity.largest(begin, end) > 0, int(begun)
 
 
-def jumps(scene: Scene) -> Array:
-    """List the times after 0 and before the end at which a force or the activity of the virtual springs jumps [s]."""
-    t, left, right = _both_sides(scene, key_times(scene))
-    changes = (left.strength != right.strength).any(axis=(1, 2))
-    if scene.springs.virtual > 0:
-        changes |= left.active != right.active
-    return t[changes]
+class _Line:
+    """A function of time, linear between its keys, where it may jump; 0 before the first, constant after the last.
 
-
-def steps_to_meet_jumps(scene: Scene) -> int:
-    """Find the number of steps a frame of which every multiple has a step at every jump; 0 where there is none."""
-    frames = [Fraction(float(t) * scene.time.frames_per_second).limit_denominator(MOST_CUTS) for t in jumps(scene)]
-    steps = math.lcm(*(share.denominator for share in frames))
-    return steps if steps <= MOST_CUTS and _meet(scene, steps, jumps(scene)) else 0
-
-
-def meets_jumps(scene: Scene) -> bool:
-    """Tell whether every jump falls on a step and no ramp is shorter than one: if not, the method is of order 1."""
-    steps = steps_per_frame(scene)
-    rate = scene.time.frames_per_second * steps
-    return _meet(scene, steps, jumps(scene)) and shortest_ramp(scene) * rate >= 1 - SNAP
-
-
-def _meet(scene: Scene, steps: int, times: Array) -> bool:
-    rate = scene.time.frames_per_second * steps
-    return bool((np.abs(np.round(times * rate) / rate - times) <= SNAP * times).all())
-
-
-def shortest_ramp(scene: Scene) -> float:
-    """Find the shortest time between two keys of one list that are no jump [s]; infinite where there is none."""
-    return min((float(gap) for times in _key_lists(scene) for gap in np.diff(times) if gap > 0), default=math.inf)
-
-
-def shortest_event(scene: Scene) -> float:
-    """Find the shortest time in which more than a jump or a ramp happens: three keys of one list [s]; or infinity.
-
-    What takes less than two steps may fall between them, or be counted in full for the one instant that a step sees.
+    Args:
+        times: keys [s], in order; two at one time are a jump.
+        values: at these keys.
     """
-    spans = [times[2:] - times[:-2] for times in _key_lists(scene) if len(times) > 2]
-    return min((float(span) for each in spans for span in each), default=math.inf)
+
+    def __init__(self, times: Array, values: Array) -> None:
+        keys = np.unique(times)
+        # Its limits at every key.
+        before, after = values[times.searchsorted(keys, "left")], values[times.searchsorted(keys, "right") - 1]
+        before[0] = 0.0
+        # A key around which nothing changes is none, and costs no bit.
+        last, following = np.append(0.0, after[:-1]), np.append(before[1:], after[-1])
+        told = (last != before) | (before != after) | (after != following)
+        told[0] = True
+        self.times, self.before, self.after = keys[told], before[told], after[told]
+
+    def values(self, t: Array) -> Array:
+        """Evaluate it; at a key its right limit."""
+        return self._values(t, self.times.searchsorted(t, "right"))
+
+    def averages(self, t: Array, h: float, begin: float = -math.inf, end: float = math.inf) -> Array:
+        """Average it with the hat of half-width h about times from 0 on, counting what is from begin to end.
+
+        Where no key is within the hat, and neither begin nor end, it is its value there.
+        """
+        edges = [edge for edge in (begin, end) if math.isfinite(edge)]
+        found = self.values(t) * ((begin <= t) & (t < end))
+        bounds = np.union1d(self.times, edges)
+        # At t = 0 the hat is half a hat, whose average even of a line is not the value in its middle.
+        uneven = (t <= 0) | (
+            bounds.searchsorted(t + h * (1 - EDGE), "left") > bounds.searchsorted(t - h * (1 - EDGE), "right")
+        )
+        for n in np.flatnonzero(uneven):
+            found[n] = self._average(float(t[n]), h, begin, end)
+        return found
+
+    def largest(self, begin: float, end: float) -> float:
+        """Find the largest absolute value from one time to another."""
+        first, last = self.times.searchsorted(begin, "left"), self.times.searchsorted(end, "right")
+        ends = np.array([begin, end])
+        return float(
+            np.abs(np.concatenate([self.values(ends), self.before[first:last], self.after[first:last]])).max()
+        )
+
+    def _values(self, t: Array, after: NDArray[np.intp]) -> Array:
+        """Evaluate it between the keys after[n] - 1 and after[n]."""
+        low, high = np.maximum(after - 1, 0), np.minimum(after, len(self.times) - 1)
+        span = self.times[high] - self.times[low]
+        share = np.divide(t - self.times[low], span, out=np.zeros_like(t), where=span > 0)
+        slope = np.where(span > 0, self.before[high] - self.after[low], 0.0)
+        return np.where(after == 0, 0.0, self.after[low] + share * slope)
+
+    def _average(self, t: float, h: float, begin: float, end: float) -> float:
+        """Integrate piece by piece: on each both the hat and the function are linear, and Simpson's rule is exact."""
+        low, high = max(t - h, 0.0 if t <= 0 else -math.inf, begin), min(t + h, end)
+        inner = self.times[(self.times > low) & (self.times < high)]
+        cuts = np.unique(np.concatenate([[low, high], inner, [t] if low < t < high else []]))
+        if low >= high:
+            return 0.0
+        left, right = cuts[:-1], cuts[1:]
+        piece = self.times.searchsorted((left + right) / 2, "right")
+        ends = np.stack([self._values(left, piece), self._values(right, piece)])
+        weights = 1 - np.abs(np.stack([left, right]) - t) / h
+        middle = ends.sum(axis=0) * weights.sum(axis=0)
+        total = float(((right - left) * ((ends * weights).sum(axis=0) + middle)).sum() / (6 * h))
+        return 2 * total if t <= 0 else total
+
+
+def _by_turns(line: _Line, jumps: Array, turns: int, t: Array, h: float) -> tuple[Array, NDArray[np.intp]]:
+    """Share the load out among the grips of a probe whose control point jumps.
+
+    Returns:
+        Percent of every grip, and the stay of the control point that it is at, each of shape (steps, grips).
+    """
+    bounds = np.concatenate([[-math.inf], jumps, [math.inf]])
+    first = jumps.searchsorted(t - h * (1 - EDGE), "right")
+    last = jumps.searchsorted(t + h * (1 - EDGE), "left")
+    shares, places = np.zeros((len(t), turns)), np.empty((len(t), turns), np.intp)
+    for turn in range(turns):
+        place = first + (turn - first) % turns
+        acts = place <= last
+        places[:, turn] = np.where(acts, place, first)
+        for number in np.unique(place[acts]):
+            chosen = acts & (place == number)
+            shares[chosen, turn] = line.averages(t[chosen], h, bounds[number], bounds[number + 1])
+    return shares, places
+
+
+def _held(stay: Stay, t: Array) -> Array:
+    """Tell where a control point is, held outside its keys; shape (times, 2)."""
+    return np.stack([np.interp(t, stay.times, stay.points[:, axis]) for axis in range(2)], axis=-1)
+
+
+def _activity(scene: Scene) -> _Line:
+    """Tell when the virtual springs exist: 1 while the percent of any probe is not 0, or always; else 0."""
+    if scene.springs.virtual_active == "always":
+        return _Line(np.array([LONG_AGO]), np.array([1.0]))
+    times = np.unique([time for probe in scene.probes for time, _ in probe.load])
+    if not times.size:
+        return _Line(np.zeros(1), np.zeros(1))
+    # Between two keys, and after the last one.
+    middles = np.append((times[:-1] + times[1:]) / 2, times[-1] + 1)
+    active = np.zeros(len(times))
+    for probe in scene.probes:
+        line = _Line(*np.array(probe.load, dtype=float).T)
+        after = line.times.searchsorted(middles, "right")
+        following = np.minimum(after, len(line.times) - 1)
+        pressed = (line.after[after - 1] != 0) | ((line.before[following] != 0) & (after < len(line.times)))
+        active[(after > 0) & pressed] = 1.0
+    return _Line(np.repeat(times, 2)[1:], np.repeat(active, 2)[:-1])
 
 
 def _key_lists(scene: Scene) -> list[Array]:
     """List the times of every list of keys [s]."""
     loads = [np.array([time for time, _ in probe.load]) for probe in scene.probes]
     return [*loads, *(control_points(probe, scene.sheet)[0] for probe in scene.probes)]
-
-
-def _both_sides(scene: Scene, t: Array) -> tuple[Array, Schedule, Schedule]:
-    """Take the left and the right limits of the loads; the times come back moved onto the keys that they mean."""
-    count = len(t)
-    percent = np.zeros((len(scene.probes), 2, count))
-    pressing = np.zeros((2, count), dtype=bool)
-    for index, probe in enumerate(scene.probes):
-        times, values = np.array(probe.load).T
-        t = _snap(t, times)
-        # Not zero between two keys when it is not zero at one of them; afterwards when the last value is not.
-        nonzero = np.concatenate([[False], (values[:-1] != 0) | (values[1:] != 0), [values[-1] != 0]])
-        for side, after in enumerate(_limits(times, t)):
-            percent[index, side] = _between(times, values, t, after, 0.0)
-            pressing[side] |= nonzero[after]
-    if scene.springs.virtual_active == "always":
-        pressing[:] = True
-
-    parts = grips(scene)
-    for part in parts:
-        t = _snap(t, part.times)
-    strength = np.zeros((2, count, len(parts), 3))
-    point = np.zeros((count, len(parts), 2))
-    for n, part in enumerate(parts):
-        jumps = np.isin(t, part.jumps)
-        for side, acts in enumerate((jumps, np.False_) if part.before else (~jumps, np.True_)):
-            share = percent[part.probe, side] * acts / 100
-            strength[side, :, n] = np.multiply.outer(share, scene.probes[part.probe].force)
-        limit = _limits(part.times, t)[0 if part.before else 1]
-        point[:, n] = _between(part.times, part.points, t, limit, part.points[0])
-    active = pressing * 1.0
-    return t, Schedule(strength[0], point, active[0]), Schedule(strength[1], point, active[1])
-
-
-def _snap(t: Array, keys: Array) -> Array:
-    """Move every time that is on a key but for rounding onto the key; the keys are in order."""
-    after = keys.searchsorted(t)
-    for index in (np.maximum(after - 1, 0), np.minimum(after, len(keys) - 1)):
-        key = keys[index]
-        t = np.where(np.abs(t - key) <= SNAP * np.abs(key), key, t)
-    return t
-
-
-def _limits(times: Array, t: Array) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
-    """Number the first key at or after t (for the left limit) and the first key after t (for the right one)."""
-    return np.searchsorted(times, t, "left"), np.searchsorted(times, t, "right")
-
-
-def _mean(left: Array, right: Array, t: Array) -> Array:
-    """Take the mean of both limits; at t = 0, before which nothing is, the right one."""
-    return np.where(t.reshape((-1,) + (1,) * (left.ndim - 1)) <= 0, right, (left + right) / 2)

@@ -72,11 +72,10 @@ def test_the_step_chosen_is_right_and_the_largest(kind: str, precision: str, tol
     made = scene(**sections | {"time": {"precision": precision, "tolerance": tolerance, **sections.get("time", {})}})
     chosen, estimate = choose_step(made, device)
     assert estimate.error <= tolerance
-    # A release between steps is of order 1, and 64 times finer is needed to know it.
-    error = true_error(chosen, device, fine=64 if kind == "between" else 12)
+    error = true_error(chosen, device, fine=12)
     assert error <= 1.5 * tolerance, estimate
     assert estimate.steps_per_frame == steps_per_frame(chosen) >= steps_per_frame(made)
-    if kind != "between" and steps_per_frame(chosen) > steps_per_frame(made):
+    if steps_per_frame(chosen) > steps_per_frame(made):
         # Half as many steps would not have done.
         with closing(Pilots(chosen, device)) as pilots:
             assert pilots.estimate(steps_per_frame(chosen) // 2, lambda done, total: None).error > tolerance
@@ -91,11 +90,8 @@ def test_an_estimate_is_near_the_error(kind: str, difference: str, device: Devic
     exact = with_time(made, damping_difference="central")
     reference = frames(exact, device, cut=64 * steps_per_frame(made))
     error = longest(frames(made, device) - reference) / longest(reference)
-    # Where the step misses a jump by d the error is d plus the rest, and the difference of both pilots a quarter of a
-    # step plus 3/4 of the rest, which counts twice. Where it does not, Richardson is exact but for the next order.
-    misses = kind in ("stiff", "between")
-    assert error / 1.5 < estimate.error < (3 if misses else 1.5) * error
-    if not misses and difference == "central":
+    assert error / 1.5 < estimate.error < 1.5 * error
+    if difference == "central":
         # The next power of h is (w h)^2 / 24 of the error at most, w h <= 1; and twice that for the kinks of the load.
         assert estimate.error == pytest.approx(error, rel=1 / 12)
 
@@ -120,22 +116,19 @@ class Falling:
         pass
 
 
-@pytest.mark.parametrize(
-    ("difference", "release", "p"), [("central", 0.2, 2), ("backward", 0.2, 1), ("central", 0.1 * 2**0.5, 1)]
-)
+@pytest.mark.parametrize(("difference", "p"), [("central", 2), ("backward", 1)])
 def test_an_error_that_is_a_power_of_the_step_is_told_exactly(
-    difference: str, release: float, p: int, monkeypatch: pytest.MonkeyPatch, device: Device
+    difference: str, p: int, monkeypatch: pytest.MonkeyPatch, device: Device
 ) -> None:
     monkeypatch.setattr(accuracy, "Dynamics", partial(Falling, p))
-    probe = {**SOFT_PRESS, "load": [[0, 0], [0.1, 100], [release, 100], [release, 0]]}
-    made = scene(probes=[probe], time={"step": 0.005, "damping_difference": difference})
+    made = scene(probes=[SOFT_PRESS], time={"step": 0.005, "damping_difference": difference})
     # In numbers near 1 the error, 2.5e-5 or more, is rounded by 1e-11 of itself.
     assert estimate_error(made, device).error == pytest.approx(0.005**p, rel=1e-9)
 
 
 def test_how_much_finer_the_other_pilot_is() -> None:
     assert refinement(scene(**SCENES["release"])) == 2
-    assert refinement(scene(**SCENES["between"])) == 16, "a jump is missed"
+    assert refinement(scene(**SCENES["between"])) == 2
     assert refinement(scene(damping=3.0, time={"step": 0.0025})) == 8, "g h is 7.5"
 
 
@@ -174,7 +167,7 @@ def test_a_sheet_that_does_not_move_has_no_error(device: Device) -> None:
 
 
 def test_a_simulation_meets_the_tolerance_by_itself(device: Device) -> None:
-    made = scene(probes=[SOFT_PRESS], damping=0.02, time={"tolerance": 2e-4})
+    made = scene(probes=[SOFT_PRESS], damping=0.02, time={"tolerance": 5e-5})
     with Simulation(made, threads=2) as simulation:
         assert step(simulation.scene) < step(made) <= stable_step(made) / 2
 
@@ -190,28 +183,40 @@ def test_progress_may_interrupt(device: Device) -> None:
 
 
 # 25 frames a second in steps of 0.01 s.
-ON, BETWEEN = 0.1, 0.105
+BETWEEN = 0.105
 
 
 @pytest.mark.parametrize(
     ("expected", "sections"),
     [
-        (2, {"probes": [{**PRESS, "load": [[0, 100], [ON, 100], [ON, 0]]}]}),
-        (1, {"probes": [{**PRESS, "load": [[0, 100], [BETWEEN, 100], [BETWEEN, 0]]}]}),
-        # A kink between steps is no jump,
-        (2, {"probes": [{**PRESS, "load": [[0, 0], [BETWEEN, 100]]}], "springs": {**SPRINGS, "virtual": 0}}),
-        # but the virtual springs vanish with the last of the load,
-        (1, {"probes": [{**PRESS, "load": [[0, 100], [BETWEEN, 0]]}]}),
-        (2, {"probes": [{**PRESS, "load": [[0, 100], [BETWEEN, 0]]}], "springs": {**SPRINGS, "virtual": 0}}),
-        # and a ramp within a step is one, to a step.
-        (1, {"probes": [{**PRESS, "load": [[0, 0], [ON, 0], [ON + 1e-9, 100]]}]}),
-        (1, {"probes": [{**PRESS, "at": [[0, 0, 0], [BETWEEN, 1, 0], [BETWEEN, 0, 0]]}]}),
+        (2, {"probes": [{**PRESS, "load": [[0, 100], [BETWEEN, 100], [BETWEEN, 0]]}]}),
+        (2, {"probes": [{**PRESS, "at": [[0, 0, 0], [BETWEEN, 1, 0], [BETWEEN, 0, 0]]}]}),
         (1, {"probes": [], "time": {"damping_difference": "backward"}}),
         (2, {"probes": [], "time": {"damping_difference": "backward"}, "damping": 0}),
     ],
 )
 def test_order(expected: int, sections: dict[str, Any]) -> None:
     assert order(scene(sheet=SHEET, **sections | {"time": {"step": 0.01, **sections.get("time", {})}})) == expected
+
+
+@pytest.mark.parametrize(
+    "probe",
+    [
+        {"load": [[0, 0], [0.1, 100], [0.1 * 2**0.5, 100], [0.1 * 2**0.5, 0]]},
+        {"load": [[0.0313, 0], [0.0313, 100], [0.0314, 100], [0.0314, 0]]},
+        {"load": [[0, 0], [0.1 * 3**0.5, 100], [0.1 * 3**0.5 + 1e-9, 0]]},
+        {"at": [[0, 0.2, 0.5], [0.1 * 2**0.5, 0.4, 0.5], [0.1 * 2**0.5, 0.7, 0.4], [0.3, 0.6, 0.3]]},
+    ],
+    ids=["release", "blow", "nanosecond", "place"],
+)
+def test_jumps_between_steps_leave_the_order_2(probe: dict[str, Any], device: Device) -> None:
+    """By regression over steps that meet none of the jumps; a probe of many steps is the truth."""
+    made = scene(probes=[{**SOFT_PRESS, **probe}], damping=0.02)
+    counts = (20, 40, 80, 160)
+    exact = frames(made, device, cut=1280)
+    errors = [longest(frames(made, device, cut=count) - exact) / longest(exact) for count in counts]
+    slope = np.polyfit(np.log(counts), np.log(errors), 1)[0]
+    assert slope == pytest.approx(-2, abs=0.1), errors
 
 
 @pytest.mark.parametrize("damping", [3.0, 20.0])
@@ -232,15 +237,14 @@ def test_damping_within_a_hundredth_of_a_step_has_no_estimate(device: Device) ->
 
 
 @pytest.mark.parametrize("pulse", [[0.2005, 0.2006], [0.2, 0.2 + 1e-9], [0.2021, 0.2032]])
-def test_a_load_shorter_than_a_step_has_no_estimate_until_steps_are_shorter(pulse: list[float], device: Device) -> None:
+def test_the_error_of_a_load_shorter_than_a_step_is_known(pulse: list[float], device: Device) -> None:
     start, end = pulse
     made = scene(probes=[{**SOFT_PRESS, "load": [[start, 0], [start, 100], [end, 100], [end, 0]]}])
-    assert estimate_error(made, device).error == np.inf
-    assert "three keys of a load" in "".join(notes(made, 1.0, 1.0, None))
-    nearly = with_steps(made, int(2 * 0.04 / (end - start)) - 1)
-    assert "three keys of a load" in "".join(notes(nearly, 1.0, 1.0, None))
-    fine = with_steps(made, int(2 * 0.04 / (end - start)) + 1)
-    assert "three keys of a load" not in "".join(notes(fine, 1.0, 1.0, None))
+    estimate = estimate_error(made, device)
+    exact = frames(made, device, cut=64 * steps_per_frame(made))
+    error = longest(frames(made, device) - exact) / longest(exact)
+    assert error / 1.5 < estimate.error < 1.5 * error < 0.2
+    assert not list(notes(made, 1.0, 1.0, None))
 
 
 def test_a_scene_that_is_all_right_has_no_notes() -> None:
@@ -268,18 +272,16 @@ def test_positions_written_in_f32_have_the_digits_of_the_sheet(device: Device) -
             assert found.error <= share * estimate.rounding
 
 
-def test_a_step_that_meets_the_jump_is_taken_where_it_is_the_cheaper(device: Device) -> None:
+@pytest.mark.parametrize("difference", ["central", "backward"])
+def test_a_tighter_tolerance_takes_no_fewer_steps(difference: str, device: Device) -> None:
     # A release at 3.25 frames is met by 12 steps a frame; 9 would be stable at half the limit.
     probe = {**SOFT_PRESS, "load": [[0, 100], [0.13, 100], [0.13, 0]]}
-    sections: dict[str, Any] = {"probes": [probe], "damping": 0.05}
-    least = estimate_error(scene(**sections), device)
-    found = [choose_step(scene(**sections, time={"tolerance": t}), device)[1] for t in (3e-2, 1e-2, 3e-3, 1e-3, 1e-4)]
+    time = {"damping_difference": difference}
+    made = scene(probes=[probe], damping=0.05, time=time)
+    found = [choose_step(with_time(made, tolerance=t), device)[1] for t in (3e-2, 1e-2, 3e-3, 1e-3)]
     steps = [one.steps_per_frame for one in found]
-    assert steps == sorted(steps), "a tighter tolerance takes no fewer steps"
-    assert least.order == 1
-    assert [one.order for one in found[3:]] == [2, 2]
-    assert all(count % 4 == 0 for count in steps[3:])
-    assert "0.00333333333333 s meets every jump" in "".join(notes(with_steps(scene(**sections), 9), 1.0, 1.0, None))
+    assert steps == sorted(steps)
+    assert {one.order for one in found} == {2 if difference == "central" else 1}
 
 
 def test_the_error_in_f64_is_that_of_the_step(device: Device) -> None:

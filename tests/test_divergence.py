@@ -153,7 +153,7 @@ def test_springs_that_begin_to_pull_from_afar_give_energy(device: Device) -> Non
     with Simulation(made, threads=device.threads) as simulation:
         simulation.go_on(Saved(State(0, away, np.zeros_like(away)), Course(reach=0.04)))
         simulation.advance()
-        assert simulation.course.energy > 15 * held
+        assert simulation.course.energy > 10 * held
 
 
 def diagnosed(made: Scene, device: Device, fault: Callable[[Simulation], None] = lambda _: None) -> Diagnosis:
@@ -190,12 +190,12 @@ def test_a_force_that_is_too_strong_is_named(device: Device) -> None:
 
 
 def test_a_step_that_is_too_long_is_named(device: Device) -> None:
-    """It counts a blow that is over in a thousandth of a second as if it lasted for a whole step."""
-    blow = [[0, 0], [0.0995, 0], [0.1, 100], [0.1005, 0]]
-    made = pressed("f64", probes=[{"force": [0, 0, -3e7], "load": blow, "falloff": 20}])
-    made = with_steps(made, 10)
+    """Near the limit of stability, an undamped sheet that is hit hard flies apart."""
+    blow = {"force": [0, 0, -4e6], "load": [[0.1, 0], [0.1, 100]], "falloff": 60}
+    made = pressed("f64", probes=[blow], damping=0)
+    made = with_steps(made, 9)
     found = diagnosed(made, device).message
-    assert "; likely cause: time.step, 0.004 s; with 0.00" in found
+    assert "; likely cause: time.step, 0.00444444 s; with 0.00" in found
     finer = float(re.findall(r"with ([.\d]+) s it goes well here", found)[0])
     with Simulation(with_steps(made, round(1 / 25 / finer)), threads=device.threads) as simulation:
         simulation.advance(3)

@@ -17,7 +17,6 @@ from taichi_msm import lattice, reference
 from taichi_msm.accuracy import estimate_error
 from taichi_msm.divergence import MOST_SHEET_SIZES
 from taichi_msm.dynamics import Dynamics
-from taichi_msm.loads import meets_jumps
 from taichi_msm.runtime import Device
 from taichi_msm.scene import Scene
 from taichi_msm.scene_file import load_scene
@@ -31,8 +30,6 @@ F32, F64 = 2.0**-24, 2.0**-53
 
 # Without phase after 10^6 steps: what holds of them is tested apart.
 LONG = {"limit", "undamped"}
-# Of order 1, for no step meets a jump; and so many steps a frame that meet it.
-MISSED = {"released_between": 400, "nanosecond": 320}
 SHORT = sorted(path.stem for path in FOLDER.glob("*.yaml") if path.stem not in LONG)
 
 # Twin and kernel are compared for so many steps of points: a second or less a case.
@@ -78,18 +75,6 @@ def truth(scene: Scene, cut: int, device: Device) -> tuple[Array, float]:
     return exact, longest(fine - coarse) / longest(exact)
 
 
-def on_steps(scene: Scene) -> Scene:
-    """The scene with the keys of its loads 1 ns earlier at most, so that a jump is a jump.
-
-    That moves an impulse by 1 ns in runs whose steps are 10^6 times as long: by far less than the doubt.
-    """
-    probes = [
-        probe.model_copy(update={"load": tuple((round(t, 8), percent) for t, percent in probe.load)})
-        for probe in scene.probes
-    ]
-    return scene.model_copy(update={"probes": tuple(probes)})
-
-
 def test_the_cases_are_as_hard_as_they_say(root: Path) -> None:
     press, stiff = load_scene(root / "scenes/press.yaml").springs, hard("stiff").springs
     assert (stiff.structural, stiff.shear) == pytest.approx((1e4 * press.structural, 1e4 * press.shear))
@@ -97,7 +82,6 @@ def test_the_cases_are_as_hard_as_they_say(root: Path) -> None:
     damped = hard("overdamped")
     assert damped.damping / damped.sheet.mass * step(damped) > 2
     assert damped.time.damping_difference == "central"
-    assert not any(meets_jumps(hard(name)) for name in MISSED)
     for path in FOLDER.glob("*.yaml"):
         scene = load_scene(path)
         assert (scene.output, scene.image, scene.time.precision) == ((), None, "f32")
@@ -106,10 +90,10 @@ def test_the_cases_are_as_hard_as_they_say(root: Path) -> None:
 @pytest.mark.parametrize("name", SHORT)
 def test_the_error_is_small_and_known(name: str, device: Device) -> None:
     scene = hard(name)
-    exact, doubt = truth(on_steps(scene), MISSED.get(name, steps_per_frame(scene)), device)
+    exact, doubt = truth(scene, steps_per_frame(scene), device)
     error = longest(motion(scene, device) - exact) / longest(exact)
     estimate = estimate_error(scene, device)
-    assert estimate.order == (1 if name in MISSED else 2)
+    assert estimate.order == 2
     # At order 2 the runs at 8 and 16 times the steps differ by (1/64 - 1/256) of the error at once: 1/85.
     assert doubt < estimate.error / 16, "the reference has converged"
     # The estimate leaves out the next power of h: at most half of the error where the pilots have begun to converge.

@@ -1,21 +1,15 @@
 from __future__ import annotations
 
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
 import pytest
+from scipy.integrate import quad
 
-from taichi_msm.loads import (
-    grips,
-    jumps,
-    key_times,
-    loads_at,
-    meets_jumps,
-    schedule,
-    shortest_ramp,
-    steps_to_meet_jumps,
-)
-from taichi_msm.stability import with_steps
+from taichi_msm.loads import Envelope, grips, key_times, loads_at, schedule
+from taichi_msm.scene import Scene
+from taichi_msm.stability import step, with_steps
 from tests.scenes import PRESS, SPRINGS, scene
 
 # 25 frames a second in 4 steps of 0.01 s.
@@ -26,25 +20,96 @@ SOFT = {**SPRINGS, "structural": 0.1, "shear": 0.1, "virtual": 0.1}
 def percent(load: list[list[float]], **changes: Any) -> list[float]:
     """Percent at the steps 0 to 5, that is at 0 s to 0.05 s."""
     made = scene(springs=SOFT, probes=[{"force": [100, 0, 0], "load": load}], time=STEPS, **changes)
-    return [round(float(value), 9) for value in schedule(made, 0, 6).strength[:, 0, 0]]
+    return [round(float(value), 5) for value in schedule(made, 0, 6).strength[:, 0, 0]]
 
 
 @pytest.mark.parametrize(
     ("load", "expected"),
     [
-        ([[0, 0], [0.04, 100]], [0, 25, 50, 75, 100, 100]),
+        # A ramp of 25 a step counts with a third of that at t = 0, and a kink with a sixth less or more.
+        ([[0, 0], [0.04, 100]], [25 / 3, 25, 50, 75, 100 - 25 / 6, 100]),
         ([[0, 100]], [100, 100, 100, 100, 100, 100]),
+        # A jump on a step counts with the mean of its limits; half-way between two steps with 1/8 and 7/8,
         ([[0.02, 100]], [0, 0, 50, 100, 100, 100]),
-        ([[0, 0], [0.02, 100], [0.02, 0]], [0, 50, 50, 0, 0, 0]),
+        ([[0.025, 100]], [0, 0, 12.5, 87.5, 100, 100]),
+        # and so does the end of a ramp: 5/8 of its value before the jump at the top.
+        ([[0, 0], [0.02, 100], [0.02, 0]], [50 / 3, 50, 50 - 25 / 3, 0, 0, 0]),
         ([[0, 0], [0, 100]], [100, 100, 100, 100, 100, 100]),
-        ([[0, -80], [0.04, 80]], [-80, -40, 0, 40, 80, 80]),
-        ([[0, 0], [0.03, 0], [0.03, 100]], [0, 0, 0, 50, 100, 100]),
-        # Keys 1 ns apart are a ramp, not a jump: at the first of them its own value counts.
-        ([[0, 0], [0.02, 0], [0.020000001, 100]], [0, 0, 0, 100, 100, 100]),
+        ([[0, -80], [0.04, 80]], [-80 + 40 / 3, -40, 0, 40, 80 - 20 / 3, 80]),
+        # Keys 1 ns apart are a jump.
+        ([[0, 0], [0.02, 0], [0.020000001, 100]], [0, 0, 49.99999, 99.99999, 100, 100]),
+        # A blow of a tenth of a step, at a step and half-way between two.
+        ([[0.0195, 0], [0.0195, 100], [0.0205, 100], [0.0205, 0]], [0, 0.125, 9.75, 0.125, 0, 0]),
+        ([[0.0245, 0], [0.0245, 100], [0.0255, 100], [0.0255, 0]], [0, 0, 5, 5, 0, 0]),
     ],
 )
 def test_percent(load: list[list[float]], expected: list[float]) -> None:
-    assert percent(load) == expected
+    assert percent(load) == pytest.approx(expected, abs=1.1e-5)
+
+
+def test_what_no_key_is_near_is_the_value_itself() -> None:
+    load = [[0, 0], [0.1, 33.3], [0.3, 33.3], [0.7, 80], [2, 81]]
+    made = scene(springs=SOFT, probes=[{"force": [100, 0, 0], "load": load}], time=STEPS)
+    found = schedule(made, 0, 100).strength[:, 0, 0]
+    t = np.arange(100) / 100
+    expected = np.interp(t, *np.array(load).T)
+    near = np.isin(np.arange(100), [0, 10, 30, 70])
+    np.testing.assert_allclose(found[~near], expected[~near], rtol=1e-15)
+    assert (found[11:30] == 33.3).all()
+    assert (np.abs(found[near] - expected[near]) > 1e-3).all()
+
+
+def random_load(seed: int) -> list[list[float]]:
+    rng = np.random.default_rng(seed)
+    times = np.sort(rng.uniform(-0.02, 0.08, 9))
+    times[3] = times[4]
+    times[6] = times[7] - 1e-9
+    return [[float(t), float(rng.uniform(-100, 100))] for t in times]
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_the_average_is_the_integral_with_the_hat(seed: int) -> None:
+    load = random_load(seed)
+    at = [[0, 0, 0], [0.011, 1, 0], [0.011, 0, 1], [0.043, 0.5, 0.5], [0.043, 0.25, 0]]
+    made = scene(springs=SOFT, probes=[{"force": [100, 0, 0], "load": load, "at": at}], time=STEPS)
+    found, h = schedule(made, 0, 7), step(made)
+    keys = sorted({time for time, _ in load} | {0.011, 0.043})
+
+    def integral(of: Any, n: int) -> float:
+        low, high = max(0.0, (n - 1) * h), (n + 1) * h
+        cuts = [low, *(time for time in [*keys, n * h] if low < time < high), high]
+        parts = [
+            quad(lambda t: of(t) * (1 - abs(t - n * h) / h) / h, a, b, epsabs=1e-13)[0]
+            for a, b in pairwise(sorted(cuts))
+        ]
+        return sum(parts) * (2 if n == 0 else 1)
+
+    for n in range(7):
+        for grip in range(2):
+            strength = integral(lambda t, grip=grip: loads_at(made, np.array([t])).strength[0, grip, 0], n)
+            assert found.strength[n, grip, 0] == pytest.approx(strength, abs=1e-9), (n, grip)
+        active = integral(lambda t: loads_at(made, np.array([t])).active[0], n)
+        assert found.active[n] == pytest.approx(active, abs=1e-9), n
+
+
+def test_a_free_point_goes_where_the_load_takes_it() -> None:
+    """Verlet's u_{n+1} = 2 u_n - u_{n-1} + h^2 a_n is then exact, whatever the load."""
+    load = random_load(5)
+    made = scene(springs={}, probes=[{"force": [1, 0, 0], "load": load}], time=STEPS)
+    a, h = schedule(made, 0, 8).strength[:, 0, 0], step(made)
+    u = [0.0, h**2 / 2 * a[0]]
+    for n in range(1, 8):
+        u.append(2 * u[-1] - u[-2] + h**2 * a[n])
+    keys = sorted(time for time, _ in load if 0 < time < 8 * h)
+
+    def double_integral(end: float) -> float:
+        cuts = [0.0, *(time for time in keys if time < end), end]
+        return sum(
+            quad(lambda t: (end - t) * loads_at(made, np.array([t])).strength[0, 0, 0], a, b, epsabs=1e-14)[0]
+            for a, b in pairwise(cuts)
+        )
+
+    np.testing.assert_allclose(u, [double_integral(n * h) for n in range(9)], atol=1e-12)
 
 
 def test_a_step_meets_a_key_in_spite_of_rounding() -> None:
@@ -55,7 +120,7 @@ def test_a_step_meets_a_key_in_spite_of_rounding() -> None:
         time={"duration": 20, "frames_per_second": 0.1, "step": 10 / 3},
     )
     assert 3 / (3 * 0.1) < 10
-    assert schedule(made, 0, 6).strength[:, 0, 0].tolist() == [0, 0, 0, 50, 100, 100]
+    np.testing.assert_allclose(schedule(made, 0, 6).strength[:, 0, 0], [0, 0, 0, 50, 100, 100], atol=1e-12)
 
 
 @pytest.mark.parametrize(
@@ -63,6 +128,8 @@ def test_a_step_meets_a_key_in_spite_of_rounding() -> None:
     [
         # A jump of the activity, though the percent has none.
         ([[[0.01, 0], [0.03, 100], [0.04, 0]]], [0, 0.5, 1, 1, 0.5, 0]),
+        # Between two steps.
+        ([[[0, 100], [0.025, 0]]], [1, 1, 0.875, 0.125, 0, 0]),
         # A percent that only crosses 0 keeps the springs.
         ([[[0, -50], [0.04, 50]]], [1, 1, 1, 1, 1, 1]),
         ([[[0, 0], [0.02, 0], [0.02, 100]]], [0, 0, 0.5, 1, 1, 1]),
@@ -74,7 +141,7 @@ def test_a_step_meets_a_key_in_spite_of_rounding() -> None:
 def test_virtual_springs_while_loaded(loads: list[list[list[float]]], expected: list[float]) -> None:
     probes = [{"force": [0, 0, 1], "load": load} for load in loads]
     made = scene(springs=SOFT, probes=probes, time=STEPS)
-    assert schedule(made, 0, 6).active.tolist() == expected
+    assert schedule(made, 0, 6).active.tolist() == pytest.approx(expected, abs=1e-12)
 
 
 def test_virtual_springs_always() -> None:
@@ -91,6 +158,19 @@ def test_a_schedule_does_not_depend_on_where_it_is_cut() -> None:
             np.testing.assert_array_equal(np.concatenate([half[n] for half in halves]), whole[n])
 
 
+def test_keys_that_change_nothing_change_no_bit() -> None:
+    """As those that a session leaves out of its record, and those that are not known yet when a step is taken."""
+
+    def bits(load: list[list[float]], steps: int) -> bytes:
+        made = scene(springs=SOFT, probes=[{"force": [0, 0, 8], "load": load}], time=STEPS)
+        return b"".join(part.tobytes() for part in schedule(made, 0, steps))
+
+    load: list[list[float]] = [[0, 0], [0.013, 70], [0.031, 70]]
+    assert bits(load, 9) == bits([*load[:2], [0.017, 70], [0.02, 70], *load[2:], [0.05, 70], [0.06, 70]], 9)
+    # What begins at step 6 is not seen by step 5.
+    assert bits(load, 6) == bits([*load, [0.06, 70], [0.06, 0], [0.08, 5]], 6)
+
+
 def test_a_control_point_moves_between_its_keys_and_is_held_outside() -> None:
     keys = [[0.01, 0, 0], [0.03, 1, 0.5]]
     made = scene(springs=SOFT, probes=[{"force": [0, 0, 1], "at": keys}], time=STEPS)
@@ -104,65 +184,60 @@ def test_a_control_point_moves_between_its_keys_and_is_held_outside() -> None:
 def test_a_jump_of_the_control_point_shares_the_force_between_both_places(keys: list[list[float]]) -> None:
     probe = {"force": [0, 0, 8], "at": keys, "load": [[0, 100], [0.02, 100], [0.02, 50]]}
     made = scene(springs=SOFT, probes=[probe], time=STEPS)
-    assert [grip.before for grip in grips(made)] == [True, False]
-    strength = schedule(made, 0, 5).strength[..., 2]
-    np.testing.assert_allclose(strength.T, [[0, 0, 4, 0, 0], [8, 8, 2, 4, 4]])
-    point = schedule(made, 0, 5).point
-    np.testing.assert_allclose(point[2], [[-0.2, 0.15], [0.2, -0.15]])
-    np.testing.assert_allclose(point[[0, 1, 3, 4], 1], [[-0.2, 0.15], [-0.2, 0.15], [0.2, -0.15], [0.2, -0.15]])
+    assert [(grip.turn, grip.turns, grip.moves) for grip in grips(made)] == [(0, 2, True), (1, 2, True)]
+    found = schedule(made, 0, 5)
+    np.testing.assert_allclose(found.strength[..., 2].T, [[8, 8, 4, 0, 0], [0, 0, 2, 4, 4]], atol=1e-12)
+    np.testing.assert_allclose(found.point[2], [[-0.2, 0.15], [0.2, -0.15]])
+    np.testing.assert_allclose(found.point[:2, 0], [[-0.2, 0.15]] * 2)
+    np.testing.assert_allclose(found.point[3:, 1], [[0.2, -0.15]] * 2)
 
 
-def test_a_control_point_that_jumps_a_thousand_times_has_two_places() -> None:
-    """However many jumps, a step has no more forces to add up."""
-    at = [[n / 1000, *place] for n in range(1000) for place in ([n % 7 / 7, 0.5], [n % 5 / 5, 0.25])]
-    made = scene(springs=SOFT, probes=[{"force": [0, 0, 8], "at": at}, PRESS], time=STEPS)
-    assert [(grip.probe, grip.before, grip.moves) for grip in grips(made)] == [
-        (0, True, True),
-        (0, False, True),
-        (1, False, False),
-    ]
-    # On the jump at 0.01 s, and between this and the next.
-    loads = loads_at(made, np.array([0.01, 0.0104, 0.011]))
-    np.testing.assert_allclose(loads.strength[:, :2, 2], [[4, 4], [0, 8], [4, 4]])
-    expected = [[(10 % 7 / 7 - 0.5) * 0.4, 0], [(10 % 5 / 5 - 0.5) * 0.4, 0.075]]
-    np.testing.assert_allclose(loads.point[0, :2], expected, atol=1e-15)
+def test_before_and_after_a_jump_the_control_point_is_where_its_keys_have_it() -> None:
+    # The jump is between two steps; before it the control point moves, and after it too.
+    at = [[0, 0, 0], [0.024, 0.6, 0], [0.024, 1, 1], [0.044, 0.5, 1]]
+    made = scene(springs=SOFT, probes=[{"force": [0, 0, 8], "at": at}], time=STEPS)
+    x = schedule(made, 0, 5).point[..., 0] / 0.4 + 0.5
+    np.testing.assert_allclose(x[[0, 1, 2, 3], 0], [0, 0.25, 0.5, 0.6], atol=1e-12)
+    np.testing.assert_allclose(x[[2, 3, 4], 1], [1, 0.85, 0.6], atol=1e-12)
 
 
-def test_keys_and_jumps() -> None:
+def test_a_control_point_that_jumps_a_thousand_times_has_few_places() -> None:
+    """However many jumps, a step has no more forces to add up than it sees jumps."""
+    at = [[n / 100, *place] for n in range(1000) for place in ([n % 7 / 7, 0.5], [n % 5 / 5, 0.25])]
+    probes = [{"force": [0, 0, 8], "at": at}, PRESS]
+    made = scene(springs=SOFT, probes=probes, time={"duration": 10.0, "step": 0.005})
+    found = [(grip.probe, grip.turn, grip.turns, grip.moves) for grip in grips(made)]
+    assert found == [(0, 0, 2, True), (0, 1, 2, True), (1, 0, 1, False)]
+    assert len(grips(with_steps(made, 4))) == 1 + 3, "steps of 0.01 s see two jumps"
+    loads = loads_at(made, np.array([0.0104, 0.0204]))
+    np.testing.assert_allclose(loads.strength[:, :2, 2], [[8, 0], [0, 8]])
+    between = schedule(made, 2, 1)
+    np.testing.assert_allclose(sum(between.strength[0, :2, 2]), 8, rtol=1e-12)
+
+
+def test_keys() -> None:
     load = [[-1, 0], [0, 0], [0.1, 50], [0.1, 100], [0.3, 100], [0.5, 0], [0.7, 0], [2, 1]]
     at = [[0, 0, 0], [0.25, 0, 1], [0.25, 1, 1], [0.6, 1, 0]]
     made = scene(springs=SOFT, probes=[{"force": [0, 0, 8], "load": load, "at": at}], time=STEPS)
     np.testing.assert_allclose(key_times(made), [0.1, 0.25, 0.3, 0.5, 0.6, 0.7])
-    # The load jumps at 0.1 s, the control point at 0.25 s; the virtual springs end at 0.5 s and are back at 0.7 s.
-    np.testing.assert_allclose(jumps(made), [0.1, 0.25, 0.5, 0.7])
-    without = scene(springs={**SOFT, "virtual": 0}, probes=made.model_dump()["probes"], time=STEPS)
-    np.testing.assert_allclose(jumps(without), [0.1, 0.25])
-    assert shortest_ramp(made) == pytest.approx(0.1)
-    assert jumps(scene(probes=[])).size == key_times(scene(probes=[])).size == 0
-    assert shortest_ramp(scene(probes=[])) == np.inf
+    assert key_times(scene(probes=[])).size == 0
 
 
-def test_a_first_key_that_presses_is_a_jump() -> None:
-    made = scene(springs=SOFT, probes=[{"force": [0, 0, 8], "load": [[0.1, 100]]}], time=STEPS)
-    np.testing.assert_allclose(jumps(made), [0.1])
+def within(made: Scene, begin: float, end: float) -> tuple[float, bool, int]:
+    forces, active, begins = Envelope(made).between(begin, end)
+    return round(float(forces.max()), 12), active, begins
 
 
-@pytest.mark.parametrize(
-    ("times", "steps"),
-    [
-        ([0.12], 1),
-        ([0.13], 4),
-        ([0.13, 0.15], 4),
-        ([0.13, 0.04 / 3], 12),
-        ([0.1 * 2**0.5], 0),
-        ([0.0401], 400),
-        ([], 1),
-    ],
-)
-def test_steps_that_meet_every_jump(times: list[float], steps: int) -> None:
-    probes = [{"force": [0, 0, 8], "load": [[0, 100], [time, 100], [time, 0]]} for time in times]
-    made = scene(springs=SOFT, probes=probes, time={"duration": 1.0})
-    assert steps_to_meet_jumps(made) == steps
-    if steps:
-        assert meets_jumps(with_steps(made, 3 * steps))
-    assert meets_jumps(with_steps(made, 7)) == (steps == 1)
+def test_the_envelope_holds_what_steps_see() -> None:
+    load = [[0.1, 50], [0.2, -100], [0.2, 0], [0.5, 0], [0.5, 20], [0.6, 0]]
+    made = scene(springs=SOFT, probes=[{"force": [0, 3, 4], "load": load}], time=STEPS)
+    assert within(made, 0, 0.08) == (0.0, False, 0)
+    assert within(made, 0, 0.1) == (5 * 0.5, True, 1)
+    assert within(made, 0.15, 0.18) == (5 * 0.85, True, 0)
+    assert within(made, 0.15, 0.19) == (5, True, 0), "the step at 0.19 s sees as far as 0.2 s"
+    assert within(made, 0.3, 0.4) == (0.0, False, 0)
+    assert within(made, 0.3, 0.55) == (5 * 0.2, True, 1)
+    found = schedule(made, 0, 100)
+    for first in range(0, 96, 4):
+        most = np.linalg.norm(found.strength[first : first + 5, 0], axis=-1).max()
+        assert most <= within(made, first / 100, (first + 4) / 100)[0] * (1 + 1e-12)

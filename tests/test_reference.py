@@ -9,8 +9,8 @@ from scipy.integrate import solve_ivp
 
 from taichi_msm import reference
 from taichi_msm.lattice import fixed_points, rest_positions
-from taichi_msm.loads import schedule
-from taichi_msm.stability import step, steps_per_frame
+from taichi_msm.loads import loads_at
+from taichi_msm.stability import step
 from tests.scenes import scene
 
 # A 2 x 2 sheet without springs but virtual ones: four independent oscillators.
@@ -89,7 +89,7 @@ def test_a_spring_without_length_has_no_force() -> None:
 def test_agrees_with_dop853() -> None:
     made = scene(probes=[{"force": [0, 300, -1000], "load": [[0, 0], [0.4, 100]], "falloff": 20}])
     rest, moves = rest_positions(made.sheet), ~fixed_points(made.sheet)[..., None]
-    full = schedule(made, made.time.frames * steps_per_frame(made), 1)
+    full = loads_at(made, np.array([0.4]))
 
     def motion(t: float, y: NDArray[np.float64]) -> NDArray[np.float64]:
         u, v = y.reshape(2, *rest.shape)

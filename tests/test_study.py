@@ -85,7 +85,7 @@ def test_observed_orders(stepping: SteppingStudy) -> None:
 
 def test_orders_are_fitted_above_the_rounding_floor() -> None:
     def point(step: float, error: float, rounding: float) -> Stepping:
-        return Stepping("f32", "central", 1, step, error, rounding, True, True, Timing(1, 1, 1, 5))
+        return Stepping("f32", "central", 1, step, error, rounding, True, Timing(1, 1, 1, 5))
 
     points = [point(0.1**n, 0.1 ** (2 * n) + 1e-6, 1e-6) for n in range(5)]
     # The points of 1e-6 and 2e-6 are mostly rounding; the next is, by 1 %.
@@ -93,25 +93,13 @@ def test_orders_are_fitted_above_the_rounding_floor() -> None:
     assert observed_orders(points[2:]) == {"f32 central": None}
 
 
-def test_steps_that_miss_a_jump_are_not_fitted_with_those_that_meet_it() -> None:
-    def point(step: float, error: float, meets: bool) -> Stepping:
-        return Stepping("f64", "central", 1, step, error, None, True, meets, Timing(1, 1, 1, 5))
-
-    missing, meeting = (
-        [point(0.1**n, 0.1**n, False) for n in range(3)],
-        [point(0.1**n, 0.01**n, True) for n in range(3)],
-    )
-    assert observed_orders([*missing, *meeting]) == {"f64 central": pytest.approx(2)}
-    assert observed_orders(missing) == {"f64 central": pytest.approx(1)}
-
-
-def test_a_series_meets_the_jumps_after_its_first_step(device: Device) -> None:
-    # A release at 3.25 frames: every fourth step of a frame meets it.
+def test_a_series_halves_its_steps_though_they_miss_a_jump(device: Device) -> None:
+    # A release at 3.25 frames, which no ninth of a frame meets.
     made = scene(probes=[{**SOFT_PRESS, "load": [[0, 100], [0.13, 100], [0.13, 0]]}], time={"duration": 0.2})
     with closing(SteppingStudy(made, device, 0.001, nothing)) as measured:
         measured.run()
         counts = [point.steps_per_frame for point in measured.points() if point.method == "f64 central"]
-    assert counts == [9, 12, 24]
+    assert counts == [9, 18, 36]
 
 
 def test_dop853_solves_moving_and_jumping_probes() -> None:
@@ -219,7 +207,6 @@ def stepping_point(error: float | None, seconds: float, **changes: Any) -> Stepp
         error=error,
         rounding=0.0,
         known=True,
-        meets_jumps=True,
         seconds=Timing(seconds, seconds, seconds, 5),
     )
 

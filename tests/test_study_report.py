@@ -47,7 +47,7 @@ def spread(median: float, runs: int = 5) -> Timing:
 
 def series(precision: str, difference: str) -> list[Stepping]:
     """Points of order 2 or 1, the coarsest of which diverged."""
-    points = [Stepping(precision, difference, 10, 0.004, None, None, False, True, spread(0.02))]
+    points = [Stepping(precision, difference, 10, 0.004, None, None, False, spread(0.02))]
     for halving in range(6):
         exact = 9e-4 / 4**halving if difference == "central" else 2.7e-3 / 2**halving
         rounding = FLOOR if precision == "f32" else None
@@ -63,7 +63,6 @@ def series(precision: str, difference: str) -> list[Stepping]:
                 error,
                 rounding,
                 known,
-                True,
                 spread(seconds),
             )
         )

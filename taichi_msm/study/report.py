@@ -35,7 +35,6 @@ COLUMNS = (
     "error",
     "rounding",
     "known",
-    "meets_jumps",
     "psnr",
     "largest_error",
     "seconds_median",

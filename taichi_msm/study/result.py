@@ -58,7 +58,6 @@ class Stepping:
         error: largest error of any point at any frame, as a fraction of the largest displacement; None: it diverged.
         rounding: the part of it that f32 makes; None for f64.
         known: whether the reference is exact enough for this error; if not, the error is at most about this.
-        meets_jumps: whether every jump of the scene falls on a step, as it must for order 2.
         seconds: of stepping through the whole scene, compiled and warm.
     """
 
@@ -69,7 +68,6 @@ class Stepping:
     error: float | None
     rounding: float | None
     known: bool
-    meets_jumps: bool
     seconds: Timing
 
     @property

@@ -15,7 +15,6 @@ from numpy.typing import NDArray
 from taichi_msm.accuracy import longest
 from taichi_msm.divergence import farthest_displacement
 from taichi_msm.dynamics import Dynamics
-from taichi_msm.loads import meets_jumps, steps_to_meet_jumps
 from taichi_msm.runtime import Device
 from taichi_msm.scene import Scene
 from taichi_msm.stability import stable_step, step, with_steps, with_time
@@ -32,9 +31,6 @@ MARGIN = 20
 
 # The steps of a series below the largest stable one, whatever they cost.
 LEAST_HALVINGS = 2
-
-# Steps that meet every jump are not looked for where they are finer than the largest stable one by more than this.
-COARSEST = 16
 
 Frames = NDArray[Any]
 Progress = Callable[[int, int], None]
@@ -124,34 +120,23 @@ class SteppingStudy:
         steps = max(1, math.ceil(1 / self.scene.time.frames_per_second / limit * (1 - 1e-12)))
         samples: list[float] = []
         self._run("f64", difference, steps, samples)
-        # After the first they meet every jump, if that is possible: else the method would be of order 1.
-        meeting = steps_to_meet_jumps(self.scene)
-        misses = meeting > 1 and steps % meeting > 0 and meeting <= COARSEST * steps
-        finer = math.ceil(steps / meeting) * meeting if misses else 2 * steps
-        affordable = samples[0] * finer / steps
         yield steps
-        for halving in range(64):
-            if halving >= LEAST_HALVINGS and affordable * 2**halving > self._longest_run:
+        for halving in range(1, 64):
+            if halving > LEAST_HALVINGS and samples[0] * 2**halving > self._longest_run:
                 return
-            yield finer * 2**halving
+            yield steps * 2**halving
 
     def _make_reference(self, finest: int) -> None:
         """Extrapolate central differences from steps well below the finest that is measured.
 
         u* = u_{h/2} + (u_{h/2} - u_h) / 3; its error is at most about its distance from the same at twice the step.
         """
-        meeting = max(1, steps_to_meet_jumps(self.scene))
-        steps = math.ceil(finest / meeting) * meeting
-        coarse, middle, fine = (self._run("f64", "central", steps * 2**halving, []) for halving in range(3))
-        if meets_jumps(with_steps(self.scene, steps)):
-            before = middle + (middle - coarse) / 3
-            self.frames = fine + (fine - middle) / 3
-        else:
-            # Missed jumps are moved by up to half a step: extrapolation would not help.
-            before, self.frames = coarse, fine
+        coarse, middle, fine = (self._run("f64", "central", finest * 2**halving, []) for halving in range(3))
+        before = middle + (middle - coarse) / 3
+        self.frames = fine + (fine - middle) / 3
         largest = longest(self.frames)
         error = longest(self.frames - before) / largest if largest > 0 else 0.0
-        self.reference = Reference(4 * steps, error, largest)
+        self.reference = Reference(4 * finest, error, largest)
 
     def _measure_errors(self, difference: str, counts: list[int]) -> None:
         """Run every step once, in f32 until rounding dominates and in f64 until the reference is not exact enough."""
@@ -203,7 +188,6 @@ class SteppingStudy:
             error=trial.error if finite else None,
             rounding=trial.rounding if finite else None,
             known=finite and self.known(trial.error),
-            meets_jumps=meets_jumps(made),
             seconds=Timing.of(trial.samples),
         )
 
@@ -211,8 +195,6 @@ class SteppingStudy:
 def observed_orders(points: list[Stepping]) -> dict[str, float | None]:
     """Fit the order of every method over the points where the step, and not rounding, makes the error."""
     orders: dict[str, float | None] = {}
-    # Steps that miss a jump make a method of another order, and count only where none meets it.
-    meets = any(point.meets_jumps for point in points)
     for method in dict.fromkeys(point.method for point in points):
         fit = [
             (math.log(point.step), math.log(point.error))
@@ -220,7 +202,6 @@ def observed_orders(points: list[Stepping]) -> dict[str, float | None]:
             if point.method == method
             and point.error
             and point.known
-            and point.meets_jumps == meets
             and (point.rounding or 0) < point.error / 10
         ]
         steps, errors = np.array(fit).reshape(-1, 2).T
