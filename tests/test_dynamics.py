@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import time
+from collections.abc import Iterator
 from dataclasses import replace
 from typing import Any
 
@@ -11,10 +12,9 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from taichi_msm import reference, sweep
+from taichi_msm import gather, reference, sweep
 from taichi_msm.dynamics import POINTS_PER_WORKER, Dynamics, structure
 from taichi_msm.forces import Structure
-from taichi_msm.gather import STEPS_PER_LAUNCH
 from taichi_msm.lattice import rest_positions
 from taichi_msm.runtime import Device, available_threads, lanes
 from taichi_msm.scene import Scene
@@ -85,10 +85,21 @@ def test_small_sheets_and_fixed_sides(points: list[int], fixed: Any, device: Dev
     assert_like_twin(scene(sheet=sheet, probes=[{"force": [1, 2, 30], "falloff": 3, "offset": 6}]), device)
 
 
+@pytest.fixture
+def short_launches(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
+    """Few steps a launch on a GPU, as each of them is compiled."""
+    gather._kernels.cache_clear()
+    for module in ("gather", "dynamics"):
+        monkeypatch.setattr(f"taichi_msm.{module}.STEPS_PER_LAUNCH", 3)
+    yield
+    gather._kernels.cache_clear()
+
+
+@pytest.mark.usefixtures("short_launches")
 def test_the_plain_layout_of_a_gpu_gives_the_same(device: Device) -> None:
     made = scene(probes=[PRESS], time={"duration": 0.08})
     layout = as_on_a_gpu(structure(made, device))
-    assert steps_per_frame(made) % STEPS_PER_LAUNCH != 0, "a launch that is not full is part of the test"
+    assert steps_per_frame(made) % gather.STEPS_PER_LAUNCH != 0, "a launch that is not full is part of the test"
     assert simulate(made, device, layout).tobytes() == simulate(made, device).tobytes()
 
 
@@ -282,6 +293,7 @@ def energy(made: Scene, u: NDArray[Any], v: NDArray[Any]) -> float:
     return float(total)
 
 
+@pytest.mark.usefixtures("short_launches")
 @pytest.mark.parametrize(
     "change",
     [
@@ -316,6 +328,7 @@ def test_a_state_is_gone_on_from_with_the_same_bits(change: dict[str, Any] | Non
     dynamics.close()
 
 
+@pytest.mark.usefixtures("short_launches")
 @pytest.mark.parametrize(("seed", "width"), [(0, 8), (3, 8), (4, 1)])
 def test_the_energy_is_that_of_motion_and_springs(seed: int, width: int, device: Device) -> None:
     made = random_scene(seed)
