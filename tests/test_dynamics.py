@@ -45,8 +45,22 @@ def assert_like_twin(made: Scene, device: Device, layout: Structure | None = Non
     np.testing.assert_allclose(simulate(made, device, layout), twin, rtol=0, atol=tolerance)
 
 
-@pytest.mark.parametrize("precision", ["f32", "f64"])
-@pytest.mark.parametrize("seed", [*range(6), *(pytest.param(seed, marks=pytest.mark.slow) for seed in (6, 7))])
+# Each of terms of its own, so that all take long: these, and others as fuzz and slow ones.
+QUICK_SCENES = [(0, "f32"), (1, "f64"), (2, "f32"), (3, "f32"), (3, "f64"), (4, "f64"), (5, "f64")]
+
+
+@pytest.mark.parametrize(
+    ("seed", "precision"),
+    [
+        pytest.param(
+            seed,
+            precision,
+            marks=() if (seed, precision) in QUICK_SCENES else pytest.mark.slow if seed > 5 else pytest.mark.fuzz,
+        )
+        for seed in range(8)
+        for precision in ("f32", "f64")
+    ],
+)
 def test_random_scene_is_like_the_twin(seed: int, precision: str, device: Device) -> None:
     assert_like_twin(random_scene(seed, precision), device)
 
@@ -137,10 +151,11 @@ def test_the_depth_of_a_pass_is_chosen_from_the_size(device: Device) -> None:
     assert depths == [1, 8, 8, 1]
 
 
-def test_lanes_do_not_change_the_bits(device: Device) -> None:
+@pytest.mark.parametrize("widths", [(16, 2), pytest.param((16, 8, 4, 2), marks=pytest.mark.fuzz)])
+def test_lanes_do_not_change_the_bits(widths: tuple[int, ...], device: Device) -> None:
     made = scene(sheet={**SHEET, "points": [7, 13]}, time={"precision": "f32"})
     whole = structure(made, device)
-    motions = [simulate(made, device, with_lanes(whole, width)).tobytes() for width in (16, 8, 4, 2)]
+    motions = [simulate(made, device, with_lanes(whole, width)).tobytes() for width in widths]
     assert len(set(motions)) == 1
 
 
@@ -191,11 +206,18 @@ def test_absent_terms_are_left_out(device: Device) -> None:
     assert structure(scene(), device).code.lanes == lanes("f64")
 
 
-@pytest.mark.parametrize("fixed", ["border", "none"])
 @pytest.mark.parametrize(
-    "springs",
-    [{"structural": 20, "shear": 10}, {"structural": 20}, {"shear": 10}, {}],
-    ids=["both", "4", "diagonal", "0"],
+    ("springs", "fixed"),
+    [
+        pytest.param({"structural": 20, "shear": 10}, "border", id="both-border"),
+        pytest.param({"structural": 20, "shear": 10}, "none", id="both-none"),
+        pytest.param({"structural": 20}, "border", id="4-border", marks=pytest.mark.fuzz),
+        pytest.param({"structural": 20}, "none", id="4-none"),
+        pytest.param({"shear": 10}, "border", id="diagonal-border", marks=pytest.mark.fuzz),
+        pytest.param({"shear": 10}, "none", id="diagonal-none"),
+        pytest.param({}, "border", id="0-border", marks=pytest.mark.fuzz),
+        pytest.param({}, "none", id="0-none"),
+    ],
 )
 def test_the_shortest_spring_is_that_of_the_twin(springs: dict[str, Any], fixed: str, device: Device) -> None:
     # Pushed along the sheet, at each of whose sides in turn springs are compressed the most.
