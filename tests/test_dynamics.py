@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import time
+from collections.abc import Iterator
 from dataclasses import replace
 from typing import Any
 
@@ -11,10 +12,9 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from taichi_msm import reference, sweep
+from taichi_msm import gather, reference, sweep
 from taichi_msm.dynamics import POINTS_PER_WORKER, Dynamics, structure
 from taichi_msm.forces import Structure
-from taichi_msm.gather import STEPS_PER_LAUNCH
 from taichi_msm.lattice import rest_positions
 from taichi_msm.runtime import Device, available_threads, lanes
 from taichi_msm.scene import Scene
@@ -45,8 +45,22 @@ def assert_like_twin(made: Scene, device: Device, layout: Structure | None = Non
     np.testing.assert_allclose(simulate(made, device, layout), twin, rtol=0, atol=tolerance)
 
 
-@pytest.mark.parametrize("precision", ["f32", "f64"])
-@pytest.mark.parametrize("seed", [*range(6), *(pytest.param(seed, marks=pytest.mark.slow) for seed in (6, 7))])
+# Each of terms of its own, so that all take long: these, and others as fuzz and slow ones.
+QUICK_SCENES = [(0, "f32"), (1, "f64"), (2, "f32"), (3, "f32"), (3, "f64"), (4, "f64"), (5, "f64")]
+
+
+@pytest.mark.parametrize(
+    ("seed", "precision"),
+    [
+        pytest.param(
+            seed,
+            precision,
+            marks=() if (seed, precision) in QUICK_SCENES else pytest.mark.slow if seed > 5 else pytest.mark.fuzz,
+        )
+        for seed in range(8)
+        for precision in ("f32", "f64")
+    ],
+)
 def test_random_scene_is_like_the_twin(seed: int, precision: str, device: Device) -> None:
     assert_like_twin(random_scene(seed, precision), device)
 
@@ -85,10 +99,21 @@ def test_small_sheets_and_fixed_sides(points: list[int], fixed: Any, device: Dev
     assert_like_twin(scene(sheet=sheet, probes=[{"force": [1, 2, 30], "falloff": 3, "offset": 6}]), device)
 
 
+@pytest.fixture
+def short_launches(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
+    """Few steps a launch on a GPU, as each of them is compiled."""
+    gather._kernels.cache_clear()
+    for module in ("gather", "dynamics"):
+        monkeypatch.setattr(f"taichi_msm.{module}.STEPS_PER_LAUNCH", 3)
+    yield
+    gather._kernels.cache_clear()
+
+
+@pytest.mark.usefixtures("short_launches")
 def test_the_plain_layout_of_a_gpu_gives_the_same(device: Device) -> None:
     made = scene(probes=[PRESS], time={"duration": 0.08})
     layout = as_on_a_gpu(structure(made, device))
-    assert steps_per_frame(made) % STEPS_PER_LAUNCH != 0, "a launch that is not full is part of the test"
+    assert steps_per_frame(made) % gather.STEPS_PER_LAUNCH != 0, "a launch that is not full is part of the test"
     assert simulate(made, device, layout).tobytes() == simulate(made, device).tobytes()
 
 
@@ -126,10 +151,11 @@ def test_the_depth_of_a_pass_is_chosen_from_the_size(device: Device) -> None:
     assert depths == [1, 8, 8, 1]
 
 
-def test_lanes_do_not_change_the_bits(device: Device) -> None:
+@pytest.mark.parametrize("widths", [(16, 2), pytest.param((16, 8, 4, 2), marks=pytest.mark.fuzz)])
+def test_lanes_do_not_change_the_bits(widths: tuple[int, ...], device: Device) -> None:
     made = scene(sheet={**SHEET, "points": [7, 13]}, time={"precision": "f32"})
     whole = structure(made, device)
-    motions = [simulate(made, device, with_lanes(whole, width)).tobytes() for width in (16, 8, 4, 2)]
+    motions = [simulate(made, device, with_lanes(whole, width)).tobytes() for width in widths]
     assert len(set(motions)) == 1
 
 
@@ -180,11 +206,18 @@ def test_absent_terms_are_left_out(device: Device) -> None:
     assert structure(scene(), device).code.lanes == lanes("f64")
 
 
-@pytest.mark.parametrize("fixed", ["border", "none"])
 @pytest.mark.parametrize(
-    "springs",
-    [{"structural": 20, "shear": 10}, {"structural": 20}, {"shear": 10}, {}],
-    ids=["both", "4", "diagonal", "0"],
+    ("springs", "fixed"),
+    [
+        pytest.param({"structural": 20, "shear": 10}, "border", id="both-border"),
+        pytest.param({"structural": 20, "shear": 10}, "none", id="both-none"),
+        pytest.param({"structural": 20}, "border", id="4-border", marks=pytest.mark.fuzz),
+        pytest.param({"structural": 20}, "none", id="4-none"),
+        pytest.param({"shear": 10}, "border", id="diagonal-border", marks=pytest.mark.fuzz),
+        pytest.param({"shear": 10}, "none", id="diagonal-none"),
+        pytest.param({}, "border", id="0-border", marks=pytest.mark.fuzz),
+        pytest.param({}, "none", id="0-none"),
+    ],
 )
 def test_the_shortest_spring_is_that_of_the_twin(springs: dict[str, Any], fixed: str, device: Device) -> None:
     # Pushed along the sheet, at each of whose sides in turn springs are compressed the most.
@@ -282,6 +315,7 @@ def energy(made: Scene, u: NDArray[Any], v: NDArray[Any]) -> float:
     return float(total)
 
 
+@pytest.mark.usefixtures("short_launches")
 @pytest.mark.parametrize(
     "change",
     [
@@ -316,6 +350,7 @@ def test_a_state_is_gone_on_from_with_the_same_bits(change: dict[str, Any] | Non
     dynamics.close()
 
 
+@pytest.mark.usefixtures("short_launches")
 @pytest.mark.parametrize(("seed", "width"), [(0, 8), (3, 8), (4, 1)])
 def test_the_energy_is_that_of_motion_and_springs(seed: int, width: int, device: Device) -> None:
     made = random_scene(seed)

@@ -133,7 +133,7 @@ def test_a_trajectory_may_be_longer_than_4_gib(tmp_path: Path, monkeypatch: pyte
         assert trajectory["position"].shape == (20, ROWS, COLS, 3)
 
 
-@pytest.mark.parametrize("light", [1.25, 0.7, 0.25])
+@pytest.mark.parametrize("light", [1.25, pytest.param(0.7, marks=pytest.mark.fuzz), 0.25])
 def test_the_animation_is_like_its_frames(tmp_path: Path, light: float) -> None:
     """The palette, made from the first frame, foresees later ones in other light, and the background."""
     first = np.empty((16, 16, 3), np.uint8)
@@ -164,7 +164,9 @@ def test_leaving_without_publishing_leaves_what_was_there(tmp_path: Path) -> Non
     assert not (tmp_path / "fresh").exists()
 
 
-@pytest.mark.parametrize(("rows", "frames"), [(0, 1), (HEIGHT // 2, 1), (HEIGHT, 2)])
+@pytest.mark.parametrize(
+    ("rows", "frames"), [pytest.param(0, 1, marks=pytest.mark.fuzz), (HEIGHT // 2, 1), (HEIGHT, 2)]
+)
 def test_an_interrupted_hand_over_leaves_whole_frames(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, rows: int, frames: int
 ) -> None:

@@ -16,8 +16,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-from hypothesis import HealthCheck, given, settings
-from hypothesis import strategies as st
 from PIL import Image
 
 from taichi_msm.dynamics import Dynamics
@@ -32,6 +30,17 @@ from tests.scenes import SHEET, SPRINGS, speckle
 resource: Any = pytest.importorskip("resource")
 
 SCENES, OVERRIDES, PICTURES, VALID, BROKEN = 20_000, 2_000, 5_000, 500, 1_500
+
+# Of these so many are tried by default, and all by -m fuzz.
+PART = 10
+
+
+def tries(all_of_them: int) -> pytest.MarkDecorator:
+    """Give a test the argument `tries`."""
+    return pytest.mark.parametrize(
+        "tries", [all_of_them // PART, pytest.param(all_of_them, marks=pytest.mark.fuzz)], ids=["some", "all"]
+    )
+
 
 # The slowest that one input may be [s], and the most that memory may grow over all of them [KiB].
 SLOWEST, GROWTH = 1.0, 50_000
@@ -75,26 +84,28 @@ def in_bounds(folder: Path) -> Iterator[Callable[[Callable[[], object]], bool]]:
     assert sorted(folder.rglob("*")) == before
 
 
-def test_damaged_scenes(here: Path, root: Path) -> None:
+@tries(SCENES)
+def test_damaged_scenes(tries: int, here: Path, root: Path) -> None:
     rng = random.Random(1)
     scenes = [path.read_bytes() for path in sorted((root / "scenes").glob("*.yaml"))]
     file = here / "damaged.yaml"
     file.touch()
     with in_bounds(here) as attempt:
         accepted = 0
-        for _ in range(SCENES):
+        for _ in range(tries):
             file.write_bytes(damaged_text(rng, rng.choice(scenes)))
             accepted += attempt(lambda: load_scene("damaged.yaml"))
-    assert 0 < accepted < SCENES / 2, "some damage does no harm, and most does"
+    assert 0 < accepted < tries / 2, "some damage does no harm, and most does"
 
 
-def test_damaged_overrides(here: Path, root: Path) -> None:
+@tries(OVERRIDES)
+def test_damaged_overrides(tries: int, here: Path, root: Path) -> None:
     rng = random.Random(2)
     shutil.copy(root / "scenes" / "press.yaml", here)
     keys = ["sheet.points", "probes.0.load", "probes.9.at", "render.camera.eye", "time.step", "image", "a.b", "0", ""]
     values = ["[61,61]", "[[0,100]]", "1e4", "-1", "null", "{a: 1}", "[", "top", "!!x 1", "&a 1", "[]", "é", "\ud800"]
     with in_bounds(here) as attempt:
-        for _ in range(OVERRIDES):
+        for _ in range(tries):
             text = rng.choice(keys) + rng.choice(("=", "=", "", "==")) + rng.choice(values)
             if rng.random() < 0.5:
                 # As the command line gives bytes that are no UTF-8.
@@ -124,7 +135,8 @@ def pictures() -> list[bytes]:
     return made
 
 
-def test_damaged_pictures(here: Path, capfd: pytest.CaptureFixture[str]) -> None:
+@tries(PICTURES)
+def test_damaged_pictures(tries: int, here: Path, capfd: pytest.CaptureFixture[str]) -> None:
     rng = random.Random(3)
     whole = pictures()
     scene = Scene.model_validate(
@@ -141,10 +153,10 @@ def test_damaged_pictures(here: Path, capfd: pytest.CaptureFixture[str]) -> None
 
     with in_bounds(here) as attempt:
         accepted = 0
-        for _ in range(PICTURES):
+        for _ in range(tries):
             file.write_bytes(damaged_picture(rng, rng.choice(whole)))
             accepted += attempt(read)
-    assert 0 < accepted < PICTURES / 2
+    assert 0 < accepted < tries / 2
     assert capfd.readouterr() == ("", ""), "no library talks past us"
 
 
@@ -211,23 +223,17 @@ def flow(value: Any) -> str:
     return json.dumps(value).replace("Infinity", ".inf").replace("NaN", ".nan")
 
 
-QUIET = settings(
-    deadline=None,
-    database=None,
-    derandomize=True,
-    suppress_health_check=[HealthCheck.function_scoped_fixture, HealthCheck.too_slow],
-)
-
-
-@settings(QUIET, max_examples=VALID)
-@given(rng=st.randoms(use_true_random=True))
-def test_a_scene_that_keeps_every_rule_runs(rng: random.Random, here: Path, device: Device) -> None:
-    Path("valid.yaml").write_text(write(valid_scene(rng)))
-    dynamics = Dynamics(load_scene("valid.yaml"), device)
-    dynamics.advance(3)
-    displacement = dynamics.displacement()
-    dynamics.close()
-    assert np.isfinite(displacement).all()
+@tries(VALID)
+def test_a_scene_that_keeps_every_rule_runs(tries: int, here: Path, device: Device) -> None:
+    rng = random.Random(4)
+    for _ in range(tries):
+        text = write(valid_scene(rng))
+        Path("valid.yaml").write_text(text)
+        dynamics = Dynamics(load_scene("valid.yaml"), device)
+        dynamics.advance(3)
+        displacement = dynamics.displacement()
+        dynamics.close()
+        assert np.isfinite(displacement).all(), text
 
 
 # Values that break one rule, each of the key above them.
@@ -251,25 +257,23 @@ RULES: dict[str, list[Any]] = {
 }
 
 
-@settings(QUIET, max_examples=BROKEN)
-@given(
-    rng=st.randoms(use_true_random=True),
-    rule=st.sampled_from([(key, value) for key in RULES for value in RULES[key]]),
-)
-def test_a_scene_that_breaks_one_rule_is_refused_where_it_does(
-    rng: random.Random, rule: tuple[str, Any], here: Path
-) -> None:
-    key, value = rule
-    broken: Any = valid_scene(rng)
-    *sections, name = key.split(".")
-    holder = broken
-    for section in sections:
-        holder = holder[int(section) if section.isdigit() else section]
-    holder[name] = value
-    text = write(broken)
-    Path("broken.yaml").write_text(text)
-    with pytest.raises(SceneError) as caught:
-        load_scene("broken.yaml")
-    line = next(n for n, said in enumerate(text.splitlines(), 1) if said.lstrip("- ").startswith(f"{name}:"))
-    places = [said.split(": ")[:2] for said in caught.value.lines]
-    assert all(at.startswith(f"broken.yaml:{line}:") and where.startswith(key) for at, where in places), caught.value
+@tries(BROKEN)
+def test_a_scene_that_breaks_one_rule_is_refused_where_it_does(tries: int, here: Path) -> None:
+    rng = random.Random(5)
+    rules = [(key, value) for key in RULES for value in RULES[key]]
+    for n in range(tries):
+        key, value = rules[n % len(rules)]
+        broken: Any = valid_scene(rng)
+        *sections, name = key.split(".")
+        holder = broken
+        for section in sections:
+            holder = holder[int(section) if section.isdigit() else section]
+        holder[name] = value
+        text = write(broken)
+        Path("broken.yaml").write_text(text)
+        with pytest.raises(SceneError) as caught:
+            load_scene("broken.yaml")
+        line = next(n for n, said in enumerate(text.splitlines(), 1) if said.lstrip("- ").startswith(f"{name}:"))
+        places = [said.split(": ")[:2] for said in caught.value.lines]
+        right = all(at.startswith(f"broken.yaml:{line}:") and where.startswith(key) for at, where in places)
+        assert right, (text, caught.value)

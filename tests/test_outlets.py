@@ -29,6 +29,18 @@ BAD = [f"{command} bad.yaml" for command in ("run", "check", "study", "view")] +
 ]
 CODES = {**dict.fromkeys(GOOD, 0), **dict.fromkeys(BAD, 2)}
 
+# Commands that write in a way of their own, on stderr and on stdout; the others are tried by -m fuzz.
+TELLING = [RUN, "--help", "check bad.yaml", "run", "nothing"]
+PRINTING = [RUN, "schema", "--help", "run none.yaml --json", "run", "nothing"]
+
+
+def commands(default: list[str]) -> pytest.MarkDecorator:
+    """Give a test every command as its argument `command`."""
+    return pytest.mark.parametrize(
+        "command",
+        [pytest.param(command, marks=() if command in default else pytest.mark.fuzz) for command in CODES],
+    )
+
 
 @pytest.fixture
 def here(small: Path) -> Path:
@@ -46,14 +58,14 @@ def shell(line: str, **environment: str) -> subprocess.CompletedProcess[str]:
     )
 
 
-@pytest.mark.parametrize("command", CODES)
+@commands(TELLING)
 def test_errors_that_nobody_can_read_do_not_change_the_exit_code(command: str, here: Path) -> None:
     for outlet in ("2>&-", "2>/dev/full", "2> >(true)") if command != RUN else ("2>&-",):
         assert shell(f"msm {command} >/dev/null {outlet}").returncode == CODES[command]
     assert (here / "output" / "small" / "trajectory.npz").exists() == (command == RUN)
 
 
-@pytest.mark.parametrize("command", CODES)
+@commands(PRINTING)
 def test_results_that_nobody_can_read_are_4(command: str, here: Path) -> None:
     """A stream that was closed is one that nobody wants; what was wrong with the input goes to stderr."""
     said_on_stdout = command in GOOD or "--json" in command

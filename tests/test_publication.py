@@ -19,13 +19,12 @@ OLD = ["frames/0000.png", "frames/0001.png", "frames/0002.png", "animation.gif",
 NEW = ["frames/0000.png", "frames/0001.png", "frames/0003.png", "trajectory.npz", "run.json"]
 FOREIGN = ["notes.txt", "frames/notes.txt", "frames/0000 copy.png", "frames/12.png", "a/frames/0000.png"]
 
-# Publishes files and dies before the n-th operation on a path; ends well where there are fewer.
+# For every number n that it reads it forks a process that publishes files and dies before the n-th operation on a path,
+# or ends well where there are fewer, and tells how it ended.
 MORTAL = """
 import os, signal, sys
 from pathlib import Path
 from tests.test_publication import publish
-
-left = int(sys.argv[1])
 
 def mortal(operation):
     def call(*args, **kwargs):
@@ -36,9 +35,15 @@ def mortal(operation):
         return operation(*args, **kwargs)
     return call
 
-for name in ("open", "mkdir", "replace", "unlink", "rmdir"):
-    setattr(os, name, mortal(getattr(os, name)))
-publish(Path(sys.argv[2]), sys.argv[3:])
+for line in sys.stdin:
+    left = int(line)
+    process = os.fork()
+    if not process:
+        for name in ("open", "mkdir", "replace", "unlink", "rmdir"):
+            setattr(os, name, mortal(getattr(os, name)))
+        publish(Path(sys.argv[1]), sys.argv[2:])
+        os._exit(0)
+    print(os.waitstatus_to_exitcode(os.waitpid(process, 0)[1]), flush=True)
 """
 
 
@@ -123,26 +128,30 @@ def test_frames_that_are_not_wanted_go_with_their_directory(tmp_path: Path) -> N
 @pytest.mark.skipif(not hasattr(os, "fork"), reason="kills with SIGKILL")
 def test_killed_at_any_moment_the_results_are_all_old_or_all_new(directory: Path, root: Path) -> None:
     outcomes: list[str] = []
-    for moment in range(100):
-        write(directory, OLD, "old")
-        (directory / "trajectory.npz").unlink(missing_ok=True)
-        (directory / "frames/0003.png").unlink(missing_ok=True)
-        command = [sys.executable, "-c", MORTAL, str(moment), str(directory), *NEW]
-        status = subprocess.run(command, cwd=root, check=False).returncode
-        if status == 0:
-            break
-        assert status < 0
-        if (directory / "run.json").exists():
-            # Where there is a record, results are whole without the help of a next run.
-            assert contents(directory) in (expected(OLD, "old"), expected(NEW, "new"))
-        else:
-            assert (directory / ".partial" / "complete").exists()
-        with Publication(directory):
-            pass
-        found = contents(directory)
-        assert found in (expected(OLD, "old"), expected(NEW, "new")), f"killed before operation {moment}"
-        outcomes.append(found["run.json"])
-        assert_tidy(directory)
+    command = [sys.executable, "-c", MORTAL, str(directory), *NEW]
+    with subprocess.Popen(command, cwd=root, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True) as parent:
+        assert parent.stdin
+        assert parent.stdout
+        for moment in range(100):
+            write(directory, OLD, "old")
+            (directory / "trajectory.npz").unlink(missing_ok=True)
+            (directory / "frames/0003.png").unlink(missing_ok=True)
+            print(moment, file=parent.stdin, flush=True)
+            status = int(parent.stdout.readline())
+            if status == 0:
+                break
+            assert status < 0
+            if (directory / "run.json").exists():
+                # Where there is a record, results are whole without the help of a next run.
+                assert contents(directory) in (expected(OLD, "old"), expected(NEW, "new"))
+            else:
+                assert (directory / ".partial" / "complete").exists()
+            with Publication(directory):
+                pass
+            found = contents(directory)
+            assert found in (expected(OLD, "old"), expected(NEW, "new")), f"killed before operation {moment}"
+            outcomes.append(found["run.json"])
+            assert_tidy(directory)
     assert status == 0
     # Once new, always new: all operations but those before the marker roll forward.
     assert outcomes == sorted(outcomes, reverse=True)

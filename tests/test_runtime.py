@@ -31,7 +31,7 @@ def work():
     for i in range(tasks * ITERATIONS_PER_THREAD):
         if i % ITERATIONS_PER_THREAD == 0:
             total = ti.cast(0, ti.f64)
-            for j in range(30_000_000):
+            for j in range(10_000_000):
                 total += ti.sin(total + j)
             sums[i // ITERATIONS_PER_THREAD] = total
 work()
@@ -78,7 +78,7 @@ def test_a_process_may_have_many_sheets_and_gets_their_memory_back(device: runti
     sheets: list[Any] = []
     sizes = []
     for _ in range(3):
-        for _ in range(200):
+        for _ in range(100):
             sheets.append(Dynamics(made, device))
             sheets.append(Drawing(made, texture))
         sheets[-2].advance(1)
@@ -86,7 +86,7 @@ def test_a_process_may_have_many_sheets_and_gets_their_memory_back(device: runti
         sheets.clear()
         if Path("/proc/self/statm").exists():
             sizes.append(resident())
-    # Nothing stays of the last 400; Python's own pools may grow by a little.
+    # Nothing stays of the last 200; Python's own pools may grow by a little.
     assert not sizes or sizes[2] - sizes[1] < 4 * 2**20
 
 

@@ -295,7 +295,14 @@ def test_the_page_says_that_no_step_is_good_enough(tmp_path: Path) -> None:
     assert "(interrupted)" in page(tmp_path)
 
 
-@pytest.mark.parametrize("made", CASES[:-1], ids=lambda made: made.__name__)
+@pytest.mark.parametrize(
+    "made",
+    [
+        pytest.param(made, marks=pytest.mark.fuzz if made in (halfway, diverged, without_reference) else ())
+        for made in CASES[:-1]
+    ],
+    ids=lambda made: made.__name__,
+)
 def test_the_picture_is_readable_and_keeps_inside(made: Callable[[], Study], tmp_path: Path) -> None:
     pytest.importorskip("matplotlib")
     outputs = write_report(made(), tmp_path)

@@ -29,6 +29,7 @@ from taichi_msm.live.script import load_script, timed
 from taichi_msm.live.window import QUIT, Hand
 from taichi_msm.runtime import ti
 from taichi_msm.scene import Scene
+from tests.conftest import Program
 from tests.outputs import duration
 
 SCRIPT = """\
@@ -40,19 +41,9 @@ events:
 """
 
 
-def view(*arguments: str, **environment: str) -> subprocess.CompletedProcess[str]:
-    return subprocess.run(
-        [sys.executable, "-m", "taichi_msm", "view", *arguments, "--threads", "2"],
-        capture_output=True,
-        text=True,
-        check=False,
-        env=os.environ | environment,
-    )
-
-
-def test_a_script_is_done_and_filmed(small: Path) -> None:
+def test_a_script_is_done_and_filmed(small: Path, program: Program) -> None:
     Path("script.yaml").write_text(SCRIPT)
-    done = view("small.yaml", "--record", "films/live.gif", "--seconds", "1", "--script", "script.yaml")
+    done = program("view", "small.yaml", "--record", "films/live.gif", "--seconds", "1", "--script", "script.yaml")
     assert (done.returncode, done.stderr) == (0, "0.7 s: saved output/small-live/session-1.yaml\n")
     assert done.stdout == "films/live.gif\noutput/small-live/session-1.yaml\n"
     assert [path.name for path in Path("films").iterdir()] == ["live.gif"], "and nothing is left beside it"
@@ -204,9 +195,10 @@ events:
     ]
 
 
-def test_without_a_display_it_says_what_to_do(small: Path) -> None:
+def test_without_a_display_it_says_what_to_do(small: Path, program: Program, monkeypatch: pytest.MonkeyPatch) -> None:
     for display in ("", ":54321"):
-        done = view("small.yaml", DISPLAY=display)
+        monkeypatch.setenv("DISPLAY", display)
+        done = program("view", "small.yaml")
         expected = (
             "there is no display to open a window on; set DISPLAY, or film without one: --record FILE.gif --seconds N"
         )
@@ -252,16 +244,16 @@ def test_a_script_is_taken_event_by_event(tmp_path: Path) -> None:
     assert [frame for frame, _ in islice(events, 3)] == [0, 1_000_000, 1_000_001]
 
 
-def test_a_film_that_cannot_be_written(small: Path) -> None:
+def test_a_film_that_cannot_be_written(small: Path, program: Program) -> None:
     Path("films").write_text("no folder")
-    done = view("small.yaml", "--record", "films/live.gif", "--seconds", "1")
+    done = program("view", "small.yaml", "--record", "films/live.gif", "--seconds", "1")
     assert (done.returncode, done.stderr) == (4, "films: cannot write: Not a directory; choose another --record\n")
     Path("folder.gif").mkdir()
-    done = view("small.yaml", "--record", "folder.gif", "--seconds", "1")
+    done = program("view", "small.yaml", "--record", "folder.gif", "--seconds", "1")
     assert (done.returncode, done.stderr) == (4, "folder.gif: a directory; choose another --record\n")
 
 
-def test_what_goes_wrong_in_a_script_is_told_and_filmed(small: Path) -> None:
+def test_what_goes_wrong_in_a_script_is_told_and_filmed(small: Path, program: Program) -> None:
     Path("kept").write_text("no folder")
     Path("script.yaml").write_text(
         """\
@@ -272,8 +264,8 @@ events:
 """
     )
     size = ["--set", "render.camera=oblique"]
-    done = view(
-        "small.yaml", "--record", "a.gif", "--seconds", "0.5", "--script", "script.yaml", "--out", "kept", *size
+    done = program(
+        "view", "small.yaml", "--record", "a.gif", "--seconds", "0.5", "--script", "script.yaml", "--out", "kept", *size
     )
     assert done.returncode == 4
     assert done.stderr.splitlines() == [

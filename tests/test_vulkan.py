@@ -31,9 +31,11 @@ SETTINGS = [
 # A run, one that is interrupted and resumed, and one that diverges, in one process.
 RUNS = """
 import json, sys
-from taichi_msm import load_scene, resume, run
+from taichi_msm import diagnosis, load_scene, resume, run
 from tests.test_resume import Stop
 
+# Finer steps, of which none goes well, take long here.
+diagnosis.CUTS = (2,)
 settings = json.loads(sys.argv[1])
 made = load_scene("small.yaml", settings)
 records = [run(made, "whole", arch="vulkan")]
