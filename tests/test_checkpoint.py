@@ -243,6 +243,14 @@ def test_a_forged_plan_is_refused(change: dict[str, Any], out: Path) -> None:
         read_plan(out)
 
 
+def test_a_seal_is_broken_by_what_is_still_valid_json() -> None:
+    sealed = seal({"frames": 12, "name": "a"})
+    for changed in (sealed.replace(b"12", b"13"), sealed.replace(b'"a"', b'"b"'), sealed.replace(b"name", b"nane")):
+        assert changed != sealed
+        with pytest.raises(ValueError, match="damaged"):
+            unseal(changed)
+
+
 def test_what_is_sealed_comes_back() -> None:
     value = {"a": [1, 2.5, math.inf, "é\udcff", None, True], "b": {}}
     assert unseal(seal(value)) == value
