@@ -16,10 +16,10 @@ import skimage
 from PIL import Image
 
 from taichi_msm import Simulation, load_scene, run
-from taichi_msm.live.album import Album
-from taichi_msm.live.record import record
-from taichi_msm.live.script import load_script, timed
-from taichi_msm.live.session import Session
+from taichi_msm.viewer.captures import Album
+from taichi_msm.viewer.recorder import record
+from taichi_msm.viewer.script import load_script, timed
+from taichi_msm.viewer.session import Session
 
 ROOT = Path(__file__).parent.parent
 SCENES = ROOT / "scenes"

@@ -21,8 +21,8 @@ import click
 
 from taichi_msm import __version__
 from taichi_msm.errors import DeviceError, FilesError, SceneError, printable
-from taichi_msm.interruption import Interruption
-from taichi_msm.outlets import mute, tell
+from taichi_msm.system.signals import Interruption
+from taichi_msm.system.streams import mute, tell
 
 if TYPE_CHECKING:
     from taichi_msm.console import Progress
@@ -88,7 +88,7 @@ def run(
     elif scene is None:
         raise click.MissingParameter(param_hint="'SCENE'", param_type="argument")
     else:
-        from taichi_msm.scene_file import load_scene
+        from taichi_msm.scenefile.load import load_scene
 
         loaded = load_scene(scene, overrides, image)
         directory = result_directory(out, Path(scene).stem)
@@ -134,19 +134,20 @@ def run(
 @json_option
 def check(scene: str, image: str | None, overrides: tuple[str, ...], as_json: bool) -> int:
     """Validate SCENE and say what it would take; compute nothing."""
-    from taichi_msm import budget, stability
-    from taichi_msm.scene_file import load_scene
+    from taichi_msm.physics import timestep
+    from taichi_msm.scenefile import budget
+    from taichi_msm.scenefile.load import load_scene
 
     loaded = load_scene(scene, overrides, image)
     with naming(scene):
         budget.require_disk(loaded, Path("output"))
     need = budget.estimate(loaded)
-    limit = stability.stable_step(loaded)
+    limit = timestep.stable_step(loaded)
     facts = {
         "scene": loaded.model_dump(mode="json"),
-        "step": stability.step(loaded),
+        "step": timestep.step(loaded),
         "stable_step": limit if limit < float("inf") else None,
-        "steps_per_frame": stability.steps_per_frame(loaded),
+        "steps_per_frame": timestep.steps_per_frame(loaded),
         "steps": need.steps,
         "frames": need.frames,
         "memory": need.memory_bytes,
@@ -172,7 +173,7 @@ def check(scene: str, image: str | None, overrides: tuple[str, ...], as_json: bo
 @program.command()
 def schema() -> int:
     """Print the JSON Schema of a scene, for editors."""
-    from taichi_msm.scene_file import schema
+    from taichi_msm.scenefile.load import schema
 
     print_json(schema())
     return DONE
@@ -206,7 +207,7 @@ def study(
 ) -> int:
     """Measure how fast and how wrong every setting of SCENE is, and recommend one."""
     from taichi_msm.scene import LARGEST_TOLERANCE, SMALLEST_TOLERANCE
-    from taichi_msm.scene_file import load_scene
+    from taichi_msm.scenefile.load import load_scene
 
     loaded = load_scene(scene, overrides, image)
     directory = result_directory(out, f"{Path(scene).stem}-study")
@@ -272,7 +273,7 @@ def view(
     script: str | None,
 ) -> int:
     """Press the tissue of SCENE with the mouse."""
-    from taichi_msm.scene_file import load_scene
+    from taichi_msm.scenefile.load import load_scene
 
     if (record is None) != (seconds is None):
         raise click.UsageError("--record FILE.gif and --seconds N go together")
@@ -285,23 +286,23 @@ def view(
     loaded = load_scene(scene, overrides, image)
     directory = result_directory(out, f"{Path(scene).stem}-live")
 
-    from taichi_msm.live.script import load_script, timed
+    from taichi_msm.viewer.script import load_script, timed
 
     done = load_script(script, loaded.render.size) if script is not None else None
 
     from taichi_msm.console import Progress
-    from taichi_msm.live import record as recording
-    from taichi_msm.live.album import Album
-    from taichi_msm.live.session import Session
-    from taichi_msm.live.window import Window, show
+    from taichi_msm.viewer import record as recording
+    from taichi_msm.viewer.captures import Captures
+    from taichi_msm.viewer.session import Session
+    from taichi_msm.viewer.window import Window, show
 
-    album, interruption = Album(directory, scene), Interruption()
+    captures, interruption = Captures(directory, scene), Interruption()
     notices: list[str] = []
 
     def begin() -> Session:
         with Progress(quiet=False) as bar:
             progress = interruptible(bar, interruption)
-            return Session(loaded, album, arch, threads, play=play, progress=lambda stage: progress(stage, 0, 0))
+            return Session(loaded, captures, arch, threads, play=play, progress=lambda stage: progress(stage, 0, 0))
 
     try:
         with naming(scene):
@@ -321,7 +322,7 @@ def view(
         return interruption.code
     finally:
         tell(notices)
-        for path in album.kept:
+        for path in captures.kept:
             click.echo(printable(str(path)))
     return DIVERGED if record is not None and session.fault else DONE
 
@@ -358,7 +359,7 @@ def without_link(folder: Path, option: str) -> Path:
 
 def going_on(directory: Path) -> str:
     """Say how to go on with the unfinished run into a directory; nothing where there is none."""
-    from taichi_msm.publication import is_unfinished
+    from taichi_msm.results.publication import is_unfinished
 
     if not is_unfinished(directory):
         return ""

@@ -17,19 +17,22 @@ import numpy as np
 import PIL
 from numpy.typing import NDArray
 
-from taichi_msm import __version__, accuracy, budget, runtime
-from taichi_msm.accuracy import Estimate
-from taichi_msm.course import Course
+from taichi_msm import __version__
 from taichi_msm.errors import DamagedError, DivergedError, FilesError, SceneError, writing
-from taichi_msm.files import ResultWriter
-from taichi_msm.notes import notes
-from taichi_msm.plan import Plan, digest, read_plan
-from taichi_msm.runtime import Device
+from taichi_msm.physics import error_control
+from taichi_msm.physics.error_control import Estimate
+from taichi_msm.physics.run_progress import RunProgress
+from taichi_msm.physics.timestep import stable_step, step, steps_per_frame
+from taichi_msm.physics.warnings import notes
+from taichi_msm.render.texture import load_texture
+from taichi_msm.results.manifest import Manifest, digest, read_manifest
+from taichi_msm.results.writer import ResultWriter
 from taichi_msm.scene import Scene
+from taichi_msm.scenefile import budget
+from taichi_msm.scenefile.validation import checked
 from taichi_msm.simulation import Simulation
-from taichi_msm.stability import stable_step, step, steps_per_frame
-from taichi_msm.texture import load_texture
-from taichi_msm.validation import checked
+from taichi_msm.system import runtime
+from taichi_msm.system.runtime import Device
 
 # Encoding a pixel takes as long as so many steps of a point.
 STEPS_PER_PIXEL = 40
@@ -104,23 +107,23 @@ def run(
     watch.lap("startup")
     given, estimate = scene, None
     if scene.time.tolerance is not None:
-        scene, estimate = accuracy.choose_step(scene, device, partial(progress, "pilot"))
+        scene, estimate = error_control.choose_step(scene, device, partial(progress, "pilot"))
     elif estimate_error:
-        estimate = accuracy.estimate_error(scene, device, partial(progress, "pilot"))
+        estimate = error_control.estimate_error(scene, device, partial(progress, "pilot"))
     watch.lap("pilot")
     with writing(directory):
         here = str(Path.cwd())
-    plan = Plan(given, scene, tuple(overrides), estimate, here, arch, digest(texture), versions())
-    if _is_begun(plan, Path(directory)):
+    manifest = Manifest(given, scene, tuple(overrides), estimate, here, arch, digest(texture), versions())
+    if _is_begun(manifest, Path(directory)):
         with suppress(DamagedError):
-            return _carry_out(plan, Path(directory), device, texture, watch, progress, resumes=True)
-    return _carry_out(plan, Path(directory), device, texture, watch, progress, resumes=False)
+            return _carry_out(manifest, Path(directory), device, texture, watch, progress, resumes=True)
+    return _carry_out(manifest, Path(directory), device, texture, watch, progress, resumes=False)
 
 
-def _is_begun(plan: Plan, directory: Path) -> bool:
+def _is_begun(manifest: Manifest, directory: Path) -> bool:
     """Tell whether the unfinished run into a directory, if there is one, gives the bits of this one."""
     try:
-        return plan.gives_the_bits_of(read_plan(directory))
+        return manifest.gives_the_bits_of(read_manifest(directory))
     except FilesError:
         return False
 
@@ -150,18 +153,18 @@ def resume(
         KeyboardInterrupt: when interrupted before there is a frame more; all is as it was then.
     """
     watch = Stopwatch(started)
-    plan = read_plan(Path(directory))
-    if too_large := [str(problem) for problem in budget.problems(plan.scene)]:
+    manifest = read_manifest(Path(directory))
+    if too_large := [str(problem) for problem in budget.problems(manifest.scene)]:
         raise SceneError(too_large)
-    texture = plan.load_texture()
-    plan.require_same(digest(texture), versions())
-    device = runtime.start(plan.arch, threads)
+    texture = manifest.load_texture()
+    manifest.require_same(digest(texture), versions())
+    device = runtime.start(manifest.arch, threads)
     watch.lap("startup")
-    return _carry_out(plan, Path(directory), device, texture, watch, progress, resumes=True)
+    return _carry_out(manifest, Path(directory), device, texture, watch, progress, resumes=True)
 
 
 def _carry_out(
-    plan: Plan,
+    manifest: Manifest,
     directory: Path,
     device: Device,
     texture: NDArray[np.uint8] | None,
@@ -171,7 +174,7 @@ def _carry_out(
     resumes: bool,
 ) -> dict[str, Any]:
     """Simulate and draw, from the beginning or what the unfinished run in the directory lacks."""
-    scene = plan.scene
+    scene = manifest.scene
     frames = scene.time.frames + 1
     ending: dict[str, Any] = {"status": "complete"}
 
@@ -186,7 +189,7 @@ def _carry_out(
     cores = free_cores(scene)
     # In this order, so that the encoder starts up while kernels are compiled.
     with (
-        ResultWriter(directory, scene, plan.as_json(), resumes=resumes) as writer,
+        ResultWriter(directory, scene, manifest.as_json(), resumes=resumes) as writer,
         Simulation(scene, device.arch, device.threads, texture, cores) as simulation,
     ):
         resumed = writer.stored
@@ -231,31 +234,31 @@ def _carry_out(
                     ending["dump"] = writer.save(found.good)
         progress("write", writer.frames, frames)
         writer.finish()
-        record = {**ending, **_facts(plan, simulation.course), "resumed": resumed}
-        pilot = ["pilot"] if plan.estimate is not None and "pilot" in watch.seconds else []
+        record = {**ending, **_facts(manifest, simulation.progress), "resumed": resumed}
+        pilot = ["pilot"] if manifest.estimate is not None and "pilot" in watch.seconds else []
         stages = ["startup", *pilot, "compile", "simulate", "render"]
         seconds = {stage: watch.seconds.get(stage, 0.0) for stage in stages}
         record["timings"] = {**seconds, "encode": writer.encode_seconds, "total": watch.total()}
         record |= {"arch": device.arch, "device": device.name, "threads": device.threads, "lanes": simulation.lanes}
-        record |= {"workers": simulation.workers, "versions": plan.versions}
+        record |= {"workers": simulation.workers, "versions": manifest.versions}
         return writer.publish(record)
 
 
-def _facts(plan: Plan, course: Course) -> dict[str, Any]:
+def _facts(manifest: Manifest, progress: RunProgress) -> dict[str, Any]:
     """Say what was run, and what is known of its last frame, for run.json."""
-    scene, limit = plan.scene, stable_step(plan.scene)
+    scene, limit = manifest.scene, stable_step(manifest.scene)
     return {
-        "scene": plan.given.model_dump(mode="json"),
-        "working_directory": plan.folder,
-        "overrides": list(plan.overrides),
+        "scene": manifest.given.model_dump(mode="json"),
+        "working_directory": manifest.folder,
+        "overrides": list(manifest.overrides),
         "step": step(scene),
         "stable_step": limit if limit < math.inf else None,
         "steps_per_frame": steps_per_frame(scene),
-        "steps": course.frame * steps_per_frame(scene),
-        "max_displacement": course.max_displacement,
-        "shortest_spring": course.shortest_spring,
-        "notes": list(notes(scene, course.max_displacement, course.shortest_spring, plan.estimate)),
-        "error_estimate": None if plan.estimate is None else error_record(plan.estimate),
+        "steps": progress.frame * steps_per_frame(scene),
+        "max_displacement": progress.max_displacement,
+        "shortest_spring": progress.shortest_spring,
+        "notes": list(notes(scene, progress.max_displacement, progress.shortest_spring, manifest.estimate)),
+        "error_estimate": None if manifest.estimate is None else error_record(manifest.estimate),
     }
 
 

@@ -10,15 +10,15 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from taichi_msm import accuracy
-from taichi_msm.accuracy import Estimate, Pilots, choose_step, estimate_error, longest, order, refinement
-from taichi_msm.dynamics import Dynamics
 from taichi_msm.errors import SceneError
-from taichi_msm.notes import notes
-from taichi_msm.runtime import Device
+from taichi_msm.physics import error_control
+from taichi_msm.physics.error_control import Estimate, Pilots, choose_step, estimate_error, longest, order, refinement
+from taichi_msm.physics.solver import Dynamics
+from taichi_msm.physics.timestep import stable_step, step, steps_per_frame, with_steps, with_time
+from taichi_msm.physics.warnings import notes
 from taichi_msm.scene import Scene
 from taichi_msm.simulation import Simulation
-from taichi_msm.stability import stable_step, step, steps_per_frame, with_steps, with_time
+from taichi_msm.system.runtime import Device
 from tests.scenes import PRESS, SHEET, SPRINGS, scene
 
 SOFT_PRESS = {**PRESS, "force": [0, 300, -1000]}
@@ -120,7 +120,7 @@ class Falling:
 def test_an_error_that_is_a_power_of_the_step_is_told_exactly(
     difference: str, p: int, monkeypatch: pytest.MonkeyPatch, device: Device
 ) -> None:
-    monkeypatch.setattr(accuracy, "Dynamics", partial(Falling, p))
+    monkeypatch.setattr(error_control, "Dynamics", partial(Falling, p))
     made = scene(probes=[SOFT_PRESS], time={"step": 0.005, "damping_difference": difference})
     # In numbers near 1 the error, 2.5e-5 or more, is rounded by 1e-11 of itself.
     assert estimate_error(made, device).error == pytest.approx(0.005**p, rel=1e-9)

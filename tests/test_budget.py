@@ -9,10 +9,10 @@ from typing import Any
 import pytest
 from PIL import Image
 
-from taichi_msm import budget
-from taichi_msm.budget import available_memory, estimate, problems, require_disk
 from taichi_msm.errors import SceneError
 from taichi_msm.scene import Scene
+from taichi_msm.scenefile import budget
+from taichi_msm.scenefile.budget import available_memory, estimate, problems, require_disk
 
 PROBE = {"force": [0, 0, 1]}
 

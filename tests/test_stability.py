@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 
 from taichi_msm import reference
-from taichi_msm.lattice import rest_positions
-from taichi_msm.stability import highest_frequency, problems, stable_step, step, steps_per_frame
+from taichi_msm.physics.lattice import rest_positions
+from taichi_msm.physics.timestep import highest_frequency, problems, stable_step, step, steps_per_frame
 from tests.scenes import SHEET, scene
 
 
