@@ -64,7 +64,11 @@ def program() -> None:
 @set_option
 @arch_option
 @threads_option
-@click.option("--estimate-error", is_flag=True, help="Say how wrong the step is, by pilot runs.")
+@click.option(
+    "--estimate-error/--no-estimate",
+    default=None,
+    help="Estimate the error whatever it costs, or never.  [default: where it takes less than a third of the run]",
+)
 @click.option("--resume", metavar="DIR", help="Go on with the unfinished run into DIR, instead of SCENE.")
 @click.option("--quiet", is_flag=True, help="No progress and no summary.")
 @json_option
@@ -77,7 +81,7 @@ def run(
     overrides: tuple[str, ...],
     arch: str,
     threads: int | None,
-    estimate_error: bool,
+    estimate_error: bool | None,
     resume: str | None,
     quiet: bool,
     as_json: bool,
@@ -134,7 +138,7 @@ def run(
 @json_option
 def check(scene: str, image: str | None, overrides: tuple[str, ...], as_json: bool) -> int:
     """Validate SCENE and say what it would take; compute nothing."""
-    from taichi_msm.physics import timestep
+    from taichi_msm.physics import timestep, workload
     from taichi_msm.scenefile import budget
     from taichi_msm.scenefile.load import load_scene
 
@@ -148,6 +152,7 @@ def check(scene: str, image: str | None, overrides: tuple[str, ...], as_json: bo
         "step": timestep.step(loaded),
         "stable_step": limit if limit < float("inf") else None,
         "steps_per_frame": timestep.steps_per_frame(loaded),
+        "precision": workload.precision(loaded),
         "steps": need.steps,
         "frames": need.frames,
         "memory": need.memory_bytes,
@@ -163,7 +168,7 @@ def check(scene: str, image: str | None, overrides: tuple[str, ...], as_json: bo
     click.echo(yaml.safe_dump(facts["scene"], sort_keys=False, default_flow_style=None), nl=False)
     click.echo(
         f"\n{need.points} points, {need.frames} frames, {need.steps} steps of {facts['step']:.6g} s "
-        f"(limit {limit:.6g} s), {facts['steps_per_frame']} a frame{at_least}\n"
+        f"(limit {limit:.6g} s), {facts['steps_per_frame']} a frame{at_least}, in {facts['precision']}\n"
         f"about {need.memory_bytes / 2**20:.0f} MiB of memory, {need.disk_bytes / 2**20:.1f} MiB on disk, "
         f"{need.working_bytes / 2**20:.1f} MiB more while it runs"
     )
@@ -291,7 +296,7 @@ def view(
     done = load_script(script, loaded.render.size) if script is not None else None
 
     from taichi_msm.console import Progress
-    from taichi_msm.viewer import record as recording
+    from taichi_msm.viewer import recorder
     from taichi_msm.viewer.captures import Captures
     from taichi_msm.viewer.session import Session
     from taichi_msm.viewer.window import Window, show
@@ -315,7 +320,7 @@ def view(
                 with begin() as session, Progress(quiet=False) as bar:
                     events = timed(done, session.rate, loaded.render.size) if done else ()
                     progress = partial(interruptible(bar, interruption), "film")
-                    recording.record(session, Path(record), seconds, events, progress, notices.append)
+                    recorder.record(session, Path(record), seconds, events, progress, notices.append)
                 click.echo(printable(record))
     except KeyboardInterrupt:
         report("interrupted", ["interrupted" if record is None else "interrupted; no film was written"], as_json=False)

@@ -17,6 +17,7 @@ from taichi_msm.physics.lattice import axes
 from taichi_msm.physics.run_progress import RunProgress, Saved
 from taichi_msm.physics.solver import Dynamics, Pause
 from taichi_msm.physics.timestep import step, steps_per_frame
+from taichi_msm.physics.workload import with_precision
 from taichi_msm.render.camera import View, view
 from taichi_msm.render.picking import pick
 from taichi_msm.render.surface import Surface, surface
@@ -53,7 +54,7 @@ class Simulation:
         SceneError: when the scene cannot be run, or no step meets its tolerance.
 
     Attributes:
-        scene: the scene, with the step that was chosen.
+        scene: the scene, with the step and the precision that were chosen.
     """
 
     def __init__(
@@ -67,9 +68,7 @@ class Simulation:
         scene = checked(scene)
         texture = None if texture is None else require_texture(texture)
         self.device = runtime.start(arch, threads)
-        if scene.time.tolerance is not None:
-            scene, _ = choose_step(scene, self.device)
-        self.scene = scene
+        self.scene = scene = self._resolved(scene)
         self._watch = Watch(scene)
         self._closed = False
         self._dynamics = Dynamics(scene, self.device, cores=cores)
@@ -77,6 +76,12 @@ class Simulation:
         self._texture = texture
         self._own_texture = texture is None
         self._drawing: Drawing | None = None
+
+    def _resolved(self, scene: Scene) -> Scene:
+        """Choose what the scene leaves open: the step for a tolerance, and the precision."""
+        if scene.time.tolerance is not None:
+            return choose_step(scene, self.device)[0]
+        return with_precision(scene, self.device.arch)
 
     @property
     def frame(self) -> int:
@@ -159,9 +164,7 @@ class Simulation:
         """
         self._require_open()
         if scene is not None:
-            scene = checked(scene)
-            if scene.time.tolerance is not None:
-                scene, _ = choose_step(scene, self.device)
+            scene = self._resolved(checked(scene))
             if self._own_texture and (scene.image, scene.region) != (self.scene.image, self.scene.region):
                 self._texture = None
             self.scene = scene

@@ -104,8 +104,8 @@ def test_small_sheets_and_fixed_sides(points: list[int], fixed: Any, device: Dev
 def short_launches(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
     """Few steps a launch on a GPU, as each of them is compiled."""
     kernel_gpu._kernels.cache_clear()
-    for module in ("gather", "dynamics"):
-        monkeypatch.setattr(f"taichi_msm.{module}.STEPS_PER_LAUNCH", 3)
+    for module in ("kernel_gpu", "solver"):
+        monkeypatch.setattr(f"taichi_msm.physics.{module}.STEPS_PER_LAUNCH", 3)
     yield
     kernel_gpu._kernels.cache_clear()
 

@@ -13,6 +13,7 @@ from taichi_msm.physics.loads import Envelope, ProbeSlot, decay, probe_slots
 from taichi_msm.physics.run_progress import RunProgress
 from taichi_msm.physics.solver import Dynamics
 from taichi_msm.physics.timestep import stable_step, step
+from taichi_msm.physics.workload import precision
 from taichi_msm.scene import Scene
 
 # Farther from rest than this many sheet sizes is no deformation any more; a sheet that nothing holds may fly besides.
@@ -174,7 +175,7 @@ def farthest(displacement: NDArray[np.floating]) -> Farthest:
 
 def _underflow(scene: Scene) -> float:
     """Tell the energy below which the squares that it is summed from have no digits [J]."""
-    tiny = float(np.finfo(np.float32 if scene.time.precision == "f32" else np.float64).tiny)
+    tiny = float(np.finfo(np.float32 if precision(scene) == "f32" else np.float64).tiny)
     dx, dy = spacing(scene.sheet)
     stiffness = scene.springs.structural + scene.springs.shear
     return math.prod(scene.sheet.points) * tiny * (scene.sheet.mass / step(scene) ** 2 + stiffness * (dx**2 + dy**2))

@@ -1,6 +1,6 @@
-"""How wrong a step is, by pilot runs at h and h / r, and the largest step that is right enough.
+"""How wrong a run is, by a pilot beside it, and the largest step that is right enough.
 
-The error of a displacement u_h is taken against Richardson's extrapolation of both pilots, which are in float64:
+The error of a displacement u_h is taken against Richardson's extrapolation of runs with steps h and h / r in float64:
 
     u* = u_{h/r} + (u_{h/r} - u_h) / (r^p - 1)        p: order of the method, r: `refinement`, mostly 2
 
@@ -26,6 +26,7 @@ from taichi_msm.physics.divergence import farthest_displacement
 from taichi_msm.physics.lattice import rest_positions
 from taichi_msm.physics.solver import Dynamics
 from taichi_msm.physics.timestep import step, steps_per_frame, with_steps, with_time
+from taichi_msm.physics.workload import precision, with_precision
 from taichi_msm.scene import LARGEST_TOLERANCE, Scene
 from taichi_msm.system.runtime import Device
 
@@ -75,8 +76,8 @@ def estimate_error(scene: Scene, device: Device, progress: Progress = lambda don
         device: what `runtime.start` returned.
         progress: called with the frames done and the frames in all.
     """
-    with closing(Pilots(scene, device)) as pilots:
-        return pilots.estimate(steps_per_frame(scene), progress)
+    with closing(Trials(with_precision(scene, device.arch), device)) as trials:
+        return trials.estimate(steps_per_frame(scene), progress)
 
 
 def choose_step(scene: Scene, device: Device, progress: Progress = lambda done, total: None) -> tuple[Scene, Estimate]:
@@ -88,14 +89,15 @@ def choose_step(scene: Scene, device: Device, progress: Progress = lambda done, 
         progress: called with the frames done and the frames in all of each pilot run.
 
     Returns:
-        The scene with that step, and its error.
+        The scene with that step and the precision it is stepped in, and its error.
 
     Raises:
         SceneError: when no step is good enough; says which precision or which tolerance would do.
     """
+    scene = with_precision(scene, device.arch)
     assert scene.time.tolerance is not None
-    with closing(Pilots(scene, device)) as pilots:
-        found = _search(scene.time.tolerance, steps_per_frame(scene), pilots, progress)
+    with closing(Trials(scene, device)) as trials:
+        found = _search(scene.time.tolerance, steps_per_frame(scene), trials, progress)
     return with_steps(scene, found.steps_per_frame), found
 
 
@@ -108,67 +110,121 @@ def refinement(scene: Scene) -> int:
     return max(2, math.ceil(g * step(scene)))
 
 
-class Pilots:
-    """The runs beside each other, frame by frame: h and h / r in float64, and h in the scene's own precision."""
+class Pilot:
+    """Runs in float64 beside another one that tell its error frame by frame: with finer steps, and with its own.
 
-    def __init__(self, scene: Scene, device: Device) -> None:
-        self._scene = scene
-        self._exact = with_time(scene, precision="f64")
+    Args:
+        scene: what is run, with its step.
+        device: what `runtime.start` returned.
+        cores: how many cores are free for it; None: all. With as many as the run has, nothing is compiled anew.
+
+    Raises:
+        DeviceError: when the device cannot run it in float64.
+    """
+
+    def __init__(self, scene: Scene, device: Device, cores: int | None = None) -> None:
+        exact = with_time(scene, precision="f64")
         with ExitStack() as opened:
 
-            def dynamics(scene: Scene) -> Dynamics:
-                made = Dynamics(scene, device)
+            def dynamics() -> Dynamics:
+                made = Dynamics(exact, device, cores=cores)
                 opened.callback(made.close)
                 return made
 
-            self._coarse, self._fine = dynamics(self._exact), dynamics(self._exact)
-            self._own = self._coarse if scene.time.precision == "f64" else dynamics(scene)
+            self._fine = dynamics()
+            # What is run in float64 needs no other with its step.
+            self._coarse = None if precision(scene) == "f64" else dynamics()
+            self._open = opened.pop_all()
+        self.restart(scene)
+
+    def restart(self, scene: Scene) -> None:
+        """Begin again beside another run of the same scene, with its step."""
+        self._scene = scene
+        self._steps, self._ratio, self._order = steps_per_frame(scene), refinement(scene), order(scene)
+        exact = with_time(scene, precision="f64")
+        if self._ratio <= FINEST:
+            self._fine.restart(with_steps(exact, self._ratio * self._steps))
+            if self._coarse:
+                self._coarse.restart(with_steps(exact, self._steps))
+        self._error = self._rounding = self._in_f64 = self._largest = 0.0
+
+    def compile(self) -> None:
+        """Compile now what would be compiled by the first frame."""
+        self._fine.compile()
+
+    def follow(self, displacement: NDArray[Any], pause: Callable[[], None]) -> None:
+        """Take the next frame, and compare.
+
+        Args:
+            displacement: of the run at that frame, shape (rows, cols, 3).
+            pause: called some times a second; what it raises stops the pilot for good.
+        """
+        if self._ratio > FINEST:
+            return
+        self._fine.advance(self._ratio * self._steps, pause)
+        if self._coarse:
+            self._coarse.advance(self._steps, pause)
+        fine = self._fine.displacement()
+        coarse = self._coarse.displacement() if self._coarse else displacement
+        with np.errstate(all="ignore"):
+            exact = fine + (fine - coarse) / (self._ratio**self._order - 1)
+            self._error = max(self._error, longest(displacement - exact))
+            self._in_f64 = max(self._in_f64, longest(coarse - exact))
+            self._rounding = max(self._rounding, longest(displacement - coarse))
+            self._largest = max(self._largest, longest(exact))
+
+    @property
+    def estimate(self) -> Estimate:
+        """What is known by the frames so far."""
+        if self._ratio > FINEST:
+            return Estimate(self._steps, math.inf, 0.0, math.inf, self._order)
+        farthest = farthest_displacement(self._scene, self._scene.time.duration)
+
+        def share(part: float) -> float:
+            # Nothing moves, nothing is wrong; and what is not finite is not known.
+            relative = part / self._largest if self._largest > 0 else 0.0
+            return relative if relative < math.inf and self._largest <= farthest else math.inf
+
+        return Estimate(self._steps, share(self._error), share(self._rounding), share(self._in_f64), self._order)
+
+    def close(self) -> None:
+        """Free the memory."""
+        self._open.close()
+
+
+class Trials:
+    """Runs of a scene with one step after another, each with a pilot beside it."""
+
+    def __init__(self, scene: Scene, device: Device) -> None:
+        self._scene = scene
+        with ExitStack() as opened:
+            self._pilot = Pilot(scene, device)
+            opened.callback(self._pilot.close)
+            self._own = Dynamics(scene, device)
+            opened.callback(self._own.close)
             self._open = opened.pop_all()
 
     def estimate(self, steps: int, progress: Progress) -> Estimate:
         """Run the scene with so many steps a frame.
 
         Args:
-            steps: steps per frame of the coarse pilot and of the one in the scene's precision.
+            steps: steps per frame.
             progress: called with the frames done and the frames in all.
         """
         scene = with_steps(self._scene, steps)
-        finer = refinement(scene)
-        if finer > FINEST:
-            return Estimate(steps, math.inf, 0.0, math.inf, order(scene))
-        self._fine.restart(with_steps(self._exact, finer * steps))
-        self._coarse.restart(with_steps(self._exact, steps))
-        if self._own is not self._coarse:
-            self._own.restart(scene)
-        p, frames = order(scene), scene.time.frames
-        farthest = farthest_displacement(scene, scene.time.duration)
-        error = rounding = in_f64 = largest = 0.0
-        for frame in range(frames):
+        self._pilot.restart(scene)
+        self._own.restart(scene)
+        frames = scene.time.frames
+        for frame in range(frames if refinement(scene) <= FINEST else 0):
             pause = partial(progress, frame, frames)
             pause()
-            self._fine.advance(finer * steps, pause)
-            self._coarse.advance(steps, pause)
-            if self._own is not self._coarse:
-                self._own.advance(steps, pause)
-            fine, coarse = self._fine.displacement(), self._coarse.displacement()
-            own = coarse if self._own is self._coarse else self._as_written(self._own.displacement())
-            with np.errstate(all="ignore"):
-                exact = fine + (fine - coarse) / (finer**p - 1)
-                error = max(error, longest(own - exact))
-                rounding = max(rounding, longest(own - coarse))
-                in_f64 = max(in_f64, longest(coarse - exact))
-                largest = max(largest, longest(exact))
+            self._own.advance(steps, pause)
+            self._pilot.follow(self._as_written(self._own.displacement()), pause)
+        return self._pilot.estimate
 
-        def share(part: float) -> float:
-            # Nothing moves, nothing is wrong; and what is not finite is not known.
-            relative = part / largest if largest > 0 else 0.0
-            return relative if relative < math.inf and largest <= farthest else math.inf
-
-        return Estimate(steps, share(error), share(rounding), share(in_f64), p)
-
-    def _as_written(self, displacement: NDArray[np.float32]) -> NDArray[Any]:
+    def _as_written(self, displacement: NDArray[Any]) -> NDArray[Any]:
         """Round as the trajectory does, whose positions in f32 have the digits of the sheet's size."""
-        if "trajectory" not in self._scene.output:
+        if "trajectory" not in self._scene.output or precision(self._scene) == "f64":
             return displacement
         rest = rest_positions(self._scene.sheet)
         return (rest + displacement).astype(np.float32) - rest
@@ -191,12 +247,12 @@ def _above(error: float) -> float:
     return float(f"{math.ceil(1.2 * error / digit) * digit:.3g}")
 
 
-def _search(tolerance: float, least: int, pilots: Pilots, progress: Progress) -> Estimate:
+def _search(tolerance: float, least: int, trials: Trials, progress: Progress) -> Estimate:
     """Narrow down the steps a frame between too few and enough."""
     too_few, enough, failures = least - 1, None, []
     steps = least
     for _ in range(MOST_PILOTS):
-        found = pilots.estimate(steps, progress)
+        found = trials.estimate(steps, progress)
         if found.error <= tolerance:
             enough = found
         else:

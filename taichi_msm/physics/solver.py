@@ -22,6 +22,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from taichi_msm.errors import ArgumentError, DeviceError
+from taichi_msm.physics import workload
 from taichi_msm.physics.kernel import (
     ACROSS,
     BYTES,
@@ -92,7 +93,7 @@ def structure(scene: Scene, device: Device, cores: int | None = None) -> Structu
     """
     rows, cols = scene.sheet.points
     fixed = fixed_points(scene.sheet)
-    precision = scene.time.precision
+    precision = workload.precision(scene, device.arch)
     fixed_rows = bool(fixed[0].all()), bool(fixed[-1].all())
     if device.arch == "cpu":
         # Workers wait by spinning: more of them than cores would only keep each other from their work.

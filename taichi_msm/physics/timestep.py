@@ -7,11 +7,7 @@ from collections.abc import Iterator
 from typing import Any
 
 from taichi_msm.errors import Problem
-from taichi_msm.physics.lattice import spacing
 from taichi_msm.scene import WHOLE, Scene
-
-# Lengths [m] whose squares, and a few of their products, f32 holds.
-SMALLEST_SINGLE, LARGEST_SINGLE = 1e-15, 1e17
 
 
 def highest_frequency(scene: Scene) -> float:
@@ -65,31 +61,7 @@ def step(scene: Scene) -> float:
 
 
 def problems(scene: Scene) -> Iterator[Problem]:
-    """Say why a given step cannot be taken, and what is too small or too large for f32."""
-    yield from _step_problems(scene)
-    if scene.time.precision == "f32":
-        yield from _single_problems(scene)
-
-
-def _single_problems(scene: Scene) -> Iterator[Problem]:
-    """Find what would vanish or overflow when it is squared or multiplied."""
-    cells = spacing(scene.sheet)
-    if min(cells) < SMALLEST_SINGLE or max(scene.sheet.size) > LARGEST_SINGLE:
-        yield Problem(
-            ("sheet", "size"),
-            f"cells of {min(cells):g} m in a sheet of {max(scene.sheet.size):g} m leave the range of f32, "
-            f"{SMALLEST_SINGLE:g} to {LARGEST_SINGLE:g} m; take time.precision: f64",
-        )
-    gain = step(scene) ** 2 / scene.sheet.mass
-    if not SMALLEST_SINGLE**2 < gain < LARGEST_SINGLE**2:
-        yield Problem(
-            ("time", "precision"),
-            f"f32 cannot hold the {gain:g} m by which a step of {step(scene):g} s moves a mass of "
-            f"{scene.sheet.mass:g} kg for every newton; take f64",
-        )
-
-
-def _step_problems(scene: Scene) -> Iterator[Problem]:
+    """Say why a given step cannot be taken."""
     given = scene.time.step
     if given == "auto":
         return

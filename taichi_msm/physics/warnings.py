@@ -12,18 +12,28 @@ from taichi_msm.scene import Scene
 # Down to this share of its rest length no spring shakes the limit of stability (see `stability.highest_frequency`).
 SHORTEST = 0.5
 
+# An error above this share of the largest displacement is told with what would help.
+WRONG = 0.01
 
-def notes(scene: Scene, max_displacement: float, shortest_spring: float, estimate: Estimate | None) -> Iterator[str]:
+
+def notes(
+    scene: Scene, max_displacement: float, shortest_spring: float, estimate: Estimate | None, reason: str = ""
+) -> Iterator[str]:
     """Say what is remarkable about a run, one line each.
 
     Args:
         scene: with the step that was taken.
         max_displacement: largest displacement [m].
         shortest_spring: smallest length of a spring over its rest length.
-        estimate: of the error, if it was wanted.
+        estimate: of the error, if there is one.
+        reason: why there is none.
     """
     if estimate is not None:
         yield error(estimate)
+        if WRONG < estimate.error < math.inf:
+            yield f"the run is about {100 * estimate.error:.2g} % wrong; {_remedy(scene, estimate)}"
+    elif reason:
+        yield f"error not estimated: {reason}"
     if max_displacement == 0:
         yield "nothing moved: does a probe press where and when it should?"
     if shortest_spring < SHORTEST:
@@ -44,7 +54,17 @@ def error(estimate: Estimate) -> str:
     """Say how wrong a run is."""
     if estimate.error == math.inf:
         return "error not known: a pilot run diverged, or a step is longer than the damping"
-    said = f"error about {estimate.error:.2g} of the largest displacement, by pilot runs"
-    if estimate.in_f64 < estimate.error / 2:
-        said += f"; most of it is rounding in f32: with time.precision: f64 it is about {estimate.in_f64:.2g}"
-    return said
+    parts = f"step {estimate.in_f64:.1g}, rounding {estimate.rounding:.1g}" if estimate.rounding else "of the step"
+    return f"error {estimate.error:.1g} of the largest displacement ({parts})"
+
+
+def _remedy(scene: Scene, estimate: Estimate) -> str:
+    """Say what would make it less wrong."""
+    said = []
+    if estimate.rounding > WRONG / 2:
+        said.append("time.precision: f64")
+    if estimate.in_f64 > WRONG / 2:
+        finer = step(scene) * (WRONG / 2 / estimate.in_f64) ** (1 / estimate.order)
+        said.append(f"a time.step of at most {finer:.2g} s")
+    said.append("stiffer springs.virtual, where the sheet buckles")
+    return f"try {', or '.join(said)}"

@@ -23,6 +23,7 @@ from taichi_msm.errors import DamagedError
 from taichi_msm.physics.run_progress import RunProgress, Saved
 from taichi_msm.physics.solver import State
 from taichi_msm.physics.timestep import steps_per_frame
+from taichi_msm.physics.workload import precision
 from taichi_msm.results.folder import Folder, write_all
 from taichi_msm.results.npz import read_array, write_array
 from taichi_msm.results.publication import CHECKPOINT, CHECKPOINT_TREE, DRAFT, MANIFEST, POSITIONS, STATE
@@ -52,7 +53,7 @@ class Checkpoint:
         self._staging = staging
         self._scene = scene
         self._shape = (*scene.sheet.points, 3)
-        self.precision = np.dtype(np.float32 if scene.time.precision == "f32" else np.float64)
+        self.precision = np.dtype(np.float32 if precision(scene) == "f32" else np.float64)
         self._frame_bytes = math.prod(self._shape) * self.precision.itemsize
         self._record_bytes = (DIGEST_BYTES + self._frame_bytes) if scene.output else 0
         self._due = 0.0

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from pydantic import TypeAdapter
 
 from taichi_msm.errors import DamagedError, FilesError
-from taichi_msm.physics import timestep
+from taichi_msm.physics import timestep, workload
 from taichi_msm.physics.error_control import Estimate
 from taichi_msm.render import camera
 from taichi_msm.render.texture import load_texture
@@ -34,7 +34,8 @@ class Manifest:
         given: the scene as it was loaded.
         scene: the scene with the step that was chosen.
         overrides: what made the scene, beside its file.
-        estimate: of the error of the step, if it was wanted.
+        estimate: of the error, if a tolerance wanted it before the run.
+        asks_estimate: whether an estimate is wanted beside the run; None: where it is cheap.
         folder: the current directory, from which the scene's picture is found.
         arch: cpu, cuda or vulkan.
         picture: the digest of the picture on the sheet.
@@ -45,6 +46,7 @@ class Manifest:
     scene: Scene
     overrides: tuple[str, ...]
     estimate: Estimate | None
+    asks_estimate: bool | None
     folder: str
     arch: str
     picture: str
@@ -106,7 +108,8 @@ def read_manifest(directory: Path) -> Manifest:
     # Anybody may have written it.
     numbers = () if manifest.estimate is None else asdict(manifest.estimate).values()
     possible = manifest.arch in ARCHS and all(number >= 0 for number in numbers)
-    if not possible or [*timestep.problems(manifest.scene), *camera.problems(manifest.scene)]:
+    checks = (timestep.problems, workload.problems, camera.problems)
+    if not possible or any(list(check(manifest.scene)) for check in checks):
         raise DamagedError(f"{path} is of no scene that can be run; run another")
     return manifest
 

@@ -13,6 +13,7 @@ from pathlib import Path
 from taichi_msm.errors import Path as Key
 from taichi_msm.errors import Problem, SceneError
 from taichi_msm.physics import timestep
+from taichi_msm.physics.workload import affords_pilot, precision
 from taichi_msm.render import texture
 from taichi_msm.scene import Scene
 
@@ -75,8 +76,9 @@ def estimate(scene: Scene) -> Budget:
     frames, pixels = scene.time.frames + 1, math.prod(scene.render.size)
     positions = frames * points * 3 * _number_bytes(scene)
     numbers = STATE_NUMBERS + OUTPUT_NUMBERS + len(scene.probes)
-    # Pilot runs are two more sheets, in f64.
-    sheets = _number_bytes(scene) + (2 * 8 if scene.time.tolerance is not None else 0)
+    # A pilot is up to two more sheets, in f64.
+    pilot = scene.time.tolerance is not None or affords_pilot(scene, 2)
+    sheets = _number_bytes(scene) + (2 * 8 if pilot else 0)
     return Budget(
         points=points,
         steps=scene.time.frames * timestep.steps_per_frame(scene),
@@ -138,7 +140,7 @@ def require_disk(scene: Scene, directory: Path) -> None:
 
 
 def _number_bytes(scene: Scene) -> int:
-    return 4 if scene.time.precision == "f32" else 8
+    return 4 if precision(scene) == "f32" else 8
 
 
 def drawing_bytes(scene: Scene) -> int:

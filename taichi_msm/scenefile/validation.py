@@ -9,7 +9,7 @@ from pydantic import ValidationError
 
 from taichi_msm import faults
 from taichi_msm.errors import ArgumentError, Problem, SceneError
-from taichi_msm.physics import timestep
+from taichi_msm.physics import timestep, workload
 from taichi_msm.render import camera, texture
 from taichi_msm.scene import Scene, Section
 from taichi_msm.scenefile import budget
@@ -19,6 +19,7 @@ Model = TypeVar("Model", bound=Section)
 # What one section cannot know: these see the whole scene.
 CHECKS: tuple[Callable[[Scene], Iterable[Problem]], ...] = (
     timestep.problems,
+    workload.problems,
     camera.problems,
     texture.problems,
     budget.problems,

@@ -13,6 +13,7 @@ from taichi_msm.errors import DivergedError, FilesError, SceneError
 from taichi_msm.physics.error_control import choose_step
 from taichi_msm.physics.lattice import rest_positions
 from taichi_msm.physics.timestep import steps_per_frame, with_time
+from taichi_msm.physics.workload import with_precision
 from taichi_msm.render.picking import on_rest_plane, pick
 from taichi_msm.render.texture import load_texture
 from taichi_msm.results.gif import Picture
@@ -95,7 +96,7 @@ class Session:
         threads: int | None = None,
         *,
         play: bool = False,
-        progress: Callable[[str], None] = lambda viewport: None,
+        progress: Callable[[str], None] = lambda stage: None,
     ) -> None:
         _require_usable(scene, play=play)
         progress("start")
@@ -104,6 +105,8 @@ class Session:
         scene, self.parts = with_live_frames(scene)
         if scene.time.tolerance is not None:
             scene, _ = choose_step(scene, device, lambda done, total: progress("pilot"))
+        else:
+            scene = with_precision(scene, device.arch)
         rate = scene.time.frames_per_second
         self._album = captures
         self._film: Film | None = None
