@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from benchmarks.clock import seconds
-from taichi_msm import runtime
+from taichi_msm.system import runtime
 
 # Iterations of a parallel loop, enough for every thread of a common machine to get some.
 ITERATIONS = 1 << 16

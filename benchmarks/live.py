@@ -15,10 +15,10 @@ from pathlib import Path
 
 from benchmarks.process import ROOT
 from taichi_msm import load_scene
-from taichi_msm.live.album import Album
-from taichi_msm.live.events import Drag, Press, Release
-from taichi_msm.live.session import Session
-from taichi_msm.live.window import Window
+from taichi_msm.viewer.captures import Captures
+from taichi_msm.viewer.events import Drag, Press, Release
+from taichi_msm.viewer.session import Session
+from taichi_msm.viewer.window import Window
 
 SIZES = (512, 1024)
 POINTS = (31, 101)
@@ -44,7 +44,7 @@ class Case:
             {"render.size": [size, size], "sheet.points": [points, points], "render.refine": 300 // (points - 1) - 1},
         )
         self.size, self.points = size, points
-        self.session = Session(scene, Album(Path(tempfile.gettempdir()), "press.yaml"))
+        self.session = Session(scene, Captures(Path(tempfile.gettempdir()), "press.yaml"))
         self.window = Window(f"{size} {points}", scene.render.size)
         self.latencies: list[float] = []
         self.periods: list[float] = []

@@ -14,11 +14,11 @@ from benchmarks.parts import NARROW, PIXELS, READY, REFINE
 from benchmarks.process import ROOT
 from benchmarks.stepping.measure import TOLERANCE
 from taichi_msm import load_scene
-from taichi_msm.runtime import Device, available_threads, vector_bits
-from taichi_msm.stability import steps_per_frame
+from taichi_msm.physics.timestep import steps_per_frame
 from taichi_msm.study import measure
 from taichi_msm.study.result import Timing
 from taichi_msm.study.table import duration, number, timing
+from taichi_msm.system.runtime import Device, available_threads, vector_bits
 
 TEMPLATE = ROOT / "docs" / "performance.template"
 NOT_MEASURED = "(not measured yet)"

@@ -10,7 +10,7 @@ from benchmarks import bounds, instructions, whole_run
 from benchmarks.drawing import FLAT, LIT
 from benchmarks.race import Progress, race
 from benchmarks.stepping import FASTEST, PEERS
-from taichi_msm.runtime import available_threads, vector_bits
+from taichi_msm.system.runtime import available_threads, vector_bits
 
 STEPPING, DRAWING = "benchmarks.stepping.measure", "benchmarks.drawing.measure"
 

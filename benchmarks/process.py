@@ -9,7 +9,7 @@ import sys
 from pathlib import Path
 from typing import Any
 
-from taichi_msm import runtime
+from taichi_msm.system import runtime
 
 ROOT = Path(__file__).parent.parent
 

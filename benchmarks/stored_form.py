@@ -14,10 +14,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from taichi_msm import load_scene
-from taichi_msm.lattice import fixed_points, rest_positions, springs
-from taichi_msm.loads import Schedule, decay, grips, schedule
+from taichi_msm.physics.lattice import fixed_points, rest_positions, springs
+from taichi_msm.physics.loads import Schedule, decay, probe_slots, schedule
+from taichi_msm.physics.timestep import step, steps_per_frame, with_steps
 from taichi_msm.scene import Scene
-from taichi_msm.stability import step, steps_per_frame, with_steps
 
 SCENE = Path(__file__).parent.parent / "scenes" / "figure-3.yaml"
 STEPS_PER_SECOND = 18000
@@ -53,7 +53,7 @@ def displacements(scene: Scene, real: type[np.floating[Any]], form: str) -> Arra
     rest64 = rest_positions(scene.sheet)
     rest = rest64.astype(real)
     moves = ~fixed_points(scene.sheet)[..., None]
-    share = [decay(grip, scene).astype(real)[..., None] for grip in grips(scene)]
+    share = [decay(slot, scene).astype(real)[..., None] for slot in probe_slots(scene)]
     loads: Schedule = schedule(scene, 0, scene.time.frames * steps_per_frame(scene))
     now = rest.copy() if form == "positions" else np.zeros_like(rest)
     # The one before, or the difference from it.

@@ -16,10 +16,10 @@ import skimage
 from PIL import Image
 
 from taichi_msm import Simulation, load_scene, run
-from taichi_msm.live.album import Album
-from taichi_msm.live.record import record
-from taichi_msm.live.script import load_script, timed
-from taichi_msm.live.session import Session
+from taichi_msm.viewer.captures import Captures
+from taichi_msm.viewer.recorder import record
+from taichi_msm.viewer.script import load_script, timed
+from taichi_msm.viewer.session import Session
 
 ROOT = Path(__file__).parent.parent
 SCENES = ROOT / "scenes"
@@ -60,7 +60,7 @@ def live(name: str, size: int, rate: float, seconds: float) -> None:
     settings = {"render.size": [size, size], "render.supersample": 2, "time.frames_per_second": rate}
     scene = load_scene(SCENES / "press.yaml", settings)
     script = load_script(SCENES / "scripts" / "press.yaml", scene.render.size)
-    with tempfile.TemporaryDirectory() as directory, Session(scene, Album(Path(directory), "press.yaml")) as session:
+    with tempfile.TemporaryDirectory() as directory, Session(scene, Captures(Path(directory), "press.yaml")) as session:
         record(session, IMAGES / f"{name}.gif", seconds, timed(script, session.rate, scene.render.size))
 
 

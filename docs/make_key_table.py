@@ -10,8 +10,8 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
-from taichi_msm.live.events import KEYS, POINTER
-from taichi_msm.scene_file import schema
+from taichi_msm.scenefile.load import schema
+from taichi_msm.viewer.events import KEYS, POINTER
 
 README = Path(__file__).parent.parent / "README.md"
 MARKS = "<!-- {}: made by docs/make_key_table.py -->\n", "<!-- end of {} -->\n"

@@ -9,11 +9,11 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from taichi_msm.errors import ArgumentError, DeviceError, DivergedError, FilesError, MsmError, SceneError
+    from taichi_msm.render.surface import Surface
     from taichi_msm.runner import resume, run
     from taichi_msm.scene import Camera, Probe, Render, Scene, Sheet, Springs, Time
-    from taichi_msm.scene_file import load_scene
+    from taichi_msm.scenefile.load import load_scene
     from taichi_msm.simulation import Simulation
-    from taichi_msm.surface import Surface
 
 __version__ = "0.1.0"
 
@@ -23,8 +23,8 @@ _HOMES = {
     ),
     **dict.fromkeys(("Camera", "Probe", "Render", "Scene", "Sheet", "Springs", "Time"), "scene"),
     "Simulation": "simulation",
-    "Surface": "surface",
-    "load_scene": "scene_file",
+    "Surface": "render.surface",
+    "load_scene": "scenefile.load",
     **dict.fromkeys(("resume", "run"), "runner"),
 }
 

@@ -3,13 +3,13 @@
 import io
 import sys
 
-from taichi_msm import interruption, outlets
+from taichi_msm.system import signals, streams
 
 
 def main() -> int:
     """Run the command line of the process."""
-    outlets.open_missing()
-    interruption.leave_at_once()
+    streams.open_missing()
+    signals.leave_at_once()
     if isinstance(sys.stdout, io.TextIOWrapper):
         # A file name need not be text; errors, on stderr, are printed this way already.
         sys.stdout.reconfigure(errors="backslashreplace")

@@ -21,8 +21,8 @@ import click
 
 from taichi_msm import __version__
 from taichi_msm.errors import DeviceError, FilesError, SceneError, printable
-from taichi_msm.interruption import Interruption
-from taichi_msm.outlets import mute, tell
+from taichi_msm.system.signals import Interruption
+from taichi_msm.system.streams import mute, tell
 
 if TYPE_CHECKING:
     from taichi_msm.console import Progress
@@ -64,7 +64,11 @@ def program() -> None:
 @set_option
 @arch_option
 @threads_option
-@click.option("--estimate-error", is_flag=True, help="Say how wrong the step is, by pilot runs.")
+@click.option(
+    "--estimate-error/--no-estimate",
+    default=None,
+    help="Estimate the error whatever it costs, or never.  [default: where it takes less than a third of the run]",
+)
 @click.option("--resume", metavar="DIR", help="Go on with the unfinished run into DIR, instead of SCENE.")
 @click.option("--quiet", is_flag=True, help="No progress and no summary.")
 @json_option
@@ -77,7 +81,7 @@ def run(
     overrides: tuple[str, ...],
     arch: str,
     threads: int | None,
-    estimate_error: bool,
+    estimate_error: bool | None,
     resume: str | None,
     quiet: bool,
     as_json: bool,
@@ -88,7 +92,7 @@ def run(
     elif scene is None:
         raise click.MissingParameter(param_hint="'SCENE'", param_type="argument")
     else:
-        from taichi_msm.scene_file import load_scene
+        from taichi_msm.scenefile.load import load_scene
 
         loaded = load_scene(scene, overrides, image)
         directory = result_directory(out, Path(scene).stem)
@@ -134,19 +138,21 @@ def run(
 @json_option
 def check(scene: str, image: str | None, overrides: tuple[str, ...], as_json: bool) -> int:
     """Validate SCENE and say what it would take; compute nothing."""
-    from taichi_msm import budget, stability
-    from taichi_msm.scene_file import load_scene
+    from taichi_msm.physics import timestep, workload
+    from taichi_msm.scenefile import budget
+    from taichi_msm.scenefile.load import load_scene
 
     loaded = load_scene(scene, overrides, image)
     with naming(scene):
         budget.require_disk(loaded, Path("output"))
     need = budget.estimate(loaded)
-    limit = stability.stable_step(loaded)
+    limit = timestep.stable_step(loaded)
     facts = {
         "scene": loaded.model_dump(mode="json"),
-        "step": stability.step(loaded),
+        "step": timestep.step(loaded),
         "stable_step": limit if limit < float("inf") else None,
-        "steps_per_frame": stability.steps_per_frame(loaded),
+        "steps_per_frame": timestep.steps_per_frame(loaded),
+        "precision": workload.precision(loaded),
         "steps": need.steps,
         "frames": need.frames,
         "memory": need.memory_bytes,
@@ -162,7 +168,7 @@ def check(scene: str, image: str | None, overrides: tuple[str, ...], as_json: bo
     click.echo(yaml.safe_dump(facts["scene"], sort_keys=False, default_flow_style=None), nl=False)
     click.echo(
         f"\n{need.points} points, {need.frames} frames, {need.steps} steps of {facts['step']:.6g} s "
-        f"(limit {limit:.6g} s), {facts['steps_per_frame']} a frame{at_least}\n"
+        f"(limit {limit:.6g} s), {facts['steps_per_frame']} a frame{at_least}, in {facts['precision']}\n"
         f"about {need.memory_bytes / 2**20:.0f} MiB of memory, {need.disk_bytes / 2**20:.1f} MiB on disk, "
         f"{need.working_bytes / 2**20:.1f} MiB more while it runs"
     )
@@ -172,7 +178,7 @@ def check(scene: str, image: str | None, overrides: tuple[str, ...], as_json: bo
 @program.command()
 def schema() -> int:
     """Print the JSON Schema of a scene, for editors."""
-    from taichi_msm.scene_file import schema
+    from taichi_msm.scenefile.load import schema
 
     print_json(schema())
     return DONE
@@ -206,7 +212,7 @@ def study(
 ) -> int:
     """Measure how fast and how wrong every setting of SCENE is, and recommend one."""
     from taichi_msm.scene import LARGEST_TOLERANCE, SMALLEST_TOLERANCE
-    from taichi_msm.scene_file import load_scene
+    from taichi_msm.scenefile.load import load_scene
 
     loaded = load_scene(scene, overrides, image)
     directory = result_directory(out, f"{Path(scene).stem}-study")
@@ -272,7 +278,7 @@ def view(
     script: str | None,
 ) -> int:
     """Press the tissue of SCENE with the mouse."""
-    from taichi_msm.scene_file import load_scene
+    from taichi_msm.scenefile.load import load_scene
 
     if (record is None) != (seconds is None):
         raise click.UsageError("--record FILE.gif and --seconds N go together")
@@ -285,23 +291,23 @@ def view(
     loaded = load_scene(scene, overrides, image)
     directory = result_directory(out, f"{Path(scene).stem}-live")
 
-    from taichi_msm.live.script import load_script, timed
+    from taichi_msm.viewer.script import load_script, timed
 
     done = load_script(script, loaded.render.size) if script is not None else None
 
     from taichi_msm.console import Progress
-    from taichi_msm.live import record as recording
-    from taichi_msm.live.album import Album
-    from taichi_msm.live.session import Session
-    from taichi_msm.live.window import Window, show
+    from taichi_msm.viewer import recorder
+    from taichi_msm.viewer.captures import Captures
+    from taichi_msm.viewer.session import Session
+    from taichi_msm.viewer.window import Window, show
 
-    album, interruption = Album(directory, scene), Interruption()
+    captures, interruption = Captures(directory, scene), Interruption()
     notices: list[str] = []
 
     def begin() -> Session:
         with Progress(quiet=False) as bar:
             progress = interruptible(bar, interruption)
-            return Session(loaded, album, arch, threads, play=play, progress=lambda stage: progress(stage, 0, 0))
+            return Session(loaded, captures, arch, threads, play=play, progress=lambda stage: progress(stage, 0, 0))
 
     try:
         with naming(scene):
@@ -314,14 +320,14 @@ def view(
                 with begin() as session, Progress(quiet=False) as bar:
                     events = timed(done, session.rate, loaded.render.size) if done else ()
                     progress = partial(interruptible(bar, interruption), "film")
-                    recording.record(session, Path(record), seconds, events, progress, notices.append)
+                    recorder.record(session, Path(record), seconds, events, progress, notices.append)
                 click.echo(printable(record))
     except KeyboardInterrupt:
         report("interrupted", ["interrupted" if record is None else "interrupted; no film was written"], as_json=False)
         return interruption.code
     finally:
         tell(notices)
-        for path in album.kept:
+        for path in captures.kept:
             click.echo(printable(str(path)))
     return DIVERGED if record is not None and session.fault else DONE
 
@@ -358,7 +364,7 @@ def without_link(folder: Path, option: str) -> Path:
 
 def going_on(directory: Path) -> str:
     """Say how to go on with the unfinished run into a directory; nothing where there is none."""
-    from taichi_msm.publication import is_unfinished
+    from taichi_msm.results.publication import is_unfinished
 
     if not is_unfinished(directory):
         return ""

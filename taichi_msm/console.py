@@ -10,7 +10,7 @@ from types import TracebackType
 from typing import TYPE_CHECKING, Any
 
 from taichi_msm.errors import printable
-from taichi_msm.outlets import tell
+from taichi_msm.system.streams import tell
 
 if TYPE_CHECKING:
     from rich.progress import Progress as Bar

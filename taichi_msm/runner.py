@@ -7,7 +7,7 @@ import platform
 import sys
 import time
 from collections.abc import Callable, Mapping, Sequence
-from contextlib import suppress
+from contextlib import ExitStack, suppress
 from dataclasses import asdict
 from functools import partial
 from pathlib import Path
@@ -17,19 +17,24 @@ import numpy as np
 import PIL
 from numpy.typing import NDArray
 
-from taichi_msm import __version__, accuracy, budget, runtime
-from taichi_msm.accuracy import Estimate
-from taichi_msm.course import Course
-from taichi_msm.errors import DamagedError, DivergedError, FilesError, SceneError, writing
-from taichi_msm.files import ResultWriter
-from taichi_msm.notes import notes
-from taichi_msm.plan import Plan, digest, read_plan
-from taichi_msm.runtime import Device
+from taichi_msm import __version__
+from taichi_msm.errors import DamagedError, DeviceError, DivergedError, FilesError, SceneError, writing
+from taichi_msm.physics import error_control
+from taichi_msm.physics.error_control import Estimate, Pilot
+from taichi_msm.physics.lattice import rest_positions
+from taichi_msm.physics.run_progress import RunProgress
+from taichi_msm.physics.timestep import stable_step, step, steps_per_frame
+from taichi_msm.physics.warnings import notes
+from taichi_msm.physics.workload import affords_pilot, with_precision
+from taichi_msm.render.texture import load_texture
+from taichi_msm.results.manifest import Manifest, digest, read_manifest
+from taichi_msm.results.writer import ResultWriter
 from taichi_msm.scene import Scene
+from taichi_msm.scenefile import budget
+from taichi_msm.scenefile.validation import checked
 from taichi_msm.simulation import Simulation
-from taichi_msm.stability import stable_step, step, steps_per_frame
-from taichi_msm.texture import load_texture
-from taichi_msm.validation import checked
+from taichi_msm.system import runtime
+from taichi_msm.system.runtime import Device
 
 # Encoding a pixel takes as long as so many steps of a point.
 STEPS_PER_PIXEL = 40
@@ -66,7 +71,7 @@ def run(
     arch: str = "cpu",
     threads: int | None = None,
     overrides: Sequence[str] = (),
-    estimate_error: bool = False,
+    estimate_error: bool | None = None,
     started: float | None = None,
     progress: Progress = lambda stage, done, total: None,
 ) -> dict[str, Any]:
@@ -80,7 +85,8 @@ def run(
         arch: cpu, cuda or vulkan.
         threads: number of CPU threads; None takes every core.
         overrides: the overrides that made the scene, for the record.
-        estimate_error: whether to estimate the error of the step; a tolerance in the scene does in any case.
+        estimate_error: whether to estimate the error of the run, by a pilot beside it; None: where it takes less than
+            a third of the run. A tolerance in the scene does in any case.
         started: `time.perf_counter()` when the program began; None: now.
         progress: called with the stage, the frames done and the frames in all, often; what it raises stops the run
             there, KeyboardInterrupt keeping the frames done.
@@ -104,23 +110,25 @@ def run(
     watch.lap("startup")
     given, estimate = scene, None
     if scene.time.tolerance is not None:
-        scene, estimate = accuracy.choose_step(scene, device, partial(progress, "pilot"))
-    elif estimate_error:
-        estimate = accuracy.estimate_error(scene, device, partial(progress, "pilot"))
-    watch.lap("pilot")
+        scene, estimate = error_control.choose_step(scene, device, partial(progress, "pilot"))
+        watch.lap("pilot")
+    else:
+        scene = with_precision(scene, device.arch)
     with writing(directory):
         here = str(Path.cwd())
-    plan = Plan(given, scene, tuple(overrides), estimate, here, arch, digest(texture), versions())
-    if _is_begun(plan, Path(directory)):
+    manifest = Manifest(
+        given, scene, tuple(overrides), estimate, estimate_error, here, arch, digest(texture), versions()
+    )
+    if _is_begun(manifest, Path(directory)):
         with suppress(DamagedError):
-            return _carry_out(plan, Path(directory), device, texture, watch, progress, resumes=True)
-    return _carry_out(plan, Path(directory), device, texture, watch, progress, resumes=False)
+            return _carry_out(manifest, Path(directory), device, texture, watch, progress, resumes=True)
+    return _carry_out(manifest, Path(directory), device, texture, watch, progress, resumes=False)
 
 
-def _is_begun(plan: Plan, directory: Path) -> bool:
+def _is_begun(manifest: Manifest, directory: Path) -> bool:
     """Tell whether the unfinished run into a directory, if there is one, gives the bits of this one."""
     try:
-        return plan.gives_the_bits_of(read_plan(directory))
+        return manifest.gives_the_bits_of(read_manifest(directory))
     except FilesError:
         return False
 
@@ -150,18 +158,18 @@ def resume(
         KeyboardInterrupt: when interrupted before there is a frame more; all is as it was then.
     """
     watch = Stopwatch(started)
-    plan = read_plan(Path(directory))
-    if too_large := [str(problem) for problem in budget.problems(plan.scene)]:
+    manifest = read_manifest(Path(directory))
+    if too_large := [str(problem) for problem in budget.problems(manifest.scene)]:
         raise SceneError(too_large)
-    texture = plan.load_texture()
-    plan.require_same(digest(texture), versions())
-    device = runtime.start(plan.arch, threads)
+    texture = manifest.load_texture()
+    manifest.require_same(digest(texture), versions())
+    device = runtime.start(manifest.arch, threads)
     watch.lap("startup")
-    return _carry_out(plan, Path(directory), device, texture, watch, progress, resumes=True)
+    return _carry_out(manifest, Path(directory), device, texture, watch, progress, resumes=True)
 
 
 def _carry_out(
-    plan: Plan,
+    manifest: Manifest,
     directory: Path,
     device: Device,
     texture: NDArray[np.uint8] | None,
@@ -171,7 +179,7 @@ def _carry_out(
     resumes: bool,
 ) -> dict[str, Any]:
     """Simulate and draw, from the beginning or what the unfinished run in the directory lacks."""
-    scene = plan.scene
+    scene = manifest.scene
     frames = scene.time.frames + 1
     ending: dict[str, Any] = {"status": "complete"}
 
@@ -186,19 +194,30 @@ def _carry_out(
     cores = free_cores(scene)
     # In this order, so that the encoder starts up while kernels are compiled.
     with (
-        ResultWriter(directory, scene, plan.as_json(), resumes=resumes) as writer,
+        ResultWriter(directory, scene, manifest.as_json(), resumes=resumes) as writer,
         Simulation(scene, device.arch, device.threads, texture, cores) as simulation,
+        ExitStack() as opened,
     ):
         resumed = writer.stored
+        pilot, reason = _pilot(manifest, device, cores, resumed=resumed > 0)
+        if pilot is not None:
+            opened.callback(pilot.close)
+        rest = rest_positions(scene.sheet)
         for frame in range(resumed if scene.output else 0):
             progress("check", frame, resumed)
             writer.position(frame)  # finds damage before anything is made of it
         watch.lap("startup")
         try:
             simulation.compile(partial(progress, "compile", 0, frames))
+            if pilot is not None:
+                pilot.compile()
             watch.lap("compile")
             if writer.saved:
                 simulation.go_on(writer.saved)
+            if pilot is not None:
+                for frame in range(1, writer.frames):
+                    pilot.follow(writer.position(frame) - rest, partial(progress, "pilot", frame, frames))
+                watch.lap("pilot")
             for frame in range(writer.frames, frames):
                 progress("frames", frame, frames)
                 watch.lap("hand over")
@@ -209,6 +228,10 @@ def _carry_out(
                 picture = simulation.draw(positions=position) if scene.draws else None
                 watch.lap("render")
                 writer.add(position, picture, partial(progress, "frames", frame, frames))
+                watch.lap("hand over")
+                if pilot is not None and frame > 0:
+                    pilot.follow(position - rest, partial(progress, "frames", frame, frames))
+                    watch.lap("pilot")
             writer.finish(partial(progress, "frames", frames, frames))
         except KeyboardInterrupt:
             # Who interrupts elsewhere than in `progress` may do so before the last frame is stored.
@@ -223,6 +246,7 @@ def _carry_out(
                 raise
             ending = {"status": "interrupted"}
         except DivergedError as error:
+            pilot, reason = None, "the run diverged"
             ending = {"status": "diverged", "error": str(error), "dump": None}
             with suppress(KeyboardInterrupt):
                 found = simulation.diagnose(writer.load(), partial(progress, "diagnosis", writer.frames, frames))
@@ -231,31 +255,52 @@ def _carry_out(
                     ending["dump"] = writer.save(found.good)
         progress("write", writer.frames, frames)
         writer.finish()
-        record = {**ending, **_facts(plan, simulation.course), "resumed": resumed}
-        pilot = ["pilot"] if plan.estimate is not None and "pilot" in watch.seconds else []
-        stages = ["startup", *pilot, "compile", "simulate", "render"]
+        estimate = manifest.estimate if pilot is None else pilot.estimate
+        record = {**ending, **_facts(manifest, simulation.progress, estimate, reason), "resumed": resumed}
+        stages = ["startup", *(["pilot"] if estimate is not None else []), "compile", "simulate", "render"]
         seconds = {stage: watch.seconds.get(stage, 0.0) for stage in stages}
         record["timings"] = {**seconds, "encode": writer.encode_seconds, "total": watch.total()}
         record |= {"arch": device.arch, "device": device.name, "threads": device.threads, "lanes": simulation.lanes}
-        record |= {"workers": simulation.workers, "versions": plan.versions}
+        record |= {"workers": simulation.workers, "versions": manifest.versions}
         return writer.publish(record)
 
 
-def _facts(plan: Plan, course: Course) -> dict[str, Any]:
+def _pilot(manifest: Manifest, device: Device, cores: int, *, resumed: bool) -> tuple[Pilot | None, str]:
+    """Begin the pilot of a run, or say why there is none."""
+    scene = manifest.scene
+    if manifest.estimate is not None:
+        return None, ""
+    if manifest.asks_estimate is False:
+        return None, "not asked for"
+    if manifest.asks_estimate is None and device.arch != "cpu":
+        return None, "on a GPU only --estimate-error asks for it"
+    if manifest.asks_estimate is None and not affords_pilot(scene, error_control.refinement(scene)):
+        return None, "it would take more than a third of the run; --estimate-error asks for it"
+    if resumed and not scene.output:
+        return None, "the frames before the interruption were not kept"
+    try:
+        return Pilot(scene, device, cores), ""
+    except DeviceError:
+        return None, f"{device.arch} cannot run this scene in f64"
+
+
+def _facts(manifest: Manifest, progress: RunProgress, estimate: Estimate | None, reason: str) -> dict[str, Any]:
     """Say what was run, and what is known of its last frame, for run.json."""
-    scene, limit = plan.scene, stable_step(plan.scene)
+    scene, limit = manifest.scene, stable_step(manifest.scene)
     return {
-        "scene": plan.given.model_dump(mode="json"),
-        "working_directory": plan.folder,
-        "overrides": list(plan.overrides),
+        "scene": manifest.given.model_dump(mode="json"),
+        "working_directory": manifest.folder,
+        "overrides": list(manifest.overrides),
         "step": step(scene),
         "stable_step": limit if limit < math.inf else None,
         "steps_per_frame": steps_per_frame(scene),
-        "steps": course.frame * steps_per_frame(scene),
-        "max_displacement": course.max_displacement,
-        "shortest_spring": course.shortest_spring,
-        "notes": list(notes(scene, course.max_displacement, course.shortest_spring, plan.estimate)),
-        "error_estimate": None if plan.estimate is None else error_record(plan.estimate),
+        "precision": scene.time.precision,
+        "steps": progress.frame * steps_per_frame(scene),
+        "max_displacement": progress.max_displacement,
+        "shortest_spring": progress.shortest_spring,
+        "notes": list(notes(scene, progress.max_displacement, progress.shortest_spring, estimate, reason)),
+        "error_estimate": None if estimate is None else error_record(estimate),
+        **({"error_estimate_reason": reason} if estimate is None else {}),
     }
 
 

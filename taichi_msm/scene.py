@@ -186,7 +186,11 @@ class Time(Section):
         "(the paper's eq. 3) of order 1",
         expects="central or backward",
     )
-    precision: Literal["f32", "f64"] = key("f32", means="floating-point precision", expects="f32 or f64")
+    precision: Literal["auto", "f32", "f64"] = key(
+        "auto",
+        means="floating-point precision; auto: f64 while stepping is a small part of the run, else f32",
+        expects="auto, f32 or f64",
+    )
 
     @property
     def frames(self) -> int:

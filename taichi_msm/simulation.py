@@ -9,25 +9,26 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from taichi_msm import runtime
-from taichi_msm.accuracy import choose_step
-from taichi_msm.camera import View, view
-from taichi_msm.course import Course, Saved
-from taichi_msm.diagnosis import Diagnosis, diagnose
-from taichi_msm.divergence import Watch, farthest
-from taichi_msm.dynamics import Dynamics, Pause
 from taichi_msm.errors import ArgumentError, DivergedError, MsmError
-from taichi_msm.lattice import axes
-from taichi_msm.picking import pick
+from taichi_msm.physics.diagnosis import Diagnosis, diagnose
+from taichi_msm.physics.divergence import Watch, farthest
+from taichi_msm.physics.error_control import choose_step
+from taichi_msm.physics.lattice import axes
+from taichi_msm.physics.run_progress import RunProgress, Saved
+from taichi_msm.physics.solver import Dynamics, Pause
+from taichi_msm.physics.timestep import step, steps_per_frame
+from taichi_msm.physics.workload import with_precision
+from taichi_msm.render.camera import View, view
+from taichi_msm.render.picking import pick
+from taichi_msm.render.surface import Surface, surface
+from taichi_msm.render.texture import load_texture, require_texture
 from taichi_msm.scene import Camera, Probe, Scene
-from taichi_msm.stability import step, steps_per_frame
-from taichi_msm.surface import Surface, surface
-from taichi_msm.texture import load_texture, require_texture
-from taichi_msm.validation import checked
+from taichi_msm.scenefile.validation import checked
+from taichi_msm.system import runtime
 
 if TYPE_CHECKING:
-    from taichi_msm.drawing import Drawing
-    from taichi_msm.player import Player
+    from taichi_msm.notebook import Player
+    from taichi_msm.render.rasterizer import Drawing
 
 # A camera as a scene has it; None: the scene's own. A `View` is one that was set up already.
 CameraLike = str | Mapping[str, Any] | Camera | View | None
@@ -53,7 +54,7 @@ class Simulation:
         SceneError: when the scene cannot be run, or no step meets its tolerance.
 
     Attributes:
-        scene: the scene, with the step that was chosen.
+        scene: the scene, with the step and the precision that were chosen.
     """
 
     def __init__(
@@ -67,9 +68,7 @@ class Simulation:
         scene = checked(scene)
         texture = None if texture is None else require_texture(texture)
         self.device = runtime.start(arch, threads)
-        if scene.time.tolerance is not None:
-            scene, _ = choose_step(scene, self.device)
-        self.scene = scene
+        self.scene = scene = self._resolved(scene)
         self._watch = Watch(scene)
         self._closed = False
         self._dynamics = Dynamics(scene, self.device, cores=cores)
@@ -78,10 +77,16 @@ class Simulation:
         self._own_texture = texture is None
         self._drawing: Drawing | None = None
 
+    def _resolved(self, scene: Scene) -> Scene:
+        """Choose what the scene leaves open: the step for a tolerance, and the precision."""
+        if scene.time.tolerance is not None:
+            return choose_step(scene, self.device)[0]
+        return with_precision(scene, self.device.arch)
+
     @property
     def frame(self) -> int:
         """Number of frames simulated so far."""
-        return self.course.frame
+        return self.progress.frame
 
     @property
     def time(self) -> float:
@@ -104,9 +109,9 @@ class Simulation:
         return self._dynamics.structure.workers
 
     @property
-    def course(self) -> Course:
+    def progress(self) -> RunProgress:
         """What is known of the run up to the last frame."""
-        return self._watch.course
+        return self._watch.progress
 
     def advance(self, frames: int = 1, pause: Pause = lambda: None) -> None:
         """Simulate a number of frames; the scene's loads go on as its keys say.
@@ -159,9 +164,7 @@ class Simulation:
         """
         self._require_open()
         if scene is not None:
-            scene = checked(scene)
-            if scene.time.tolerance is not None:
-                scene, _ = choose_step(scene, self.device)
+            scene = self._resolved(checked(scene))
             if self._own_texture and (scene.image, scene.region) != (self.scene.image, self.scene.region):
                 self._texture = None
             self.scene = scene
@@ -180,14 +183,14 @@ class Simulation:
         self._require_open()
         state = self._dynamics.state()
         self._require_good(self._watch.judge(self._dynamics, state.displacement))
-        return Saved(state, self.course)
+        return Saved(state, self.progress)
 
     def go_on(self, saved: Saved) -> None:
         """Be where a simulation of the same scene was, maybe between two frames; what follows has the same bits."""
         self._require_open()
         self._dynamics.restart(self.scene, saved.state)
         self._position = self._place(self._dynamics.displacement())
-        self._watch.course = saved.course
+        self._watch.progress = saved.progress
 
     def positions(self) -> NDArray[Any]:
         """Give where the points are.
@@ -265,7 +268,7 @@ class Simulation:
         Raises:
             MsmError: as for `advance` and `draw`.
         """
-        from taichi_msm.player import Player
+        from taichi_msm.notebook import Player
 
         pictures = [self.draw(camera)]
         for _ in range(frames):
@@ -277,10 +280,10 @@ class Simulation:
         """Show the sheet as it is now, in a notebook."""
         if self._closed:
             return None
-        from taichi_msm.player import captioned
+        from taichi_msm.notebook import captioned
 
         rows, cols = self.scene.sheet.points
-        largest = 1000 * self.course.max_displacement
+        largest = 1000 * self.progress.max_displacement
         caption = f"{self.time:g} s, {rows} × {cols} points, largest displacement so far {largest:.1f} mm"
         return captioned(self.draw(), caption)
 
@@ -326,7 +329,7 @@ class Simulation:
 
     def _drawn(self) -> Drawing:
         if self._drawing is None:
-            from taichi_msm.drawing import Drawing
+            from taichi_msm.render.rasterizer import Drawing
 
             if self._texture is None:
                 self._texture = load_texture(self.scene)

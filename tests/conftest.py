@@ -9,9 +9,9 @@ from pathlib import Path
 import pytest
 from PIL import Image
 
-from taichi_msm import runtime
 from taichi_msm.cli import main
-from taichi_msm.interruption import SIGNALS
+from taichi_msm.system import runtime
+from taichi_msm.system.signals import SIGNALS
 from tests.scenes import SMALL, speckle
 
 

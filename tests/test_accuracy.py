@@ -10,15 +10,15 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from taichi_msm import accuracy
-from taichi_msm.accuracy import Estimate, Pilots, choose_step, estimate_error, longest, order, refinement
-from taichi_msm.dynamics import Dynamics
 from taichi_msm.errors import SceneError
-from taichi_msm.notes import notes
-from taichi_msm.runtime import Device
+from taichi_msm.physics import error_control
+from taichi_msm.physics.error_control import Estimate, Trials, choose_step, estimate_error, longest, order, refinement
+from taichi_msm.physics.solver import Dynamics
+from taichi_msm.physics.timestep import stable_step, step, steps_per_frame, with_steps, with_time
+from taichi_msm.physics.warnings import notes
 from taichi_msm.scene import Scene
 from taichi_msm.simulation import Simulation
-from taichi_msm.stability import stable_step, step, steps_per_frame, with_steps, with_time
+from taichi_msm.system.runtime import Device
 from tests.scenes import PRESS, SHEET, SPRINGS, scene
 
 SOFT_PRESS = {**PRESS, "force": [0, 300, -1000]}
@@ -77,8 +77,8 @@ def test_the_step_chosen_is_right_and_the_largest(kind: str, precision: str, tol
     assert estimate.steps_per_frame == steps_per_frame(chosen) >= steps_per_frame(made)
     if steps_per_frame(chosen) > steps_per_frame(made):
         # Half as many steps would not have done.
-        with closing(Pilots(chosen, device)) as pilots:
-            assert pilots.estimate(steps_per_frame(chosen) // 2, lambda done, total: None).error > tolerance
+        with closing(Trials(chosen, device)) as trials:
+            assert trials.estimate(steps_per_frame(chosen) // 2, lambda done, total: None).error > tolerance
 
 
 @pytest.mark.parametrize("difference", ["central", "backward"])
@@ -99,7 +99,7 @@ def test_an_estimate_is_near_the_error(kind: str, difference: str, device: Devic
 class Falling:
     """A stand-in for Dynamics, of every displacement of which h^p is wrong and no more."""
 
-    def __init__(self, p: int, made: Scene, device: Device) -> None:
+    def __init__(self, p: int, made: Scene, device: Device, cores: int | None = None) -> None:
         self.p = p
         self.restart(made)
 
@@ -120,7 +120,7 @@ class Falling:
 def test_an_error_that_is_a_power_of_the_step_is_told_exactly(
     difference: str, p: int, monkeypatch: pytest.MonkeyPatch, device: Device
 ) -> None:
-    monkeypatch.setattr(accuracy, "Dynamics", partial(Falling, p))
+    monkeypatch.setattr(error_control, "Dynamics", partial(Falling, p))
     made = scene(probes=[SOFT_PRESS], time={"step": 0.005, "damping_difference": difference})
     # In numbers near 1 the error, 2.5e-5 or more, is rounded by 1e-11 of itself.
     assert estimate_error(made, device).error == pytest.approx(0.005**p, rel=1e-9)
@@ -250,7 +250,7 @@ def test_the_error_of_a_load_shorter_than_a_step_is_known(pulse: list[float], de
 def test_a_scene_that_is_all_right_has_no_notes() -> None:
     assert not list(notes(scene(), 1.0, 0.51, None))
     assert next(notes(scene(), 0.0, 0.49, Estimate(40, 1e-3, 1e-4, 1e-3, 2))) == (
-        "error about 0.001 of the largest displacement, by pilot runs"
+        "error 0.001 of the largest displacement (step 0.001, rounding 0.0001)"
     )
     assert len(list(notes(scene(), 0.0, 0.49, None))) == 2
 
@@ -290,9 +290,9 @@ def test_the_error_in_f64_is_that_of_the_step(device: Device) -> None:
     assert single.in_f64 == pytest.approx(double.error, rel=1e-9)
     assert double.in_f64 == double.error
     (said,) = notes(made, 1.0, 1.0, single)
-    assert f"with time.precision: f64 it is about {double.error:.2g}" in said
+    assert f"(step {double.error:.1g}, rounding {single.rounding:.1g})" in said
     (said,) = notes(made, 1.0, 1.0, double)
-    assert "f64" not in said
+    assert said.endswith("(of the step)")
 
 
 @pytest.mark.parametrize("ends", [(0.0044889, 0.0121111), pytest.param((0.0067778, 0.0164444), marks=pytest.mark.slow)])

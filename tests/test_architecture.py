@@ -11,37 +11,30 @@ import pytest
 
 PACKAGE = Path(__file__).parent.parent / "taichi_msm"
 
-# A module imports from earlier lines only.
-ORDER = [
-    {"errors", "look", "interruption", "silence", "sealed", "npz"},
-    {"faults"},
-    {"scene", "folder", "outlets"},
-    {"lattice", "camera", "texture", "surface", "player"},
-    {"picking"},
-    {"stability"},
-    {"loads", "budget", "yaml_reader"},
-    {"validation"},
-    {"scene_file", "reference", "runtime"},
-    {"forces", "samples"},
-    {"sweep", "gather", "coverage", "shading"},
-    {"dynamics", "drawing", "gif", "publication", "trajectory"},
-    {"course", "encoding"},
-    {"divergence"},
-    {"accuracy", "diagnosis", "checkpoint"},
-    {"simulation", "notes", "plan"},
-    {"files"},
+# A module or a package imports from earlier lines, and a package from itself.
+LAYERS = [
+    {"errors", "notebook"},
+    {"faults", "system"},
+    {"scene"},
+    {"physics", "render"},
+    {"scenefile", "reference"},
+    {"simulation", "results"},
     {"runner", "console"},
-    {"study", "live"},
+    {"study", "viewer"},
     {"cli"},
     {"__main__", "__init__"},
 ]
-LEVEL = {name: level for level, names in enumerate(ORDER) for name in names}
+LAYER = {name: level for level, names in enumerate(LAYERS) for name in names}
 MODULES = sorted(PACKAGE.rglob("*.py"))
 
 
-def name_of(path: Path) -> str:
-    """Name of a module, or of the package that it is a part of."""
-    return path.relative_to(PACKAGE).parts[0].removesuffix(".py")
+def module_name(path: Path) -> str:
+    """Dotted name of a module within the package; of a package that of its __init__.py."""
+    parts = path.relative_to(PACKAGE).with_suffix("").parts
+    return ".".join(parts[:-1] if len(parts) > 1 and parts[-1] == "__init__" else parts)
+
+
+NAMES = {module_name(path) for path in MODULES}
 
 
 def imports(path: Path) -> set[str]:
@@ -49,9 +42,10 @@ def imports(path: Path) -> set[str]:
     found = set()
     for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
         if isinstance(node, ast.ImportFrom) and node.module and node.module.split(".")[0] == "taichi_msm":
-            inner = node.module.split(".")[1:]
-            found |= {inner[0]} if inner else {alias.name for alias in node.names}
-    return found & set(LEVEL)
+            inner = node.module.partition(".")[2]
+            # What is imported may be a module, or something in one.
+            found |= {name for alias in node.names if (name := f"{inner}.{alias.name}".strip(".")) in NAMES} or {inner}
+    return found & NAMES
 
 
 def third_party(path: Path) -> set[str]:
@@ -64,15 +58,23 @@ def third_party(path: Path) -> set[str]:
     return found
 
 
-def test_every_module_has_its_place() -> None:
-    assert {name_of(path) for path in MODULES} == set(LEVEL)
+def test_every_module_has_its_layer() -> None:
+    assert {name.split(".")[0] for name in NAMES} == set(LAYER)
 
 
-@pytest.mark.parametrize("path", MODULES, ids=lambda path: str(path.relative_to(PACKAGE)))
-def test_imports_go_one_way(path: Path) -> None:
-    own = name_of(path)
-    later = {name for name in imports(path) - {own} if LEVEL[name] >= LEVEL[own]}
-    assert not later, f"{path} imports {later}, which is not below it"
+@pytest.mark.parametrize("path", MODULES, ids=module_name)
+def test_imports_go_down(path: Path) -> None:
+    own = module_name(path).split(".")[0]
+    for name in imports(path):
+        other = name.split(".")[0]
+        assert other == own or LAYER[other] < LAYER[own], f"{path} imports {name}, which is not below it"
+
+
+def test_no_modules_import_each_other() -> None:
+    graph = {module_name(path): imports(path) - {module_name(path)} for path in MODULES}
+    while leaves := {name for name, needed in graph.items() if not needed}:
+        graph = {name: needed - leaves for name, needed in graph.items() if name not in leaves}
+    assert not graph, f"these import each other, or what does: {sorted(graph)}"
 
 
 def test_only_runtime_imports_taichi() -> None:

@@ -14,7 +14,7 @@ from benchmarks import child, page, process, race
 from benchmarks.drawing.measure import psnr
 from benchmarks.stepping import PEERS, measure, numpy_
 from benchmarks.stepping.problem import Array, Problem
-from taichi_msm.runtime import Device
+from taichi_msm.system.runtime import Device
 
 
 @pytest.fixture(autouse=True)

@@ -9,11 +9,12 @@ from typing import Any
 import pytest
 from PIL import Image
 
-from taichi_msm import budget
-from taichi_msm.budget import available_memory, estimate, problems, require_disk
 from taichi_msm.errors import SceneError
 from taichi_msm.scene import Scene
+from taichi_msm.scenefile import budget
+from taichi_msm.scenefile.budget import available_memory, estimate, problems, require_disk
 
+TIME = {"duration": 2, "frames_per_second": 10, "step": 0.025, "precision": "f32"}
 PROBE = {"force": [0, 0, 1]}
 
 
@@ -24,9 +25,9 @@ def scene(**keys: Any) -> Scene:
             "image": "none.png",
             "sheet": {"points": [30, 40], "size": [1, 1], "mass": 1},
             "springs": {},
-            "time": {"duration": 2, "frames_per_second": 10, "step": 0.025},
             "output": [],
             **keys,
+            "time": {**TIME, **keys.get("time", {})},
         }
     )
 
@@ -41,12 +42,14 @@ def test_counts() -> None:
 
 
 def test_simulation() -> None:
-    assert estimate(scene()).simulation_bytes == 1200 * 4 * 21
-    assert estimate(scene(probes=[PROBE, PROBE])).simulation_bytes == 1200 * 4 * 23
-    precise = scene(time={"duration": 2, "precision": "f64"})
-    assert estimate(precise).simulation_bytes == 1200 * 8 * 21
-    piloted = scene(time={"duration": 1, "tolerance": 1e-3})
-    assert estimate(piloted).simulation_bytes == 1200 * (4 + 8 + 8) * 21
+    # With a pilot, which is two sheets in f64.
+    assert estimate(scene()).simulation_bytes == 1200 * (4 + 8 + 8) * 21
+    assert estimate(scene(probes=[PROBE, PROBE])).simulation_bytes == 1200 * (4 + 8 + 8) * 23
+    assert estimate(scene(time={"precision": "f64"})).simulation_bytes == 1200 * (8 + 8 + 8) * 21
+    large = {"sheet": {"points": [2000, 2000], "size": [1, 1], "mass": 1}, "time": {"step": 1e-4}}
+    assert estimate(scene(**large)).simulation_bytes == 2000**2 * 4 * 21
+    piloted = scene(sheet=large["sheet"], time={"step": "auto", "duration": 100, "tolerance": 1e-3})
+    assert estimate(piloted).simulation_bytes == 2000**2 * (4 + 8 + 8) * 21
 
 
 def test_drawing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -122,7 +125,7 @@ def test_memory_that_just_fits(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def test_too_many_steps() -> None:
-    time = {"duration": 1e6, "frames_per_second": 10}
+    time = {"duration": 1e6, "frames_per_second": 10, "step": "auto"}
     assert faults(scene(time=time | {"step": 1e-6})) == []
     assert faults(scene(time=time | {"step": 1e-7})) == [
         "time.step: 1e+06 s in steps of 1e-07 s is 1e+13 steps, more than the 1e+12 that can be taken; "

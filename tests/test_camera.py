@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from taichi_msm.camera import problems, view
+from taichi_msm.render.camera import problems, view
 from taichi_msm.scene import Scene
 from tests.scenes import scene
 

@@ -12,15 +12,15 @@ from typing import Any
 import numpy as np
 import pytest
 
-from taichi_msm.checkpoint import Checkpoint
-from taichi_msm.course import Course, Saved
-from taichi_msm.dynamics import State
 from taichi_msm.errors import DamagedError
-from taichi_msm.folder import Folder
-from taichi_msm.plan import Plan, read_plan
-from taichi_msm.publication import PLAN, POSITIONS, STATE
+from taichi_msm.physics.run_progress import RunProgress, Saved
+from taichi_msm.physics.solver import State
+from taichi_msm.results.checkpoint import Checkpoint
+from taichi_msm.results.folder import Folder
+from taichi_msm.results.manifest import Manifest, read_manifest
+from taichi_msm.results.publication import MANIFEST, POSITIONS, STATE
+from taichi_msm.results.sealed import seal, unseal
 from taichi_msm.scene import Scene
-from taichi_msm.sealed import seal, unseal
 from tests.scenes import scene
 
 FRAMES = 3
@@ -35,17 +35,17 @@ def position(frame: int) -> Any:
     return np.random.default_rng(frame).normal(size=(2, 3, 3))
 
 
-def plan() -> Plan:
+def manifest() -> Manifest:
     made = small_scene()
-    return Plan(made, made, (), None, "/", "cpu", "", {"taichi": "1.7"})
+    return Manifest(made, made, (), None, None, "/", "cpu", "", {"taichi": "1.7"})
 
 
 def state(**changes: Any) -> Saved:
     """The state of a run at its third frame."""
     steps = {"steps": EVERY * (FRAMES - 1), "displacement": position(8), "difference": position(9)}
-    course = Course(frame=FRAMES - 1, energy=1.0, peak=2.0, reach=3.0)
+    progress = RunProgress(frame=FRAMES - 1, energy=1.0, peak=2.0, reach=3.0)
     kept = {key: changes.pop(key) for key in list(changes) if key in steps}
-    return Saved(State(**{**steps, **kept}), Course(**{**vars(course), **changes}))
+    return Saved(State(**{**steps, **kept}), RunProgress(**{**vars(progress), **changes}))
 
 
 @pytest.fixture
@@ -54,7 +54,7 @@ def out(tmp_path: Path) -> Path:
     (tmp_path / ".partial").mkdir()
     with Folder.at(tmp_path / ".partial") as staging:
         checkpoint = Checkpoint(staging, small_scene())
-        checkpoint.begin(plan().as_json())
+        checkpoint.begin(manifest().as_json())
         for frame in range(FRAMES):
             checkpoint.add(position(frame))
         checkpoint.save(state())
@@ -73,19 +73,19 @@ def read(out: Path) -> list[Any]:
         finally:
             checkpoint.close()
     return [
-        read_plan(out).as_json(),
+        read_manifest(out).as_json(),
         positions,
         saved.state.steps,
         saved.state.displacement.tolist(),
         saved.state.difference.tolist(),
-        saved.course,
+        saved.progress,
     ]
 
 
 @pytest.mark.parametrize(
     ("name", "harmless", "every"),
     [
-        (PLAN, 0.0, 1),
+        (MANIFEST, 0.0, 1),
         (POSITIONS, 0.0, 5),
         (STATE, 0.25, 5),
         pytest.param(POSITIONS, 0.0, 1, marks=pytest.mark.fuzz),
@@ -186,7 +186,7 @@ def test_parts_of_another_run_are_refused(name: str, out: Path, tmp_path: Path) 
     with Folder.at(tmp_path / ".partial") as staging:
         other = Checkpoint(staging, small_scene())
         part = (out / ".partial" / "checkpoint" / name).read_bytes()
-        other.begin({**plan().as_json(), "folder": "/elsewhere"})
+        other.begin({**manifest().as_json(), "folder": "/elsewhere"})
         for frame in range(FRAMES):
             other.add(position(frame))
         other.save(state())
@@ -237,10 +237,10 @@ def test_frames_that_are_exchanged_are_found(out: Path) -> None:
     ],
 )
 def test_a_forged_plan_is_refused(change: dict[str, Any], out: Path) -> None:
-    path = out / ".partial" / "checkpoint" / PLAN
-    path.write_bytes(seal({**plan().as_json(), **change}))
-    with pytest.raises(DamagedError, match=r"plan\.json is"):
-        read_plan(out)
+    path = out / ".partial" / "checkpoint" / MANIFEST
+    path.write_bytes(seal({**manifest().as_json(), **change}))
+    with pytest.raises(DamagedError, match=r"manifest\.json is"):
+        read_manifest(out)
 
 
 def test_a_seal_is_broken_by_what_is_still_valid_json() -> None:

@@ -18,7 +18,7 @@ from PIL import Image
 
 from taichi_msm import console, reference
 from taichi_msm.cli import main
-from taichi_msm.scene_file import load_scene
+from taichi_msm.scenefile.load import load_scene
 from tests.conftest import Program
 from tests.outputs import files
 from tests.scenes import SMALL, speckle
@@ -42,7 +42,7 @@ def test_run_writes_everything(small: Path) -> None:
     scene = load_scene("small.yaml")
     twin = reference.simulate(scene)
     trajectory = np.load(out / "trajectory.npz")
-    assert trajectory["position"].dtype == np.float32
+    assert trajectory["position"].dtype == np.float64
     np.testing.assert_allclose(trajectory["position"], twin, atol=1e-6)
     np.testing.assert_allclose(trajectory["time"], [0, 0.1, 0.2, 0.3, 0.4])
     for frame in (0, 2):
@@ -54,7 +54,7 @@ def test_run_writes_everything(small: Path) -> None:
     assert record["scene"]["render"]["camera"] == "top"
     assert record["steps"] == record["steps_per_frame"] * 4 == 164
     assert record["max_displacement"] == pytest.approx(np.linalg.norm(twin - twin[0], axis=-1).max(), rel=1e-4)
-    assert set(record["timings"]) == {"startup", "compile", "simulate", "render", "encode", "total"}
+    assert set(record["timings"]) == {"startup", "pilot", "compile", "simulate", "render", "encode", "total"}
     assert record["outputs"] == ["frames", "animation.gif", "trajectory.npz", "run.json"]
     assert (record["arch"], record["threads"], record["overrides"]) == ("cpu", 2, [])
 
@@ -90,20 +90,21 @@ def test_a_tolerance_chooses_the_step_and_is_reported(small: Path, program: Prog
     assert record["scene"]["time"]["step"] == "auto"
     estimate = record["error_estimate"]
     assert set(estimate) == {"error", "rounding", "in_f64", "order"}
-    assert 0 < estimate["rounding"] < estimate["error"] <= 1e-4
-    assert f"error about {estimate['error']:.2g} of the largest displacement, by pilot runs" in done.stdout
+    assert 0 == estimate["rounding"] < estimate["error"] <= 1e-4
+    assert f"error {estimate['error']:.1g} of the largest displacement (of the step)" in done.stdout
     assert record["timings"]["pilot"] > 0
     # The step as run.json gives it makes the same run without pilot runs, whose error it is.
     settings = ["--set", "output=[]", "--set", f"time.step={record['step']!r}"]
     again = program("run", "small.yaml", *settings, "--estimate-error", "--json", "--out", "again")
-    assert json.loads(again.stdout)["error_estimate"] == estimate
+    assert json.loads(again.stdout)["error_estimate"] == pytest.approx(estimate, rel=1e-9)
     assert json.loads(again.stdout)["steps"] == record["steps"]
 
 
 def test_a_tolerance_out_of_reach_is_refused_and_keeps_earlier_results(small: Path, program: Program) -> None:
     (small / "kept").mkdir()
     (small / "kept" / "run.json").write_text("earlier")
-    done = program("run", "small.yaml", "--set", "output=[]", "--set", "time.tolerance=1e-9", "--out", "kept")
+    settings = ["--set", "output=[]", "--set", "time.tolerance=1e-9", "--set", "time.precision=f32"]
+    done = program("run", "small.yaml", *settings, "--out", "kept")
     assert done.returncode == 2
     assert done.stderr.startswith(
         "small.yaml: time.tolerance: 1e-09 is out of reach of f32, whose rounding alone makes"
@@ -526,7 +527,7 @@ def test_check_prints_the_resolved_scene_and_what_it_takes(small: Path, capsys: 
     code, out, err = call(capsys, "check", "small.yaml")
     assert (code, err) == (0, "")
     assert "falloff: 20.0" in out
-    assert "\n99 points, 5 frames, 164 steps of 0.00243902 s (limit 0.00499221 s), 41 a frame\n" in out
+    assert "\n99 points, 5 frames, 164 steps of 0.00243902 s (limit 0.00499221 s), 41 a frame, in f64\n" in out
     assert not (small / "output").exists()
     facts = json.loads(call(capsys, "check", "small.yaml", "--json")[1])
     assert facts["scene"]["time"]["damping_difference"] == "central"
@@ -558,7 +559,7 @@ def test_a_bug_is_one_line(small: Path, capsys: pytest.CaptureFixture[str], monk
         raise ZeroDivisionError("by zero\nin two lines")
 
     monkeypatch.delenv("TAICHI_MSM_TRACEBACK", raising=False)
-    monkeypatch.setattr("taichi_msm.scene_file.load_scene", broken)
+    monkeypatch.setattr("taichi_msm.scenefile.load.load_scene", broken)
     code, _, err = call(capsys, "check", "small.yaml")
     assert code == 1
     assert err == (

@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from taichi_msm.dynamics import Dynamics
-from taichi_msm.runtime import Device
-from taichi_msm.stability import steps_per_frame
+from taichi_msm.physics.solver import Dynamics
+from taichi_msm.physics.timestep import steps_per_frame
+from taichi_msm.system.runtime import Device
 from tests.scenes import scene
 
 FRAME = 0.04

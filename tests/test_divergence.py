@@ -10,13 +10,13 @@ import numpy as np
 import pytest
 
 from taichi_msm import DivergedError, Simulation
-from taichi_msm.course import Course, Saved
-from taichi_msm.diagnosis import Diagnosis
-from taichi_msm.divergence import farthest_displacement
-from taichi_msm.dynamics import State
-from taichi_msm.runtime import Device
+from taichi_msm.physics.diagnosis import Diagnosis
+from taichi_msm.physics.divergence import farthest_displacement
+from taichi_msm.physics.run_progress import RunProgress, Saved
+from taichi_msm.physics.solver import State
+from taichi_msm.physics.timestep import stable_step, steps_per_frame, with_steps
 from taichi_msm.scene import Scene
-from taichi_msm.stability import stable_step, steps_per_frame, with_steps
+from taichi_msm.system.runtime import Device
 from tests.scenes import SHEET, scene
 
 # Pressed for three frames.
@@ -42,7 +42,7 @@ def pressed(precision: str = "f32", **sections: object) -> Scene:
 
 def rest(made: Scene) -> Saved:
     nothing = np.zeros((*made.sheet.points, 3), made.time.precision.replace("f", "float"))
-    return Saved(State(0, nothing, nothing), Course())
+    return Saved(State(0, nothing, nothing), RunProgress())
 
 
 def with_fault(saved: Saved, part: str, change: float, random: np.random.Generator) -> Saved:
@@ -85,7 +85,7 @@ def test_no_fault_is_found_where_there_is_none(precision: str, active: str, devi
     for steps in (steps_per_frame(made), math.ceil(1 / 25 / stable_step(made) / 0.995)):
         with Simulation(with_steps(made, steps), threads=device.threads) as simulation:
             simulation.advance(20)
-            assert simulation.course.peak > 1e-3
+            assert simulation.progress.peak > 1e-3
 
 
 PLAIN = {"falloff": 0, "offset": 0}
@@ -134,7 +134,7 @@ SOUND = {
 def test_what_is_sound_is_let_pass(name: str, device: Device) -> None:
     with Simulation(SOUND[name], threads=device.threads) as simulation:
         simulation.advance(SOUND[name].time.frames)
-        assert simulation.course.peak > 0
+        assert simulation.progress.peak > 0
 
 
 def test_springs_that_begin_to_pull_from_afar_give_energy(device: Device) -> None:
@@ -151,9 +151,9 @@ def test_springs_that_begin_to_pull_from_afar_give_energy(device: Device) -> Non
     away = np.full((2, 2, 3), [0, 0, 0.02])
     held = 50 / 2 * 0.02**2 * 4
     with Simulation(made, threads=device.threads) as simulation:
-        simulation.go_on(Saved(State(0, away, np.zeros_like(away)), Course(reach=0.04)))
+        simulation.go_on(Saved(State(0, away, np.zeros_like(away)), RunProgress(reach=0.04)))
         simulation.advance()
-        assert simulation.course.energy > 10 * held
+        assert simulation.progress.energy > 10 * held
 
 
 def diagnosed(made: Scene, device: Device, fault: Callable[[Simulation], None] = lambda _: None) -> Diagnosis:
@@ -210,7 +210,7 @@ def test_a_machine_that_makes_errors_is_told_of(device: Device) -> None:
     found = diagnosed(made, device, flip)
     assert found.message.endswith("but not when it was repeated: this machine makes errors; go on with --resume")
     assert found.good
-    assert found.good.course.frame == 1, "where it was saved"
+    assert found.good.progress.frame == 1, "where it was saved"
     with Simulation(made, threads=device.threads) as simulation:
         simulation.go_on(found.good)
         simulation.advance(made.time.frames - simulation.frame)

@@ -12,10 +12,10 @@ from typing import Any
 
 import pytest
 
-from taichi_msm import runtime
-from taichi_msm.live.script import load_script
-from taichi_msm.runtime import Device
-from taichi_msm.scene_file import load_scene
+from taichi_msm.scenefile.load import load_scene
+from taichi_msm.system import runtime
+from taichi_msm.system.runtime import Device
+from taichi_msm.viewer.script import load_script
 
 SCENES = ["press", "figure-3", "drag", "grasp", "two-tools"]
 

@@ -10,11 +10,11 @@ import pytest
 from numpy.typing import NDArray
 
 from taichi_msm import reference
-from taichi_msm.camera import view
-from taichi_msm.drawing import Drawing, structure
-from taichi_msm.lattice import rest_positions
-from taichi_msm.runtime import Device
+from taichi_msm.physics.lattice import rest_positions
+from taichi_msm.render.camera import view
+from taichi_msm.render.rasterizer import Drawing, structure
 from taichi_msm.scene import Scene
+from taichi_msm.system.runtime import Device
 from tests.scenes import SHEET, scene, speckle
 
 NEAR = {"eye": [0, -0.1, 0.1], "target": [0, 0.1, 0], "fov": 80}

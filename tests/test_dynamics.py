@@ -12,13 +12,14 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from taichi_msm import gather, reference, sweep
-from taichi_msm.dynamics import POINTS_PER_WORKER, Dynamics, structure
-from taichi_msm.forces import Structure
-from taichi_msm.lattice import rest_positions
-from taichi_msm.runtime import Device, available_threads, lanes
+from taichi_msm import reference
+from taichi_msm.physics import kernel_cpu, kernel_gpu
+from taichi_msm.physics.kernel import Structure
+from taichi_msm.physics.lattice import rest_positions
+from taichi_msm.physics.solver import POINTS_PER_WORKER, Dynamics, structure
+from taichi_msm.physics.timestep import stable_step, step, steps_per_frame, with_steps
 from taichi_msm.scene import Scene
-from taichi_msm.stability import stable_step, step, steps_per_frame, with_steps
+from taichi_msm.system.runtime import Device, available_threads, lanes
 from tests.scenes import PRESS, SHEET, SPRINGS, random_scene, scene
 
 ROUNDING = {"f32": 2.0**-24, "f64": 2.0**-53}
@@ -102,18 +103,18 @@ def test_small_sheets_and_fixed_sides(points: list[int], fixed: Any, device: Dev
 @pytest.fixture
 def short_launches(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
     """Few steps a launch on a GPU, as each of them is compiled."""
-    gather._kernels.cache_clear()
-    for module in ("gather", "dynamics"):
-        monkeypatch.setattr(f"taichi_msm.{module}.STEPS_PER_LAUNCH", 3)
+    kernel_gpu._kernels.cache_clear()
+    for module in ("kernel_gpu", "solver"):
+        monkeypatch.setattr(f"taichi_msm.physics.{module}.STEPS_PER_LAUNCH", 3)
     yield
-    gather._kernels.cache_clear()
+    kernel_gpu._kernels.cache_clear()
 
 
 @pytest.mark.usefixtures("short_launches")
 def test_the_plain_layout_of_a_gpu_gives_the_same(device: Device) -> None:
     made = scene(probes=[PRESS], time={"duration": 0.08})
     layout = as_on_a_gpu(structure(made, device))
-    assert steps_per_frame(made) % gather.STEPS_PER_LAUNCH != 0, "a launch that is not full is part of the test"
+    assert steps_per_frame(made) % kernel_gpu.STEPS_PER_LAUNCH != 0, "a launch that is not full is part of the test"
     assert simulate(made, device, layout).tobytes() == simulate(made, device).tobytes()
 
 
@@ -175,7 +176,7 @@ def test_a_launch_ends_soon(device: Device, monkeypatch: pytest.MonkeyPatch) -> 
     dynamics.advance(100)
     whole = dynamics.displacement()
     dynamics.restart(made)
-    monkeypatch.setattr("taichi_msm.dynamics.POINT_STEPS_PER_LAUNCH", 12 * math.prod(made.sheet.points))
+    monkeypatch.setattr("taichi_msm.physics.solver.POINT_STEPS_PER_LAUNCH", 12 * math.prod(made.sheet.points))
 
     def stop() -> None:
         if dynamics.steps_done == 36:
@@ -200,7 +201,13 @@ def test_a_frame_of_a_small_sheet_is_one_launch(device: Device) -> None:
 
 def test_absent_terms_are_left_out(device: Device) -> None:
     bare = structure(scene(springs={"structural": 1}, probes=[]), device).code
-    assert (bare.structural, bare.shear, bare.virtual, bare.open_edges, bare.grips) == (True, False, False, False, ())
+    assert (bare.structural, bare.shear, bare.virtual, bare.open_edges, bare.slots_move) == (
+        True,
+        False,
+        False,
+        False,
+        (),
+    )
     assert not structure(scene(probes=[]), device).code.virtual, "loaded, but nothing ever loads"
     assert structure(scene(), device).code.virtual
     assert structure(scene(), device).code.lanes == lanes("f64")
@@ -303,7 +310,7 @@ def test_energy_does_not_drift(device: Device) -> None:
 
 def energy(made: Scene, u: NDArray[Any], v: NDArray[Any]) -> float:
     """Kinetic and potential energy [J] at the middle of a step."""
-    from taichi_msm.lattice import springs
+    from taichi_msm.physics.lattice import springs
 
     total = 0.5 * made.sheet.mass * (v**2).sum() + 0.5 * made.springs.virtual * (u**2).sum()
     x = u + rest_positions(made.sheet)
@@ -451,9 +458,9 @@ def test_workers_that_give_up_waiting_go_on_to_the_same_bits(
     steps = (3, 200, 1, 77, 400, 5)
     for count in steps:
         alone.advance(count)
-    monkeypatch.setattr(sweep, "PATIENCE", patience)
-    monkeypatch.setattr(sweep, "SHORTEST_REST", 0.001)
-    monkeypatch.setattr(sweep, "LONGEST_REST", 0.002)
+    monkeypatch.setattr(kernel_cpu, "PATIENCE", patience)
+    monkeypatch.setattr(kernel_cpu, "SHORTEST_REST", 0.001)
+    monkeypatch.setattr(kernel_cpu, "LONGEST_REST", 0.002)
     for workers, depth in ((2, 1), (2, 4), (3, 2)):
         together = Dynamics(made, device, replace(structure(made, device), workers=workers, depth=depth))
         for count in steps:

@@ -17,10 +17,10 @@ import pytest
 from numpy.typing import NDArray
 from PIL import Image
 
-from taichi_msm.encoding import Encoder
 from taichi_msm.errors import FilesError
-from taichi_msm.files import ResultWriter
-from taichi_msm.folder import Folder
+from taichi_msm.results.encoder import Encoder
+from taichi_msm.results.folder import Folder
+from taichi_msm.results.writer import ResultWriter
 from taichi_msm.scene import Scene
 from tests.outputs import files
 from tests.scenes import scene, speckle
@@ -33,7 +33,7 @@ ENDLESS = """
 import itertools
 import sys
 from pathlib import Path
-from taichi_msm.files import ResultWriter
+from taichi_msm.results.writer import ResultWriter
 from tests.test_files import picture, position, small_scene
 
 with ResultWriter(Path(sys.argv[1]), small_scene()) as writer:

@@ -1,6 +1,6 @@
 """The hard cases for numerical stability, scenes in tests/hard: each stays right with a known error, or says otherwise.
 
-Errors are of displacements, and fractions of the largest one of the run, as in `taichi_msm.accuracy`.
+Errors are of displacements, and fractions of the largest one of the run, as in `taichi_msm.physics.error_control`.
 """
 
 from __future__ import annotations
@@ -13,15 +13,16 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from taichi_msm import lattice, reference
-from taichi_msm.accuracy import estimate_error
-from taichi_msm.divergence import MOST_SHEET_SIZES
-from taichi_msm.dynamics import Dynamics
-from taichi_msm.runtime import Device
+from taichi_msm import reference
+from taichi_msm.physics import lattice
+from taichi_msm.physics.divergence import MOST_SHEET_SIZES
+from taichi_msm.physics.error_control import estimate_error
+from taichi_msm.physics.solver import Dynamics
+from taichi_msm.physics.timestep import stable_step, step, steps_per_frame, with_steps
 from taichi_msm.scene import Scene
-from taichi_msm.scene_file import load_scene
+from taichi_msm.scenefile.load import load_scene
 from taichi_msm.simulation import Simulation
-from taichi_msm.stability import stable_step, step, steps_per_frame, with_steps
+from taichi_msm.system.runtime import Device
 
 Array = NDArray[np.float64]
 
@@ -37,7 +38,7 @@ TWIN_STEPS_OF_POINTS = 300_000
 
 
 def hard(name: str) -> Scene:
-    return load_scene(FOLDER / f"{name}.yaml")
+    return load_scene(FOLDER / f"{name}.yaml", ["time.precision=f32"])
 
 
 def changed(scene: Scene, **sections: dict[str, Any]) -> Scene:
@@ -84,7 +85,7 @@ def test_the_cases_are_as_hard_as_they_say(root: Path) -> None:
     assert damped.time.damping_difference == "central"
     for path in FOLDER.glob("*.yaml"):
         scene = load_scene(path)
-        assert (scene.output, scene.image, scene.time.precision) == ((), None, "f32")
+        assert (scene.output, scene.image, scene.time.precision) == ((), None, "auto")
 
 
 @pytest.mark.parametrize("name", SHORT)
@@ -110,9 +111,9 @@ def test_only_the_pinch_is_noted(name: str, device: Device) -> None:
     largest = longest(motion(scene, device))
     with Simulation(scene, device.arch, device.threads) as run:
         run.advance(scene.time.frames)
-        assert (run.course.shortest_spring < 0.5) == (name == "pinch")
+        assert (run.progress.shortest_spring < 0.5) == (name == "pinch")
         # Three squares, their sum and its root in f32.
-        assert run.course.max_displacement == pytest.approx(largest, rel=4 * F32)
+        assert run.progress.max_displacement == pytest.approx(largest, rel=4 * F32)
 
 
 @pytest.mark.slow

@@ -18,12 +18,12 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from taichi_msm.dynamics import Dynamics
 from taichi_msm.errors import SceneError
-from taichi_msm.runtime import Device
+from taichi_msm.physics.solver import Dynamics
+from taichi_msm.render.texture import load_texture, texture_size
 from taichi_msm.scene import Scene
-from taichi_msm.scene_file import load_scene
-from taichi_msm.texture import load_texture, texture_size
+from taichi_msm.scenefile.load import load_scene
+from taichi_msm.system.runtime import Device
 from tests.mutation import damaged_picture, damaged_text
 from tests.scenes import SHEET, SPRINGS, speckle
 

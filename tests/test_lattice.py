@@ -5,7 +5,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from taichi_msm.lattice import fixed_points, rest_positions, springs
+from taichi_msm.physics.lattice import fixed_points, rest_positions, springs
 from tests.scenes import SHEET, scene
 
 

@@ -27,10 +27,10 @@ from taichi_msm import (
     reference,
     run,
 )
-from taichi_msm.camera import view
-from taichi_msm.lattice import rest_positions
-from taichi_msm.runtime import Device, processor
-from taichi_msm.stability import stable_step, step, with_time
+from taichi_msm.physics.lattice import rest_positions
+from taichi_msm.physics.timestep import stable_step, step, with_time
+from taichi_msm.render.camera import view
+from taichi_msm.system.runtime import Device, processor
 from tests.scenes import PRESS, SHEET, scene, speckle
 
 HAND = {"at": [[0, 0.5, 0.5]], "force": [0, 0, -20], "falloff": 20, "offset": 0}
@@ -224,7 +224,7 @@ def test_a_record_says_where_its_picture_and_its_device_are(
 
 def test_in_a_notebook_nothing_is_said() -> None:
     # There stdout is an object of its own.
-    notebook = "import io, sys; sys.stdout = io.StringIO(); import taichi_msm.runtime"
+    notebook = "import io, sys; sys.stdout = io.StringIO(); import taichi_msm.system.runtime"
     done = subprocess.run([sys.executable, "-c", notebook], capture_output=True, text=True, check=True)
     assert (done.stdout, done.stderr) == ("", "")
 

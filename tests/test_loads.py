@@ -7,9 +7,9 @@ import numpy as np
 import pytest
 from scipy.integrate import quad
 
-from taichi_msm.loads import Envelope, grips, key_times, loads_at, schedule
+from taichi_msm.physics.loads import Envelope, key_times, loads_at, probe_slots, schedule
+from taichi_msm.physics.timestep import step, with_steps
 from taichi_msm.scene import Scene
-from taichi_msm.stability import step, with_steps
 from tests.scenes import PRESS, SPRINGS, scene
 
 # 25 frames a second in 4 steps of 0.01 s.
@@ -85,9 +85,9 @@ def test_the_average_is_the_integral_with_the_hat(seed: int) -> None:
         return sum(parts) * (2 if n == 0 else 1)
 
     for n in range(7):
-        for grip in range(2):
-            strength = integral(lambda t, grip=grip: loads_at(made, np.array([t])).strength[0, grip, 0], n)
-            assert found.strength[n, grip, 0] == pytest.approx(strength, abs=1e-9), (n, grip)
+        for slot in range(2):
+            strength = integral(lambda t, slot=slot: loads_at(made, np.array([t])).strength[0, slot, 0], n)
+            assert found.strength[n, slot, 0] == pytest.approx(strength, abs=1e-9), (n, slot)
         active = integral(lambda t: loads_at(made, np.array([t])).active[0], n)
         assert found.active[n] == pytest.approx(active, abs=1e-9), n
 
@@ -184,7 +184,7 @@ def test_a_control_point_moves_between_its_keys_and_is_held_outside() -> None:
 def test_a_jump_of_the_control_point_shares_the_force_between_both_places(keys: list[list[float]]) -> None:
     probe = {"force": [0, 0, 8], "at": keys, "load": [[0, 100], [0.02, 100], [0.02, 50]]}
     made = scene(springs=SOFT, probes=[probe], time=STEPS)
-    assert [(grip.turn, grip.turns, grip.moves) for grip in grips(made)] == [(0, 2, True), (1, 2, True)]
+    assert [(slot.turn, slot.turns, slot.moves) for slot in probe_slots(made)] == [(0, 2, True), (1, 2, True)]
     found = schedule(made, 0, 5)
     np.testing.assert_allclose(found.strength[..., 2].T, [[8, 8, 4, 0, 0], [0, 0, 2, 4, 4]], atol=1e-12)
     np.testing.assert_allclose(found.point[2], [[-0.2, 0.15], [0.2, -0.15]])
@@ -206,9 +206,9 @@ def test_a_control_point_that_jumps_a_thousand_times_has_few_places() -> None:
     at = [[n / 100, *place] for n in range(1000) for place in ([n % 7 / 7, 0.5], [n % 5 / 5, 0.25])]
     probes = [{"force": [0, 0, 8], "at": at}, PRESS]
     made = scene(springs=SOFT, probes=probes, time={"duration": 10.0, "step": 0.005})
-    found = [(grip.probe, grip.turn, grip.turns, grip.moves) for grip in grips(made)]
+    found = [(slot.probe, slot.turn, slot.turns, slot.moves) for slot in probe_slots(made)]
     assert found == [(0, 0, 2, True), (0, 1, 2, True), (1, 0, 1, False)]
-    assert len(grips(with_steps(made, 4))) == 1 + 3, "steps of 0.01 s see two jumps"
+    assert len(probe_slots(with_steps(made, 4))) == 1 + 3, "steps of 0.01 s see two jumps"
     loads = loads_at(made, np.array([0.0104, 0.0204]))
     np.testing.assert_allclose(loads.strength[:, :2, 2], [[8, 0], [0, 8]])
     between = schedule(made, 2, 1)

@@ -13,7 +13,7 @@ from types import SimpleNamespace
 
 import pytest
 
-from taichi_msm import runtime
+from taichi_msm.system import runtime
 from tests.scenes import SMALL
 
 pytestmark = pytest.mark.skipif(not Path("/dev/full").exists(), reason="needs a shell and a device that is always full")

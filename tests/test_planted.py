@@ -13,16 +13,26 @@ import numpy as np
 import pytest
 
 from taichi_msm.errors import FilesError
-from taichi_msm.files import ResultWriter
-from taichi_msm.plan import read_plan
-from taichi_msm.publication import PLAN, is_unfinished
+from taichi_msm.results.manifest import read_manifest
+from taichi_msm.results.publication import MANIFEST, is_unfinished
+from taichi_msm.results.writer import ResultWriter
 from taichi_msm.scene import Scene
 from tests.scenes import scene, speckle
 
 pytestmark = pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="needs links and pipes")
 
 # Everything that a run might reach beyond its folder.
-TREASURE = ["notes.txt", "0000.png", "plan.json", "positions", "state.npz", "run.json", "lock", "new/a.txt", "draft"]
+TREASURE = [
+    "notes.txt",
+    "0000.png",
+    "manifest.json",
+    "positions",
+    "state.npz",
+    "run.json",
+    "lock",
+    "new/a.txt",
+    "draft",
+]
 
 Plant = Callable[[Path, Path], None]
 
@@ -110,9 +120,18 @@ PLANTED = {
     "the new frames lead elsewhere": (link(".partial/new/frames"), ".partial/new/frames: a symbolic link"),
     "unknown link beside them": (link(".partial/x"), ".partial/x: a symbolic link"),
     "the checkpoint leads elsewhere": (link(".partial/checkpoint"), ".partial/checkpoint: a symbolic link"),
-    "the plan leads elsewhere": (link(".partial/checkpoint/plan.json", "plan.json"), "plan.json: a symbolic link"),
-    "the plan is a pipe": (pipe(".partial/checkpoint/plan.json"), "checkpoint/plan.json: a pipe or a device"),
-    "the plan is a device": (device(".partial/checkpoint/plan.json"), "checkpoint/plan.json: a pipe or a device"),
+    "the manifest leads elsewhere": (
+        link(".partial/checkpoint/manifest.json", "manifest.json"),
+        "manifest.json: a symbolic link",
+    ),
+    "the manifest is a pipe": (
+        pipe(".partial/checkpoint/manifest.json"),
+        "checkpoint/manifest.json: a pipe or a device",
+    ),
+    "the manifest is a device": (
+        device(".partial/checkpoint/manifest.json"),
+        "checkpoint/manifest.json: a pipe or a device",
+    ),
     "the positions lead elsewhere": (
         link(".partial/checkpoint/positions", "positions"),
         "checkpoint/positions: a symbolic link",
@@ -162,16 +181,16 @@ def test_what_no_run_has_put_there_is_left_alone(case: str, treasure: Path) -> N
         assert (snapshot(treasure), snapshot(out)) == (precious, before)
 
 
-@pytest.mark.parametrize("case", [case for case in PLANTED if "plan" in case or "checkpoint" in case])
+@pytest.mark.parametrize("case", [case for case in PLANTED if "manifest" in case or "checkpoint" in case])
 def test_a_planted_plan_is_not_read(case: str, treasure: Path) -> None:
     out = treasure.parent / "out"
     PLANTED[case][0](out, treasure)
     assert not is_unfinished(out)
     with pytest.raises(FilesError):
-        read_plan(out)
+        read_manifest(out)
 
 
-@pytest.mark.parametrize("name", ["positions", "plan.json", "state.npz"])
+@pytest.mark.parametrize("name", ["positions", "manifest.json", "state.npz"])
 def test_a_checkpoint_whose_file_has_another_name(name: str, treasure: Path) -> None:
     """A hard link to what is elsewhere is not written to."""
     checkpoint = treasure.parent / "out" / ".partial" / "checkpoint"
@@ -219,5 +238,5 @@ def test_the_default_folder_is_not_reached_by_a_link(treasure: Path, monkeypatch
 
 
 def test_a_plan_alone_is_enough_to_be_unfinished(tmp_path: Path) -> None:
-    file(f".partial/checkpoint/{PLAN}")(tmp_path, tmp_path)
+    file(f".partial/checkpoint/{MANIFEST}")(tmp_path, tmp_path)
     assert is_unfinished(tmp_path)

@@ -11,9 +11,9 @@ from pathlib import Path
 import pytest
 
 from taichi_msm.errors import FilesError, ForeignError
-from taichi_msm.folder import Folder, Tree
-from taichi_msm.publication import Publication, is_result
-from taichi_msm.sealed import seal
+from taichi_msm.results.folder import Folder, Tree
+from taichi_msm.results.publication import Publication, is_result
+from taichi_msm.results.sealed import seal
 
 OLD = ["frames/0000.png", "frames/0001.png", "frames/0002.png", "animation.gif", "run.json"]
 NEW = ["frames/0000.png", "frames/0001.png", "frames/0003.png", "trajectory.npz", "run.json"]

@@ -8,9 +8,9 @@ from numpy.typing import NDArray
 from scipy.integrate import solve_ivp
 
 from taichi_msm import reference
-from taichi_msm.lattice import fixed_points, rest_positions
-from taichi_msm.loads import loads_at
-from taichi_msm.stability import step
+from taichi_msm.physics.lattice import fixed_points, rest_positions
+from taichi_msm.physics.loads import loads_at
+from taichi_msm.physics.timestep import step
 from tests.scenes import scene
 
 # A 2 x 2 sheet without springs but virtual ones: four independent oscillators.

@@ -19,12 +19,13 @@ import pytest
 from numpy.typing import NDArray
 from PIL import Image
 
-from taichi_msm import FilesError, dynamics, resume, run, runner
-from taichi_msm.checkpoint import Checkpoint
-from taichi_msm.publication import PLAN, POSITIONS, STATE
-from taichi_msm.runtime import Device
+from taichi_msm import FilesError, resume, run, runner
+from taichi_msm.physics import solver
+from taichi_msm.results.checkpoint import Checkpoint
+from taichi_msm.results.publication import MANIFEST, POSITIONS, STATE
 from taichi_msm.scene import Scene
-from taichi_msm.scene_file import load_scene
+from taichi_msm.scenefile.load import load_scene
+from taichi_msm.system.runtime import Device
 from tests.outputs import files, results
 from tests.scenes import speckle
 
@@ -79,10 +80,10 @@ def test_a_run_that_is_interrupted_goes_on_to_the_same_bits(
     output: str, small: Path, device: Device, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Again and again, at a frame's end and within one, and while earlier frames are drawn anew."""
-    monkeypatch.setattr(dynamics, "MAX_STEPS_PER_LAUNCH", 300)
+    monkeypatch.setattr(solver, "MAX_STEPS_PER_LAUNCH", 300)
     made = dragged("time.duration=0.12", f"output=[{output}]")
-    whole = run(made, "whole", threads=device.threads)
-    record = run(made, "parts", threads=device.threads, progress=Stop(5))
+    whole = run(made, "whole", threads=device.threads, estimate_error=False)
+    record = run(made, "parts", threads=device.threads, estimate_error=False, progress=Stop(5))
     steps = []
     for after in range(4, 40, 4):
         assert record["status"] == "interrupted"
@@ -90,7 +91,7 @@ def test_a_run_that_is_interrupted_goes_on_to_the_same_bits(
             steps.append(int(state["steps"]))
         before = published(small / "parts")
         try:
-            # From another directory: what the plan names is found all the same.
+            # From another directory: what the manifest names is found all the same.
             monkeypatch.chdir(small / "whole")
             record = resume("../parts", threads=device.threads, progress=Stop(after))
         except KeyboardInterrupt:
@@ -139,7 +140,7 @@ def test_a_run_that_finds_the_disk_full_goes_on_when_it_is_not(
             run(made, "parts", threads=device.threads)
     left = files(small / "parts")
     assert {name: left[name] for name in earlier} == earlier
-    assert sorted(set(left) - set(earlier)) == [f".partial/checkpoint/{name}" for name in (PLAN, POSITIONS, STATE)]
+    assert sorted(set(left) - set(earlier)) == [f".partial/checkpoint/{name}" for name in (MANIFEST, POSITIONS, STATE)]
     assert 0 < resume("parts", threads=device.threads)["resumed"] <= 6
     assert results(small / "parts") == results(small / "whole")
 
@@ -181,11 +182,11 @@ def array() -> bytes:
 @pytest.mark.parametrize(
     ("name", "damage"),
     [
-        (PLAN, lambda data: data[: len(data) // 2]),
-        (PLAN, lambda data: b"[]"),
-        (PLAN, lambda data: data.replace(b'"rows"', b'"sheep"').replace(b'"points"', b'"sheep"')),
+        (MANIFEST, lambda data: data[: len(data) // 2]),
+        (MANIFEST, lambda data: b"[]"),
+        (MANIFEST, lambda data: data.replace(b'"rows"', b'"sheep"').replace(b'"points"', b'"sheep"')),
         (STATE, lambda data: data[: len(data) // 2]),
-        (PLAN, lambda data: b"[" * 100_000),
+        (MANIFEST, lambda data: b"[" * 100_000),
         (STATE, lambda data: b"nothing like it"),
         (STATE, lambda data: b""),
         (STATE, lambda data: array()),
@@ -254,7 +255,7 @@ def test_a_run_that_is_killed_at_any_moment_goes_on_to_the_same_bits(kills: int,
         shutil.rmtree(small / "parts", ignore_errors=True)
         going = True
         while going:
-            begun = (checkpoint_in(small / "parts") / PLAN).exists()
+            begun = (checkpoint_in(small / "parts") / MANIFEST).exists()
             # Mostly while it works, which it begins after half of the time, and else at its start or end.
             seconds = whole * random.uniform(0.4, 1.1) if done < kills else 100
             going = killed(["--resume", "parts"] if begun else [*begin, "parts"], seconds)

@@ -11,18 +11,18 @@ from typing import Any
 
 import pytest
 
-from taichi_msm import runtime
-from taichi_msm.drawing import Drawing
-from taichi_msm.dynamics import Dynamics
-from taichi_msm.lattice import rest_positions
+from taichi_msm.physics.lattice import rest_positions
+from taichi_msm.physics.solver import Dynamics
+from taichi_msm.render.rasterizer import Drawing
+from taichi_msm.system import runtime
 from tests.scenes import SHEET, scene, speckle
 
 # Start, make every thread of the pool work, and tell of each thread its processor time [ticks] and its cores.
 WORK = """
 import json, os
 from pathlib import Path
-from taichi_msm import runtime
-from taichi_msm.runtime import ITERATIONS_PER_THREAD, ti
+from taichi_msm.system import runtime
+from taichi_msm.system.runtime import ITERATIONS_PER_THREAD, ti
 
 tasks = runtime.start().threads
 sums = ti.field(ti.f64, tasks)

@@ -17,16 +17,16 @@ from PIL import Image
 
 from taichi_msm import load_scene, run
 from taichi_msm.errors import FilesError, SceneError
-from taichi_msm.lattice import rest_positions
-from taichi_msm.live import album
-from taichi_msm.live import session as live_session
-from taichi_msm.live.album import Album
-from taichi_msm.live.events import KEYS, Drag, Event, Harder, Key, Percent, Press, Release, Turn
-from taichi_msm.live.record import record
-from taichi_msm.live.session import Session, with_live_frames
-from taichi_msm.loads import schedule
-from taichi_msm.runtime import Device
-from taichi_msm.stability import steps_per_frame
+from taichi_msm.physics.lattice import rest_positions
+from taichi_msm.physics.loads import schedule
+from taichi_msm.physics.timestep import steps_per_frame
+from taichi_msm.system.runtime import Device
+from taichi_msm.viewer import captures
+from taichi_msm.viewer import session as live_session
+from taichi_msm.viewer.captures import Captures
+from taichi_msm.viewer.events import KEYS, Drag, Event, Harder, Key, Percent, Press, Release, Turn
+from taichi_msm.viewer.recorder import record
+from taichi_msm.viewer.session import Session, with_live_frames
 from tests.outputs import duration
 
 # small.yaml with a force that dimples it as tissue, and a camera that sees it tilted.
@@ -48,12 +48,12 @@ Begin = Callable[..., Session]
 
 @pytest.fixture
 def begin(small: Path, device: Device) -> Iterator[Begin]:
-    """Begin a session with small.yaml; what it keeps goes to ./album."""
+    """Begin a session with small.yaml; what it keeps goes to ./captures."""
     with ExitStack() as stack:
 
         def begin(overrides: dict[str, Any] | None = None, **options: Any) -> Session:
             scene = load_scene("small.yaml", overrides or {})
-            return stack.enter_context(Session(scene, Album(Path("album"), "small.yaml"), threads=2, **options))
+            return stack.enter_context(Session(scene, Captures(Path("captures"), "small.yaml"), threads=2, **options))
 
         yield begin
 
@@ -73,7 +73,7 @@ def displacement(session: Session) -> np.ndarray:
 
 def pixel_of(session: Session, row: int, col: int) -> tuple[float, float]:
     """The pixel at which a mass point is seen now."""
-    x, y, w, _ = session.stage.view.matrix @ [*session.positions()[row, col].astype(float), 1]
+    x, y, w, _ = session.viewport.view.matrix @ [*session.positions()[row, col].astype(float), 1]
     return round(x / w - 0.5), round(y / w - 0.5)
 
 
@@ -166,7 +166,7 @@ def test_run_repeats_a_session_to_the_bit(overrides: dict[str, Any], play: bool,
             session.picture()
     assert session.frame == 48, "paused for two"
     session.handle(Key("w"))
-    written = Path("album/session-1.yaml")
+    written = Path("captures/session-1.yaml")
     assert session.notice == f"saved {written}"
     record = run(load_scene(written, {"output": ["trajectory"]}), "again", threads=2)
     assert record["status"] == "complete"
@@ -274,9 +274,9 @@ def test_turning_follows_the_pointer(begin: Begin) -> None:
     near = pixel_of(session, 20, 12)
     session.handle(Turn(10, 0))
     assert pixel_of(session, 20, 12)[0] > near[0] + 2
-    before = session.stage.view.toward[2]
+    before = session.viewport.view.toward[2]
     session.handle(Turn(0, 10))
-    assert session.stage.view.toward[2] > before, "pushed down, the sheet shows more of its face"
+    assert session.viewport.view.toward[2] > before, "pushed down, the sheet shows more of its face"
 
 
 def test_a_press_beside_the_sheet_says_so(begin: Begin) -> None:
@@ -303,23 +303,23 @@ def test_what_is_kept_has_a_name_of_its_own(begin: Begin) -> None:
             session.picture()
         session.handle(Key("g"))
         session.handle(Key("w"))
-    kept = sorted(path.name for path in Path("album").iterdir())
+    kept = sorted(path.name for path in Path("captures").iterdir())
     assert kept == [
         *("film-1.gif", "film-2.gif", "picture-1.png", "picture-2.png", "session-1.yaml", "session-2.yaml"),
         "speckle.png",
     ]
-    with Image.open("album/picture-1.png") as image:
+    with Image.open("captures/picture-1.png") as image:
         assert image.size == (120, 100)
-    assert load_scene("album/session-2.yaml").time.duration == pytest.approx(10 / session.rate)
+    assert load_scene("captures/session-2.yaml").time.duration == pytest.approx(10 / session.rate)
 
 
 def test_another_picture_of_the_same_name_stays(begin: Begin) -> None:
-    Path("album").mkdir()
-    Path("album/speckle.png").write_bytes(b"mine")
+    Path("captures").mkdir()
+    Path("captures/speckle.png").write_bytes(b"mine")
     session = begin()
     session.handle(Key("w"))
-    assert Path("album/speckle.png").read_bytes() == b"mine"
-    assert load_scene("album/session-1.yaml").image == "album/speckle-2.png"
+    assert Path("captures/speckle.png").read_bytes() == b"mine"
+    assert load_scene("captures/session-1.yaml").image == "captures/speckle-2.png"
 
 
 def test_a_film_shows_as_much_time_as_went_by(begin: Begin) -> None:
@@ -333,7 +333,9 @@ def test_a_film_shows_as_much_time_as_went_by(begin: Begin) -> None:
         session.handle(Harder(-5))
         session.picture()
     session.close()
-    assert duration("album/film-1.gif") == 1300, "from the first picture, 1.2 s to the last one, and that one's tenth"
+    assert duration("captures/film-1.gif") == 1300, (
+        "from the first picture, 1.2 s to the last one, and that one's tenth"
+    )
 
 
 def test_a_film_begins_when_it_is_begun(begin: Begin) -> None:
@@ -344,7 +346,7 @@ def test_a_film_begins_when_it_is_begun(begin: Begin) -> None:
         advance(session, 6)
         session.picture()
     session.handle(Key("g"))
-    assert duration("album/film-1.gif") == 500
+    assert duration("captures/film-1.gif") == 500
 
 
 def test_a_film_without_a_picture_is_none(begin: Begin) -> None:
@@ -352,7 +354,7 @@ def test_a_film_without_a_picture_is_none(begin: Begin) -> None:
     session.handle(Key("g"))
     session.handle(Key("g"))
     assert session.notice == "the film had no picture yet"
-    assert list(Path("album").iterdir()) == []
+    assert list(Path("captures").iterdir()) == []
 
 
 def test_a_film_that_cannot_go_on_ends_and_the_session_goes_on(begin: Begin) -> None:
@@ -366,12 +368,12 @@ def test_a_film_that_cannot_go_on_ends_and_the_session_goes_on(begin: Begin) -> 
         if session.notice:
             break
         time.sleep(0.05)
-    assert session.notice.startswith("album: cannot write: ")
-    assert list(Path("album").iterdir()) == []
+    assert session.notice.startswith("captures: cannot write: ")
+    assert list(Path("captures").iterdir()) == []
     session.handle(Key("g"))
     session.picture()
     session.handle(Key("g"))
-    assert session.notice == "saved album/film-1.gif"
+    assert session.notice == "saved captures/film-1.gif"
 
 
 def test_a_film_shows_the_tissue_alone(begin: Begin) -> None:
@@ -381,17 +383,17 @@ def test_a_film_shows_the_tissue_alone(begin: Begin) -> None:
     shown = session.picture()
     session.handle(Key("g"))
     session.handle(Key("p"))
-    with Image.open("album/picture-1.png") as image:
+    with Image.open("captures/picture-1.png") as image:
         alone = np.array(image)
     assert (shown != alone).any()
-    with Image.open("album/film-1.gif") as film:
+    with Image.open("captures/film-1.gif") as film:
         # As near as 256 colours are.
         assert np.abs(np.array(film.convert("RGB")).astype(int) - alone).mean() < 8
     assert np.abs(shown.astype(int) - alone).mean() > 15
 
 
 def test_a_session_too_long_for_a_file_says_so_before(begin: Begin, monkeypatch: pytest.MonkeyPatch) -> None:
-    for module in (live_session, album):
+    for module in (live_session, captures):
         monkeypatch.setattr(module, "MAX_NODES", 1100)
     session = begin(TILTED)
     session.handle(Press(60, 50))
@@ -404,10 +406,10 @@ def test_a_session_too_long_for_a_file_says_so_before(begin: Begin, monkeypatch:
     assert sum(notice != "" for notice in told) <= 160, "once"
     with pytest.raises(FilesError, match=r"^this session is too long for the file of a scene; reset it, and do less$"):
         session.handle(Key("w"))
-    assert list(Path("album").iterdir()) == [Path("album/speckle.png")]
+    assert list(Path("captures").iterdir()) == [Path("captures/speckle.png")]
     session.handle(Key("r"))
     session.handle(Key("w"))
-    assert load_scene("album/session-1.yaml").time.duration == pytest.approx(1 / session.rate)
+    assert load_scene("captures/session-1.yaml").time.duration == pytest.approx(1 / session.rate)
 
 
 def test_a_film_ends_where_the_session_diverges(begin: Begin) -> None:
@@ -426,11 +428,11 @@ def test_two_albums_of_one_folder_keep_both_films(begin: Begin) -> None:
         session.picture()
     for session in sessions:
         session.handle(Key("g"))
-    assert sorted(path.name for path in Path("album").iterdir()) == ["film-1.gif", "film-2.gif"]
+    assert sorted(path.name for path in Path("captures").iterdir()) == ["film-1.gif", "film-2.gif"]
 
 
 def test_a_name_of_two_lines_is_one_in_the_comment(small: Path) -> None:
-    keeper = Album(Path("album"), "a\nb: [.yaml")
+    keeper = Captures(Path("captures"), "a\nb: [.yaml")
     assert load_scene(keeper.keep_scene(load_scene("small.yaml"))).sheet == load_scene("small.yaml").sheet
 
 
@@ -448,12 +450,12 @@ def test_a_sheet_that_nothing_holds_may_fly_after_a_press(begin: Begin) -> None:
 
 
 def test_what_cannot_be_kept_is_told_and_nothing_is_lost(begin: Begin) -> None:
-    Path("album").write_text("no folder")
+    Path("captures").write_text("no folder")
     session = begin(TILTED)
     session.handle(Press(60, 50))
     advance(session, 5)
     for key in "pgw":
-        with pytest.raises(FilesError, match=r"^album: cannot write: .*; choose another --out$"):
+        with pytest.raises(FilesError, match=r"^captures: cannot write: .*; choose another --out$"):
             session.handle(Key(key))
     advance(session, 5)
     assert session.frame == 10
@@ -470,8 +472,8 @@ def test_a_session_that_diverged_says_so_and_can_be_reset(begin: Begin) -> None:
     advance(session, 3)
     assert session.frame == frame
     session.handle(Key("w"))
-    assert session.notice == "saved album/session-1.yaml"
-    again = run(load_scene("album/session-1.yaml", {"output": []}), "again", threads=2)
+    assert session.notice == "saved captures/session-1.yaml"
+    again = run(load_scene("captures/session-1.yaml", {"output": []}), "again", threads=2)
     assert again["status"] == "diverged", "what goes wrong goes wrong again"
     session.handle(Key("r"))
     assert session.fault == ""

@@ -6,8 +6,9 @@ import numpy as np
 import pytest
 
 import taichi_msm
-from taichi_msm import DivergedError, MsmError, Simulation, reference, runner, runtime
-from taichi_msm.runtime import Device
+from taichi_msm import DivergedError, MsmError, Simulation, reference, runner
+from taichi_msm.system import runtime
+from taichi_msm.system.runtime import Device
 from tests.scenes import scene, speckle
 
 
@@ -24,7 +25,7 @@ def test_frames_positions_and_pictures(device: Device) -> None:
         assert (apart > 1).mean() < 0.01
         simulation.advance(0)
         assert simulation.frame == 3
-    assert simulation.course.max_displacement == pytest.approx(np.linalg.norm(twin[:4] - twin[0], axis=-1).max())
+    assert simulation.progress.max_displacement == pytest.approx(np.linalg.norm(twin[:4] - twin[0], axis=-1).max())
 
 
 def test_positions_of_a_frame_stay_as_they_were(device: Device) -> None:

@@ -7,8 +7,9 @@ import numpy as np
 import pytest
 
 from taichi_msm import reference
-from taichi_msm.lattice import rest_positions
-from taichi_msm.stability import highest_frequency, problems, stable_step, step, steps_per_frame
+from taichi_msm.physics import workload
+from taichi_msm.physics.lattice import rest_positions
+from taichi_msm.physics.timestep import highest_frequency, problems, stable_step, step, steps_per_frame
 from tests.scenes import SHEET, scene
 
 
@@ -84,7 +85,7 @@ def test_what_f32_cannot_hold_is_refused(said: str, changes: dict[str, Any]) -> 
     sections = {"sheet": {**SHEET, "points": [11, 11], **changes}, "springs": {"structural": 3.0}}
     sections |= {"time": {"frames_per_second": 1e3, "step": 1e-3}} if "mass" in changes else {}
     single = scene(**sections | {"time": {**sections.get("time", {}), "precision": "f32"}})
-    (problem,) = problems(single)
+    (problem,) = workload.problems(single)
     assert str(problem).startswith(said)
     assert "f64" in str(problem)
-    assert not list(problems(scene(**sections)))
+    assert not list(workload.problems(scene(**sections)))

@@ -10,16 +10,16 @@ import pytest
 from pydantic import BaseModel
 
 from taichi_msm import reference
-from taichi_msm.dynamics import structure
-from taichi_msm.lattice import rest_positions
-from taichi_msm.runtime import Device
-from taichi_msm.stability import stable_step, step, steps_per_frame, with_time
+from taichi_msm.physics.lattice import rest_positions
+from taichi_msm.physics.solver import structure
+from taichi_msm.physics.timestep import stable_step, step, steps_per_frame, with_time
 from taichi_msm.study import pictures
 from taichi_msm.study.peer import TooSlowError, solve
 from taichi_msm.study.pictures import PictureStudy
 from taichi_msm.study.result import Drawn, Stepping, Study, Timing
 from taichi_msm.study.stepping import MARGIN, ROUNDS, SteppingStudy, observed_orders
 from taichi_msm.study.terms import TermStudy, variants
+from taichi_msm.system.runtime import Device
 from tests.scenes import PRESS, SPRINGS, scene, speckle
 
 SOFT_PRESS = {**PRESS, "force": [0, 300, -1000]}
@@ -152,7 +152,7 @@ def test_terms_are_left_out_of_the_kernel(device: Device) -> None:
     assert not shapes["springs.shear"].shear
     assert not shapes["springs.virtual"].virtual
     assert not shapes["damping"].damped
-    assert len(shapes["probes.1"].grips) == 1
+    assert len(shapes["probes.1"].slots_move) == 1
     assert {steps_per_frame(variant) for _, variant in variants(made)} == {steps_per_frame(made)}
     assert list(dict(variants(scene(springs={}, damping=0, probes=[])))) == [""]
 

@@ -12,8 +12,8 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from taichi_msm.errors import SceneError
+from taichi_msm.render.texture import load_texture, problems, texture_size
 from taichi_msm.scene import Scene
-from taichi_msm.texture import load_texture, problems, texture_size
 from tests.scenes import speckle
 
 BACKGROUND = (10, 20, 30)

@@ -5,10 +5,10 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from taichi_msm.live.tool import RISE, Tool
-from taichi_msm.loads import Schedule, schedule
+from taichi_msm.physics.loads import Schedule, schedule
+from taichi_msm.physics.timestep import steps_per_frame
 from taichi_msm.scene import Probe, Scene
-from taichi_msm.stability import steps_per_frame
+from taichi_msm.viewer.tool import RISE, Tool
 from tests.scenes import scene
 
 RATE = 50.0

@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from taichi_msm.runtime import Device, our_compilation, ti
+from taichi_msm.system.runtime import Device, our_compilation, ti
 
 NUMBERS, WHOLE = 27, 6
 

@@ -21,14 +21,14 @@ from PIL import Image
 from taichi_msm import load_scene
 from taichi_msm.cli import main
 from taichi_msm.errors import SceneError
-from taichi_msm.folder import Folder
-from taichi_msm.live.events import Drag, Harder, Key, Percent, Press, Release, Turn
-from taichi_msm.live.film import Film
-from taichi_msm.live.pace import LONGEST, Pace
-from taichi_msm.live.script import load_script, timed
-from taichi_msm.live.window import QUIT, Hand
-from taichi_msm.runtime import ti
+from taichi_msm.results.folder import Folder
 from taichi_msm.scene import Scene
+from taichi_msm.system.runtime import ti
+from taichi_msm.viewer.events import Drag, Harder, Key, Percent, Press, Release, Turn
+from taichi_msm.viewer.film import Film
+from taichi_msm.viewer.pacing import LONGEST, Pacing
+from taichi_msm.viewer.script import load_script, timed
+from taichi_msm.viewer.window import QUIT, Hand
 from tests.conftest import Program
 from tests.outputs import duration
 
@@ -326,14 +326,14 @@ class Clock:
 
 def shown(clock: Clock, stepping: float, drawing: float, seconds: float) -> tuple[int, str]:
     """Let a machine that needs so long for a frame and a picture work for some time; the frames, and what is said."""
-    pace, frames = Pace(50.0, clock), 0
+    pacing, frames = Pacing(50.0, clock), 0
     while clock.now < seconds:
-        clock.now += pace.wait()
-        for _ in pace.due():
+        clock.now += pacing.wait()
+        for _ in pacing.due():
             clock.now += stepping
             frames += 1
         clock.now += drawing
-    return frames, pace.said()
+    return frames, pacing.said()
 
 
 @pytest.mark.parametrize(
@@ -355,9 +355,9 @@ def test_time_goes_as_fast_as_it_does_outside(stepping: float, drawing: float, f
 
 def test_what_was_missed_is_not_made_up_for() -> None:
     clock = Clock()
-    pace = Pace(50.0, clock)
+    pacing = Pacing(50.0, clock)
     clock.now = 60.0
-    assert len(list(pace.due())) <= LONGEST * 50 + 1
+    assert len(list(pacing.due())) <= LONGEST * 50 + 1
 
 
 @pytest.fixture

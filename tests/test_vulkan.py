@@ -13,8 +13,8 @@ import pytest
 from PIL import Image
 
 from taichi_msm import run
-from taichi_msm.runtime import Device
-from taichi_msm.scene_file import load_scene
+from taichi_msm.scenefile.load import load_scene
+from taichi_msm.system.runtime import Device
 from tests.outputs import results
 
 DRIVERS = sorted(Path("/usr/share/vulkan/icd.d").glob("lvp_icd*.json"))
@@ -31,7 +31,8 @@ SETTINGS = [
 # A run, one that is interrupted and resumed, and one that diverges, in one process.
 RUNS = """
 import json, sys
-from taichi_msm import diagnosis, load_scene, resume, run
+from taichi_msm.physics import diagnosis
+from taichi_msm import load_scene, resume, run
 from tests.test_resume import Stop
 
 # Finer steps, of which none goes well, take long here.

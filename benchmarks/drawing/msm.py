@@ -6,8 +6,8 @@ from dataclasses import replace
 
 from benchmarks.drawing.problem import Artist, Problem
 from benchmarks.process import vector_bits
-from taichi_msm import runtime
-from taichi_msm.drawing import Drawing, structure
+from taichi_msm.render.rasterizer import Drawing, structure
+from taichi_msm.system import runtime
 
 
 def prepare(problem: Problem, threads: int | None) -> Artist:

@@ -15,9 +15,9 @@ from numpy.typing import NDArray
 
 from benchmarks.process import CACHE, ROOT
 from taichi_msm import reference
-from taichi_msm.lattice import rest_positions
+from taichi_msm.physics.lattice import rest_positions
+from taichi_msm.render.texture import load_texture
 from taichi_msm.scene import Scene
-from taichi_msm.texture import load_texture
 
 POINTS, SIDE = 31, 0.33
 

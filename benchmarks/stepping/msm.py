@@ -6,8 +6,8 @@ from dataclasses import replace
 
 from benchmarks.process import vector_bits
 from benchmarks.stepping.problem import Problem, Stepper
-from taichi_msm import runtime
-from taichi_msm.dynamics import Dynamics, structure
+from taichi_msm.physics.solver import Dynamics, structure
+from taichi_msm.system import runtime
 
 
 def prepare(problem: Problem, threads: int | None) -> Stepper:

@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 from benchmarks.stepping.problem import Problem, Stepper
-from taichi_msm import runtime
-from taichi_msm.dynamics import Dynamics
-from taichi_msm.stability import with_time
+from taichi_msm.physics.solver import Dynamics
+from taichi_msm.physics.timestep import with_time
+from taichi_msm.system import runtime
 
 
 def prepare(problem: Problem, threads: int | None) -> Stepper:

@@ -5,7 +5,7 @@
 import taichi as ti
 
 from benchmarks.stepping.problem import Array, Problem, Stepper
-from taichi_msm.lattice import springs
+from taichi_msm.physics.lattice import springs
 
 
 class PlainTaichi:

@@ -21,10 +21,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from taichi_msm import reference
-from taichi_msm.lattice import Spring, springs
-from taichi_msm.loads import decay, grips
+from taichi_msm.physics.lattice import Spring, springs
+from taichi_msm.physics.loads import decay, probe_slots
+from taichi_msm.physics.timestep import step
 from taichi_msm.scene import Scene
-from taichi_msm.stability import step
 
 CELL = 0.01
 FORCE = (0.02, 0.01, -0.08)
@@ -78,7 +78,7 @@ class Problem:
     @cached_property
     def load(self) -> Array:
         """Force on each point, constant in time [N], shape (3, n, n)."""
-        share = decay(grips(self.scene)[0], self.scene)
+        share = decay(probe_slots(self.scene)[0], self.scene)
         return np.array(FORCE, np.float32)[:, None, None] * share.astype(np.float32)
 
     @property

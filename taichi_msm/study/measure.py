@@ -10,19 +10,20 @@ from dataclasses import dataclass
 from functools import partial
 from typing import Any
 
-from taichi_msm import budget, runtime
 from taichi_msm.errors import SceneError
-from taichi_msm.lattice import rest_positions
+from taichi_msm.physics.lattice import rest_positions
+from taichi_msm.physics.timestep import with_time
+from taichi_msm.render.texture import load_texture
 from taichi_msm.runner import versions
-from taichi_msm.runtime import Device
 from taichi_msm.scene import Scene
-from taichi_msm.stability import with_time
+from taichi_msm.scenefile import budget
 from taichi_msm.study.peer import TooSlowError, solve
 from taichi_msm.study.pictures import PictureStudy
 from taichi_msm.study.result import Peer, Study, Timing
 from taichi_msm.study.stepping import SteppingStudy, observed_orders
 from taichi_msm.study.terms import TermStudy
-from taichi_msm.texture import load_texture
+from taichi_msm.system import runtime
+from taichi_msm.system.runtime import Device
 
 TOLERANCE = 1e-3
 

@@ -10,8 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from taichi_msm import reference
-from taichi_msm.lattice import fixed_points
-from taichi_msm.loads import Schedule, key_times, loads_at
+from taichi_msm.physics.lattice import fixed_points
+from taichi_msm.physics.loads import Schedule, key_times, loads_at
 from taichi_msm.scene import Scene
 
 # Loads are read this far inside a piece between two keys, as a fraction of it: at its ends they may jump.

@@ -12,9 +12,9 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import BaseModel
 
-from taichi_msm import budget
-from taichi_msm.drawing import Drawing
+from taichi_msm.render.rasterizer import Drawing
 from taichi_msm.scene import Scene
+from taichi_msm.scenefile import budget
 from taichi_msm.study.result import Drawn, Timing
 
 REFINES = (0, 1, 2, 5, 10, 20)

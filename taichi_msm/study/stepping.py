@@ -12,13 +12,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from taichi_msm.accuracy import longest
-from taichi_msm.divergence import farthest_displacement
-from taichi_msm.dynamics import Dynamics
-from taichi_msm.runtime import Device
+from taichi_msm.physics.divergence import farthest_displacement
+from taichi_msm.physics.error_control import longest
+from taichi_msm.physics.solver import Dynamics
+from taichi_msm.physics.timestep import stable_step, step, with_steps, with_time
 from taichi_msm.scene import Scene
-from taichi_msm.stability import stable_step, step, with_steps, with_time
 from taichi_msm.study.result import Reference, Stepping, Timing
+from taichi_msm.system.runtime import Device
 
 PRECISIONS = ("f64", "f32")
 DIFFERENCES = ("central", "backward")
@@ -199,10 +199,7 @@ def observed_orders(points: list[Stepping]) -> dict[str, float | None]:
         fit = [
             (math.log(point.step), math.log(point.error))
             for point in points
-            if point.method == method
-            and point.error
-            and point.known
-            and (point.rounding or 0) < point.error / 10
+            if point.method == method and point.error and point.known and (point.rounding or 0) < point.error / 10
         ]
         steps, errors = np.array(fit).reshape(-1, 2).T
         orders[method] = float(np.polyfit(steps, errors, 1)[0]) if len(fit) > 2 else None

@@ -6,11 +6,11 @@ import time
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack
 
-from taichi_msm.dynamics import Dynamics
-from taichi_msm.runtime import Device
+from taichi_msm.physics.solver import Dynamics
+from taichi_msm.physics.timestep import steps_per_frame, with_steps
 from taichi_msm.scene import Scene
-from taichi_msm.stability import steps_per_frame, with_steps
 from taichi_msm.study.result import Term, Timing
+from taichi_msm.system.runtime import Device
 
 ROUNDS = 9
 

@@ -1,0 +1,88 @@
+"""Draw the layers of the package and the imports between them, read from the source.
+
+    PYTHONPATH=. python docs/make_architecture.py
+
+writes docs/images/architecture.png.
+"""
+
+from __future__ import annotations
+
+import sys
+from collections import Counter
+from pathlib import Path
+
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
+from matplotlib.patches import FancyArrowPatch, FancyBboxPatch
+
+from taichi_msm.study.plot import BLUE, DPI, GREY, INK
+
+ROOT = Path(__file__).parent.parent
+sys.path.insert(0, str(ROOT))
+
+from tests.test_architecture import LAYERS, MODULES, imports, module_name  # noqa: E402
+
+# What a person calls or reads; __init__ and __main__ only lead there.
+SHOWN = [[name for name in sorted(layer) if not name.startswith("__")] for layer in LAYERS]
+WIDTH, HEIGHT, GAP = 1.7, 0.62, 1.12
+
+
+def arrows() -> Counter[tuple[str, str]]:
+    """Count the imports from a module or package to another."""
+    found: Counter[tuple[str, str]] = Counter()
+    for path in MODULES:
+        own = module_name(path).split(".")[0]
+        found.update((own, other) for name in imports(path) if (other := name.split(".")[0]) != own)
+    return found
+
+
+def main() -> None:
+    """Draw."""
+    layers = [layer for layer in SHOWN if layer]
+    place = {
+        name: (2.3 * (column - (len(layer) - 1) / 2), GAP * level)
+        for level, layer in enumerate(layers)
+        for column, name in enumerate(layer)
+    }
+    figure = Figure(figsize=(7.2, 8.4), dpi=DPI, layout="constrained")
+    FigureCanvasAgg(figure)
+    axes = figure.subplots()
+    axes.set_axis_off()
+    axes.set_xlim(-3.4, 3.4)
+    axes.set_ylim(-0.6, GAP * (len(layers) - 1) + 0.6)
+    for (upper, lower), count in arrows().items():
+        if upper in place and lower in place:
+            (x, y), (to_x, to_y) = place[upper], place[lower]
+            bend = 0.0 if abs(x - to_x) > 0.1 or y - to_y < 1.5 * GAP else 0.25
+            arrow = FancyArrowPatch(
+                (x, y - HEIGHT / 2),
+                (to_x, to_y + HEIGHT / 2),
+                connectionstyle=f"arc3,rad={bend}",
+                arrowstyle="-|>",
+                mutation_scale=9,
+                linewidth=0.6 + 0.12 * min(count, 12),
+                color=GREY,
+                alpha=0.75,
+            )
+            axes.add_patch(arrow)
+    packages = {path.parent.name for path in MODULES if path.name == "__init__.py"}
+    for name, (x, y) in place.items():
+        filled = name in packages
+        box = FancyBboxPatch(
+            (x - WIDTH / 2, y - HEIGHT / 2),
+            WIDTH,
+            HEIGHT,
+            boxstyle="round,pad=0,rounding_size=0.08",
+            facecolor=BLUE if filled else "white",
+            edgecolor=BLUE,
+            linewidth=1.2,
+            zorder=3,
+        )
+        axes.add_patch(box)
+        text = f"{name}/" if filled else f"{name}.py"
+        axes.text(x, y, text, ha="center", va="center", color="white" if filled else INK, fontsize=10, zorder=4)
+    figure.savefig(ROOT / "docs" / "images" / "architecture.png", format="png")
+
+
+if __name__ == "__main__":
+    main()

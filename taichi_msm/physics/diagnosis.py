@@ -1,0 +1,128 @@
+"""Why a run went wrong, and which step would have gone right: it is repeated, and tried with finer steps."""
+
+from __future__ import annotations
+
+import math
+import time
+from dataclasses import dataclass
+
+import numpy as np
+
+from taichi_msm.physics.divergence import Watch, farthest
+from taichi_msm.physics.lattice import axes
+from taichi_msm.physics.loads import control_points
+from taichi_msm.physics.run_progress import RunProgress, Saved
+from taichi_msm.physics.solver import Dynamics, Pause
+from taichi_msm.physics.timestep import step, steps_per_frame, with_steps
+from taichi_msm.scene import Scene
+
+# How much finer the steps are that are tried, and how long that may take in all [s].
+CUTS = (2, 4, 8, 16, 32, 64)
+MOST_SECONDS = 10.0
+
+
+@dataclass(frozen=True)
+class Diagnosis:
+    """What is found about a divergence.
+
+    Attributes:
+        message: the time, the step, the point, the key that most likely did it and the remedy.
+        good: where the run was when it was fine for the last time; None: nothing is known but the start.
+    """
+
+    message: str
+    good: Saved | None
+
+
+def diagnose(dynamics: Dynamics, start: Saved | None, pause: Pause) -> Diagnosis:
+    """Find out how a run went wrong in the frame at whose end, or within which, it is.
+
+    Args:
+        dynamics: of the run; where it is afterwards is of no use.
+        start: where the run was when it was fine; None: at rest.
+        pause: called often; what it raises stops the search.
+    """
+    scene, bad = dynamics.scene, dynamics.steps_done
+    state, progress = start or (None, RunProgress())
+    per_frame, watch = steps_per_frame(scene), Watch(scene, progress)
+    dynamics.restart(scene, state)
+    low, wrong = dynamics.state(), ""
+    while low.steps < bad:
+        dynamics.advance(min(bad, (watch.progress.frame + 1) * per_frame) - low.steps, pause)
+        wrong = watch.follow(dynamics, dynamics.displacement())
+        if wrong:
+            break
+        low = dynamics.state()
+    if not wrong:
+        said = "but not when it was repeated: this machine makes errors; go on with --resume"
+        return Diagnosis(f"diverged before {bad * step(scene):.6g} s, step {bad}, {said}", start)
+    high = dynamics.steps_done
+    while high - low.steps > 1:
+        dynamics.restart(scene, low)
+        dynamics.advance((high - low.steps) // 2, pause)
+        middle = dynamics.state()
+        if watch.judge(dynamics, middle.displacement):
+            high = middle.steps
+        else:
+            low = middle
+    dynamics.restart(scene, low)
+    dynamics.advance(1)
+    displacement = dynamics.displacement()
+    wrong = watch.judge(dynamics, displacement)
+    cause = _cause(dynamics, high, farthest(displacement)[:2], pause)
+    message = f"diverged at {high * step(scene):.6g} s, step {high}: {wrong}; {cause}"
+    return Diagnosis(message, Saved(low, watch.progress))
+
+
+def _cause(dynamics: Dynamics, bad: int, point: tuple[int, int], pause: Pause) -> str:
+    """Name the key that most likely did it: the step, if a finer one goes well, or else a force."""
+    scene = dynamics.scene
+    per_frame = steps_per_frame(scene)
+    frames = -(-bad // per_frame)
+    tried, end = math.inf, time.monotonic() + MOST_SECONDS
+
+    def pause_or_stop() -> None:
+        pause()
+        if time.monotonic() > end:
+            raise TimeoutError
+
+    for cut in CUTS:
+        finer = with_steps(scene, cut * per_frame)
+        try:
+            went_well = _goes_well(dynamics, finer, frames, pause_or_stop)
+        except TimeoutError:
+            break
+        if went_well:
+            return f"likely cause: time.step, {step(scene):.6g} s; with {step(finer):.9g} s it goes well here"
+        tried = step(finer)
+    index, force = _strongest_probe(scene, point)
+    said = f"likely cause: probes.{index}.force, which reaches {force:.3g} N at this point"
+    if tried < math.inf:
+        return f"{said}; take less, as no time.step of {tried:.3g} s or more goes well here"
+    return f"{said}; take less, or a time.step below {step(scene):.6g} s, of which none was tried, as that takes long"
+
+
+def _goes_well(dynamics: Dynamics, scene: Scene, frames: int, pause: Pause) -> bool:
+    """Tell whether so many frames from rest go well."""
+    dynamics.restart(scene)
+    watch = Watch(scene)
+    for _ in range(frames):
+        dynamics.advance(steps_per_frame(scene), pause)
+        if watch.follow(dynamics, dynamics.displacement()):
+            return False
+    return True
+
+
+def _strongest_probe(scene: Scene, point: tuple[int, int]) -> tuple[int, float]:
+    """Find the probe that pushes a point hardest at any time, and how hard [N]."""
+    x, y = axes(scene.sheet)
+    rest = np.array([x[point[1]], y[point[0], 0]])
+
+    def force(index: int) -> float:
+        probe = scene.probes[index]
+        nearest = np.linalg.norm(control_points(probe, scene.sheet)[1] - rest, axis=1).min()
+        most = max(abs(percent) for _, percent in probe.load) / 100 * math.hypot(*probe.force)
+        return float(most * math.exp(-probe.falloff * nearest - probe.offset))
+
+    strongest = max(range(len(scene.probes)), key=force)
+    return strongest, force(strongest)

@@ -1,0 +1,314 @@
+"""How wrong a run is, by a pilot beside it, and the largest step that is right enough.
+
+The error of a displacement u_h is taken against Richardson's extrapolation of runs with steps h and h / r in float64:
+
+    u* = u_{h/r} + (u_{h/r} - u_h) / (r^p - 1)        p: order of the method, r: `refinement`, mostly 2
+
+so that it holds the error of the scene's own precision too. An error is the largest of any point at any frame, over the
+largest displacement of any point at any frame.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from contextlib import ExitStack, closing
+from dataclasses import dataclass
+from functools import partial
+from itertools import pairwise
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from taichi_msm.errors import SceneError
+from taichi_msm.physics.divergence import farthest_displacement
+from taichi_msm.physics.lattice import rest_positions
+from taichi_msm.physics.solver import Dynamics
+from taichi_msm.physics.timestep import step, steps_per_frame, with_steps, with_time
+from taichi_msm.physics.workload import precision, with_precision
+from taichi_msm.scene import LARGEST_TOLERANCE, Scene
+from taichi_msm.system.runtime import Device
+
+# The step found is the largest but for some 10 %: its error is at least this share of the tolerance.
+CLOSE = 0.75
+
+# The pilot runs of one search, and how much finer each may be than the one before.
+MOST_PILOTS = 12
+LARGEST_CUT = 8.0
+
+# How much finer the other pilot may be; where it must be finer yet, the error is not known.
+FINEST = 64
+
+Progress = Callable[[int, int], None]
+
+
+@dataclass(frozen=True)
+class Estimate:
+    """What is known about the error of a step.
+
+    Attributes:
+        steps_per_frame: the step, as a fraction of a frame.
+        error: largest error, as a fraction of the largest displacement; infinite where it is not known, because a
+            pilot diverged or the step does not resolve the damping.
+        rounding: the part of it that comes from f32, that of the positions in the trajectory included; 0 for f64.
+        in_f64: the error of the same step in f64.
+        order: of the method in this scene and at this step.
+    """
+
+    steps_per_frame: int
+    error: float
+    rounding: float
+    in_f64: float
+    order: int
+
+
+def order(scene: Scene) -> int:
+    """Tell the order of the method: 1 with backward differences of a damping, else 2."""
+    return 2 if scene.time.damping_difference == "central" or scene.damping == 0 else 1
+
+
+def estimate_error(scene: Scene, device: Device, progress: Progress = lambda done, total: None) -> Estimate:
+    """Estimate the error of the scene's own step.
+
+    Args:
+        scene: a checked scene.
+        device: what `runtime.start` returned.
+        progress: called with the frames done and the frames in all.
+    """
+    with closing(Trials(with_precision(scene, device.arch), device)) as trials:
+        return trials.estimate(steps_per_frame(scene), progress)
+
+
+def choose_step(scene: Scene, device: Device, progress: Progress = lambda done, total: None) -> tuple[Scene, Estimate]:
+    """Find the largest stable step whose estimated error is within the scene's tolerance.
+
+    Args:
+        scene: a checked scene with a tolerance.
+        device: what `runtime.start` returned.
+        progress: called with the frames done and the frames in all of each pilot run.
+
+    Returns:
+        The scene with that step and the precision it is stepped in, and its error.
+
+    Raises:
+        SceneError: when no step is good enough; says which precision or which tolerance would do.
+    """
+    scene = with_precision(scene, device.arch)
+    assert scene.time.tolerance is not None
+    with closing(Trials(scene, device)) as trials:
+        found = _search(scene.time.tolerance, steps_per_frame(scene), trials, progress)
+    return with_steps(scene, found.steps_per_frame), found
+
+
+def refinement(scene: Scene) -> int:
+    """Tell how much finer the other pilot must be: twice, where steps resolve the damping.
+
+    Where g h / r > 1, central differences make velocities change their sign at every step, in both pilots alike.
+    """
+    g = scene.damping / scene.sheet.mass
+    return max(2, math.ceil(g * step(scene)))
+
+
+class Pilot:
+    """Runs in float64 beside another one that tell its error frame by frame: with finer steps, and with its own.
+
+    Args:
+        scene: what is run, with its step.
+        device: what `runtime.start` returned.
+        cores: how many cores are free for it; None: all. With as many as the run has, nothing is compiled anew.
+
+    Raises:
+        DeviceError: when the device cannot run it in float64.
+    """
+
+    def __init__(self, scene: Scene, device: Device, cores: int | None = None) -> None:
+        exact = with_time(scene, precision="f64")
+        with ExitStack() as opened:
+
+            def dynamics() -> Dynamics:
+                made = Dynamics(exact, device, cores=cores)
+                opened.callback(made.close)
+                return made
+
+            self._fine = dynamics()
+            # What is run in float64 needs no other with its step.
+            self._coarse = None if precision(scene) == "f64" else dynamics()
+            self._open = opened.pop_all()
+        self.restart(scene)
+
+    def restart(self, scene: Scene) -> None:
+        """Begin again beside another run of the same scene, with its step."""
+        self._scene = scene
+        self._steps, self._ratio, self._order = steps_per_frame(scene), refinement(scene), order(scene)
+        exact = with_time(scene, precision="f64")
+        if self._ratio <= FINEST:
+            self._fine.restart(with_steps(exact, self._ratio * self._steps))
+            if self._coarse:
+                self._coarse.restart(with_steps(exact, self._steps))
+        self._error = self._rounding = self._in_f64 = self._largest = 0.0
+
+    def compile(self) -> None:
+        """Compile now what would be compiled by the first frame."""
+        self._fine.compile()
+
+    def follow(self, displacement: NDArray[Any], pause: Callable[[], None]) -> None:
+        """Take the next frame, and compare.
+
+        Args:
+            displacement: of the run at that frame, shape (rows, cols, 3).
+            pause: called some times a second; what it raises stops the pilot for good.
+        """
+        if self._ratio > FINEST:
+            return
+        self._fine.advance(self._ratio * self._steps, pause)
+        if self._coarse:
+            self._coarse.advance(self._steps, pause)
+        fine = self._fine.displacement()
+        coarse = self._coarse.displacement() if self._coarse else displacement
+        with np.errstate(all="ignore"):
+            exact = fine + (fine - coarse) / (self._ratio**self._order - 1)
+            self._error = max(self._error, longest(displacement - exact))
+            self._in_f64 = max(self._in_f64, longest(coarse - exact))
+            self._rounding = max(self._rounding, longest(displacement - coarse))
+            self._largest = max(self._largest, longest(exact))
+
+    @property
+    def estimate(self) -> Estimate:
+        """What is known by the frames so far."""
+        if self._ratio > FINEST:
+            return Estimate(self._steps, math.inf, 0.0, math.inf, self._order)
+        farthest = farthest_displacement(self._scene, self._scene.time.duration)
+
+        def share(part: float) -> float:
+            # Nothing moves, nothing is wrong; and what is not finite is not known.
+            relative = part / self._largest if self._largest > 0 else 0.0
+            return relative if relative < math.inf and self._largest <= farthest else math.inf
+
+        return Estimate(self._steps, share(self._error), share(self._rounding), share(self._in_f64), self._order)
+
+    def close(self) -> None:
+        """Free the memory."""
+        self._open.close()
+
+
+class Trials:
+    """Runs of a scene with one step after another, each with a pilot beside it."""
+
+    def __init__(self, scene: Scene, device: Device) -> None:
+        self._scene = scene
+        with ExitStack() as opened:
+            self._pilot = Pilot(scene, device)
+            opened.callback(self._pilot.close)
+            self._own = Dynamics(scene, device)
+            opened.callback(self._own.close)
+            self._open = opened.pop_all()
+
+    def estimate(self, steps: int, progress: Progress) -> Estimate:
+        """Run the scene with so many steps a frame.
+
+        Args:
+            steps: steps per frame.
+            progress: called with the frames done and the frames in all.
+        """
+        scene = with_steps(self._scene, steps)
+        self._pilot.restart(scene)
+        self._own.restart(scene)
+        frames = scene.time.frames
+        for frame in range(frames if refinement(scene) <= FINEST else 0):
+            pause = partial(progress, frame, frames)
+            pause()
+            self._own.advance(steps, pause)
+            self._pilot.follow(self._as_written(self._own.displacement()), pause)
+        return self._pilot.estimate
+
+    def _as_written(self, displacement: NDArray[Any]) -> NDArray[Any]:
+        """Round as the trajectory does, whose positions in f32 have the digits of the sheet's size."""
+        if "trajectory" not in self._scene.output or precision(self._scene) == "f64":
+            return displacement
+        rest = rest_positions(self._scene.sheet)
+        return (rest + displacement).astype(np.float32) - rest
+
+    def close(self) -> None:
+        """Free the memory."""
+        self._open.close()
+
+
+def longest(vectors: NDArray[Any]) -> float:
+    """Give the length of the longest vector, shape (..., 3); infinite where one is not finite."""
+    with np.errstate(all="ignore"):
+        length = math.sqrt(np.einsum("...k,...k->...", vectors, vectors, dtype=np.float64).max())
+    return length if length < math.inf else math.inf
+
+
+def _above(error: float) -> float:
+    """Round up to one digit, with some room."""
+    digit = 10.0 ** math.floor(math.log10(error))
+    return float(f"{math.ceil(1.2 * error / digit) * digit:.3g}")
+
+
+def _search(tolerance: float, least: int, trials: Trials, progress: Progress) -> Estimate:
+    """Narrow down the steps a frame between too few and enough."""
+    too_few, enough, failures = least - 1, None, []
+    steps = least
+    for _ in range(MOST_PILOTS):
+        found = trials.estimate(steps, progress)
+        if found.error <= tolerance:
+            enough = found
+        else:
+            too_few = steps
+            failures.append(found)
+            if found.rounding > CLOSE * tolerance or _stuck(failures):
+                break
+        if enough and (enough.error >= CLOSE * tolerance or enough.steps_per_frame - too_few <= 1):
+            return enough
+        steps = max(_next(found, tolerance), too_few + 1)
+        if enough and steps >= enough.steps_per_frame:
+            return enough
+    if enough:
+        return enough
+    raise SceneError([_out_of_reach(tolerance, failures)])
+
+
+def _next(found: Estimate, tolerance: float) -> int:
+    """Guess the steps a frame that are just enough, from an error that falls as the step to the power of its order."""
+    if found.error == math.inf:
+        cut = LARGEST_CUT
+    else:
+        # What the step may make of it, beside rounding, and what it does.
+        allowed = max((1 + CLOSE) / 2 * tolerance - found.rounding, tolerance / 16)
+        made = max(found.error - found.rounding, 0.0)
+        cut = min((made / allowed) ** (1 / found.order), LARGEST_CUT)
+    return max(1, math.ceil(found.steps_per_frame * cut))
+
+
+def _stuck(failures: list[Estimate]) -> bool:
+    """Tell whether three times in a row much smaller steps hardly helped."""
+    if len(failures) < 4:
+        return False
+    return all(
+        after.error >= before.error / math.sqrt(after.steps_per_frame / before.steps_per_frame)
+        for before, after in pairwise(failures[-4:])
+    )
+
+
+def _out_of_reach(tolerance: float, failures: list[Estimate]) -> str:
+    best = min(failures, key=lambda one: one.error)
+    last = failures[-1]
+    if best.error == math.inf:
+        return (
+            f"time.tolerance: {tolerance:g} is out of reach: with {last.steps_per_frame} steps a frame the error is "
+            "not known yet, as runs diverge or a step is longer than the damping; take a weaker load or less damping"
+        )
+    if last.rounding > CLOSE * tolerance:
+        return (
+            f"time.tolerance: {tolerance:g} is out of reach of f32, whose rounding alone makes an error of "
+            f"{last.rounding:.2g} here; take time.precision: f64, or a tolerance of {_above(4 * last.rounding):g}"
+        )
+    remedy = "take a weaker load or a shorter time"
+    if best.error < LARGEST_TOLERANCE / 2:
+        remedy += f", or a tolerance of {_above(best.error):g}"
+    return (
+        f"time.tolerance: {tolerance:g} is out of reach: with {last.steps_per_frame} steps a frame the error is still "
+        f"{last.error:.2g}, and it hardly falls any more; {remedy}"
+    )

@@ -1,0 +1,373 @@
+"""What both forms of kernel 1 are made of: the force of a spring, the step of a point, strains.
+
+A value of the sheet is a vector of lanes, each of another column; on a GPU of one. Arrays are Taichi's ndarrays of such
+vectors, row after row, each of `width` entries: one for every column of a strip and a halo of one at both ends. The
+arrays are one-dimensional, as every index then takes a few instructions less:
+
+    u, d         displacements and last differences, three arrays each, of x, y and z
+    by_column    whether the points move, of a first, middle and last row; their place across [m]; whether they have a
+                 left and a right neighbour: six rows
+    decay        of every standing slot, as many rows as the sheet has
+
+Vectors stay vectors down to the machine code (docs/decisions/0010), where some operations of Taichi's crash or are
+wrong: there are no unary minus, `-=`, abs, any and all of vectors here, and exp is taken lane by lane.
+"""
+
+# No `from __future__ import annotations` here: Taichi reads the annotations of a kernel.
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import cache
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from taichi_msm.system.runtime import Memory, our_compilation, ti
+
+# Rows of the array by_column; the first three say which points of a first, a middle and a last row move.
+MOVES, ACROSS, HAS_LEFT, HAS_RIGHT = 0, 3, 4, 5
+
+# Columns of the table of loads: gain, stiffness of the virtual springs, then for each slot force (3), point (2),
+# falloff and offset.
+SLOT_COLUMN, SLOT_COLUMNS = 2, 7
+
+# What is read of every row of points: the least of (L^2 - L0^2) / L0^2, the sums of (L / L0 - 1)^2 of springs along the
+# row, down and diagonal, and the sum of |d|^2.
+MEASURES = 5
+
+# Bytes of a number.
+BYTES = {"f32": 4, "f64": 8}
+
+
+@dataclass(frozen=True)
+class Code:
+    """What a kernel is compiled for; all else is an argument.
+
+    Attributes:
+        precision: f32 or f64.
+        lanes: strips of columns.
+        structural, shear: whether there are springs of that family.
+        open_edges: whether a point at an edge moves, so that springs beyond the edge must be left out.
+        virtual: whether there are virtual springs.
+        damped: whether there is damping.
+        slots_move: for every probe slot whether it moves.
+    """
+
+    precision: str
+    lanes: int
+    structural: bool
+    shear: bool
+    open_edges: bool
+    virtual: bool
+    damped: bool
+    slots_move: tuple[bool, ...]
+
+    @property
+    def real(self) -> Any:
+        """Taichi's type of a number."""
+        return getattr(ti, self.precision)
+
+    @property
+    def vector(self) -> Any:
+        """Taichi's type of a vector of lanes."""
+        return ti.types.vector(self.lanes, self.real)
+
+    @property
+    def load_columns(self) -> int:
+        """Number of columns of the table of loads."""
+        return SLOT_COLUMN + SLOT_COLUMNS * len(self.slots_move)
+
+
+@dataclass(frozen=True)
+class Structure:
+    """How a sheet lies in memory and is shared out, and the code that steps it.
+
+    Attributes:
+        rows, cols: points of the sheet.
+        workers: bands of rows that step side by side; 0 on a GPU, where every point does.
+        depth: steps that a band takes in one sweep.
+        fixed_rows: whether every point of the first row is fixed, and of the last.
+        code: what the kernels are compiled for.
+    """
+
+    rows: int
+    cols: int
+    workers: int
+    depth: int
+    fixed_rows: tuple[bool, bool]
+    code: Code
+
+    @property
+    def strip(self) -> int:
+        """Number of columns of a strip."""
+        return -(-self.cols // self.code.lanes)
+
+    @property
+    def width(self) -> int:
+        """Entries of a row, the halo of its strips included."""
+        return self.strip + 2
+
+
+class Start(NamedTuple):
+    """What the arrays of a sheet hold at the start.
+
+    Attributes:
+        by_column: of the array of that name, shape (6, cols).
+        decay: likewise, shape (standing slots, rows, cols).
+        state: displacements and differences, each of shape (rows, cols, 3); None: at rest.
+    """
+
+    by_column: NDArray[Any]
+    decay: NDArray[Any]
+    state: tuple[NDArray[Any], NDArray[Any]] | None
+
+
+class Readings(NamedTuple):
+    """What is read of a sheet, in the order of the kernel's arguments.
+
+    Attributes:
+        differences: whether d is wanted, and not u.
+        out: filled with it, shape (rows, cols, 3).
+        measures: filled with those of every row of points, shape (rows, MEASURES).
+    """
+
+    differences: bool
+    out: NDArray[Any]
+    measures: NDArray[Any]
+
+
+def in_lanes(s: Structure, values: NDArray[Any]) -> NDArray[Any]:
+    """Lay columns out in strips with their halo.
+
+    Args:
+        s: the structure.
+        values: shape (..., cols).
+
+    Returns:
+        Shape (entries, lanes), in the precision of the code; 0 where there is no column, infinite what is too large
+        for it.
+    """
+    column = np.arange(s.code.lanes) * s.strip + np.arange(-1, s.strip + 1)[:, None]
+    inside = (column >= 0) & (column < s.cols)
+    real = np.float32 if s.code.precision == "f32" else np.float64
+    with np.errstate(over="ignore"):
+        laid = np.take(values.astype(real), column * inside, axis=-1) * inside.astype(real)
+    return laid.reshape(-1, s.code.lanes)
+
+
+def _fill_kernel(code: Code) -> Callable[..., None]:
+    """Make the kernel that copies numbers into the beginning of an array of vectors; their last axis is the lanes."""
+    vector, lanes = code.vector, code.lanes
+
+    @ti.kernel
+    def fill(target: ti.types.ndarray(dtype=vector, ndim=1), source: ti.types.ndarray(dtype=code.real, ndim=2)):
+        for n in range(source.shape[0]):
+            target[n] = vector([source[n, lane] for lane in ti.static(range(lanes))])
+
+    return fill
+
+
+def _clear_kernel(code: Code) -> Callable[..., None]:
+    """Make the kernel that puts zeros into the beginning of an array of vectors."""
+
+    @ti.kernel
+    def clear(target: ti.types.ndarray(dtype=code.vector, ndim=1), length: ti.i32):
+        for n in range(length):
+            target[n] = code.vector(0)
+
+    return clear
+
+
+class SheetArrays:
+    """The arrays that both forms of kernel 1 have.
+
+    Args:
+        s: the structure.
+        stored: of every stored row of displacements the row of the sheet that it holds, or -1 for none.
+        start: what the arrays hold at the start.
+    """
+
+    def __init__(self, s: Structure, stored: NDArray[np.int32], start: Start) -> None:
+        by_column, decay, state = start
+        self._s = s
+        self._memory = Memory()
+        self._fill, clear = _filling(s.code)
+        self.u = [self.rows(len(stored)) for _ in range(3)]
+        self.d = [self.rows(s.rows) for _ in range(3)]
+        self.by_column = self.rows(len(by_column))
+        self.decay = self.rows(max(1, len(decay)) * s.rows)
+        with our_compilation():
+            self._fill(self.by_column, in_lanes(s, by_column))
+            for c in range(3):
+                if state is None:
+                    clear(self.u[c], len(stored) * s.width)
+                    clear(self.d[c], s.rows * s.width)
+                else:
+                    held = (stored >= 0)[:, None]
+                    self._fill(self.u[c], in_lanes(s, np.where(held, state[0][stored, :, c], 0)))
+                    self._fill(self.d[c], in_lanes(s, state[1][..., c]))
+        self.set_decay(decay)
+
+    def set_decay(self, decay: NDArray[Any]) -> None:
+        """Put the decays of other standing slots in the place of those that are there, shape (slots, rows, cols)."""
+        if len(decay):
+            with our_compilation():
+                self._fill(self.decay, in_lanes(self._s, decay))
+
+    def rows(self, count: int) -> Any:
+        """Take an array of so many rows, of whatever was in it."""
+        return self._memory.array(self._s.code.precision, self._s.code.lanes, count * self._s.width)
+
+
+@cache
+def _filling(code: Code) -> tuple[Callable[..., None], Callable[..., None]]:
+    return _fill_kernel(code), _clear_kernel(code)
+
+
+def spring_forces(code: Code) -> tuple[Callable[..., Any], Callable[..., Any]]:
+    """Make the functions that give the force of a spring along a row, and of one to the other row.
+
+    With q = u_Q - u_P and the rest vector o from P to Q, L^2 - L0^2 = q (q + 2 o), so that the force
+
+        k (L - L0) (Q - P) / L = k (L^2 - L0^2) / (L^2 + L0 L) (o + q)                         (eq. 2)
+
+    keeps the digits of a small motion on a large sheet. Swapping P and Q changes its sign and not one bit more.
+    """
+    open_edges = code.open_edges
+    # Keeps L = 0 from dividing by 0: the force is then 0, as Q - P is. A literal in a kernel is f32, also among f64.
+    tiny = 1e-36
+
+    @ti.func
+    def pull(longer, square, length, stiffness):
+        return stiffness * longer / (square + length * ti.sqrt(square))
+
+    @ti.func
+    def along(x, y, z, dx, stiffness, exists):
+        """Force by the right neighbour, whose displacement is (x, y, z) more; exists: 0 where there is none."""
+        to_x = x + dx
+        rest = y * y + z * z
+        force = pull(x * (to_x + dx) + rest, to_x * to_x + rest + tiny, dx, stiffness)
+        if ti.static(open_edges):
+            force *= exists
+        return force * to_x, force * y, force * z
+
+    @ti.func
+    def to_other_row(x, y, z, right: ti.template(), dx, dy, length, stiffness, exists):
+        """Force by the entry `right` of a row dy above, whose displacement is (x, y, z) more; exists: 0 for none."""
+        to_x = x
+        to_y = y + dy
+        longer = x * x + (y * (to_y + dy) + z * z)
+        if ti.static(right != 0):
+            to_x = x + right * dx
+            longer = x * (to_x + right * dx) + (y * (to_y + dy) + z * z)
+        force = pull(longer, to_x * to_x + to_y * to_y + z * z + tiny, length, stiffness)
+        if ti.static(open_edges):
+            force *= exists
+        return force * to_x, force * to_y, force * z
+
+    return along, to_other_row
+
+
+def strains(code: Code) -> Callable[..., Any]:
+    """Make the function that tells how far springs are stretched: those to the right of an entry and to a row below.
+
+    The function gives, in every lane, the least (L^2 - L0^2) / L0^2 of all of them, and the sums of (L / L0 - 1)^2 of
+    those along the row, those down and the diagonals.
+    """
+    vector, open_edges, structural, shear = code.vector, code.open_edges, code.structural, code.shear
+
+    @ti.func
+    def longer(u: ti.template(), by_column: ti.template(), width, p, q, b, right: ti.template(), x0, y0):
+        """(L^2 - L0^2) / L0^2 of the spring from entry b of row p to entry b + right of row q; with all its digits."""
+        x = u[0][q * width + b + right] - u[0][p * width + b]
+        y = u[1][q * width + b + right] - u[1][p * width + b]
+        z = u[2][q * width + b + right] - u[2][p * width + b]
+        share = (x * (x + 2 * x0) + (y * (y + 2 * y0) + z * z)) / (x0 * x0 + y0 * y0)
+        # Beyond the edge there is no spring.
+        if ti.static(open_edges and right < 0):
+            share = ti.select(by_column[HAS_LEFT * width + b] > 0, share, vector(0))
+        if ti.static(open_edges and right > 0):
+            share = ti.select(by_column[HAS_RIGHT * width + b] > 0, share, vector(0))
+        return share
+
+    @ti.func
+    def square(share):
+        """(L / L0 - 1)^2, given (L^2 - L0^2) / L0^2, which rounding may put below -1."""
+        stretch = share / (1 + ti.sqrt(ti.max(share + 1, vector(0))))
+        return stretch * stretch
+
+    @ti.func
+    def strain(u: ti.template(), by_column: ti.template(), width, p, q, b, dx, dy, exists):
+        """Entry b of row p, and row q below it if it exists."""
+        least, right, below, across = vector(0), vector(0), vector(0), vector(0)
+        if ti.static(structural):
+            share = longer(u, by_column, width, p, p, b, 1, dx, 0)
+            least = ti.min(least, share)
+            right = square(share)
+        if exists:
+            if ti.static(structural):
+                share = longer(u, by_column, width, p, q, b, 0, 0, -dy)
+                least = ti.min(least, share)
+                below = square(share)
+            if ti.static(shear):
+                one = longer(u, by_column, width, p, q, b, -1, -dx, -dy)
+                other = longer(u, by_column, width, p, q, b, 1, dx, -dy)
+                least = ti.min(least, ti.min(one, other))
+                across = square(one) + square(other)
+        return least, right, below, across
+
+    return strain
+
+
+def point_step(code: Code) -> Callable[..., None]:
+    """Make the function that adds to the forces of springs those of the tissue and the probes, and steps a point.
+
+    d_{n+1} = keep d_n + gain F_n,    u_{n+1} = u_n + d_{n+1}                                  (eq. 6 to 9)
+    """
+    vector, lanes = code.vector, code.lanes
+    virtual, damped, slot_moves = code.virtual, code.damped, code.slots_move
+    standing = [slot_moves[:n].count(False) for n in range(len(slot_moves))]
+
+    @ti.func
+    def move(
+        u: ti.template(), d: ti.template(), by_column: ti.template(), decay: ti.template(),
+        rows, width, q, i, b, kind, x, y, z, spring_x, spring_y, spring_z, keep, dy, top, now,
+    ):  # fmt: skip
+        """Step entry b of row i of the sheet, displaced by (x, y, z), into row q of u; now is a row of the loads."""
+        force_x, force_y, force_z = spring_x, spring_y, spring_z
+        if ti.static(virtual):
+            force_x = force_x - now[1] * x
+            force_y = force_y - now[1] * y
+            force_z = force_z - now[1] * z
+        for g in ti.static(range(len(slot_moves))):
+            column = ti.static(SLOT_COLUMN + SLOT_COLUMNS * g)
+            share = vector(0)
+            if ti.static(slot_moves[g]):
+                off_x = by_column[ACROSS * width + b] - now[column + 3]
+                off_y = top - i * dy - now[column + 4]
+                exponent = now[column + 5] * ti.sqrt(off_x * off_x + off_y * off_y) + now[column + 6]
+                share = vector([ti.exp(-exponent[lane]) for lane in ti.static(range(lanes))])
+            else:
+                share = decay[(standing[g] * rows + i) * width + b]
+            force_x += now[column] * share
+            force_y += now[column + 1] * share
+            force_z += now[column + 2] * share
+
+        gain = now[0] * by_column[kind * width + b]
+        d_x, d_y, d_z = d[0][i * width + b], d[1][i * width + b], d[2][i * width + b]
+        if ti.static(damped):
+            d_x *= keep
+            d_y *= keep
+            d_z *= keep
+        d_x += gain * force_x
+        d_y += gain * force_y
+        d_z += gain * force_z
+        d[0][i * width + b] = d_x
+        d[1][i * width + b] = d_y
+        d[2][i * width + b] = d_z
+        u[0][q * width + b] = x + d_x
+        u[1][q * width + b] = y + d_y
+        u[2][q * width + b] = z + d_z
+
+    return move

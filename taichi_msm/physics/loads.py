@@ -1,0 +1,323 @@
+"""The probes in time: how hard each presses, where, and whether the virtual springs exist, step by step.
+
+What enters step n is the average with the hat function of half-width h about t_n,
+
+    percent_n = integral of percent(t) (1 - |t - t_n| / h) dt / h,    at n = 0 twice that over [0, h],
+
+which is what moves a free point as far as the load itself does, so that every load, a jump anywhere included, keeps
+the method of order 2. Where no key lies within the hat it is the value at t_n. The activity of the virtual springs is
+averaged alike.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from taichi_msm.physics.lattice import axes
+from taichi_msm.physics.timestep import step, steps_per_frame
+from taichi_msm.scene import Probe, Scene, Sheet
+
+# A key that is nearer than this to an end of the hat, as a fraction of its half-width, is outside: what it would add
+# is less than rounding.
+EDGE = 1e-9
+
+# Before all times [s].
+LONG_AGO = -1e300
+
+Array = NDArray[np.float64]
+
+
+class ProbeSegment(NamedTuple):
+    """A control point between two jumps.
+
+    Attributes:
+        times: keys [s], shape (n,).
+        points: control point at those keys, x and y at rest [m], shape (n, 2); held outside.
+    """
+
+    times: Array
+    points: Array
+
+
+@dataclass(frozen=True)
+class ProbeSlot:
+    """A place at which a probe acts; one whose control point jumps acts at several by turns.
+
+    A hat that a jump falls into needs the place before and the one after it. So the segments of the control point are
+    dealt out to two slots, the first, third, ... and the second, fourth, ...; to more where several jumps fall into one
+    hat.
+
+    Attributes:
+        probe: index of the probe in the scene.
+        segments: of the control point, all of them.
+        turn: number of the first of its own segments.
+        turns: how many slots the probe has.
+    """
+
+    probe: int
+    segments: tuple[ProbeSegment, ...]
+    turn: int
+    turns: int
+
+    @property
+    def moves(self) -> bool:
+        """Whether the control point moves."""
+        return len(self.segments) > 1 or len(self.segments[0].times) > 1
+
+    @property
+    def rest(self) -> Array:
+        """The first control point, x and y at rest [m]; of one that stands the only one."""
+        return self.segments[0].points[0]
+
+
+class Schedule(NamedTuple):
+    """The loads at consecutive steps.
+
+    Attributes:
+        strength: force at the control point before its decay [N], shape (steps, slots, 3).
+        point: control point, x and y at rest [m], shape (steps, slots, 2).
+        active: share of the virtual springs' stiffness, 0 to 1; shape (steps,).
+    """
+
+    strength: Array
+    point: Array
+    active: Array
+
+
+def control_points(probe: Probe, sheet: Sheet) -> tuple[Array, Array]:
+    """Give the keys of a probe's control point: times [s], shape (n,), and points [m], shape (n, 2)."""
+    first = probe.at[0]
+    keys = probe.at if isinstance(first, tuple) else ((0.0, *probe.at),)
+    time, across, down = np.array(keys, dtype=float).T
+    height, width = sheet.size
+    return time, np.stack([(across - 0.5) * width, (0.5 - down) * height], axis=1)
+
+
+def probe_slots(scene: Scene) -> tuple[ProbeSlot, ...]:
+    """List the slots of all probes."""
+    found = []
+    for index, probe in enumerate(scene.probes):
+        times, points = control_points(probe, scene.sheet)
+        jumps = np.flatnonzero((times[1:] == times[:-1]) & (points[1:] != points[:-1]).any(axis=1)) + 1
+        parts = zip(np.split(times, jumps), np.split(points, jumps), strict=True)
+        segments = tuple(ProbeSegment(*part) for part in parts)
+        # As many as there are in the hat that has the most jumps.
+        jumped = times[jumps]
+        within = np.searchsorted(jumped, jumped + 2 * step(scene) * (1 - EDGE), "left") - np.arange(len(jumped))
+        turns = 1 + int(within.max(initial=0))
+        found += [ProbeSlot(index, segments, turn, turns) for turn in range(turns)]
+    return tuple(found)
+
+
+def decay(slot: ProbeSlot, scene: Scene) -> Array:
+    """Evaluate exp(-falloff d - offset) of a standing slot (eq. 5).
+
+    Returns:
+        Share of the force that each point feels, shape (rows, cols).
+    """
+    probe = scene.probes[slot.probe]
+    x, y = axes(scene.sheet)
+    distance = np.hypot(x - slot.rest[0], y - slot.rest[1])
+    return np.exp(-probe.falloff * distance - probe.offset)
+
+
+def schedule(scene: Scene, first: int, count: int) -> Schedule:
+    """Average the loads over the steps first, ..., first + count - 1.
+
+    The time of step n is n / (frames per second x steps per frame), never a sum of steps.
+    """
+    t = np.arange(first, first + count) / (scene.time.frames_per_second * steps_per_frame(scene))
+    h, parts = step(scene), probe_slots(scene)
+    strength, point = np.zeros((count, len(parts), 3)), np.zeros((count, len(parts), 2))
+    for index, probe in enumerate(scene.probes):
+        times, percents = np.array(probe.load, dtype=float).T
+        own = [n for n, part in enumerate(parts) if part.probe == index]
+        turns, segments = len(own), parts[own[0]].segments
+        jumps = np.array([segment.times[0] for segment in segments[1:]])
+        line = _Line(times, percents)
+        if turns == 1:
+            shares = line.averages(t, h)[:, None]
+            places = np.zeros((count, 1), np.intp)
+        else:
+            shares, places = _by_turns(line, jumps, turns, t, h)
+        strength[:, own] = np.multiply.outer(shares / 100, probe.force)
+        for n, place in zip(own, places.T, strict=True):
+            for number in np.unique(place):
+                chosen = place == number
+                point[chosen, n] = _held(segments[number], t[chosen])
+    return Schedule(strength, point, _activity(scene).averages(t, h))
+
+
+def loads_at(scene: Scene, t: Array) -> Schedule:
+    """Evaluate the loads at times on which no key falls, and not their averages [s], shape (times,)."""
+    parts = probe_slots(scene)
+    strength, point = np.zeros((len(t), len(parts), 3)), np.zeros((len(t), len(parts), 2))
+    for n, part in enumerate(parts):
+        probe = scene.probes[part.probe]
+        line = _Line(*np.array(probe.load, dtype=float).T)
+        jumps = np.array([segment.times[0] for segment in part.segments[1:]])
+        number = jumps.searchsorted(t, "right")
+        acts = number % part.turns == part.turn
+        strength[:, n] = np.multiply.outer(line.values(t) * acts / 100, probe.force)
+        for segment in np.unique(number):
+            point[number == segment, n] = _held(part.segments[segment], t[number == segment])
+    return Schedule(strength, point, _activity(scene).values(t))
+
+
+def key_times(scene: Scene) -> Array:
+    """List the times of all keys after 0 and before the end [s], where the loads are not smooth."""
+    times = {float(time) for keys in _key_lists(scene) for time in keys}
+    return np.array(sorted(time for time in times if 0 < time < scene.time.duration))
+
+
+class Envelope:
+    """How hard the loads push at most from one time to another.
+
+    Args:
+        scene: a checked scene.
+    """
+
+    def __init__(self, scene: Scene) -> None:
+        self._h = step(scene)
+        self._lines = [_Line(*np.array(probe.load, dtype=float).T) for probe in scene.probes]
+        self._forces = [math.hypot(*probe.force) / 100 for probe in scene.probes]
+        self._probes = [slot.probe for slot in probe_slots(scene)]
+        self._activity = _activity(scene)
+        self._begins = self._activity.times[self._activity.before < self._activity.after]
+
+    def between(self, begin: float, end: float) -> tuple[Array, bool, int]:
+        """Bound what the loads do in the steps from one time to another, both included.
+
+        Returns:
+            The largest force at each slot's control point [N], shape (slots,); whether the virtual springs act at any
+            time; and how often they begin to.
+        """
+        # A step sees what is within its hat.
+        begin, end = begin - self._h, end + self._h
+        most = [force * line.largest(begin, end) for force, line in zip(self._forces, self._lines, strict=True)]
+        begun = self._begins.searchsorted(end, "right") - self._begins.searchsorted(begin, "left")
+        return np.array([most[probe] for probe in self._probes]), self._activity.largest(begin, end) > 0, int(begun)
+
+
+class _Line:
+    """A function of time, linear between its keys, where it may jump; 0 before the first, constant after the last.
+
+    Args:
+        times: keys [s], in order; two at one time are a jump.
+        values: at these keys.
+    """
+
+    def __init__(self, times: Array, values: Array) -> None:
+        keys = np.unique(times)
+        # Its limits at every key.
+        before, after = values[times.searchsorted(keys, "left")], values[times.searchsorted(keys, "right") - 1]
+        before[0] = 0.0
+        # A key around which nothing changes is none, and costs no bit.
+        last, following = np.append(0.0, after[:-1]), np.append(before[1:], after[-1])
+        told = (last != before) | (before != after) | (after != following)
+        told[0] = True
+        self.times, self.before, self.after = keys[told], before[told], after[told]
+
+    def values(self, t: Array) -> Array:
+        """Evaluate it; at a key its right limit."""
+        return self._values(t, self.times.searchsorted(t, "right"))
+
+    def averages(self, t: Array, h: float, begin: float = -math.inf, end: float = math.inf) -> Array:
+        """Average it with the hat of half-width h about times from 0 on, counting what is from begin to end.
+
+        Where no key is within the hat, and neither begin nor end, it is its value there.
+        """
+        edges = [edge for edge in (begin, end) if math.isfinite(edge)]
+        found = self.values(t) * ((begin <= t) & (t < end))
+        bounds = np.union1d(self.times, edges)
+        # At t = 0 the hat is half a hat, whose average even of a line is not the value in its middle.
+        uneven = (t <= 0) | (
+            bounds.searchsorted(t + h * (1 - EDGE), "left") > bounds.searchsorted(t - h * (1 - EDGE), "right")
+        )
+        for n in np.flatnonzero(uneven):
+            found[n] = self._average(float(t[n]), h, begin, end)
+        return found
+
+    def largest(self, begin: float, end: float) -> float:
+        """Find the largest absolute value from one time to another."""
+        first, last = self.times.searchsorted(begin, "left"), self.times.searchsorted(end, "right")
+        ends = np.array([begin, end])
+        return float(np.abs(np.concatenate([self.values(ends), self.before[first:last], self.after[first:last]])).max())
+
+    def _values(self, t: Array, after: NDArray[np.intp]) -> Array:
+        """Evaluate it between the keys after[n] - 1 and after[n]."""
+        low, high = np.maximum(after - 1, 0), np.minimum(after, len(self.times) - 1)
+        span = self.times[high] - self.times[low]
+        share = np.divide(t - self.times[low], span, out=np.zeros_like(t), where=span > 0)
+        slope = np.where(span > 0, self.before[high] - self.after[low], 0.0)
+        return np.where(after == 0, 0.0, self.after[low] + share * slope)
+
+    def _average(self, t: float, h: float, begin: float, end: float) -> float:
+        """Integrate piece by piece: on each both the hat and the function are linear, and Simpson's rule is exact."""
+        low, high = max(t - h, 0.0 if t <= 0 else -math.inf, begin), min(t + h, end)
+        inner = self.times[(self.times > low) & (self.times < high)]
+        cuts = np.unique(np.concatenate([[low, high], inner, [t] if low < t < high else []]))
+        if low >= high:
+            return 0.0
+        left, right = cuts[:-1], cuts[1:]
+        piece = self.times.searchsorted((left + right) / 2, "right")
+        ends = np.stack([self._values(left, piece), self._values(right, piece)])
+        weights = 1 - np.abs(np.stack([left, right]) - t) / h
+        middle = ends.sum(axis=0) * weights.sum(axis=0)
+        total = float(((right - left) * ((ends * weights).sum(axis=0) + middle)).sum() / (6 * h))
+        return 2 * total if t <= 0 else total
+
+
+def _by_turns(line: _Line, jumps: Array, turns: int, t: Array, h: float) -> tuple[Array, NDArray[np.intp]]:
+    """Share the load out among the slots of a probe whose control point jumps.
+
+    Returns:
+        Percent of every slot, and the segment of the control point that it is at, each of shape (steps, slots).
+    """
+    bounds = np.concatenate([[-math.inf], jumps, [math.inf]])
+    first = jumps.searchsorted(t - h * (1 - EDGE), "right")
+    last = jumps.searchsorted(t + h * (1 - EDGE), "left")
+    shares, places = np.zeros((len(t), turns)), np.empty((len(t), turns), np.intp)
+    for turn in range(turns):
+        place = first + (turn - first) % turns
+        acts = place <= last
+        places[:, turn] = np.where(acts, place, first)
+        for number in np.unique(place[acts]):
+            chosen = acts & (place == number)
+            shares[chosen, turn] = line.averages(t[chosen], h, bounds[number], bounds[number + 1])
+    return shares, places
+
+
+def _held(segment: ProbeSegment, t: Array) -> Array:
+    """Tell where a control point is, held outside its keys; shape (times, 2)."""
+    return np.stack([np.interp(t, segment.times, segment.points[:, axis]) for axis in range(2)], axis=-1)
+
+
+def _activity(scene: Scene) -> _Line:
+    """Tell when the virtual springs exist: 1 while the percent of any probe is not 0, or always; else 0."""
+    if scene.springs.virtual_active == "always":
+        return _Line(np.array([LONG_AGO]), np.array([1.0]))
+    times = np.unique([time for probe in scene.probes for time, _ in probe.load])
+    if not times.size:
+        return _Line(np.zeros(1), np.zeros(1))
+    # Between two keys, and after the last one.
+    middles = np.append((times[:-1] + times[1:]) / 2, times[-1] + 1)
+    active = np.zeros(len(times))
+    for probe in scene.probes:
+        line = _Line(*np.array(probe.load, dtype=float).T)
+        after = line.times.searchsorted(middles, "right")
+        following = np.minimum(after, len(line.times) - 1)
+        pressed = (line.after[after - 1] != 0) | ((line.before[following] != 0) & (after < len(line.times)))
+        active[(after > 0) & pressed] = 1.0
+    return _Line(np.repeat(times, 2)[1:], np.repeat(active, 2)[:-1])
+
+
+def _key_lists(scene: Scene) -> list[Array]:
+    """List the times of every list of keys [s]."""
+    loads = [np.array([time for time, _ in probe.load]) for probe in scene.probes]
+    return [*loads, *(control_points(probe, scene.sheet)[0] for probe in scene.probes)]

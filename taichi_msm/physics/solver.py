@@ -1,0 +1,326 @@
+"""Kernel 1 from outside: the forces on every point and its Verlet update, all the steps of a frame in few launches.
+
+State of point P: its displacement u_n = x_n - X and the last difference d_n = u_n - u_{n-1}, from which the Verlet
+step (eq. 6 to 9) reads
+
+    d_{n+1} = keep d_n + gain F_n,    u_{n+1} = u_n + d_{n+1}
+
+    central:   keep = (1 - g h / 2) / (1 + g h / 2)    gain = h^2 / m / (1 + g h / 2)    g = C / m
+    backward:  keep = 1 - g h                          gain = h^2 / m
+    step 0:    d_0 = 0                                 gain = h^2 / m / 2
+
+which is the position form without its cancellation: in f32 it keeps the digits of a small motion on a large sheet.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from taichi_msm.errors import ArgumentError, DeviceError
+from taichi_msm.physics import workload
+from taichi_msm.physics.kernel import (
+    ACROSS,
+    BYTES,
+    HAS_LEFT,
+    HAS_RIGHT,
+    MEASURES,
+    MOVES,
+    SLOT_COLUMN,
+    SLOT_COLUMNS,
+    Code,
+    Readings,
+    Start,
+    Structure,
+)
+from taichi_msm.physics.kernel_cpu import Sweep
+from taichi_msm.physics.kernel_gpu import STEPS_PER_LAUNCH, Gather
+from taichi_msm.physics.lattice import axes, fixed_points, spacing
+from taichi_msm.physics.loads import decay, probe_slots, schedule
+from taichi_msm.physics.timestep import step, steps_per_frame
+from taichi_msm.scene import Scene
+from taichi_msm.system.runtime import Device, available_threads, lanes
+
+# Below this many points a worker costs more in waiting for the others than it saves.
+POINTS_PER_WORKER = 450
+
+# What a band may take of a core's cache, and the most steps of one sweep.
+CACHE = 3 << 17
+MOST_DEPTH = 8
+
+# Numbers that a sweep keeps for a point: displacement, difference, forces for the row ahead.
+NUMBERS_PER_POINT = 9
+
+# A launch is to end soon enough for Ctrl-C: so many steps of points, some 0.1 s of one core.
+POINT_STEPS_PER_LAUNCH = 40_000_000
+MAX_STEPS_PER_LAUNCH = 8192
+
+# Loads are tabulated for so many steps at a time: for one of a few frames' steps NumPy takes as long.
+STEPS_PER_TABLE = 4096
+
+
+Pause = Callable[[], None]
+
+
+class State(NamedTuple):
+    """All that the next steps depend on.
+
+    Attributes:
+        steps: number of steps taken, n.
+        displacement: u_n [m], shape (rows, cols, 3).
+        difference: d_n = u_n - u_{n-1} [m], shape (rows, cols, 3).
+    """
+
+    steps: int
+    displacement: NDArray[Any]
+    difference: NDArray[Any]
+
+
+def structure(scene: Scene, device: Device, cores: int | None = None) -> Structure:
+    """Find out what the scene needs: absent terms are left out of the kernel.
+
+    Args:
+        scene: a checked scene.
+        device: what `runtime.start` returned.
+        cores: how many cores are free for it; None: all.
+
+    Raises:
+        DeviceError: when the device cannot do what the scene needs.
+    """
+    rows, cols = scene.sheet.points
+    fixed = fixed_points(scene.sheet)
+    precision = workload.precision(scene, device.arch)
+    fixed_rows = bool(fixed[0].all()), bool(fixed[-1].all())
+    if device.arch == "cpu":
+        # Workers wait by spinning: more of them than cores would only keep each other from their work.
+        cores = min(device.threads, available_threads() if cores is None else cores)
+        workers = max(1, min(cores, rows * cols // POINTS_PER_WORKER, (rows - sum(fixed_rows)) // 2))
+    else:
+        workers = 0
+    code = Code(
+        precision=precision,
+        lanes=lanes(precision),
+        structural=scene.springs.structural > 0,
+        shear=scene.springs.shear > 0,
+        open_edges=not (all(fixed_rows) and fixed[:, [0, -1]].all()),
+        virtual=scene.springs.virtual > 0 and (scene.springs.virtual_active == "always" or bool(scene.probes)),
+        damped=scene.damping > 0,
+        slots_move=tuple(slot.moves for slot in probe_slots(scene)),
+    )
+    if device.arch == "vulkan" and precision == "f64" and any(code.slots_move):
+        raise DeviceError(
+            "--arch vulkan: has no exp in f64, which control points that move need; take time.precision: f32 without a "
+            "tolerance or an estimate of the error, or --arch cpu"
+        )
+    depth = _depth(rows // workers, cols * NUMBERS_PER_POINT * BYTES[precision]) if workers else 1
+    return Structure(rows, cols, workers, depth, fixed_rows, code)
+
+
+def _depth(rows: int, row_bytes: int) -> int:
+    """Choose the steps of a sweep: one where the band stays in the cache anyway, else as many as its rows leave."""
+    if rows * row_bytes <= CACHE:
+        return 1
+    return max(1, min(MOST_DEPTH, CACHE // row_bytes - 2))
+
+
+class Dynamics:
+    """The sheet in motion.
+
+    Args:
+        scene: a checked scene.
+        device: what `runtime.start` returned.
+        layout: another structure than the scene's own; for tests.
+        cores: how many cores are free for it; None: all.
+
+    Attributes:
+        structure: what the kernels are compiled for.
+        steps_done: number of steps taken.
+        launches: number of launches of the kernel.
+        shortest_spring: the least L / L0 of all springs when `displacement` or `state` was read last.
+        energy: of the motion and of the stretched springs, without the virtual ones, then [J].
+    """
+
+    def __init__(self, scene: Scene, device: Device, layout: Structure | None = None, cores: int | None = None) -> None:
+        self.scene = scene
+        self._device = device
+        self._cores = cores
+        self._layout = layout
+        self.launches = 0
+        self._sheet: Sweep | Gather | None = None
+        self.restart(scene)
+
+    def restart(self, scene: Scene, state: State | None = None) -> None:
+        """Begin again, with the same scene or another; nothing is compiled where only numbers differ.
+
+        Args:
+            scene: a checked scene.
+            state: where to begin, as `state` gave it with the same points and step; None: at rest.
+        """
+        self.scene = scene
+        self.structure = self._layout or structure(scene, self._device, self._cores)
+        self._begin(state)
+
+    def steer(self, scene: Scene) -> None:
+        """Go on from here with other loads.
+
+        Args:
+            scene: the scene with other probes, of which each moves, jumps or stands as it did.
+
+        Raises:
+            ArgumentError: when it needs another kernel.
+        """
+        moves = tuple(slot.moves for slot in probe_slots(scene))
+        if moves != self.structure.code.slots_move:
+            raise ArgumentError(
+                "probes: the scene's move, jump or stand otherwise (control points that move: "
+                f"{_in_words(self.structure.code.slots_move)}; now {_in_words(moves)}); "
+                "restart with a scene that has these"
+            )
+        if _standing(scene) != _standing(self.scene):
+            self._moving.set_decay(_standing_decays(scene))
+        self.scene = scene
+        # Who steers does so again in a frame.
+        self._first_tabled, self._loads = self.steps_done, self._table(self.steps_done, steps_per_frame(scene))
+
+    def advance(self, steps: int, pause: Pause = lambda: None) -> None:
+        """Take a number of steps.
+
+        Args:
+            steps: how many.
+            pause: called after every launch; what it raises stops the sheet there, and it can go on.
+        """
+        points = self.structure.rows * self.structure.cols
+        most = max(1, min(MAX_STEPS_PER_LAUNCH, POINT_STEPS_PER_LAUNCH // points))
+        if self.structure.workers == 0:
+            most = STEPS_PER_LAUNCH
+        end = self.steps_done + steps
+        while self.steps_done < end:
+            count = min(most, end - self.steps_done)
+            self._moving.advance(count, self._arguments, self._next_loads(count))
+            self.steps_done += count
+            self.launches += 1
+            pause()
+
+    def compile(self) -> None:
+        """Compile the step and the read-out without moving anything."""
+        self._moving.compile(self._arguments, self._loads)
+        self.displacement()
+
+    def displacement(self) -> NDArray[Any]:
+        """Read the displacements, and measure the sheet.
+
+        Returns:
+            x - X [m], shape (rows, cols, 3), in the scene's precision.
+        """
+        return self._read(differences=False)
+
+    def state(self) -> State:
+        """Read all that the next steps depend on, and measure the sheet."""
+        return State(self.steps_done, self._read(differences=False), self._read(differences=True))
+
+    def _read(self, *, differences: bool) -> NDArray[Any]:
+        """Read displacements or differences, and measure the sheet."""
+        s, sheet = self.structure, self.scene.sheet
+        out, measures = np.empty((s.rows, s.cols, 3), self._real), np.empty((s.rows, MEASURES), self._real)
+        dx, dy = spacing(sheet)
+        self._moving.read((dx, dy), Readings(differences, out, measures))
+        self.shortest_spring = math.sqrt(max(0.0, 1.0 + float(measures[:, 0].min())))
+        along, down, diagonal, motion = measures[:, 1:].sum(axis=0, dtype=np.float64)
+        springs, h = self.scene.springs, step(self.scene)
+        stretching = springs.structural * (along * dx**2 + down * dy**2) + springs.shear * diagonal * (dx**2 + dy**2)
+        self.energy = float(stretching + sheet.mass * motion / h**2) / 2
+        return out
+
+    def close(self) -> None:
+        """Free the memory."""
+        self._sheet = None
+
+    @property
+    def _moving(self) -> Sweep | Gather:
+        assert self._sheet is not None, "it is closed"
+        return self._sheet
+
+    def _begin(self, state: State | None) -> None:
+        """Put the sheet at rest, or where it was."""
+        self._real = np.dtype(np.float32 if self.structure.code.precision == "f32" else np.float64)
+        self.steps_done = 0 if state is None else state.steps
+        self.shortest_spring = 1.0
+        self.energy = 0.0
+        self._arguments = self._numbers()
+        self._first_tabled, self._loads = self.steps_done, self._table(self.steps_done, STEPS_PER_TABLE)
+        self._place(state)
+
+    def _numbers(self) -> tuple[float, ...]:
+        """Give the numbers of the scene in the order of the kernel's arguments."""
+        scene, h = self.scene, step(self.scene)
+        g = scene.damping / scene.sheet.mass
+        central = scene.time.damping_difference == "central"
+        keep = (1 - g * h / 2) / (1 + g * h / 2) if central else 1 - g * h
+        dx, dy = spacing(scene.sheet)
+        return keep, dx, dy, scene.springs.structural, scene.springs.shear, scene.sheet.size[0] / 2
+
+    def _next_loads(self, count: int) -> NDArray[Any]:
+        """Give the table of the loads of the next steps, shape (count, columns)."""
+        done = self.steps_done - self._first_tabled
+        if done + count > len(self._loads):
+            done = 0
+            self._first_tabled = self.steps_done
+            self._loads = self._table(self.steps_done, max(count, STEPS_PER_TABLE))
+        return self._loads[done : done + count]
+
+    def _table(self, first: int, count: int) -> NDArray[Any]:
+        """Tabulate the loads of steps first, ..., first + count - 1, shape (count, columns)."""
+        scene, h = self.scene, step(self.scene)
+        g = scene.damping / scene.sheet.mass
+        loads = schedule(scene, first, count)
+        parts = probe_slots(scene)
+        table = np.empty((count, self.structure.code.load_columns))
+        table[:, 0] = h * h / scene.sheet.mass
+        if scene.time.damping_difference == "central":
+            table[:, 0] /= 1 + g * h / 2
+        if first == 0:
+            table[0, 0] = h * h / scene.sheet.mass / 2
+        table[:, 1] = scene.springs.virtual * loads.active
+        slot = table[:, SLOT_COLUMN:].reshape(count, len(parts), SLOT_COLUMNS)
+        slot[..., :3] = loads.strength
+        slot[..., 3:5] = loads.point
+        for n, part in enumerate(parts):
+            slot[:, n, 5:] = scene.probes[part.probe].falloff, scene.probes[part.probe].offset
+        # What is too large for f32 is infinite, and found when the sheet is read.
+        with np.errstate(over="ignore"):
+            return table.astype(self._real)
+
+    def _place(self, state: State | None) -> None:
+        """Put the sheet where it begins."""
+        s, scene = self.structure, self.scene
+        moves = ~fixed_points(scene.sheet)
+        column = np.arange(s.cols)
+        by_column = np.empty((6, s.cols))
+        # Rows are of three kinds: the first, any in between, the last.
+        by_column[MOVES : MOVES + 3] = moves[[0, s.rows // 2, -1]]
+        by_column[ACROSS] = axes(scene.sheet)[0]
+        by_column[HAS_LEFT] = column > 0
+        by_column[HAS_RIGHT] = column < s.cols - 1
+        self._sheet = None  # Its memory is free before there is another.
+        kind = Sweep if s.workers else Gather
+        begun = None if state is None else (state.displacement, state.difference)
+        self._sheet = kind(s, Start(by_column, _standing_decays(scene), begun))
+
+
+def _standing(scene: Scene) -> list[tuple[object, ...]]:
+    """List all on which the decays of the slots that stand depend."""
+    probes = [scene.probes[slot.probe] for slot in probe_slots(scene) if not slot.moves]
+    return [(probe.at, probe.falloff, probe.offset) for probe in probes]
+
+
+def _standing_decays(scene: Scene) -> NDArray[np.float64]:
+    """Give the decays of all slots that stand, shape (slots, rows, cols)."""
+    return np.array([decay(slot, scene) for slot in probe_slots(scene) if not slot.moves])
+
+
+def _in_words(moves: tuple[bool, ...]) -> str:
+    return ", ".join("yes" if one else "no" for one in moves) or "none"

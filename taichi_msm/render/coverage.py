@@ -1,0 +1,404 @@
+"""What every sample of the picture shows: the nearest point of the surface, and where on the sheet it is.
+
+A point of the surface is carried as (X, Y, w, depth), what the camera's matrix makes of it. That map is linear, so
+refining the projected mass points is refining the surface, and the perspective needs no special case: within a cell,
+the surface between four mass points, with s to the right and t down,
+
+    P(s, t) = A + B s + C t + D s t,    seen at sample (x, y) where    X - x w = 0,  Y - y w = 0.
+
+No vertex is stored. A sample inside the outline of a cell solves these two equations, which tells the small quad, its
+side of the diagonal the triangle, and the triangle's own two linear equations the place on it. A cell that is folded or
+reaches behind the camera is drawn triangle by triangle instead.
+"""
+
+# No `from __future__ import annotations` here: Taichi reads the annotations of a kernel.
+
+from collections.abc import Callable
+from functools import cache
+from typing import Any, NamedTuple
+
+from taichi_msm.render import style
+from taichi_msm.render.samples import DEPTH, INFINITY, TEXEL_X, TEXEL_Y, Code
+from taichi_msm.system.runtime import ti
+
+# A triangle that is drawn by itself may be overstepped, so that no gap is left beside it: by so much of its side, and
+# of the picture's, for which f32 has places.
+OVERSTEP = 1e-5
+OVERSTEP_OF_PICTURE = 2e-6
+
+# Beyond so many samples f32 has no places for the outline of a cell that is drawn as a whole.
+FARTHEST = float(1 << 16)
+
+# What is kept of a mass point: (X, Y, w, depth), its place in the picture [samples], its unit normal.
+SEEN, NORMAL, POINT_NUMBERS = 4, 6, 9
+
+vec4 = ti.types.vector(4, ti.f32)
+
+
+class Surface(NamedTuple):
+    """What is drawn.
+
+    Attributes:
+        point: of every mass point the POINT_NUMBERS.
+        rows, cols: mass points.
+        parts: small quads along a side of a cell.
+        texture_width, texture_height: of the texture [texels].
+    """
+
+    point: Any
+    rows: Any
+    cols: Any
+    parts: Any
+    texture_width: Any
+    texture_height: Any
+
+
+class Band(NamedTuple):
+    """A band of the picture, and the view.
+
+    Attributes:
+        samples: what is kept of the tiles of all workers.
+        first: entry of `samples` where the band begins.
+        across: tiles of a row of them.
+        top, bottom: first row of samples, and the row after the last.
+        width, height: of the picture [samples].
+        near: what is not farther than this is not drawn.
+        toward: direction to the headlight.
+    """
+
+    samples: Any
+    first: Any
+    across: Any
+    top: Any
+    bottom: Any
+    width: Any
+    height: Any
+    near: Any
+    toward: Any
+
+
+class Cell(NamedTuple):
+    """The surface between four mass points: P = A + B s + C t + D s t.
+
+    Attributes:
+        a, b, c, d: coefficients, each (X, Y, w, depth).
+        whole: whether it is drawn as a whole, and not triangle by triangle.
+        side: 1 where its front is seen, else -1.
+        corner: entry of its upper left mass point.
+        texel_x, texel_y: whole texels to that point.
+        rest_x, rest_y: what is left of a texel there.
+        step_x, step_y: texels of the cell.
+    """
+
+    a: Any
+    b: Any
+    c: Any
+    d: Any
+    whole: Any
+    side: Any
+    corner: Any
+    texel_x: Any
+    texel_y: Any
+    rest_x: Any
+    rest_y: Any
+    step_x: Any
+    step_y: Any
+
+
+class Plane(NamedTuple):
+    """The triangle P + R s + D t of a small quad that a sample is on, each of them (X, Y, w)."""
+
+    p_x: Any
+    p_y: Any
+    p_w: Any
+    r_x: Any
+    r_y: Any
+    r_w: Any
+    d_x: Any
+    d_y: Any
+    d_w: Any
+
+
+@cache
+def covering(code: Code) -> Callable[..., Any]:
+    """Make Taichi's function that covers the samples of a band with one cell.
+
+    Args:
+        code: what it is compiled for.
+    """
+    lanes, floats, planes = code.lanes, code.floats, code.planes
+    columns = [lane % code.tile_width + 0.5 for lane in range(lanes)]
+    lines = [lane // code.tile_width + 0.5 for lane in range(lanes)]
+
+    @ti.func
+    def absolute(values):
+        return ti.max(values, values * (-1.0))
+
+    @ti.func
+    def on_triangle(x, y, plane: ti.template()):
+        """Find (s, t) where the triangle is seen at (x, y)."""
+        p_1 = plane.p_x - x * plane.p_w
+        r_1 = plane.r_x - x * plane.r_w
+        d_1 = plane.d_x - x * plane.d_w
+        p_2 = plane.p_y - y * plane.p_w
+        r_2 = plane.r_y - y * plane.r_w
+        d_2 = plane.d_y - y * plane.d_w
+        share = 1.0 / (r_1 * d_2 - r_2 * d_1)
+        return (p_2 * d_1 - p_1 * d_2) * share, (p_1 * r_2 - p_2 * r_1) * share
+
+    @ti.func
+    def edge(p_x, p_y, q_x, q_y, x, y):
+        """Twice the area of p, q and (x, y), of one sign on each side; the same bits for both cells of an edge."""
+        return (q_x - p_x) * (y - p_y) - (q_y - p_y) * (x - p_x)
+
+    @ti.func
+    def largest_edge(p_x, p_y, q_x, q_y, x, y, side):
+        """The largest `edge` times side of a tile whose upper left sample is at (x, y), rounded alike."""
+        right, down = (q_x - p_x) * side, (q_y - p_y) * side
+        x += ti.select(down > 0.0, 0.0, code.tile_width - 1.0)
+        y += ti.select(right > 0.0, code.tile_height - 1.0, 0.0)
+        return right * (y - p_y) - down * (x - p_x)
+
+    @ti.func
+    def turn(p_x, p_y, q_x, q_y, r_x, r_y):
+        return (q_x - p_x) * (r_y - q_y) - (q_y - p_y) * (r_x - q_x)
+
+    @ti.func
+    def small_quad(x, y, inside, parts, cell: ti.template()):
+        """Find column and line of the small quads of the cell that are seen at (x, y)."""
+        a, b, c, d = ti.static((cell.a, cell.b, cell.c, cell.d))
+        a_1 = a[0] - x * a[2]
+        b_1 = b[0] - x * b[2]
+        c_1 = c[0] - x * c[2]
+        d_1 = d[0] - x * d[2]
+        a_2 = a[1] - y * a[2]
+        b_2 = b[1] - y * b[2]
+        c_2 = c[1] - y * c[2]
+        d_2 = d[1] - y * d[2]
+        # Without t the two equations are bd s^2 + (ad + bc) s + ac = 0; without s they have the same discriminant.
+        ad = a_1 * d_2 - d_1 * a_2
+        bc = b_1 * c_2 - c_1 * b_2
+        ac = a_1 * c_2 - c_1 * a_2
+        ab = a_1 * b_2 - b_1 * a_2
+        bd = b_1 * d_2 - d_1 * b_2
+        linear = ad + bc
+        root = ti.sqrt(ti.max(linear * linear - 4.0 * bd * ac, 0.0)) * cell.side
+        s = ti.select(inside, -2.0 * ac / (linear + root), 0.0)
+        t = ti.select(inside, -2.0 * ab / (ad - bc - root), 0.0)
+        return (
+            ti.max(ti.min(ti.floor(s * parts), parts - 1.0), 0.0),
+            ti.max(ti.min(ti.floor(t * parts), parts - 1.0), 0.0),
+        )
+
+    @ti.func
+    def light(surface: ti.template(), cell: ti.template(), toward: ti.template(), across, along):
+        """Share of the headlight that comes back: the cosine between the normal and the direction to the light."""
+        normal = [floats(0) for _ in ti.static(range(3))]
+        corner = cell.corner + NORMAL
+        below = corner + surface.cols * POINT_NUMBERS
+        for n in ti.static(range(3)):
+            n_a, n_b = surface.point[corner + n], surface.point[corner + POINT_NUMBERS + n]
+            n_c, n_d = surface.point[below + n], surface.point[below + POINT_NUMBERS + n]
+            normal[n] = n_a + (n_b - n_a) * across + (n_c - n_a + (n_d - n_b - (n_c - n_a)) * across) * along
+        n_x, n_y, n_z = normal[0], normal[1], normal[2]
+        length = ti.sqrt(n_x * n_x + n_y * n_y + n_z * n_z)
+        return absolute(n_x * toward[0] + n_y * toward[1] + n_z * toward[2]) / ti.max(length, 1e-30)
+
+    @ti.func
+    def wire_share(across, down, right_across, right_down, below_across, below_down):
+        """Share of the mesh lines in a sample's colour, from places on the mesh; see `reference/drawing.py`."""
+        to_right, to_below = right_across - across, below_across - across
+        slope = ti.sqrt(to_right * to_right + to_below * to_below)
+        distance = absolute(across - ti.round(across)) / ti.max(slope, 1e-12)
+        to_right, to_below = right_down - down, below_down - down
+        slope = ti.sqrt(to_right * to_right + to_below * to_below)
+        distance = ti.min(distance, absolute(down - ti.round(down)) / ti.max(slope, 1e-12))
+        reach = style.WIRE_WIDTH / 2 * code.supersample + 0.5
+        return style.WIRE_OPACITY * ti.max(ti.min(reach - distance, 1.0), 0.0)
+
+    @ti.func
+    def keep(at, visible, value, samples: ti.template()):
+        samples[at] = ti.select(visible, value, samples[at])
+
+    @ti.func
+    def cover_tile(
+        at, x, y, inside, column, line, lower, overstep,
+        cell: ti.template(), surface: ti.template(), band: ti.template(),
+    ):  # fmt: skip
+        """Cover a tile of samples with the small quads (column, line) of a cell."""
+        # The small quad: P = A + B s + C t + D s t again.
+        a, b, c, d = ti.static((cell.a, cell.b, cell.c, cell.d))
+        part = 1.0 / surface.parts
+        s0 = column * part
+        t0 = line * part
+        p_x = a[0] + b[0] * s0 + (c[0] + d[0] * s0) * t0
+        p_y = a[1] + b[1] * s0 + (c[1] + d[1] * s0) * t0
+        p_w = a[2] + b[2] * s0 + (c[2] + d[2] * s0) * t0
+        p_z = a[3] + b[3] * s0 + (c[3] + d[3] * s0) * t0
+        r_x = (b[0] + d[0] * t0) * part
+        r_y = (b[1] + d[1] * t0) * part
+        r_w = (b[2] + d[2] * t0) * part
+        r_z = (b[3] + d[3] * t0) * part
+        d_x = (c[0] + d[0] * s0) * part
+        d_y = (c[1] + d[1] * s0) * part
+        d_w = (c[2] + d[2] * s0) * part
+        d_z = (c[3] + d[3] * s0) * part
+        twist = d * (part * part)
+        # Its triangles share the diagonal from P to F; the lower one has t > s.
+        f_w = p_w + r_w + d_w + twist[2]
+        below = (
+            (p_x - x * p_w) * (p_y + r_y + d_y + twist[1] - y * f_w)
+            - (p_y - y * p_w) * (p_x + r_x + d_x + twist[0] - x * f_w)
+        ) * cell.side >= 0.0
+        if not cell.whole:
+            below = floats(ti.cast(lower, ti.f32)) > 0.5
+        r_x += ti.select(below, twist[0], 0.0)
+        r_y += ti.select(below, twist[1], 0.0)
+        r_w += ti.select(below, twist[2], 0.0)
+        r_z += ti.select(below, twist[3], 0.0)
+        d_x += ti.select(below, 0.0, twist[0])
+        d_y += ti.select(below, 0.0, twist[1])
+        d_w += ti.select(below, 0.0, twist[2])
+        d_z += ti.select(below, 0.0, twist[3])
+        plane = ti.static(Plane(p_x, p_y, p_w, r_x, r_y, r_w, d_x, d_y, d_w))
+        s, t = on_triangle(x, y, plane)
+        if not cell.whole:
+            upper_limit = ti.select(below, t, s)
+            lower_limit = ti.select(below, s, t)
+            inside = (
+                (lower_limit >= -overstep)
+                & (upper_limit <= 1.0 + overstep)
+                & (lower_limit <= upper_limit + overstep)
+                & (p_w + r_w * s + d_w * t > band.near)
+            )
+        z = p_z + r_z * s + d_z * t
+        visible = inside & (z < band.samples[at + DEPTH])
+        across = (column + s) * part
+        along = (line + t) * part
+        keep(at + DEPTH, visible, z, band.samples)
+        keep(at + TEXEL_X, visible, cell.rest_x + across * cell.step_x + cell.texel_x, band.samples)
+        keep(at + TEXEL_Y, visible, cell.rest_y + along * cell.step_y + cell.texel_y, band.samples)
+        if ti.static(code.lit):
+            keep(at + code.light, visible, light(surface, cell, band.toward, across, along), band.samples)
+        if ti.static(code.wireframe):
+            s_right, t_right = on_triangle(x + 1.0, y, plane)
+            s_below, t_below = on_triangle(x, y + 1.0, plane)
+            wire = wire_share(
+                across, along,
+                (column + s_right) * part, (line + t_right) * part,
+                (column + s_below) * part, (line + t_below) * part,
+            )  # fmt: skip
+            keep(at + code.wire, visible, wire, band.samples)
+
+    @ti.func
+    def cover(i, j, surface: ti.template(), band: ti.template()):
+        """Cover the samples of a band with the cell to the right and below of mass point (i, j)."""
+        point, near = ti.static((surface.point, band.near))
+        corner = (i * surface.cols + j) * POINT_NUMBERS
+        corner_b, corner_c = corner + POINT_NUMBERS, corner + surface.cols * POINT_NUMBERS
+        corner_d = corner_c + POINT_NUMBERS
+        a_x, a_y = point[corner + SEEN], point[corner + SEEN + 1]
+        b_x, b_y = point[corner_b + SEEN], point[corner_b + SEEN + 1]
+        c_x, c_y = point[corner_c + SEEN], point[corner_c + SEEN + 1]
+        d_x, d_y = point[corner_d + SEEN], point[corner_d + SEEN + 1]
+        a = vec4([point[corner + n] for n in ti.static(range(4))])
+        right = vec4([point[corner_b + n] for n in ti.static(range(4))])
+        down = vec4([point[corner_c + n] for n in ti.static(range(4))])
+        far = vec4([point[corner_d + n] for n in ti.static(range(4))])
+        b = right - a
+        c = down - a
+        d = far - right - c
+        before = a[2] > near and right[2] > near and down[2] > near and far[2] > near
+        abd = turn(a_x, a_y, b_x, b_y, d_x, d_y)
+        bdc = turn(b_x, b_y, d_x, d_y, c_x, c_y)
+        dca = turn(d_x, d_y, c_x, c_y, a_x, a_y)
+        cab = turn(c_x, c_y, a_x, a_y, b_x, b_y)
+        convex = ti.min(abd, bdc, dca, cab) > 0 or ti.max(abd, bdc, dca, cab) < 0
+        left_end, right_end = ti.min(a_x, b_x, c_x, d_x), ti.max(a_x, b_x, c_x, d_x)
+        upper_end, lower_end = ti.min(a_y, b_y, c_y, d_y), ti.max(a_y, b_y, c_y, d_y)
+        whole = (
+            before and convex and ti.max(-left_end, right_end) < FARTHEST and ti.max(-upper_end, lower_end) < FARTHEST
+        )
+        side = ti.select(abd > 0, 1.0, -1.0)
+        # Where the texture is, in texels, exact to a fraction of one on any sheet.
+        texel_x = ti.cast(j, ti.f64) * surface.texture_width / (surface.cols - 1) - 0.5
+        texel_y = ti.cast(i, ti.f64) * surface.texture_height / (surface.rows - 1) - 0.5
+        whole_x, whole_y = ti.floor(texel_x), ti.floor(texel_y)
+        first_x, first_y = ti.cast(whole_x, ti.f32), ti.cast(whole_y, ti.f32)
+        rest_x, rest_y = ti.cast(texel_x - whole_x, ti.f32), ti.cast(texel_y - whole_y, ti.f32)
+        step_x = ti.cast(surface.texture_width, ti.f32) / (surface.cols - 1)
+        step_y = ti.cast(surface.texture_height, ti.f32) / (surface.rows - 1)
+        cell = ti.static(Cell(a, b, c, d, whole, side, corner, first_x, first_y, rest_x, rest_y, step_x, step_y))
+        count = ti.cast(surface.parts, ti.i32)
+        part = 1.0 / surface.parts
+
+        pieces = ti.select(whole, 1, 2 * count * count)
+        for piece in range(pieces):
+            # Of a triangle that is drawn by itself: its quad, and whether it is below the diagonal.
+            quad = piece // 2
+            quad_s = ti.cast(quad % count, ti.f32)
+            quad_t = ti.cast(quad // count, ti.f32)
+            lower = piece % 2 == 0
+            low_x, high_x, low_y, high_y = 0.0, ti.cast(band.width, ti.f32), -INFINITY, INFINITY
+            overstep = OVERSTEP
+            if whole:
+                low_x, high_x, low_y, high_y = left_end, right_end, upper_end, lower_end
+            else:
+                s0, t0 = quad_s * part, quad_t * part
+                s1, t1 = (quad_s + 1) * part, (quad_t + 1) * part
+                one = a + b * s0 + (c + d * s0) * t0
+                two = a + b * s1 + (c + d * s1) * t1
+                three = a + b * s0 + (c + d * s0) * t1
+                if not lower:
+                    three = a + b * s1 + (c + d * s1) * t0
+                if one[2] > near and two[2] > near and three[2] > near:
+                    low_x = ti.min(one[0] / one[2], two[0] / two[2], three[0] / three[2])
+                    high_x = ti.max(one[0] / one[2], two[0] / two[2], three[0] / three[2])
+                    low_y = ti.min(one[1] / one[2], two[1] / two[2], three[1] / three[2])
+                    high_y = ti.max(one[1] / one[2], two[1] / two[2], three[1] / three[2])
+                    extent = ti.max(high_x - low_x, high_y - low_y, 1e-3)
+                    overstep += OVERSTEP_OF_PICTURE * (band.width + band.height) / extent
+                elif one[2] <= near and two[2] <= near and three[2] <= near:
+                    high_x = -1.0
+            first_row = ti.cast(ti.math.clamp(ti.floor(low_y - 0.5), band.top, band.bottom), ti.i32)
+            end_row = ti.cast(ti.math.clamp(ti.ceil(high_y + 0.5), band.top, band.bottom), ti.i32)
+            first_column = ti.cast(ti.math.clamp(ti.floor(low_x - 0.5), 0.0, band.width), ti.i32)
+            end_column = ti.cast(ti.math.clamp(ti.ceil(high_x + 0.5), 0.0, band.width), ti.i32)
+            first_line = (first_row - band.top) // code.tile_height
+            end_line = (end_row - band.top + (code.tile_height - 1)) // code.tile_height
+            first_tile = first_column // code.tile_width
+            end_tile = (end_column + (code.tile_width - 1)) // code.tile_width
+            for tile_line in range(first_line, end_line):
+                tile_y = ti.cast(band.top + tile_line * code.tile_height, ti.f32)
+                for tile in range(first_tile, end_tile):
+                    tile_x = ti.cast(tile * code.tile_width, ti.f32)
+                    reached = True
+                    if whole:
+                        upper_x, upper_y = tile_x + 0.5, tile_y + 0.5
+                        reached = (
+                            largest_edge(a_x, a_y, c_x, c_y, upper_x, upper_y, -side) >= 0.0
+                            and largest_edge(b_x, b_y, d_x, d_y, upper_x, upper_y, side) > 0.0
+                            and largest_edge(a_x, a_y, b_x, b_y, upper_x, upper_y, side) >= 0.0
+                            and largest_edge(c_x, c_y, d_x, d_y, upper_x, upper_y, -side) > 0.0
+                        )
+                    if reached:
+                        x = floats(columns) + tile_x
+                        y = floats(lines) + tile_y
+                        inside = floats(1) > 0.0
+                        column, line = floats(quad_s), floats(quad_t)
+                        if whole:
+                            # Left and upper edges belong to a cell, right and lower ones do not.
+                            inside = (
+                                (edge(a_x, a_y, c_x, c_y, x, y) * side <= 0.0)
+                                & (edge(b_x, b_y, d_x, d_y, x, y) * side > 0.0)
+                                & (edge(a_x, a_y, b_x, b_y, x, y) * side >= 0.0)
+                                & (edge(c_x, c_y, d_x, d_y, x, y) * side < 0.0)
+                            )
+                            if ti.static(code.refined):
+                                column, line = small_quad(x, y, inside, surface.parts, cell)
+                        cover_tile(
+                            band.first + (tile_line * band.across + tile) * planes, x, y, inside, column, line,
+                            lower, overstep, cell, surface, band,
+                        )  # fmt: skip
+
+    return cover

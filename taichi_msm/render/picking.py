@@ -1,0 +1,116 @@
+"""Which material point is seen at a pixel: the way back from the picture to the sheet."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from taichi_msm.render.camera import View
+
+# So many cells are looked into at a time.
+CELLS = 1024
+
+Array = NDArray[np.float64]
+Pixel = tuple[float, float]
+Place = tuple[float, float]
+Seen = tuple[float, Place]
+
+
+def pick(position: NDArray[np.floating], refine: int, view: View, pixel: Pixel) -> Place | None:
+    """Find the material point that is drawn at the centre of a pixel: of the surface's triangles there the nearest.
+
+    With (X, Y, w, depth) what the camera makes of a point, a = X - x w and b = Y - y w are linear in the point and
+    both 0 where it is seen at (x, y). So nothing has to be divided by w, which is no positive number behind the camera.
+
+    Args:
+        position: positions of the mass points [m], shape (rows, cols, 3).
+        refine: vertices inserted between two neighbours, as drawn.
+        view: the camera.
+        pixel: x to the right and y down from the picture's top-left pixel, which is (0, 0).
+
+    Returns:
+        Fractions of the sheet's width from its left and of its height from its top; None where no surface is.
+    """
+    rows, cols = position.shape[:2]
+    matrix = _seen_from(view, pixel)
+    found: list[Seen] = []
+    cells = np.argwhere(_may_show(position, matrix))
+    for first in range(0, len(cells), CELLS):
+        i, j = cells[first : first + CELLS].T
+        corners = np.stack([position[i + down, j + right] for down in (0, 1) for right in (0, 1)], axis=1)
+        found += _in_cells(corners @ matrix[:, :3].T + matrix[:, 3], i, j, refine, view.near)
+    if not found:
+        return None
+    _, (across, down) = min(found)
+    return across / (cols - 1), down / (rows - 1)
+
+
+def on_rest_plane(view: View, pixel: Pixel) -> NDArray[np.floating] | None:
+    """Find where the line of sight through the centre of a pixel meets the plane of the sheet at rest.
+
+    Returns:
+        x and y [m]; None where it does not meet it in front of the camera.
+    """
+    matrix = _seen_from(view, pixel)
+    planar = matrix[:2, :2]
+    size = np.linalg.norm(planar, axis=1).prod()
+    if not abs(np.linalg.det(planar)) > 1e-9 * size:
+        return None
+    point = np.linalg.solve(planar, -matrix[:2, 3])
+    return point if matrix[2] @ [*point, 0, 1] > view.near else None
+
+
+def _seen_from(view: View, pixel: Pixel) -> Array:
+    """Give the matrix that makes (a, b, w, depth) of a point, shape (4, 4)."""
+    matrix = view.matrix.copy()
+    for row in (0, 1):
+        matrix[row] -= (pixel[row] + 0.5) * matrix[2]
+    return matrix
+
+
+def _may_show(position: NDArray[np.floating], matrix: Array) -> NDArray[np.bool_]:
+    """Mark the cells in which a and b can both be 0, given the matrix that makes (a, b, w, depth) of a point."""
+    rows, cols = position.shape[:2]
+    marked = np.ones((rows - 1, cols - 1), dtype=bool)
+    for row in matrix[:2]:
+        # One number of every point at a time: all of a large sheet at once are no longer in the cache.
+        value = position @ row[:3] + row[3]
+        for side in (value <= 0, value >= 0):
+            pairs = side[:-1] | side[1:]
+            marked &= pairs[:, :-1] | pairs[:, 1:]
+    return marked
+
+
+def _around_zero(corners: Array) -> NDArray[np.bool_]:
+    """Mark the figures, given by their corners of shape (..., corners, 4), in which a and b can both be 0."""
+    least, most = corners[..., :2].min(axis=-2), corners[..., :2].max(axis=-2)
+    return ((least <= 0) & (most >= 0)).all(axis=-1)
+
+
+def _in_cells(corners: Array, i: NDArray[np.intp], j: NDArray[np.intp], refine: int, near: float) -> list[Seen]:
+    """List the depth and the place, in cells from the top left, of all that is seen in some cells at the pixel."""
+    parts = refine + 1
+    share = np.arange(parts + 1) / parts
+    s, t = share[:, None], share[:, None, None]
+    a, right, down, far = (corners[:, None, None, n] for n in range(4))
+    vertex = a + (right - a) * s + (down - a) * t + (far - right - down + a) * s * t
+    quads = np.stack([vertex[:, :-1, :-1], vertex[:, :-1, 1:], vertex[:, 1:, :-1], vertex[:, 1:, 1:]], axis=-2)
+    cell, line, column = np.nonzero(_around_zero(quads))
+    quad = quads[cell, line, column]
+    found = []
+    for third in (1, 2):  # the corner besides the ends of the diagonal: upper right, lower left
+        triangle = quad[:, [0, third, 3]]
+        p, q, r = np.moveaxis(triangle[..., :2], 1, 0)
+        share = np.stack([_cross(q, r), _cross(r, p), _cross(p, q)], axis=-1)
+        with np.errstate(divide="ignore", invalid="ignore"):
+            share /= share.sum(axis=-1, keepdims=True)
+        w, depth = np.moveaxis((share[..., None] * triangle[..., 2:]).sum(axis=1), -1, 0)
+        for n in np.flatnonzero((share >= 0).all(axis=-1) & (w > near)):
+            across = j[cell[n]] + (column[n] + share[n, 2] + (third == 1) * share[n, 1]) / parts
+            along = i[cell[n]] + (line[n] + share[n, 2] + (third == 2) * share[n, 1]) / parts
+            found.append((float(depth[n]), (float(across), float(along))))
+    return found
+
+
+def _cross(p: Array, q: Array) -> Array:
+    return p[..., 0] * q[..., 1] - p[..., 1] * q[..., 0]

@@ -1,0 +1,211 @@
+"""Kernel 2: bilinear refinement, projection, rasterisation of textured triangles, shading.
+
+The picture is cut into bands of rows. A worker takes the next band, finds what each of its samples shows (coverage.py),
+shades them and gives out the pixels (shading.py). As in kernel 1, vectors stay vectors down to the machine code
+(docs/decisions/0010); casts, and floor and abs of vectors, are written so that they can.
+"""
+
+# No `from __future__ import annotations` here: Taichi reads the annotations of a kernel.
+
+from collections.abc import Callable
+from functools import cache
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from taichi_msm.render.camera import View, view
+from taichi_msm.render.coverage import NORMAL, POINT_NUMBERS, SEEN, Band, Surface, covering
+from taichi_msm.render.samples import DEPTH, INFINITY, Code
+from taichi_msm.render.shading import Texture, packed, resolving
+from taichi_msm.scene import Scene
+from taichi_msm.system.runtime import ITERATIONS_PER_THREAD, Memory, lanes, our_compilation, started, ti
+
+
+def structure(scene: Scene) -> Code:
+    """Find out what the scene's picture needs."""
+    render = scene.render
+    return Code(
+        refined=render.refine > 0,
+        supersample=render.supersample,
+        lit=render.shading == "headlight",
+        wireframe=render.wireframe,
+        lanes=lanes("f32"),
+    )
+
+
+class Drawing:
+    """Draws one scene's sheet; `runtime.start` comes first.
+
+    Args:
+        scene: a checked scene.
+        texture: the picture on the sheet, shape (height, width, 3).
+        code: another than the scene's own; for tests.
+    """
+
+    def __init__(self, scene: Scene, texture: NDArray[np.uint8], code: Code | None = None) -> None:
+        self.scene = scene
+        self.code = code or structure(scene)
+        self._draw = _kernel(self.code)
+        self._view = view(scene)
+        (rows, cols), (width, height) = scene.sheet.points, scene.render.size
+        bands = -(-height // self.code.band_rows)
+        self._workers = min(bands, started().threads) if started().arch == "cpu" else bands
+        self._memory = memory = Memory()
+        self._point = memory.array("f32", 0, rows * cols * POINT_NUMBERS)
+        # Of every row of mass points its highest and its lowest place in the picture.
+        self._reach = memory.array("f32", 0, rows * 2)
+        self._samples = memory.array("f32", self.code.lanes, self._workers * self.code.band_vectors(width))
+        self._background = np.array(scene.render.background, np.float32)
+        self._texels: Any = packed(texture).ravel()
+        self._texture_size = texture.shape[1], texture.shape[0]
+        if started().arch != "cpu":
+            # Kept there, or it would travel there and back with every picture.
+            texels, self._texels = self._texels, ti.ndarray(ti.f32, self._texels.size)
+            self._texels.from_numpy(texels)
+
+    def draw(self, position: NDArray[Any], camera: View | None = None) -> NDArray[np.uint8]:
+        """Draw the sheet.
+
+        Args:
+            position: positions of the mass points [m], shape (rows, cols, 3).
+            camera: another view than the scene's.
+
+        Returns:
+            Colours, shape (height, width, 3).
+        """
+        camera = camera or self._view
+        (rows, cols), (width, height), factor = self.scene.sheet.points, self.scene.render.size, self.code.supersample
+        scale = np.array([[factor], [factor], [1], [1]])
+        across = self.code.tiles_across(width)
+        # Whole tiles are given out, of which the last may be wider than the picture.
+        stride = across * self.code.tile_width if self.code.in_words else width
+        out = np.empty((height, stride, 3), np.uint8)
+        with our_compilation(optimised=False):
+            self._draw(
+                np.ascontiguousarray(position, np.float32),
+                self._texels,
+                np.ascontiguousarray(camera.matrix * scale, np.float32),
+                np.ascontiguousarray(camera.toward, np.float32),
+                self._background,
+                camera.near,
+                self.scene.render.refine + 1,
+                rows,
+                cols,
+                width,
+                height,
+                *self._texture_size,
+                self._workers,
+                np.zeros(1, np.int32),
+                self._point,
+                self._reach,
+                self._samples,
+                out.ravel().view(np.int32) if self.code.in_words else out.ravel(),
+            )
+        return out if stride == width else np.ascontiguousarray(out[:, :width])
+
+
+@cache
+def _kernel(code: Code) -> Callable[..., None]:
+    """Make the kernel of one code."""
+    factor, floats = code.supersample, code.floats
+    cover, resolve = covering(code), resolving(code)
+
+    @ti.func
+    def project(position: ti.template(), matrix: ti.template(), point: ti.template(), i, j, rows, cols):
+        """Note where mass point (i, j) is seen, and its normal."""
+        here = (i * cols + j) * POINT_NUMBERS
+        x, y, z = position[i, j, 0], position[i, j, 1], position[i, j, 2]
+        for n in ti.static(range(4)):
+            point[here + n] = matrix[n, 0] * x + matrix[n, 1] * y + matrix[n, 2] * z + matrix[n, 3]
+        point[here + SEEN] = point[here] / point[here + 2]
+        point[here + SEEN + 1] = point[here + 1] / point[here + 2]
+        if ti.static(code.lit):
+            i0, i1 = ti.max(i - 1, 0), ti.min(i + 1, rows - 1)
+            j0, j1 = ti.max(j - 1, 0), ti.min(j + 1, cols - 1)
+            r_x = position[i, j1, 0] - position[i, j0, 0]
+            r_y = position[i, j1, 1] - position[i, j0, 1]
+            r_z = position[i, j1, 2] - position[i, j0, 2]
+            u_x = position[i0, j, 0] - position[i1, j, 0]
+            u_y = position[i0, j, 1] - position[i1, j, 1]
+            u_z = position[i0, j, 2] - position[i1, j, 2]
+            n_x = r_y * u_z - r_z * u_y
+            n_y = r_z * u_x - r_x * u_z
+            n_z = r_x * u_y - r_y * u_x
+            length = ti.max(ti.sqrt(n_x * n_x + n_y * n_y + n_z * n_z), 1e-30)
+            point[here + NORMAL] = n_x / length
+            point[here + NORMAL + 1] = n_y / length
+            point[here + NORMAL + 2] = n_z / length
+
+    @ti.func
+    def draw_band(surface: ti.template(), band: ti.template(), reach: ti.template()):
+        """Find what every sample of a band shows."""
+        lines = (band.bottom - band.top + code.tile_height - 1) // code.tile_height
+        for tile in range(lines * band.across):
+            band.samples[band.first + tile * code.planes + DEPTH] = floats(INFINITY)
+        for i in range(surface.rows - 1):
+            low = ti.min(reach[2 * i], reach[2 * i + 2])
+            high = ti.max(reach[2 * i + 1], reach[2 * i + 3])
+            if low < band.bottom and high > band.top:
+                for j in range(surface.cols - 1):
+                    cover(i, j, surface, band)
+
+    @ti.kernel
+    def draw(
+        position: ti.types.ndarray(dtype=ti.f32, ndim=3),
+        texels: ti.types.ndarray(dtype=ti.f32, ndim=1),
+        matrix: ti.types.ndarray(dtype=ti.f32, ndim=2),
+        toward: ti.types.ndarray(dtype=ti.f32, ndim=1),
+        background: ti.types.ndarray(dtype=ti.f32, ndim=1),
+        near: ti.f32,
+        parts: ti.f32,
+        rows: ti.i32,
+        cols: ti.i32,
+        width: ti.i32,
+        height: ti.i32,
+        texture_width: ti.i32,
+        texture_height: ti.i32,
+        workers: ti.i32,
+        taken: ti.types.ndarray(dtype=ti.i32, ndim=1),
+        point: ti.types.ndarray(dtype=ti.f32, ndim=1),
+        reach: ti.types.ndarray(dtype=ti.f32, ndim=1),
+        samples: ti.types.ndarray(dtype=floats, ndim=1),
+        out: ti.types.ndarray(dtype=ti.i32 if code.in_words else ti.u8, ndim=1),
+    ):
+        for index in range(rows * ITERATIONS_PER_THREAD):
+            if index % ITERATIONS_PER_THREAD == 0:
+                i = index // ITERATIONS_PER_THREAD
+                low, high = INFINITY, -INFINITY
+                for j in range(cols):
+                    project(position, matrix, point, i, j, rows, cols)
+                    here = (i * cols + j) * POINT_NUMBERS
+                    if point[here + 2] > near:
+                        low = ti.min(low, point[here + SEEN + 1])
+                        high = ti.max(high, point[here + SEEN + 1])
+                    else:
+                        low, high = -INFINITY, INFINITY
+                reach[2 * i] = low
+                reach[2 * i + 1] = high
+
+        for index in range(workers * ITERATIONS_PER_THREAD):
+            if index % ITERATIONS_PER_THREAD == 0:
+                across = (width * factor + code.tile_width - 1) // code.tile_width
+                first = index // ITERATIONS_PER_THREAD * across * (code.band_lines * code.planes)
+                surface = ti.static(Surface(point, rows, cols, parts, texture_width, texture_height))
+                texture = ti.static(Texture(texels, texture_width, texture_height, background))
+                samples_width, samples_height = width * factor, height * factor
+                # A worker that another program holds up leaves the bands to the others.
+                taking = True
+                while taking:
+                    row = ti.atomic_add(taken[0], 1) * code.band_rows
+                    taking = row < height
+                    if taking:
+                        end_row = ti.min(row + code.band_rows, height)
+                        top, bottom = row * factor, end_row * factor
+                        band = ti.static(
+                            Band(samples, first, across, top, bottom, samples_width, samples_height, near, toward)
+                        )
+                        draw_band(surface, band, reach)
+                        resolve(samples, first, row, end_row, across, width, texture, out)
+
+    return draw

@@ -1,0 +1,117 @@
+"""What is kept of every sample of the picture between covering and shading, and how it lies in memory.
+
+Samples are pixels, or where pixels are supersampled their parts. A tile of them is one vector: 4 x 4 samples for the 16
+lanes of AVX-512, 4 x 2 for 8 lanes, 4 x 1 for 4; on a GPU a single one. Bands of rows of tiles are the unit of parallel
+work; a worker keeps one band at a time, `planes` vectors a tile.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any
+
+from taichi_msm.system.runtime import ti
+
+# Rows of samples of a band on a CPU, about.
+BAND_ROWS = 16
+
+# Samples of a row of a tile, where there are as many lanes.
+TILE_WIDTH = 4
+
+# Planes of every tile: the depth of what is seen, and its place in the texture [texels]; then, where the code has
+# them, the share of light, the share of the mesh's lines, and the shaded colour.
+DEPTH, TEXEL_X, TEXEL_Y, FIRST_OPTIONAL = 0, 1, 2, 3
+
+# Farther than anything that is drawn.
+INFINITY = 3e38
+
+
+@dataclass(frozen=True)
+class Code:
+    """What kernel 2 is compiled for; all else is an argument.
+
+    Attributes:
+        refined: whether vertices are inserted between mass points.
+        supersample: samples of a pixel along each axis.
+        lit: whether there is a headlight.
+        wireframe: whether the mass-point mesh is drawn.
+        lanes: samples of a tile.
+    """
+
+    refined: bool
+    supersample: int
+    lit: bool
+    wireframe: bool
+    lanes: int
+
+    @property
+    def tile_width(self) -> int:
+        """Columns of samples of a tile."""
+        return min(self.lanes, TILE_WIDTH)
+
+    @property
+    def tile_height(self) -> int:
+        """Rows of samples of a tile."""
+        return self.lanes // self.tile_width
+
+    @property
+    def light(self) -> int:
+        """Plane of the light."""
+        return FIRST_OPTIONAL
+
+    @property
+    def wire(self) -> int:
+        """Plane of the mesh's lines."""
+        return FIRST_OPTIONAL + self.lit
+
+    @property
+    def colour(self) -> int:
+        """First of the three planes of the colour, which is kept where samples are averaged."""
+        return FIRST_OPTIONAL + self.lit + self.wireframe
+
+    @property
+    def planes(self) -> int:
+        """Vectors that are kept of a tile."""
+        return self.colour + (3 if self.supersample > 1 else 0)
+
+    @property
+    def band_rows(self) -> int:
+        """Rows of pixels of a band: all of the samples of a row of tiles; one on a GPU."""
+        return 1 if self.lanes == 1 else max(1, BAND_ROWS // self.supersample)
+
+    @property
+    def band_lines(self) -> int:
+        """Rows of tiles of a band."""
+        return -(-self.band_rows * self.supersample // self.tile_height)
+
+    @property
+    def in_words(self) -> bool:
+        """Whether pixels are given out by fours, as three words, and not as bytes."""
+        return self.supersample == 1 and self.tile_width == TILE_WIDTH
+
+    def tiles_across(self, width: int) -> int:
+        """Count the tiles of a row of them.
+
+        Args:
+            width: of the picture [px].
+        """
+        return -(-width * self.supersample // self.tile_width)
+
+    def band_vectors(self, width: int) -> int:
+        """Count the vectors that a worker keeps.
+
+        Args:
+            width: of the picture [px].
+        """
+        return self.band_lines * self.tiles_across(width) * self.planes
+
+    @cached_property
+    def floats(self) -> Any:
+        """Taichi's type of a number for every lane."""
+        return ti.types.vector(self.lanes, ti.f32)
+
+    @cached_property
+    def integers(self) -> Any:
+        """Taichi's type of a whole number for every lane."""
+        return ti.types.vector(self.lanes, ti.i32)

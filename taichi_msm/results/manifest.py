@@ -1,0 +1,123 @@
+"""What a run is to do, in words that another process understands, so that it can go on with it."""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import TypeAdapter
+
+from taichi_msm.errors import DamagedError, FilesError
+from taichi_msm.physics import timestep, workload
+from taichi_msm.physics.error_control import Estimate
+from taichi_msm.render import camera
+from taichi_msm.render.texture import load_texture
+from taichi_msm.results.publication import CHECKPOINT, MANIFEST, STAGING, open_checkpoint
+from taichi_msm.results.sealed import unseal
+from taichi_msm.scene import Scene
+from taichi_msm.system.runtime import ARCHS
+
+# A manifest holds its scene twice, each of which a file of 1 MiB may have described.
+MAX_BYTES = 1 << 26
+
+
+@dataclass(frozen=True)
+class Manifest:
+    """Everything that the bits of a result depend on, and what its record says.
+
+    Attributes:
+        given: the scene as it was loaded.
+        scene: the scene with the step that was chosen.
+        overrides: what made the scene, beside its file.
+        estimate: of the error, if a tolerance wanted it before the run.
+        asks_estimate: whether an estimate is wanted beside the run; None: where it is cheap.
+        folder: the current directory, from which the scene's picture is found.
+        arch: cpu, cuda or vulkan.
+        picture: the digest of the picture on the sheet.
+        versions: what the results depend on besides.
+    """
+
+    given: Scene
+    scene: Scene
+    overrides: tuple[str, ...]
+    estimate: Estimate | None
+    asks_estimate: bool | None
+    folder: str
+    arch: str
+    picture: str
+    versions: Mapping[str, str]
+
+    def as_json(self) -> dict[str, Any]:
+        """Write it down."""
+        known = None if self.estimate is None else asdict(self.estimate)
+        scenes = {"given": self.given.model_dump(mode="json"), "scene": self.scene.model_dump(mode="json")}
+        return {**vars(self), **scenes, "estimate": known}
+
+    def load_texture(self) -> NDArray[np.uint8] | None:
+        """Read the picture of the scene, if it draws; raises what `texture.load_texture` does."""
+        if not self.scene.draws:
+            return None
+        image = str(Path(self.folder) / str(self.scene.image))
+        return load_texture(self.scene.model_copy(update={"image": image}))
+
+    def require_same(self, picture: str, versions: Mapping[str, str]) -> None:
+        """Make sure that what follows has the bits of one run.
+
+        Raises:
+            FilesError: when the picture or a version is another one.
+        """
+        if picture != self.picture:
+            raise FilesError(f"{self.scene.image} is another picture than when the run began; run the scene again")
+        others = [f"{key} {self.versions.get(key)}" for key in versions if versions[key] != self.versions.get(key)]
+        if others:
+            raise FilesError(f"the run was begun with {', '.join(others)}; take these, or run the scene again")
+
+    def gives_the_bits_of(self, other: Manifest) -> bool:
+        """Tell whether the results are the same, so that either run can go on with the other."""
+        renamed = other.scene.model_copy(update={"image": self.scene.image})
+        mine, its = (self.arch, self.picture, self.versions), (other.arch, other.picture, other.versions)
+        return self.scene == renamed and mine == its
+
+
+_PLAN = TypeAdapter(Manifest)
+
+
+def read_manifest(directory: Path) -> Manifest:
+    """Read the manifest of the unfinished run into a directory.
+
+    Raises:
+        FilesError: when there is none.
+        DamagedError: when it cannot be understood.
+    """
+    path = directory / STAGING / CHECKPOINT / MANIFEST
+    try:
+        with open_checkpoint(directory) as folder, folder.open(MANIFEST) as file:
+            data = file.read(MAX_BYTES + 1)
+        manifest = _PLAN.validate_python(unseal(data))
+    except (FileNotFoundError, NotADirectoryError):
+        raise FilesError(f"{directory}: there is no unfinished run to go on with") from None
+    except OSError as error:
+        raise FilesError(f"{path}: {(error.strerror or str(error)).lower()}") from None
+    except ValueError:  # pydantic's too
+        raise DamagedError(f"{path} is damaged; run the scene again") from None
+    # Anybody may have written it.
+    numbers = () if manifest.estimate is None else asdict(manifest.estimate).values()
+    possible = manifest.arch in ARCHS and all(number >= 0 for number in numbers)
+    checks = (timestep.problems, workload.problems, camera.problems)
+    if not possible or any(list(check(manifest.scene)) for check in checks):
+        raise DamagedError(f"{path} is of no scene that can be run; run another")
+    return manifest
+
+
+def digest(picture: NDArray[np.uint8] | None) -> str:
+    """Tell pictures apart; empty where there is none."""
+    if picture is None:
+        return ""
+    found = hashlib.sha256(repr(picture.shape).encode())
+    found.update(np.ascontiguousarray(picture).data)
+    return found.hexdigest()

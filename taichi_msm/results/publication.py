@@ -1,0 +1,333 @@
+"""Replace the results in a directory: whole or not at all, and nothing that is not a run's.
+
+New files are staged below the directory, so that every move is a rename within one file system. When all are there, a
+marker with their names says so. Then the record of the earlier results goes first, the other files are moved, and the
+new record comes last: where there is a record, the results are whole and belong together. A process killed before the
+marker leaves the directory as it was; after it, the next publication completes the moves first.
+
+The record lists what a run has written, and only that is ever replaced or removed. Anything else in its place is an
+error before anything is touched.
+"""
+
+from __future__ import annotations
+
+import errno
+import json
+import os
+import re
+from collections.abc import Collection, Iterable, Iterator
+from contextlib import ExitStack, suppress
+from pathlib import Path
+from typing import BinaryIO
+
+from taichi_msm.errors import DamagedError, FilesError, ForeignError
+from taichi_msm.results.folder import FILE, HAS_DESCRIPTORS, INHERITS, Folder, Tree
+from taichi_msm.results.sealed import seal, unseal
+
+FRAMES = "frames"
+ANIMATION = "animation.gif"
+TRAJECTORY = "trajectory.npz"
+RECORD = "run.json"
+
+# What makes a checkpoint one: a run's manifest. Besides there are the positions of its frames, and its last state.
+MANIFEST, POSITIONS, STATE = "manifest.json", "positions", "state.npz"
+
+STAGING, NEW, CHECKPOINT = ".partial", "new", "checkpoint"
+LOCK, MARKER, DRAFT = "lock", "complete", "draft"
+
+# All that a run ever puts below a directory until it publishes its results.
+CHECKPOINT_TREE: Tree = dict.fromkeys((MANIFEST, POSITIONS, re.escape(STATE), DRAFT))
+NEW_TREE: Tree = {FRAMES: {r"[0-9]{4,}\.png": None}, **dict.fromkeys((ANIMATION, TRAJECTORY, RECORD))}
+STAGING_TREE: Tree = {**dict.fromkeys((LOCK, MARKER, DRAFT)), NEW: NEW_TREE, CHECKPOINT: CHECKPOINT_TREE}
+
+# How often a directory is tried that other runs are leaving; after that it is itself gone.
+ATTEMPTS = 100
+
+# A record of so many frames that no disk holds them is smaller [bytes].
+MAX_RECORD = 1 << 28
+
+
+def open_checkpoint(directory: Path) -> Folder:
+    """Open what an unfinished run into a directory needs to go on; raises OSError where there is none."""
+    with Folder.at(directory) as here, here.folder(STAGING) as staging:
+        return staging.folder(CHECKPOINT)
+
+
+def is_unfinished(directory: Path) -> bool:
+    """Tell whether there is a run into a directory to go on with."""
+    try:
+        with open_checkpoint(directory) as checkpoint:
+            return checkpoint.kind(MANIFEST) == FILE
+    except (OSError, FilesError):
+        return False
+
+
+def frame_file(number: int) -> str:
+    """Name the picture of a frame within its folder."""
+    return f"{number:04}.png"
+
+
+def result_names(outputs: Iterable[str], frames: int) -> list[str]:
+    """List the files of results, with their folder.
+
+    Args:
+        outputs: names of files, and FRAMES for the pictures of all frames.
+        frames: how many frames.
+    """
+    names = []
+    for output in outputs:
+        names += [f"{FRAMES}/{frame_file(n)}" for n in range(frames)] if output == FRAMES else [output]
+    return names
+
+
+class Publication:
+    """New contents for a directory. Leaving the with statement without `publish` discards them.
+
+    Args:
+        directory: where the results go; made where it does not exist.
+        names: what will be published, at most; it is an error if anything but earlier results is there.
+
+    Raises:
+        FilesError: on entering, when another process publishes there, or something is in the way that no run has put
+            there; here and in `publish`.
+        OSError: when the directory cannot be written.
+
+    Attributes:
+        staging: where all that is not published yet lies; known when entered.
+        staged: the folder to write the new files in, under their final names; likewise.
+        keep: whether the checkpoint of an unfinished run, this one or an earlier, stays when the with statement is
+            left.
+    """
+
+    staging: Folder
+    staged: Folder
+
+    def __init__(self, directory: Path, names: Collection[str] = ()) -> None:
+        self.keep = True
+        self._path = directory
+        self._names = names
+        self._open = ExitStack()
+        self._lock: BinaryIO | None = None
+        self._created = False
+
+    @property
+    def lock_descriptors(self) -> tuple[int, ...]:
+        """File descriptors that a child process inherits to keep the directory locked while it lives."""
+        return (self._lock.fileno(),) if self._lock and INHERITS else ()
+
+    def publish(self, names: Collection[str]) -> None:
+        """Put the staged files in the place of earlier results.
+
+        Args:
+            names: of the files, all of which were staged, RECORD among them.
+
+        Raises:
+            FilesError: when one was taken away, or something has come in its place.
+        """
+        with ExitStack() as opened:
+            staged = _Files(self.staged, opened)
+            for name in names:
+                if staged.kind(name) != FILE:
+                    raise FilesError(f"{self.staged.path / name} was taken away while the run worked; run it again")
+        earlier = self._earlier()
+        self._require_free(names, earlier)
+        with ExitStack() as opened:
+            here = _Files(self._here, opened)
+            # So that nobody can make up a marker by which the user's files would go.
+            known = {name: here.identity(name) for name in sorted(earlier)}
+        self.staging.write(MARKER, seal({"names": sorted(names), "earlier": known}), DRAFT)
+        self._complete()
+
+    def __enter__(self) -> Publication:
+        self._created = not self._path.exists()
+        with ExitStack() as opened:
+            self._here = opened.enter_context(Folder.at(self._path, create=True))
+            opened.callback(self._remove_if_created)
+            try:
+                self._acquire(opened)
+            except BlockingIOError:
+                raise FilesError(f"{self._path}: another run is writing there; choose another --out") from None
+            self._complete()
+            self._clear()
+            self._require_free(self._names, self._earlier())
+            self.staged = opened.enter_context(self.staging.folder(NEW, create=True))
+            self._open = opened.pop_all()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        # What cannot be tidied now is tidied by the next publication; an error on its way out matters more.
+        with suppress(OSError, FilesError):
+            self._complete()
+            self._clear()
+        self._open.close()
+
+    def _earlier(self) -> set[str]:
+        """List the results that are there of the run before, as its record tells."""
+        if self._here.kind(RECORD) is None:
+            return set()
+        try:
+            with self._here.open(RECORD) as file:
+                record = json.loads(file.read(MAX_RECORD))
+            outputs, frames = set(record["outputs"]), int(record["frames"])
+        except (ValueError, KeyError, TypeError, RecursionError, OverflowError):
+            raise ForeignError.at(self._path / RECORD, "a file") from None
+        return {
+            name
+            for name in _results(self._here)
+            if (_number(name) < frames and FRAMES in outputs if "/" in name else name in outputs)
+        }
+
+    def _require_free(self, names: Collection[str], earlier: Collection[str]) -> None:
+        """Make sure that results can be put in place, and that nothing is there but earlier ones."""
+        with ExitStack() as opened:
+            here = _Files(self._here, opened)
+            # Before the run rather than halfway through the moves.
+            if here.has_folder(FRAMES) and not self._here.is_writable(FRAMES):
+                raise PermissionError(errno.EACCES, f"{FRAMES} is no directory that can be written")
+            for name in names:
+                kind = here.kind(name)
+                if kind is not None and (kind != FILE or name not in earlier):
+                    raise ForeignError.at(self._path / name, kind)
+
+    def _complete(self) -> None:
+        """Move the staged files into place if the marker says that all are there; as often as it takes."""
+        try:
+            with self.staging.open(MARKER) as file:
+                marker = unseal(file.read(MAX_RECORD))
+            # Anybody may have written it.
+            names = [name for name in marker["names"] if is_result(name)]
+            known = {name: identity for name, identity in marker["earlier"].items() if is_result(name)}
+        except FileNotFoundError:
+            return
+        except (ValueError, KeyError, TypeError, AttributeError):
+            message = f"{self.staging.path / MARKER} is damaged; remove {self.staging.path} and run the scene again"
+            raise DamagedError(message) from None
+        if self.staging.kind(NEW) is None:
+            return
+        with ExitStack() as opened:
+            new = opened.enter_context(self.staging.folder(NEW))
+            here, staged = _Files(self._here, opened), _Files(new, opened)
+            left = [name for name in names if staged.kind(name) is not None]
+            if RECORD not in left:
+                return  # It comes last, so all is done.
+            earlier = [name for name, identity in known.items() if here.identity(name) == identity]
+            self._require_free(left, earlier)
+            here.remove(RECORD)
+            for name in left:
+                if name != RECORD:
+                    staged.replace(name, here)
+            gone = [name for name in set(earlier).difference(names) if here.kind(name) == FILE]
+            for name in gone:
+                here.remove(name)
+            if any("/" in name for name in gone):
+                with suppress(OSError):  # not empty
+                    self._here.remove_folder(FRAMES)
+            staged.replace(RECORD, here)
+
+    def _clear(self) -> None:
+        """Empty the staging directory but for the lock and what is to be kept."""
+        if not self.keep and self.staging.kind(CHECKPOINT) is not None:
+            with self.staging.folder(CHECKPOINT) as checkpoint:
+                # First of all, so that a part of a checkpoint is none.
+                checkpoint.remove(MANIFEST)
+        self.staging.clear(STAGING_TREE, keep=(LOCK, CHECKPOINT) if self.keep else (LOCK,))
+
+    def _acquire(self, opened: ExitStack) -> None:
+        """Make the staging directory and lock it. The lock dies with the processes that hold it."""
+        for _ in range(ATTEMPTS):
+            # A run that ends just now may remove what we open, or have removed it when we have its lock.
+            with suppress(FileNotFoundError), ExitStack() as tried:
+                self.staging = tried.enter_context(self._here.folder(STAGING, create=True))
+                # Before anything is put there.
+                self.staging.require_only(STAGING_TREE)
+                tried.callback(self._remove_staging)
+                lock = tried.enter_context(self.staging.lock(LOCK))
+                if HAS_DESCRIPTORS:
+                    status = os.stat(LOCK, dir_fd=self.staging.descriptor, follow_symlinks=False)
+                    if not os.path.samestat(os.fstat(lock.fileno()), status):
+                        continue
+                self._lock = lock
+                tried.callback(self._remove_lock)
+                opened.push(tried.pop_all())
+                return
+        raise FileNotFoundError(errno.ENOENT, os.strerror(errno.ENOENT))
+
+    def _remove_lock(self) -> None:
+        with suppress(OSError, FilesError):
+            self.staging.remove(LOCK)
+
+    def _remove_staging(self) -> None:
+        with suppress(OSError):  # not empty
+            self._here.remove_folder(STAGING)
+
+    def _remove_if_created(self) -> None:
+        if self._created:
+            with suppress(OSError):  # not empty
+                self._path.rmdir()
+
+
+class _Files:
+    """Files by names that may have a folder, which is opened once.
+
+    Args:
+        top: the folder of names without one.
+        opened: closes what is opened.
+    """
+
+    def __init__(self, top: Folder, opened: ExitStack) -> None:
+        self._top, self._opened = top, opened
+        self._folders = {"": top}
+
+    def has_folder(self, name: str) -> bool:
+        """Tell whether a folder is there; raises ForeignError where something else is."""
+        if name not in self._folders and self._top.kind(name) is not None:
+            self._folders[name] = self._opened.enter_context(self._top.folder(name))
+        return name in self._folders
+
+    def kind(self, name: str) -> str | None:
+        """Say what is there."""
+        folder, _, file = name.rpartition("/")
+        return self._folders[folder].kind(file) if self.has_folder(folder) else None
+
+    def identity(self, name: str) -> list[int] | None:
+        """Tell a file from any other that may come in its place."""
+        folder, _, file = name.rpartition("/")
+        return self._folders[folder].identity(file) if self.has_folder(folder) else None
+
+    def remove(self, name: str) -> None:
+        """Remove a file, if it is there."""
+        folder, _, file = name.rpartition("/")
+        if self.has_folder(folder):
+            self._folders[folder].remove(file)
+
+    def replace(self, name: str, other: _Files) -> None:
+        """Move a file to the same place among others."""
+        folder, _, file = name.rpartition("/")
+        if not other.has_folder(folder):
+            other._top.folder(folder, create=True).close()
+            other.has_folder(folder)
+        self._folders[folder].replace(file, other._folders[folder], file)
+
+
+def _results(directory: Folder) -> Iterator[str]:
+    """List the files in a directory whose names are those of results."""
+    for name, kind in directory.entries():
+        if name == FRAMES:
+            with directory.folder(FRAMES) as frames:
+                names = [f"{FRAMES}/{name}" for name, kind in frames.entries() if kind == FILE]
+            yield from filter(is_result, names)
+        elif kind == FILE and is_result(name):
+            yield name
+
+
+def is_result(name: object) -> bool:
+    """Tell whether this is the name of a result."""
+    if not isinstance(name, str):
+        return False
+    return name in (ANIMATION, TRAJECTORY, RECORD) or _number(name) >= 0
+
+
+def _number(name: str) -> int:
+    """Give the number of a frame's picture, or -1 for another name."""
+    found = re.fullmatch(rf"{FRAMES}/([0-9]{{4,15}})\.png", name)
+    return int(found[1]) if found and name == f"{FRAMES}/{frame_file(int(found[1]))}" else -1

@@ -1,0 +1,233 @@
+"""What a scene will need, before anything is computed."""
+
+from __future__ import annotations
+
+import math
+import os
+import shutil
+import sys
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+from taichi_msm.errors import Path as Key
+from taichi_msm.errors import Problem, SceneError
+from taichi_msm.physics import timestep
+from taichi_msm.physics.workload import affords_pilot, precision
+from taichi_msm.render import texture
+from taichi_msm.scene import Scene
+
+MAX_STEPS = 10**12
+
+# Bytes of the parts of a drawing.
+POINT_BYTES = 36  # a mass point, as it is seen, and its normal
+SAMPLE_BYTES = 32  # what is kept of a sample at most
+BAND_ROWS = 16  # rows of samples that a thread keeps at a time
+PIXEL_BYTES = 3 * 12  # colours of one pixel, from sums to bytes
+PICTURE_PIXEL_BYTES = 20  # of the file, while it is decoded and converted; its texture takes less
+
+# Bytes of a pixel in a file.
+PIXEL_FILE_BYTES = {"png": 2, "gif": 1}
+
+# Numbers for each mass point: displacement and difference; and the copies made at the start and for output.
+STATE_NUMBERS = 6
+OUTPUT_NUMBERS = 15
+
+
+@dataclass(frozen=True)
+class Budget:
+    """What a scene will need.
+
+    Attributes:
+        points: mass points.
+        steps: time steps in all.
+        frames: frames in all, the one at rest included.
+        simulation_bytes: memory for the state of the sheet and its output.
+        drawing_bytes: memory for a frame and the texture; 0 where nothing is drawn.
+        picture_bytes: size of the files with pictures, about.
+        trajectory_bytes: size of the trajectory.
+        working_bytes: disk space that is taken besides until the run ends.
+    """
+
+    points: int
+    steps: int
+    frames: int
+    simulation_bytes: int
+    drawing_bytes: int
+    picture_bytes: int
+    trajectory_bytes: int
+    working_bytes: int
+
+    @property
+    def memory_bytes(self) -> int:
+        """Memory in use at one time. Trajectories do not count: they are streamed to disk."""
+        return self.simulation_bytes + self.drawing_bytes
+
+    @property
+    def disk_bytes(self) -> int:
+        """Size of all files."""
+        return self.picture_bytes + self.trajectory_bytes
+
+
+def estimate(scene: Scene) -> Budget:
+    """Estimate what the scene will need."""
+    rows, cols = scene.sheet.points
+    points = rows * cols
+    frames, pixels = scene.time.frames + 1, math.prod(scene.render.size)
+    positions = frames * points * 3 * _number_bytes(scene)
+    numbers = STATE_NUMBERS + OUTPUT_NUMBERS + len(scene.probes)
+    # A pilot is up to two more sheets, in f64.
+    pilot = scene.time.tolerance is not None or affords_pilot(scene, 2)
+    sheets = _number_bytes(scene) + (2 * 8 if pilot else 0)
+    return Budget(
+        points=points,
+        steps=scene.time.frames * timestep.steps_per_frame(scene),
+        frames=frames,
+        simulation_bytes=points * sheets * numbers,
+        drawing_bytes=drawing_bytes(scene) if scene.draws else 0,
+        picture_bytes=frames * sum(pixels * PIXEL_FILE_BYTES.get(kind, 0) for kind in set(scene.output)),
+        trajectory_bytes=positions if "trajectory" in scene.output else 0,
+        # Two of the states with which a run can go on, and all its positions.
+        working_bytes=2 * points * STATE_NUMBERS * _number_bytes(scene) + (positions if scene.output else 0),
+    )
+
+
+def available_memory() -> int:
+    """Tell how much memory a run may take [bytes]: what is free and what the control group still allows.
+
+    Without /proc it is all the memory there is, and sys.maxsize where the system does not tell.
+    """
+    try:
+        free = _free_memory(Path("/proc/meminfo"))
+        return min(free, _control_group_rest(Path("/proc/self/cgroup"), Path("/sys/fs/cgroup")))
+    except (OSError, KeyError, ValueError, IndexError):
+        return _physical_memory()
+
+
+def problems(scene: Scene) -> Iterator[Problem]:
+    """Say what makes the scene too large, with the numbers and the key to change."""
+    yield from _step_problems(scene)
+    yield from _memory_problems(scene)
+
+
+def require_disk(scene: Scene, directory: Path) -> None:
+    """Make sure that there is room for the results.
+
+    Args:
+        scene: a checked scene.
+        directory: where they are to go; it may not be there yet.
+
+    Raises:
+        SceneError: when there is not, with the numbers and the key to change.
+    """
+    budget, free = estimate(scene), _free_disk(directory)
+    needed = budget.disk_bytes + budget.working_bytes
+    if needed <= free:
+        return
+    rows, cols = scene.sheet.points
+    width, height = scene.render.size
+    parts = [
+        (needed - budget.picture_bytes, "sheet.points", f"positions of {rows} x {cols} points"),
+        (budget.picture_bytes, "render.size", f"pictures of {width} x {height} pixels"),
+    ]
+    size, key, name = max(parts)
+    said = (
+        f"{budget.frames} frames need {_in_words(needed)} on disk, {_in_words(size)} of it for {name}, but "
+        f"{_in_words(free)} is free for {directory}; take less, fewer time.frames_per_second, less output or "
+        "another --out"
+    )
+    raise SceneError([f"{key}: {said}"])
+
+
+def _number_bytes(scene: Scene) -> int:
+    return 4 if precision(scene) == "f32" else 8
+
+
+def drawing_bytes(scene: Scene) -> int:
+    """Estimate the memory for drawing a frame [bytes], whether the scene's output asks for it or not."""
+    rows, cols = scene.sheet.points
+    width, height = scene.render.size
+    # The whole picture is decoded, whatever the region.
+    picture = math.prod(texture.image_size(scene) or (0,))
+    factor = scene.render.supersample
+    band_rows = min(height * factor, BAND_ROWS * (os.cpu_count() or 1))
+    samples = band_rows * width * factor * SAMPLE_BYTES
+    return rows * cols * POINT_BYTES + samples + width * height * PIXEL_BYTES + picture * PICTURE_PIXEL_BYTES
+
+
+def _step_problems(scene: Scene) -> Iterator[Problem]:
+    steps = scene.time.frames * timestep.steps_per_frame(scene)
+    if steps <= MAX_STEPS:
+        return
+    count = f"{scene.time.duration:g} s in steps of {timestep.step(scene):.6g} s is {steps:.3g} steps"
+    limit = f"more than the {MAX_STEPS:.0e} that can be taken"
+    if scene.time.step == "auto":
+        remedy = "take a shorter time, softer springs or more mass"
+        yield Problem(("time", "duration"), f"{count}, {limit}; {remedy}")
+    else:
+        yield Problem(("time", "step"), f"{count}, {limit}; take a longer step or a shorter time")
+
+
+def _memory_problems(scene: Scene) -> Iterator[Problem]:
+    budget, available = estimate(scene), available_memory()
+    if budget.memory_bytes <= available:
+        return
+    rows, cols = scene.sheet.points
+    width, height = scene.render.size
+    parts: list[tuple[int, Key, str]] = [
+        (budget.simulation_bytes, ("sheet", "points"), f"{rows} x {cols} points"),
+        (budget.drawing_bytes, ("render", "size"), f"frames of {width} x {height} pixels and their texture"),
+    ]
+    size, key, name = max(parts)
+    yield Problem(
+        key,
+        f"the scene needs {_in_words(budget.memory_bytes)} of memory, {_in_words(size)} of it for {name}, "
+        f"but {_in_words(available)} is free; take less",
+    )
+
+
+def _free_disk(directory: Path) -> int:
+    """Tell how much may be written to a directory [bytes]; sys.maxsize where the system does not tell."""
+    for path in (directory, *directory.absolute().parents):
+        try:
+            return shutil.disk_usage(path).free
+        except OSError:
+            continue
+    return sys.maxsize
+
+
+def _in_words(size: int) -> str:
+    unit, name = next(((unit, name) for unit, name in ((2**30, "GiB"), (2**20, "MiB")) if size >= unit), (2**10, "KiB"))
+    return f"{size / unit:.3g} {name}"
+
+
+def _free_memory(meminfo: Path) -> int:
+    """Read Linux's estimate of what can be taken without swapping [bytes]."""
+    fields = dict(line.split(":", 1) for line in meminfo.read_text().splitlines())
+    return int(fields["MemAvailable"].split()[0]) * 1024
+
+
+def _control_group_rest(membership: Path, root: Path) -> int:
+    """Find what the control groups (version 2) of this process still allow [bytes]; sys.maxsize: no limit."""
+    lines = membership.read_text().splitlines()
+    own = next((line[len("0::/") :] for line in lines if line.startswith("0::/")), "")
+    group = root / own
+    return min(_group_rest(each) for each in (group, *group.parents) if each.is_relative_to(root))
+
+
+def _group_rest(group: Path) -> int:
+    try:
+        limit = (group / "memory.max").read_text().strip()
+        used = int((group / "memory.current").read_text())
+        cached = dict(line.split() for line in (group / "memory.stat").read_text().splitlines())
+    except OSError:
+        return sys.maxsize
+    # Cached files count as used, but make room when memory is asked for.
+    return sys.maxsize if limit == "max" else max(0, int(limit) - used + int(cached.get("inactive_file", 0)))
+
+
+def _physical_memory() -> int:
+    try:
+        return os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
+    except (AttributeError, OSError, ValueError):
+        return sys.maxsize

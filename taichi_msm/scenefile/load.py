@@ -1,0 +1,299 @@
+"""Scene file and overrides -> Scene, with the place in every error; and the schema for editors."""
+
+from __future__ import annotations
+
+import codecs
+import json
+import re
+import stat
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from itertools import chain
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from taichi_msm.errors import Path as Key
+from taichi_msm.errors import Problem, SceneError
+from taichi_msm.faults import cut, flow
+from taichi_msm.scene import MAX_PATH, Scene
+from taichi_msm.scenefile.validation import validate
+from taichi_msm.scenefile.yaml_reader import MAX_DEPTH, Document, Mark, UnreadableError, mark_at, read
+
+MAX_BYTES = 2**20
+
+# Nobody reads further, and a broken file of the greatest size has tens of thousands.
+MAX_LINES = 100
+
+
+class Kind(NamedTuple):
+    """What a file should be.
+
+    Attributes:
+        name: what it is called.
+        needs: the keys that it must have.
+    """
+
+    name: str
+    needs: str
+
+
+_SCENE = Kind("scene", "sheet, springs and time")
+
+_NO_KEY = Problem((), "expected KEY=VALUE, such as sheet.points=[61,61]")
+_NO_PATH = Problem((), "expected a key such as sheet.points")
+_INDEX = re.compile("[0-9]{1,9}")
+
+
+def load_scene(
+    path: str | Path, overrides: Sequence[str] | Mapping[str, Any] = (), image: str | Path | None = None
+) -> Scene:
+    """Read a scene and check all that can be checked before computing.
+
+    Args:
+        path: the scene file; the image that it names is relative to its folder, and in it or below. An override may
+            name one elsewhere, relative to the same folder.
+        overrides: what to put in place of the file's values: "KEY=VALUE" with a dotted key (items of a list
+            by number, probes.0.load) and the value in YAML, which errors call --set; or a mapping from dotted keys
+            to values, which they call override.
+        image: another picture for the sheet, relative to the current directory.
+
+    Returns:
+        The scene, its image relative to the current directory.
+
+    Raises:
+        SceneError: all problems of the scene, one line each, in the order in which they stand.
+    """
+    draft = Draft(str(path), read_file(str(path), _SCENE))
+    for override in _parse_overrides(overrides):
+        draft.override(override)
+    if image is None:
+        draft.find_image(Path(path).parent)
+    else:
+        draft.override(_Override(f"--image {cut(str(image))}", ("image",), str(image)))
+    scene, problems = validate(draft.data)
+    draft.report(problems)
+    if scene is None or draft.found:
+        raise SceneError(draft.lines())
+    return scene
+
+
+def schema() -> dict[str, Any]:
+    """Describe the scene for editors, as JSON Schema (draft 2020-12).
+
+    It holds what can be said of one key by itself; rules that join several keys, such as the step limit, are
+    checked when a scene is loaded.
+    """
+    return {"$schema": "https://json-schema.org/draft/2020-12/schema"} | Scene.model_json_schema()
+
+
+class _Override(NamedTuple):
+    """One value in place of the file's; `problems` says why it cannot be read, if so."""
+
+    name: str
+    path: Key
+    value: Any = None
+    problems: Sequence[Problem] = ()
+
+
+def _parse_overrides(overrides: Sequence[str] | Mapping[str, Any]) -> Iterator[_Override]:
+    if isinstance(overrides, Mapping):
+        return (_parse_value(key, value) for key, value in overrides.items())
+    return (_parse_text(text) for text in overrides)
+
+
+def _parse_text(text: str) -> _Override:
+    key, equals, value = text.partition("=")
+    name = f"--set {cut(key)}{equals}{cut(value)}"
+    path = _parse_key(key)
+    if not equals or not path:
+        return _Override(name, (), problems=[_NO_KEY])
+    try:
+        document = read(value)
+    except UnreadableError as error:
+        return _Override(name, path, problems=[Problem(path, str(error))])
+    faults = [Problem(path + fault.path, fault.message) for fault in document.faults]
+    return _Override(name, path, document.data, faults)
+
+
+def _parse_value(key: str, value: Any) -> _Override:
+    path = _parse_key(key)
+    name = f"override {cut(key)}"
+    if not path:
+        return _Override(name, (), problems=[_NO_PATH])
+    try:
+        plain = json.loads(json.dumps(value))
+    except (TypeError, ValueError, RecursionError):
+        problem = Problem(path, f"a file cannot hold this {type(value).__name__}; use numbers, text, lists, dicts")
+        return _Override(name, path, problems=[problem])
+    return _Override(f"{name}={flow(plain)}", path, plain)
+
+
+def _parse_key(key: str) -> Key:
+    """Split a dotted key; into nothing, if it is none."""
+    parts = key.split(".")
+    if len(parts) > MAX_DEPTH or not all(part and part.isprintable() for part in parts):
+        return ()
+    return tuple(int(part) if _INDEX.fullmatch(part) else part for part in parts)
+
+
+class _Place(NamedTuple):
+    """Where a key was given; places sort as they are read, the file and then the overrides.
+
+    Attributes:
+        source: 0 for the file, then 1, 2, ... for each override.
+        mark: line and column in the file.
+        name: the place as the user knows it, such as press.yaml:7:3.
+    """
+
+    source: int
+    mark: Mark
+    name: str
+
+
+class Draft:
+    """A file as given so far.
+
+    Args:
+        name: the file's.
+        document: what it says.
+
+    Attributes:
+        data: what it says, with its overrides.
+        found: what is wrong with it, and where.
+    """
+
+    def __init__(self, name: str, document: Document) -> None:
+        self._name = name
+        self._marks = document.marks
+        self._overrides = 0
+        self._overridden: dict[Key, _Place] = {}
+        self.data: dict[str, Any] = document.data
+        self.found = [(self._in_file(mark), Problem(key, message)) for mark, key, message in document.faults]
+
+    def override(self, override: _Override) -> None:
+        """Put one value in place."""
+        self._overrides += 1
+        place = _Place(self._overrides, Mark(1, 1), override.name)
+        if override.problems:
+            self.found += [(place, problem) for problem in override.problems]
+        elif problem := self._put(override.path, override.value, place):
+            self.found.append((place, problem))
+
+    def find_image(self, folder: Path) -> None:
+        """Make the path of the image, relative to a folder so far, relative to the current directory."""
+        image = self.data.get("image")
+        if not (isinstance(image, str) and 0 < len(image) <= MAX_PATH):
+            return
+        self.data["image"] = str(folder / image)
+        # A scene may come from anybody, and is to see no more than what came with it.
+        if ("image",) not in self._overridden and not _is_below(folder / image, folder):
+            said = f"{image} is not below the scene's folder; put the picture there, or name it with --image"
+            self.found.append((self._place(("image",)), Problem(("image",), said)))
+            del self.data["image"]
+
+    def report(self, problems: Iterable[Problem]) -> None:
+        """Note problems, each at its place, leaving out what was said of the same key before."""
+        keys = {problem.path for _, problem in self.found}
+        for problem in problems:
+            if problem.path not in keys:
+                keys.add(problem.path)
+                self.found.append((self._place(problem.path), problem))
+
+    def lines(self) -> list[str]:
+        """Write the problems down in the order of their places."""
+        found = sorted(self.found, key=lambda item: item[0][:2])
+        lines = [_line(place.name, problem) for place, problem in found[:MAX_LINES]]
+        return lines if len(lines) == len(found) else [*lines, "and more"]
+
+    def _in_file(self, mark: Mark) -> _Place:
+        return _Place(0, mark, f"{self._name}:{mark.line}:{mark.column}")
+
+    def _place(self, path: Key) -> _Place:
+        """Find where a key was given, or else the nearest section or list around it."""
+        around = [path[:n] for n in range(len(path), -1, -1)]
+        overridden = (self._overridden[key] for key in around if key in self._overridden)
+        given = (self._in_file(self._marks[key]) for key in around if key in self._marks)
+        return next(chain(overridden, given))
+
+    def _put(self, path: Key, value: Any, place: _Place) -> Problem | None:
+        """Set one key, making the sections above it that are not there yet."""
+        holder: Any = self.data
+        here: Key = ()
+        for n, part in enumerate(path):
+            if isinstance(holder, dict):
+                part = str(part)
+            elif not isinstance(holder, list):
+                return Problem(here, f"{flow(holder)} has no keys to set one of; set it as a whole")
+            elif not (isinstance(part, int) and part < len(holder)):
+                example = ".".join(str(one) for one in (*here, 0, *path[n:][isinstance(part, int) :]))
+                said = f"no such item; the list has {len(holder)}, numbered from 0, as in {example}"
+                return Problem((*here, part), said)
+            here = (*here, part)
+            if n == len(path) - 1:
+                holder[part] = value
+                self._overridden = {key: at for key, at in self._overridden.items() if key[: len(here)] != here}
+                self._overridden[here] = place
+            elif isinstance(holder, dict) and part not in holder:
+                holder[part] = [] if isinstance(path[n + 1], int) else {}
+                self._overridden[here] = place
+            holder = holder[part]
+        return None
+
+
+def _is_below(path: Path, folder: Path) -> bool:
+    """Tell whether a path is in a folder or below it, wherever symbolic links lead."""
+    try:
+        return path.resolve().is_relative_to(folder.resolve())
+    except (OSError, RuntimeError, ValueError):
+        # A loop of links, or no path at all: reading it says so.
+        return True
+
+
+def read_file(name: str, kind: Kind) -> Document:
+    """Read a file, whatever it says, as long as it is a mapping.
+
+    Raises:
+        SceneError: when it is none, or cannot be read.
+    """
+    text = _read_text(name, kind)
+    try:
+        document = read(text)
+    except UnreadableError as error:
+        raise _error(f"{name}:{error.mark.line}:{error.mark.column}", str(error)) from None
+    if document.data is None:
+        raise _error(f"{name}:1:1", f"no keys; a {kind.name} needs at least {kind.needs}")
+    if not isinstance(document.data, dict):
+        raise _error(f"{name}:1:1", f"{flow(document.data)} is not a {kind.name}; expected keys such as {kind.needs}")
+    return document
+
+
+def _read_text(name: str, kind: Kind) -> str:
+    path = Path(name)
+    try:
+        mode = path.stat().st_mode
+        if not stat.S_ISREG(mode):
+            # Opening a pipe would wait for its other end.
+            found = "a directory" if stat.S_ISDIR(mode) else "not a regular file"
+            raise _error(name, f"{found}; name a {kind.name} file")
+        with path.open("rb") as file:
+            raw = file.read(MAX_BYTES + 1).removeprefix(codecs.BOM_UTF8)
+    except ValueError:
+        raise _error(name, f"not a path; name a {kind.name} file") from None
+    except OSError as error:
+        raise _error(name, (error.strerror or str(error)).lower()) from None
+    if len(raw) > MAX_BYTES:
+        raise _error(name, f"larger than {MAX_BYTES // 2**20} MiB; a {kind.name} is smaller")
+    try:
+        return raw.decode()
+    except UnicodeDecodeError as error:
+        before = raw[: error.start].decode()
+        mark = mark_at(before, len(before))
+        raise _error(f"{name}:{mark.line}:{mark.column}", "not UTF-8; save the file as UTF-8") from None
+
+
+def _error(place: str, message: str) -> SceneError:
+    return SceneError([_line(place, Problem((), message))])
+
+
+def _line(place: str, problem: Problem) -> str:
+    """Write one problem as one line."""
+    return f"{place}: {Problem(tuple(cut(str(part)) for part in problem.path), problem.message)}"

@@ -1,0 +1,1 @@
+"""The machine: Taichi, signals, streams."""

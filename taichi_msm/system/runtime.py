@@ -1,0 +1,370 @@
+"""The only place that imports and starts Taichi."""
+
+from __future__ import annotations
+
+import contextlib
+import errno
+import io
+import os
+import platform
+import re
+import tempfile
+import threading
+import time
+import weakref
+from collections import defaultdict
+from collections.abc import Iterator
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any
+
+from taichi_msm.errors import DeviceError, MsmError
+from taichi_msm.system.silence import silenced
+
+__all__ = [
+    "ARCHS",
+    "ITERATIONS_PER_THREAD",
+    "Device",
+    "Memory",
+    "available_threads",
+    "lanes",
+    "open_window",
+    "our_compilation",
+    "processor",
+    "require_here",
+    "start",
+    "started",
+    "ti",
+    "vector_bits",
+]
+
+if not os.environ.get("HOME"):
+    # Without one Taichi aborts the process.
+    os.environ.pop("HOME", None)
+    _folder = os.path.expanduser("~")  # noqa: PTH111  # Path.home raises where there is none
+    os.environ["HOME"] = _folder if _folder != "~" else tempfile.gettempdir()
+
+# No banner on stdout, which may be JSON, and no call home.
+os.environ.setdefault("ENABLE_TAICHI_HEADER_PRINT", "0")
+os.environ.setdefault("TI_SKIP_VERSION_CHECK", "ON")
+
+# In a notebook Taichi says on import that it is in one. This is for the import alone; ti.init has a level of its own.
+os.environ.setdefault("TI_LOG_LEVEL", "error")
+
+import numpy as np
+import taichi as ti
+from taichi.lang.ast.ast_transformer_utils import ASTTransformerContext
+
+if os.environ["TI_LOG_LEVEL"] == "error":
+    del os.environ["TI_LOG_LEVEL"]
+
+_core: Any = getattr(np, "_core", None) or np.core  # NumPy 2, or 1
+_features: dict[str, bool] = _core._multiarray_umath.__cpu_features__
+
+ARCHS = ("cpu", "cuda", "vulkan")
+
+# A lock on Taichi's cache that is older than this was left by a process that was killed [s].
+STALE_LOCK = 60.0
+
+
+# The widest vectors of a processor, by what NumPy calls them.
+VECTOR_BITS = {"AVX512F": 512, "AVX2": 256}
+
+# What the kernels of a run may take in the cache: files, and bytes.
+CACHE_FILES, CACHE_BYTES = 64, 1 << 24
+
+# Taichi takes 1 GiB of addresses at once, and its libraries as much again.
+ADDRESS_SPACE = 1900 << 20
+
+# How Taichi names a GPU in its log.
+GPU_NAME = re.compile(r'Vulkan Device "(.+)" supports|CUDA device \[id=\d+\]: (.+)')
+
+# Taichi gives a CPU thread at least this many iterations of a parallel loop: make_cpu_multithreaded_range_for.cpp.
+ITERATIONS_PER_THREAD = 512
+
+
+@dataclass(frozen=True)
+class Device:
+    """Where kernels run.
+
+    Attributes:
+        arch: cpu, cuda or vulkan.
+        threads: number of CPU threads.
+        name: of the processor or the GPU; "" where the system does not tell.
+    """
+
+    arch: str
+    threads: int
+    name: str = field(default="", compare=False)
+
+
+class Memory:
+    """Arrays of Taichi's. When this is dropped they are used again, as Taichi frees none on a CPU."""
+
+    def __init__(self) -> None:
+        self._taken: list[tuple[tuple[str, int], Any]] = []
+        weakref.finalize(self, _give_back, self._taken)
+
+    def array(self, precision: str, lanes: int, length: int) -> Any:
+        """Take a one-dimensional array, or a longer one, of whatever was in it.
+
+        Args:
+            precision: f32 or f64.
+            lanes: numbers of a vector; 0: plain numbers.
+            length: of the array, at least.
+        """
+        kind = precision, lanes
+        fitting = [array for array in _free[kind] if array.shape[0] >= length]
+        if fitting:
+            array = min(fitting, key=lambda one: one.shape[0])
+            _free[kind] = [one for one in _free[kind] if one is not array]
+        else:
+            real = getattr(ti, precision)
+            array = ti.ndarray(ti.types.vector(lanes, real) if lanes else real, length)
+        self._taken.append((kind, array))
+        return array
+
+
+_free: dict[tuple[str, int], list[Any]] = defaultdict(list)
+
+
+def _give_back(taken: list[tuple[tuple[str, int], Any]]) -> None:
+    for kind, array in taken:
+        _free[kind].append(array)
+
+
+_device: Device | None = None
+# The process and the thread that started Taichi.
+_home = (0, 0)
+
+
+def available_threads() -> int:
+    """Count the cores this process may use: its affinity, and the quota of its control group."""
+    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    with contextlib.suppress(OSError, ValueError):
+        quota, period = Path("/sys/fs/cgroup/cpu.max").read_text().split()
+        cores = min(cores, max(1, int(quota) // int(period)))
+    return cores
+
+
+def processor() -> str:
+    """Name the processor."""
+    with contextlib.suppress(OSError):
+        for line in Path("/proc/cpuinfo").read_text(encoding="utf-8").splitlines():
+            if line.startswith("model name"):
+                return line.split(":", 1)[1].strip()
+    return platform.processor() or platform.machine()
+
+
+def lanes(precision: str) -> int:
+    """Tell how many numbers a vector register of the processor holds; one on a GPU, where every point is a thread.
+
+    Args:
+        precision: f32 or f64.
+    """
+    if started().arch != "cpu":
+        return 1
+    return vector_bits() // (32 if precision == "f32" else 64)
+
+
+def vector_bits() -> int:
+    """Tell how wide the processor's vectors are."""
+    return next((bits for feature, bits in VECTOR_BITS.items() if _features.get(feature)), 128)
+
+
+def started() -> Device:
+    """Give the device that runs."""
+    assert _device is not None, "runtime.start comes first"
+    return _device
+
+
+def start(arch: str = "cpu", threads: int | None = None) -> Device:
+    """Start Taichi, once in a process.
+
+    Args:
+        arch: cpu, cuda or vulkan.
+        threads: number of CPU threads; None takes every core.
+
+    Raises:
+        DeviceError: when the arch is not supported or not there, or Taichi already runs otherwise.
+        MsmError: as for `require_here`.
+    """
+    global _device, _home
+    if _device is not None:
+        require_here()
+    if arch not in ARCHS:
+        raise DeviceError(f"--arch {arch}: not supported; take one of: {', '.join(ARCHS)}")
+    wanted = Device(arch, available_threads() if threads is None else threads)
+    if _device is None:
+        _device = replace(wanted, name=_initialise(wanted))
+        _home = os.getpid(), threading.get_ident()
+    elif wanted != _device:
+        raise DeviceError(
+            f"Taichi already runs on {_device.arch} with {_device.threads} threads in this process; "
+            f"start another process for {wanted.arch} with {wanted.threads}"
+        )
+    return _device
+
+
+def require_here() -> None:
+    """Make sure that Taichi works where it is called.
+
+    Raises:
+        MsmError: in a process that was forked from the one that started it, or in another of its threads.
+    """
+    process, thread = _home
+    if process != os.getpid():
+        raise MsmError(
+            "Taichi was started before this process was forked from another, and would hang here; start processes by "
+            "multiprocessing's 'spawn' or 'forkserver'"
+        )
+    if thread != threading.get_ident():
+        raise MsmError("Taichi works in the thread that started it; simulate and draw there")
+
+
+def open_window(title: str, size: tuple[int, int]) -> Any:
+    """Open Taichi's window, which needs no GPU; pixels are written to its `img`, one number each, rows from the top.
+
+    Args:
+        title: of the window.
+        size: width, height [px].
+
+    Raises:
+        DeviceError: when there is no display.
+    """
+    try:
+        with silenced(1, 2):
+            window = ti.GUI(title, res=size, fast_gui=True)
+    except RuntimeError:
+        raise DeviceError(
+            "there is no display to open a window on; set DISPLAY, or film without one: --record FILE.gif --seconds N"
+        ) from None
+    window.fps_limit = None
+    return window
+
+
+@contextlib.contextmanager
+def our_compilation(*, optimised: bool = True) -> Iterator[None]:
+    """Launch kernels of this package, which are compiled otherwise than a user's own in the same process.
+
+    Every operation rounds as IEEE 754 says, so that the bits of a result do not depend on threads, lanes or the
+    compiler's mood; on a CPU vectors stay vectors (docs/decisions/0010); and Taichi's optimisation of control flow,
+    which takes half of the time of compiling for what LLVM does again, is left out.
+
+    Args:
+        optimised: False leaves all to LLVM that Taichi would optimise before it. A kernel is launched always alike.
+    """
+    config, found = ti.lang.impl.current_cfg(), {}
+    wanted = {
+        "fast_math": False,
+        "cfg_optimization": False,
+        "advanced_optimization": optimised,
+        "real_matrix_scalarize": started().arch != "cpu",
+    }
+    for name, value in wanted.items():
+        found[name] = getattr(config, name)
+        setattr(config, name, value)
+    position = ASTTransformerContext.get_pos_info
+    if "TAICHI_MSM_TRACEBACK" not in os.environ:
+        # For every node of a kernel Taichi prepares the source line that an error in it would show: a third of a warm
+        # compilation. Only who changes a kernel misses it.
+        ASTTransformerContext.get_pos_info = lambda self, node: ""
+    try:
+        yield
+    finally:
+        ASTTransformerContext.get_pos_info = position
+        for name, value in found.items():
+            setattr(config, name, value)
+
+
+def _cache() -> dict[str, Any]:
+    """Give Taichi's options for keeping compiled kernels for the next process."""
+    folder = Path(os.environ.get("TI_OFFLINE_CACHE_FILE_PATH") or ti.lang.impl.default_cfg().offline_cache_file_path)
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        with tempfile.TemporaryFile(dir=folder):
+            pass
+        _require_room(folder)
+    except OSError:
+        # Taichi crashes at the end of a process whose folder it cannot write, even where it is not to.
+        os.environ.pop("TI_OFFLINE_CACHE_FILE_PATH", None)
+        return {"offline_cache": False, "offline_cache_file_path": tempfile.gettempdir()}
+    # Held for milliseconds, but a process that was killed leaves it, and no other uses the cache until it is gone.
+    lock = folder / "ticache.lock"
+    with contextlib.suppress(OSError):
+        if time.time() - lock.stat().st_mtime > STALE_LOCK:
+            lock.unlink()
+    return {}
+
+
+def _require_room(folder: Path) -> None:
+    """Raise OSError where the files of a run's kernels may not fit."""
+    if hasattr(os, "statvfs"):
+        free = os.statvfs(folder)
+        # Some file systems have as many files as one wants, and say that it is none.
+        if (free.f_files > 0 and free.f_favail < CACHE_FILES) or free.f_bavail * free.f_frsize < CACHE_BYTES:
+            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+
+def _require_address_space() -> None:
+    """Raise DeviceError where Taichi would not get the memory that it takes at once."""
+    try:
+        import resource
+    except ImportError:  # Windows
+        return
+    limit = resource.getrlimit(resource.RLIMIT_AS)[0]
+    if limit != resource.RLIM_INFINITY and limit < ADDRESS_SPACE:
+        raise DeviceError(
+            f"Taichi needs {ADDRESS_SPACE >> 20} MiB of address space, and this process may have {limit >> 20} MiB; "
+            "raise its limit (ulimit -v)"
+        )
+
+
+def _threads() -> list[int]:
+    """List the threads of this process by their numbers, which mostly grow; empty where the system does not tell."""
+    with contextlib.suppress(OSError):
+        return sorted(int(task.name) for task in Path("/proc/self/task").iterdir())
+    return []
+
+
+def _pin(pool: list[int]) -> None:
+    """Give every thread of Taichi's pool a core of its own, if it has one for each that this process may use.
+
+    Left to the system two of them may share a core for some 10 ms, the one spinning until the other has done its part.
+    """
+    if hasattr(os, "sched_setaffinity") and len(pool) == len(os.sched_getaffinity(0)):
+        for thread, core in zip(pool, sorted(os.sched_getaffinity(0)), strict=True):
+            with contextlib.suppress(OSError):
+                os.sched_setaffinity(thread, {core})
+
+
+def _initialise(device: Device) -> str:
+    """Start Taichi, and name what it runs on."""
+    _require_address_space()
+    cache = _cache()
+    before = _threads()
+    on_cpu = device.arch == "cpu"
+    try:
+        # Taichi prints the arch and, where a driver is missing, its search for it, which our error says in a line. What
+        # it tells of a GPU that is there is the only way to its name.
+        with tempfile.NamedTemporaryFile("r", errors="replace") as told:
+            with contextlib.redirect_stdout(io.StringIO()), silenced(*(() if on_cpu else (2,)), into=told.name):
+                ti.init(
+                    arch=getattr(ti, device.arch),
+                    cpu_max_num_threads=device.threads,
+                    enable_fallback=False,
+                    **cache,
+                    # No warning of loops over the samples of a pixel.
+                    unrolling_limit=0,
+                    log_level=ti.ERROR if on_cpu else ti.TRACE,
+                )
+                ti.set_logging_level(ti.ERROR)
+            named = GPU_NAME.search(told.read())
+    except Exception as error:
+        said = f"Taichi says: {' '.join(str(error).split())}" if on_cpu else "take --arch cpu"
+        raise DeviceError(f"--arch {device.arch}: not available on this machine; {said}") from error
+    # The pool is the last that Taichi starts.
+    _pin([thread for thread in _threads() if thread not in before][-device.threads :])
+    if on_cpu:
+        return processor()
+    return next(filter(None, named.groups())) if named else ""

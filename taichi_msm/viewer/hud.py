@@ -1,0 +1,112 @@
+"""What a session writes over its picture: figures, keys, and where the tool is."""
+
+from __future__ import annotations
+
+import textwrap
+from collections.abc import Mapping, Sequence
+from functools import lru_cache
+
+import numpy as np
+from numpy.typing import NDArray
+from PIL import Image, ImageDraw, ImageFont
+
+from taichi_msm.results.gif import Picture
+
+# Heights of letters [px]: this share of the picture's, within limits.
+LETTER = 1 / 36
+SMALLEST, LARGEST = 11, 22
+
+# A letter is so wide, as a share of its height, in most texts at most.
+LETTER_WIDTH = 0.56
+
+# Behind text the picture is so many times darker.
+DARKER = 3
+
+SHADE = (0, 0, 0)
+PUSH = (255, 255, 255)
+PULL = (255, 214, 90)
+
+# Radius of the ring around the tool, as a share of the picture's height.
+RING = 1 / 50
+
+
+def write(picture: Picture, above: Sequence[str], below: str = "", table: Mapping[str, str] | None = None) -> None:
+    """Write text over a picture, as large as its height asks for, on darker panels.
+
+    Args:
+        picture: colours, shape (height, width, 3); changed.
+        above: lines for its top left corner.
+        below: a text for its bottom left corner, in as many lines as it needs.
+        table: two columns, under the first lines.
+    """
+    height, width = picture.shape[:2]
+    size = _size(picture)
+    edge = size // 2
+    top = edge
+    for panel in (_lines(tuple(above), size), _columns(tuple((table or {}).items()), size)):
+        _lay(picture, panel, edge, top)
+        top += len(panel) + edge if len(panel) else 0
+    lines = textwrap.wrap(below, max(1, int((width - 4 * edge) / (LETTER_WIDTH * size))))
+    panel = _lines(tuple(lines), size)
+    _lay(picture, panel, edge, height - len(panel) - edge)
+
+
+def announce(picture: Picture, text: str) -> None:
+    """Write a text over the middle of a picture, shape (height, width, 3), which is changed."""
+    panel = _lines((text,), _size(picture))
+    _lay(picture, panel, (picture.shape[1] - panel.shape[1]) // 2, (len(picture) - len(panel)) // 2)
+
+
+def mark(picture: Picture, tool: tuple[float, float], *, pulls: bool) -> None:
+    """Draw a ring around the place of the tool.
+
+    Args:
+        picture: colours, shape (height, width, 3); changed.
+        tool: the pixel that the tool is seen at.
+        pulls: whether it pulls.
+    """
+    radius = picture.shape[0] * RING
+    reach = int(radius) + 4
+    left, top = max(0, int(tool[0]) - reach), max(0, int(tool[1]) - reach)
+    # To copy the whole picture would take longer than all else here.
+    part = picture[top : max(0, int(tool[1]) + reach), left : max(0, int(tool[0]) + reach)]
+    if part.size == 0:
+        return
+    image = Image.fromarray(part)
+    x, y = tool[0] - left, tool[1] - top
+    for r, colour, line in ((radius + 1, SHADE, 3), (radius, PULL if pulls else PUSH, 1)):
+        ImageDraw.Draw(image).ellipse((x - r, y - r, x + r, y + r), outline=colour, width=line)
+    part[:] = np.asarray(image)
+
+
+def _lay(picture: Picture, panel: NDArray[np.uint8], left: int, top: int) -> None:
+    """Lay a panel of white letters over a picture, as far as it has place."""
+    left, top = max(0, left), max(0, top)
+    part = picture[top : top + panel.shape[0], left : left + panel.shape[1]]
+    part[:] = np.maximum(part // DARKER, panel[: part.shape[0], : part.shape[1], None])
+
+
+@lru_cache(maxsize=64)
+def _lines(lines: tuple[str, ...], size: int) -> NDArray[np.uint8]:
+    """Make the panel of some lines."""
+    return _columns(tuple((line, "") for line in lines), size)
+
+
+@lru_cache(maxsize=64)
+def _columns(rows: tuple[tuple[str, str], ...], size: int) -> NDArray[np.uint8]:
+    """Make the panel of two columns, shape (height, width); without a row it is empty."""
+    if not rows:
+        return np.zeros((0, 0), np.uint8)
+    font, line, edge = ImageFont.load_default(size), round(1.4 * size), size // 2
+    first, second = (max(int(font.getlength(row[n])) + 1 for row in rows) for n in (0, 1))
+    right = edge + first + size
+    width = right + second + edge if any(row[1] for row in rows) else first + 2 * edge
+    image = Image.new("L", (width, line * len(rows) + edge))
+    for n, (name, meaning) in enumerate(rows):
+        ImageDraw.Draw(image).text((edge, edge // 2 + n * line), name, fill=255, font=font)
+        ImageDraw.Draw(image).text((right, edge // 2 + n * line), meaning, fill=255, font=font)
+    return np.asarray(image)
+
+
+def _size(picture: Picture) -> int:
+    return int(min(LARGEST, max(SMALLEST, picture.shape[0] * LETTER)))

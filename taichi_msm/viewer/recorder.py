@@ -1,0 +1,70 @@
+"""A session without a window: a script is done, and a film taken of it."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable
+from functools import partial
+from pathlib import Path
+
+from taichi_msm.errors import FilesError, writing
+from taichi_msm.viewer.events import Event
+from taichi_msm.viewer.film import Film
+from taichi_msm.viewer.session import Session
+
+OPTION = "--record"
+
+
+def record(
+    session: Session,
+    path: Path,
+    seconds: float,
+    events: Iterable[tuple[int, Event]] = (),
+    progress: Callable[[int, int], None] = lambda done, total: None,
+    say: Callable[[str], None] = lambda notice: None,
+) -> None:
+    """Let a session go on for some time and film it.
+
+    Args:
+        session: the session.
+        path: the GIF; one that is there is replaced when the film is whole.
+        seconds: how long.
+        events: each with the frame of the session before which it happens, in order; taken one after another.
+        progress: called with the frames done and the frames in all, often; what it raises stops here.
+        say: called with what the person should know.
+
+    Raises:
+        FilesError: when the film cannot be written, or, when it is, what an event was to keep could not.
+    """
+    if path.is_dir():
+        raise FilesError(f"{path}: a directory; choose another {OPTION}")
+    frames = round(seconds * session.rate)
+    left = iter(events)
+    upcoming = next(left, None)
+    failures: list[FilesError] = []
+    notice = ""
+    render = session.scene.render
+    with Film(path.parent, render.size, session.rate / session.parts, render.background, OPTION) as reel:
+        for frame in range(frames + 1):
+            progress(frame, frames)
+            while upcoming is not None and upcoming[0] <= frame:
+                try:
+                    session.handle(upcoming[1])
+                except FilesError as error:
+                    failures.append(error)
+                if session.notice not in ("", notice):
+                    say(f"{frame / session.rate:g} s: {session.notice}")
+                notice = session.notice
+                upcoming = next(left, None)
+            if frame % session.parts == 0:
+                reel.add(session.picture(), partial(progress, frame, frames))
+            if frame < frames:
+                session.advance()
+            if session.fault:
+                say(session.fault)
+                break
+        if upcoming is not None:
+            say(f"the film ends at {frame / session.rate:g} s, before some of the script's events")
+        with writing(path, OPTION):
+            reel.encoded(partial(progress, frames, frames)).replace(path)
+    if failures:
+        raise failures[0]

@@ -1,0 +1,402 @@
+"""A session: events in, the state of the tissue and its picture out. It knows no window and no clock."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from types import TracebackType
+
+import numpy as np
+from numpy.typing import NDArray
+
+from taichi_msm.errors import DivergedError, FilesError, SceneError
+from taichi_msm.physics.error_control import choose_step
+from taichi_msm.physics.lattice import rest_positions
+from taichi_msm.physics.timestep import steps_per_frame, with_time
+from taichi_msm.physics.workload import with_precision
+from taichi_msm.render.picking import on_rest_plane, pick
+from taichi_msm.render.texture import load_texture
+from taichi_msm.results.gif import Picture
+from taichi_msm.scene import MAX_PROBES, Camera, Scene
+from taichi_msm.scenefile.yaml_reader import MAX_NODES
+from taichi_msm.simulation import Simulation
+from taichi_msm.system import runtime
+from taichi_msm.viewer import hud
+from taichi_msm.viewer.captures import Captures, values
+from taichi_msm.viewer.events import KEYS, NOTCH, POINTER, Drag, Event, Harder, Key, Percent, Press, Release, Turn
+from taichi_msm.viewer.film import Film
+from taichi_msm.viewer.tool import Place, Tool
+from taichi_msm.viewer.viewport import Viewport
+
+# A session has as many frames a second as a screen shows, as whole parts of the scene's.
+MOST_FRAMES = 60.0
+
+# A displacement of less than this share of the sheet is none that is shown.
+AT_REST = 1e-6
+
+# Between figures.
+SEPARATOR = "  ·  "
+
+# A notice is shown for so long [s].
+NOTICE = 3.0
+
+# What is recorded is looked at every so many frames; it is nearly too long at this share of what it may be.
+CHECKED = 200
+NEARLY = 0.75
+
+# The time of stepping is averaged over about so many frames.
+AVERAGED = 20
+
+
+def with_live_frames(scene: Scene) -> tuple[Scene, int]:
+    """Cut the frames of a scene into as many as a screen shows; a given step stays.
+
+    Returns:
+        The scene, and how many of its frames make one of the given scene's.
+    """
+    parts = max(1, int(MOST_FRAMES / scene.time.frames_per_second * (1 + 1e-9)))
+    if scene.time.step != "auto":
+        while steps_per_frame(scene) % parts:
+            parts -= 1
+    return with_time(scene, frames_per_second=scene.time.frames_per_second * parts), parts
+
+
+class Session:
+    """A person with a tool at the tissue of a scene. Usable in a with statement, which keeps a film that is on.
+
+    The tool has the force, the falloff and the offset of the scene's first probe.
+
+    Args:
+        scene: a checked scene with a picture.
+        captures: where is kept what the person wants to.
+        arch: cpu or cuda.
+        threads: number of CPU threads; None takes every core.
+        play: whether the scene's probes do what the scene says, besides.
+        progress: called with the viewport before each, often; what it raises stops here.
+
+    Raises:
+        SceneError: when the scene has no picture or no probe, or no place for one more.
+        DeviceError: when the arch is not there.
+
+    Attributes:
+        scene: with the frames and the step of the session.
+        tool: the tool in the hand.
+        viewport: how the tissue is looked at.
+        parts: how many of its frames make one of the given scene's.
+        paused: whether time stands still.
+        fault: why the tissue moves no more; nothing if it does.
+        seconds_a_frame: how long the steps of a frame take [s].
+    """
+
+    def __init__(
+        self,
+        scene: Scene,
+        captures: Captures,
+        arch: str = "cpu",
+        threads: int | None = None,
+        *,
+        play: bool = False,
+        progress: Callable[[str], None] = lambda stage: None,
+    ) -> None:
+        _require_usable(scene, play=play)
+        progress("start")
+        device = runtime.start(arch, threads)
+        given, texture = scene, load_texture(scene)
+        scene, self.parts = with_live_frames(scene)
+        if scene.time.tolerance is not None:
+            scene, _ = choose_step(scene, device, lambda done, total: progress("pilot"))
+        else:
+            scene = with_precision(scene, device.arch)
+        rate = scene.time.frames_per_second
+        self._album = captures
+        self._film: Film | None = None
+        self._film_rate = given.time.frames_per_second
+        self._filmed_from = 0
+        self._others = scene.probes if play else ()
+        self.tool = Tool(scene.probes[0], rate)
+        self.scene = scene.model_copy(update={"probes": (*self._others, self.tool.recorded(0))})
+        self._rest = rest_positions(scene.sheet)
+        self.viewport = Viewport(scene, texture)
+        # A place of the tool, and the point on the plane at rest that was under the pointer then.
+        self._held: tuple[Place, NDArray[np.floating] | None] | None = None
+        self._pointer = (0.0, 0.0)
+        self._figures, self._keys = True, False
+        self._once = False
+        self._beats = 0
+        self._notice, self._notice_until = "", 0
+        self._warned = False
+        self.fault = ""
+        self.paused = False
+        self.seconds_a_frame = 0.0
+        progress("compile")
+        # The pictures are drawn here.
+        self._simulation = Simulation(self.scene.model_copy(update={"output": ()}), arch, threads)
+        self._simulation.compile(lambda: progress("compile"))
+        self._beginning = self._simulation.save()
+        self.viewport.draw(self.positions())
+
+    @property
+    def rate(self) -> float:
+        """Frames per second of the session."""
+        return self.scene.time.frames_per_second
+
+    @property
+    def frame(self) -> int:
+        """Frames simulated since the tissue was at rest."""
+        return self._simulation.frame
+
+    def positions(self) -> NDArray[np.floating]:
+        """Positions of the points [m], shape (rows, cols, 3)."""
+        return self._simulation.positions()
+
+    def displacement(self) -> float:
+        """Tell how far the tissue at the tool is from rest [m]."""
+        across, down = self.tool.place
+        moved = _between(self.positions(), across, down) - _between(self._rest, across, down)
+        return float(np.linalg.norm(moved))
+
+    def recorded(self) -> Scene:
+        """Give what was done as a scene; its run has the same bits."""
+        # What went wrong within a frame goes wrong again.
+        frames = max(1, self.frame + bool(self.fault))
+        time = self.scene.time.model_copy(update={"duration": frames / self.rate, "tolerance": None})
+        probes = (*self._others, self.tool.recorded(frames))
+        return self.scene.model_copy(update={"probes": probes, "time": time, "render": self.viewport.render})
+
+    def handle(self, event: Event) -> None:
+        """Do what an event asks for; what it does to the tissue is seen in the next frame.
+
+        Raises:
+            FilesError: when something to be kept cannot be written.
+        """
+        match event:
+            case Press(x, y, pull):
+                self._press(x, y, -1 if pull else 1)
+            case Drag(x, y):
+                self._drag(x, y)
+            case Release():
+                self._held = None
+                if self.tool.held:
+                    self.tool.release()
+            case Turn(right, down):
+                self.viewport.turn(right, down)
+                self._hold_on()
+            case Percent(percent):
+                self.tool.strength = min(100.0, max(0.0, percent))
+            case Harder(percent):
+                self.handle(Percent(self.tool.strength + percent))
+            case Key(name):
+                self._do(name)
+
+    def advance(self) -> None:
+        """Let a frame's time pass: the tissue moves, unless it is paused."""
+        self._beats += 1
+        if (self.paused and not self._once) or self.fault:
+            return
+        self._once = False
+        self._warn_of_length()
+        begun = time.perf_counter()
+        try:
+            if probe := self.tool.follow(self.frame):
+                self._simulation.steer((*self._others, probe))
+            self._simulation.advance()
+        except DivergedError as error:
+            self.fault = str(error)
+        spent = time.perf_counter() - begun
+        share = 1 / AVERAGED if self.seconds_a_frame else 1.0
+        self.seconds_a_frame += share * (spent - self.seconds_a_frame)
+
+    def picture(self, pacing: str = "") -> Picture:
+        """Draw the tissue and what is written over it. A film that is on takes it without text, or ends if it cannot.
+
+        Args:
+            pacing: what is to be said of the speed of the pictures.
+
+        Returns:
+            Colours, shape (height, width, 3).
+        """
+        picture = self.viewport.draw(self.positions())
+        if self.tool.percent != 0:
+            seen = self.viewport.pixel(_between(self.positions(), *self.tool.place))
+            if seen is not None:
+                hud.mark(picture, seen, pulls=self._pulls)
+        if self._film is not None:
+            self._expose(self._film, picture)
+        above = self._figure_lines(pacing) if self._figures else ["paused"] if self.paused else []
+        hud.write(picture, above, self.notice, POINTER | KEYS if self._keys else None)
+        return picture
+
+    def say(self, notice: str) -> None:
+        """Show a notice for some time."""
+        self._notice, self._notice_until = notice, self._beats + round(NOTICE * self.rate)
+
+    @property
+    def notice(self) -> str:
+        """What the person should know now."""
+        return self._notice if self._beats < self._notice_until else self.fault
+
+    def close(self) -> None:
+        """Keep the film that is on, and free the memory."""
+        self._simulation.close()
+        self.viewport.close()
+        self._end_film()
+
+    def __enter__(self) -> Session:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.close()
+
+    def _warn_of_length(self) -> None:
+        """Say once that soon there will be more than a scene file may hold."""
+        if self.frame % CHECKED == 0 and not self._warned and values(self.recorded()) > NEARLY * MAX_NODES:
+            self._warned = True
+            self.say("soon this session will be too long for a scene: write it now (w), then reset it (r)")
+
+    def _press(self, x: float, y: float, direction: int) -> None:
+        place = pick(self.positions(), self.scene.render.refine, self.viewport.view, (x, y))
+        if place is None:
+            self.say(f"no tissue at pixel {x:g}, {y:g}")
+            return
+        self._notice_until = 0
+        self.tool.press(place, direction)
+        self._pointer = x, y
+        self._held = place, on_rest_plane(self.viewport.view, (x, y))
+
+    def _drag(self, x: float, y: float) -> None:
+        """Move the control point as far over the sheet at rest as the pointer went.
+
+        Where the sheet is now is no guide: it gives way under the tool, and the pointer would run after itself.
+        """
+        if self._held is None:
+            return
+        self._pointer = x, y
+        ((across, down), begun), here = self._held, on_rest_plane(self.viewport.view, (x, y))
+        if begun is None or here is None:
+            return
+        (right, up), (height, width) = here - begun, self.scene.sheet.size
+        self.tool.move((across + right / width, down - up / height))
+
+    def _look(self, camera: str | Camera) -> None:
+        self.viewport.look(camera)
+        self._hold_on()
+
+    def _hold_on(self) -> None:
+        """Keep the tool where it is under a camera that moved; a drag goes on from there."""
+        if self._held is not None:
+            self._held = self.tool.goal, on_rest_plane(self.viewport.view, self._pointer)
+
+    def _do(self, key: str) -> None:
+        match key:
+            case "up":
+                self.handle(Harder(NOTCH))
+            case "down":
+                self.handle(Harder(-NOTCH))
+            case "c":
+                self._look(self.scene.render.camera)
+            case "t":
+                self._look("top")
+            case "o":
+                self._look("oblique")
+            case "m":
+                self.viewport.mesh()
+            case "l":
+                self.viewport.light()
+            case "space":
+                self.paused, self._once = not self.paused, False
+            case ".":
+                self._once = self.paused
+            case "r":
+                self._once = False
+                self._simulation.go_on(self._beginning)
+                self.tool.rest()
+                self._held = None
+                self._warned = False
+                self.fault = ""
+            case "p":
+                self.say(f"saved {self._album.keep_picture(self.viewport.draw(self.positions()))}")
+            case "g":
+                self._start_or_stop_film()
+            case "w":
+                self.say(f"saved {self._album.keep_scene(self.recorded())}")
+            case "i":
+                self._figures = not self._figures
+            case "h":
+                self._keys = not self._keys
+
+    def _start_or_stop_film(self) -> None:
+        if self._film is None:
+            render = self.scene.render
+            self._film = self._album.film(render.size, self._film_rate, render.background)
+            self._filmed_from = self._beats
+        else:
+            self._end_film()
+
+    def _end_film(self) -> None:
+        """Keep the film that is on, if it has a picture."""
+        film, self._film = self._film, None
+        if film is not None and film.pictures > 0:
+            self.say(f"saved {self._album.keep_film(film)}")
+        elif film is not None:
+            with film:
+                self.say("the film had no picture yet")
+
+    def _expose(self, film: Film, picture: Picture) -> None:
+        """Film a picture; where the pictures are too slow for the film one stays for several."""
+        try:
+            while film.pictures * self.parts <= self._beats - self._filmed_from:
+                film.add(picture)
+        except FilesError as error:
+            self._film = None
+            with film:
+                self.say(str(error))
+
+    @property
+    def _pulls(self) -> bool:
+        """Whether the tool pulls out of the sheet, where scenes may have a force that does."""
+        return self.tool.percent * self.scene.probes[-1].force[2] > 0
+
+    def _figure_lines(self, pacing: str) -> list[str]:
+        tool, speed = self.tool, ""
+        if self.seconds_a_frame > 0:
+            speed = f"steps {1 / self.rate / self.seconds_a_frame:.0f} x real time"
+        state = [word for word, on in (("paused", self.paused), ("film", self._film is not None)) if on]
+        does = "pull" if self._pulls else "push"
+        percent = f"{does} {abs(tool.percent):.0f} %" if tool.percent else f"tool {tool.strength:.0f} %"
+        moved = self.displacement()
+        # Less is what f32 makes of places.
+        moved = moved if moved > AT_REST * max(self.scene.sheet.size) else 0.0
+        lines = [percent, length(moved)], [pacing, speed, *state]
+        return [SEPARATOR.join(part for part in line if part) for line in lines]
+
+
+def _require_usable(scene: Scene, *, play: bool) -> None:
+    problems = []
+    if scene.image is None:
+        problems.append("image: none; a session shows one, name it here or with --image")
+    if not scene.probes:
+        problems.append("probes: none; the tool takes its force from the first one, add it")
+    if play and len(scene.probes) == MAX_PROBES:
+        problems.append(f"probes: {MAX_PROBES} leave no place for the tool; remove one, or leave out --play")
+    if problems:
+        raise SceneError(problems)
+
+
+def _between(values: NDArray[np.floating], across: float, down: float) -> NDArray[np.float64]:
+    """Interpolate what points have, shape (rows, cols, 3), bilinearly at a place on the sheet."""
+    rows, cols = values.shape[:2]
+    y, x = down * (rows - 1), across * (cols - 1)
+    i, j = min(int(y), rows - 2), min(int(x), cols - 2)
+    t, s = y - i, x - j
+    corners = values[i : i + 2, j : j + 2].astype(np.float64)
+    rows_between: NDArray[np.float64] = corners[0] + t * (corners[1] - corners[0])
+    return rows_between[0] + s * (rows_between[1] - rows_between[0])
+
+
+def length(metres: float) -> str:
+    """Write a length in a unit in which it is legible."""
+    if metres == 0 or 1e-6 <= metres < 1:
+        return f"{1e3 * metres:.3g} mm"
+    return f"{metres:.3g} m"

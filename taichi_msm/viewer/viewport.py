@@ -1,0 +1,86 @@
+"""How the tissue is looked at: the camera, the light and the mesh, which a person changes while it moves."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from taichi_msm.render.camera import View, pinhole, turned, view
+from taichi_msm.render.rasterizer import Drawing
+from taichi_msm.results.gif import Picture
+from taichi_msm.scene import Camera, Render, Scene
+
+
+class Viewport:
+    """Draws a sheet as is wanted now; `runtime.start` comes first.
+
+    Args:
+        scene: a checked scene; what it says of its picture is where one begins.
+        texture: the picture on the sheet, shape (height, width, 3).
+
+    Attributes:
+        render: how the sheet is drawn now.
+        view: the camera now.
+    """
+
+    def __init__(self, scene: Scene, texture: NDArray[np.uint8]) -> None:
+        self._scene = scene
+        self._texture = texture
+        self._drawings: dict[tuple[str, bool], Drawing] = {}
+        self.render: Render = scene.render
+        self.view: View = view(scene)
+
+    @property
+    def compiled(self) -> bool:
+        """Whether the next picture needs no other kernel than those there are."""
+        return (self.render.shading, self.render.wireframe) in self._drawings
+
+    def look(self, camera: str | Camera) -> None:
+        """Take another camera."""
+        self._change(camera=camera)
+        self.view = view(self._seen())
+
+    def turn(self, right: float, down: float) -> None:
+        """Turn the picture as if its nearest side were pushed by so many pixels; by its height, half around."""
+        angle = math.pi / self.render.size[1]
+        self.look(turned(pinhole(self._seen()), -right * angle, down * angle))
+
+    def light(self) -> None:
+        """Switch the headlight on or off."""
+        self._change(shading="none" if self.render.shading == "headlight" else "headlight")
+
+    def mesh(self) -> None:
+        """Show the mesh, or hide it."""
+        self._change(wireframe=not self.render.wireframe)
+
+    def draw(self, position: NDArray[Any]) -> Picture:
+        """Draw the sheet; the kernel is compiled when it is first wanted.
+
+        Args:
+            position: positions of the mass points [m], shape (rows, cols, 3).
+
+        Returns:
+            Colours, shape (height, width, 3).
+        """
+        wanted = self.render.shading, self.render.wireframe
+        if not self.compiled:
+            self._drawings[wanted] = Drawing(self._seen(), self._texture)
+        return self._drawings[wanted].draw(position, self.view)
+
+    def pixel(self, point: NDArray[np.floating]) -> tuple[float, float] | None:
+        """Find where a point [m] is seen; None if it is behind the camera."""
+        x, y, w, _ = self.view.matrix @ [*point, 1.0]
+        return (x / w, y / w) if w > self.view.near else None
+
+    def close(self) -> None:
+        """Free the memory."""
+        self._drawings.clear()
+
+    def _change(self, **changes: Any) -> None:
+        self.render = self.render.model_copy(update=changes)
+
+    def _seen(self) -> Scene:
+        return self._scene.model_copy(update={"render": self.render})

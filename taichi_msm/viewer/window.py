@@ -1,0 +1,149 @@
+"""The window: the pointer and the keys become events, pictures become visible, and nothing else."""
+
+from __future__ import annotations
+
+import sys
+import time
+from collections.abc import Callable, Iterable, Iterator
+from types import TracebackType
+from typing import Any
+
+import numpy as np
+
+from taichi_msm.errors import FilesError
+from taichi_msm.results.gif import Picture
+from taichi_msm.system.runtime import open_window, ti
+from taichi_msm.viewer import hud
+from taichi_msm.viewer.events import NOTCH, Drag, Event, Harder, Key, Press, Release, Turn
+from taichi_msm.viewer.pacing import Pacing
+from taichi_msm.viewer.session import Session
+
+# What the keyboard calls keys that have no letter.
+NAMES = {" ": "space", "Escape": "q"}
+NAMES |= dict.fromkeys(("Up", "=", "+", "KP_Add"), "up") | dict.fromkeys(("Down", "-", "KP_Subtract"), "down")
+
+# Held down they go on; of all other keys the keyboard's repetition is none.
+REPEATED = ("up", "down")
+
+QUIT = Key("q")
+
+
+class Window:
+    """A window with a picture. Usable in a with statement, which closes it.
+
+    Args:
+        title: of the window.
+        size: width, height of the picture [px].
+
+    Raises:
+        DeviceError: when there is no display.
+    """
+
+    def __init__(self, title: str, size: tuple[int, int]) -> None:
+        self._gui = open_window(title, size)
+        # What is written here is shown: rows from the top, blue, green, red and nothing; on a Mac red comes first.
+        self._shown = self._gui.img.view(np.uint8).reshape(size[1], size[0], 4)
+        self._shown[..., 3] = 255
+        self._places = (0, 1, 2) if sys.platform == "darwin" else (2, 1, 0)
+        self._hand = Hand(size)
+
+    def show(self, picture: Picture) -> None:
+        """Show a picture, shape (height, width, 3)."""
+        # Plane by plane it takes an eighth of the time of all at once.
+        for channel, place in enumerate(self._places):
+            self._shown[..., place] = picture[..., channel]
+        self._gui.show()
+
+    def say(self, text: str) -> None:
+        """Write over what is shown."""
+        picture = self._shown[..., self._places]
+        hud.announce(picture, text)
+        self.show(picture)
+
+    def events(self) -> Iterator[Event]:
+        """Give what was done since the last call, up to now."""
+        # A window learns of it when it is shown.
+        self._gui.show()
+        yield from self._hand.events(self._gui.get_events())
+
+    def __enter__(self) -> Window:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self._gui.close()
+
+
+class Hand:
+    """Understands what a window tells of the pointer and the keyboard.
+
+    Args:
+        size: width, height of the picture [px].
+    """
+
+    def __init__(self, size: tuple[int, int]) -> None:
+        self._size = size
+        self._pressing = False
+        self._turning: tuple[float, float] | None = None
+
+    def events(self, told: Iterable[Any]) -> Iterator[Event]:
+        """Turn what a window tells at a time, in events of `ti.GUI`, into ours."""
+        before = None
+        for event in told:
+            # A key that is held down is released and pressed at the same time, again and again.
+            repeated = before is not None and before.type == ti.GUI.RELEASE and before.key == event.key
+            before = event
+            for understood in self._understood(event):
+                if not (repeated and isinstance(understood, Key) and understood.name not in REPEATED):
+                    yield understood
+
+    def _understood(self, event: Any) -> Iterator[Event]:
+        width, height = self._size
+        x, y = event.pos[0] * width, height - 1 - event.pos[1] * height
+        pressed = event.type == ti.GUI.PRESS
+        if event.key == ti.GUI.EXIT:
+            yield QUIT
+        elif event.key == ti.GUI.LMB:
+            self._pressing = pressed
+            yield Press(x, y, "Shift" in event.modifier) if pressed else Release()
+        elif event.key == ti.GUI.RMB:
+            self._turning = (x, y) if pressed else None
+        elif event.key == ti.GUI.WHEEL:
+            yield Harder(NOTCH if event.delta[1] > 0 else -NOTCH)
+        elif event.key == ti.GUI.MOVE:
+            if self._pressing:
+                yield Drag(x, y)
+            if self._turning is not None:
+                yield Turn(x - self._turning[0], y - self._turning[1])
+                self._turning = (x, y)
+        elif pressed:
+            yield Key(NAMES.get(event.key, event.key))
+
+
+def show(session: Session, window: Window, pause: Callable[[], None]) -> None:
+    """Show a session until the person has enough of it.
+
+    Args:
+        session: the session.
+        window: where.
+        pause: called before every picture; what it raises ends the session.
+    """
+    pacing = Pacing(session.rate, time.perf_counter)
+    session.say("h: the keys")
+    while True:
+        pause()
+        time.sleep(pacing.wait())
+        for event in window.events():
+            if event == QUIT:
+                return
+            try:
+                session.handle(event)
+            except FilesError as error:
+                # What was done until now is not to be lost for a full disk.
+                session.say(str(error))
+        for _ in pacing.due():
+            session.advance()
+        if not session.viewport.compiled:
+            window.say("one moment: compiling")
+        window.show(session.picture(pacing.said()))
