@@ -1,4 +1,6 @@
-"""Draw the layers of the package and the imports between them, read from the source.
+"""Draw the layers of the package and the imports between them, as the source has them.
+
+An import that others lead to as well is not drawn.
 
     PYTHONPATH=. python docs/make_architecture.py
 
@@ -36,6 +38,21 @@ def arrows() -> Counter[tuple[str, str]]:
     return found
 
 
+def direct(edges: Counter[tuple[str, str]]) -> Counter[tuple[str, str]]:
+    """Keep the arrows that no way over others makes needless."""
+
+    def leads(start: str, end: str) -> bool:
+        return any(lower == end or leads(lower, end) for upper, lower in edges if upper == start)
+
+    return Counter(
+        {
+            (upper, lower): count
+            for (upper, lower), count in edges.items()
+            if not any(leads(other, lower) for start, other in edges if start == upper and other != lower)
+        }
+    )
+
+
 def main() -> None:
     """Draw."""
     layers = [layer for layer in SHOWN if layer]
@@ -50,10 +67,10 @@ def main() -> None:
     axes.set_axis_off()
     axes.set_xlim(-3.4, 3.4)
     axes.set_ylim(-0.6, GAP * (len(layers) - 1) + 0.6)
-    for (upper, lower), count in arrows().items():
+    for (upper, lower), count in direct(arrows()).items():
         if upper in place and lower in place:
             (x, y), (to_x, to_y) = place[upper], place[lower]
-            bend = 0.0 if abs(x - to_x) > 0.1 or y - to_y < 1.5 * GAP else 0.25
+            bend = 0.0 if abs(x - to_x) > 0.1 or y - to_y < 1.5 * GAP else 0.45
             arrow = FancyArrowPatch(
                 (x, y - HEIGHT / 2),
                 (to_x, to_y + HEIGHT / 2),

@@ -31,7 +31,8 @@ def notes(
     if estimate is not None:
         yield error(estimate)
         if WRONG < estimate.error < math.inf:
-            yield f"the run is about {100 * estimate.error:.2g} % wrong; {_remedy(scene, estimate)}"
+            wrong = float(f"{100 * estimate.error:.2g}")
+            yield f"the run is about {wrong:g} % wrong; {_remedy(scene, estimate)}"
     elif reason:
         yield f"error not estimated: {reason}"
     if max_displacement == 0:
@@ -39,7 +40,7 @@ def notes(
     if shortest_spring < SHORTEST:
         yield (
             f"a spring was pressed to {shortest_spring:.2g} of its rest length: below {SHORTEST} the sheet folds over "
-            "itself and small errors grow; look at --estimate-error, or press less"
+            "itself and small errors grow; press less"
         )
     h = step(scene)
     quick = scene.damping / scene.sheet.mass * h
