@@ -43,7 +43,7 @@ set_option = click.option(
     help="Override a key of the scene by its dotted path, e.g. sheet.points=[61,61]; list items by index.",
 )
 arch_option = click.option(
-    "--arch", metavar="cpu|cuda|vulkan", default="cpu", show_default=True, help="Where to compute."
+    "--arch", metavar="cpu|cuda|vulkan", default="cpu", show_default=True, help="Device to compute on."
 )
 threads_option = click.option(
     "--threads", type=click.IntRange(min=1), metavar="N", help="CPU threads.  [default: every core]"
@@ -59,7 +59,7 @@ def program() -> None:
 
 @program.command()
 @click.argument("scene", metavar="SCENE", required=False)
-@click.option("--out", metavar="DIR", help="Where the results go.  [default: output/<name of the scene file>]")
+@click.option("--out", metavar="DIR", help="Directory for the results.  [default: output/<name of the scene file>]")
 @image_option
 @set_option
 @arch_option
@@ -69,7 +69,7 @@ def program() -> None:
     default=None,
     help="Estimate the error whatever it costs, or never.  [default: where it takes less than a third of the run]",
 )
-@click.option("--resume", metavar="DIR", help="Go on with the unfinished run into DIR, instead of SCENE.")
+@click.option("--resume", metavar="DIR", help="Continue the unfinished run into DIR, instead of running SCENE.")
 @click.option("--quiet", is_flag=True, help="No progress and no summary.")
 @json_option
 @click.pass_context
@@ -137,7 +137,7 @@ def run(
 @set_option
 @json_option
 def check(scene: str, image: str | None, overrides: tuple[str, ...], as_json: bool) -> int:
-    """Validate SCENE and say what it would take; compute nothing."""
+    """Validate SCENE and print the steps, memory and disk space it needs; compute nothing."""
     from taichi_msm.physics import timestep, workload
     from taichi_msm.scenefile import budget
     from taichi_msm.scenefile.load import load_scene
@@ -186,7 +186,7 @@ def schema() -> int:
 
 @program.command()
 @scene_argument
-@click.option("--out", metavar="DIR", help="Where the report goes.  [default: output/<name of the scene file>-study]")
+@click.option("--out", metavar="DIR", help="Directory for the report.  [default: output/<name of the scene file>-study]")
 @image_option
 @set_option
 @arch_option
@@ -256,15 +256,15 @@ def study(
 
 @program.command()
 @scene_argument
-@click.option("--out", metavar="DIR", help="Where goes what you save.  [default: output/<name of the scene file>-live]")
+@click.option("--out", metavar="DIR", help="Directory for saved images, films and scenes.  [default: output/<name of the scene file>-live]")
 @image_option
 @set_option
 @arch_option
 @threads_option
-@click.option("--play", is_flag=True, help="Let the scene's probes do what the scene says, too.")
-@click.option("--record", metavar="FILE.gif", help="Without a window: film the session.")
+@click.option("--play", is_flag=True, help="Let the scene's own probes act as well.")
+@click.option("--record", metavar="FILE.gif", help="Film the session instead of opening a window.")
 @click.option("--seconds", type=click.FloatRange(min=0, max=3600, min_open=True), metavar="N", help="How long to film.")
-@click.option("--script", metavar="EVENTS", help="What happens in the film: a YAML file of events.")
+@click.option("--script", metavar="EVENTS", help="Events of the film: a YAML file.")
 def view(
     scene: str,
     out: str | None,
