@@ -17,8 +17,9 @@ from taichi_msm import load_scene
 from taichi_msm.physics.timestep import steps_per_frame
 from taichi_msm.study import measure
 from taichi_msm.study.result import Timing
-from taichi_msm.study.table import duration, number, timing
-from taichi_msm.system.runtime import Device, available_threads, vector_bits
+from taichi_msm.study.table import duration, markdown, number, timing
+from taichi_msm.system.resources import available_threads
+from taichi_msm.system.runtime import Device, vector_bits
 
 TEMPLATE = ROOT / "docs" / "performance.template"
 NOT_MEASURED = "(not measured yet)"
@@ -132,8 +133,7 @@ def launch_share(results: Results) -> str:
 
 def table(head: list[str], rows: list[list[str]]) -> str:
     """Write a table, its first column of text and the others of numbers."""
-    lines = ["| " + " | ".join(head) + " |", "|---|" + "---:|" * (len(head) - 1)]
-    return "\n".join(lines + ["| " + " | ".join(row) + " |" for row in rows])
+    return markdown(head, rows, left=(0,))
 
 
 def stepping_table(measured: dict[str, list[Entry]]) -> str:

@@ -22,6 +22,7 @@ from benchmarks import stored_form
 from taichi_msm.study.pictures import FINEST
 from taichi_msm.study.result import REFINED_ENOUGH
 from taichi_msm.study.stepping import MARGIN
+from taichi_msm.study.table import markdown
 
 ROOT = Path(__file__).parent.parent
 PAGE, TEMPLATE = ROOT / "docs" / "accuracy.md", ROOT / "docs" / "accuracy.template"
@@ -75,8 +76,7 @@ def significant(value: float | None, digits: int = 2) -> str:
 
 def table(head: list[str], rows: list[list[str]]) -> str:
     """Write a table, its first column of text and the others of numbers."""
-    lines = ["| " + " | ".join(head) + " |", "|---|" + "---:|" * (len(head) - 1)]
-    return "\n".join(lines + ["| " + " | ".join(row) + " |" for row in rows])
+    return markdown(head, rows, left=(0,))
 
 
 def scene_table(studies: dict[str, Record]) -> str:

@@ -186,7 +186,9 @@ def schema() -> int:
 
 @program.command()
 @scene_argument
-@click.option("--out", metavar="DIR", help="Directory for the report.  [default: output/<name of the scene file>-study]")
+@click.option(
+    "--out", metavar="DIR", help="Directory for the report.  [default: output/<name of the scene file>-study]"
+)
 @image_option
 @set_option
 @arch_option
@@ -256,7 +258,11 @@ def study(
 
 @program.command()
 @scene_argument
-@click.option("--out", metavar="DIR", help="Directory for saved images, films and scenes.  [default: output/<name of the scene file>-live]")
+@click.option(
+    "--out",
+    metavar="DIR",
+    help="Directory for saved images, films and scenes.  [default: output/<name of the scene file>-live]",
+)
 @image_option
 @set_option
 @arch_option

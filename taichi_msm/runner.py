@@ -6,12 +6,12 @@ import math
 import platform
 import sys
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from contextlib import ExitStack, suppress
 from dataclasses import asdict
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 import PIL
@@ -26,20 +26,20 @@ from taichi_msm.physics.run_progress import RunProgress
 from taichi_msm.physics.timestep import stable_step, step, steps_per_frame
 from taichi_msm.physics.warnings import notes
 from taichi_msm.physics.workload import affords_pilot, with_precision
+from taichi_msm.progress import Progress
 from taichi_msm.render.texture import load_texture
 from taichi_msm.results.manifest import Manifest, digest, read_manifest
+from taichi_msm.results.record import RunRecord
 from taichi_msm.results.writer import ResultWriter
 from taichi_msm.scene import Scene
 from taichi_msm.scenefile import budget
 from taichi_msm.scenefile.validation import checked
 from taichi_msm.simulation import Simulation
-from taichi_msm.system import runtime
+from taichi_msm.system import resources, runtime
 from taichi_msm.system.runtime import Device
 
 # Encoding a pixel takes as long as so many steps of a point.
 STEPS_PER_PIXEL = 40
-
-Progress = Callable[[str, int, int], None]
 
 
 class Stopwatch:
@@ -74,7 +74,7 @@ def run(
     estimate_error: bool | None = None,
     started: float | None = None,
     progress: Progress = lambda stage, done, total: None,
-) -> dict[str, Any]:
+) -> RunRecord:
     """Simulate a scene and write its results: whole or not at all.
 
     An unfinished run of the same scene into the same directory is gone on with: the results have the same bits.
@@ -139,7 +139,7 @@ def resume(
     threads: int | None = None,
     started: float | None = None,
     progress: Progress = lambda stage, done, total: None,
-) -> dict[str, Any]:
+) -> RunRecord:
     """Go on with a run that was interrupted, killed, short of disk space or diverged; the result has the same bits.
 
     Args:
@@ -177,7 +177,7 @@ def _carry_out(
     progress: Progress,
     *,
     resumes: bool,
-) -> dict[str, Any]:
+) -> RunRecord:
     """Simulate and draw, from the beginning or what the unfinished run in the directory lacks."""
     scene = manifest.scene
     frames = scene.time.frames + 1
@@ -262,7 +262,7 @@ def _carry_out(
         record["timings"] = {**seconds, "encode": writer.encode_seconds, "total": watch.total()}
         record |= {"arch": device.arch, "device": device.name, "threads": device.threads, "lanes": simulation.lanes}
         record |= {"workers": simulation.workers, "versions": manifest.versions}
-        return writer.publish(record)
+        return cast(RunRecord, writer.publish(record))
 
 
 def _pilot(manifest: Manifest, device: Device, cores: int, *, resumed: bool) -> tuple[Pilot | None, str]:
@@ -310,7 +310,7 @@ def free_cores(scene: Scene) -> int:
     rows, cols = scene.sheet.points
     encoding = width * height * STEPS_PER_PIXEL if scene.draws else 0
     busy = encoding > rows * cols * steps_per_frame(scene)
-    return max(1, runtime.available_threads() - busy)
+    return max(1, resources.available_threads() - busy)
 
 
 def error_record(estimate: Estimate) -> dict[str, Any]:

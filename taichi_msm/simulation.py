@@ -15,9 +15,11 @@ from taichi_msm.physics.divergence import Watch, farthest
 from taichi_msm.physics.error_control import choose_step
 from taichi_msm.physics.lattice import axes
 from taichi_msm.physics.run_progress import RunProgress, Saved
-from taichi_msm.physics.solver import Dynamics, Pause
+from taichi_msm.physics.solver import Dynamics
+from taichi_msm.physics.state import Reading
 from taichi_msm.physics.timestep import step, steps_per_frame
 from taichi_msm.physics.workload import with_precision
+from taichi_msm.progress import Pause
 from taichi_msm.render.camera import View, view
 from taichi_msm.render.picking import pick
 from taichi_msm.render.surface import Surface, surface
@@ -181,9 +183,9 @@ class Simulation:
             DivergedError: as for `advance`.
         """
         self._require_open()
-        state = self._dynamics.state()
-        self._require_good(self._watch.judge(self._dynamics, state.displacement))
-        return Saved(state, self.progress)
+        reading = self._dynamics.read()
+        self._require_good(reading, self._watch.judge(reading))
+        return Saved(self._dynamics.state(), self.progress)
 
     def go_on(self, saved: Saved) -> None:
         """Be where a simulation of the same scene was, maybe between two frames; what follows has the same bits."""
@@ -338,14 +340,15 @@ class Simulation:
 
     def _read(self) -> NDArray[Any]:
         """Read where the points are, if the simulation has not gone wrong since the last frame."""
-        displacement = self._dynamics.displacement()
-        self._require_good(self._watch.follow(self._dynamics, displacement))
-        return self._place(displacement)
+        reading = self._dynamics.read()
+        self._require_good(reading, self._watch.follow(reading))
+        return self._place(reading.displacement)
 
-    def _require_good(self, wrong: str) -> None:
+    def _require_good(self, reading: Reading, wrong: str) -> None:
         if wrong:
-            time, point = self.steps * step(self.scene), farthest(self._dynamics.displacement())[:2]
-            raise DivergedError(f"diverged before {time:g} s, step {self.steps}: {wrong}", self.steps, time, point)
+            steps, time = reading.steps, reading.steps * step(self.scene)
+            point = farthest(reading.displacement)[:2]
+            raise DivergedError(f"diverged before {time:g} s, step {steps}: {wrong}", steps, time, point)
 
     def _place(self, displacement: NDArray[Any]) -> NDArray[Any]:
         """Turn displacements into positions."""

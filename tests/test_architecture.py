@@ -13,7 +13,7 @@ PACKAGE = Path(__file__).parent.parent / "taichi_msm"
 
 # A module or a package imports from earlier lines, and a package from itself.
 LAYERS = [
-    {"errors", "notebook"},
+    {"errors", "notebook", "progress"},
     {"faults", "system"},
     {"scene"},
     {"physics", "render"},

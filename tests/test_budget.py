@@ -12,7 +12,9 @@ from PIL import Image
 from taichi_msm.errors import SceneError
 from taichi_msm.scene import Scene
 from taichi_msm.scenefile import budget
-from taichi_msm.scenefile.budget import available_memory, estimate, problems, require_disk
+from taichi_msm.scenefile.budget import estimate, problems, require_disk
+from taichi_msm.system import resources
+from taichi_msm.system.resources import available_memory
 
 TIME = {"duration": 2, "frames_per_second": 10, "step": 0.025, "precision": "f32"}
 PROBE = {"force": [0, 0, 1]}
@@ -144,7 +146,7 @@ def test_available_memory() -> None:
 
 def test_free_memory(tmp_path: Path) -> None:
     (tmp_path / "meminfo").write_text("MemTotal:  900 kB\nMemFree:  1 kB\nMemAvailable:  300 kB\n")
-    assert budget._free_memory(tmp_path / "meminfo") == 300 * 1024
+    assert resources._free_memory(tmp_path / "meminfo") == 300 * 1024
 
 
 def control_group(folder: Path, limit: str, used: int, cached: int) -> None:
@@ -158,24 +160,24 @@ def test_the_narrowest_control_group_counts(tmp_path: Path) -> None:
     root, membership = tmp_path / "cgroup", tmp_path / "membership"
     root.mkdir()
     membership.write_text("4:memory:/elsewhere\n0::/outer/inner\n")
-    assert budget._control_group_rest(membership, root) == sys.maxsize
+    assert resources._control_group_rest(membership, root) == sys.maxsize
     control_group(root / "outer" / "inner", "max", 10, 0)
-    assert budget._control_group_rest(membership, root) == sys.maxsize
+    assert resources._control_group_rest(membership, root) == sys.maxsize
     control_group(root / "outer", "1000", 300, 100)
-    assert budget._control_group_rest(membership, root) == 800
+    assert resources._control_group_rest(membership, root) == 800
     control_group(root / "outer" / "inner", "400", 500, 50)
-    assert budget._control_group_rest(membership, root) == 0
+    assert resources._control_group_rest(membership, root) == 0
     control_group(root / "elsewhere", "1", 0, 0)
     membership.write_text("0::/\n")
     control_group(root, "90", 20, 0)
-    assert budget._control_group_rest(membership, root) == 70
+    assert resources._control_group_rest(membership, root) == 70
 
 
 def test_a_limit_below_the_free_memory_counts(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(budget, "_free_memory", lambda _: 500)
-    monkeypatch.setattr(budget, "_control_group_rest", lambda *_: 400)
+    monkeypatch.setattr(resources, "_free_memory", lambda _: 500)
+    monkeypatch.setattr(resources, "_control_group_rest", lambda *_: 400)
     assert available_memory() == 400
-    monkeypatch.setattr(budget, "_control_group_rest", lambda *_: 600)
+    monkeypatch.setattr(resources, "_control_group_rest", lambda *_: 600)
     assert available_memory() == 500
 
 
@@ -183,7 +185,7 @@ def test_systems_without_proc(monkeypatch: pytest.MonkeyPatch) -> None:
     def missing(_: Path) -> int:
         raise FileNotFoundError
 
-    monkeypatch.setattr(budget, "_free_memory", missing)
+    monkeypatch.setattr(resources, "_free_memory", missing)
     assert 2**20 < available_memory() < sys.maxsize
     monkeypatch.delattr(os, "sysconf")
     assert available_memory() == sys.maxsize

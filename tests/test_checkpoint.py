@@ -14,7 +14,7 @@ import pytest
 
 from taichi_msm.errors import DamagedError
 from taichi_msm.physics.run_progress import RunProgress, Saved
-from taichi_msm.physics.solver import State
+from taichi_msm.physics.state import State
 from taichi_msm.results.checkpoint import Checkpoint
 from taichi_msm.results.folder import Folder
 from taichi_msm.results.manifest import Manifest, read_manifest

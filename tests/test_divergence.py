@@ -13,7 +13,7 @@ from taichi_msm import DivergedError, Simulation
 from taichi_msm.physics.diagnosis import Diagnosis
 from taichi_msm.physics.divergence import farthest_displacement
 from taichi_msm.physics.run_progress import RunProgress, Saved
-from taichi_msm.physics.solver import State
+from taichi_msm.physics.state import State
 from taichi_msm.physics.timestep import stable_step, steps_per_frame, with_steps
 from taichi_msm.scene import Scene
 from taichi_msm.system.runtime import Device

@@ -13,7 +13,7 @@ from typing import Any
 import pytest
 
 from taichi_msm.scenefile.load import load_scene
-from taichi_msm.system import runtime
+from taichi_msm.system import resources
 from taichi_msm.system.runtime import Device
 from taichi_msm.viewer.script import load_script
 
@@ -58,7 +58,7 @@ def test_the_notebook_runs(
     root: Path, device: Device, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.chdir(root)
-    monkeypatch.setattr(runtime, "available_threads", lambda: device.threads)
+    monkeypatch.setattr(resources, "available_threads", lambda: device.threads)
     notebook = json.loads((root / "docs" / "notebooks" / "closed-loop.ipynb").read_text(encoding="utf-8"))
     cells = ["".join(cell["source"]) for cell in notebook["cells"] if cell["cell_type"] == "code"]
     names: dict[str, Any] = {}

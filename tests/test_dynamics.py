@@ -19,7 +19,8 @@ from taichi_msm.physics.lattice import rest_positions
 from taichi_msm.physics.solver import POINTS_PER_WORKER, Dynamics, structure
 from taichi_msm.physics.timestep import stable_step, step, steps_per_frame, with_steps
 from taichi_msm.scene import Scene
-from taichi_msm.system.runtime import Device, available_threads, lanes
+from taichi_msm.system.resources import available_threads
+from taichi_msm.system.runtime import Device, lanes
 from tests.scenes import PRESS, SHEET, SPRINGS, random_scene, scene
 
 ROUNDING = {"f32": 2.0**-24, "f64": 2.0**-53}
@@ -244,8 +245,8 @@ def test_the_shortest_spring_is_that_of_the_twin(springs: dict[str, Any], fixed:
         dynamics = Dynamics(made, device)
         dynamics.advance(30)
         u = dynamics.displacement()
-        assert dynamics.shortest_spring == pytest.approx(reference.shortest_spring(made, u), abs=1e-12)
-        found.append(dynamics.shortest_spring)
+        assert dynamics.read().shortest_spring == pytest.approx(reference.shortest_spring(made, u), abs=1e-12)
+        found.append(dynamics.read().shortest_spring)
         dynamics.close()
     assert (min(found) < 0.999) == bool(springs)
 
@@ -342,12 +343,12 @@ def test_a_state_is_gone_on_from_with_the_same_bits(change: dict[str, Any] | Non
     whole = structure(made, device)
     dynamics = Dynamics(made, device, as_on_a_gpu(whole) if change is None else replace(whole, **change))
     dynamics.advance(37)
-    state, energy = dynamics.state(), dynamics.energy
+    state, energy = dynamics.state(), dynamics.read().energy
     dynamics.advance(50)
     end = dynamics.state()
     dynamics.restart(made, state)
     again = dynamics.state()
-    assert dynamics.energy == energy
+    assert dynamics.read().energy == energy
     dynamics.advance(50)
     for there, here in ((again, state), (dynamics.state(), end)):
         assert there.steps == here.steps
@@ -367,8 +368,10 @@ def test_the_energy_is_that_of_motion_and_springs(seed: int, width: int, device:
     state = dynamics.state()
     without_virtual = made.model_copy(update={"springs": made.springs.model_copy(update={"virtual": 0.0})})
     expected = energy(without_virtual, state.displacement, state.difference / step(made))
-    assert dynamics.energy == pytest.approx(expected, rel=1e-12)
-    assert dynamics.shortest_spring == pytest.approx(reference.shortest_spring(made, state.displacement), rel=1e-12)
+    assert dynamics.read().energy == pytest.approx(expected, rel=1e-12)
+    assert dynamics.read().shortest_spring == pytest.approx(
+        reference.shortest_spring(made, state.displacement), rel=1e-12
+    )
     dynamics.close()
 
 

@@ -30,7 +30,8 @@ from taichi_msm import (
 from taichi_msm.physics.lattice import rest_positions
 from taichi_msm.physics.timestep import stable_step, step, with_time
 from taichi_msm.render.camera import view
-from taichi_msm.system.runtime import Device, processor
+from taichi_msm.system.resources import processor
+from taichi_msm.system.runtime import Device
 from tests.scenes import PRESS, SHEET, scene, speckle
 
 HAND = {"at": [[0, 0.5, 0.5]], "force": [0, 0, -20], "falloff": 20, "offset": 0}

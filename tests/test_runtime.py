@@ -14,7 +14,7 @@ import pytest
 from taichi_msm.physics.lattice import rest_positions
 from taichi_msm.physics.solver import Dynamics
 from taichi_msm.render.rasterizer import Drawing
-from taichi_msm.system import runtime
+from taichi_msm.system import resources, runtime
 from tests.scenes import SHEET, scene, speckle
 
 # Start, make every thread of the pool work, and tell of each thread its processor time [ticks] and its cores.
@@ -55,7 +55,7 @@ def test_threads_that_take_all_cores_have_one_each(
 @pytest.mark.skipif(not Path("/proc/self/task").is_dir(), reason="the system does not tell the cores of threads")
 def test_the_threads_that_are_pinned_are_those_that_work(tmp_path: Path) -> None:
     cores = sorted(os.sched_getaffinity(0))
-    if runtime.available_threads() != len(cores):
+    if resources.available_threads() != len(cores):
         pytest.skip("a quota keeps this process from using all of its cores")
     # Taichi reads the source of a kernel from its file.
     script = tmp_path / "work.py"

@@ -12,8 +12,9 @@ from taichi_msm.physics.divergence import Watch, farthest
 from taichi_msm.physics.lattice import axes
 from taichi_msm.physics.loads import control_points
 from taichi_msm.physics.run_progress import RunProgress, Saved
-from taichi_msm.physics.solver import Dynamics, Pause
+from taichi_msm.physics.solver import Dynamics
 from taichi_msm.physics.timestep import step, steps_per_frame, with_steps
+from taichi_msm.progress import Pause
 from taichi_msm.scene import Scene
 
 # How much finer the steps are that are tried, and how long that may take in all [s].
@@ -49,7 +50,7 @@ def diagnose(dynamics: Dynamics, start: Saved | None, pause: Pause) -> Diagnosis
     low, wrong = dynamics.state(), ""
     while low.steps < bad:
         dynamics.advance(min(bad, (watch.progress.frame + 1) * per_frame) - low.steps, pause)
-        wrong = watch.follow(dynamics, dynamics.displacement())
+        wrong = watch.follow(dynamics.read())
         if wrong:
             break
         low = dynamics.state()
@@ -60,16 +61,15 @@ def diagnose(dynamics: Dynamics, start: Saved | None, pause: Pause) -> Diagnosis
     while high - low.steps > 1:
         dynamics.restart(scene, low)
         dynamics.advance((high - low.steps) // 2, pause)
-        middle = dynamics.state()
-        if watch.judge(dynamics, middle.displacement):
-            high = middle.steps
+        if watch.judge(dynamics.read()):
+            high = dynamics.steps_done
         else:
-            low = middle
+            low = dynamics.state()
     dynamics.restart(scene, low)
     dynamics.advance(1)
-    displacement = dynamics.displacement()
-    wrong = watch.judge(dynamics, displacement)
-    cause = _cause(dynamics, high, farthest(displacement)[:2], pause)
+    reading = dynamics.read()
+    wrong = watch.judge(reading)
+    cause = _cause(dynamics, high, farthest(reading.displacement)[:2], pause)
     message = f"diverged at {high * step(scene):.6g} s, step {high}: {wrong}; {cause}"
     return Diagnosis(message, Saved(low, watch.progress))
 
@@ -108,7 +108,7 @@ def _goes_well(dynamics: Dynamics, scene: Scene, frames: int, pause: Pause) -> b
     watch = Watch(scene)
     for _ in range(frames):
         dynamics.advance(steps_per_frame(scene), pause)
-        if watch.follow(dynamics, dynamics.displacement()):
+        if watch.follow(dynamics.read()):
             return False
     return True
 

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from taichi_msm.physics.lattice import axes, spacing
 from taichi_msm.physics.loads import Envelope, ProbeSlot, decay, probe_slots
 from taichi_msm.physics.run_progress import RunProgress
-from taichi_msm.physics.solver import Dynamics
+from taichi_msm.physics.state import Reading
 from taichi_msm.physics.timestep import stable_step, step
 from taichi_msm.physics.workload import precision
 from taichi_msm.scene import Scene
@@ -93,33 +93,28 @@ class Watch:
         self._loads = Envelope(scene)
         self._acceleration = max(self._acceleration, _free_acceleration(scene))
 
-    def follow(self, dynamics: Dynamics, displacement: NDArray[np.floating]) -> str:
-        """Judge a frame that was reached and, if it is fine, take note of it; the arguments are those of `judge`."""
-        where, progress = farthest(displacement), self.progress
-        wrong = self._fault(dynamics, where)
+    def follow(self, reading: Reading) -> str:
+        """Judge a frame that was reached, as `judge` does, and take note of it if it is fine."""
+        where, progress = farthest(reading.displacement), self.progress
+        wrong = self._fault(reading, where)
         if not wrong:
             self.progress = RunProgress(
                 frame=progress.frame + 1,
                 max_displacement=max(progress.max_displacement, where.distance),
-                shortest_spring=min(progress.shortest_spring, dynamics.shortest_spring),
-                energy=dynamics.energy,
+                shortest_spring=min(progress.shortest_spring, reading.shortest_spring),
+                energy=reading.energy,
                 reach=where.reach,
-                peak=max(progress.peak, dynamics.energy),
+                peak=max(progress.peak, reading.energy),
             )
         return wrong
 
-    def judge(self, dynamics: Dynamics, displacement: NDArray[np.floating]) -> str:
-        """Say what is wrong at the present step; nothing if it is fine.
+    def judge(self, reading: Reading) -> str:
+        """Say what is wrong at a step after the last frame that was taken note of; nothing if it is fine."""
+        return self._fault(reading, farthest(reading.displacement))
 
-        Args:
-            dynamics: the run, whose last frame was taken note of.
-            displacement: as just read from it [m], shape (rows, cols, 3).
-        """
-        return self._fault(dynamics, farthest(displacement))
-
-    def _fault(self, dynamics: Dynamics, where: Farthest) -> str:
-        begin, end = self.progress.frame / self._scene.time.frames_per_second, dynamics.steps_done * step(self._scene)
-        point, distance, energy = f"point ({where.row}, {where.column})", where.distance, dynamics.energy
+    def _fault(self, reading: Reading, where: Farthest) -> str:
+        begin, end = self.progress.frame / self._scene.time.frames_per_second, reading.steps * step(self._scene)
+        point, distance, energy = f"point ({where.row}, {where.column})", where.distance, reading.energy
         # Written so that NaN is found as well: it is not below anything.
         if not distance <= farthest_displacement(self._scene, end, self._acceleration):
             size = max(self._scene.sheet.size)

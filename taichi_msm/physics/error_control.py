@@ -11,7 +11,6 @@ largest displacement of any point at any frame.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
 from contextlib import ExitStack, closing
 from dataclasses import dataclass
 from functools import partial
@@ -27,6 +26,7 @@ from taichi_msm.physics.lattice import rest_positions
 from taichi_msm.physics.solver import Dynamics
 from taichi_msm.physics.timestep import step, steps_per_frame, with_steps, with_time
 from taichi_msm.physics.workload import precision, with_precision
+from taichi_msm.progress import Count, Pause
 from taichi_msm.scene import LARGEST_TOLERANCE, Scene
 from taichi_msm.system.runtime import Device
 
@@ -39,8 +39,6 @@ LARGEST_CUT = 8.0
 
 # How much finer the other pilot may be; where it must be finer yet, the error is not known.
 FINEST = 64
-
-Progress = Callable[[int, int], None]
 
 
 @dataclass(frozen=True)
@@ -68,7 +66,7 @@ def order(scene: Scene) -> int:
     return 2 if scene.time.damping_difference == "central" or scene.damping == 0 else 1
 
 
-def estimate_error(scene: Scene, device: Device, progress: Progress = lambda done, total: None) -> Estimate:
+def estimate_error(scene: Scene, device: Device, progress: Count = lambda done, total: None) -> Estimate:
     """Estimate the error of the scene's own step.
 
     Args:
@@ -80,7 +78,7 @@ def estimate_error(scene: Scene, device: Device, progress: Progress = lambda don
         return trials.estimate(steps_per_frame(scene), progress)
 
 
-def choose_step(scene: Scene, device: Device, progress: Progress = lambda done, total: None) -> tuple[Scene, Estimate]:
+def choose_step(scene: Scene, device: Device, progress: Count = lambda done, total: None) -> tuple[Scene, Estimate]:
     """Find the largest stable step whose estimated error is within the scene's tolerance.
 
     Args:
@@ -152,7 +150,7 @@ class Pilot:
         """Compile now what would be compiled by the first frame."""
         self._fine.compile()
 
-    def follow(self, displacement: NDArray[Any], pause: Callable[[], None]) -> None:
+    def follow(self, displacement: NDArray[Any], pause: Pause) -> None:
         """Take the next frame, and compare.
 
         Args:
@@ -204,7 +202,7 @@ class Trials:
             opened.callback(self._own.close)
             self._open = opened.pop_all()
 
-    def estimate(self, steps: int, progress: Progress) -> Estimate:
+    def estimate(self, steps: int, progress: Count) -> Estimate:
         """Run the scene with so many steps a frame.
 
         Args:
@@ -247,7 +245,7 @@ def _above(error: float) -> float:
     return float(f"{math.ceil(1.2 * error / digit) * digit:.3g}")
 
 
-def _search(tolerance: float, least: int, trials: Trials, progress: Progress) -> Estimate:
+def _search(tolerance: float, least: int, trials: Trials, progress: Count) -> Estimate:
     """Narrow down the steps a frame between too few and enough."""
     too_few, enough, failures = least - 1, None, []
     steps = least

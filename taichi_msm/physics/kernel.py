@@ -123,7 +123,7 @@ class Start(NamedTuple):
     state: tuple[NDArray[Any], NDArray[Any]] | None
 
 
-class Readings(NamedTuple):
+class ReadArguments(NamedTuple):
     """What is read of a sheet, in the order of the kernel's arguments.
 
     Attributes:

@@ -37,7 +37,7 @@ from taichi_msm.physics.kernel import (
     HAS_RIGHT,
     MOVES,
     Code,
-    Readings,
+    ReadArguments,
     SheetArrays,
     Start,
     Structure,
@@ -125,7 +125,7 @@ class Sweep:
         """Let standing slots act elsewhere, or otherwise; shape (slots, rows, cols)."""
         self._arrays.set_decay(decay)
 
-    def read(self, spacing: tuple[float, float], out: Readings) -> None:
+    def read(self, spacing: tuple[float, float], out: ReadArguments) -> None:
         """Copy what is asked for, and measure every row.
 
         Args:

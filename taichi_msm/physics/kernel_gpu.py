@@ -18,7 +18,7 @@ from taichi_msm.physics.kernel import (
     MEASURES,
     MOVES,
     Code,
-    Readings,
+    ReadArguments,
     SheetArrays,
     Start,
     Structure,
@@ -65,7 +65,7 @@ class Gather:
         """Let standing slots act elsewhere, or otherwise; shape (slots, rows, cols)."""
         self._arrays.set_decay(decay)
 
-    def read(self, spacing: tuple[float, float], out: Readings) -> None:
+    def read(self, spacing: tuple[float, float], out: ReadArguments) -> None:
         """Copy what is asked for, and measure every row."""
         s, arrays = self._s, self._arrays
         with our_compilation():

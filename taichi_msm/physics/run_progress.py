@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import NamedTuple
 
-from taichi_msm.physics.solver import State
+from taichi_msm.physics.state import State
 
 
 @dataclass(frozen=True)

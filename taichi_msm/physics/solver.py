@@ -15,8 +15,7 @@ which is the position form without its cancellation: in f32 it keeps the digits 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -33,7 +32,7 @@ from taichi_msm.physics.kernel import (
     SLOT_COLUMN,
     SLOT_COLUMNS,
     Code,
-    Readings,
+    ReadArguments,
     Start,
     Structure,
 )
@@ -41,9 +40,13 @@ from taichi_msm.physics.kernel_cpu import Sweep
 from taichi_msm.physics.kernel_gpu import STEPS_PER_LAUNCH, Gather
 from taichi_msm.physics.lattice import axes, fixed_points, spacing
 from taichi_msm.physics.loads import decay, probe_slots, schedule
+from taichi_msm.physics.state import Reading, State
 from taichi_msm.physics.timestep import step, steps_per_frame
+from taichi_msm.physics.verlet import coefficients
+from taichi_msm.progress import Pause
 from taichi_msm.scene import Scene
-from taichi_msm.system.runtime import Device, available_threads, lanes
+from taichi_msm.system.resources import available_threads
+from taichi_msm.system.runtime import Device, lanes
 
 # Below this many points a worker costs more in waiting for the others than it saves.
 POINTS_PER_WORKER = 450
@@ -61,23 +64,6 @@ MAX_STEPS_PER_LAUNCH = 8192
 
 # Loads are tabulated for so many steps at a time: for one of a few frames' steps NumPy takes as long.
 STEPS_PER_TABLE = 4096
-
-
-Pause = Callable[[], None]
-
-
-class State(NamedTuple):
-    """All that the next steps depend on.
-
-    Attributes:
-        steps: number of steps taken, n.
-        displacement: u_n [m], shape (rows, cols, 3).
-        difference: d_n = u_n - u_{n-1} [m], shape (rows, cols, 3).
-    """
-
-    steps: int
-    displacement: NDArray[Any]
-    difference: NDArray[Any]
 
 
 def structure(scene: Scene, device: Device, cores: int | None = None) -> Structure:
@@ -140,8 +126,6 @@ class Dynamics:
         structure: what the kernels are compiled for.
         steps_done: number of steps taken.
         launches: number of launches of the kernel.
-        shortest_spring: the least L / L0 of all springs when `displacement` or `state` was read last.
-        energy: of the motion and of the stretched springs, without the virtual ones, then [J].
     """
 
     def __init__(self, scene: Scene, device: Device, layout: Structure | None = None, cores: int | None = None) -> None:
@@ -211,29 +195,33 @@ class Dynamics:
         self.displacement()
 
     def displacement(self) -> NDArray[Any]:
-        """Read the displacements, and measure the sheet.
+        """Read the displacements.
 
         Returns:
             x - X [m], shape (rows, cols, 3), in the scene's precision.
         """
-        return self._read(differences=False)
+        return self.read().displacement
 
     def state(self) -> State:
-        """Read all that the next steps depend on, and measure the sheet."""
-        return State(self.steps_done, self._read(differences=False), self._read(differences=True))
+        """Read all that the next steps depend on."""
+        return State(self.steps_done, self._copy(differences=False)[0], self._copy(differences=True)[0])
 
-    def _read(self, *, differences: bool) -> NDArray[Any]:
-        """Read displacements or differences, and measure the sheet."""
-        s, sheet = self.structure, self.scene.sheet
-        out, measures = np.empty((s.rows, s.cols, 3), self._real), np.empty((s.rows, MEASURES), self._real)
-        dx, dy = spacing(sheet)
-        self._moving.read((dx, dy), Readings(differences, out, measures))
-        self.shortest_spring = math.sqrt(max(0.0, 1.0 + float(measures[:, 0].min())))
+    def read(self) -> Reading:
+        """Read the displacements and measure the sheet, in the scene's precision."""
+        displacement, measures = self._copy(differences=False)
+        shortest = math.sqrt(max(0.0, 1.0 + float(measures[:, 0].min())))
         along, down, diagonal, motion = measures[:, 1:].sum(axis=0, dtype=np.float64)
-        springs, h = self.scene.springs, step(self.scene)
+        springs, sheet, (dx, dy) = self.scene.springs, self.scene.sheet, spacing(self.scene.sheet)
         stretching = springs.structural * (along * dx**2 + down * dy**2) + springs.shear * diagonal * (dx**2 + dy**2)
-        self.energy = float(stretching + sheet.mass * motion / h**2) / 2
-        return out
+        energy = float(stretching + sheet.mass * motion / step(self.scene) ** 2) / 2
+        return Reading(self.steps_done, displacement, shortest, energy)
+
+    def _copy(self, *, differences: bool) -> tuple[NDArray[Any], NDArray[Any]]:
+        """Copy displacements or differences, and what is measured of every row."""
+        s = self.structure
+        out, measures = np.empty((s.rows, s.cols, 3), self._real), np.empty((s.rows, MEASURES), self._real)
+        self._moving.read(spacing(self.scene.sheet), ReadArguments(differences, out, measures))
+        return out, measures
 
     def close(self) -> None:
         """Free the memory."""
@@ -248,20 +236,15 @@ class Dynamics:
         """Put the sheet at rest, or where it was."""
         self._real = np.dtype(np.float32 if self.structure.code.precision == "f32" else np.float64)
         self.steps_done = 0 if state is None else state.steps
-        self.shortest_spring = 1.0
-        self.energy = 0.0
         self._arguments = self._numbers()
         self._first_tabled, self._loads = self.steps_done, self._table(self.steps_done, STEPS_PER_TABLE)
         self._place(state)
 
     def _numbers(self) -> tuple[float, ...]:
         """Give the numbers of the scene in the order of the kernel's arguments."""
-        scene, h = self.scene, step(self.scene)
-        g = scene.damping / scene.sheet.mass
-        central = scene.time.damping_difference == "central"
-        keep = (1 - g * h / 2) / (1 + g * h / 2) if central else 1 - g * h
+        scene = self.scene
         dx, dy = spacing(scene.sheet)
-        return keep, dx, dy, scene.springs.structural, scene.springs.shear, scene.sheet.size[0] / 2
+        return coefficients(scene).keep, dx, dy, scene.springs.structural, scene.springs.shear, scene.sheet.size[0] / 2
 
     def _next_loads(self, count: int) -> NDArray[Any]:
         """Give the table of the loads of the next steps, shape (count, columns)."""
@@ -274,16 +257,13 @@ class Dynamics:
 
     def _table(self, first: int, count: int) -> NDArray[Any]:
         """Tabulate the loads of steps first, ..., first + count - 1, shape (count, columns)."""
-        scene, h = self.scene, step(self.scene)
-        g = scene.damping / scene.sheet.mass
+        scene, verlet = self.scene, coefficients(self.scene)
         loads = schedule(scene, first, count)
         parts = probe_slots(scene)
         table = np.empty((count, self.structure.code.load_columns))
-        table[:, 0] = h * h / scene.sheet.mass
-        if scene.time.damping_difference == "central":
-            table[:, 0] /= 1 + g * h / 2
+        table[:, 0] = verlet.gain
         if first == 0:
-            table[0, 0] = h * h / scene.sheet.mass / 2
+            table[0, 0] = verlet.first_gain
         table[:, 1] = scene.springs.virtual * loads.active
         slot = table[:, SLOT_COLUMN:].reshape(count, len(parts), SLOT_COLUMNS)
         slot[..., :3] = loads.strength

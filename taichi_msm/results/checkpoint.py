@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 
 from taichi_msm.errors import DamagedError
 from taichi_msm.physics.run_progress import RunProgress, Saved
-from taichi_msm.physics.solver import State
+from taichi_msm.physics.state import State
 from taichi_msm.physics.timestep import steps_per_frame
 from taichi_msm.physics.workload import precision
 from taichi_msm.results.folder import Folder, write_all

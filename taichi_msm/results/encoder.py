@@ -26,6 +26,7 @@ import numpy as np
 from PIL import Image
 
 from taichi_msm.errors import FilesError
+from taichi_msm.progress import Pause
 from taichi_msm.results.folder import Folder
 from taichi_msm.results.gif import GifWriter, Palette, Picture, shades
 from taichi_msm.results.publication import ANIMATION, FRAMES, frame_file
@@ -113,7 +114,7 @@ class Encoder:
         if os.name != "nt":  # where pipes always block
             os.set_blocking(self._pictures.fileno(), False)
 
-    def add(self, picture: Picture, pause: Callable[[], None] = lambda: None) -> None:
+    def add(self, picture: Picture, pause: Pause = lambda: None) -> None:
         """Hand over the next picture; waits while too many are not encoded yet.
 
         Args:
@@ -132,7 +133,7 @@ class Encoder:
             self.finish()  # raises what ended the process
             raise
 
-    def finish(self, pause: Callable[[], None] = lambda: None, *, hurry: bool = False) -> Report:
+    def finish(self, pause: Pause = lambda: None, *, hurry: bool = False) -> Report:
         """Wait until all pictures are encoded.
 
         Args:
@@ -159,7 +160,7 @@ class Encoder:
             self._report = result
         return self._report
 
-    def _read_answer(self, pause: Callable[[], None]) -> bytes:
+    def _read_answer(self, pause: Pause) -> bytes:
         """Wait for the next part of the answer; nothing is left after an empty one."""
         if os.name != "nt":  # where pipes cannot be waited for
             while not select.select([self._answer], [], [], PATIENCE)[0]:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from contextlib import ExitStack
 from pathlib import Path
 from types import TracebackType
@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from taichi_msm.errors import writing
 from taichi_msm.physics.run_progress import Saved
+from taichi_msm.progress import Pause
 from taichi_msm.results.checkpoint import Checkpoint
 from taichi_msm.results.encoder import Encoder, Job
 from taichi_msm.results.gif import Picture
@@ -78,7 +79,7 @@ class ResultWriter:
         with writing(self._directory):
             return self._checkpoint.position(frame)
 
-    def add(self, position: NDArray[Any], picture: Picture | None, pause: Callable[[], None] = lambda: None) -> None:
+    def add(self, position: NDArray[Any], picture: Picture | None, pause: Pause = lambda: None) -> None:
         """Add the next frame.
 
         Args:
@@ -113,7 +114,7 @@ class ResultWriter:
         with writing(self._directory):
             return self._checkpoint.load()
 
-    def finish(self, pause: Callable[[], None] = lambda: None, *, hurry: bool = False) -> None:
+    def finish(self, pause: Pause = lambda: None, *, hurry: bool = False) -> None:
         """Wait until every frame is encoded and close the files.
 
         Args:

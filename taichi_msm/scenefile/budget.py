@@ -16,6 +16,7 @@ from taichi_msm.physics import timestep
 from taichi_msm.physics.workload import affords_pilot, precision
 from taichi_msm.render import texture
 from taichi_msm.scene import Scene
+from taichi_msm.system.resources import available_memory
 
 MAX_STEPS = 10**12
 
@@ -90,18 +91,6 @@ def estimate(scene: Scene) -> Budget:
         # Two of the states with which a run can go on, and all its positions.
         working_bytes=2 * points * STATE_NUMBERS * _number_bytes(scene) + (positions if scene.output else 0),
     )
-
-
-def available_memory() -> int:
-    """Tell how much memory a run may take [bytes]: what is free and what the control group still allows.
-
-    Without /proc it is all the memory there is, and sys.maxsize where the system does not tell.
-    """
-    try:
-        free = _free_memory(Path("/proc/meminfo"))
-        return min(free, _control_group_rest(Path("/proc/self/cgroup"), Path("/sys/fs/cgroup")))
-    except (OSError, KeyError, ValueError, IndexError):
-        return _physical_memory()
 
 
 def problems(scene: Scene) -> Iterator[Problem]:
@@ -199,35 +188,3 @@ def _free_disk(directory: Path) -> int:
 def _in_words(size: int) -> str:
     unit, name = next(((unit, name) for unit, name in ((2**30, "GiB"), (2**20, "MiB")) if size >= unit), (2**10, "KiB"))
     return f"{size / unit:.3g} {name}"
-
-
-def _free_memory(meminfo: Path) -> int:
-    """Read Linux's estimate of what can be taken without swapping [bytes]."""
-    fields = dict(line.split(":", 1) for line in meminfo.read_text().splitlines())
-    return int(fields["MemAvailable"].split()[0]) * 1024
-
-
-def _control_group_rest(membership: Path, root: Path) -> int:
-    """Find what the control groups (version 2) of this process still allow [bytes]; sys.maxsize: no limit."""
-    lines = membership.read_text().splitlines()
-    own = next((line[len("0::/") :] for line in lines if line.startswith("0::/")), "")
-    group = root / own
-    return min(_group_rest(each) for each in (group, *group.parents) if each.is_relative_to(root))
-
-
-def _group_rest(group: Path) -> int:
-    try:
-        limit = (group / "memory.max").read_text().strip()
-        used = int((group / "memory.current").read_text())
-        cached = dict(line.split() for line in (group / "memory.stat").read_text().splitlines())
-    except OSError:
-        return sys.maxsize
-    # Cached files count as used, but make room when memory is asked for.
-    return sys.maxsize if limit == "max" else max(0, int(limit) - used + int(cached.get("inactive_file", 0)))
-
-
-def _physical_memory() -> int:
-    try:
-        return os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
-    except (AttributeError, OSError, ValueError):
-        return sys.maxsize

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import os
 import time
-from collections.abc import Callable
 from contextlib import closing
 from dataclasses import dataclass
 from functools import partial
@@ -13,24 +12,22 @@ from typing import Any
 from taichi_msm.errors import SceneError
 from taichi_msm.physics.lattice import rest_positions
 from taichi_msm.physics.timestep import with_time
+from taichi_msm.progress import Progress
 from taichi_msm.render.texture import load_texture
 from taichi_msm.runner import versions
 from taichi_msm.scene import Scene
-from taichi_msm.scenefile import budget
 from taichi_msm.study.peer import TooSlowError, solve
 from taichi_msm.study.pictures import PictureStudy
 from taichi_msm.study.result import Peer, Study, Timing
 from taichi_msm.study.stepping import SteppingStudy, observed_orders
 from taichi_msm.study.terms import TermStudy
-from taichi_msm.system import runtime
+from taichi_msm.system import resources, runtime
 from taichi_msm.system.runtime import Device
 
 TOLERANCE = 1e-3
 
 # Trajectories of the whole scene in memory at one time: the reference, and those that it is made of or compared with.
 TRAJECTORIES = 6
-
-Progress = Callable[[str, int, int], None]
 
 
 @dataclass(frozen=True)
@@ -118,7 +115,7 @@ def study(
 def machine(device: Device) -> dict[str, Any]:
     """Describe where the study ran."""
     return {
-        "cpu": runtime.processor(),
+        "cpu": resources.processor(),
         "cores": os.cpu_count(),
         "arch": device.arch,
         "threads": device.threads,
@@ -129,7 +126,7 @@ def machine(device: Device) -> dict[str, Any]:
 def _require_memory(scene: Scene) -> None:
     rows, cols = scene.sheet.points
     needed = TRAJECTORIES * scene.time.frames * rows * cols * 3 * 8
-    available = budget.available_memory()
+    available = resources.available_memory()
     if needed > available:
         raise SceneError(
             [

@@ -16,6 +16,7 @@ from taichi_msm.render.rasterizer import Drawing
 from taichi_msm.scene import Scene
 from taichi_msm.scenefile import budget
 from taichi_msm.study.result import Drawn, Timing
+from taichi_msm.system import resources
 
 REFINES = (0, 1, 2, 5, 10, 20)
 SUPERSAMPLES = (1, 2, 3, 4)
@@ -75,7 +76,7 @@ class PictureStudy:
 
     def run(self) -> None:
         """Draw the truth, then every setting, all of them in turn."""
-        memory = budget.available_memory() // 2
+        memory = resources.available_memory() // 2
         if not self._draw_truth(memory):
             return
         drawings = []

@@ -22,7 +22,7 @@ from matplotlib.transforms import Bbox, offset_copy
 from numpy.typing import NDArray
 
 from taichi_msm.study.result import Drawn, Peer, Stepping, Study, Timing
-from taichi_msm.study.table import duration, number, printable, unit, where
+from taichi_msm.study.table import duration, number, shown, unit, where
 
 # The colours of Okabe and Ito, which everybody can tell apart.
 BLUE, VERMILION, GREEN, ORANGE, PURPLE, SKY = "#0072B2", "#D55E00", "#009E73", "#E69F00", "#CC79A7", "#56B4E9"
@@ -145,7 +145,7 @@ def _write_header(figure: Figure, study: Study) -> None:
     """Say above the panels what was studied, where, and what came out."""
     versions = study.machine["versions"]
     machine = f"{where(study)}; taichi-msm {versions['taichi-msm']}, Taichi {versions['taichi']}"
-    title = f"{printable(study.scene)}: speed against error"
+    title = f"{shown(study.scene)}: speed against error"
     step, drawn = study.best_stepping, study.best_drawing
     advice = []
     if step is not None:

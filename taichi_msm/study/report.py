@@ -7,14 +7,14 @@ import io
 import json
 import math
 import tempfile
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
 from taichi_msm.errors import writing
 from taichi_msm.study.result import Peer, Stepping, Study, Timing
-from taichi_msm.study.table import decibels, duration, number, printable, shortfall, timing, where, wrong
+from taichi_msm.study.table import decibels, duration, markdown, number, shortfall, shown, timing, where, wrong
 
 PICTURE, FLAT, PAGE, RECORD = "study.png", "study.csv", "study.md", "study.json"
 
@@ -156,7 +156,7 @@ def _page(study: Study) -> str:
     versions = study.machine["versions"]
     state = "" if study.status == "complete" else f" ({study.status})"
     blocks = [
-        f"# {printable(study.scene)}: speed against error{state}",
+        f"# {shown(study.scene)}: speed against error{state}",
         f"Measured on {where(study)}, with taichi-msm {versions['taichi-msm']}, Taichi {versions['taichi']}, "
         f"NumPy {versions['numpy']} and Python {versions['python']} ({versions['platform']}). "
         "Times are medians, with the fastest and the slowest in brackets.",
@@ -198,7 +198,7 @@ def _stepping(study: Study) -> Iterator[str]:
         )
         for one in study.stepping
     ]
-    yield _table(
+    yield markdown(
         ("method", "step", "steps/frame", "error", "of it rounding", "time of the scene", ""), rows, left=(0, 6)
     )
     orders = [f"{method} {order:.2f}" for method, order in study.orders.items() if order is not None]
@@ -207,7 +207,7 @@ def _stepping(study: Study) -> Iterator[str]:
     if study.peers:
         yield "SciPy's DOP853 on the same equations:"
         peers = [(f"{one.rtol:g}", wrong(one), str(one.evaluations), timing(one.seconds)) for one in study.peers]
-        yield _table(("rtol", "error", "evaluations", "time of the scene"), peers)
+        yield markdown(("rtol", "error", "evaluations", "time of the scene"), peers)
     every: list[Stepping | Peer] = [*study.stepping, *study.peers]
     if any(wrong(one).startswith("<") for one in every):
         yield "An error with < is at most about that; the reference is not exact enough to tell it."
@@ -233,7 +233,7 @@ def _drawing(study: Study) -> Iterator[str]:
         )
         for one in study.drawing
     ]
-    yield _table(("refine", "supersample", "PSNR", "largest error", "time of a frame", ""), rows, left=(5,))
+    yield markdown(("refine", "supersample", "PSNR", "largest error", "time of a frame", ""), rows, left=(5,))
 
 
 def _terms(study: Study) -> Iterator[str]:
@@ -242,23 +242,8 @@ def _terms(study: Study) -> Iterator[str]:
     yield "## Terms"
     whole = study.terms[0].seconds.median
     rows = [(one.without or "nothing", timing(one.seconds), _share(one.seconds, whole)) for one in study.terms]
-    yield _table(("without", "time of a step", "of the whole step"), rows, left=(0,))
+    yield markdown(("without", "time of a step", "of the whole step"), rows, left=(0,))
 
 
 def _share(seconds: Timing, whole: float) -> str:
     return f"{100 * seconds.median / whole:.0f} %"
-
-
-def _table(head: Sequence[str], rows: Sequence[Sequence[str]], left: Sequence[int] = ()) -> str:
-    """Write a Markdown table, numbers to the right; `left` names the columns of words."""
-    widths = [max(len(row[column]) for row in [head, *rows]) for column in range(len(head))]
-    rule = ["-" * width if column in left else "-" * (width - 1) + ":" for column, width in enumerate(widths)]
-
-    def line(cells: Sequence[str]) -> str:
-        padded = [
-            cell.ljust(width) if column in left else cell.rjust(width)
-            for column, (cell, width) in enumerate(zip(cells, widths, strict=True))
-        ]
-        return f"| {' | '.join(padded)} |"
-
-    return "\n".join([line(head), line(rule), *map(line, rows)])

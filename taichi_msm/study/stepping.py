@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import ExitStack
 from dataclasses import dataclass, field
 from typing import Any
@@ -16,6 +16,7 @@ from taichi_msm.physics.divergence import farthest_displacement
 from taichi_msm.physics.error_control import longest
 from taichi_msm.physics.solver import Dynamics
 from taichi_msm.physics.timestep import stable_step, step, with_steps, with_time
+from taichi_msm.progress import Count
 from taichi_msm.scene import Scene
 from taichi_msm.study.result import Reference, Stepping, Timing
 from taichi_msm.system.runtime import Device
@@ -33,7 +34,6 @@ MARGIN = 20
 LEAST_HALVINGS = 2
 
 Frames = NDArray[Any]
-Progress = Callable[[int, int], None]
 
 
 @dataclass
@@ -62,7 +62,7 @@ class SteppingStudy:
         reference: what is known of it.
     """
 
-    def __init__(self, scene: Scene, device: Device, longest_run: float, progress: Progress) -> None:
+    def __init__(self, scene: Scene, device: Device, longest_run: float, progress: Count) -> None:
         self.scene = scene
         self.frames: Frames | None = None
         self.reference: Reference | None = None

@@ -50,7 +50,7 @@ def wrong(point: Stepping | Peer) -> str:
     return f"{'' if point.known else '< '}{number(size)}" if size < math.inf else "diverged"
 
 
-def printable(text: str) -> str:
+def shown(text: str) -> str:
     """Write a file name that is not UTF-8 so that it can be shown."""
     return text.encode("utf-8", "backslashreplace").decode("utf-8")
 
@@ -87,7 +87,7 @@ def print_summary(study: Study, console: Console) -> None:
         # Neither markup nor line breaks, so that what is copied is what was meant.
         console.print(Text(text), soft_wrap=True, highlight=False)
 
-    say(f"{printable(study.scene)} on {where(study)}")
+    say(f"{shown(study.scene)} on {where(study)}")
     if study.reference is not None:
         say(
             f"error: the largest of any point at any frame, as a fraction of {number(study.reference.largest)} m; "
@@ -98,7 +98,7 @@ def print_summary(study: Study, console: Console) -> None:
     if study.drawing:
         console.print(_drawing_table(study))
     for note in study.notes:
-        say(f"note: {printable(note)}")
+        say(f"note: {shown(note)}")
     if (reason := shortfall(study)) is not None:
         say(reason)
     if lines := study.recommendation():
@@ -192,3 +192,18 @@ def _table(*columns: str) -> Table:
 
 def _add(table: Table, recommended: bool, *cells: str) -> None:
     table.add_row(*(Text(cell) for cell in cells), style="bold" if recommended else "")
+
+
+def markdown(head: Sequence[str], rows: Sequence[Sequence[str]], left: Sequence[int] = ()) -> str:
+    """Write a Markdown table, numbers to the right; `left` names the columns of words."""
+    widths = [max(len(row[column]) for row in [head, *rows]) for column in range(len(head))]
+    rule = ["-" * width if column in left else "-" * (width - 1) + ":" for column, width in enumerate(widths)]
+
+    def line(cells: Sequence[str]) -> str:
+        padded = [
+            cell.ljust(width) if column in left else cell.rjust(width)
+            for column, (cell, width) in enumerate(zip(cells, widths, strict=True))
+        ]
+        return f"| {' | '.join(padded)} |"
+
+    return "\n".join([line(head), line(rule), *map(line, rows)])

@@ -3,18 +3,17 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import ExitStack
 
 from taichi_msm.physics.solver import Dynamics
 from taichi_msm.physics.timestep import steps_per_frame, with_steps
+from taichi_msm.progress import Count
 from taichi_msm.scene import Scene
 from taichi_msm.study.result import Term, Timing
 from taichi_msm.system.runtime import Device
 
 ROUNDS = 9
-
-Progress = Callable[[int, int], None]
 
 
 class TermStudy:
@@ -27,7 +26,7 @@ class TermStudy:
         progress: called with the measurements done and all of them; may raise KeyboardInterrupt.
     """
 
-    def __init__(self, scene: Scene, device: Device, sample: float, progress: Progress) -> None:
+    def __init__(self, scene: Scene, device: Device, sample: float, progress: Count) -> None:
         self._device = device
         self._variants = dict(variants(scene))
         self._samples: dict[str, list[float]] = {name: [] for name in self._variants}

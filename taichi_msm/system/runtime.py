@@ -6,7 +6,6 @@ import contextlib
 import errno
 import io
 import os
-import platform
 import re
 import tempfile
 import threading
@@ -19,6 +18,7 @@ from pathlib import Path
 from typing import Any
 
 from taichi_msm.errors import DeviceError, MsmError
+from taichi_msm.system import resources
 from taichi_msm.system.silence import silenced
 
 __all__ = [
@@ -26,11 +26,9 @@ __all__ = [
     "ITERATIONS_PER_THREAD",
     "Device",
     "Memory",
-    "available_threads",
     "lanes",
     "open_window",
     "our_compilation",
-    "processor",
     "require_here",
     "start",
     "started",
@@ -138,24 +136,6 @@ _device: Device | None = None
 _home = (0, 0)
 
 
-def available_threads() -> int:
-    """Count the cores this process may use: its affinity, and the quota of its control group."""
-    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-    with contextlib.suppress(OSError, ValueError):
-        quota, period = Path("/sys/fs/cgroup/cpu.max").read_text().split()
-        cores = min(cores, max(1, int(quota) // int(period)))
-    return cores
-
-
-def processor() -> str:
-    """Name the processor."""
-    with contextlib.suppress(OSError):
-        for line in Path("/proc/cpuinfo").read_text(encoding="utf-8").splitlines():
-            if line.startswith("model name"):
-                return line.split(":", 1)[1].strip()
-    return platform.processor() or platform.machine()
-
-
 def lanes(precision: str) -> int:
     """Tell how many numbers a vector register of the processor holds; one on a GPU, where every point is a thread.
 
@@ -194,7 +174,7 @@ def start(arch: str = "cpu", threads: int | None = None) -> Device:
         require_here()
     if arch not in ARCHS:
         raise DeviceError(f"--arch {arch}: not supported; take one of: {', '.join(ARCHS)}")
-    wanted = Device(arch, available_threads() if threads is None else threads)
+    wanted = Device(arch, resources.available_threads() if threads is None else threads)
     if _device is None:
         _device = replace(wanted, name=_initialise(wanted))
         _home = os.getpid(), threading.get_ident()
@@ -366,5 +346,5 @@ def _initialise(device: Device) -> str:
     # The pool is the last that Taichi starts.
     _pin([thread for thread in _threads() if thread not in before][-device.threads :])
     if on_cpu:
-        return processor()
+        return resources.processor()
     return next(filter(None, named.groups())) if named else ""

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import re
 import secrets
-from collections.abc import Callable
 from contextlib import ExitStack, suppress
 from pathlib import Path
 from types import TracebackType
 
 from taichi_msm.errors import FilesError, writing
+from taichi_msm.progress import Pause
 from taichi_msm.results.encoder import Encoder, Job
 from taichi_msm.results.folder import FOLDER, INHERITS, Folder, Tree
 from taichi_msm.results.gif import Picture
@@ -56,13 +56,13 @@ class Film:
             opened.callback(self._encoder.abort)
             self._open = opened.pop_all()
 
-    def add(self, picture: Picture, pause: Callable[[], None] = lambda: None) -> None:
+    def add(self, picture: Picture, pause: Pause = lambda: None) -> None:
         """Add the next picture, shape (height, width, 3); `pause` as for `Encoder.add`."""
         with writing(*self._place):
             self._encoder.add(picture, pause)
         self.pictures += 1
 
-    def encoded(self, pause: Callable[[], None] = lambda: None) -> Path:
+    def encoded(self, pause: Pause = lambda: None) -> Path:
         """Wait for the last picture; returns the file, which is to be moved to its place. There must be a picture."""
         with writing(*self._place):
             self._encoder.finish(pause)

@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import sys
 import time
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Iterable, Iterator
 from types import TracebackType
 from typing import Any
 
 import numpy as np
 
 from taichi_msm.errors import FilesError
+from taichi_msm.progress import Pause
 from taichi_msm.results.gif import Picture
 from taichi_msm.system.runtime import open_window, ti
 from taichi_msm.viewer import hud
@@ -121,7 +122,7 @@ class Hand:
             yield Key(NAMES.get(event.key, event.key))
 
 
-def show(session: Session, window: Window, pause: Callable[[], None]) -> None:
+def show(session: Session, window: Window, pause: Pause) -> None:
     """Show a session until the person has enough of it.
 
     Args:

@@ -1,0 +1,37 @@
+"""The state of a sheet, and what is read of it."""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+from numpy.typing import NDArray
+
+
+class State(NamedTuple):
+    """All that the next steps depend on.
+
+    Attributes:
+        steps: number of steps taken, n.
+        displacement: u_n [m], shape (rows, cols, 3).
+        difference: d_n = u_n - u_{n-1} [m], shape (rows, cols, 3).
+    """
+
+    steps: int
+    displacement: NDArray[Any]
+    difference: NDArray[Any]
+
+
+class Reading(NamedTuple):
+    """What is seen of a sheet at a step.
+
+    Attributes:
+        steps: number of steps taken, n.
+        displacement: u_n = x - X [m], shape (rows, cols, 3).
+        shortest_spring: the least L / L0 of all springs.
+        energy: of the motion and of the stretched springs, without the virtual ones [J].
+    """
+
+    steps: int
+    displacement: NDArray[Any]
+    shortest_spring: float
+    energy: float
