@@ -108,7 +108,7 @@ class Session:
         else:
             scene = with_precision(scene, device.arch)
         rate = scene.time.frames_per_second
-        self._album = captures
+        self._captures = captures
         self._film: Film | None = None
         self._film_rate = given.time.frames_per_second
         self._filmed_from = 0
@@ -316,11 +316,11 @@ class Session:
                 self._warned = False
                 self.fault = ""
             case "p":
-                self.say(f"saved {self._album.keep_picture(self.viewport.draw(self.positions()))}")
+                self.say(f"saved {self._captures.keep_picture(self.viewport.draw(self.positions()))}")
             case "g":
                 self._start_or_stop_film()
             case "w":
-                self.say(f"saved {self._album.keep_scene(self.recorded())}")
+                self.say(f"saved {self._captures.keep_scene(self.recorded())}")
             case "i":
                 self._figures = not self._figures
             case "h":
@@ -329,7 +329,7 @@ class Session:
     def _start_or_stop_film(self) -> None:
         if self._film is None:
             render = self.scene.render
-            self._film = self._album.film(render.size, self._film_rate, render.background)
+            self._film = self._captures.film(render.size, self._film_rate, render.background)
             self._filmed_from = self._beats
         else:
             self._end_film()
@@ -338,7 +338,7 @@ class Session:
         """Keep the film that is on, if it has a picture."""
         film, self._film = self._film, None
         if film is not None and film.pictures > 0:
-            self.say(f"saved {self._album.keep_film(film)}")
+            self.say(f"saved {self._captures.keep_film(film)}")
         elif film is not None:
             with film:
                 self.say("the film had no picture yet")
