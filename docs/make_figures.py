@@ -77,7 +77,7 @@ def main() -> None:
     """Write every picture."""
     IMAGES.mkdir(exist_ok=True)
     animation("press", 340)
-    animation("retina", 320, "render.camera={eye: [0, 0.28, 0.36], target: [0, 0.045, 0], fov: 42}", image=RETINA)
+    animation("retina", 320, "render.camera=oblique", image=RETINA)
     live("live", 250, 10, 4.8)
     strip(frames(SCENES / "figure-3.yaml", STAGES, (400, 250))).save(IMAGES / "figure-3.png", optimize=True)
     stills = [frames(SCENES / f"{name}.yaml", (moment,), (400, 400))[0] for name, moment in MOMENTS.items()]

@@ -46,7 +46,7 @@ arch_option = click.option(
     "--arch", metavar="cpu|cuda|vulkan", default="cpu", show_default=True, help="Device to compute on."
 )
 threads_option = click.option(
-    "--threads", type=click.IntRange(min=1), metavar="N", help="CPU threads.  [default: every core]"
+    "--threads", type=click.IntRange(1, 1024), metavar="N", help="CPU threads.  [default: every core]"
 )
 json_option = click.option("--json", "as_json", is_flag=True, help="Print one JSON object on stdout and nothing else.")
 

@@ -39,7 +39,8 @@ class SceneError(MsmError):
     """A scene that cannot be run; `lines` holds one line for each fault, whatever characters the user's names hold."""
 
     def __init__(self, lines: Sequence[str]) -> None:
-        self.lines = tuple(printable(line) for line in lines)
+        # A value that is wrong in two ways may be told of twice.
+        self.lines = tuple(dict.fromkeys(printable(line) for line in lines))
         super().__init__("\n".join(self.lines))
 
 

@@ -30,7 +30,7 @@ MAX_FAULTS = 1000
 
 def flow(value: Any) -> str:
     """Show a value as it could stand in the file, cut to a line's measure."""
-    return cut(json.dumps(value, ensure_ascii=False))
+    return cut(json.dumps(value, ensure_ascii=False, default=repr))
 
 
 def cut(text: str) -> str:

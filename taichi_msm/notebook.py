@@ -13,6 +13,8 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
 
+from taichi_msm.errors import ArgumentError
+
 # Small enough for a notebook to hold some hundred frames; differences from the picture are not seen.
 QUALITY = 92
 
@@ -58,6 +60,8 @@ class Player:
 
     def __init__(self, frames: Sequence[NDArray[np.uint8]], rate: float) -> None:
         self.frames = tuple(frames)
+        if not self.frames:
+            raise ArgumentError("frames: none; take at least one")
         self.rate = rate
 
     def _repr_html_(self) -> str:

@@ -298,7 +298,11 @@ def _facts(manifest: Manifest, progress: RunProgress, estimate: Estimate | None,
         "steps": progress.frame * steps_per_frame(scene),
         "max_displacement": progress.max_displacement,
         "shortest_spring": progress.shortest_spring,
-        "notes": list(notes(scene, progress.max_displacement, progress.shortest_spring, estimate, reason)),
+        "notes": list(
+            notes(
+                scene, progress.max_displacement, progress.shortest_spring, estimate, reason, reached=progress.frame > 0
+            )
+        ),
         "error_estimate": None if estimate is None else error_record(estimate),
         **({"error_estimate_reason": reason} if estimate is None else {}),
     }

@@ -123,7 +123,10 @@ class Probe(Section):
         "or keys [[t, across, down], ...], linear between, held outside",
         expects="[across, down], fractions from -1 to 2, or keys [[t, across, down], ...]",
     )
-    force: Vector = key(means="force at 100 % [N]", expects="three numbers: [x, y, z] in newtons")
+    force: Vector = key(
+        means="force at 100 % [N]; on the point at the control point times e^-offset",
+        expects="three numbers: [x, y, z] in newtons",
+    )
     load: Annotated[tuple[tuple[Number, Number], ...], Field(min_length=1)] = key(
         ((0.0, 100.0),),
         means="keys [t, percent], linear between; 0 before the first, the last value after the last; "

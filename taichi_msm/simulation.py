@@ -23,7 +23,7 @@ from taichi_msm.progress import Pause
 from taichi_msm.render.camera import View, view
 from taichi_msm.render.picking import pick
 from taichi_msm.render.surface import Surface, surface
-from taichi_msm.render.texture import load_texture, require_texture
+from taichi_msm.render.texture import as_array, load_texture, require_texture
 from taichi_msm.scene import Camera, Probe, Scene
 from taichi_msm.scenefile.validation import checked
 from taichi_msm.system import runtime
@@ -72,7 +72,7 @@ class Simulation:
         self.device = runtime.start(arch, threads)
         self.scene = scene = self._resolved(scene)
         self._watch = Watch(scene)
-        self._closed = False
+        self._closed = self._diverged = False
         self._dynamics = Dynamics(scene, self.device, cores=cores)
         self._position = self._place(self._dynamics.displacement())
         self._texture = texture
@@ -128,8 +128,7 @@ class Simulation:
             DivergedError: when a point is no longer finite or has left every bound. `positions` and `draw` then give
                 the last frame that was good.
         """
-        if not (isinstance(frames, int) and frames >= 0):
-            raise ArgumentError(f"{frames!r} frames cannot be simulated; take a whole number, 0 or more")
+        _require_count(frames)
         self._require_open()
         for _ in range(frames):
             end = (self.frame + 1) * steps_per_frame(self.scene)
@@ -149,6 +148,8 @@ class Simulation:
             SceneError: when one of them is no probe.
         """
         self._require_open()
+        if not isinstance(probes, Sequence):
+            raise ArgumentError(f"probes: {probes!r}; take a list of them")
         scene = self.scene.model_copy(update={"probes": tuple(probes)})
         self._dynamics.steer(scene)
         self._watch.steer(scene)
@@ -171,6 +172,7 @@ class Simulation:
                 self._texture = None
             self.scene = scene
         self._watch = Watch(self.scene)
+        self._diverged = False
         self._dynamics.restart(self.scene)
         self._drawing = None
         self._position = self._place(self._dynamics.displacement())
@@ -188,8 +190,23 @@ class Simulation:
         return Saved(self._dynamics.state(), self.progress)
 
     def go_on(self, saved: Saved) -> None:
-        """Be where a simulation of the same scene was, maybe between two frames; what follows has the same bits."""
+        """Be where a simulation of the same scene was, maybe between two frames; what follows has the same bits.
+
+        Raises:
+            MsmError: when the simulation is closed.
+            ArgumentError: when it was saved with other points, another precision or another step.
+        """
         self._require_open()
+        if not isinstance(saved, Saved):
+            raise ArgumentError(f"{type(saved).__name__} is nothing that `save` gave")
+        state, per_frame = saved.state, steps_per_frame(self.scene)
+        since = state.steps - saved.progress.frame * per_frame
+        alike = (state.displacement.shape, state.displacement.dtype) == (self._position.shape, self._position.dtype)
+        if not (alike and 0 <= since < per_frame):
+            raise ArgumentError(
+                f"saved at step {state.steps}, frame {saved.progress.frame}, {state.displacement.dtype} of shape "
+                f"{state.displacement.shape}; take what was saved with this scene's points, precision and step"
+            )
         self._dynamics.restart(self.scene, saved.state)
         self._position = self._place(self._dynamics.displacement())
         self._watch.progress = saved.progress
@@ -225,8 +242,16 @@ class Simulation:
         Returns:
             Fractions of the sheet's width from its left and of its height from its top, as in a probe's `at`;
             None where no surface is.
+
+        Raises:
+            ArgumentError: when the pixel is not two numbers.
+            SceneError: as for `draw`.
         """
-        return pick(self._position, self.scene.render.refine, self._view(camera), pixel)
+        seen = as_array(pixel, "pixel")
+        if seen.shape != (2,) or seen.dtype.kind not in "fiu" or not np.isfinite(seen).all():
+            raise ArgumentError(f"pixel: {pixel!r}; take two numbers, x to the right and y down")
+        x, y = (float(number) for number in seen)
+        return pick(self._position, self.scene.render.refine, self._view(camera), (x, y))
 
     def diagnose(self, start: Saved | None = None, pause: Pause = lambda: None) -> Diagnosis:
         """Find out why `advance` said that the simulation diverged; it cannot advance afterwards, but by `go_on`.
@@ -234,8 +259,13 @@ class Simulation:
         Args:
             start: what `save` gave before; None: the simulation is repeated from rest.
             pause: called some times a second; what it raises stops the search.
+
+        Raises:
+            MsmError: when the simulation is closed, or has not diverged.
         """
         self._require_open()
+        if not self._diverged:
+            raise MsmError("this simulation has not diverged; there is nothing to find out")
         return diagnose(self._dynamics, start, pause)
 
     def draw(self, camera: CameraLike = None, positions: NDArray[Any] | None = None) -> NDArray[np.uint8]:
@@ -254,7 +284,7 @@ class Simulation:
         """
         self._require_open()
         if positions is not None:
-            positions = np.asarray(positions)
+            positions = as_array(positions, "positions")
             found, expected = positions.shape, self._position.shape
             if found != expected or positions.dtype.kind not in "fiu":
                 raise ArgumentError(f"positions: {positions.dtype} of shape {found}; take numbers of shape {expected}")
@@ -272,6 +302,7 @@ class Simulation:
         """
         from taichi_msm.notebook import Player
 
+        _require_count(frames)
         pictures = [self.draw(camera)]
         for _ in range(frames):
             self.advance()
@@ -294,7 +325,11 @@ class Simulation:
 
         Args:
             pause: called between kernels; what it raises stops here.
+
+        Raises:
+            MsmError: when the simulation is closed.
         """
+        self._require_open()
         self._dynamics.compile()
         pause()
         if self.scene.draws:
@@ -326,7 +361,8 @@ class Simulation:
             return camera
         if camera is None:
             return view(self.scene)
-        render = self.scene.render.model_copy(update={"camera": camera})
+        # As a whole, so that an error names the key as a scene has it.
+        render = {**dict(self.scene.render), "camera": camera}
         return view(self.scene.model_copy(update={"render": render}))
 
     def _drawn(self) -> Drawing:
@@ -346,6 +382,7 @@ class Simulation:
 
     def _require_good(self, reading: Reading, wrong: str) -> None:
         if wrong:
+            self._diverged = True
             steps, time = reading.steps, reading.steps * step(self.scene)
             point = farthest(reading.displacement)[:2]
             raise DivergedError(f"diverged before {time:g} s, step {steps}: {wrong}", steps, time, point)
@@ -358,3 +395,9 @@ class Simulation:
         np.add(position[..., 1], y, out=position[..., 1], casting="same_kind")
         position.flags.writeable = False
         return position
+
+
+def _require_count(frames: int) -> None:
+    """Make sure that a number of frames is one."""
+    if isinstance(frames, bool) or not isinstance(frames, (int, np.integer)) or frames < 0:
+        raise ArgumentError(f"{frames!r} frames cannot be simulated; take a whole number, 0 or more")

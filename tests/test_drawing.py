@@ -77,6 +77,19 @@ def test_the_shape_of_a_tile_does_not_change_the_bits(lanes: int, device: Device
         assert (alone.draw(dented(made)) == expected).all()
 
 
+@pytest.mark.parametrize("far", [1e3, 1e5, 1e7, 1e30, np.nan, np.inf])
+def test_points_thrown_far_away_do_not_make_bits_depend_on_tiles(far: float, device: Device) -> None:
+    # Cells beyond what f32 can outline are drawn triangle by triangle, where rounding may put any sample.
+    made, texture = drawable((5, 4), size=[40, 40], refine=3), speckle(20, 30)
+    for point in ((0, 0), (2, 1), (4, 3)):
+        position = rest_positions(made.sheet)
+        position[point] = far
+        pictures = [
+            Drawing(made, texture, replace(structure(made), lanes=lanes)).draw(position) for lanes in (1, 4, 8, 16)
+        ]
+        assert all((picture == pictures[0]).all() for picture in pictures), point
+
+
 @pytest.mark.parametrize("size", [(17, 13), (64, 64), (331, 331), (1021, 509)])
 @pytest.mark.parametrize("refine", [0, 10])
 def test_at_rest_the_picture_is_the_texture(size: tuple[int, int], refine: int, device: Device) -> None:

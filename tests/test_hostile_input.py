@@ -20,7 +20,7 @@ from PIL import Image
 
 from taichi_msm.errors import SceneError
 from taichi_msm.physics.solver import Dynamics
-from taichi_msm.render.texture import load_texture, texture_size
+from taichi_msm.render.texture import image_size, load_texture
 from taichi_msm.scene import Scene
 from taichi_msm.scenefile.load import load_scene
 from taichi_msm.system.runtime import Device
@@ -146,7 +146,7 @@ def test_damaged_pictures(tries: int, here: Path, capfd: pytest.CaptureFixture[s
     file.touch()
 
     def read() -> None:
-        texture_size(scene)
+        image_size(scene)
         texture = load_texture(scene)
         assert texture.dtype == np.uint8
         assert texture.ndim == 3

@@ -246,6 +246,58 @@ def test_all_errors_are_ours(simulation: Simulation) -> None:
     assert issubclass(ArgumentError, MsmError)
     assert issubclass(ArgumentError, ValueError)
     simulation.close()
-    for call in (simulation.advance, simulation.draw, simulation.velocities, simulation.restart, simulation.save):
+    calls = (simulation.advance, simulation.draw, simulation.velocities, simulation.restart, simulation.compile)
+    for call in (*calls, simulation.save):
         with pytest.raises(MsmError, match="this simulation is closed"):
             call()
+
+
+@pytest.mark.parametrize("threads", [0, -1, 10**6, True, 1.5, "2"])
+def test_a_wrong_number_of_threads_is_refused(threads: Any, device: Device) -> None:
+    # Taichi would abort the process, or start them all.
+    with pytest.raises(ArgumentError, match=r"threads: .*; take a whole number, 1 to 1024, or None"):
+        Simulation(scene(), threads=threads)
+
+
+def test_what_was_saved_elsewhere_is_not_gone_on_with(simulation: Simulation, device: Device) -> None:
+    simulation.advance(3)
+    before = simulation.positions()
+    others = (
+        scene(time={"step": step(simulation.scene) / 4}),
+        scene(sheet={**SHEET, "points": [5, 5]}),
+        scene(time={"precision": "f32"}),
+    )
+    for other in others:
+        with Simulation(other, threads=device.threads) as elsewhere:
+            elsewhere.advance(1)
+            with pytest.raises(ArgumentError, match="take what was saved with this scene's points, precision and step"):
+                simulation.go_on(elsewhere.save())
+    with pytest.raises(ArgumentError, match="int is nothing that `save` gave"):
+        simulation.go_on(3)  # type: ignore[arg-type]
+    np.testing.assert_array_equal(simulation.positions(), before)
+    simulation.advance()
+
+
+def test_nothing_is_diagnosed_of_a_sound_simulation(simulation: Simulation) -> None:
+    simulation.advance(2)
+    with pytest.raises(MsmError, match="has not diverged"):
+        simulation.diagnose()
+
+
+@pytest.mark.parametrize("pixel", [3, None, ("a", 1), (1, 2, 3), (np.inf, 1), [[1], [1, 2]]])
+def test_what_is_no_pixel_is_refused(pixel: Any, simulation: Simulation) -> None:
+    with pytest.raises(ArgumentError, match="pixel: "):
+        simulation.pick(pixel)
+
+
+def test_rows_of_unequal_length_are_refused(simulation: Simulation) -> None:
+    with pytest.raises(ArgumentError, match="positions: "):
+        simulation.draw(positions=[[1], [1, 2]])  # type: ignore[arg-type]
+    with pytest.raises(ArgumentError, match="frames cannot be simulated"):
+        simulation.play(-1)
+    with pytest.raises(ArgumentError, match="probes: 3"):
+        simulation.steer(3)  # type: ignore[arg-type]
+    with pytest.raises(SceneError) as caught:
+        simulation.draw("side")
+    assert caught.value.lines[0].startswith('render.camera: "side" is not allowed')
+    assert len(caught.value.lines) == 1

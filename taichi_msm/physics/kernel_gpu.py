@@ -40,7 +40,7 @@ class Kernels(NamedTuple):
 
 
 class Gather:
-    """The state of a sheet in the memory of a GPU, and its kernels; its arguments are those of `sweep.Sweep`."""
+    """The state of a sheet in the memory of a GPU, and its kernels; its arguments are those of `kernel_cpu.Sweep`."""
 
     def __init__(self, s: Structure, start: Start) -> None:
         self._s = s

@@ -36,7 +36,7 @@ def steps_per_frame(scene: Scene) -> int:
     """Count the steps of one frame.
 
     auto: the fewest whose step is at most half the stability limit; a tolerance may ask for more, which
-    `accuracy.choose_step` finds. A given step is what the scene says.
+    `error_control.choose_step` finds. A given step is what the scene says.
     """
     frame = 1 / scene.time.frames_per_second
     if scene.time.step == "auto":

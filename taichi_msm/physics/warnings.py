@@ -6,10 +6,10 @@ import math
 from collections.abc import Iterator
 
 from taichi_msm.physics.error_control import Estimate
-from taichi_msm.physics.timestep import step
+from taichi_msm.physics.timestep import step, steps_per_frame, with_steps
 from taichi_msm.scene import Scene
 
-# Down to this share of its rest length no spring shakes the limit of stability (see `stability.highest_frequency`).
+# Down to this share of its rest length no spring shakes the limit of stability (see `timestep.highest_frequency`).
 SHORTEST = 0.5
 
 # An error above this share of the largest displacement is told with what would help.
@@ -17,7 +17,13 @@ WRONG = 0.01
 
 
 def notes(
-    scene: Scene, max_displacement: float, shortest_spring: float, estimate: Estimate | None, reason: str = ""
+    scene: Scene,
+    max_displacement: float,
+    shortest_spring: float,
+    estimate: Estimate | None,
+    reason: str = "",
+    *,
+    reached: bool = True,
 ) -> Iterator[str]:
     """Say what is remarkable about a run, one line each.
 
@@ -27,6 +33,7 @@ def notes(
         shortest_spring: smallest length of a spring over its rest length.
         estimate: of the error, if there is one.
         reason: why there is none.
+        reached: whether any frame after the first was reached.
     """
     if estimate is not None:
         yield error(estimate)
@@ -35,7 +42,7 @@ def notes(
             yield f"the run is about {wrong:g} % wrong; {_remedy(scene, estimate)}"
     elif reason:
         yield f"error not estimated: {reason}"
-    if max_displacement == 0:
+    if max_displacement == 0 and reached:
         yield "nothing moved: does a probe press where and when it should?"
     if shortest_spring < SHORTEST:
         yield (
@@ -64,8 +71,9 @@ def _remedy(scene: Scene, estimate: Estimate) -> str:
     said = []
     if estimate.rounding > WRONG / 2:
         said.append("time.precision: f64")
+        if scene.springs.structural > 0 or scene.springs.shear > 0:
+            said.append("stiffer springs.virtual, where the sheet buckles")
     if estimate.in_f64 > WRONG / 2:
-        finer = step(scene) * (WRONG / 2 / estimate.in_f64) ** (1 / estimate.order)
-        said.append(f"a time.step of at most {finer:.2g} s")
-    said.append("stiffer springs.virtual, where the sheet buckles")
+        needed = steps_per_frame(scene) * (estimate.in_f64 / (WRONG / 2)) ** (1 / estimate.order)
+        said.insert(0, f"time.step: {step(with_steps(scene, math.ceil(needed))):.9g}")
     return f"try {', or '.join(said)}"

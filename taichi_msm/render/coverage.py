@@ -202,7 +202,9 @@ def covering(code: Code) -> Callable[..., Any]:
             normal[n] = n_a + (n_b - n_a) * across + (n_c - n_a + (n_d - n_b - (n_c - n_a)) * across) * along
         n_x, n_y, n_z = normal[0], normal[1], normal[2]
         length = ti.sqrt(n_x * n_x + n_y * n_y + n_z * n_z)
-        return absolute(n_x * toward[0] + n_y * toward[1] + n_z * toward[2]) / ti.max(length, 1e-30)
+        cosine = absolute(n_x * toward[0] + n_y * toward[1] + n_z * toward[2]) / ti.max(length, 1e-30)
+        # The normal of a point that is infinitely far, or nowhere, is none.
+        return ti.max(ti.min(cosine, 1.0), 0.0)
 
     @ti.func
     def wire_share(across, down, right_across, right_down, below_across, below_down):
@@ -266,7 +268,8 @@ def covering(code: Code) -> Callable[..., Any]:
             upper_limit = ti.select(below, t, s)
             lower_limit = ti.select(below, s, t)
             inside = (
-                (lower_limit >= -overstep)
+                inside
+                & (lower_limit >= -overstep)
                 & (upper_limit <= 1.0 + overstep)
                 & (lower_limit <= upper_limit + overstep)
                 & (p_w + r_w * s + d_w * t > band.near)
@@ -386,6 +389,14 @@ def covering(code: Code) -> Callable[..., Any]:
                         y = floats(lines) + tile_y
                         inside = floats(1) > 0.0
                         column, line = floats(quad_s), floats(quad_t)
+                        if not whole:
+                            # Beyond its bounds rounding decides, and how far tiles reach there depends on their shape.
+                            inside = (
+                                (x > ti.cast(first_column, ti.f32))
+                                & (x < ti.cast(end_column, ti.f32))
+                                & (y > ti.cast(first_row, ti.f32))
+                                & (y < ti.cast(end_row, ti.f32))
+                            )
                         if whole:
                             # Left and upper edges belong to a cell, right and lower ones do not.
                             inside = (

@@ -76,7 +76,7 @@ def require_texture(texture: Any) -> NDArray[np.uint8]:
     """
     import numpy as np
 
-    found = np.asarray(texture)
+    found = as_array(texture, "texture")
     is_picture = found.dtype == np.uint8 and found.ndim == 3 and found.shape[2] == 3
     if not (is_picture and min(found.shape) > 0 and max(found.shape) <= MAX_SIDE):
         raise ArgumentError(
@@ -86,9 +86,18 @@ def require_texture(texture: Any) -> NDArray[np.uint8]:
     return found
 
 
-def texture_size(scene: Scene) -> tuple[int, int] | None:
-    """Tell the texture's width and height [px] without decoding it; None if there is no usable picture."""
-    return image_size(scene) if scene.region is None else scene.region[2:]
+def as_array(values: Any, name: str) -> NDArray[Any]:
+    """Make an array of what a caller gave.
+
+    Raises:
+        ArgumentError: when it is none, as its rows differ in length.
+    """
+    import numpy as np
+
+    try:
+        return np.asarray(values)
+    except ValueError as error:
+        raise ArgumentError(f"{name}: {error}; take an array") from None
 
 
 def image_size(scene: Scene) -> tuple[int, int] | None:

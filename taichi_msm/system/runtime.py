@@ -17,7 +17,7 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
-from taichi_msm.errors import DeviceError, MsmError
+from taichi_msm.errors import ArgumentError, DeviceError, MsmError
 from taichi_msm.system import resources
 from taichi_msm.system.silence import silenced
 
@@ -60,6 +60,9 @@ _core: Any = getattr(np, "_core", None) or np.core  # NumPy 2, or 1
 _features: dict[str, bool] = _core._multiarray_umath.__cpu_features__
 
 ARCHS = ("cpu", "cuda", "vulkan")
+
+# More threads than any machine has cores; Taichi starts them all.
+MOST_THREADS = 1024
 
 # A lock on Taichi's cache that is older than this was left by a process that was killed [s].
 STALE_LOCK = 60.0
@@ -166,12 +169,15 @@ def start(arch: str = "cpu", threads: int | None = None) -> Device:
         threads: number of CPU threads; None takes every core.
 
     Raises:
+        ArgumentError: when there is no such number of threads.
         DeviceError: when the arch is not supported or not there, or Taichi already runs otherwise.
         MsmError: as for `require_here`.
     """
     global _device, _home
     if _device is not None:
         require_here()
+    if threads is not None and not (type(threads) is int and 1 <= threads <= MOST_THREADS):
+        raise ArgumentError(f"threads: {threads!r}; take a whole number, 1 to {MOST_THREADS}, or None for every core")
     if arch not in ARCHS:
         raise DeviceError(f"--arch {arch}: not supported; take one of: {', '.join(ARCHS)}")
     wanted = Device(arch, resources.available_threads() if threads is None else threads)

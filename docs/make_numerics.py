@@ -1,0 +1,314 @@
+"""Write docs/numerics.md and its pictures: what the program computes beside independent solutions.
+
+    PYTHONPATH=. python docs/make_numerics.py
+
+It takes some minutes; nothing in it is timed.
+"""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from matplotlib import style
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
+from numpy.typing import NDArray
+from scipy.sparse import coo_matrix, csc_matrix, identity
+from scipy.sparse.linalg import eigsh, spsolve
+
+from taichi_msm import Scene, load_scene
+from taichi_msm.physics.error_control import estimate_error, longest
+from taichi_msm.physics.lattice import fixed_points, rest_positions, spacing
+from taichi_msm.physics.loads import decay, loads_at, probe_slots
+from taichi_msm.physics.solver import Dynamics
+from taichi_msm.physics.state import State
+from taichi_msm.physics.timestep import stable_step, step, steps_per_frame, with_steps, with_time
+from taichi_msm.physics.workload import precision
+from taichi_msm.study.plot import BLUE, DPI, GREY, STYLE, VERMILION, WIDE
+from taichi_msm.study.table import markdown
+from taichi_msm.system import runtime
+
+ROOT = Path(__file__).parent.parent
+PAGE, TEMPLATE = ROOT / "docs" / "numerics.md", ROOT / "docs" / "numerics.template"
+IMAGES = ROOT / "docs" / "images"
+
+Array = NDArray[np.float64]
+
+STIFFER = (1, 2, 5, 10)
+BUCKLING = 5
+ENERGY_STEPS = 100_000
+MODES = 6
+
+# Springs of which every one is counted once: down, right.
+HALF = ((0, 1), (1, 0), (1, 1), (1, -1))
+
+
+def press(*overrides: str) -> Scene:
+    """Load the shipped press, without its pictures."""
+    return load_scene(ROOT / "scenes" / "press.yaml", ["output=[]", *overrides])
+
+
+def stiffer(times: int) -> Scene:
+    """Make the springs of the press stiffer, but not the virtual ones."""
+    springs = press().springs
+    return press(f"springs.structural={times * springs.structural}", f"springs.shear={times * springs.shear}")
+
+
+def motion(scene: Scene) -> Array:
+    """Displacements of every frame but the first, as they are written."""
+    dynamics = Dynamics(scene, runtime.started())
+    rest, frames = rest_positions(scene.sheet), []
+    for _ in range(scene.time.frames):
+        dynamics.advance(steps_per_frame(scene))
+        u = dynamics.displacement()
+        # In f32 the trajectory has positions.
+        frames.append((rest + u).astype(u.dtype) - rest)
+    dynamics.close()
+    return np.array(frames)
+
+
+def truth(scene: Scene) -> Array:
+    """Extrapolate in float64, from displacements."""
+    exact = with_time(scene, precision="f64")
+    coarse, fine = (motion(with_steps(exact, n * steps_per_frame(scene))) for n in (8, 16))
+    return fine + (fine - coarse) / 3
+
+
+def silent_table() -> str:
+    """Compare f32, the precision of `auto`, and the error that is told."""
+    faint = load_scene(ROOT / "tests" / "hard" / "faint.yaml")
+    cases = {f"`press`, springs {times} × as stiff": stiffer(times) for times in STIFFER}
+    cases |= {"`faint`, displacements of 10 nm": faint}
+    rows = []
+    for name, scene in cases.items():
+        exact = truth(scene)
+        largest = longest(exact)
+        errors = [
+            longest(motion(with_time(scene, precision=kind)) - exact) / largest for kind in ("f32", precision(scene))
+        ]
+        told = estimate_error(with_time(scene, precision=precision(scene)), runtime.started()).error
+        rows.append([name, *(f"{error:.2g}" for error in errors), f"{told:.2g}", precision(scene)])
+    return markdown(["run", "error in f32", "error with auto", "error told", "auto takes"], rows, left=(0, 4))
+
+
+def stiffness(scene: Scene, displacement: Array, active: float) -> csc_matrix:
+    """Assemble the second derivative of the energy over the coordinates of all points that move [N/m].
+
+    A spring of direction n and lengths L and L0 adds k ((1 - L0 / L) (I - n n^T) + n n^T) between its ends.
+    """
+    rows, cols = scene.sheet.points
+    dx, dy = spacing(scene.sheet)
+    x = rest_positions(scene.sheet) + displacement
+    number = np.arange(rows * cols).reshape(rows, cols)
+    parts = []
+    for down, right in HALF:
+        k = scene.springs.shear if down and right else scene.springs.structural
+        here = np.s_[0 : rows - down, max(0, -right) : cols - max(0, right)]
+        there = np.s_[down:rows, max(0, right) : cols + min(0, right)]
+        along = x[there] - x[here]
+        length = np.linalg.norm(along, axis=-1)[..., None, None]
+        n = (along / length[..., 0])[..., :, None]
+        project = n * np.swapaxes(n, -1, -2)
+        block = k * ((1 - math.hypot(right * dx, down * dy) / length) * (np.eye(3) - project) + project)
+        a, b = number[here].ravel(), number[there].ravel()
+        blocks = block.reshape(-1, 3, 3)
+        parts += [(a, a, blocks), (b, b, blocks), (a, b, -blocks), (b, a, -blocks)]
+    size = 3 * rows * cols
+    first = np.concatenate([np.repeat(3 * i[:, None] + np.arange(3), 3, axis=1).ravel() for i, _, _ in parts])
+    second = np.concatenate([np.tile(3 * j[:, None] + np.arange(3), (1, 3)).ravel() for _, j, _ in parts])
+    values = np.concatenate([blocks.ravel() for _, _, blocks in parts])
+    whole = coo_matrix((values, (first, second)), shape=(size, size)).tocsc()
+    whole = whole + active * scene.springs.virtual * identity(size, format="csc")
+    moves = np.repeat(~fixed_points(scene.sheet).ravel(), 3)
+    return whole[moves][:, moves]
+
+
+def forces(scene: Scene, displacement: Array, t: float) -> Array:
+    """Sum up springs, virtual springs and probes on the points that move [N], by the same list of springs."""
+    rows, cols = scene.sheet.points
+    dx, dy = spacing(scene.sheet)
+    x, total = rest_positions(scene.sheet) + displacement, np.zeros((rows, cols, 3))
+    for down, right in HALF:
+        k = scene.springs.shear if down and right else scene.springs.structural
+        here = np.s_[0 : rows - down, max(0, -right) : cols - max(0, right)]
+        there = np.s_[down:rows, max(0, right) : cols + min(0, right)]
+        along = x[there] - x[here]
+        length = np.linalg.norm(along, axis=-1, keepdims=True)
+        pull = k * (1 - math.hypot(right * dx, down * dy) / length) * along
+        total[here] += pull
+        total[there] -= pull
+    loads = loads_at(scene, np.array([t]))
+    total -= loads.active[0] * scene.springs.virtual * displacement
+    for n, slot in enumerate(probe_slots(scene)):
+        total += decay(slot, scene)[..., None] * loads.strength[0, n]
+    return total[~fixed_points(scene.sheet)].ravel()
+
+
+def lowest(matrix: csc_matrix, below: float, count: int = 1) -> tuple[Array, Array]:
+    """Find the smallest eigenvalues and their vectors, near a number that is below all of them."""
+    values, vectors = eigsh(matrix, k=count, sigma=below, which="LM", tol=1e-9)
+    assert values.min() > below
+    order = np.argsort(values)
+    return values[order], vectors[:, order]
+
+
+def buckling() -> dict[str, Any]:
+    """Follow the smallest eigenvalue through a stiffer press, and draw it and its mode."""
+    scene = with_time(stiffer(BUCKLING), precision="f64")
+    dynamics = Dynamics(scene, runtime.started())
+    moves = ~fixed_points(scene.sheet)
+    times, values, modes = [], [], []
+    for frame in range(scene.time.frames + 1):
+        if frame:
+            dynamics.advance(steps_per_frame(scene))
+        t = frame / scene.time.frames_per_second
+        active = float(loads_at(scene, np.array([t])).active[0])
+        value, vector = lowest(stiffness(scene, dynamics.displacement(), active), below=-6.0)
+        mode = np.zeros((*scene.sheet.points, 3))
+        mode[moves] = vector[:, 0].reshape(-1, 3)
+        times.append(t)
+        values.append(float(value[0]))
+        modes.append(mode)
+    dynamics.close()
+    worst = int(np.argmin(values))
+    size = np.linalg.norm(modes[worst], axis=-1)
+    row = int(np.unravel_index(size.argmax(), size.shape)[0])
+    component = int(np.abs(modes[worst]).max(axis=(0, 1)).argmax())
+    along = modes[worst][row, :, component]
+
+    with style.context(STYLE, after_reset=True):
+        figure = Figure(figsize=(WIDE, 3.2), dpi=DPI, layout="constrained")
+        FigureCanvasAgg(figure)
+        left, middle, right = figure.subplots(1, 3, width_ratios=(1.4, 1, 1))
+        left.axhline(0, color=GREY, linewidth=0.8)
+        left.plot(times, values, "o-", color=BLUE, markersize=3)
+        left.set(title=f"Smallest eigenvalue, springs {BUCKLING} × as stiff", xlabel="time [s]", ylabel="N/m")
+        load = np.array(scene.probes[0].load)
+        twin = left.twinx()
+        twin.plot(*load.T, color=VERMILION, linewidth=1)
+        twin.set_ylim(0, 400)
+        twin.grid(visible=False)
+        twin.set_yticks([0, 100])
+        twin.set_ylabel("load [%]", color=VERMILION, loc="bottom")
+        mode = modes[worst]
+        middle.imshow(np.linalg.norm(mode, axis=-1), cmap="magma")
+        middle.set(title=f"Its mode at {times[worst]:g} s: size", xticks=[], yticks=[])
+        near = np.s_[max(0, row - 10) : row + 11]
+        column = int(np.abs(along).argmax())
+        beside = np.s_[max(0, column - 10) : column + 11]
+        largest = np.abs(mode[..., component]).max()
+        right.imshow(mode[near, beside, component], cmap="RdBu", vmin=-largest, vmax=largest)
+        right.set(title=f"and {'xyz'[component]}, around its largest point", xticks=[], yticks=[])
+        figure.savefig(IMAGES / "numerics-buckling.png", format="png")
+    return {"buckled": f"{values[worst]:.2g}", "unloaded": f"{values[0]:.2g}"}
+
+
+def energy() -> dict[str, Any]:
+    """Read the energy of an undamped sheet over many steps, and draw it."""
+    press_time, every, rows = 0.2, 20, []
+    scene = load_scene(ROOT / "tests" / "hard" / "undamped.yaml", [f"time.duration={ENERGY_STEPS}"])
+    base = scene.model_copy(update={"springs": scene.springs.model_copy(update={"virtual": 0.0})})
+    h = 0.1 * stable_step(base)
+    probe = scene.probes[0].model_copy(update={"load": [[0, 0], [press_time, 100], [press_time, 0]]})
+    rate = 1 / (every * h)
+    made = base.model_copy(update={"probes": (probe,)})
+    time = {"duration": ENERGY_STEPS // every / rate, "frames_per_second": rate, "step": h, "tolerance": None}
+    made = made.model_copy(update={"time": made.time.model_copy(update=time)})
+    with style.context(STYLE, after_reset=True):
+        figure = Figure(figsize=(WIDE, 2.8), dpi=DPI, layout="constrained")
+        FigureCanvasAgg(figure)
+        axes = figure.subplots()
+        for kind, colour in (("f32", VERMILION), ("f64", BLUE)):
+            dynamics = Dynamics(with_time(made, precision=kind), runtime.started())
+            found = []
+            for _ in range(ENERGY_STEPS // every):
+                dynamics.advance(every)
+                found.append(dynamics.read().energy)
+            dynamics.close()
+            steps = every * np.arange(1, len(found) + 1)
+            free = steps * h > press_time + every * h
+            known = np.array(found)[free]
+            mean = known.mean()
+            tenth = len(known) // 10
+            drift = known[-tenth:].mean() / known[:tenth].mean() - 1
+            swing = np.abs(known / mean - 1).max()
+            rows.append([kind, f"{mean:.4g} J", f"{100 * swing:.2g} %", f"{100 * drift:+.1g} %"])
+            axes.plot(steps[free], known / mean, color=colour, linewidth=0.8, label=kind)
+        axes.set(
+            xlabel="steps", ylabel="energy / its mean", title=f"Energy of an undamped sheet, read every {every} steps"
+        )
+        axes.legend()
+        figure.savefig(IMAGES / "numerics-energy.png", format="png")
+    return {
+        "energy_points": " × ".join(map(str, made.sheet.points)),
+        "energy_press": press_time,
+        "energy_steps": f"{ENERGY_STEPS:,}",
+        "energy_share": f"{h / stable_step(made):g}",
+        "energy_table": markdown(
+            ["precision", "mean energy", "largest swing", "last tenth of the time, against the first"], rows, left=(0,)
+        ),
+    }
+
+
+def static() -> dict[str, Any]:
+    """Compare the shape at rest under load with Newton's."""
+    seconds = 6
+    scene = press(
+        "probes.0.load=[[0, 0], [0.36, 100]]", f"time.duration={seconds}", "damping=0.04", "time.precision=f64"
+    )
+    dynamics = Dynamics(scene, runtime.started())
+    dynamics.advance(scene.time.frames * steps_per_frame(scene))
+    stepped = dynamics.displacement()
+    dynamics.close()
+    moves = ~fixed_points(scene.sheet)
+    # From nearby, as Newton's method needs, but not from the answer.
+    u = 0.97 * stepped
+    for _ in range(60):
+        residual = forces(scene, u, float(seconds))
+        u[moves] += spsolve(stiffness(scene, u, 1.0), residual).reshape(-1, 3)
+    return {
+        "static_seconds": seconds,
+        "static_error": f"{longest(stepped - u) / longest(u):.1g}",
+        "static_depth": f"{1000 * longest(u):.1f}",
+        "static_residual": f"{np.abs(forces(scene, u, float(seconds))).max():.1g}",
+    }
+
+
+def frequencies() -> dict[str, Any]:
+    """Compare the phase of small motions with that of the modes."""
+    scene = press("springs.virtual_active=always", "damping=0", "time.precision=f64", "probes=[]", "time.duration=0.8")
+    moves, h = ~fixed_points(scene.sheet), step(scene)
+    values, vectors = lowest(stiffness(scene, np.zeros((*scene.sheet.points, 3)), 1.0), 0.0, MODES)
+    rows = []
+    dynamics, steps = Dynamics(scene, runtime.started()), scene.time.frames * steps_per_frame(scene)
+    for value, vector in zip(values, vectors.T, strict=True):
+        w = math.sqrt(value / scene.sheet.mass)
+        theta = 2 * math.asin(w * h / 2)
+        shape = np.zeros((*scene.sheet.points, 3))
+        shape[moves] = 1e-6 * spacing(scene.sheet)[0] * vector.reshape(-1, 3) / np.abs(vector).max()
+        # Of u_n = cos(n theta) that is u_0, and the difference from u_{-1}. A first step from rest would be another.
+        dynamics.restart(scene, State(1, shape, shape * (1 - math.cos(theta))))
+        dynamics.advance(steps)
+        found = float((dynamics.displacement() * shape).sum() / (shape * shape).sum())
+        expected = math.cos(steps * theta)
+        rows.append([f"{w / (2 * math.pi):.4f}", f"{expected:+.9f}", f"{found:+.9f}", f"{abs(found - expected):.0e}"])
+    dynamics.close()
+    head = ["frequency [Hz]", "cos(n theta)", "amplitude after n steps", "apart"]
+    return {"modes": MODES, "modes_table": markdown(head, rows)}
+
+
+def main() -> None:
+    """Compute, draw, and write the page."""
+    runtime.start("cpu")
+    facts: dict[str, Any] = {}
+    for part in (frequencies, static, energy, buckling, lambda: {"silent_table": silent_table()}):
+        facts |= part()
+        print(facts, flush=True)
+    PAGE.write_text(TEMPLATE.read_text(encoding="utf-8").format(**facts), encoding="utf-8")
+
+
+if __name__ == "__main__":
+    main()
