@@ -202,11 +202,12 @@ class Simulation:
         state, per_frame = saved.state, steps_per_frame(self.scene)
         since = state.steps - saved.progress.frame * per_frame
         alike = (state.displacement.shape, state.displacement.dtype) == (self._position.shape, self._position.dtype)
-        if not (alike and 0 <= since < per_frame):
+        if not (alike and 0 <= since <= per_frame):
             raise ArgumentError(
                 f"saved at step {state.steps}, frame {saved.progress.frame}, {state.displacement.dtype} of shape "
                 f"{state.displacement.shape}; take what was saved with this scene's points, precision and step"
             )
+        self._diverged = False
         self._dynamics.restart(self.scene, saved.state)
         self._position = self._place(self._dynamics.displacement())
         self._watch.progress = saved.progress

@@ -13,8 +13,8 @@ PACKAGE = Path(__file__).parent.parent / "taichi_msm"
 
 # A module or a package imports from earlier lines, and a package from itself.
 LAYERS = [
-    {"errors", "notebook", "progress"},
-    {"faults", "system"},
+    {"errors", "progress"},
+    {"faults", "notebook", "system"},
     {"scene"},
     {"physics", "render"},
     {"scenefile", "reference"},

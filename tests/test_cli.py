@@ -435,7 +435,7 @@ def call(capsys: pytest.CaptureFixture[str], *arguments: str) -> tuple[int, str,
         ),
         (
             ["run", "small.yaml", "--threads", "0"],
-            "taichi-msm: Invalid value for '--threads': 0 is not in the range x>=1. (see taichi-msm --help)\n",
+            "taichi-msm: Invalid value for '--threads': 0 is not in the range 1<=x<=1024. (see taichi-msm --help)\n",
         ),
         (
             ["run", "small.yaml", "--arch", "metal"],
