@@ -9,12 +9,11 @@ from types import TracebackType
 import numpy as np
 from numpy.typing import NDArray
 
-from taichi_msm.errors import DivergedError, FilesError, SceneError
+from taichi_msm.errors import DivergedError, SceneError
 from taichi_msm.physics.error_control import choose_step
 from taichi_msm.physics.lattice import rest_positions
 from taichi_msm.physics.timestep import steps_per_frame, with_time
 from taichi_msm.physics.workload import with_precision
-from taichi_msm.render.picking import on_rest_plane, pick
 from taichi_msm.render.texture import load_texture
 from taichi_msm.results.gif import Picture
 from taichi_msm.scene import MAX_PROBES, Camera, Scene
@@ -23,9 +22,10 @@ from taichi_msm.simulation import Simulation
 from taichi_msm.system import runtime
 from taichi_msm.viewer import hud
 from taichi_msm.viewer.captures import Captures, values
+from taichi_msm.viewer.controller import Controller
 from taichi_msm.viewer.events import KEYS, NOTCH, POINTER, Drag, Event, Harder, Key, Percent, Press, Release, Turn
-from taichi_msm.viewer.film import Film
-from taichi_msm.viewer.tool import Place, Tool
+from taichi_msm.viewer.recording import Recording
+from taichi_msm.viewer.tool import Tool
 from taichi_msm.viewer.viewport import Viewport
 
 # A session has as many frames a second as a screen shows, as whole parts of the scene's.
@@ -109,17 +109,13 @@ class Session:
             scene = with_precision(scene, device.arch)
         rate = scene.time.frames_per_second
         self._captures = captures
-        self._film: Film | None = None
-        self._film_rate = given.time.frames_per_second
-        self._filmed_from = 0
+        self._recording = Recording(captures, scene, given.time.frames_per_second, self.parts)
         self._others = scene.probes if play else ()
         self.tool = Tool(scene.probes[0], rate)
         self.scene = scene.model_copy(update={"probes": (*self._others, self.tool.recorded(0))})
         self._rest = rest_positions(scene.sheet)
         self.viewport = Viewport(scene, texture)
-        # A place of the tool, and the point on the plane at rest that was under the pointer then.
-        self._held: tuple[Place, NDArray[np.floating] | None] | None = None
-        self._pointer = (0.0, 0.0)
+        self._controller = Controller(self.tool, self.viewport, scene)
         self._figures, self._keys = True, False
         self._once = False
         self._beats = 0
@@ -171,16 +167,17 @@ class Session:
         """
         match event:
             case Press(x, y, pull):
-                self._press(x, y, -1 if pull else 1)
+                if self._controller.press(self.positions(), x, y, -1 if pull else 1):
+                    self._notice_until = 0
+                else:
+                    self.say(f"no tissue at pixel {x:g}, {y:g}")
             case Drag(x, y):
-                self._drag(x, y)
+                self._controller.drag(x, y)
             case Release():
-                self._held = None
-                if self.tool.held:
-                    self.tool.release()
+                self._controller.release()
             case Turn(right, down):
                 self.viewport.turn(right, down)
-                self._hold_on()
+                self._controller.hold_on()
             case Percent(percent):
                 self.tool.strength = min(100.0, max(0.0, percent))
             case Harder(percent):
@@ -220,8 +217,7 @@ class Session:
             seen = self.viewport.pixel(_between(self.positions(), *self.tool.place))
             if seen is not None:
                 hud.mark(picture, seen, pulls=self._pulls)
-        if self._film is not None:
-            self._expose(self._film, picture)
+        self._tell(self._recording.expose(picture, self._beats))
         above = self._figure_lines(pacing) if self._figures else ["paused"] if self.paused else []
         hud.write(picture, above, self.notice, POINTER | KEYS if self._keys else None)
         return picture
@@ -239,7 +235,7 @@ class Session:
         """Keep the film that is on, and free the memory."""
         self._simulation.close()
         self.viewport.close()
-        self._end_film()
+        self._tell(self._recording.end())
 
     def __enter__(self) -> Session:
         return self
@@ -255,38 +251,9 @@ class Session:
             self._warned = True
             self.say("soon this session will be too long for a scene: write it now (w), then reset it (r)")
 
-    def _press(self, x: float, y: float, direction: int) -> None:
-        place = pick(self.positions(), self.scene.render.refine, self.viewport.view, (x, y))
-        if place is None:
-            self.say(f"no tissue at pixel {x:g}, {y:g}")
-            return
-        self._notice_until = 0
-        self.tool.press(place, direction)
-        self._pointer = x, y
-        self._held = place, on_rest_plane(self.viewport.view, (x, y))
-
-    def _drag(self, x: float, y: float) -> None:
-        """Move the control point as far over the sheet at rest as the pointer went.
-
-        Where the sheet is now is no guide: it gives way under the tool, and the pointer would run after itself.
-        """
-        if self._held is None:
-            return
-        self._pointer = x, y
-        ((across, down), begun), here = self._held, on_rest_plane(self.viewport.view, (x, y))
-        if begun is None or here is None:
-            return
-        (right, up), (height, width) = here - begun, self.scene.sheet.size
-        self.tool.move((across + right / width, down - up / height))
-
     def _look(self, camera: str | Camera) -> None:
         self.viewport.look(camera)
-        self._hold_on()
-
-    def _hold_on(self) -> None:
-        """Keep the tool where it is under a camera that moved; a drag goes on from there."""
-        if self._held is not None:
-            self._held = self.tool.goal, on_rest_plane(self.viewport.view, self._pointer)
+        self._controller.hold_on()
 
     def _do(self, key: str) -> None:
         match key:
@@ -311,14 +278,16 @@ class Session:
             case "r":
                 self._once = False
                 self._simulation.go_on(self._beginning)
-                self.tool.rest()
-                self._held = None
+                self._controller.forget()
                 self._warned = False
                 self.fault = ""
             case "p":
                 self.say(f"saved {self._captures.keep_picture(self.viewport.draw(self.positions()))}")
             case "g":
-                self._start_or_stop_film()
+                if self._recording.on:
+                    self._tell(self._recording.end())
+                else:
+                    self._recording.start(self._beats)
             case "w":
                 self.say(f"saved {self._captures.keep_scene(self.recorded())}")
             case "i":
@@ -326,32 +295,10 @@ class Session:
             case "h":
                 self._keys = not self._keys
 
-    def _start_or_stop_film(self) -> None:
-        if self._film is None:
-            render = self.scene.render
-            self._film = self._captures.film(render.size, self._film_rate, render.background)
-            self._filmed_from = self._beats
-        else:
-            self._end_film()
-
-    def _end_film(self) -> None:
-        """Keep the film that is on, if it has a picture."""
-        film, self._film = self._film, None
-        if film is not None and film.pictures > 0:
-            self.say(f"saved {self._captures.keep_film(film)}")
-        elif film is not None:
-            with film:
-                self.say("the film had no picture yet")
-
-    def _expose(self, film: Film, picture: Picture) -> None:
-        """Film a picture; where the pictures are too slow for the film one stays for several."""
-        try:
-            while film.pictures * self.parts <= self._beats - self._filmed_from:
-                film.add(picture)
-        except FilesError as error:
-            self._film = None
-            with film:
-                self.say(str(error))
+    def _tell(self, notice: str) -> None:
+        """Show a notice, if there is one."""
+        if notice:
+            self.say(notice)
 
     @property
     def _pulls(self) -> bool:
@@ -362,7 +309,7 @@ class Session:
         tool, speed = self.tool, ""
         if self.seconds_a_frame > 0:
             speed = f"steps {1 / self.rate / self.seconds_a_frame:.0f} x real time"
-        state = [word for word, on in (("paused", self.paused), ("film", self._film is not None)) if on]
+        state = [word for word, on in (("paused", self.paused), ("film", self._recording.on)) if on]
         does = "pull" if self._pulls else "push"
         percent = f"{does} {abs(tool.percent):.0f} %" if tool.percent else f"tool {tool.strength:.0f} %"
         moved = self.displacement()

@@ -1,0 +1,69 @@
+"""The pointer in a session: where it presses, and how far a drag moves the tool."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from taichi_msm.render.picking import on_rest_plane, pick
+from taichi_msm.scene import Scene
+from taichi_msm.viewer.tool import Place, Tool
+from taichi_msm.viewer.viewport import Viewport
+
+
+class Controller:
+    """Moves a tool by a pointer over a picture.
+
+    Args:
+        tool: what is moved.
+        viewport: how the tissue is looked at.
+        scene: what is looked at.
+    """
+
+    def __init__(self, tool: Tool, viewport: Viewport, scene: Scene) -> None:
+        self._tool = tool
+        self._viewport = viewport
+        self._refine, self._size = scene.render.refine, scene.sheet.size
+        # A place of the tool, and the point on the plane at rest that was under the pointer then.
+        self._held: tuple[Place, NDArray[np.floating] | None] | None = None
+        self._pointer = (0.0, 0.0)
+
+    def press(self, position: NDArray[np.floating], x: float, y: float, direction: int) -> bool:
+        """Press, 1, or pull, -1, what is seen at a pixel; tells whether there is anything."""
+        place = pick(position, self._refine, self._viewport.view, (x, y))
+        if place is None:
+            return False
+        self._tool.press(place, direction)
+        self._pointer = x, y
+        self._held = place, on_rest_plane(self._viewport.view, (x, y))
+        return True
+
+    def drag(self, x: float, y: float) -> None:
+        """Move the control point as far over the sheet at rest as the pointer went.
+
+        Where the sheet is now is no guide: it gives way under the tool, and the pointer would run after itself.
+        """
+        if self._held is None:
+            return
+        self._pointer = x, y
+        ((across, down), begun), here = self._held, on_rest_plane(self._viewport.view, (x, y))
+        if begun is None or here is None:
+            return
+        (right, up), (height, width) = here - begun, self._size
+        self._tool.move((across + right / width, down - up / height))
+
+    def release(self) -> None:
+        """Let go."""
+        self._held = None
+        if self._tool.held:
+            self._tool.release()
+
+    def hold_on(self) -> None:
+        """Keep the tool where it is under a camera that moved; a drag goes on from there."""
+        if self._held is not None:
+            self._held = self._tool.goal, on_rest_plane(self._viewport.view, self._pointer)
+
+    def forget(self) -> None:
+        """Put the tool at rest."""
+        self._tool.rest()
+        self._held = None
