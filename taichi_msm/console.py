@@ -79,8 +79,8 @@ def summary(record: Mapping[str, Any], directory: Path) -> str:
     times = record["timings"]
     stages = ", ".join(f"{stage} {seconds:.2f}" for stage, seconds in times.items() if stage != "total")
     lines = [
-        f"{printable(str(directory))}: {record['frames']} frames, {record['steps']} steps of {record['step']:.4g} s, "
-        f"largest displacement {record['max_displacement']:.4g} m",
+        f"{printable(str(directory))}: {record['frames']} frames, {record['steps']} steps of {record['step']:.4g} s in "
+        f"{record['precision']}, largest displacement {record['max_displacement']:.4g} m",
         *([f"the first {record['resumed']} frames were simulated by an earlier run"] if record["resumed"] else []),
         *record["notes"],
         f"{times['total']:.2f} s: {stages}{' (encode overlaps)' if times['encode'] > 0 else ''}",
