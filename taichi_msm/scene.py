@@ -10,7 +10,7 @@ from pydantic_core import PydanticCustomError
 from typing_extensions import Self
 
 from taichi_msm import faults
-from taichi_msm.errors import SceneError
+from taichi_msm.errors import ArgumentError, SceneError
 from taichi_msm.faults import LARGEST, REFUSED, SMALLEST
 
 MAX_POINTS = 4096
@@ -56,7 +56,9 @@ else:
 class _Checked(ModelMetaclass):
     """Makes sections; pydantic itself makes those inside others without it, and collects their faults."""
 
-    def __call__(cls: type[BaseModel], /, **keys: Any) -> Any:  # type: ignore[misc]  # noqa: N805
+    def __call__(cls: type[BaseModel], /, *values: Any, **keys: Any) -> Any:  # type: ignore[misc]  # noqa: N805
+        if values:
+            raise ArgumentError(f"{cls.__name__} takes its keys by name: {', '.join(cls.model_fields)}")
         try:
             return super().__call__(**keys)  # type: ignore[misc]
         except ValidationError as error:
@@ -67,7 +69,7 @@ class Section(BaseModel, metaclass=_Checked):
     """A section of the scene: immutable, and strict about its keys.
 
     Raises:
-        SceneError: when a key is unknown, missing or wrong, here and in `model_copy`.
+        SceneError: when a key is unknown, missing or wrong, here and in `model_copy`; when a key is assigned to.
     """
 
     model_config = ConfigDict(frozen=True, extra="forbid", validate_default=True)
@@ -75,7 +77,12 @@ class Section(BaseModel, metaclass=_Checked):
     def model_copy(self, *, update: Mapping[str, Any] | None = None, deep: bool = False) -> Self:
         """Copy the section, with other values for some keys."""
         del deep  # Nothing in it can be changed.
+        if not (update is None or (isinstance(update, Mapping) and all(isinstance(name, str) for name in update))):
+            raise ArgumentError(f"update: {update!r}; take a mapping from keys to values")
         return type(self)(**{**{name: getattr(self, name) for name in type(self).model_fields}, **(update or {})})
+
+    def __setattr__(self, name: str, value: object) -> None:
+        raise SceneError([f"{name}: a scene is not changed; take model_copy(update={{{name!r}: ...}})"])
 
 
 class Sheet(Section):

@@ -22,9 +22,11 @@ from taichi_msm import (
     Render,
     Scene,
     SceneError,
+    Sheet,
     Simulation,
     load_scene,
     reference,
+    resume,
     run,
 )
 from taichi_msm.physics.lattice import rest_positions
@@ -301,3 +303,30 @@ def test_rows_of_unequal_length_are_refused(simulation: Simulation) -> None:
         simulation.draw("side")
     assert caught.value.lines[0].startswith('render.camera: "side" is not allowed')
     assert len(caught.value.lines) == 1
+
+
+def test_sections_take_keys_by_name_and_stay_as_they_are(simulation: Simulation) -> None:
+    made = simulation.scene
+    with pytest.raises(ArgumentError, match="Sheet takes its keys by name: points, size, mass, fixed"):
+        Sheet((3, 3), (1, 1), 1)  # type: ignore[call-arg]
+    with pytest.raises(
+        SceneError, match=r"damping: a scene is not changed; take model_copy\(update={'damping': ...}\)"
+    ):
+        made.damping = 3
+    for update in (3, {3: 3}):
+        with pytest.raises(ArgumentError, match=r"update: .*; take a mapping from keys to values"):
+            made.model_copy(update=update)  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize("overrides", [None, 3, {3: 3}, [3], "damping=1"])
+def test_overrides_are_texts(overrides: Any, small: Path) -> None:
+    with pytest.raises(ArgumentError, match="overrides: "):
+        load_scene("small.yaml", overrides)
+
+
+@pytest.mark.parametrize("directory", [None, 3, "a\0b"])
+def test_a_directory_is_a_path(directory: Any, device: Device) -> None:
+    with pytest.raises(ArgumentError, match=r"directory: .*; take a path"):
+        run(scene(), directory, threads=device.threads)
+    with pytest.raises(ArgumentError, match=r"directory: .*; take a path"):
+        resume(directory)

@@ -11,8 +11,8 @@ from itertools import chain
 from pathlib import Path
 from typing import Any, NamedTuple
 
+from taichi_msm.errors import ArgumentError, Problem, SceneError
 from taichi_msm.errors import Path as Key
-from taichi_msm.errors import Problem, SceneError
 from taichi_msm.faults import cut, flow
 from taichi_msm.scene import MAX_PATH, Scene
 from taichi_msm.scenefile.validation import validate
@@ -60,8 +60,13 @@ def load_scene(
         The scene, its image relative to the current directory.
 
     Raises:
+        ArgumentError: when the overrides are neither a sequence of texts nor a mapping from texts.
         SceneError: all problems of the scene, one line each, in the order in which they stand.
     """
+    if isinstance(overrides, str) or not (
+        isinstance(overrides, (Sequence, Mapping)) and all(isinstance(one, str) for one in overrides)
+    ):
+        raise ArgumentError(f'overrides: {overrides!r}; take ["sheet.points=[61,61]"] or {{"sheet.points": [61, 61]}}')
     draft = Draft(str(path), read_file(str(path), _SCENE))
     for override in _parse_overrides(overrides):
         draft.override(override)
