@@ -92,7 +92,7 @@ def test_a_process_may_have_many_sheets_and_gets_their_memory_back(device: runti
 
 # One simulation in another thread and another process.
 ELSEWHERE = """
-import os, threading
+import os, threading, warnings
 from taichi_msm import MsmError, Simulation
 from tests.scenes import scene
 
@@ -107,6 +107,8 @@ for work in (simulation.advance, simulation.draw, simulation.close, lambda: Simu
     thread = threading.Thread(target=attempt, args=[work])
     thread.start()
     thread.join()
+# Python from 3.12 on warns of forking a process with threads, such as Taichi's.
+warnings.filterwarnings("ignore", "This process .* is multi-threaded", DeprecationWarning)
 child = os.fork()
 if child == 0:
     attempt(simulation.advance)
