@@ -25,7 +25,7 @@ from taichi_msm.physics.lattice import rest_positions
 from taichi_msm.physics.run_progress import RunProgress
 from taichi_msm.physics.timestep import stable_step, step, steps_per_frame
 from taichi_msm.physics.warnings import notes
-from taichi_msm.physics.workload import affords_pilot, with_precision
+from taichi_msm.physics.workload import ENCODING, affords_pilot, with_precision
 from taichi_msm.progress import Progress
 from taichi_msm.render.texture import load_texture
 from taichi_msm.results.manifest import Manifest, digest, read_manifest
@@ -37,9 +37,6 @@ from taichi_msm.scenefile.validation import checked
 from taichi_msm.simulation import Simulation
 from taichi_msm.system import resources, runtime
 from taichi_msm.system.runtime import Device
-
-# Encoding a pixel takes as long as so many steps of a point.
-STEPS_PER_PIXEL = 40
 
 
 class Stopwatch:
@@ -321,7 +318,7 @@ def free_cores(scene: Scene) -> int:
     """Count the cores that are free for stepping: the encoder needs one of them, unless it mostly waits for frames."""
     width, height = scene.render.size
     rows, cols = scene.sheet.points
-    encoding = width * height * STEPS_PER_PIXEL if scene.draws else 0
+    encoding = width * height * ENCODING if scene.draws else 0
     busy = encoding > rows * cols * steps_per_frame(scene)
     return max(1, resources.available_threads() - busy)
 

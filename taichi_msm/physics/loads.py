@@ -74,6 +74,11 @@ class ProbeSlot:
         """The first control point, x and y at rest [m]; of one that stands the only one."""
         return self.segments[0].points[0]
 
+    @property
+    def jumps(self) -> Array:
+        """When the control point jumps [s]: at the first key of every segment but the first."""
+        return np.array([segment.times[0] for segment in self.segments[1:]])
+
 
 class Schedule(NamedTuple):
     """The loads at consecutive steps.
@@ -135,11 +140,9 @@ def schedule(scene: Scene, first: int, count: int) -> Schedule:
     h, parts = step(scene), probe_slots(scene)
     strength, point = np.zeros((count, len(parts), 3)), np.zeros((count, len(parts), 2))
     for index, probe in enumerate(scene.probes):
-        times, percents = np.array(probe.load, dtype=float).T
         own = [n for n, part in enumerate(parts) if part.probe == index]
-        turns, segments = len(own), parts[own[0]].segments
-        jumps = np.array([segment.times[0] for segment in segments[1:]])
-        line = _Line(times, percents)
+        turns, segments, jumps = len(own), parts[own[0]].segments, parts[own[0]].jumps
+        line = _load(probe)
         if turns == 1:
             shares = line.averages(t, h)[:, None]
             places = np.zeros((count, 1), np.intp)
@@ -159,9 +162,8 @@ def loads_at(scene: Scene, t: Array) -> Schedule:
     strength, point = np.zeros((len(t), len(parts), 3)), np.zeros((len(t), len(parts), 2))
     for n, part in enumerate(parts):
         probe = scene.probes[part.probe]
-        line = _Line(*np.array(probe.load, dtype=float).T)
-        jumps = np.array([segment.times[0] for segment in part.segments[1:]])
-        number = jumps.searchsorted(t, "right")
+        line = _load(probe)
+        number = part.jumps.searchsorted(t, "right")
         acts = number % part.turns == part.turn
         strength[:, n] = np.multiply.outer(line.values(t) * acts / 100, probe.force)
         for segment in np.unique(number):
@@ -184,7 +186,7 @@ class Envelope:
 
     def __init__(self, scene: Scene) -> None:
         self._h = step(scene)
-        self._lines = [_Line(*np.array(probe.load, dtype=float).T) for probe in scene.probes]
+        self._lines = [_load(probe) for probe in scene.probes]
         self._forces = [math.hypot(*probe.force) / 100 for probe in scene.probes]
         self._probes = [slot.probe for slot in probe_slots(scene)]
         self._activity = _activity(scene)
@@ -217,7 +219,7 @@ class _Line:
         # Its limits at every key.
         before, after = values[times.searchsorted(keys, "left")], values[times.searchsorted(keys, "right") - 1]
         before[0] = 0.0
-        # A key around which nothing changes is none, and costs no bit.
+        # A key that changes nothing is dropped, so that it changes no rounding either.
         last, following = np.append(0.0, after[:-1]), np.append(before[1:], after[-1])
         told = (last != before) | (before != after) | (after != following)
         told[0] = True
@@ -228,9 +230,9 @@ class _Line:
         return self._values(t, self.times.searchsorted(t, "right"))
 
     def averages(self, t: Array, h: float, begin: float = -math.inf, end: float = math.inf) -> Array:
-        """Average it with the hat of half-width h about times from 0 on, counting what is from begin to end.
+        """Average it with the hat of half-width h about times from 0 on; outside begin to end it counts as 0.
 
-        Where no key is within the hat, and neither begin nor end, it is its value there.
+        The average is the value itself where the hat holds no key, nor begin or end.
         """
         edges = [edge for edge in (begin, end) if math.isfinite(edge)]
         found = self.values(t) * ((begin <= t) & (t < end))
@@ -298,6 +300,11 @@ def _held(segment: ProbeSegment, t: Array) -> Array:
     return np.stack([np.interp(t, segment.times, segment.points[:, axis]) for axis in range(2)], axis=-1)
 
 
+def _load(probe: Probe) -> _Line:
+    """Give the percent of a probe's force as a function of time."""
+    return _Line(*np.array(probe.load, dtype=float).T)
+
+
 def _activity(scene: Scene) -> _Line:
     """Tell when the virtual springs exist: 1 while the percent of any probe is not 0, or always; else 0."""
     if scene.springs.virtual_active == "always":
@@ -309,7 +316,7 @@ def _activity(scene: Scene) -> _Line:
     middles = np.append((times[:-1] + times[1:]) / 2, times[-1] + 1)
     active = np.zeros(len(times))
     for probe in scene.probes:
-        line = _Line(*np.array(probe.load, dtype=float).T)
+        line = _load(probe)
         after = line.times.searchsorted(middles, "right")
         following = np.minimum(after, len(line.times) - 1)
         pressed = (line.after[after - 1] != 0) | ((line.before[following] != 0) & (after < len(line.times)))

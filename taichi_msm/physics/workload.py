@@ -24,12 +24,12 @@ START = 4e8
 DOUBLE = 2.0
 
 # Encoding a pixel, and drawing a sample of it.
-PIXEL, SAMPLE = 40.0, 6.0
+ENCODING, SAMPLE = 40.0, 6.0
 
 # Stepping in f64 is a small part of a run up to this share of all else.
 SMALL = 0.25
 
-# A pilot that takes more than this share of the run is not taken unasked.
+# Without a tolerance, a pilot is run only where it takes at most this share of the run.
 MOST_FOR_PILOT = 1 / 3
 
 
@@ -94,4 +94,4 @@ def _steps(scene: Scene) -> float:
 def _other(scene: Scene) -> float:
     """Count the work beside stepping."""
     pixels = (scene.time.frames + 1) * math.prod(scene.render.size) if scene.draws else 0
-    return START + pixels * (PIXEL + SAMPLE * scene.render.supersample**2)
+    return START + pixels * (ENCODING + SAMPLE * scene.render.supersample**2)
