@@ -13,12 +13,12 @@ from numpy.typing import NDArray
 from taichi_msm.errors import SceneError
 from taichi_msm.physics import error_control
 from taichi_msm.physics.error_control import Estimate, Trials, choose_step, estimate_error, longest, order, refinement
-from taichi_msm.physics.solver import Dynamics
 from taichi_msm.physics.timestep import stable_step, step, steps_per_frame, with_steps, with_time
 from taichi_msm.physics.warnings import notes
 from taichi_msm.scene import Scene
 from taichi_msm.simulation import Simulation
 from taichi_msm.system.runtime import Device
+from tests.motion import frames, true_error
 from tests.scenes import PRESS, SHEET, SPRINGS, scene
 
 SOFT_PRESS = {**PRESS, "force": [0, 300, -1000]}
@@ -43,26 +43,6 @@ SCENES: dict[str, Any] = {
         "damping": 0.02,
     },
 }
-
-
-def frames(made: Scene, device: Device, cut: int | None = None) -> NDArray[np.float64]:
-    """Displacements of every frame."""
-    if cut is not None:
-        made = with_steps(made, cut)
-    dynamics = Dynamics(made, device)
-    found = []
-    for _ in range(made.time.frames):
-        dynamics.advance(steps_per_frame(made))
-        found.append(dynamics.displacement().astype(np.float64))
-    dynamics.close()
-    return np.array(found)
-
-
-def true_error(made: Scene, device: Device, fine: int) -> float:
-    """Error of the scene's step, by a float64 run with so many times more steps, whose own error is 1 % of it."""
-    exact = with_time(with_steps(made, fine * steps_per_frame(made)), precision="f64")
-    reference = frames(exact, device)
-    return longest(frames(made, device) - reference) / longest(reference)
 
 
 @pytest.mark.parametrize(("precision", "tolerance"), [("f32", 5e-4), pytest.param("f64", 5e-5, marks=pytest.mark.slow)])

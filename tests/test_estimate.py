@@ -12,35 +12,18 @@ import pytest
 
 from taichi_msm import load_scene, resume, run, runner
 from taichi_msm.physics import workload
-from taichi_msm.physics.error_control import longest
-from taichi_msm.physics.solver import Dynamics
-from taichi_msm.physics.timestep import steps_per_frame, with_steps, with_time
+from taichi_msm.physics.timestep import steps_per_frame, with_time
 from taichi_msm.physics.warnings import notes
 from taichi_msm.physics.workload import affords_pilot, precision
 from taichi_msm.results.record import RunRecord
 from taichi_msm.scene import Scene
 from taichi_msm.system.runtime import Device
+from tests.motion import true_error
 from tests.scenes import PRESS, scene
 from tests.test_resume import Stop
 
-# Where no pilot is asked for, as tests of runs in pieces are.
+# A run of four frames that draws nothing.
 SHORT = ["output=[trajectory]", "time.duration=0.4"]
-
-
-def true_error(made: Scene, device: Device) -> float:
-    """Error of a scene's step and precision, by a run in float64 with 32 times as many steps."""
-
-    def frames(of: Scene) -> np.ndarray[Any, np.dtype[np.float64]]:
-        dynamics = Dynamics(of, device)
-        found = []
-        for _ in range(of.time.frames):
-            dynamics.advance(steps_per_frame(of))
-            found.append(dynamics.displacement().astype(np.float64))
-        dynamics.close()
-        return np.array(found)
-
-    exact = frames(with_time(with_steps(made, 32 * steps_per_frame(made)), precision="f64"))
-    return longest(frames(made) - exact) / longest(exact)
 
 
 def told(record: RunRecord) -> float:
@@ -67,7 +50,7 @@ def test_a_run_says_how_wrong_it_is(overrides: Sequence[str], small: Path, devic
     record = run(made, "out", threads=device.threads)
     found = told(record)
     with_it = with_time(made, precision=record["precision"])
-    error = true_error(with_it, device)
+    error = true_error(with_it, device, fine=32)
     # Outside, 0.89 to 1.5 were found over 98 scenes.
     assert 0.8 * error < found < 1.5 * error
     assert record["notes"][0].startswith(f"error {found:.1g} of the largest displacement")
@@ -158,4 +141,4 @@ def test_a_tolerance_is_met_with_either_difference(difference: str, small: Path,
     assert record["error_estimate"] is not None
     assert record["error_estimate"]["order"] == (2 if difference == "central" else 1)
     chosen = with_time(made, step=record["step"], tolerance=None, precision=record["precision"])
-    assert true_error(chosen, device) <= 3e-3
+    assert true_error(chosen, device, fine=32) <= 3e-3
