@@ -26,7 +26,7 @@ from tests.test_architecture import LAYERS, MODULES, imports, module_name  # noq
 
 # What a person calls or reads; __init__ and __main__ only lead there.
 SHOWN = [[name for name in sorted(layer) if not name.startswith("__")] for layer in LAYERS]
-WIDTH, HEIGHT, GAP = 1.7, 0.62, 1.12
+WIDTH, HEIGHT, GAP, PITCH = 1.7, 0.62, 1.12, 2.3
 
 
 def arrows() -> Counter[tuple[str, str]]:
@@ -57,15 +57,16 @@ def main() -> None:
     """Draw."""
     layers = [layer for layer in SHOWN if layer]
     place = {
-        name: (2.3 * (column - (len(layer) - 1) / 2), GAP * level)
+        name: (PITCH * (column - (len(layer) - 1) / 2), GAP * level)
         for level, layer in enumerate(layers)
         for column, name in enumerate(layer)
     }
-    figure = Figure(figsize=(7.2, 8.4), dpi=DPI, layout="constrained")
+    reach = (PITCH * (max(map(len, layers)) - 1) + WIDTH) / 2 + 0.1
+    figure = Figure(figsize=(2.12 * reach, 8.4), dpi=DPI, layout="constrained")
     FigureCanvasAgg(figure)
     axes = figure.subplots()
     axes.set_axis_off()
-    axes.set_xlim(-3.4, 3.4)
+    axes.set_xlim(-reach, reach)
     axes.set_ylim(-0.6, GAP * (len(layers) - 1) + 0.6)
     for (upper, lower), count in direct(arrows()).items():
         if upper in place and lower in place:

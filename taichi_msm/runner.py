@@ -18,7 +18,8 @@ import PIL
 from numpy.typing import NDArray
 
 from taichi_msm import __version__
-from taichi_msm.errors import ArgumentError, DamagedError, DeviceError, DivergedError, FilesError, SceneError, writing
+from taichi_msm.arguments import require_path
+from taichi_msm.errors import DamagedError, DeviceError, DivergedError, FilesError, SceneError, writing
 from taichi_msm.physics import error_control
 from taichi_msm.physics.error_control import Estimate, Pilot
 from taichi_msm.physics.lattice import rest_positions
@@ -102,7 +103,7 @@ def run(
     """
     watch = Stopwatch(started)
     scene = checked(scene)
-    _require_path(directory)
+    require_path(directory)
     budget.require_disk(scene, Path(directory))
     device = runtime.start(arch, threads)
     texture = load_texture(scene) if scene.draws else None
@@ -122,12 +123,6 @@ def run(
         with suppress(DamagedError):
             return _carry_out(manifest, Path(directory), device, texture, watch, progress, resumes=True)
     return _carry_out(manifest, Path(directory), device, texture, watch, progress, resumes=False)
-
-
-def _require_path(directory: str | Path) -> None:
-    """Make sure that something may be the path of a directory."""
-    if not isinstance(directory, (str, Path)) or "\0" in str(directory):
-        raise ArgumentError(f"directory: {directory!r}; take a path")
 
 
 def _is_begun(manifest: Manifest, directory: Path) -> bool:
@@ -163,7 +158,7 @@ def resume(
         KeyboardInterrupt: when interrupted before there is a frame more; all is as it was then.
     """
     watch = Stopwatch(started)
-    _require_path(directory)
+    require_path(directory)
     manifest = read_manifest(Path(directory))
     if too_large := [str(problem) for problem in budget.problems(manifest.scene)]:
         raise SceneError(too_large)

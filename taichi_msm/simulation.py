@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
+from taichi_msm.arguments import as_array, require_frame_count
 from taichi_msm.errors import ArgumentError, DivergedError, MsmError
 from taichi_msm.physics.diagnosis import Diagnosis, diagnose
 from taichi_msm.physics.divergence import Watch, farthest
@@ -23,7 +24,7 @@ from taichi_msm.progress import Pause
 from taichi_msm.render.camera import View, view
 from taichi_msm.render.picking import pick
 from taichi_msm.render.surface import Surface, surface
-from taichi_msm.render.texture import as_array, load_texture, require_texture
+from taichi_msm.render.texture import load_texture, require_texture
 from taichi_msm.scene import Camera, Probe, Scene
 from taichi_msm.scenefile.validation import checked
 from taichi_msm.system import runtime
@@ -128,7 +129,7 @@ class Simulation:
             DivergedError: when a point is no longer finite or has left every bound. `positions` and `draw` then give
                 the last frame that was good.
         """
-        _require_count(frames)
+        require_frame_count(frames)
         self._require_open()
         for _ in range(frames):
             end = (self.frame + 1) * steps_per_frame(self.scene)
@@ -303,7 +304,7 @@ class Simulation:
         """
         from taichi_msm.notebook import Player
 
-        _require_count(frames)
+        require_frame_count(frames)
         pictures = [self.draw(camera)]
         for _ in range(frames):
             self.advance()
@@ -396,9 +397,3 @@ class Simulation:
         np.add(position[..., 1], y, out=position[..., 1], casting="same_kind")
         position.flags.writeable = False
         return position
-
-
-def _require_count(frames: int) -> None:
-    """Make sure that a number of frames is one."""
-    if isinstance(frames, bool) or not isinstance(frames, (int, np.integer)) or frames < 0:
-        raise ArgumentError(f"{frames!r} frames cannot be simulated; take a whole number, 0 or more")

@@ -14,7 +14,7 @@ PACKAGE = Path(__file__).parent.parent / "taichi_msm"
 # A module or a package imports from earlier lines, and a package from itself.
 LAYERS = [
     {"errors", "progress"},
-    {"faults", "notebook", "system"},
+    {"arguments", "faults", "notebook", "system"},
     {"scene"},
     {"physics", "render"},
     {"scenefile", "reference"},

@@ -10,6 +10,7 @@ from mmap import ACCESS_READ, mmap
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from taichi_msm.arguments import as_array
 from taichi_msm.errors import ArgumentError, Problem, SceneError
 from taichi_msm.scene import Scene
 from taichi_msm.system.silence import silenced
@@ -84,20 +85,6 @@ def require_texture(texture: Any) -> NDArray[np.uint8]:
             f"up to {MAX_SIDE} a side, such as numpy.asarray(image.convert('RGB'))"
         )
     return found
-
-
-def as_array(values: Any, name: str) -> NDArray[Any]:
-    """Make an array of what a caller gave.
-
-    Raises:
-        ArgumentError: when it is none, as its rows differ in length.
-    """
-    import numpy as np
-
-    try:
-        return np.asarray(values)
-    except ValueError as error:
-        raise ArgumentError(f"{name}: {error}; take an array") from None
 
 
 def image_size(scene: Scene) -> tuple[int, int] | None:

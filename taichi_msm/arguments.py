@@ -1,0 +1,47 @@
+"""Checks of what a caller gives to the library."""
+
+from __future__ import annotations
+
+from numbers import Integral
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from taichi_msm.errors import ArgumentError
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+
+def as_array(values: Any, name: str) -> NDArray[Any]:
+    """Make an array of an argument.
+
+    Raises:
+        ArgumentError: when that is impossible, as where rows differ in length.
+    """
+    # Not at the top: checking a scene starts without NumPy.
+    import numpy as np
+
+    try:
+        return np.asarray(values)
+    except ValueError as error:
+        raise ArgumentError(f"{name}: {error}; take an array") from None
+
+
+def require_frame_count(frames: int) -> None:
+    """Make sure that a number of frames is a whole number, 0 or more.
+
+    Raises:
+        ArgumentError: when it is not.
+    """
+    if isinstance(frames, bool) or not isinstance(frames, Integral) or frames < 0:
+        raise ArgumentError(f"{frames!r} frames cannot be simulated; take a whole number, 0 or more")
+
+
+def require_path(directory: str | Path) -> None:
+    """Make sure that something may be the path of a directory.
+
+    Raises:
+        ArgumentError: when it may not.
+    """
+    if not isinstance(directory, (str, Path)) or "\0" in str(directory):
+        raise ArgumentError(f"directory: {directory!r}; take a path")
