@@ -15,6 +15,7 @@ PACKAGE = Path(__file__).parent.parent / "taichi_msm"
 LAYERS = [
     {"errors", "progress"},
     {"arguments", "faults", "notebook", "system"},
+    {"picture"},
     {"scene"},
     {"physics", "render"},
     {"scenefile", "reference"},

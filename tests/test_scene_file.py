@@ -774,7 +774,7 @@ def test_a_scene_sees_no_picture_outside_its_folder(name: str, tmp_path: Path, m
     name = name.format(absolute=tmp_path / "secret.png")
     Path("s.yaml").write_text(GOOD + f"image: {name}\nregion: [0, 0, 9, 9]\n")
     opened: list[str] = []
-    monkeypatch.setattr("taichi_msm.render.texture._require_file", opened.append)
+    monkeypatch.setattr("taichi_msm.picture._require_file", opened.append)
     with pytest.raises(SceneError) as caught:
         load_scene("s.yaml")
     said = "is not below the scene's folder; put the picture there, or name it with --image"

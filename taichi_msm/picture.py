@@ -1,0 +1,154 @@
+"""Reading a picture's file, whatever is in it: its size, its pixels."""
+
+from __future__ import annotations
+
+import stat
+import warnings
+from collections.abc import Iterator
+from contextlib import contextmanager
+from mmap import ACCESS_READ, mmap
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from taichi_msm.system.silence import silenced
+
+if TYPE_CHECKING:
+    from PIL import Image
+
+FORMATS = ("PNG", "JPEG", "WEBP", "BMP", "TIFF")
+
+# The pixels, by Pillow's names, whose colours are certain; 32-bit and floating-point greys have any range.
+_MODES_16_BIT = ("I;16", "I;16L", "I;16B", "I;16N")
+_MODES = ("1", "L", "LA", "P", "PA", "RGB", "RGBA", "RGBa", "RGBX", "CMYK", "YCbCr", *_MODES_16_BIT)
+
+# The longest side of a picture. Pillow needs memory and time for every row, and a picture of one column has many.
+MAX_SIDE = 65535
+
+# Every scan of a JPEG goes over all pixels. Encoders make some ten; a few seconds' work may be more.
+USUAL_SCANS = 16
+SCANNED_PIXELS = 2 * 10**8
+
+_ORIENTATION = 0x0112
+_LYING = (5, 6, 7, 8)
+
+
+class PictureError(Exception):
+    """The file cannot be used as a picture; the message says why and what to do."""
+
+
+def read_rgb(path: str, background: tuple[int, int, int]) -> Image.Image:
+    """Read a picture, upright, in 8-bit RGB; a transparent one lies on the background.
+
+    Of several pictures in one file the first is taken.
+
+    Raises:
+        PictureError: when the file cannot be used.
+    """
+    from PIL import ImageOps
+
+    with _open(path) as opened:
+        return _to_rgb(ImageOps.exif_transpose(opened), background)
+
+
+def picture_size(path: str) -> tuple[int, int]:
+    """Read the width and height of the upright picture [px] from the file's header."""
+    from PIL import Image
+
+    with _open(path) as image:
+        # Pillow's size of a TIFF is that of the upright picture already. The base class's getexif() keeps to
+        # the header, where that of PNG would decode the picture to look behind it.
+        if image.format != "TIFF" and Image.Image.getexif(image).get(_ORIENTATION) in _LYING:
+            return image.height, image.width
+        return image.size
+
+
+@contextmanager
+def _open(path: str) -> Iterator[Image.Image]:
+    """Open a picture for a block that decodes it.
+
+    Raises:
+        PictureError: whatever Pillow raises, here or in the block; broken pictures raise many types.
+    """
+    from PIL import Image, UnidentifiedImageError
+
+    _require_file(path)
+    # What libtiff and Pillow's log say of a broken picture the error says that is raised.
+    with silenced(2), warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        warnings.simplefilter("error", Image.DecompressionBombWarning)
+        try:
+            with Image.open(path, formats=FORMATS) as image:
+                if max(image.size) > MAX_SIDE:
+                    said = f"has {image.width} x {image.height} pixels; a side may have {MAX_SIDE}, cut it"
+                    raise PictureError(f"{path} {said}")
+                if image.format in ("JPEG", "MPO"):
+                    scans = _scans(path)
+                    most = max(USUAL_SCANS, SCANNED_PIXELS // (image.width * image.height))
+                    if scans > most:
+                        raise PictureError(f"{path} has {scans} scans, of which {most} are allowed; save it anew")
+                if image.mode not in _MODES:
+                    raise PictureError(f"{path} has pixels of kind {image.mode}; save it as 8-bit RGB")
+                yield image
+        except PictureError:
+            raise
+        except UnidentifiedImageError:
+            raise PictureError(f"{path} is not a PNG, JPEG, WebP, BMP or TIFF picture; convert it") from None
+        except (Image.DecompressionBombWarning, Image.DecompressionBombError):
+            limit = (Image.MAX_IMAGE_PIXELS or 0) // 10**6
+            raise PictureError(f"{path} has more than {limit} million pixels; scale it down") from None
+        except Exception as error:
+            raise PictureError(f"{path} cannot be decoded ({error}); save it anew") from None
+
+
+def _scans(path: str) -> int:
+    """Count the scans of a JPEG, as far as it is one."""
+    with Path(path).open("rb") as file, mmap(file.fileno(), 0, access=ACCESS_READ) as data:
+        return _count_scans(data)
+
+
+def _count_scans(data: mmap) -> int:
+    place, scans = 2, 0
+    while (place := data.find(b"\xff", place)) >= 0 and (marker := data[place + 1 : place + 2]) not in (b"", b"\xd9"):
+        # Stuffed and padding bytes and restarts have no length; they occur within the data of a scan.
+        if marker in b"\x00\x01\xff" or b"\xd0" <= marker <= b"\xd8":
+            place += 1 if marker == b"\xff" else 2
+            continue
+        scans += marker == b"\xda"
+        place += 2 + int.from_bytes(data[place + 2 : place + 4], "big")
+    return scans
+
+
+def _require_file(path: str) -> None:
+    """Refuse what is not a regular file, without opening it: opening a pipe would wait for its other end."""
+    try:
+        mode = Path(path).stat().st_mode
+    except ValueError:
+        raise PictureError(f"{path} is not a path; name a picture") from None
+    except OSError as error:
+        raise PictureError(
+            f"{path}: {(error.strerror or str(error)).lower()}; name a picture that can be read"
+        ) from None
+    if not stat.S_ISREG(mode):
+        kind = "a directory" if stat.S_ISDIR(mode) else "not a regular file"
+        raise PictureError(f"{path} is {kind}; name a picture")
+
+
+def _to_rgb(image: Image.Image, background: tuple[int, int, int]) -> Image.Image:
+    """Convert pixels of any kind in `_MODES`."""
+    from PIL import Image
+
+    if image.mode in _MODES_16_BIT:
+        image = _to_8_bit(image)
+    if not image.has_transparency_data:
+        return image.convert("RGB")
+    below = Image.new("RGBA", image.size, (*background, 255))
+    return Image.alpha_composite(below, image.convert("RGBA")).convert("RGB")
+
+
+def _to_8_bit(image: Image.Image) -> Image.Image:
+    """Scale 16-bit grey to 8 bits, 65535 to 255, to the nearest; Pillow's own conversion clips at 255."""
+    import numpy as np
+    from PIL import Image
+
+    grey = np.asarray(image).astype(np.uint32)
+    return Image.fromarray(((grey * 255 + 32767) // 65535).astype(np.uint8))
