@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from taichi_msm import load_scene
 from taichi_msm.physics.lattice import fixed_points, rest_positions, springs
 from taichi_msm.physics.loads import Schedule, decay, probe_slots, schedule
+from taichi_msm.physics.material import material
 from taichi_msm.physics.timestep import step, steps_per_frame, with_steps
 from taichi_msm.scene import Scene
 
@@ -47,7 +48,8 @@ def elastic_force(scene: Scene, values: Array, form: str) -> Array:
 
 def displacements(scene: Scene, real: type[np.floating[Any]], form: str) -> Array:
     """Step the scene with its state stored in one form; gives the displacements of all frames."""
-    h, m = step(scene), scene.sheet.mass
+    made = material(scene)
+    h, m = step(scene), made.mass
     g = scene.damping / m
     keep = real((1 - g * h / 2) / (1 + g * h / 2))
     rest64 = rest_positions(scene.sheet)
@@ -61,7 +63,7 @@ def displacements(scene: Scene, real: type[np.floating[Any]], form: str) -> Arra
     frames = []
     for n in range(len(loads.active)):
         u = now - rest if form == "positions" else now
-        force = elastic_force(scene, now, form) - real(scene.springs.virtual * loads.active[n]) * u
+        force = elastic_force(scene, now, form) - real(made.virtual * loads.active[n]) * u
         for part, strength in zip(share, loads.strength[n], strict=True):
             force += part * strength.astype(real)
         gain = real(h * h / m / (1 + g * h / 2) if n else h * h / m / 2)

@@ -23,6 +23,7 @@ from taichi_msm import Scene, load_scene
 from taichi_msm.physics.error_control import estimate_error, longest
 from taichi_msm.physics.lattice import fixed_points, rest_positions, spacing
 from taichi_msm.physics.loads import decay, loads_at, probe_slots
+from taichi_msm.physics.material import material
 from taichi_msm.physics.solver import Dynamics
 from taichi_msm.physics.state import State
 from taichi_msm.physics.timestep import stable_step, step, steps_per_frame, with_steps, with_time
@@ -53,8 +54,8 @@ def press(*overrides: str) -> Scene:
 
 def stiffer(times: int) -> Scene:
     """Make the springs of the press stiffer, but not the virtual ones."""
-    springs = press().springs
-    return press(f"springs.structural={times * springs.structural}", f"springs.shear={times * springs.shear}")
+    sheet = material(press())
+    return press(f"springs.structural={times * sheet.across}", f"springs.shear={times * sheet.shear}")
 
 
 def motion(scene: Scene) -> Array:
@@ -105,7 +106,7 @@ def stiffness(scene: Scene, displacement: Array, active: float) -> csc_matrix:
     number = np.arange(rows * cols).reshape(rows, cols)
     parts = []
     for down, right in HALF:
-        k = scene.springs.shear if down and right else scene.springs.structural
+        k = material(scene).shear if down and right else material(scene).across
         here = np.s_[0 : rows - down, max(0, -right) : cols - max(0, right)]
         there = np.s_[down:rows, max(0, right) : cols + min(0, right)]
         along = x[there] - x[here]
@@ -121,7 +122,7 @@ def stiffness(scene: Scene, displacement: Array, active: float) -> csc_matrix:
     second = np.concatenate([np.tile(3 * j[:, None] + np.arange(3), (1, 3)).ravel() for _, j, _ in parts])
     values = np.concatenate([blocks.ravel() for _, _, blocks in parts])
     whole = coo_matrix((values, (first, second)), shape=(size, size)).tocsc()
-    whole = whole + active * scene.springs.virtual * identity(size, format="csc")
+    whole = whole + active * material(scene).virtual * identity(size, format="csc")
     moves = np.repeat(~fixed_points(scene.sheet).ravel(), 3)
     return whole[moves][:, moves]
 
@@ -132,7 +133,7 @@ def forces(scene: Scene, displacement: Array, t: float) -> Array:
     dx, dy = spacing(scene.sheet)
     x, total = rest_positions(scene.sheet) + displacement, np.zeros((rows, cols, 3))
     for down, right in HALF:
-        k = scene.springs.shear if down and right else scene.springs.structural
+        k = material(scene).shear if down and right else material(scene).across
         here = np.s_[0 : rows - down, max(0, -right) : cols - max(0, right)]
         there = np.s_[down:rows, max(0, right) : cols + min(0, right)]
         along = x[there] - x[here]
@@ -141,7 +142,7 @@ def forces(scene: Scene, displacement: Array, t: float) -> Array:
         total[here] += pull
         total[there] -= pull
     loads = loads_at(scene, np.array([t]))
-    total -= loads.active[0] * scene.springs.virtual * displacement
+    total -= loads.active[0] * material(scene).virtual * displacement
     for n, slot in enumerate(probe_slots(scene)):
         total += decay(slot, scene)[..., None] * loads.strength[0, n]
     return total[~fixed_points(scene.sheet)].ravel()
@@ -210,6 +211,7 @@ def energy() -> dict[str, Any]:
     """Read the energy of an undamped sheet over many steps, and draw it."""
     press_time, every, rows = 0.2, 20, []
     scene = load_scene(ROOT / "tests" / "hard" / "undamped.yaml", [f"time.duration={ENERGY_STEPS}"])
+    assert scene.springs is not None
     base = scene.model_copy(update={"springs": scene.springs.model_copy(update={"virtual": 0.0})})
     h = 0.1 * stable_step(base)
     probe = scene.probes[0].model_copy(update={"load": [[0, 0], [press_time, 100], [press_time, 0]]})
@@ -285,7 +287,7 @@ def frequencies() -> dict[str, Any]:
     rows = []
     dynamics, steps = Dynamics(scene, runtime.started()), scene.time.frames * steps_per_frame(scene)
     for value, vector in zip(values, vectors.T, strict=True):
-        w = math.sqrt(value / scene.sheet.mass)
+        w = math.sqrt(value / material(scene).mass)
         theta = 2 * math.asin(w * h / 2)
         shape = np.zeros((*scene.sheet.points, 3))
         shape[moves] = 1e-6 * spacing(scene.sheet)[0] * vector.reshape(-1, 3) / np.abs(vector).max()

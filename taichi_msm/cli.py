@@ -139,6 +139,7 @@ def run(
 def check(scene: str, image: str | None, overrides: tuple[str, ...], as_json: bool) -> int:
     """Validate SCENE and print the steps, memory and disk space it needs; compute nothing."""
     from taichi_msm.physics import timestep, workload
+    from taichi_msm.physics.probe_force import in_words, probe_records
     from taichi_msm.scenefile import budget
     from taichi_msm.scenefile.load import load_scene
 
@@ -147,7 +148,7 @@ def check(scene: str, image: str | None, overrides: tuple[str, ...], as_json: bo
         budget.require_disk(loaded, Path("output"))
     need = budget.estimate(loaded)
     limit = timestep.stable_step(loaded)
-    facts = {
+    facts: dict[str, Any] = {
         "scene": loaded.model_dump(mode="json"),
         "step": timestep.step(loaded),
         "stable_step": limit if limit < float("inf") else None,
@@ -158,6 +159,7 @@ def check(scene: str, image: str | None, overrides: tuple[str, ...], as_json: bo
         "memory": need.memory_bytes,
         "disk": need.disk_bytes,
         "disk_while_running": need.disk_bytes + need.working_bytes,
+        "probes": probe_records(loaded),
     }
     if as_json:
         print_json(facts)
@@ -172,6 +174,8 @@ def check(scene: str, image: str | None, overrides: tuple[str, ...], as_json: bo
         f"about {need.memory_bytes / 2**20:.0f} MiB of memory, {need.disk_bytes / 2**20:.1f} MiB on disk, "
         f"{need.working_bytes / 2**20:.1f} MiB more while it runs"
     )
+    for index, probe in enumerate(facts["probes"]):
+        click.echo(f"probes.{index}: {in_words(probe)}")
     return DONE
 
 

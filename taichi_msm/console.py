@@ -10,6 +10,7 @@ from types import TracebackType
 from typing import TYPE_CHECKING, Any
 
 from taichi_msm.errors import printable
+from taichi_msm.physics.probe_force import in_words
 from taichi_msm.system.streams import tell
 
 if TYPE_CHECKING:
@@ -82,6 +83,7 @@ def summary(record: Mapping[str, Any], directory: Path) -> str:
         f"{printable(str(directory))}: {record['frames']} frames, {record['steps']} steps of {record['step']:.4g} s in "
         f"{record['precision']}, largest displacement {record['max_displacement']:.4g} m",
         *([f"the first {record['resumed']} frames were simulated by an earlier run"] if record["resumed"] else []),
+        *(f"probes.{index}: {in_words(probe)}" for index, probe in enumerate(record["probes"])),
         *record["notes"],
         f"{times['total']:.2f} s: {stages}{' (encode overlaps)' if times['encode'] > 0 else ''}",
     ]

@@ -11,7 +11,7 @@ from contextlib import ExitStack, suppress
 from dataclasses import asdict
 from functools import partial
 from pathlib import Path
-from typing import Any, cast
+from typing import Any, NamedTuple, cast
 
 import numpy as np
 import PIL
@@ -23,6 +23,8 @@ from taichi_msm.errors import DamagedError, DeviceError, DivergedError, FilesErr
 from taichi_msm.physics import error_control
 from taichi_msm.physics.error_control import Estimate, Pilot
 from taichi_msm.physics.lattice import rest_positions
+from taichi_msm.physics.mesh_error import MeshPilot, coarser
+from taichi_msm.physics.probe_force import probe_records
 from taichi_msm.physics.run_progress import RunProgress
 from taichi_msm.physics.timestep import stable_step, step, steps_per_frame
 from taichi_msm.physics.warnings import notes
@@ -117,7 +119,7 @@ def run(
     with writing(directory):
         here = str(Path.cwd())
     manifest = Manifest(
-        given, scene, tuple(overrides), estimate, estimate_error, here, arch, digest(texture), versions()
+        given, scene, tuple(overrides), estimate, estimate_error, here, arch, digest(texture, scene), versions()
     )
     if _is_begun(manifest, Path(directory)):
         with suppress(DamagedError):
@@ -163,7 +165,7 @@ def resume(
     if too_large := [str(problem) for problem in budget.problems(manifest.scene)]:
         raise SceneError(too_large)
     texture = manifest.load_texture()
-    manifest.require_same(digest(texture), versions())
+    manifest.require_same(digest(texture, manifest.scene), versions())
     device = runtime.start(manifest.arch, threads)
     watch.lap("startup")
     return _carry_out(manifest, Path(directory), device, texture, watch, progress, resumes=True)
@@ -201,8 +203,10 @@ def _carry_out(
     ):
         resumed = writer.stored
         pilot, reason = _pilot(manifest, device, cores, resumed=resumed > 0)
-        if pilot is not None:
-            opened.callback(pilot.close)
+        mesh = _mesh_pilot(manifest, device, cores, reason)
+        pilots = [one for one in (pilot, mesh) if one is not None]
+        for one in pilots:
+            opened.callback(one.close)
         rest = rest_positions(scene.sheet)
         for frame in range(resumed if scene.output else 0):
             progress("check", frame, resumed)
@@ -210,14 +214,14 @@ def _carry_out(
         watch.lap("startup")
         try:
             simulation.compile(partial(progress, "compile", 0, frames))
-            if pilot is not None:
-                pilot.compile()
+            for one in pilots:
+                one.compile()
             watch.lap("compile")
             if writer.saved:
                 simulation.go_on(writer.saved)
-            if pilot is not None:
-                for frame in range(1, writer.frames):
-                    pilot.follow(writer.position(frame) - rest, partial(progress, "pilot", frame, frames))
+            for frame in range(1, writer.frames if pilots else 0):
+                for one in pilots:
+                    one.follow(writer.position(frame) - rest, partial(progress, "pilot", frame, frames))
                 watch.lap("pilot")
             for frame in range(writer.frames, frames):
                 progress("frames", frame, frames)
@@ -230,8 +234,8 @@ def _carry_out(
                 watch.lap("render")
                 writer.add(position, picture, partial(progress, "frames", frame, frames))
                 watch.lap("hand over")
-                if pilot is not None and frame > 0:
-                    pilot.follow(position - rest, partial(progress, "frames", frame, frames))
+                for one in pilots if frame > 0 else ():
+                    one.follow(position - rest, partial(progress, "frames", frame, frames))
                     watch.lap("pilot")
             writer.finish(partial(progress, "frames", frames, frames))
         except KeyboardInterrupt:
@@ -247,7 +251,7 @@ def _carry_out(
                 raise
             ending = {"status": "interrupted"}
         except DivergedError as error:
-            pilot, reason = None, "the run diverged"
+            pilot, mesh, reason = None, None, "the run diverged"
             ending = {"status": "diverged", "error": str(error), "dump": None}
             with suppress(KeyboardInterrupt):
                 found = simulation.diagnose(writer.load(), partial(progress, "diagnosis", writer.frames, frames))
@@ -257,7 +261,8 @@ def _carry_out(
         progress("write", writer.frames, frames)
         writer.finish()
         estimate = manifest.estimate if pilot is None else pilot.estimate
-        record = {**ending, **_facts(manifest, simulation.progress, estimate, reason), "resumed": resumed}
+        known = Known(estimate, reason, None if mesh is None else mesh.error)
+        record = {**ending, **_facts(manifest, simulation.progress, known), "resumed": resumed}
         stages = ["startup", *(["pilot"] if estimate is not None else []), "compile", "simulate", "render"]
         seconds = {stage: watch.seconds.get(stage, 0.0) for stage in stages}
         record["timings"] = {**seconds, "encode": writer.encode_seconds, "total": watch.total()}
@@ -285,7 +290,27 @@ def _pilot(manifest: Manifest, device: Device, cores: int, *, resumed: bool) -> 
         return None, f"{device.arch} cannot run this scene in f64"
 
 
-def _facts(manifest: Manifest, progress: RunProgress, estimate: Estimate | None, reason: str) -> dict[str, Any]:
+def _mesh_pilot(manifest: Manifest, device: Device, cores: int, reason: str) -> MeshPilot | None:
+    """Begin the run with half the points a side, where the error is estimated at all."""
+    coarse = None if reason or manifest.asks_estimate is False else coarser(manifest.scene)
+    return None if coarse is None else MeshPilot(manifest.scene, coarse, device, cores)
+
+
+class Known(NamedTuple):
+    """What is known of the error of a run.
+
+    Attributes:
+        estimate: of the step and of rounding; None: not estimated.
+        reason: why not.
+        mesh_error: made by the number of points; None: not estimated, infinite: not known.
+    """
+
+    estimate: Estimate | None
+    reason: str
+    mesh_error: float | None
+
+
+def _facts(manifest: Manifest, progress: RunProgress, known: Known) -> dict[str, Any]:
     """Say what was run, and what is known of its last frame, for run.json."""
     scene, limit = manifest.scene, stable_step(manifest.scene)
     return {
@@ -299,13 +324,11 @@ def _facts(manifest: Manifest, progress: RunProgress, estimate: Estimate | None,
         "steps": progress.frame * steps_per_frame(scene),
         "max_displacement": progress.max_displacement,
         "shortest_spring": progress.shortest_spring,
-        "notes": list(
-            notes(
-                scene, progress.max_displacement, progress.shortest_spring, estimate, reason, reached=progress.frame > 0
-            )
-        ),
-        "error_estimate": None if estimate is None else error_record(estimate),
-        **({"error_estimate_reason": reason} if estimate is None else {}),
+        "longest_spring": progress.longest_spring,
+        "probes": probe_records(scene),
+        "notes": list(notes(scene, progress, *known)),
+        "error_estimate": None if known.estimate is None else error_record(known.estimate, known.mesh_error),
+        **({"error_estimate_reason": known.reason} if known.estimate is None else {}),
     }
 
 
@@ -318,10 +341,12 @@ def free_cores(scene: Scene) -> int:
     return max(1, resources.available_threads() - busy)
 
 
-def error_record(estimate: Estimate) -> dict[str, Any]:
+def error_record(estimate: Estimate, mesh_error: float | None = None) -> dict[str, Any]:
     """Write an estimate down for run.json, where null stands for a pilot run that diverged."""
-    known = {key: value if value < math.inf else None for key, value in asdict(estimate).items()}
-    return {key: known[key] for key in ("error", "rounding", "in_f64", "order")}
+    found = {key: asdict(estimate)[key] for key in ("error", "rounding", "in_f64", "order")}
+    if mesh_error is not None:
+        found["mesh_error"] = mesh_error
+    return {key: value if value < math.inf else None for key, value in found.items()}
 
 
 def versions() -> dict[str, str]:

@@ -5,7 +5,16 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
-from pydantic import BaseModel, ConfigDict, Field, StrictBool, ValidationError, field_validator, model_validator
+from pydantic import (
+    BaseModel,
+    ConfigDict,
+    Field,
+    StrictBool,
+    ValidationError,
+    ValidationInfo,
+    field_validator,
+    model_validator,
+)
 from pydantic_core import PydanticCustomError
 from typing_extensions import Self
 
@@ -20,6 +29,9 @@ MAX_REFINE = 64
 
 # Systems have a limit near this for the path of a file.
 MAX_PATH = 4096
+
+# The offset of a probe in the paper (eq. 5).
+DEFAULT_OFFSET = 10.0
 
 # Times that differ by less than this fraction of a frame are one instant: 0.1 s x 30 /s is 3 frames.
 WHOLE = 1e-6
@@ -94,7 +106,9 @@ class Sheet(Section):
     size: tuple[Positive, Positive] = key(
         means="height, width of the sheet at rest [m]", expects="two numbers above 0: [height, width] in metres"
     )
-    mass: Positive = key(means="mass of one point [kg]", expects="a number above 0, in kg")
+    mass: Positive | None = key(
+        None, means="mass of one point [kg]; required with springs", expects="a number above 0, in kg"
+    )
     fixed: Literal["border", "corners", "none"] | tuple[Side, ...] = key(
         "border",
         means="the points that never move",
@@ -102,8 +116,21 @@ class Sheet(Section):
     )
 
 
+class StiffnessMap(Section):
+    """Stiffness that differs from place to place, by the grey of an image over the whole sheet."""
+
+    image: FilePath = key(
+        means="a picture whose grey tells the stiffness; relative to the scene file, in its folder or below",
+        expects="the path of a picture",
+    )
+    range: tuple[Positive, Positive] = key(
+        means="factor of the stiffness where the picture is black, and where it is white; linear between",
+        expects="two numbers above 0: [black, white]",
+    )
+
+
 class Springs(Section):
-    """The stiffness of each family of springs; 0 leaves a family out."""
+    """The stiffness of each family of springs, per spring, as in the paper; 0 leaves a family out."""
 
     structural: NotNegative = key(
         0.0, means="springs to the 4 nearest neighbours [N/m]", expects="a number, 0 or more, in N/m"
@@ -119,10 +146,47 @@ class Springs(Section):
         means="when the virtual springs exist: while any probe's percent is not 0, or always",
         expects="loaded or always",
     )
+    map: StiffnessMap | None = key(
+        None, means="factor of structural and shear from place to place", expects="a mapping with image and range"
+    )
+
+
+class Tissue(Section):
+    """Tissue in physical units: a sheet of plane stress with Poisson's ratio 1/3, alike at any number of points."""
+
+    young: Positive = key(means="Young's modulus E [Pa]", expects="a number above 0, in Pa")
+    thickness: Positive = key(means="thickness t of the sheet [m]", expects="a number above 0, in metres")
+    density: Positive = key(means="density [kg/m3]", expects="a number above 0, in kg/m3")
+    foundation: NotNegative = key(
+        0.0,
+        means="of the tissue underneath: force per area and displacement [N/m3]; the virtual springs",
+        expects="a number, 0 or more, in N/m3",
+    )
+    foundation_active: Literal["loaded", "always"] = key(
+        "loaded",
+        means="when the foundation acts: while any probe's percent is not 0, or always",
+        expects="loaded or always",
+    )
+    damping: NotNegative = key(0.0, means="C / m [1/s]", expects="a number, 0 or more, in 1/s")
+    pretension: NotNegative = key(
+        0.0,
+        means="tension S of the sheet at rest [N/m]; every side must be fixed",
+        expects="a number, 0 or more, in N/m",
+    )
+    bending: Literal["plate"] | NotNegative = key(
+        0.0,
+        means="bending stiffness D [N m]; plate: E t^3 / (12 (1 - nu^2))",
+        expects="plate, or a number, 0 or more, in N m",
+    )
+    map: StiffnessMap | None = key(
+        None, means="factor of young from place to place", expects="a mapping with image and range"
+    )
 
 
 class Probe(Section):
     """A tool: where it acts, how hard, and when (eq. 5)."""
+
+    model_config = ConfigDict(json_schema_extra={"oneOf": [{"required": ["total"]}, {"required": ["force"]}]})
 
     at: tuple[Fraction, Fraction] | Annotated[tuple[tuple[Number, Fraction, Fraction], ...], Field(min_length=1)] = key(
         (0.5, 0.5),
@@ -130,8 +194,14 @@ class Probe(Section):
         "or keys [[t, across, down], ...], linear between, held outside",
         expects="[across, down], fractions from -1 to 2, or keys [[t, across, down], ...]",
     )
-    force: Vector = key(
-        means="force at 100 % [N]; on the point at the control point times e^-offset",
+    total: Vector | None = key(
+        None,
+        means="force of the whole tool on a wide sheet at 100 % [N]",
+        expects="three numbers: [x, y, z] in newtons",
+    )
+    force: Vector | None = key(
+        None,
+        means="instead of total, with springs: force at 100 % on one point [N], at the control point times e^-offset",
         expects="three numbers: [x, y, z] in newtons",
     )
     load: Annotated[tuple[tuple[Number, Number], ...], Field(min_length=1)] = key(
@@ -142,12 +212,42 @@ class Probe(Section):
     )
     falloff: NotNegative = key(
         150.0,
-        means="decay of the force with the distance from the control point [1/m]",
+        means="decay of the force with the distance from the control point, or from the tool's flat end [1/m]",
         expects="a number, 0 or more, in 1/m",
     )
-    offset: Annotated[Number, Field(ge=-50, le=1000)] = key(
-        10.0, means="exponent subtracted at the control point itself", expects="a number, -50 to 1000"
+    radius: NotNegative = key(
+        0.0, means="of the tool's flat end, where the force does not decay [m]", expects="a number, 0 or more, in m"
     )
+    offset: Annotated[Number, Field(ge=-50, le=1000)] = key(
+        DEFAULT_OFFSET,
+        means="exponent subtracted at the control point itself; with force only",
+        expects="a number, -50 to 1000",
+    )
+
+    @field_validator("force", mode="after")
+    @classmethod
+    def _one_force(cls, force: Vector | None, info: ValidationInfo) -> Vector | None:
+        total = info.data.get("total", force)
+        if force is None and total is None:
+            said = (
+                "missing; expected total, the whole tool's, or with springs force, on one point: [x, y, z] in newtons"
+            )
+            raise PydanticCustomError(REFUSED, said)
+        if "total" in info.data and force is not None and total is not None:
+            raise PydanticCustomError(REFUSED, "stands beside total; remove one of them")
+        return force
+
+    @field_validator("falloff", "offset", mode="after")
+    @classmethod
+    def _fit_total(cls, value: float, info: ValidationInfo) -> float:
+        if info.data.get("total") is not None:
+            if info.field_name == "falloff" and value == 0:
+                said = "0 would spread total over an endless sheet; take a number above 0, in 1/m"
+                raise PydanticCustomError(REFUSED, said)
+            if info.field_name == "offset" and value != DEFAULT_OFFSET:
+                said = "belongs to force, and total is the whole of it; remove offset"
+                raise PydanticCustomError(REFUSED, said)
+        return value
 
     @field_validator("at", "load", mode="after")
     @classmethod
@@ -287,6 +387,8 @@ class Render(Section):
 class Scene(Section):
     """Everything a run needs; what the YAML file says, checked and with its defaults filled in."""
 
+    model_config = ConfigDict(json_schema_extra={"oneOf": [{"required": ["tissue"]}, {"required": ["springs"]}]})
+
     image: FilePath | None = key(
         None,
         means="the picture on the sheet: PNG, JPEG, WebP, BMP or TIFF; relative to the scene file, "
@@ -298,11 +400,18 @@ class Scene(Section):
         means="x, y, width, height [px] of the part of the image that the sheet carries; default: all of it",
         expects="four whole numbers: [x, y, width, height] in pixels",
     )
-    sheet: Sheet = key(means="the sheet of mass points", expects="a mapping with points, size and mass")
-    springs: Springs = key(means="the springs", expects="a mapping with structural, shear, virtual")
-    damping: NotNegative = key(0.0, means="C, force per velocity [N s/m]", expects="a number, 0 or more, in N s/m")
+    sheet: Sheet = key(means="the sheet of mass points", expects="a mapping with points and size")
+    tissue: Tissue | None = key(
+        None, means="what the sheet is made of", expects="a mapping with young, thickness and density"
+    )
+    springs: Springs | None = key(
+        None, means="instead of tissue: the springs", expects="a mapping with structural, shear, virtual"
+    )
+    damping: NotNegative = key(
+        0.0, means="with springs: C, force per velocity [N s/m]", expects="a number, 0 or more, in N s/m"
+    )
     probes: Annotated[tuple[Probe, ...], Field(max_length=MAX_PROBES)] = key(
-        (), means="the tools", expects=f"a list of at most {MAX_PROBES} mappings with at, force, load"
+        (), means="the tools", expects=f"a list of at most {MAX_PROBES} mappings with at, total or force, load"
     )
     time: Time = key(means="time span, frames and steps", expects="a mapping with at least duration")
     render: Render = key(Render(), means="how a frame is drawn", expects="a mapping")
@@ -316,6 +425,20 @@ class Scene(Section):
     def draws(self) -> bool:
         """Whether any output is a picture."""
         return "png" in self.output or "gif" in self.output
+
+    @property
+    def stiffness_map(self) -> StiffnessMap | None:
+        """The map of the springs or the tissue."""
+        sheet = self.tissue or self.springs
+        return None if sheet is None else sheet.map
+
+    def with_map_image(self, image: str) -> Scene:
+        """Give the map, if there is one, another image."""
+        for name, sheet in (("tissue", self.tissue), ("springs", self.springs)):
+            if sheet is not None and sheet.map is not None:
+                other = sheet.model_copy(update={"map": sheet.map.model_copy(update={"image": image})})
+                return self.model_copy(update={name: other})
+        return self
 
     @model_validator(mode="after")
     def _picture_given(self) -> Scene:

@@ -89,6 +89,54 @@ def random_scene(seed: int, precision: str = "f64") -> Scene:
     )
 
 
+def random_tissue(seed: int, image: str, precision: str = "f64") -> Scene:
+    """A random scene of tissue with few points, as stiff for its size as `random_scene`; `image` is for maps."""
+    rng = np.random.default_rng(seed)
+
+    def some(low: float, high: float) -> float:
+        return float(rng.uniform(low, high))
+
+    sides = ["top", "bottom", "left", "right"]
+    rows, cols = int(rng.integers(3, 14)), int(rng.integers(3, 23))
+    fixed = ["border", "border", "corners", "none", [side for side in sides if rng.random() < 0.4]][rng.integers(5)]
+    cell = some(0.01, 0.02)
+    size = [cell * (rows - 1), cell * some(0.65, 1.5) * (cols - 1)]
+    moving = [[0.0, some(0, 1), some(0, 1)], [0.3, some(0, 1), some(0, 1)]]
+    probes = [
+        {
+            "at": moving if rng.random() < 0.5 else [some(0, 1), some(0, 1)],
+            "total": [some(-2, 2) for _ in range(3)],
+            "radius": some(0, 0.05) if rng.random() < 0.5 else 0.0,
+            "falloff": some(20, 60),
+            "load": [[0, 0], [0.1, 100], [0.25, some(-50, 50)], [0.25, 30]],
+        }
+        for _ in range(rng.integers(1, 3))
+    ]
+    tissue = {
+        "young": some(500, 2000),
+        "thickness": some(0.01, 0.02),
+        "density": 1000,
+        "foundation": some(1e3, 1e4) if rng.random() < 0.7 else 0,
+        "foundation_active": ["loaded", "always"][rng.integers(2)],
+        "damping": some(1, 10) if rng.random() < 0.8 else 0,
+        "pretension": some(0.5, 3) if fixed == "border" and rng.random() < 0.6 else 0,
+        "bending": ["plate", 0, some(1e-5, 3e-4)][rng.integers(3)],
+    }
+    if rng.random() < 0.5:
+        tissue["map"] = {"image": image, "range": [some(0.7, 1), some(1, 4)]}
+    return Scene(
+        sheet={"points": [rows, cols], "size": size, "fixed": fixed},
+        tissue=tissue,
+        probes=probes,
+        time={
+            "duration": 0.4,
+            "precision": precision,
+            "damping_difference": ["central", "backward"][rng.integers(2)],
+        },
+        output=[],
+    )
+
+
 def speckle(height: int, width: int, seed: int = 0) -> NDArray[np.uint8]:
     """A picture of random texels, the hardest to draw right."""
     return np.random.default_rng(seed).integers(0, 256, (height, width, 3), dtype=np.uint8)

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from taichi_msm.errors import SceneError
 from taichi_msm.physics import error_control
 from taichi_msm.physics.error_control import Estimate, Trials, choose_step, estimate_error, longest, order, refinement
+from taichi_msm.physics.run_progress import RunProgress
 from taichi_msm.physics.timestep import stable_step, step, steps_per_frame, with_steps, with_time
 from taichi_msm.physics.warnings import notes
 from taichi_msm.scene import Scene
@@ -20,6 +21,10 @@ from taichi_msm.simulation import Simulation
 from taichi_msm.system.runtime import Device
 from tests.motion import frames, true_error
 from tests.scenes import PRESS, SHEET, SPRINGS, scene
+
+# Of a run in which something moved.
+MOVED = RunProgress(1, 1.0)
+
 
 SOFT_PRESS = {**PRESS, "force": [0, 300, -1000]}
 STIFF = {"structural": 2e4, "shear": 1e4, "virtual": 5e2}
@@ -207,13 +212,13 @@ def test_damping_within_a_step_is_known_or_not_told(damping: float, device: Devi
     reference = frames(made, device, cut=128 * steps_per_frame(made))
     error = longest(frames(made, device) - reference) / longest(reference)
     assert error / 1.5 < estimate.error < 1.5 * error
-    assert "velocities change their sign" in "".join(notes(made, 1.0, 1.0, None))
+    assert "velocities change their sign" in "".join(notes(made, MOVED, None))
 
 
 def test_damping_within_a_hundredth_of_a_step_has_no_estimate(device: Device) -> None:
     made = scene(probes=[{**SOFT_PRESS, "load": [[0, 100]]}], damping=100.0)
     assert estimate_error(made, device).error == np.inf
-    assert next(notes(made, 1.0, 1.0, estimate_error(made, device))).startswith("error not known")
+    assert next(notes(made, MOVED, estimate_error(made, device))).startswith("error not known")
 
 
 @pytest.mark.parametrize("pulse", [[0.2005, 0.2006], [0.2, 0.2 + 1e-9], [0.2021, 0.2032]])
@@ -224,15 +229,15 @@ def test_the_error_of_a_load_shorter_than_a_step_is_known(pulse: list[float], de
     exact = frames(made, device, cut=64 * steps_per_frame(made))
     error = longest(frames(made, device) - exact) / longest(exact)
     assert error / 1.5 < estimate.error < 1.5 * error < 0.2
-    assert not list(notes(made, 1.0, 1.0, None))
+    assert not list(notes(made, MOVED, None))
 
 
 def test_a_scene_that_is_all_right_has_no_notes() -> None:
-    assert not list(notes(scene(), 1.0, 0.51, None))
-    assert next(notes(scene(), 0.0, 0.49, Estimate(40, 1e-3, 1e-4, 1e-3, 2))) == (
+    assert not list(notes(scene(), RunProgress(1, 1.0, 0.51), None))
+    assert next(notes(scene(), RunProgress(1, 0.0, 0.49), Estimate(40, 1e-3, 1e-4, 1e-3, 2))) == (
         "error 0.001 of the largest displacement (step 0.001, rounding 0.0001)"
     )
-    assert len(list(notes(scene(), 0.0, 0.49, None))) == 2
+    assert len(list(notes(scene(), RunProgress(1, 0.0, 0.49), None))) == 2
 
 
 def test_positions_written_in_f32_have_the_digits_of_the_sheet(device: Device) -> None:
@@ -269,9 +274,9 @@ def test_the_error_in_f64_is_that_of_the_step(device: Device) -> None:
     single, double = estimate_error(made, device), estimate_error(with_time(made, precision="f64"), device)
     assert single.in_f64 == pytest.approx(double.error, rel=1e-9)
     assert double.in_f64 == double.error
-    (said,) = notes(made, 1.0, 1.0, single)
+    (said,) = notes(made, MOVED, single)
     assert f"(step {double.error:.1g}, rounding {single.rounding:.1g})" in said
-    (said,) = notes(made, 1.0, 1.0, double)
+    (said,) = notes(made, MOVED, double)
     assert said.endswith("(of the step)")
 
 

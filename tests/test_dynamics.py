@@ -16,6 +16,7 @@ from taichi_msm import reference
 from taichi_msm.physics import kernel_cpu, kernel_gpu
 from taichi_msm.physics.kernel import Structure
 from taichi_msm.physics.lattice import rest_positions
+from taichi_msm.physics.material import material
 from taichi_msm.physics.solver import POINTS_PER_WORKER, Dynamics, structure
 from taichi_msm.physics.timestep import stable_step, step, steps_per_frame, with_steps
 from taichi_msm.scene import Scene
@@ -313,7 +314,7 @@ def energy(made: Scene, u: NDArray[Any], v: NDArray[Any]) -> float:
     """Kinetic and potential energy [J] at the middle of a step."""
     from taichi_msm.physics.lattice import springs
 
-    total = 0.5 * made.sheet.mass * (v**2).sum() + 0.5 * made.springs.virtual * (u**2).sum()
+    total = 0.5 * material(made).mass * (v**2).sum() + 0.5 * material(made).virtual * (u**2).sum()
     x = u + rest_positions(made.sheet)
     for spring in springs(made):
         if (spring.down, spring.right) > (0, 0):
@@ -366,6 +367,7 @@ def test_the_energy_is_that_of_motion_and_springs(seed: int, width: int, device:
     dynamics = Dynamics(made, device, layout if width > 1 else as_on_a_gpu(layout))
     dynamics.advance(33)
     state = dynamics.state()
+    assert made.springs is not None
     without_virtual = made.model_copy(update={"springs": made.springs.model_copy(update={"virtual": 0.0})})
     expected = energy(without_virtual, state.displacement, state.difference / step(made))
     assert dynamics.read().energy == pytest.approx(expected, rel=1e-12)

@@ -12,6 +12,7 @@ import pytest
 
 from taichi_msm import load_scene, resume, run, runner
 from taichi_msm.physics import workload
+from taichi_msm.physics.run_progress import RunProgress
 from taichi_msm.physics.timestep import steps_per_frame, with_time
 from taichi_msm.physics.warnings import notes
 from taichi_msm.physics.workload import affords_pilot, precision
@@ -23,6 +24,10 @@ from tests.scenes import PRESS, scene
 from tests.test_resume import Stop
 
 # A run of four frames that draws nothing.
+# Of a run in which something moved.
+MOVED = RunProgress(1, 1.0)
+
+
 SHORT = ["output=[trajectory]", "time.duration=0.4"]
 
 
@@ -93,7 +98,7 @@ def test_a_run_that_is_wrong_says_what_helps() -> None:
     from taichi_msm.physics.error_control import Estimate
 
     def said(error: float, rounding: float, in_f64: float) -> list[str]:
-        return list(notes(scene(), 1.0, 1.0, Estimate(10, error, rounding, in_f64, 2)))
+        return list(notes(scene(), MOVED, Estimate(10, error, rounding, in_f64, 2)))
 
     assert len(said(0.009, 0.0, 0.009)) == 1
     (_, step) = said(0.04, 0.0, 0.04)
@@ -103,7 +108,7 @@ def test_a_run_that_is_wrong_says_what_helps() -> None:
     (first, rounding) = said(0.03, 0.03, 1e-4)
     assert first == "error 0.03 of the largest displacement (step 0.0001, rounding 0.03)"
     assert rounding == (
-        "the run is about 3 % wrong; try time.precision: f64, or stiffer springs.virtual, where the sheet buckles"
+        "the run is about 3 % wrong; try time.precision: f64, or more springs.virtual, where the sheet buckles"
     )
 
 

@@ -39,7 +39,8 @@ probes:
     load: [[0, 0], [1, 100]]
 """
 
-ROOT_KEYS = "image, region, sheet, springs, damping, probes, time, render, output"
+ROOT_KEYS = "image, region, sheet, tissue, springs, damping, probes, time, render, output"
+NO_FORCE = "missing; expected total, the whole tool's, or with springs force, on one point: [x, y, z] in newtons"
 POINTS = "expected two whole numbers, 2 to 4096: [rows, cols]"
 A_PROBE_KEY = "expected keys [[t, percent], ...], t in seconds"
 AN_AT = "expected [across, down], fractions from -1 to 2, or keys [[t, across, down], ...]"
@@ -109,7 +110,7 @@ WRONG_KEYS = {
     ),
     "missing": (
         GOOD.replace("  mass: 1.0e-3\n", ""),
-        ["s.yaml:1:1: sheet.mass: missing; expected a number above 0, in kg"],
+        ["s.yaml:1:1: sheet.mass: missing; with springs expected a number above 0, in kg"],
     ),
     "missing section": (
         GOOD.replace("time:\n  duration: 0.4\n", ""),
@@ -117,7 +118,7 @@ WRONG_KEYS = {
     ),
     "missing in an item of a list": (
         GOOD + "probes:\n  - at: [0, 0]\n",
-        ["s.yaml:12:5: probes.0.force: missing; expected three numbers: [x, y, z] in newtons"],
+        [f"s.yaml:12:5: probes.0.force: {NO_FORCE}"],
     ),
     "missing in a camera": (
         GOOD + "render:\n  camera: {fov: 30}\n",
@@ -180,7 +181,7 @@ WRONG_VALUES = {
     ),
     "nothing": (
         GOOD.replace("1.0e-3", ""),
-        ["s.yaml:4:3: sheet.mass: null is not allowed; expected a number above 0, in kg"],
+        ["s.yaml:4:3: sheet.mass: missing; with springs expected a number above 0, in kg"],
     ),
     "infinite": (
         GOOD + "damping: .inf\n",
@@ -261,7 +262,7 @@ WRONG_VALUES = {
         GOOD + "probes:\n" + "  - {force: [0, 0, 1]}\n" * (MAX_PROBES + 1),
         [
             's.yaml:11:1: probes: [{"force": [0, 0, 1]}, {"force": [0, 0, 1]}, {"force": [0, 0... '
-            "is not allowed; expected a list of at most 16 mappings with at, force, load"
+            "is not allowed; expected a list of at most 16 mappings with at, total or force, load"
         ],
     ),
     "nothing to draw": (GOOD.replace("[]", "[png]"), [f"s.yaml:1:1: {NO_PICTURE}"]),
@@ -558,7 +559,7 @@ region: [-1, 0, 4, 4]
 extra: 1
 """
     assert lines(load, text, ["render.size=[0, 1]", "damping"], image="other.png") == [
-        "s.yaml:2:5: probes.0.force: missing; expected three numbers: [x, y, z] in newtons",
+        f"s.yaml:2:5: probes.0.force: {NO_FORCE}",
         "s.yaml:2:21: probes.0.load.1: goes back in time, from 0 s to -1 s; sort the keys by time",
         f"s.yaml:4:12: sheet.points.0: 1 is not allowed; {POINTS}",
         "s.yaml:6:3: sheet.mass: 0 is not allowed; expected a number above 0, in kg",
@@ -665,7 +666,7 @@ def test_an_override_mends_a_fault_of_the_file(load: Load) -> None:
         (["spring.shear=3"], "--set spring.shear=3: spring: unknown key; did you mean 'springs'?"),
         (
             ["sheet.mass="],
-            "--set sheet.mass=: sheet.mass: null is not allowed; expected a number above 0, in kg",
+            "--set sheet.mass=: sheet.mass: missing; with springs expected a number above 0, in kg",
         ),
         (
             ["render.camera={fov: 30}"],

@@ -23,13 +23,13 @@ class Stepper(Planes):
         self._advance = library(Path(__file__).with_name("step.cpp")).advance
         self._advance.argtypes = [FLOATS] * 5 + [ctypes.c_int64] * 3
         self._advance.restype = None
-        springs = problem.scene.springs
+        sheet = problem.material
         self._numbers = np.array(
             [
                 *spacing(problem.scene.sheet),
-                springs.structural,
-                springs.shear,
-                springs.virtual,
+                sheet.across,
+                sheet.shear,
+                sheet.virtual,
                 problem.keep,
                 problem.gain,
                 problem.first_gain,

@@ -22,7 +22,7 @@ class Stepper:
         self._load = tuple(jnp.array(share[1:-1, 1:-1]) for share in problem.load)
         stencil = springs(problem.scene)
         virtual, keep, gain, first_gain = (
-            problem.scene.springs.virtual,
+            problem.material.virtual,
             problem.keep,
             problem.gain,
             problem.first_gain,

@@ -92,7 +92,7 @@ class Stepper(Planes):
 
     def __init__(self, problem: Problem) -> None:
         super().__init__(problem.points)
-        springs = problem.scene.springs
+        sheet = problem.material
         dx, dy = spacing(problem.scene.sheet)
         self._numbers = tuple(
             np.float32(number)
@@ -100,9 +100,9 @@ class Stepper(Planes):
                 dx,
                 dy,
                 math.hypot(dx, dy),
-                springs.structural,
-                springs.shear,
-                springs.virtual,
+                sheet.across,
+                sheet.shear,
+                sheet.virtual,
                 problem.keep,
                 problem.gain,
                 problem.first_gain,

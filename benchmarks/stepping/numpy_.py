@@ -39,7 +39,7 @@ class Stepper:
 
     def _sum_forces(self) -> None:
         force, points = self._force, (self._problem.points,) * 2
-        np.multiply(self._now, np.float32(-self._problem.scene.springs.virtual), out=force)
+        np.multiply(self._now, np.float32(-self._problem.material.virtual), out=force)
         force += self._load
         for spring in self._problem.springs:
             here, there = ((slice(None), *end) for end in spring.ends(points))

@@ -17,7 +17,7 @@ class PlainTaichi:
         now, before, load = (ti.Vector.field(3, ti.f32, shape=(n, n)) for _ in range(3))
         load.from_numpy(problem.load.transpose(1, 2, 0).copy())
         stencil = [(s.down, s.right, *s.offset, s.length, s.stiffness) for s in springs(problem.scene)]
-        virtual, keep = problem.scene.springs.virtual, problem.keep
+        virtual, keep = problem.material.virtual, problem.keep
 
         @ti.kernel
         def step(now: ti.template(), before: ti.template(), gain: ti.f32):

@@ -23,6 +23,7 @@ from numpy.typing import NDArray
 from taichi_msm import reference
 from taichi_msm.physics.lattice import Spring, springs
 from taichi_msm.physics.loads import decay, probe_slots
+from taichi_msm.physics.material import Material, material
 from taichi_msm.physics.timestep import step
 from taichi_msm.scene import Scene
 
@@ -71,6 +72,11 @@ class Problem:
         )
 
     @cached_property
+    def material(self) -> Material:
+        """The numbers of the sheet."""
+        return material(self.scene)
+
+    @cached_property
     def springs(self) -> tuple[Spring, ...]:
         """Every spring once, from the point above or to the left."""
         return tuple(spring for spring in springs(self.scene) if (spring.down, spring.right) > (0, 0))
@@ -90,16 +96,16 @@ class Problem:
     @property
     def gain(self) -> float:
         """Displacement for a force [m/N]."""
-        return step(self.scene) ** 2 / self.scene.sheet.mass / (1 + self._drag)
+        return step(self.scene) ** 2 / self.material.mass / (1 + self._drag)
 
     @property
     def first_gain(self) -> float:
         """The same of the first step."""
-        return step(self.scene) ** 2 / self.scene.sheet.mass / 2
+        return step(self.scene) ** 2 / self.material.mass / 2
 
     @property
     def _drag(self) -> float:
-        return self.scene.damping * step(self.scene) / self.scene.sheet.mass / 2
+        return self.material.drag * step(self.scene) / 2
 
     def answer(self, steps: int) -> NDArray[np.float64]:
         """Take the steps by the program's float64 twin; shape (n, n, 3)."""

@@ -59,12 +59,12 @@ class WarpStepper:
     """The state as displacements u_n and u_{n-1}."""
 
     def __init__(self, problem: Problem) -> None:
-        n, springs = problem.points, problem.scene.springs
+        n, sheet = problem.points, problem.material
         self._now, self._before = (wp.zeros((n, n), dtype=wp.vec3, device="cpu") for _ in range(2))
         self._load = wp.array(problem.load.transpose(1, 2, 0).copy(), dtype=wp.vec3, device="cpu")
         numbers = self._numbers = Numbers()
         numbers.dx, numbers.dy = spacing(problem.scene.sheet)
-        numbers.structural, numbers.shear, numbers.ground = springs.structural, springs.shear, springs.virtual
+        numbers.structural, numbers.shear, numbers.ground = sheet.across, sheet.shear, sheet.virtual
         numbers.keep = problem.keep
         self._gain, self._next_gain = problem.first_gain, problem.gain
 

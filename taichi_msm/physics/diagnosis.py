@@ -10,7 +10,7 @@ import numpy as np
 
 from taichi_msm.physics.divergence import Watch, farthest
 from taichi_msm.physics.lattice import axes
-from taichi_msm.physics.loads import control_points
+from taichi_msm.physics.probe_force import control_points, probe_force
 from taichi_msm.physics.run_progress import RunProgress, Saved
 from taichi_msm.physics.solver import Dynamics
 from taichi_msm.physics.timestep import step, steps_per_frame, with_steps
@@ -96,7 +96,8 @@ def _cause(dynamics: Dynamics, bad: int, point: tuple[int, int], pause: Pause) -
             return f"likely cause: time.step, {step(scene):.6g} s; with {step(finer):.9g} s it goes well here"
         tried = step(finer)
     index, force = _strongest_probe(scene, point)
-    said = f"likely cause: probes.{index}.force, which reaches {force:.3g} N at this point"
+    name = "force" if scene.probes[index].total is None else "total"
+    said = f"likely cause: probes.{index}.{name}, which reaches {force:.3g} N at this point"
     if tried < math.inf:
         return f"{said}; take less, as no time.step of {tried:.3g} s or more goes well here"
     return f"{said}; take less, or a time.step below {step(scene):.6g} s, of which none was tried, as that takes long"
@@ -121,8 +122,8 @@ def _strongest_probe(scene: Scene, point: tuple[int, int]) -> tuple[int, float]:
     def force(index: int) -> float:
         probe = scene.probes[index]
         nearest = np.linalg.norm(control_points(probe, scene.sheet)[1] - rest, axis=1).min()
-        most = max(abs(percent) for _, percent in probe.load) / 100 * math.hypot(*probe.force)
-        return float(most * math.exp(-probe.falloff * nearest - probe.offset))
+        acts, most = probe_force(probe, scene.sheet), max(abs(percent) for _, percent in probe.load) / 100
+        return most * math.hypot(*acts.force) * float(acts.decay(nearest))
 
     strongest = max(range(len(scene.probes)), key=force)
     return strongest, force(strongest)

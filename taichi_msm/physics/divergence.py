@@ -10,6 +10,8 @@ from numpy.typing import NDArray
 
 from taichi_msm.physics.lattice import axes, spacing
 from taichi_msm.physics.loads import Envelope, ProbeSlot, decay, probe_slots
+from taichi_msm.physics.material import material
+from taichi_msm.physics.probe_force import probe_force
 from taichi_msm.physics.run_progress import RunProgress
 from taichi_msm.physics.state import Reading
 from taichi_msm.physics.timestep import stable_step, step
@@ -29,16 +31,17 @@ ROUNDING = 1e-9
 
 def _is_held(scene: Scene) -> bool:
     """Tell whether springs lead from every point to one that is fixed; those of shear may leave every other one out."""
-    return scene.sheet.fixed not in ("none", ()) and scene.springs.structural > 0
+    made = material(scene)
+    return scene.sheet.fixed not in ("none", ()) and min(made.across, made.down) > 0
 
 
 def _free_acceleration(scene: Scene) -> float:
     """Bound the acceleration that the probes give a point that nothing holds [m/s^2]."""
     forces = (
-        math.hypot(*probe.force) * max(abs(percent) for _, percent in probe.load) / 100 * math.exp(-probe.offset)
+        probe_force(probe, scene.sheet).size * max(abs(percent) for _, percent in probe.load) / 100
         for probe in scene.probes
     )
-    return sum(forces) / scene.sheet.mass
+    return sum(forces) / material(scene).mass
 
 
 def farthest_displacement(scene: Scene, time: float, acceleration: float | None = None) -> float:
@@ -52,7 +55,8 @@ def farthest_displacement(scene: Scene, time: float, acceleration: float | None 
     most = MOST_SHEET_SIZES * max(scene.sheet.size)
     if _is_held(scene):
         return most
-    if scene.springs.virtual > 0 and scene.springs.virtual_active == "loaded":
+    made = material(scene)
+    if made.virtual > 0 and not made.always:
         # They may pull a point from afar and let it go when it is fast.
         return math.inf
     return most + (_free_acceleration(scene) if acceleration is None else acceleration) * time * time / 2
@@ -79,7 +83,7 @@ class Watch:
 
     def __init__(self, scene: Scene, progress: RunProgress | None = None) -> None:
         self.progress = progress or RunProgress()
-        self._scene = scene
+        self._scene, self._material = scene, material(scene)
         self._loads = Envelope(scene)
         self._acceleration = _free_acceleration(scene)
         self._shares = np.array([_share(slot, scene) for slot in probe_slots(scene)])
@@ -102,6 +106,7 @@ class Watch:
                 frame=progress.frame + 1,
                 max_displacement=max(progress.max_displacement, where.distance),
                 shortest_spring=min(progress.shortest_spring, reading.shortest_spring),
+                longest_spring=max(progress.longest_spring, reading.longest_spring),
                 energy=reading.energy,
                 reach=where.reach,
                 peak=max(progress.peak, reading.energy),
@@ -129,7 +134,7 @@ class Watch:
 
     def _most_energy(self, begin: float, end: float) -> float:
         """Bound the energy at the end of a time by what it was at its beginning, a frame that was taken note of [J]."""
-        progress, mass, virtual = self.progress, self._scene.sheet.mass, self._scene.springs.virtual / 2
+        progress, mass, virtual = self.progress, self._material.mass, self._material.virtual / 2
         forces, active, activations = self._loads.between(begin, end)
         push = float((forces * self._shares).sum())
         # Products and no powers, which raise where a product is infinite.
@@ -172,8 +177,9 @@ def _underflow(scene: Scene) -> float:
     """Tell the energy below which the squares that it is summed from have no digits [J]."""
     tiny = float(np.finfo(np.float32 if precision(scene) == "f32" else np.float64).tiny)
     dx, dy = spacing(scene.sheet)
-    stiffness = scene.springs.structural + scene.springs.shear
-    return math.prod(scene.sheet.points) * tiny * (scene.sheet.mass / step(scene) ** 2 + stiffness * (dx**2 + dy**2))
+    made = material(scene)
+    stiffness = max(made.across, made.down) + made.shear
+    return math.prod(scene.sheet.points) * tiny * (made.mass / step(scene) ** 2 + stiffness * (dx**2 + dy**2))
 
 
 def _share(slot: ProbeSlot, scene: Scene) -> float:
@@ -182,7 +188,6 @@ def _share(slot: ProbeSlot, scene: Scene) -> float:
         return float(np.linalg.norm(decay(slot, scene)))
     # From anywhere the points are no nearer than from one of them, but for half a cell; and around one there are no
     # more than in four sheets that meet there.
-    probe = scene.probes[slot.probe]
     x, y = axes(scene.sheet)
     nearest = np.maximum(np.hypot(x - x[0], y - y[0]) - math.hypot(*spacing(scene.sheet)) / 2, 0)
-    return 2 * float(np.linalg.norm(np.exp(-probe.falloff * nearest - probe.offset)))
+    return 2 * float(np.linalg.norm(probe_force(scene.probes[slot.probe], scene.sheet).decay(nearest)))

@@ -23,6 +23,7 @@ from numpy.typing import NDArray
 from taichi_msm.errors import SceneError
 from taichi_msm.physics.divergence import farthest_displacement
 from taichi_msm.physics.lattice import rest_positions
+from taichi_msm.physics.material import material
 from taichi_msm.physics.solver import Dynamics
 from taichi_msm.physics.timestep import step, steps_per_frame, with_steps, with_time
 from taichi_msm.physics.workload import precision, with_precision
@@ -63,7 +64,7 @@ class Estimate:
 
 def order(scene: Scene) -> int:
     """Tell the order of the method: 1 with backward differences of a damping, else 2."""
-    return 2 if scene.time.damping_difference == "central" or scene.damping == 0 else 1
+    return 2 if scene.time.damping_difference == "central" or material(scene).drag == 0 else 1
 
 
 def estimate_error(scene: Scene, device: Device, progress: Count = lambda done, total: None) -> Estimate:
@@ -102,10 +103,10 @@ def choose_step(scene: Scene, device: Device, progress: Count = lambda done, tot
 def refinement(scene: Scene) -> int:
     """Tell how much finer the other pilot must be: twice, where steps resolve the damping.
 
-    Where g h / r > 1, central differences make velocities change their sign at every step, in both pilots alike.
+    Where g h / r > 1, with g = C / m, central differences make velocities change their sign at every step, in both
+    pilots alike.
     """
-    g = scene.damping / scene.sheet.mass
-    return max(2, math.ceil(g * step(scene)))
+    return max(2, math.ceil(material(scene).drag * step(scene)))
 
 
 class Pilot:

@@ -5,9 +5,12 @@ vectors, row after row, each of `width` entries: one for every column of a strip
 arrays are one-dimensional, as every index then takes a few instructions less:
 
     u, d         displacements and last differences, three arrays each, of x, y and z
-    by_column    whether the points move, of a first, middle and last row; their place across [m]; whether they have a
-                 left and a right neighbour: six rows
+    by_column    of a first, middle and last row: 1 over the points' share of a cell's mass, 0 where they are fixed; and
+                 their share of its area. Their place across [m]; whether they have a left and a right neighbour
     decay        of every standing slot, as many rows as the sheet has
+    stiffness    with a map: of every spring along a row, as many rows as the sheet has; of those along a column and of
+                 the diagonals, a row more, with a row of zeros first and last
+    moment       with bending: D dx dy times the Laplacian of u, of rows that are needed
 
 Vectors stay vectors down to the machine code (docs/decisions/0010), where some operations of Taichi's crash or are
 wrong: there are no unary minus, `-=`, abs, any and all of vectors here, and exp is taken lane by lane.
@@ -25,16 +28,17 @@ from numpy.typing import NDArray
 
 from taichi_msm.system.runtime import Memory, our_compilation, ti
 
-# Rows of the array by_column; the first three say which points of a first, a middle and a last row move.
-MOVES, ACROSS, HAS_LEFT, HAS_RIGHT = 0, 3, 4, 5
+# Rows of the array by_column; of MOVES and of AREA there are three, for a first, a middle and a last row.
+MOVES, AREA, ACROSS, HAS_LEFT, HAS_RIGHT, COLUMN_ROWS = 0, 3, 6, 7, 8, 9
 
 # Columns of the table of loads: gain, stiffness of the virtual springs, then for each slot force (3), point (2),
-# falloff and offset.
-SLOT_COLUMN, SLOT_COLUMNS = 2, 7
+# falloff, shift and offset.
+SLOT_COLUMN, SLOT_COLUMNS = 2, 8
 
-# What is read of every row of points: the least of (L^2 - L0^2) / L0^2, the sums of (L / L0 - 1)^2 of springs along the
-# row, down and diagonal, and the sum of |d|^2.
-MEASURES = 5
+# What is read of every row of points: the least and the largest (L^2 - L0^2) / L0^2; sums over the springs along the
+# row, down and diagonal of (L / L0 - 1)^2, with a map times their stiffness, and under tension of |q|^2 / L0^2; the sum
+# of |d|^2 times the share of mass; with bending that of the Laplacian's square.
+LEAST, MOST, STRETCHED, TENSE, MOTION, BENT, MEASURES = 0, 1, 2, 5, 8, 9, 10
 
 # Bytes of a number.
 BYTES = {"f32": 4, "f64": 8}
@@ -49,9 +53,14 @@ class Code:
         lanes: strips of columns.
         structural, shear: whether there are springs of that family.
         open_edges: whether a point at an edge moves, so that springs beyond the edge must be left out.
+        by_area: whether points and springs at such an edge have less than others, as they belong to fewer cells.
+        mapped: whether the stiffness of every spring is read from an array.
+        tense: whether the sheet is under tension at rest.
+        bending: whether it resists bending.
         virtual: whether there are virtual springs.
         damped: whether there is damping.
         slots_move: for every probe slot whether it moves.
+        slots_by_area: for every probe slot whether points at an open edge get less of its force.
     """
 
     precision: str
@@ -59,9 +68,14 @@ class Code:
     structural: bool
     shear: bool
     open_edges: bool
+    by_area: bool
+    mapped: bool
+    tense: bool
+    bending: bool
     virtual: bool
     damped: bool
     slots_move: tuple[bool, ...]
+    slots_by_area: tuple[bool, ...]
 
     @property
     def real(self) -> Any:
@@ -72,6 +86,11 @@ class Code:
     def vector(self) -> Any:
         """Taichi's type of a vector of lanes."""
         return ti.types.vector(self.lanes, self.real)
+
+    @property
+    def border_rows(self) -> int:
+        """Rows beside a band of rows that it needs."""
+        return 2 if self.bending else 1
 
     @property
     def load_columns(self) -> int:
@@ -113,13 +132,16 @@ class Start(NamedTuple):
     """What the arrays of a sheet hold at the start.
 
     Attributes:
-        by_column: of the array of that name, shape (6, cols).
+        by_column: of the array of that name, shape (COLUMN_ROWS, cols).
         decay: likewise, shape (standing slots, rows, cols).
+        stiffness: of springs along rows, along columns and of diagonals, shapes (rows, cols) and twice (rows + 1,
+            cols); None without a map.
         state: displacements and differences, each of shape (rows, cols, 3); None: at rest.
     """
 
     by_column: NDArray[Any]
     decay: NDArray[Any]
+    stiffness: tuple[NDArray[Any], NDArray[Any], NDArray[Any]] | None
     state: tuple[NDArray[Any], NDArray[Any]] | None
 
 
@@ -189,7 +211,7 @@ class SheetArrays:
     """
 
     def __init__(self, s: Structure, stored: NDArray[np.int32], start: Start) -> None:
-        by_column, decay, state = start
+        by_column, decay, stiffness, state = start
         self._s = s
         self._memory = Memory()
         self._fill, clear = _filling(s.code)
@@ -197,8 +219,11 @@ class SheetArrays:
         self.d = [self.rows(s.rows) for _ in range(3)]
         self.by_column = self.rows(len(by_column))
         self.decay = self.rows(max(1, len(decay)) * s.rows)
+        self.stiffness = [self.rows(s.rows + 1 if s.code.mapped else 1) for _ in range(3)]
         with our_compilation():
             self._fill(self.by_column, in_lanes(s, by_column))
+            for array, values in zip(self.stiffness, stiffness or (), strict=False):
+                self._fill(array, in_lanes(s, values))
             for c in range(3):
                 if state is None:
                     clear(self.u[c], len(stored) * s.width)
@@ -232,9 +257,10 @@ def spring_forces(code: Code) -> tuple[Callable[..., Any], Callable[..., Any]]:
 
         k (L - L0) (Q - P) / L = k (L^2 - L0^2) / (L^2 + L0 L) (o + q)                         (eq. 2)
 
-    keeps the digits of a small motion on a large sheet. Swapping P and Q changes its sign and not one bit more.
+    keeps the digits of a small motion on a large sheet. Swapping P and Q changes its sign and not one bit more. Under
+    tension it is tau q more (see `material`).
     """
-    open_edges = code.open_edges
+    open_edges, tense = code.open_edges and not code.mapped, code.tense
     # Keeps L = 0 from dividing by 0: the force is then 0, as Q - P is. A literal in a kernel is f32, also among f64.
     tiny = 1e-36
 
@@ -243,17 +269,22 @@ def spring_forces(code: Code) -> tuple[Callable[..., Any], Callable[..., Any]]:
         return stiffness * longer / (square + length * ti.sqrt(square))
 
     @ti.func
-    def along(x, y, z, dx, stiffness, exists):
+    def along(x, y, z, dx, stiffness, tension, exists):
         """Force by the right neighbour, whose displacement is (x, y, z) more; exists: 0 where there is none."""
         to_x = x + dx
         rest = y * y + z * z
         force = pull(x * (to_x + dx) + rest, to_x * to_x + rest + tiny, dx, stiffness)
         if ti.static(open_edges):
             force *= exists
-        return force * to_x, force * y, force * z
+        force_x, force_y, force_z = force * to_x, force * y, force * z
+        if ti.static(tense):
+            force_x += tension * x
+            force_y += tension * y
+            force_z += tension * z
+        return force_x, force_y, force_z
 
     @ti.func
-    def to_other_row(x, y, z, right: ti.template(), dx, dy, length, stiffness, exists):
+    def to_other_row(x, y, z, right: ti.template(), dx, dy, length, stiffness, tension, exists):
         """Force by the entry `right` of a row dy above, whose displacement is (x, y, z) more; exists: 0 for none."""
         to_x = x
         to_y = y + dy
@@ -264,18 +295,25 @@ def spring_forces(code: Code) -> tuple[Callable[..., Any], Callable[..., Any]]:
         force = pull(longer, to_x * to_x + to_y * to_y + z * z + tiny, length, stiffness)
         if ti.static(open_edges):
             force *= exists
-        return force * to_x, force * to_y, force * z
+        force_x, force_y, force_z = force * to_x, force * to_y, force * z
+        if ti.static(tense):
+            force_x += tension * x
+            force_y += tension * y
+            force_z += tension * z
+        return force_x, force_y, force_z
 
     return along, to_other_row
 
 
-def strains(code: Code) -> Callable[..., Any]:
-    """Make the function that tells how far springs are stretched: those to the right of an entry and to a row below.
+def measuring(code: Code) -> Callable[..., Any]:
+    """Make the function that measures an entry of the sheet: its springs to the right and to the row below, its motion.
 
-    The function gives, in every lane, the least (L^2 - L0^2) / L0^2 of all of them, and the sums of (L / L0 - 1)^2 of
-    those along the row, those down and the diagonals.
+    The function gives vectors of lanes, as many as MEASURES and in their order.
     """
-    vector, open_edges, structural, shear = code.vector, code.open_edges, code.structural, code.shear
+    real, vector, open_edges = code.real, code.vector, code.open_edges
+    structural, shear = code.structural, code.shear
+    mapped, tense, by_area, bending = code.mapped, code.tense, code.by_area, code.bending
+    laplacian = five_point()
 
     @ti.func
     def longer(u: ti.template(), by_column: ti.template(), width, p, q, b, right: ti.template(), x0, y0):
@@ -283,13 +321,15 @@ def strains(code: Code) -> Callable[..., Any]:
         x = u[0][q * width + b + right] - u[0][p * width + b]
         y = u[1][q * width + b + right] - u[1][p * width + b]
         z = u[2][q * width + b + right] - u[2][p * width + b]
-        share = (x * (x + 2 * x0) + (y * (y + 2 * y0) + z * z)) / (x0 * x0 + y0 * y0)
+        square = x0 * x0 + y0 * y0
+        share = (x * (x + 2 * x0) + (y * (y + 2 * y0) + z * z)) / square
+        apart = (x * x + y * y + z * z) / square
         # Beyond the edge there is no spring.
         if ti.static(open_edges and right < 0):
             share = ti.select(by_column[HAS_LEFT * width + b] > 0, share, vector(0))
         if ti.static(open_edges and right > 0):
             share = ti.select(by_column[HAS_RIGHT * width + b] > 0, share, vector(0))
-        return share
+        return share, apart
 
     @ti.func
     def square(share):
@@ -298,26 +338,79 @@ def strains(code: Code) -> Callable[..., Any]:
         return stretch * stretch
 
     @ti.func
-    def strain(u: ti.template(), by_column: ti.template(), width, p, q, b, dx, dy, exists):
-        """Entry b of row p, and row q below it if it exists."""
-        least, right, below, across = vector(0), vector(0), vector(0), vector(0)
+    def measure(
+        u: ti.template(), d: ti.template(), by_column: ti.template(), stiffness: ti.template(),
+        width, rows, p, i, b, dx, dy,
+    ):  # fmt: skip
+        """Measure entry b of row i of the sheet, stored in row p of u, and the row below it, the next one."""
+        least, most, motion, bent = vector(0), vector(0), vector(0), vector(0)
+        along, below, across = vector(0), vector(0), vector(0)
+        along_apart, below_apart, across_apart = vector(0), vector(0), vector(0)
+        kind = ti.select(i == rows - 1, 2, ti.select(i == 0, 0, 1))
         if ti.static(structural):
-            share = longer(u, by_column, width, p, p, b, 1, dx, 0)
+            share, apart = longer(u, by_column, width, p, p, b, 1, dx, 0)
             least = ti.min(least, share)
-            right = square(share)
-        if exists:
+            most = ti.max(most, share)
+            along = square(share)
+            if ti.static(tense):
+                along_apart = apart
+            if ti.static(mapped):
+                along *= stiffness[0][i * width + b]
+            elif ti.static(by_area):
+                along *= ti.select(kind == 1, 1.0, 0.5)
+        if i < rows - 1:
             if ti.static(structural):
-                share = longer(u, by_column, width, p, q, b, 0, 0, -dy)
+                share, apart = longer(u, by_column, width, p, p + 1, b, 0, 0, -dy)
                 least = ti.min(least, share)
+                most = ti.max(most, share)
                 below = square(share)
+                if ti.static(tense):
+                    below_apart = apart
+                if ti.static(mapped):
+                    below *= stiffness[1][(i + 1) * width + b]
+                elif ti.static(by_area):
+                    below *= by_column[(AREA + 1) * width + b]
             if ti.static(shear):
-                one = longer(u, by_column, width, p, q, b, -1, -dx, -dy)
-                other = longer(u, by_column, width, p, q, b, 1, dx, -dy)
+                one, one_apart = longer(u, by_column, width, p, p + 1, b, -1, -dx, -dy)
+                other, other_apart = longer(u, by_column, width, p, p + 1, b, 1, dx, -dy)
                 least = ti.min(least, ti.min(one, other))
-                across = square(one) + square(other)
-        return least, right, below, across
+                most = ti.max(most, ti.max(one, other))
+                if ti.static(tense):
+                    across_apart = one_apart + other_apart
+                if ti.static(mapped):
+                    left, right = stiffness[2][(i + 1) * width + b - 1], stiffness[2][(i + 1) * width + b]
+                    across = left * square(one) + right * square(other)
+                else:
+                    across = square(one) + square(other)
+        for c in ti.static(range(3)):
+            change = d[c][i * width + b]
+            motion += change * change
+        if ti.static(by_area):
+            motion *= by_column[(AREA + kind) * width + b]
+        if ti.static(bending):
+            # Only an inner row has one before it and one after it.
+            inside = by_column[HAS_LEFT * width + b] * by_column[HAS_RIGHT * width + b] * ti.cast(kind == 1, real)
+            before, after = p - ti.cast(kind == 1, ti.i32), p + ti.cast(kind == 1, ti.i32)
+            for c in ti.static(range(3)):
+                curved = inside * laplacian(u, c, width, before, p, after, b, 1 / (dx * dx), 1 / (dy * dy))
+                bent += curved * curved
+        return least, most, along, below, across, along_apart, below_apart, across_apart, motion, bent
 
-    return strain
+    return measure
+
+
+def five_point() -> Callable[..., Any]:
+    """Make the function that gives the five-point Laplacian of an array."""
+
+    @ti.func
+    def laplacian(field: ti.template(), c: ti.template(), width, before, row, after, b, across, down):
+        """Of component c at entry b of a row, between the rows before and after; across, down: 1 / dx^2, 1 / dy^2."""
+        here = field[c][row * width + b]
+        beside = (field[c][row * width + b - 1] - here) + (field[c][row * width + b + 1] - here)
+        over = (field[c][before * width + b] - here) + (field[c][after * width + b] - here)
+        return across * beside + down * over
+
+    return laplacian
 
 
 def point_step(code: Code) -> Callable[..., None]:
@@ -327,19 +420,36 @@ def point_step(code: Code) -> Callable[..., None]:
     """
     vector, lanes = code.vector, code.lanes
     virtual, damped, slot_moves = code.virtual, code.damped, code.slots_move
+    by_area, slot_by_area = code.by_area, code.slots_by_area
+    bending, laplacian = code.bending, five_point()
     standing = [slot_moves[:n].count(False) for n in range(len(slot_moves))]
 
     @ti.func
     def move(
         u: ti.template(), d: ti.template(), by_column: ti.template(), decay: ti.template(),
-        rows, width, q, i, b, kind, x, y, z, spring_x, spring_y, spring_z, keep, dy, top, now,
+        moment: ti.template(), rows, width, q, i, b, kind, before, here, after,
+        x, y, z, spring_x, spring_y, spring_z, keep, dx, dy, top, now,
     ):  # fmt: skip
-        """Step entry b of row i of the sheet, displaced by (x, y, z), into row q of u; now is a row of the loads."""
+        """Step entry b of row i of the sheet, displaced by (x, y, z), into row q of u; now is a row of the loads.
+
+        The moments of the row and its neighbours are in rows before, here and after.
+        """
         force_x, force_y, force_z = spring_x, spring_y, spring_z
+        if ti.static(bending):
+            across, down = 1 / (dx * dx), 1 / (dy * dy)
+            force_x = force_x - laplacian(moment, 0, width, before, here, after, b, across, down)
+            force_y = force_y - laplacian(moment, 1, width, before, here, after, b, across, down)
+            force_z = force_z - laplacian(moment, 2, width, before, here, after, b, across, down)
         if ti.static(virtual):
-            force_x = force_x - now[1] * x
-            force_y = force_y - now[1] * y
-            force_z = force_z - now[1] * z
+            if ti.static(by_area):
+                held = now[1] * by_column[(AREA + kind) * width + b]
+                force_x = force_x - held * x
+                force_y = force_y - held * y
+                force_z = force_z - held * z
+            else:
+                force_x = force_x - now[1] * x
+                force_y = force_y - now[1] * y
+                force_z = force_z - now[1] * z
         for g in ti.static(range(len(slot_moves))):
             column = ti.static(SLOT_COLUMN + SLOT_COLUMNS * g)
             share = vector(0)
@@ -347,14 +457,17 @@ def point_step(code: Code) -> Callable[..., None]:
                 off_x = by_column[ACROSS * width + b] - now[column + 3]
                 off_y = top - i * dy - now[column + 4]
                 exponent = now[column + 5] * ti.sqrt(off_x * off_x + off_y * off_y) + now[column + 6]
+                exponent = ti.max(exponent, now[column + 7])
                 share = vector([ti.exp(-exponent[lane]) for lane in ti.static(range(lanes))])
+                if ti.static(slot_by_area[g]):
+                    share *= by_column[(AREA + kind) * width + b]
             else:
                 share = decay[(standing[g] * rows + i) * width + b]
             force_x += now[column] * share
             force_y += now[column + 1] * share
             force_z += now[column + 2] * share
 
-        gain = now[0] * by_column[kind * width + b]
+        gain = now[0] * by_column[(MOVES + kind) * width + b]
         d_x, d_y, d_z = d[0][i * width + b], d[1][i * width + b], d[2][i * width + b]
         if ti.static(damped):
             d_x *= keep

@@ -16,6 +16,10 @@ there at the same time. There each needs the other's row as it was before the st
 one of two copies, and wait for the other's. The order in which forces are added does not depend on the way of a sweep;
 so the bits of a result do not depend on the number of workers.
 
+Bending. A moment is the Laplacian of the displacements, and the force on a row is the Laplacian of the moments. So
+before a row is stepped, the moments of the row ahead of it are taken, which see one row more; a pass is one step; and
+neighbours have copies of two rows.
+
 Company. A worker that waits spins, for some time at most: its partner may have no core, as another program has it. Then
 it writes down where it is and ends, which gives its core away, and another launch goes on from there, until all
 have taken the same steps. Then a single worker takes over for some time.
@@ -32,18 +36,21 @@ import numpy as np
 from numpy.typing import NDArray
 
 from taichi_msm.physics.kernel import (
+    AREA,
     BYTES,
     HAS_LEFT,
     HAS_RIGHT,
-    MOVES,
+    LEAST,
+    MOST,
     Code,
     ReadArguments,
     SheetArrays,
     Start,
     Structure,
+    five_point,
+    measuring,
     point_step,
     spring_forces,
-    strains,
 )
 from taichi_msm.system.runtime import ITERATIONS_PER_THREAD, our_compilation, ti
 
@@ -64,6 +71,9 @@ SHORTEST_REST, LONGEST_REST = 0.002, 1.0
 
 # Where a worker is: pass, round and step of the round.
 PLACE = 3
+
+# Rows of moments that a worker needs at a time.
+MOMENTS = 3
 
 
 class Kernels(NamedTuple):
@@ -98,6 +108,7 @@ class Sweep:
         self._carried_rows = s.depth - (-PAGE // (s.width * s.code.lanes * BYTES[s.code.precision]))
         # For every worker and step of a pass the forces carried to a row, with the sign of those on the row before.
         self._carried = [self._arrays.rows(s.workers * self._carried_rows) for _ in range(3)]
+        self._moment = [self._arrays.rows(MOMENTS * s.workers if s.code.bending else 1) for _ in range(3)]
         # The number of steps that each border of each worker has done.
         self._done = np.zeros(2 * s.workers * COUNTER_STRIDE, np.int64)
 
@@ -106,7 +117,8 @@ class Sweep:
 
         Args:
             count: how many.
-            numbers: keep, dx, dy, stiffness of structural and shear springs, y of the first row.
+            numbers: keep, dx, dy; stiffness of springs along rows, along columns and of diagonals, their tensions;
+                D dx dy; y of the first row.
             table: of the loads, shape (count, columns).
         """
         together = self._s.workers > 1 and time.perf_counter() >= self._rests_until
@@ -135,7 +147,9 @@ class Sweep:
         s, arrays = self._s, self._arrays
         read = self._kernels.read_together if s.workers > 1 else self._kernels.read_alone
         with our_compilation():
-            read(*arrays.u, *arrays.d, arrays.by_column, s.rows, s.cols, s.strip, *spacing, *out)
+            read(
+                *arrays.u, *arrays.d, arrays.by_column, *arrays.stiffness, s.rows, s.cols, s.strip, *spacing, *out
+            )  # fmt: skip
 
     def _advance_alone(self, done: int, count: int, numbers: tuple[float, ...], table: NDArray[Any]) -> None:
         """Take the steps after those that are done with a single worker."""
@@ -180,7 +194,8 @@ class Sweep:
             kernel(
                 self._steps, count, workers, s.depth, self._carried_rows, s.rows, s.strip,
                 self._first_row, self._end_row, PATIENCE, *numbers, table[done:],
-                *arrays.u, *arrays.d, *self._carried, arrays.by_column, arrays.decay, self._done, places,
+                *arrays.u, *arrays.d, *self._carried, *self._moment, *arrays.stiffness,
+                arrays.by_column, arrays.decay, self._done, places,
             )  # fmt: skip
         self._steps += count
 
@@ -190,8 +205,11 @@ class Sweep:
         first, end, workers = self._first_row, self._end_row, self._s.workers
         for worker in range(workers):
             low, high = (first + (end - first) * n // workers for n in (worker, worker + 1))
-            borders = (low, high - 1) if worker % 2 else (high - 1, low)
-            rows += [row for row in borders for _ in range(2)]
+            near, far = (low, high - 1) if worker % 2 else (high - 1, low)
+            # The row at the border and, with bending, the one behind it; after even and after odd numbers of steps.
+            inward = 1 if worker % 2 else -1
+            for border in ((near, near + inward), (far, far - inward)):
+                rows += [*border[: self._s.code.border_rows]] * 2
         return np.array(rows, np.int32)
 
 
@@ -210,19 +228,47 @@ def _kernels(code: Code) -> Kernels:
 def _advance(code: Code, *, parallel: bool) -> Callable[..., None]:
     """Make the kernel that takes steps, by one worker or several."""
     real, vector, lanes, columns = code.real, code.vector, code.lanes, code.load_columns
-    structural_springs, shear_springs, open_edges = code.structural, code.shear, code.open_edges
+    structural_springs, shear_springs, bending = code.structural, code.shear, code.bending
+    # With a map there is no stiffness where there is no spring.
+    mapped, open_edges = code.mapped, code.open_edges and not code.mapped
+    by_area, border_rows = open_edges and code.by_area, code.border_rows
     along, to_other_row = spring_forces(code)
-    move = point_step(code)
+    move, laplacian = point_step(code), five_point()
+
+    @ti.func
+    def of_springs(stiffness: ti.template(), family: ti.template(), entry, uniform):
+        """Stiffness of the springs of a family at an entry of their array."""
+        if ti.static(mapped):
+            return stiffness[family][entry]
+        else:  # noqa: RET505  # Taichi would compile the rest as well.
+            return uniform
+
+    @ti.func
+    def of_column(stiffness: ti.template(), by_column: ti.template(), width, between, b, uniform):
+        """Stiffness of the springs along the columns of entry b, those along an edge less."""
+        if ti.static(mapped):
+            return stiffness[1][between + b]
+        elif ti.static(by_area):  # noqa: RET505
+            return uniform * by_column[(AREA + 1) * width + b]
+        else:
+            return uniform
 
     @ti.func
     def sweep_row(
         u: ti.template(), d: ti.template(), carried: ti.template(), by_column: ti.template(), decay: ti.template(),
-        loads: ti.template(), rows, strip, p, q, exists, i, kind, carried_row, n, moving,
-        keep, dx, dy, structural, shear, top, up,
+        moment: ti.template(), stiffness: ti.template(), loads: ti.template(), rows, strip, p, q, exists, i, kind,
+        carried_row, n, moving, moment_before, moment_here, moment_after,
+        keep, dx, dy, k_across, k_down, k_shear, t_across, t_down, t_shear, top, up,
     ):  # fmt: skip
         """Sweep row i of the sheet, stored in row p; row q is the other row, up above it; it is stepped if it moves."""
         width = strip + 2
         diagonal = ti.sqrt(dx * dx + dy * dy)
+        # Where in the arrays of stiffness the springs of the row are, and those between the rows.
+        own, between = i * width, (i + ti.select(up < 0, 1, 0)) * width
+        # Springs along an edge belong to one cell.
+        share = ti.cast(1, real)
+        if ti.static(by_area):
+            share = ti.select(kind == 1, ti.cast(1, real), ti.cast(0.5, real))
         # Displacements of the entry, in its row and in the other row, of the one before it and the one after it.
         here_x, here_y, here_z = u[0][p * width + 0], u[1][p * width + 0], u[2][p * width + 0]
         next_x, next_y, next_z = u[0][p * width + 1], u[1][p * width + 1], u[2][p * width + 1]
@@ -238,12 +284,15 @@ def _advance(code: Code, *, parallel: bool) -> Callable[..., None]:
         if ti.static(open_edges):
             has_right = by_column[HAS_RIGHT * width + 0]
         if ti.static(structural_springs):
-            x, y, z = along(next_x - here_x, next_y - here_y, next_z - here_z, dx, structural, has_right)
+            k = of_springs(stiffness, 0, own, k_across * share)
+            x, y, z = along(next_x - here_x, next_y - here_y, next_z - here_z, dx, k, t_across, has_right)
             left_x, left_y, left_z = x, y, z
         if ti.static(shear_springs):
+            k = of_springs(stiffness, 2, between, k_shear)
             x, y, z = to_other_row(
-                beside_x - here_x, beside_y - here_y, beside_z - here_z, 1, dx, up, diagonal, shear, has_right * exists
-            )
+                beside_x - here_x, beside_y - here_y, beside_z - here_z,
+                1, dx, up, diagonal, k, t_shear, has_right * exists,
+            )  # fmt: skip
             coming_x, coming_y, coming_z = x, y, z
         # Read once: the stores to the arrays could change the table, for all that the compiler knows.
         now = [loads[n, c] for c in ti.static(range(columns))]
@@ -257,19 +306,20 @@ def _advance(code: Code, *, parallel: bool) -> Callable[..., None]:
             if ti.static(open_edges):
                 has_left, has_right = by_column[HAS_LEFT * width + b], by_column[HAS_RIGHT * width + b]
             if ti.static(shear_springs):
+                k = of_springs(stiffness, 2, between + b - 1, k_shear)
                 x, y, z = to_other_row(
                     before_x - here_x, before_y - here_y, before_z - here_z,
-                    -1, dx, up, diagonal, shear, has_left * exists,
+                    -1, dx, up, diagonal, k, t_shear, has_left * exists,
                 )  # fmt: skip
                 force_x, force_y, force_z = x, y, z
                 last_x += x
                 last_y += y
                 last_z += z
             if ti.static(structural_springs):
+                k = of_column(stiffness, by_column, width, between, b, k_down)
                 x, y, z = to_other_row(
-                    beside_x - here_x, beside_y - here_y, beside_z - here_z,
-                    0, dx, up, ti.abs(up), structural, exists,
-                )  # fmt: skip
+                    beside_x - here_x, beside_y - here_y, beside_z - here_z, 0, dx, up, ti.abs(up), k, t_down, exists
+                )
                 force_x += x
                 force_y += y
                 force_z += z
@@ -277,9 +327,11 @@ def _advance(code: Code, *, parallel: bool) -> Callable[..., None]:
                 this_y += y
                 this_z += z
             if ti.static(shear_springs):
+                k = of_springs(stiffness, 2, between + b, k_shear)
                 x, y, z = to_other_row(
-                    after_x - here_x, after_y - here_y, after_z - here_z, 1, dx, up, diagonal, shear, has_right * exists
-                )
+                    after_x - here_x, after_y - here_y, after_z - here_z,
+                    1, dx, up, diagonal, k, t_shear, has_right * exists,
+                )  # fmt: skip
                 force_x += x
                 force_y += y
                 force_z += z
@@ -288,7 +340,8 @@ def _advance(code: Code, *, parallel: bool) -> Callable[..., None]:
             force_y = force_y - carried[1][carried_row * width + b]
             force_z = force_z - carried[2][carried_row * width + b]
             if ti.static(structural_springs):
-                x, y, z = along(next_x - here_x, next_y - here_y, next_z - here_z, dx, structural, has_right)
+                k = of_springs(stiffness, 0, own + b, k_across * share)
+                x, y, z = along(next_x - here_x, next_y - here_y, next_z - here_z, dx, k, t_across, has_right)
                 force_x += x - left_x
                 force_y += y - left_y
                 force_z += z - left_z
@@ -299,17 +352,20 @@ def _advance(code: Code, *, parallel: bool) -> Callable[..., None]:
             carried[2][carried_row * width + b - 1] = last_z
             if moving:
                 move(
-                    u, d, by_column, decay, rows, width, p, i, b, kind, here_x, here_y, here_z,
-                    force_x, force_y, force_z, keep, dy, top, now,
+                    u, d, by_column, decay, moment, rows, width, p, i, b, kind,
+                    moment_before, moment_here, moment_after, here_x, here_y, here_z,
+                    force_x, force_y, force_z, keep, dx, dy, top, now,
                 )  # fmt: skip
             before_x, before_y, before_z = beside_x, beside_y, beside_z
             beside_x, beside_y, beside_z = after_x, after_y, after_z
         if ti.static(shear_springs):
             if ti.static(open_edges):
                 has_left = by_column[HAS_LEFT * width + strip + 1]
+            k = of_springs(stiffness, 2, between + strip, k_shear)
             x, y, z = to_other_row(
-                before_x - next_x, before_y - next_y, before_z - next_z, -1, dx, up, diagonal, shear, has_left * exists
-            )
+                before_x - next_x, before_y - next_y, before_z - next_z,
+                -1, dx, up, diagonal, k, t_shear, has_left * exists,
+            )  # fmt: skip
             this_x += x
             this_y += y
             this_z += z
@@ -318,19 +374,49 @@ def _advance(code: Code, *, parallel: bool) -> Callable[..., None]:
         carried[2][carried_row * width + strip] = this_z
 
     @ti.func
-    def join_strips(u: ti.template(), p, strip):
+    def join_strips(field: ti.template(), p, strip):
         """Fill the halo of row p: beside the first column of a strip is the last one of the strip before."""
         width = strip + 2
         for c in ti.static(range(3)):
-            last = u[c][p * width + strip]
-            first = u[c][p * width + 1]
-            u[c][p * width + 0] = vector([last[(lane - 1) % lanes] for lane in ti.static(range(lanes))])
-            u[c][p * width + strip + 1] = vector([first[(lane + 1) % lanes] for lane in ti.static(range(lanes))])
+            last = field[c][p * width + strip]
+            first = field[c][p * width + 1]
+            field[c][p * width + 0] = vector([last[(lane - 1) % lanes] for lane in ti.static(range(lanes))])
+            field[c][p * width + strip + 1] = vector([first[(lane + 1) % lanes] for lane in ti.static(range(lanes))])
 
     @ti.func
-    def copy_row(rows, worker, border, n):
-        """Where a worker keeps the row at a border after n steps."""
-        return rows + 4 * worker + 2 * border + ti.cast(n % 2, ti.i32)
+    def bend(
+        u: ti.template(), moment: ti.template(), by_column: ti.template(), strip, rows, i, before, here, after,
+        target, bending_stiffness, dx, dy,
+    ):  # fmt: skip
+        """Put the moments of row i into row `target`, given where it and its neighbours are in u; 0 at edges."""
+        width = strip + 2
+        across, down = bending_stiffness / (dx * dx), bending_stiffness / (dy * dy)
+        for b in range(1, strip + 1):
+            for c in ti.static(range(3)):
+                moment[c][target * width + b] = vector(0)
+            if 0 < i < rows - 1:
+                inside = by_column[HAS_LEFT * width + b] * by_column[HAS_RIGHT * width + b]
+                for c in ti.static(range(3)):
+                    curved = laplacian(u, c, width, before, here, after, b, across, down)
+                    moment[c][target * width + b] = inside * curved
+        join_strips(moment, target, strip)
+
+    @ti.func
+    def copy_row(rows, worker, border, n, behind):
+        """Where a worker keeps the row that is so many behind a border after n steps."""
+        return rows + border_rows * (4 * worker + 2 * border + ti.cast(n % 2, ti.i32)) + behind
+
+    @ti.func
+    def row_at(row, low, high, way, rows, worker, workers, n):
+        """Where a row of a band, or one of two beyond its ends, is in u after n steps; if it is none, anywhere."""
+        i = ti.select(way > 0, low, high - 1) + row * way
+        stored = ti.max(0, ti.min(i, rows - 1))
+        if ti.static(parallel):
+            if row < 0 and 0 <= worker - way < workers:
+                stored = copy_row(rows, worker - way, BEGIN, n, -1 - row)
+            if row >= high - low and 0 <= worker + way < workers:
+                stored = copy_row(rows, worker + way, END, n, row - (high - low))
+        return stored
 
     @ti.func
     def has_come(done: ti.template(), worker, border, n, patience):
@@ -343,13 +429,14 @@ def _advance(code: Code, *, parallel: bool) -> Callable[..., None]:
         return steps >= n
 
     @ti.func
-    def publish(u: ti.template(), done: ti.template(), rows, strip, worker, border, i, n):
-        """Let the neighbour at a border have row i after n steps."""
+    def publish(u: ti.template(), done: ti.template(), rows, strip, worker, border, i, inward, n):
+        """Let the neighbour at a border have row i after n steps, and with bending the next one inward."""
         width = strip + 2
-        copy = copy_row(rows, worker, border, n)
-        for b in range(width):
-            for c in ti.static(range(3)):
-                u[c][copy * width + b] = u[c][i * width + b]
+        for behind in ti.static(range(border_rows)):
+            copy = copy_row(rows, worker, border, n, behind)
+            for b in range(width):
+                for c in ti.static(range(3)):
+                    u[c][copy * width + b] = u[c][(i + behind * inward) * width + b]
         ti.atomic_add(done[(2 * worker + border) * COUNTER_STRIDE], 1)
 
     @ti.kernel
@@ -367,8 +454,13 @@ def _advance(code: Code, *, parallel: bool) -> Callable[..., None]:
         keep: real,
         dx: real,
         dy: real,
-        structural: real,
-        shear: real,
+        k_across: real,
+        k_down: real,
+        k_shear: real,
+        t_across: real,
+        t_down: real,
+        t_shear: real,
+        bending_stiffness: real,
         top: real,
         loads: ti.types.ndarray(dtype=real, ndim=2),
         u_x: ti.types.ndarray(dtype=vector, ndim=1),
@@ -380,6 +472,12 @@ def _advance(code: Code, *, parallel: bool) -> Callable[..., None]:
         carried_x: ti.types.ndarray(dtype=vector, ndim=1),
         carried_y: ti.types.ndarray(dtype=vector, ndim=1),
         carried_z: ti.types.ndarray(dtype=vector, ndim=1),
+        moment_x: ti.types.ndarray(dtype=vector, ndim=1),
+        moment_y: ti.types.ndarray(dtype=vector, ndim=1),
+        moment_z: ti.types.ndarray(dtype=vector, ndim=1),
+        along_rows: ti.types.ndarray(dtype=vector, ndim=1),
+        along_columns: ti.types.ndarray(dtype=vector, ndim=1),
+        diagonals: ti.types.ndarray(dtype=vector, ndim=1),
         by_column: ti.types.ndarray(dtype=vector, ndim=1),
         decay: ti.types.ndarray(dtype=vector, ndim=1),
         done: ti.types.ndarray(dtype=ti.i64, ndim=1),
@@ -392,6 +490,8 @@ def _advance(code: Code, *, parallel: bool) -> Callable[..., None]:
                 u = ti.static((u_x, u_y, u_z))
                 d = ti.static((d_x, d_y, d_z))
                 carried = ti.static((carried_x, carried_y, carried_z))
+                moment = ti.static((moment_x, moment_y, moment_z))
+                stiffness = ti.static((along_rows, along_columns, diagonals))
                 width = strip + 2
                 worker = index // ITERATIONS_PER_THREAD
                 low = first_row + (end_row - first_row) * worker // workers
@@ -419,18 +519,35 @@ def _advance(code: Code, *, parallel: bool) -> Callable[..., None]:
                             if ti.static(parallel):
                                 if row == -1 and 0 <= neighbour < workers:
                                     goes = has_come(done, neighbour, BEGIN, first + n, patience)
-                                    p = copy_row(rows, neighbour, BEGIN, first + n)
-                                if row == high - low - 1 and 0 <= far_neighbour < workers:
+                                    p = copy_row(rows, neighbour, BEGIN, first + n, 0)
+                                # Bending looks a row further ahead.
+                                if goes and row >= high - low - border_rows and 0 <= far_neighbour < workers:
                                     goes = has_come(done, far_neighbour, END, first + n, patience)
-                                    q = copy_row(rows, far_neighbour, END, first + n)
+                                if row == high - low - 1 and 0 <= far_neighbour < workers:
+                                    q = copy_row(rows, far_neighbour, END, first + n, 0)
                             if goes:
+                                if ti.static(bending):
+                                    # Of the row ahead; at the beginning also of the first one and the one before.
+                                    for ahead in range(ti.select(row < 0, -1, row + 1), row + 2):
+                                        at = first + n
+                                        before = row_at(ahead - 1, low, high, way, rows, worker, workers, at)
+                                        here = row_at(ahead, low, high, way, rows, worker, workers, at)
+                                        after = row_at(ahead + 1, low, high, way, rows, worker, workers, at)
+                                        bend(
+                                            u, moment, by_column, strip, rows, begin + ahead * way, before, here, after,
+                                            MOMENTS * worker + (ahead + MOMENTS) % MOMENTS, bending_stiffness, dx, dy,
+                                        )  # fmt: skip
                                 q = ti.select(exists > 0, q, i)
                                 if 0 <= i < rows:
-                                    kind = ti.select(i == rows - 1, MOVES + 2, ti.select(i == 0, MOVES, MOVES + 1))
+                                    kind = ti.select(i == rows - 1, 2, ti.select(i == 0, 0, 1))
+                                    moments = MOMENTS * worker
                                     sweep_row(
-                                        u, d, carried, by_column, decay, loads, rows, strip,
+                                        u, d, carried, by_column, decay, moment, stiffness, loads, rows, strip,
                                         p, q, exists, i, kind, carried_row, n, row >= 0,
-                                        keep, dx, dy, structural, shear, top, -way * dy,
+                                        moments + (row + 2) % MOMENTS, moments + row % MOMENTS,
+                                        moments + (row + 1) % MOMENTS,
+                                        keep, dx, dy, k_across, k_down, k_shear, t_across, t_down, t_shear, top,
+                                        -way * dy,
                                     )  # fmt: skip
                                 else:
                                     for b in range(1, strip + 1):
@@ -439,10 +556,11 @@ def _advance(code: Code, *, parallel: bool) -> Callable[..., None]:
                                 if row >= 0:
                                     join_strips(u, i, strip)
                                 if ti.static(parallel):
-                                    if row == 0:
-                                        publish(u, done, rows, strip, worker, BEGIN, i, first + n + 1)
+                                    # Once all that is published has been stepped.
+                                    if row == border_rows - 1:
+                                        publish(u, done, rows, strip, worker, BEGIN, begin, way, first + n + 1)
                                     if row == high - low - 1:
-                                        publish(u, done, rows, strip, worker, END, i, first + n + 1)
+                                        publish(u, done, rows, strip, worker, END, i, -way, first + n + 1)
                                 step += 1
                         if goes:
                             k += 1
@@ -461,7 +579,7 @@ def _advance(code: Code, *, parallel: bool) -> Callable[..., None]:
 def _read(code: Code, *, parallel: bool) -> Callable[..., None]:
     """Make the kernel that reads a sheet out, and measures it, by one thread or several."""
     real, vector, lanes = code.real, code.vector, code.lanes
-    strain = strains(code)
+    measure = measuring(code)
 
     @ti.kernel
     def read(
@@ -472,6 +590,9 @@ def _read(code: Code, *, parallel: bool) -> Callable[..., None]:
         d_y: ti.types.ndarray(dtype=vector, ndim=1),
         d_z: ti.types.ndarray(dtype=vector, ndim=1),
         by_column: ti.types.ndarray(dtype=vector, ndim=1),
+        along_rows: ti.types.ndarray(dtype=vector, ndim=1),
+        along_columns: ti.types.ndarray(dtype=vector, ndim=1),
+        diagonals: ti.types.ndarray(dtype=vector, ndim=1),
         rows: ti.i32,
         cols: ti.i32,
         strip: ti.i32,
@@ -486,25 +607,34 @@ def _read(code: Code, *, parallel: bool) -> Callable[..., None]:
             if index % ITERATIONS_PER_THREAD == 0:
                 u = ti.static((u_x, u_y, u_z))
                 d = ti.static((d_x, d_y, d_z))
+                stiffness = ti.static((along_rows, along_columns, diagonals))
                 width = strip + 2
                 i = index // ITERATIONS_PER_THREAD
-                least, along, down, diagonal, motion = vector(0), vector(0), vector(0), vector(0), vector(0)
+                least, most, along, below, across = vector(0), vector(0), vector(0), vector(0), vector(0)
+                along_apart, below_apart, across_apart = vector(0), vector(0), vector(0)
+                motion, bent = vector(0), vector(0)
                 for b in range(1, strip + 1):
-                    shortest, right, below, across = strain(u, by_column, width, i, i + 1, b, dx, dy, i < rows - 1)
-                    least = ti.min(least, shortest)
-                    along += right
-                    down += below
-                    diagonal += across
+                    found = measure(u, d, by_column, stiffness, width, rows, i, i, b, dx, dy)
+                    least = ti.min(least, found[0])
+                    most = ti.max(most, found[1])
+                    along += found[2]
+                    below += found[3]
+                    across += found[4]
+                    along_apart += found[5]
+                    below_apart += found[6]
+                    across_apart += found[7]
+                    motion += found[8]
+                    bent += found[9]
                     for c in ti.static(range(3)):
-                        change = d[c][i * width + b]
-                        motion += change * change
-                        wanted = ti.select(differences, change, u[c][i * width + b])
+                        wanted = ti.select(differences, d[c][i * width + b], u[c][i * width + b])
                         for lane in ti.static(range(lanes)):
                             if lane * strip + b <= cols:
                                 out[i, lane * strip + b - 1, c] = wanted[lane]
-                measures[i, 0] = least.min()
-                for m, part in ti.static(enumerate((along, down, diagonal, motion))):
-                    measures[i, m + 1] = part.sum()
+                measures[i, LEAST] = least.min()
+                measures[i, MOST] = most.max()
+                sums = ti.static((along, below, across, along_apart, below_apart, across_apart, motion, bent))
+                for m, part in ti.static(enumerate(sums)):
+                    measures[i, MOST + 1 + m] = part.sum()
 
     return read
 

@@ -13,18 +13,21 @@ import numpy as np
 from numpy.typing import NDArray
 
 from taichi_msm.physics.kernel import (
+    AREA,
     HAS_LEFT,
     HAS_RIGHT,
+    LEAST,
     MEASURES,
-    MOVES,
+    MOST,
     Code,
     ReadArguments,
     SheetArrays,
     Start,
     Structure,
+    five_point,
+    measuring,
     point_step,
     spring_forces,
-    strains,
 )
 from taichi_msm.system.runtime import our_compilation, ti
 
@@ -49,12 +52,16 @@ class Gather:
         self._now = 0
         buffer = np.pad(np.arange(s.rows, dtype=np.int32), 1, constant_values=-1)
         self._arrays = SheetArrays(s, np.concatenate([buffer, buffer]), start)
+        self._moment = [self._arrays.rows(s.rows + 2 if s.code.bending else 1) for _ in range(3)]
 
     def advance(self, count: int, numbers: tuple[float, ...], table: NDArray[Any]) -> None:
         """Take at most STEPS_PER_LAUNCH steps."""
-        arrays = *self._arrays.u, *self._arrays.d, self._arrays.by_column, self._arrays.decay
+        arrays = self._arrays
         with our_compilation():
-            self._kernels.advance(self._now, count, self._s.rows, self._s.cols, *numbers, table, *arrays)
+            self._kernels.advance(
+                self._now, count, self._s.rows, self._s.cols, *numbers, table,
+                *arrays.u, *arrays.d, *self._moment, *arrays.stiffness, arrays.by_column, arrays.decay,
+            )  # fmt: skip
         self._now = (self._now + count) % 2
 
     def compile(self, numbers: tuple[float, ...], table: NDArray[Any]) -> None:
@@ -69,75 +76,112 @@ class Gather:
         """Copy what is asked for, and measure every row."""
         s, arrays = self._s, self._arrays
         with our_compilation():
-            self._kernels.read(self._now, s.rows, s.cols, *spacing, *out, *arrays.u, *arrays.d, arrays.by_column)
+            self._kernels.read(
+                self._now, s.rows, s.cols, *spacing, *out, *arrays.u, *arrays.d, *arrays.stiffness, arrays.by_column
+            )
 
 
 @cache
 def _kernels(code: Code) -> Kernels:
     """Make the kernels of one code; each is compiled when it is first launched."""
     real, vector, columns = code.real, code.vector, code.load_columns
-    structural_springs, shear_springs, open_edges = code.structural, code.shear, code.open_edges
+    structural_springs, shear_springs, bending = code.structural, code.shear, code.bending
+    # With a map there is no stiffness where there is no spring.
+    mapped, open_edges = code.mapped, code.open_edges and not code.mapped
+    by_area = open_edges and code.by_area
     along, to_other_row = spring_forces(code)
-    move = point_step(code)
-    strain = strains(code)
+    move, measure, laplacian = point_step(code), measuring(code), five_point()
 
     @ti.func
     def apart(u: ti.template(), here, other):
         return u[0][other] - u[0][here], u[1][other] - u[1][here], u[2][other] - u[2][here]
 
     @ti.func
-    def by_row(u: ti.template(), by_column: ti.template(), width, p, q, b, row_exists, dx, up, structural, shear):
+    def by_row(
+        u: ti.template(), by_column: ti.template(), stiffness: ti.template(), width, p, q, between, b, row_exists,
+        dx, up, k_down, k_shear, t_down, t_shear,
+    ):  # fmt: skip
         """Force on entry b of row p by the row q, which is up above: summed as a sweep does."""
         force_x, force_y, force_z = vector(0), vector(0), vector(0)
         for right in ti.static((-1, 0, 1)):
             if ti.static(structural_springs if right == 0 else shear_springs):
-                stiffness, length, exists = structural, ti.abs(up), vector(1)
+                k, tension, length, exists = k_down * vector(1), t_down, ti.abs(up), vector(1)
                 if ti.static(right != 0):
-                    stiffness, length = shear, ti.sqrt(dx * dx + up * up)
+                    k, tension, length = k_shear * vector(1), t_shear, ti.sqrt(dx * dx + up * up)
                 if ti.static(right != 0 and open_edges):
                     exists = by_column[ti.static(HAS_LEFT if right < 0 else HAS_RIGHT) * width + b]
+                if ti.static(right == 0 and by_area):
+                    k *= by_column[(AREA + 1) * width + b]
+                if ti.static(mapped):
+                    k = stiffness[ti.static(2 if right else 1)][between * width + b + ti.static(min(right, 0))]
                 x, y, z = apart(u, p * width + b, q * width + b + right)
-                x, y, z = to_other_row(x, y, z, right, dx, up, length, stiffness, exists * row_exists)
+                x, y, z = to_other_row(x, y, z, right, dx, up, length, k, tension, exists * row_exists)
                 force_x += x
                 force_y += y
                 force_z += z
         return force_x, force_y, force_z
 
     @ti.func
-    def by_right(u: ti.template(), by_column: ti.template(), width, p, b, dx, structural):
+    def by_right(
+        u: ti.template(), by_column: ti.template(), stiffness: ti.template(), width, p, i, kind, b,
+        dx, k_across, t_across,
+    ):  # fmt: skip
         """Force on entry b of row p by its right neighbour."""
-        exists = vector(1)
+        exists, k = vector(1), k_across * vector(1)
         if ti.static(open_edges):
             exists = by_column[HAS_RIGHT * width + b]
+        if ti.static(by_area):
+            k *= ti.select(kind == 1, ti.cast(1, real), ti.cast(0.5, real))
+        if ti.static(mapped):
+            k = stiffness[0][i * width + b]
         x, y, z = apart(u, p * width + b, p * width + b + 1)
-        return along(x, y, z, dx, structural, exists)
+        return along(x, y, z, dx, k, t_across, exists)
 
     @ti.func
     def step(
-        u: ti.template(), d: ti.template(), by_column: ti.template(), decay: ti.template(), loads: ti.template(),
-        now, rows, width, i, b, n, keep, dx, dy, structural, shear, top,
+        u: ti.template(), d: ti.template(), moment: ti.template(), stiffness: ti.template(), by_column: ti.template(),
+        decay: ti.template(), loads: ti.template(), now, rows, width, i, b, n,
+        keep, dx, dy, k_across, k_down, k_shear, t_across, t_down, t_shear, top,
     ):  # fmt: skip
         """Step point (i, b - 1): now is the buffer of u_n, n the row of the table."""
         p = now * (rows + 2) + i + 1
+        kind = ti.select(i == rows - 1, 2, ti.select(i == 0, 0, 1))
         below, above = ti.cast(i < rows - 1, real), ti.cast(i > 0, real)
-        force_x, force_y, force_z = by_row(u, by_column, width, p, p + 1, b, below, dx, -dy, structural, shear)
-        x, y, z = by_row(u, by_column, width, p, p - 1, b, above, dx, dy, structural, shear)
+        force_x, force_y, force_z = by_row(
+            u, by_column, stiffness, width, p, p + 1, i + 1, b, below, dx, -dy, k_down, k_shear, t_down, t_shear
+        )
+        x, y, z = by_row(
+            u, by_column, stiffness, width, p, p - 1, i, b, above, dx, dy, k_down, k_shear, t_down, t_shear
+        )
         force_x += x
         force_y += y
         force_z += z
         if ti.static(structural_springs):
-            right_x, right_y, right_z = by_right(u, by_column, width, p, b, dx, structural)
-            left_x, left_y, left_z = by_right(u, by_column, width, p, b - 1, dx, structural)
+            right_x, right_y, right_z = by_right(u, by_column, stiffness, width, p, i, kind, b, dx, k_across, t_across)
+            left_x, left_y, left_z = by_right(u, by_column, stiffness, width, p, i, kind, b - 1, dx, k_across, t_across)
             force_x += right_x - left_x
             force_y += right_y - left_y
             force_z += right_z - left_z
         row = [loads[n, c] for c in ti.static(range(columns))]
-        kind = ti.select(i == rows - 1, MOVES + 2, ti.select(i == 0, MOVES, MOVES + 1))
         move(
-            u, d, by_column, decay, rows, width, (1 - now) * (rows + 2) + i + 1, i, b, kind,
+            u, d, by_column, decay, moment, rows, width, (1 - now) * (rows + 2) + i + 1, i, b, kind, i, i + 1, i + 2,
             u[0][p * width + b], u[1][p * width + b], u[2][p * width + b],
-            force_x, force_y, force_z, keep, dy, top, row,
+            force_x, force_y, force_z, keep, dx, dy, top, row,
         )  # fmt: skip
+
+    @ti.func
+    def bend(
+        u: ti.template(), moment: ti.template(), by_column: ti.template(), now, rows, width, i, b,
+        bending_stiffness, dx, dy,
+    ):  # fmt: skip
+        """Take the moment of entry b of row i, 0 at edges, into row i + 1 of moments."""
+        across, down = bending_stiffness / (dx * dx), bending_stiffness / (dy * dy)
+        p = now * (rows + 2) + i + 1
+        inside = by_column[HAS_LEFT * width + b] * by_column[HAS_RIGHT * width + b]
+        for c in ti.static(range(3)):
+            moment[c][(i + 1) * width + b] = vector(0)
+            if 0 < i < rows - 1:
+                moment[c][(i + 1) * width + b] = inside * laplacian(u, c, width, p - 1, p, p + 1, b, across, down)
 
     @ti.kernel
     def advance(
@@ -148,8 +192,13 @@ def _kernels(code: Code) -> Kernels:
         keep: real,
         dx: real,
         dy: real,
-        structural: real,
-        shear: real,
+        k_across: real,
+        k_down: real,
+        k_shear: real,
+        t_across: real,
+        t_down: real,
+        t_shear: real,
+        bending_stiffness: real,
         top: real,
         loads: ti.types.ndarray(dtype=real, ndim=2),
         u_x: ti.types.ndarray(dtype=vector, ndim=1),
@@ -158,17 +207,31 @@ def _kernels(code: Code) -> Kernels:
         d_x: ti.types.ndarray(dtype=vector, ndim=1),
         d_y: ti.types.ndarray(dtype=vector, ndim=1),
         d_z: ti.types.ndarray(dtype=vector, ndim=1),
+        moment_x: ti.types.ndarray(dtype=vector, ndim=1),
+        moment_y: ti.types.ndarray(dtype=vector, ndim=1),
+        moment_z: ti.types.ndarray(dtype=vector, ndim=1),
+        along_rows: ti.types.ndarray(dtype=vector, ndim=1),
+        along_columns: ti.types.ndarray(dtype=vector, ndim=1),
+        diagonals: ti.types.ndarray(dtype=vector, ndim=1),
         by_column: ti.types.ndarray(dtype=vector, ndim=1),
         decay: ti.types.ndarray(dtype=vector, ndim=1),
     ):
         for n in ti.static(range(STEPS_PER_LAUNCH)):
+            if ti.static(bending):
+                for i, b in ti.ndrange((-1, rows + 1), cols + 2):
+                    if n < count:
+                        u = ti.static((u_x, u_y, u_z))
+                        moment = ti.static((moment_x, moment_y, moment_z))
+                        bend(u, moment, by_column, (now + n) % 2, rows, cols + 2, i, b, bending_stiffness, dx, dy)
             for i, b in ti.ndrange(rows, (1, cols + 1)):
                 if n < count:
                     u = ti.static((u_x, u_y, u_z))
                     d = ti.static((d_x, d_y, d_z))
+                    moment = ti.static((moment_x, moment_y, moment_z))
+                    stiffness = ti.static((along_rows, along_columns, diagonals))
                     step(
-                        u, d, by_column, decay, loads, (now + n) % 2, rows, cols + 2, i, b, n,
-                        keep, dx, dy, structural, shear, top,
+                        u, d, moment, stiffness, by_column, decay, loads, (now + n) % 2, rows, cols + 2, i, b, n,
+                        keep, dx, dy, k_across, k_down, k_shear, t_across, t_down, t_shear, top,
                     )  # fmt: skip
 
     @ti.kernel
@@ -187,24 +250,27 @@ def _kernels(code: Code) -> Kernels:
         d_x: ti.types.ndarray(dtype=vector, ndim=1),
         d_y: ti.types.ndarray(dtype=vector, ndim=1),
         d_z: ti.types.ndarray(dtype=vector, ndim=1),
+        along_rows: ti.types.ndarray(dtype=vector, ndim=1),
+        along_columns: ti.types.ndarray(dtype=vector, ndim=1),
+        diagonals: ti.types.ndarray(dtype=vector, ndim=1),
         by_column: ti.types.ndarray(dtype=vector, ndim=1),
     ):
         for i in range(rows):
             u = ti.static((u_x, u_y, u_z))
             d = ti.static((d_x, d_y, d_z))
+            stiffness = ti.static((along_rows, along_columns, diagonals))
             width = cols + 2
             p = now * (rows + 2) + i + 1
             found = ti.Vector.zero(real, MEASURES)
             for b in range(1, cols + 1):
-                least, along, down, diagonal = strain(u, by_column, width, p, p + 1, b, dx, dy, i < rows - 1)
-                found[0] = ti.min(found[0], least[0])
-                found[1] += along[0]
-                found[2] += down[0]
-                found[3] += diagonal[0]
+                measured = measure(u, d, by_column, stiffness, width, rows, p, i, b, dx, dy)
+                found[LEAST] = ti.min(found[LEAST], measured[LEAST][0])
+                found[MOST] = ti.max(found[MOST], measured[MOST][0])
+                for m in ti.static(range(MOST + 1, MEASURES)):
+                    found[m] += measured[m][0]
                 for c in ti.static(range(3)):
-                    change = d[c][i * width + b][0]
-                    found[4] += change * change
-                    out[i, b - 1, c] = ti.select(differences, change, u[c][p * width + b][0])
+                    wanted = ti.select(differences, d[c][i * width + b][0], u[c][p * width + b][0])
+                    out[i, b - 1, c] = wanted
             for m in ti.static(range(MEASURES)):
                 measures[i, m] = found[m]
 

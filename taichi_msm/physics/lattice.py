@@ -89,7 +89,11 @@ def fixed_points(sheet: Sheet) -> NDArray[np.bool_]:
 
 
 def springs(scene: Scene) -> tuple[Spring, ...]:
-    """List the springs from a point to its up to 8 neighbours, without the families of stiffness 0."""
+    """List the springs of a scene with `springs` and no map that lead from a point to its up to 8 neighbours.
+
+    Families of stiffness 0 are left out.
+    """
+    assert scene.springs is not None
     dx, dy = spacing(scene.sheet)
     around = [(down, right) for down in (-1, 0, 1) for right in (-1, 0, 1) if (down, right) != (0, 0)]
     stencil = (

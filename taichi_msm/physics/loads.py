@@ -19,8 +19,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from taichi_msm.physics.lattice import axes
+from taichi_msm.physics.material import area_shares, material
+from taichi_msm.physics.probe_force import control_points, probe_force
 from taichi_msm.physics.timestep import step, steps_per_frame
-from taichi_msm.scene import Probe, Scene, Sheet
+from taichi_msm.scene import Probe, Scene
 
 # A key that is nearer than this to an end of the hat, as a fraction of its half-width, is outside: what it would add
 # is less than rounding.
@@ -94,15 +96,6 @@ class Schedule(NamedTuple):
     active: Array
 
 
-def control_points(probe: Probe, sheet: Sheet) -> tuple[Array, Array]:
-    """Give the keys of a probe's control point: times [s], shape (n,), and points [m], shape (n, 2)."""
-    first = probe.at[0]
-    keys = probe.at if isinstance(first, tuple) else ((0.0, *probe.at),)
-    time, across, down = np.array(keys, dtype=float).T
-    height, width = sheet.size
-    return time, np.stack([(across - 0.5) * width, (0.5 - down) * height], axis=1)
-
-
 def probe_slots(scene: Scene) -> tuple[ProbeSlot, ...]:
     """List the slots of all probes."""
     found = []
@@ -120,15 +113,15 @@ def probe_slots(scene: Scene) -> tuple[ProbeSlot, ...]:
 
 
 def decay(slot: ProbeSlot, scene: Scene) -> Array:
-    """Evaluate exp(-falloff d - offset) of a standing slot (eq. 5).
+    """Evaluate the decay of a standing slot.
 
     Returns:
         Share of the force that each point feels, shape (rows, cols).
     """
-    probe = scene.probes[slot.probe]
+    acts = probe_force(scene.probes[slot.probe], scene.sheet)
     x, y = axes(scene.sheet)
-    distance = np.hypot(x - slot.rest[0], y - slot.rest[1])
-    return np.exp(-probe.falloff * distance - probe.offset)
+    shares = acts.decay(np.hypot(x - slot.rest[0], y - slot.rest[1]))
+    return shares * area_shares(scene.sheet) if acts.by_area else shares
 
 
 def schedule(scene: Scene, first: int, count: int) -> Schedule:
@@ -148,7 +141,7 @@ def schedule(scene: Scene, first: int, count: int) -> Schedule:
             places = np.zeros((count, 1), np.intp)
         else:
             shares, places = _by_turns(line, jumps, turns, t, h)
-        strength[:, own] = np.multiply.outer(shares / 100, probe.force)
+        strength[:, own] = np.multiply.outer(shares / 100, probe_force(probe, scene.sheet).force)
         for n, place in zip(own, places.T, strict=True):
             for number in np.unique(place):
                 chosen = place == number
@@ -165,7 +158,7 @@ def loads_at(scene: Scene, t: Array) -> Schedule:
         line = _load(probe)
         number = part.jumps.searchsorted(t, "right")
         acts = number % part.turns == part.turn
-        strength[:, n] = np.multiply.outer(line.values(t) * acts / 100, probe.force)
+        strength[:, n] = np.multiply.outer(line.values(t) * acts / 100, probe_force(probe, scene.sheet).force)
         for segment in np.unique(number):
             point[number == segment, n] = _held(part.segments[segment], t[number == segment])
     return Schedule(strength, point, _activity(scene).values(t))
@@ -187,7 +180,7 @@ class Envelope:
     def __init__(self, scene: Scene) -> None:
         self._h = step(scene)
         self._lines = [_load(probe) for probe in scene.probes]
-        self._forces = [math.hypot(*probe.force) / 100 for probe in scene.probes]
+        self._forces = [math.hypot(*probe_force(probe, scene.sheet).force) / 100 for probe in scene.probes]
         self._probes = [slot.probe for slot in probe_slots(scene)]
         self._activity = _activity(scene)
         self._begins = self._activity.times[self._activity.before < self._activity.after]
@@ -307,7 +300,7 @@ def _load(probe: Probe) -> _Line:
 
 def _activity(scene: Scene) -> _Line:
     """Tell when the virtual springs exist: 1 while the percent of any probe is not 0, or always; else 0."""
-    if scene.springs.virtual_active == "always":
+    if material(scene).always:
         return _Line(np.array([LONG_AGO]), np.array([1.0]))
     times = np.unique([time for probe in scene.probes for time, _ in probe.load])
     if not times.size:

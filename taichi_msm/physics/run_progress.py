@@ -16,6 +16,7 @@ class RunProgress:
         frame: its number.
         max_displacement: largest displacement of any frame so far [m].
         shortest_spring: smallest length of a spring over its rest length at any frame so far.
+        longest_spring: the largest.
         energy: of motion and springs, without the virtual ones, at this frame [J].
         reach: root of the sum of all squared displacements at this frame [m].
         peak: largest energy of any frame so far [J].
@@ -24,6 +25,7 @@ class RunProgress:
     frame: int = 0
     max_displacement: float = 0.0
     shortest_spring: float = 1.0
+    longest_spring: float = 1.0
     energy: float = 0.0
     reach: float = 0.0
     peak: float = 0.0

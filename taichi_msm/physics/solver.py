@@ -24,13 +24,21 @@ from taichi_msm.errors import ArgumentError, DeviceError
 from taichi_msm.physics import workload
 from taichi_msm.physics.kernel import (
     ACROSS,
+    AREA,
+    BENT,
     BYTES,
+    COLUMN_ROWS,
     HAS_LEFT,
     HAS_RIGHT,
+    LEAST,
     MEASURES,
+    MOST,
+    MOTION,
     MOVES,
     SLOT_COLUMN,
     SLOT_COLUMNS,
+    STRETCHED,
+    TENSE,
     Code,
     ReadArguments,
     Start,
@@ -40,6 +48,8 @@ from taichi_msm.physics.kernel_cpu import Sweep
 from taichi_msm.physics.kernel_gpu import STEPS_PER_LAUNCH, Gather
 from taichi_msm.physics.lattice import axes, fixed_points, spacing
 from taichi_msm.physics.loads import decay, probe_slots, schedule
+from taichi_msm.physics.material import area_shares, has_fixed_border, material, stiffness
+from taichi_msm.physics.probe_force import probe_force
 from taichi_msm.physics.state import Reading, State
 from taichi_msm.physics.timestep import step, steps_per_frame
 from taichi_msm.physics.verlet import coefficients
@@ -78,8 +88,8 @@ def structure(scene: Scene, device: Device, cores: int | None = None) -> Structu
         DeviceError: when the device cannot do what the scene needs.
     """
     rows, cols = scene.sheet.points
-    fixed = fixed_points(scene.sheet)
-    precision = workload.precision(scene, device.arch)
+    fixed, made, slots = fixed_points(scene.sheet), material(scene), probe_slots(scene)
+    precision, open_edges = workload.precision(scene, device.arch), not has_fixed_border(scene)
     fixed_rows = bool(fixed[0].all()), bool(fixed[-1].all())
     if device.arch == "cpu":
         # Workers wait by spinning: more of them than cores would only keep each other from their work.
@@ -90,19 +100,26 @@ def structure(scene: Scene, device: Device, cores: int | None = None) -> Structu
     code = Code(
         precision=precision,
         lanes=lanes(precision),
-        structural=scene.springs.structural > 0,
-        shear=scene.springs.shear > 0,
-        open_edges=not (all(fixed_rows) and fixed[:, [0, -1]].all()),
-        virtual=scene.springs.virtual > 0 and (scene.springs.virtual_active == "always" or bool(scene.probes)),
-        damped=scene.damping > 0,
-        slots_move=tuple(slot.moves for slot in probe_slots(scene)),
+        structural=max(made.across, made.down) > 0,
+        shear=made.shear > 0,
+        open_edges=open_edges,
+        by_area=open_edges and made.by_area,
+        mapped=made.map is not None,
+        tense=made.tension > 0,
+        bending=made.bending > 0,
+        virtual=made.virtual > 0,
+        damped=made.drag > 0,
+        slots_move=tuple(slot.moves for slot in slots),
+        slots_by_area=_slots_by_area(scene),
     )
     if device.arch == "vulkan" and precision == "f64" and any(code.slots_move):
         raise DeviceError(
             "--arch vulkan: has no exp in f64, which control points that move need; take time.precision: f32 without a "
             "tolerance or an estimate of the error, or --arch cpu"
         )
-    depth = _depth(rows // workers, cols * NUMBERS_PER_POINT * BYTES[precision]) if workers else 1
+    depth = 1
+    if workers and not code.bending:
+        depth = _depth(rows // workers, cols * NUMBERS_PER_POINT * BYTES[precision])
     return Structure(rows, cols, workers, depth, fixed_rows, code)
 
 
@@ -164,6 +181,8 @@ class Dynamics:
                 f"{_in_words(self.structure.code.slots_move)}; now {_in_words(moves)}); "
                 "restart with a scene that has these"
             )
+        if _slots_by_area(scene) != self.structure.code.slots_by_area:
+            raise ArgumentError("probes: one that had force has total now, or the reverse; restart with such a scene")
         if _standing(scene) != _standing(self.scene):
             self._moving.set_decay(_standing_decays(scene))
         self.scene = scene
@@ -209,12 +228,18 @@ class Dynamics:
     def read(self) -> Reading:
         """Read the displacements and measure the sheet, in the scene's precision."""
         displacement, measures = self._copy(differences=False)
-        shortest = math.sqrt(max(0.0, 1.0 + float(measures[:, 0].min())))
-        along, down, diagonal, motion = measures[:, 1:].sum(axis=0, dtype=np.float64)
-        springs, sheet, (dx, dy) = self.scene.springs, self.scene.sheet, spacing(self.scene.sheet)
-        stretching = springs.structural * (along * dx**2 + down * dy**2) + springs.shear * diagonal * (dx**2 + dy**2)
-        energy = float(stretching + sheet.mass * motion / step(self.scene) ** 2) / 2
-        return Reading(self.steps_done, displacement, shortest, energy)
+        shortest, longest = (
+            math.sqrt(max(0.0, 1.0 + float(one))) for one in (measures[:, LEAST].min(), measures[:, MOST].max())
+        )
+        sums = measures.sum(axis=0, dtype=np.float64)
+        made, (dx, dy) = self._material, spacing(self.scene.sheet)
+        squares = np.array([dx**2, dy**2, dx**2 + dy**2])
+        stiffness = np.ones(3) if made.map else np.array(made.stiffness)
+        springs = (stiffness * sums[STRETCHED : STRETCHED + 3] + made.tensions * sums[TENSE : TENSE + 3]) @ squares
+        motion = made.mass * sums[MOTION] / step(self.scene) ** 2
+        return Reading(
+            self.steps_done, displacement, shortest, longest, float(springs + motion + made.bending * sums[BENT]) / 2
+        )
 
     def _copy(self, *, differences: bool) -> tuple[NDArray[Any], NDArray[Any]]:
         """Copy displacements or differences, and what is measured of every row."""
@@ -236,6 +261,7 @@ class Dynamics:
         """Put the sheet at rest, or where it was."""
         self._real = np.dtype(np.float32 if self.structure.code.precision == "f32" else np.float64)
         self.steps_done = 0 if state is None else state.steps
+        self._material = material(self.scene)
         self._arguments = self._numbers()
         self._first_tabled, self._loads = self.steps_done, self._table(self.steps_done, STEPS_PER_TABLE)
         self._place(state)
@@ -244,7 +270,8 @@ class Dynamics:
         """Give the numbers of the scene in the order of the kernel's arguments."""
         scene = self.scene
         dx, dy = spacing(scene.sheet)
-        return coefficients(scene).keep, dx, dy, scene.springs.structural, scene.springs.shear, scene.sheet.size[0] / 2
+        made, keep = self._material, coefficients(scene).keep
+        return keep, dx, dy, *made.stiffness, *made.tensions, made.bending, scene.sheet.size[0] / 2
 
     def _next_loads(self, count: int) -> NDArray[Any]:
         """Give the table of the loads of the next steps, shape (count, columns)."""
@@ -264,12 +291,13 @@ class Dynamics:
         table[:, 0] = verlet.gain
         if first == 0:
             table[0, 0] = verlet.first_gain
-        table[:, 1] = scene.springs.virtual * loads.active
+        table[:, 1] = self._material.virtual * loads.active
         slot = table[:, SLOT_COLUMN:].reshape(count, len(parts), SLOT_COLUMNS)
         slot[..., :3] = loads.strength
         slot[..., 3:5] = loads.point
         for n, part in enumerate(parts):
-            slot[:, n, 5:] = scene.probes[part.probe].falloff, scene.probes[part.probe].offset
+            acts = probe_force(scene.probes[part.probe], scene.sheet)
+            slot[:, n, 5:] = acts.falloff, acts.shift, acts.offset
         # What is too large for f32 is infinite, and found when the sheet is read.
         with np.errstate(over="ignore"):
             return table.astype(self._real)
@@ -277,24 +305,46 @@ class Dynamics:
     def _place(self, state: State | None) -> None:
         """Put the sheet where it begins."""
         s, scene = self.structure, self.scene
-        moves = ~fixed_points(scene.sheet)
-        column = np.arange(s.cols)
-        by_column = np.empty((6, s.cols))
+        moves, column = ~fixed_points(scene.sheet), np.arange(s.cols)
         # Rows are of three kinds: the first, any in between, the last.
-        by_column[MOVES : MOVES + 3] = moves[[0, s.rows // 2, -1]]
+        kinds = [0, s.rows // 2, -1]
+        shares = area_shares(scene.sheet)[kinds] if s.code.by_area else np.ones((3, s.cols))
+        by_column = np.empty((COLUMN_ROWS, s.cols))
+        by_column[MOVES : MOVES + 3] = moves[kinds] / shares
+        by_column[AREA : AREA + 3] = area_shares(scene.sheet)[kinds]
         by_column[ACROSS] = axes(scene.sheet)[0]
         by_column[HAS_LEFT] = column > 0
         by_column[HAS_RIGHT] = column < s.cols - 1
         self._sheet = None  # Its memory is free before there is another.
         kind = Sweep if s.workers else Gather
         begun = None if state is None else (state.displacement, state.difference)
-        self._sheet = kind(s, Start(by_column, _standing_decays(scene), begun))
+        self._sheet = kind(s, Start(by_column, _standing_decays(scene), _mapped_stiffness(scene), begun))
+
+
+def _slots_by_area(scene: Scene) -> tuple[bool, ...]:
+    """Tell for every slot whether points at an edge move and get less of its force than others."""
+    open_edges = not has_fixed_border(scene)
+    return tuple(open_edges and scene.probes[slot.probe].total is not None for slot in probe_slots(scene))
+
+
+def _mapped_stiffness(scene: Scene) -> tuple[NDArray[Any], NDArray[Any], NDArray[Any]] | None:
+    """Give the stiffness of every spring besides its tension, as `Start` has it."""
+    made = material(scene)
+    if made.map is None:
+        return None
+    parts = zip(stiffness(scene), made.tensions, strict=True)
+    along_rows, along_columns, diagonals = (np.maximum(k - tension, 0) for k, tension in parts)
+    return (
+        np.pad(along_rows, ((0, 0), (0, 1))),
+        np.pad(along_columns, ((1, 1), (0, 0))),
+        np.pad(diagonals, ((1, 1), (0, 1))),
+    )
 
 
 def _standing(scene: Scene) -> list[tuple[object, ...]]:
     """List all on which the decays of the slots that stand depend."""
     probes = [scene.probes[slot.probe] for slot in probe_slots(scene) if not slot.moves]
-    return [(probe.at, probe.falloff, probe.offset) for probe in probes]
+    return [(probe.at, probe_force(probe, scene.sheet)[1:]) for probe in probes]
 
 
 def _standing_decays(scene: Scene) -> NDArray[np.float64]:

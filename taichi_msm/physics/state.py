@@ -27,11 +27,12 @@ class Reading(NamedTuple):
     Attributes:
         steps: number of steps taken, n.
         displacement: u_n = x - X [m], shape (rows, cols, 3).
-        shortest_spring: the least L / L0 of all springs.
-        energy: of the motion and of the stretched springs, without the virtual ones [J].
+        shortest_spring, longest_spring: the least and the largest length of a spring over the one at rest.
+        energy: of the motion, of springs but the virtual ones and of bending [J].
     """
 
     steps: int
     displacement: NDArray[Any]
     shortest_spring: float
+    longest_spring: float
     energy: float

@@ -7,18 +7,8 @@ from collections.abc import Iterator
 from typing import Any
 
 from taichi_msm.errors import Problem
+from taichi_msm.physics.material import highest_frequency, material
 from taichi_msm.scene import WHOLE, Scene
-
-
-def highest_frequency(scene: Scene) -> float:
-    """Bound the highest angular frequency of the sheet [rad/s].
-
-    w^2 = (max(8 structural, 4 structural + 8 shear) + K) / m, Gershgorin's bound of the undeformed and of every
-    sheet whose springs are longer than half their rest length.
-    """
-    springs = scene.springs
-    stiffness = max(8 * springs.structural, 4 * springs.structural + 8 * springs.shear) + springs.virtual
-    return math.sqrt(stiffness / scene.sheet.mass)
 
 
 def stable_step(scene: Scene) -> float:
@@ -27,7 +17,7 @@ def stable_step(scene: Scene) -> float:
     central: 2 / w. backward: (sqrt(g^2 + 4 w^2) - g) / w^2, written without its cancellation; g = C / m.
     """
     w = highest_frequency(scene)
-    g = scene.damping / scene.sheet.mass if scene.time.damping_difference == "backward" else 0.0
+    g = material(scene).drag if scene.time.damping_difference == "backward" else 0.0
     limit = math.hypot(g, 2 * w) + g
     return 4 / limit if limit > 0 else math.inf
 

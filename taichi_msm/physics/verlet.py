@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
+from taichi_msm.physics.material import material
 from taichi_msm.physics.timestep import step
 from taichi_msm.scene import Scene
 
@@ -28,8 +29,8 @@ def coefficients(scene: Scene) -> Coefficients:
     With g = C / m, the damping by central differences takes (1 - g h / 2) / (1 + g h / 2) of a difference, and by
     backward ones 1 - g h.
     """
-    h, g = step(scene), scene.damping / scene.sheet.mass
-    whole = h * h / scene.sheet.mass
+    h, made = step(scene), material(scene)
+    g, whole = made.drag, h * h / made.mass
     if scene.time.damping_difference == "central":
         return Coefficients((1 - g * h / 2) / (1 + g * h / 2), whole / (1 + g * h / 2), whole / 2)
     return Coefficients(1 - g * h, whole, whole / 2)

@@ -6,51 +6,58 @@ import math
 from collections.abc import Iterator
 
 from taichi_msm.physics.error_control import Estimate
+from taichi_msm.physics.material import material
+from taichi_msm.physics.run_progress import RunProgress
 from taichi_msm.physics.timestep import step, steps_per_frame, with_steps
-from taichi_msm.scene import Scene
+from taichi_msm.scene import MAX_POINTS, Scene
 
 # Down to this share of its rest length no spring shakes the limit of stability (see `timestep.highest_frequency`).
 SHORTEST = 0.5
+
+# Beyond so many times its rest length a spring is stretched more than any tissue.
+LONGEST = 2.0
 
 # An error above this share of the largest displacement is told with what would help.
 WRONG = 0.01
 
 
 def notes(
-    scene: Scene,
-    max_displacement: float,
-    shortest_spring: float,
-    estimate: Estimate | None,
-    reason: str = "",
-    *,
-    reached: bool = True,
+    scene: Scene, progress: RunProgress, estimate: Estimate | None, reason: str = "", mesh_error: float | None = None
 ) -> Iterator[str]:
     """Say what is remarkable about a run, one line each.
 
     Args:
         scene: with the step that was taken.
-        max_displacement: largest displacement [m].
-        shortest_spring: smallest length of a spring over its rest length.
+        progress: of the last frame.
         estimate: of the error, if there is one.
         reason: why there is none.
-        reached: whether any frame after the first was reached.
+        mesh_error: of the number of points, if it was estimated; infinite: not known.
     """
     if estimate is not None:
-        yield error(estimate)
+        yield error(estimate, mesh_error)
         if WRONG < estimate.error < math.inf:
             wrong = float(f"{100 * estimate.error:.2g}")
             yield f"the run is about {wrong:g} % wrong; {_remedy(scene, estimate)}"
     elif reason:
         yield f"error not estimated: {reason}"
-    if max_displacement == 0 and reached:
+    if mesh_error is not None and WRONG < mesh_error < math.inf:
+        wrong, cut = float(f"{100 * mesh_error:.2g}"), math.sqrt(mesh_error / (WRONG / 2))
+        finer = [min(MAX_POINTS, math.ceil((count - 1) * cut) + 1) for count in scene.sheet.points]
+        yield f"so few points make the run about {wrong:g} % wrong; try sheet.points: {finer}"
+    if progress.max_displacement == 0 and progress.frame > 0:
         yield "nothing moved: does a probe press where and when it should?"
-    if shortest_spring < SHORTEST:
+    if progress.longest_spring > LONGEST:
         yield (
-            f"a spring was pressed to {shortest_spring:.2g} of its rest length: below {SHORTEST} the sheet folds over "
-            "itself and small errors grow; press less"
+            f"a spring was stretched to {progress.longest_spring:.2g} times its length, which no tissue bears: press "
+            "less, or with a wider tool"
+        )
+    if progress.shortest_spring < SHORTEST:
+        yield (
+            f"a spring was pressed to {progress.shortest_spring:.2g} of its rest length: below {SHORTEST} the sheet "
+            "folds over itself and small errors grow; press less"
         )
     h = step(scene)
-    quick = scene.damping / scene.sheet.mass * h
+    quick = material(scene).drag * h
     if quick > 2 and scene.time.damping_difference == "central":
         yield (
             f"the damping stops a point within 1/{quick:.3g} of a step: velocities change their sign at every step; "
@@ -58,12 +65,17 @@ def notes(
         )
 
 
-def error(estimate: Estimate) -> str:
+def error(estimate: Estimate, mesh_error: float | None = None) -> str:
     """Say how wrong a run is."""
     if estimate.error == math.inf:
         return "error not known: a pilot run diverged, or a step is longer than the damping"
     parts = f"step {estimate.in_f64:.1g}, rounding {estimate.rounding:.1g}" if estimate.rounding else "of the step"
-    return f"error {estimate.error:.1g} of the largest displacement ({parts})"
+    said = f"error {estimate.error:.1g} of the largest displacement ({parts})"
+    if mesh_error is None:
+        return said
+    return (
+        f"{said}, and of the points {mesh_error:.1g}" if mesh_error < math.inf else f"{said}, of the points not known"
+    )
 
 
 def _remedy(scene: Scene, estimate: Estimate) -> str:
@@ -71,8 +83,9 @@ def _remedy(scene: Scene, estimate: Estimate) -> str:
     said = []
     if estimate.rounding > WRONG / 2:
         said.append("time.precision: f64")
-        if scene.springs.structural > 0 or scene.springs.shear > 0:
-            said.append("stiffer springs.virtual, where the sheet buckles")
+        if material(scene).has_springs:
+            support = "springs.virtual" if scene.tissue is None else "tissue.pretension or bending"
+            said.append(f"more {support}, where the sheet buckles")
     if estimate.in_f64 > WRONG / 2:
         needed = steps_per_frame(scene) * (estimate.in_f64 / (WRONG / 2)) ** (1 / estimate.order)
         said.insert(0, f"time.step: {step(with_steps(scene, math.ceil(needed))):.9g}")

@@ -11,6 +11,7 @@ from collections.abc import Iterator
 
 from taichi_msm.errors import Problem
 from taichi_msm.physics.lattice import spacing
+from taichi_msm.physics.material import material
 from taichi_msm.physics.timestep import step, steps_per_frame, with_time
 from taichi_msm.scene import Scene
 
@@ -63,12 +64,13 @@ def problems(scene: Scene) -> Iterator[Problem]:
             f"cells of {min(cells):g} m in a sheet of {max(scene.sheet.size):g} m leave the range of f32, "
             f"{SMALLEST_SINGLE:g} to {LARGEST_SINGLE:g} m; take time.precision: f64",
         )
-    gain = step(scene) ** 2 / scene.sheet.mass
+    mass = material(scene).mass
+    gain = step(scene) ** 2 / mass
     if not SMALLEST_SINGLE**2 < gain < LARGEST_SINGLE**2:
         yield Problem(
             ("time", "precision"),
             f"f32 cannot hold the {gain:g} m by which a step of {step(scene):g} s moves a mass of "
-            f"{scene.sheet.mass:g} kg for every newton; take f64",
+            f"{mass:g} kg for every newton; take f64",
         )
 
 
@@ -80,10 +82,12 @@ def affords_pilot(scene: Scene, ratio: int) -> bool:
         ratio: how many times as many steps the pilot takes.
     """
     steps = _steps(scene)
+    # With tissue there is one with a quarter of the points besides.
+    coarse = 0.0 if scene.tissue is None else DOUBLE * steps / 4
     if precision(scene) == "f64":
-        own, pilot = DOUBLE * steps, DOUBLE * ratio * steps
+        own, pilot = DOUBLE * steps, DOUBLE * ratio * steps + coarse
     else:
-        own, pilot = steps, DOUBLE * (ratio + 1) * steps
+        own, pilot = steps, DOUBLE * (ratio + 1) * steps + coarse
     return pilot <= MOST_FOR_PILOT * (pilot + own + _other(scene))
 
 

@@ -5,20 +5,28 @@ Not to be confused with an independent check: it is itself tested against closed
 
 from taichi_msm.reference.drawing import draw, refine
 from taichi_msm.reference.dynamics import (
+    bending_force,
     displacements,
     elastic_force,
+    energy,
     force,
+    longest_spring,
     shortest_spring,
     simulate,
     surgical_force,
 )
+from taichi_msm.reference.sheet import sheet
 
 __all__ = [
+    "bending_force",
     "displacements",
     "draw",
     "elastic_force",
+    "energy",
     "force",
+    "longest_spring",
     "refine",
+    "sheet",
     "shortest_spring",
     "simulate",
     "surgical_force",

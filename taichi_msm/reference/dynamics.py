@@ -2,22 +2,22 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Iterator
 
 import numpy as np
 from numpy.typing import NDArray
 
-from taichi_msm.physics.lattice import fixed_points, rest_positions, springs
+from taichi_msm.physics.lattice import fixed_points, rest_positions, spacing
 from taichi_msm.physics.loads import Schedule, probe_slots, schedule
 from taichi_msm.physics.timestep import step, steps_per_frame
+from taichi_msm.reference.sheet import sheet
 from taichi_msm.scene import Scene
 
 Array = NDArray[np.float64]
 
 
 def elastic_force(scene: Scene, displacement: Array) -> Array:
-    """Sum k (L - L0) (Q - P) / L over the neighbours Q of every point P (eq. 2).
+    """Sum k (L - L0) (Q - P) / L over the neighbours Q of every point P (eq. 2), but for what cancels at rest.
 
     Args:
         scene: the scene.
@@ -27,12 +27,37 @@ def elastic_force(scene: Scene, displacement: Array) -> Array:
         Force [N], shape (rows, cols, 3).
     """
     force = np.zeros_like(displacement)
-    for spring in springs(scene):
-        here, there = spring.ends(scene.sheet.points)
-        between = displacement[there] - displacement[here] + np.array([*spring.offset, 0.0])
-        length = np.linalg.norm(between, axis=-1, keepdims=True)
-        pull = np.divide(length - spring.length, length, out=np.zeros_like(length), where=length > 0)
-        force[here] += spring.stiffness * pull * between
+    for springs in sheet(scene).springs:
+        between = displacement[springs.there] - displacement[springs.here] + springs.offset
+        length = np.linalg.norm(between, axis=-1)
+        pull = np.divide(length - springs.unstretched, length, out=np.zeros_like(length), where=length > 0)
+        found = (springs.stiffness * pull)[..., None] * between
+        at_rest = springs.stiffness * (springs.length - springs.unstretched) / springs.length
+        found -= at_rest[..., None] * springs.offset
+        force[springs.here] += found
+        force[springs.there] -= found
+    return force
+
+
+def bending_force(scene: Scene, displacement: Array) -> Array:
+    """Differentiate D / 2 sum of dx dy |Laplacian of u|^2 over the points with four neighbours.
+
+    Args:
+        scene: the scene.
+        displacement: x - X [m], shape (rows, cols, 3).
+
+    Returns:
+        Force [N], shape (rows, cols, 3).
+    """
+    (dx, dy), u, force = spacing(scene.sheet), displacement, np.zeros_like(displacement)
+    inner = u[1:-1, 1:-1]
+    curvature = (u[1:-1, 2:] - 2 * inner + u[1:-1, :-2]) / dx**2 + (u[2:, 1:-1] - 2 * inner + u[:-2, 1:-1]) / dy**2
+    moment = sheet(scene).bending * curvature
+    force[1:-1, 1:-1] += (2 / dx**2 + 2 / dy**2) * moment
+    force[1:-1, 2:] -= moment / dx**2
+    force[1:-1, :-2] -= moment / dx**2
+    force[2:, 1:-1] -= moment / dy**2
+    force[:-2, 1:-1] -= moment / dy**2
     return force
 
 
@@ -44,23 +69,40 @@ def shortest_spring(scene: Scene, displacement: Array) -> float:
         displacement: x - X [m], shape (rows, cols, 3).
 
     Returns:
-        The smallest L / L0 of all springs; 1 where there are none.
+        The smallest length of a spring over the one at rest; 1 where there are none.
     """
-    smallest = 1.0
-    for spring in springs(scene):
-        if (spring.down, spring.right) < (0, 0):
-            continue
-        here, there = spring.ends(scene.sheet.points)
-        between = displacement[there] - displacement[here]
-        between[..., 0] += spring.offset[0]
-        between[..., 1] += spring.offset[1]
-        square = np.einsum("ijk,ijk->ij", between, between).min(initial=math.inf)
-        smallest = min(smallest, math.sqrt(square) / spring.length)
-    return smallest
+    return min(1.0, *(float(strain.min(initial=1.0)) for strain in _strains(scene, displacement)))
+
+
+def longest_spring(scene: Scene, displacement: Array) -> float:
+    """Find how far the springs are stretched, as `shortest_spring` does."""
+    return max(1.0, *(float(strain.max(initial=1.0)) for strain in _strains(scene, displacement)))
+
+
+def _strains(scene: Scene, displacement: Array) -> Iterator[Array]:
+    for springs in sheet(scene).springs:
+        between = displacement[springs.there] - displacement[springs.here] + springs.offset
+        yield (np.linalg.norm(between, axis=-1) / springs.length)[springs.stiffness > 0]
+
+
+def energy(scene: Scene, displacement: Array) -> float:
+    """Add up what springs and bending hold more than at rest [J], without the virtual springs."""
+    held, (dx, dy) = 0.0, spacing(scene.sheet)
+    for springs in sheet(scene).springs:
+        between = displacement[springs.there] - displacement[springs.here] + springs.offset
+        length = np.linalg.norm(between, axis=-1)
+        rest = springs.length - springs.unstretched
+        # What is linear in the displacements cancels in the sum over a sheet that is in balance at rest.
+        linear = (between - springs.offset) @ springs.offset * rest / springs.length
+        held += float((springs.stiffness * ((length - springs.unstretched) ** 2 / 2 - rest**2 / 2 - linear)).sum())
+    u = displacement
+    inner = u[1:-1, 1:-1]
+    curvature = (u[1:-1, 2:] - 2 * inner + u[1:-1, :-2]) / dx**2 + (u[2:, 1:-1] - 2 * inner + u[:-2, 1:-1]) / dy**2
+    return held + sheet(scene).bending / 2 * float((curvature**2).sum())
 
 
 def surgical_force(scene: Scene, loads: Schedule, n: int) -> Array:
-    """Sum (percent / 100) force exp(-falloff d - offset) over the probes (eq. 5).
+    """Sum the forces of the probes: (percent / 100) force exp(-falloff d - offset) (eq. 5), or their share of a total.
 
     Args:
         scene: the scene.
@@ -75,7 +117,13 @@ def surgical_force(scene: Scene, loads: Schedule, n: int) -> Array:
     for index, slot in enumerate(probe_slots(scene)):
         probe = scene.probes[slot.probe]
         distance = np.linalg.norm(rest[..., :2] - loads.point[n, index], axis=-1)
-        force += np.exp(-probe.falloff * distance - probe.offset)[..., None] * loads.strength[n, index]
+        decay = np.exp(-probe.falloff * np.maximum(distance - probe.radius, 0))
+        if probe.total is None:
+            decay *= np.exp(-probe.offset)
+        else:
+            decay[[0, -1]] /= 2
+            decay[:, [0, -1]] /= 2
+        force += decay[..., None] * loads.strength[n, index]
     return force
 
 
@@ -93,16 +141,17 @@ def force(scene: Scene, displacement: Array, loads: Schedule, n: int) -> Array:
     """
     return (
         elastic_force(scene, displacement)
+        + bending_force(scene, displacement)
         + surgical_force(scene, loads, n)
-        - loads.active[n] * scene.springs.virtual * displacement
+        - loads.active[n] * sheet(scene).virtual[..., None] * displacement
     )
 
 
 def displacements(scene: Scene) -> Iterator[Array]:
     """Step the scene by Stoermer-Verlet (eq. 6 to 9) and yield u_0, u_1, ... [m], each of shape (rows, cols, 3)."""
-    h, m, damping = step(scene), scene.sheet.mass, scene.damping
+    h, made = step(scene), sheet(scene)
+    m, g = made.mass[..., None], (made.drag / made.mass)[..., None]
     moves = ~fixed_points(scene.sheet)[..., None]
-    g = damping / m
     loads = schedule(scene, 0, scene.time.frames * steps_per_frame(scene))
 
     previous = np.zeros((*scene.sheet.points, 3))

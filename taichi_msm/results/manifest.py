@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import hashlib
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -13,8 +13,9 @@ from numpy.typing import NDArray
 from pydantic import TypeAdapter
 
 from taichi_msm.errors import DamagedError, FilesError
-from taichi_msm.physics import timestep, workload
+from taichi_msm.physics import material, timestep, workload
 from taichi_msm.physics.error_control import Estimate
+from taichi_msm.physics.material import factors
 from taichi_msm.render import camera
 from taichi_msm.render.texture import load_texture
 from taichi_msm.results.publication import CHECKPOINT, MANIFEST, STAGING, open_checkpoint
@@ -38,7 +39,7 @@ class Manifest:
         asks_estimate: whether an estimate is wanted beside the run; None: where it is cheap.
         folder: the current directory, from which the scene's picture is found.
         arch: cpu, cuda or vulkan.
-        picture: the digest of the picture on the sheet.
+        picture: the digest of the picture on the sheet and of the map.
         versions: what the results depend on besides.
     """
 
@@ -80,6 +81,8 @@ class Manifest:
     def gives_the_bits_of(self, other: Manifest) -> bool:
         """Tell whether the results are the same, so that either run can go on with the other."""
         renamed = other.scene.model_copy(update={"image": self.scene.image})
+        if self.scene.stiffness_map is not None:
+            renamed = renamed.with_map_image(self.scene.stiffness_map.image)
         mine, its = (self.arch, self.picture, self.versions), (other.arch, other.picture, other.versions)
         return self.scene == renamed and mine == its
 
@@ -98,7 +101,7 @@ def read_manifest(directory: Path) -> Manifest:
     try:
         with open_checkpoint(directory) as folder, folder.open(MANIFEST) as file:
             data = file.read(MAX_BYTES + 1)
-        manifest = _PLAN.validate_python(unseal(data))
+        manifest = _found_from_here(_PLAN.validate_python(unseal(data)))
     except (FileNotFoundError, NotADirectoryError):
         raise FilesError(f"{directory}: there is no unfinished run to go on with") from None
     except OSError as error:
@@ -108,16 +111,36 @@ def read_manifest(directory: Path) -> Manifest:
     # Anybody may have written it.
     numbers = () if manifest.estimate is None else asdict(manifest.estimate).values()
     possible = manifest.arch in ARCHS and all(number >= 0 for number in numbers)
-    checks = (timestep.problems, workload.problems, camera.problems)
+    checks = (material.problems, timestep.problems, workload.problems, camera.problems)
     if not possible or any(list(check(manifest.scene)) for check in checks):
         raise DamagedError(f"{path} is of no scene that can be run; run another")
     return manifest
 
 
-def digest(picture: NDArray[np.uint8] | None) -> str:
-    """Tell pictures apart; empty where there is none."""
-    if picture is None:
-        return ""
-    found = hashlib.sha256(repr(picture.shape).encode())
-    found.update(np.ascontiguousarray(picture).data)
-    return found.hexdigest()
+def _found_from_here(manifest: Manifest) -> Manifest:
+    """Name the map as it is found from the current directory."""
+    stiffness_map = manifest.scene.stiffness_map
+    if stiffness_map is None:
+        return manifest
+    image = str(Path(manifest.folder) / stiffness_map.image)
+    return replace(manifest, scene=manifest.scene.with_map_image(image))
+
+
+def digest(picture: NDArray[np.uint8] | None, scene: Scene) -> str:
+    """Tell pictures and maps apart; empty where there is none.
+
+    Args:
+        picture: on the sheet, if it is drawn.
+        scene: whose map it is.
+
+    Raises:
+        SceneError: when the map cannot be read.
+    """
+    arrays: list[NDArray[Any]] = [] if picture is None else [picture]
+    if scene.stiffness_map is not None:
+        arrays.append(factors(scene))
+    found = hashlib.sha256()
+    for array in arrays:
+        found.update(repr(array.shape).encode())
+        found.update(np.ascontiguousarray(array).data)
+    return found.hexdigest() if arrays else ""

@@ -4,6 +4,10 @@ from __future__ import annotations
 
 from typing import Any, Literal, TypedDict
 
+from typing_extensions import NotRequired
+
+from taichi_msm.physics.probe_force import ProbeRecord
+
 
 class ErrorRecord(TypedDict):
     """The error of a run, as fractions of the largest displacement; None: not known, as a pilot diverged.
@@ -13,12 +17,14 @@ class ErrorRecord(TypedDict):
         rounding: the part that f32 makes.
         in_f64: the error of the same step in f64.
         order: of the method.
+        mesh_error: made by the number of points; only with tissue.
     """
 
     error: float | None
     rounding: float | None
     in_f64: float | None
     order: int
+    mesh_error: NotRequired[float | None]
 
 
 class RunRecord(TypedDict, total=False):
@@ -35,7 +41,8 @@ class RunRecord(TypedDict, total=False):
         steps_per_frame, steps: steps of a frame, and of the run so far.
         precision: that was stepped in.
         max_displacement: largest displacement [m].
-        shortest_spring: least length of a spring over its rest length.
+        shortest_spring, longest_spring: least and largest length of a spring over its rest length.
+        probes: what each does at 100 %.
         notes: what one should know before trusting the result.
         error_estimate: None: there is none, for the reason in `error_estimate_reason`.
         resumed: how many frames an earlier run had simulated.
@@ -58,6 +65,8 @@ class RunRecord(TypedDict, total=False):
     steps: int
     max_displacement: float
     shortest_spring: float
+    longest_spring: float
+    probes: list[ProbeRecord]
     notes: list[str]
     error_estimate: ErrorRecord | None
     error_estimate_reason: str

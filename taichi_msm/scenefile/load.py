@@ -20,6 +20,11 @@ from taichi_msm.scenefile.yaml_reader import MAX_DEPTH, Document, Mark, Unreadab
 
 MAX_BYTES = 2**20
 
+# The keys that name pictures.
+IMAGE: Key = ("image",)
+MAPS: tuple[Key, ...] = (("tissue", "map", "image"), ("springs", "map", "image"))
+PICTURES = (IMAGE, *MAPS)
+
 # Nobody reads further, and a broken file of the greatest size has tens of thousands.
 MAX_LINES = 100
 
@@ -70,10 +75,9 @@ def load_scene(
     draft = Draft(str(path), read_file(str(path), _SCENE))
     for override in _parse_overrides(overrides):
         draft.override(override)
-    if image is None:
-        draft.find_image(Path(path).parent)
-    else:
-        draft.override(_Override(f"--image {cut(str(image))}", ("image",), str(image)))
+    draft.find_pictures(Path(path).parent, PICTURES if image is None else MAPS)
+    if image is not None:
+        draft.override(_Override(f"--image {cut(str(image))}", IMAGE, str(image)))
     scene, problems = validate(draft.data)
     draft.report(problems)
     if scene is None or draft.found:
@@ -183,17 +187,26 @@ class Draft:
         elif problem := self._put(override.path, override.value, place):
             self.found.append((place, problem))
 
-    def find_image(self, folder: Path) -> None:
-        """Make the path of the image, relative to a folder so far, relative to the current directory."""
-        image = self.data.get("image")
+    def find_pictures(self, folder: Path, keys: Sequence[Key]) -> None:
+        """Make the paths of pictures, relative to a folder so far, relative to the current directory."""
+        for key in keys:
+            self._find_picture(key, folder)
+
+    def _find_picture(self, key: Key, folder: Path) -> None:
+        holder: Any = self.data
+        for part in key[:-1]:
+            holder = holder.get(part) if isinstance(holder, dict) else None
+        image = holder.get(key[-1]) if isinstance(holder, dict) else None
         if not (isinstance(image, str) and 0 < len(image) <= MAX_PATH):
             return
-        self.data["image"] = str(folder / image)
+        holder[key[-1]] = str(folder / image)
         # A scene may come from anybody, and is to see no more than what came with it.
-        if ("image",) not in self._overridden and not _is_below(folder / image, folder):
-            said = f"{image} is not below the scene's folder; put the picture there, or name it with --image"
-            self.found.append((self._place(("image",)), Problem(("image",), said)))
-            del self.data["image"]
+        given = any(key[:n] in self._overridden for n in range(1, len(key) + 1))
+        if not given and not _is_below(folder / image, folder):
+            remedy = ", or name it with --image" if key == IMAGE else ""
+            said = f"{image} is not below the scene's folder; put the picture there{remedy}"
+            self.found.append((self._place(key), Problem(key, said)))
+            del holder[key[-1]]
 
     def report(self, problems: Iterable[Problem]) -> None:
         """Note problems, each at its place, leaving out what was said of the same key before."""

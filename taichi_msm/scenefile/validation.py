@@ -9,14 +9,14 @@ from pydantic import ValidationError
 
 from taichi_msm import faults
 from taichi_msm.errors import ArgumentError, Problem, SceneError
-from taichi_msm.physics import timestep, workload
+from taichi_msm.physics import material, timestep, workload
 from taichi_msm.render import camera, texture
 from taichi_msm.scene import Scene, Section
 from taichi_msm.scenefile import budget
 
 Model = TypeVar("Model", bound=Section)
 
-# What one section cannot know: these see the whole scene.
+# What one section cannot know: these see the whole scene, once `material` finds it to be one.
 CHECKS: tuple[Callable[[Scene], Iterable[Problem]], ...] = (
     timestep.problems,
     workload.problems,
@@ -28,7 +28,8 @@ CHECKS: tuple[Callable[[Scene], Iterable[Problem]], ...] = (
 # Faultless sections to stand for faulty ones, chosen so that no check finds anything in them.
 _STAND_INS: dict[str, Any] = {
     "image": None,
-    "sheet": {"points": [2, 2], "size": [1, 1], "mass": 1},
+    "sheet": {"points": [2, 2], "size": [1, 1]},
+    "tissue": {"young": 1e-20, "thickness": 1, "density": 1},
     "springs": {},
     "time": {"duration": 1, "frames_per_second": 1},
     "output": [],
@@ -50,10 +51,25 @@ def validate(data: dict[str, Any]) -> tuple[Scene | None, list[Problem]]:
         scene, found = parse(Scene, data)
         problems += found
         if scene is not None:
-            problems += [problem for check in CHECKS for problem in check(scene)]
+            problems += joint_problems(scene)
             break
         data = _spare(data, found)
     return (None if problems else scene), problems
+
+
+def joint_problems(scene: Scene, *, picture: bool = True) -> list[Problem]:
+    """Find what is wrong with keys that are right each by itself.
+
+    Args:
+        scene: whose sections are right.
+        picture: whether its picture is looked at.
+    """
+    checks = [check for check in CHECKS if picture or check is not texture.problems]
+    found = list(material.problems(scene))
+    if found:
+        # Steps and memory follow from what the sheet is made of.
+        checks = [check for check in checks if check in (camera.problems, texture.problems)]
+    return found + [problem for check in checks for problem in check(scene)]
 
 
 def checked(scene: Scene | Mapping[str, Any]) -> Scene:
@@ -66,7 +82,7 @@ def checked(scene: Scene | Mapping[str, Any]) -> Scene:
         SceneError: with all that is wrong with it.
     """
     if isinstance(scene, Scene):
-        problems = [problem for check in CHECKS if check is not texture.problems for problem in check(scene)]
+        problems = joint_problems(scene, picture=False)
         made: Scene | None = scene
     elif isinstance(scene, Mapping):
         made, problems = validate(dict(scene))
@@ -82,9 +98,12 @@ def _spare(data: dict[str, Any], problems: list[Problem]) -> dict[str, Any]:
     faulty = {problem.path[0] for problem in problems}
     if "image" in faulty:
         faulty.add("output")
-    return {name: value for name, value in data.items() if name not in faulty} | {
+    spared = {name: value for name, value in data.items() if name not in faulty} | {
         name: value for name, value in _STAND_INS.items() if name in faulty
     }
+    if "sheet" in faulty and "tissue" not in spared:
+        spared["sheet"] = {**spared["sheet"], "mass": 1}
+    return spared
 
 
 def parse(model: type[Model], data: dict[str, Any]) -> tuple[Model | None, list[Problem]]:

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from taichi_msm import reference
 from taichi_msm.physics.lattice import fixed_points
 from taichi_msm.physics.loads import Schedule, key_times, loads_at
+from taichi_msm.reference.sheet import sheet
 from taichi_msm.scene import Scene
 
 # Loads are read this far inside a piece between two keys, as a fraction of it: at its ends they may jump.
@@ -44,7 +45,7 @@ def solve(scene: Scene, rtol: float, atol: float, deadline: float, tick: Callabl
     from scipy.integrate import solve_ivp
 
     shape = (*scene.sheet.points, 3)
-    moves = ~fixed_points(scene.sheet)[..., None]
+    made, moves = sheet(scene), ~fixed_points(scene.sheet)[..., None]
     state = np.zeros(2 * int(np.prod(shape)))
     evaluations = 0
     found = []
@@ -59,8 +60,8 @@ def solve(scene: Scene, rtol: float, atol: float, deadline: float, tick: Callabl
             share = (t - start) / (end - start)
             loads = Schedule(*(each[:1] + share * (each[1:] - each[:1]) for each in ends))
             u, v = y.reshape(2, *shape)
-            force = reference.force(scene, u, loads, 0) - scene.damping * v
-            return np.concatenate([v.ravel(), (force / scene.sheet.mass * moves).ravel()])
+            force = reference.force(scene, u, loads, 0) - made.drag[..., None] * v
+            return np.concatenate([v.ravel(), (force / made.mass[..., None] * moves).ravel()])
 
         times = np.union1d(frames, end)
         solved = solve_ivp(motion, (start, end), state, "DOP853", t_eval=times, rtol=rtol, atol=atol)

@@ -60,14 +60,27 @@ class TermStudy:
         return max(1, min(whole.scene.time.frames, round(self._sample / seconds)))
 
 
+# The terms of a sheet that can be left out, and what stands for them then.
+SPRING_TERMS: dict[str, float | None] = {"structural": 0.0, "shear": 0.0, "virtual": 0.0, "map": None}
+TISSUE_TERMS: dict[str, float | None] = {
+    "foundation": 0.0,
+    "damping": 0.0,
+    "pretension": 0.0,
+    "bending": 0.0,
+    "map": None,
+}
+
+
 def variants(scene: Scene) -> Iterator[tuple[str, Scene]]:
     """Leave out one term after another, at the same step; the first variant is the whole scene."""
     # Fixed, as without a spring the largest stable step is another.
     scene = with_steps(scene, steps_per_frame(scene))
     yield "", scene
-    for name in ("structural", "shear", "virtual"):
-        if getattr(scene.springs, name) > 0:
-            yield f"springs.{name}", scene.model_copy(update={"springs": scene.springs.model_copy(update={name: 0.0})})
+    section, terms = ("springs", SPRING_TERMS) if scene.tissue is None else ("tissue", TISSUE_TERMS)
+    sheet = getattr(scene, section)
+    for name, absent in terms.items():
+        if getattr(sheet, name) not in (0, None):
+            yield f"{section}.{name}", scene.model_copy(update={section: sheet.model_copy(update={name: absent})})
     if scene.damping > 0:
         yield "damping", scene.model_copy(update={"damping": 0.0})
     for index in range(len(scene.probes)):

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from taichi_msm.errors import DivergedError, SceneError
 from taichi_msm.physics.error_control import choose_step
 from taichi_msm.physics.lattice import rest_positions
+from taichi_msm.physics.probe_force import probe_force
 from taichi_msm.physics.timestep import steps_per_frame, with_time
 from taichi_msm.physics.workload import with_precision
 from taichi_msm.render.texture import load_texture
@@ -303,7 +304,7 @@ class Session:
     @property
     def _pulls(self) -> bool:
         """Whether the tool pulls out of the sheet, where scenes may have a force that does."""
-        return self.tool.percent * self.scene.probes[-1].force[2] > 0
+        return self.tool.percent * probe_force(self.scene.probes[-1], self.scene.sheet).force[2] > 0
 
     def _figure_lines(self, pacing: str) -> list[str]:
         tool, speed = self.tool, ""

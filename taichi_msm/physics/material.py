@@ -1,0 +1,322 @@
+"""What a sheet is made of: the numbers of the model for points and springs, whichever way a scene gives them.
+
+With `springs` a scene gives them itself. With `tissue` they follow from it cell by cell, each cell dx x dy adding to
+the springs along its edges and diagonals and to the points at its corners (f: the factor of the map there)
+
+    along x     f E t (9/8 dy/dx - 3/8 dx/dy) / 2        along y: the same with x and y exchanged
+    diagonals   f 3/16 E t (dx^2 + dy^2) / (dx dy)
+    corners     mass rho t dx dy / 4,   K = foundation dx dy / 4,   C = damping mass
+
+so that the lattice is the isotropic sheet of plane stress with Poisson's ratio 1/3, which springs impose: docs/model.md
+derives it. Points and springs at an edge belong to fewer cells, and have less.
+
+A tension S pulls each spring at rest with tau L: tau = k1 e, where k1 is its stiffness for f = 1 and e = S / (3/2 E t).
+Then its force, but for what cancels at rest, is
+
+    (k - tau) (1 - L / |o + q|) (o + q) + tau q          o: the spring at rest, q: difference of its ends' displacements
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from dataclasses import dataclass
+from functools import lru_cache
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from taichi_msm.errors import Problem, SceneError
+from taichi_msm.physics.lattice import fixed_points, spacing
+from taichi_msm.picture import PictureError, read_rgb
+from taichi_msm.scene import Scene, Sheet, StiffnessMap
+
+# Of a lattice of springs between nearest and diagonal neighbours.
+POISSON = 1 / 3
+
+# Cells longer than so many times their width would need springs that push.
+LONGEST_CELL = math.sqrt(3)
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Material:
+    """The numbers of a sheet; where there is a map, for a factor of 1.
+
+    Attributes:
+        mass: of a point [kg].
+        drag: C / m [1/s].
+        across, down, shear: stiffness k of springs along a row, along a column and along diagonals [N/m].
+        tension: share e of its stiffness times its length with which a spring pulls at rest.
+        virtual: stiffness K of the virtual springs [N/m]; 0 where they never act.
+        always: whether the virtual springs always act, and not only under a load.
+        bending: D dx dy [N m3].
+        by_area: whether points and springs at an edge have less, as with tissue; else as much as all others.
+        map: the factor of the stiffness from place to place.
+    """
+
+    mass: float
+    drag: float
+    across: float
+    down: float
+    shear: float
+    tension: float
+    virtual: float
+    always: bool
+    bending: float
+    by_area: bool
+    map: StiffnessMap | None
+
+    @property
+    def stiffness(self) -> tuple[float, float, float]:
+        """Stiffness besides the tension, k - tau, of springs along rows, along columns and of diagonals [N/m]."""
+        return self._times(1 - self.tension)
+
+    @property
+    def tensions(self) -> tuple[float, float, float]:
+        """Tension by length, tau, of springs along rows, along columns and of diagonals [N/m]."""
+        return self._times(self.tension)
+
+    def _times(self, factor: float) -> tuple[float, float, float]:
+        return self.across * factor, self.down * factor, self.shear * factor
+
+    @property
+    def has_springs(self) -> bool:
+        """Whether there are springs between points."""
+        return max(self.across, self.down, self.shear) > 0
+
+
+class Stiffness(tuple[Array, Array, Array]):
+    """Stiffness k of every spring [N/m].
+
+    Along rows, shape (rows, cols - 1); along columns, (rows - 1, cols); along both diagonals of a cell, (rows - 1,
+    cols - 1).
+    """
+
+    __slots__ = ()
+
+
+def material(scene: Scene) -> Material:
+    """Find the numbers of a scene's sheet."""
+    if scene.tissue is not None:
+        return _of_tissue(scene)
+    springs, mass = scene.springs, scene.sheet.mass
+    assert springs is not None
+    assert mass is not None
+    return Material(
+        mass=mass,
+        drag=scene.damping / mass,
+        across=springs.structural,
+        down=springs.structural,
+        shear=springs.shear,
+        tension=0.0,
+        virtual=springs.virtual if springs.virtual_active == "always" or scene.probes else 0.0,
+        always=springs.virtual_active == "always",
+        bending=0.0,
+        by_area=False,
+        map=springs.map,
+    )
+
+
+def _of_tissue(scene: Scene) -> Material:
+    tissue, (dx, dy) = scene.tissue, spacing(scene.sheet)
+    assert tissue is not None
+    membrane, area = tissue.young * tissue.thickness, dx * dy
+    plate = tissue.young * tissue.thickness**3 / (12 * (1 - POISSON**2))
+    return Material(
+        mass=tissue.density * tissue.thickness * area,
+        drag=tissue.damping,
+        across=membrane * (9 / 8 * dy / dx - 3 / 8 * dx / dy),
+        down=membrane * (9 / 8 * dx / dy - 3 / 8 * dy / dx),
+        shear=3 / 16 * membrane * (dx * dx + dy * dy) / area,
+        tension=tissue.pretension / (1.5 * membrane),
+        virtual=tissue.foundation * area if tissue.foundation_active == "always" or scene.probes else 0.0,
+        always=tissue.foundation_active == "always",
+        bending=(plate if tissue.bending == "plate" else tissue.bending) * area,
+        by_area=True,
+        map=tissue.map,
+    )
+
+
+def factors(scene: Scene) -> Array:
+    """Give the factor of the stiffness at the centre of every cell, shape (rows - 1, cols - 1); 1 without a map.
+
+    Raises:
+        SceneError: when the map cannot be read.
+    """
+    rows, cols = scene.sheet.points
+    stiffness_map = scene.stiffness_map
+    if stiffness_map is None:
+        return np.ones((rows - 1, cols - 1))
+    try:
+        return _sampled(stiffness_map, rows - 1, cols - 1, _stamp(stiffness_map))
+    except PictureError as error:
+        section = "springs" if scene.tissue is None else "tissue"
+        raise SceneError([f"{section}.map.image: {error}"]) from None
+
+
+def _stamp(stiffness_map: StiffnessMap) -> int:
+    """Tell a file that was changed from what it was."""
+    file = Path(stiffness_map.image)
+    return file.stat().st_mtime_ns if file.is_file() else 0
+
+
+@lru_cache(maxsize=8)
+def _sampled(stiffness_map: StiffnessMap, rows: int, cols: int, stamp: int) -> Array:
+    """Sample a map at the centres of cells: bilinear between the texels' centres, held beyond them."""
+    del stamp
+    grey = np.asarray(read_rgb(stiffness_map.image, (0, 0, 0)).convert("L"), float)
+    height, width = grey.shape
+    row = np.clip((np.arange(rows) + 0.5) / rows * height - 0.5, 0, height - 1)
+    column = np.clip((np.arange(cols) + 0.5) / cols * width - 0.5, 0, width - 1)
+    top, left = row.astype(int), column.astype(int)
+    bottom, right = np.minimum(top + 1, height - 1), np.minimum(left + 1, width - 1)
+    down, across = (row - top)[:, None], column - left
+    above = grey[np.ix_(top, left)] * (1 - across) + grey[np.ix_(top, right)] * across
+    below = grey[np.ix_(bottom, left)] * (1 - across) + grey[np.ix_(bottom, right)] * across
+    black, white = stiffness_map.range
+    found = black + (white - black) / 255 * (above * (1 - down) + below * down)
+    found.flags.writeable = False
+    return found
+
+
+def stiffness(scene: Scene) -> Stiffness:
+    """Add up the stiffness of every spring, cell by cell.
+
+    Raises:
+        SceneError: when the map cannot be read.
+    """
+    made, factor = material(scene), factors(scene)
+    above_and_below, beside = np.pad(factor, ((1, 1), (0, 0))), np.pad(factor, ((0, 0), (1, 1)))
+    across = made.across / 2 * (above_and_below[:-1] + above_and_below[1:])
+    down = made.down / 2 * (beside[:, :-1] + beside[:, 1:])
+    if not made.by_area:
+        # A spring at an edge is like any other: it has the mean of its cells, of which there is one.
+        across[[0, -1]] *= 2
+        down[:, [0, -1]] *= 2
+    return Stiffness((across, down, made.shear * factor))
+
+
+def area_shares(sheet: Sheet) -> Array:
+    """Tell which share of a cell's area belongs to each point: 1, at edges 1/2, at corners 1/4; shape (rows, cols)."""
+    rows, cols = np.ones(sheet.points[0]), np.ones(sheet.points[1])
+    rows[[0, -1]], cols[[0, -1]] = 0.5, 0.5
+    return np.outer(rows, cols)
+
+
+def highest_frequency(scene: Scene) -> float:
+    """Bound the highest angular frequency of the sheet [rad/s], however it lies, if no spring is below half its length.
+
+    The energy is a sum over cells. In each, springs have at most the energy of k / 2 |q|^2, so that no mode of a cell
+    with a quarter of the points' mass at its corners has more than
+
+        w^2 = (4 max(across + down, across + 2 shear, down + 2 shear) + K) / m
+
+    and nor has the sheet. Where factors differ, cells share the mass of a point as they share its stiffness: then
+    the largest mean of the factors around a point stands before the maximum. Bending adds the square of the largest
+    Laplacian, (4 / dx^2 + 4 / dy^2)^2 D dx dy / m; by Gershgorin (1 + sqrt 2) / 2 times that where edges are free.
+    """
+    made, (dx, dy) = material(scene), spacing(scene.sheet)
+    pairs = (made.across + made.down, made.across + 2 * made.shear, made.down + 2 * made.shear)
+    springs = 4 * max(pairs) * _largest_factor(scene)
+    bending = made.bending * (4 / dx**2 + 4 / dy**2) ** 2
+    if not has_fixed_border(scene):
+        bending *= (1 + math.sqrt(2)) / 2
+    return math.sqrt((springs + made.virtual + bending) / made.mass)
+
+
+def has_fixed_border(scene: Scene) -> bool:
+    """Tell whether every point at an edge is fixed."""
+    fixed = fixed_points(scene.sheet)
+    return bool(fixed[[0, -1]].all() and fixed[:, [0, -1]].all())
+
+
+def _largest_factor(scene: Scene) -> float:
+    """Find the largest mean of the factors of the cells around a point; without shares of area the largest factor."""
+    stiffness_map, (rows, cols) = scene.stiffness_map, scene.sheet.points
+    if stiffness_map is None:
+        return 1.0
+    if not material(scene).by_area:
+        return float(factors(scene).max())
+    factors(scene)  # Says what is wrong with the map.
+    return _largest_mean(stiffness_map, rows - 1, cols - 1, _stamp(stiffness_map))
+
+
+@lru_cache(maxsize=8)
+def _largest_mean(stiffness_map: StiffnessMap, rows: int, cols: int, stamp: int) -> float:
+    """Find the largest mean of the factors of the cells around a point."""
+    found = _sampled(stiffness_map, rows, cols, stamp)
+    around, cells = np.pad(found, 1), np.pad(np.ones_like(found), 1)
+
+    def at_points(values: Array) -> Array:
+        return values[:-1, :-1] + values[:-1, 1:] + values[1:, :-1] + values[1:, 1:]
+
+    return float((at_points(around) / at_points(cells)).max())
+
+
+def problems(scene: Scene) -> Iterator[Problem]:
+    """Say what is missing or too much, of springs and of tissue, and which tissue there cannot be."""
+    kinds = list(_kind_problems(scene))
+    yield from kinds
+    if not kinds:
+        yield from _map_problems(scene)
+        yield from _tissue_problems(scene)
+
+
+def _kind_problems(scene: Scene) -> Iterator[Problem]:
+    """Find keys that belong to the other kind of sheet."""
+    sheet = scene.sheet
+    if scene.tissue is None:
+        if scene.springs is None:
+            said = "missing; expected a mapping with young, thickness and density, or springs in its place"
+            yield Problem(("tissue",), said)
+        elif sheet.mass is None:
+            yield Problem(("sheet", "mass"), "missing; with springs expected a number above 0, in kg")
+        return
+    if scene.springs is not None:
+        yield Problem(("springs",), "tissue says already how stiff the sheet is; remove springs or tissue")
+    if sheet.mass is not None:
+        yield Problem(("sheet", "mass"), "tissue has the mass of density x thickness x area; remove mass")
+    if scene.damping:
+        yield Problem(("damping",), f"{scene.damping:g} N s/m is per point; with tissue set tissue.damping, in 1/s")
+    for index, probe in enumerate(scene.probes):
+        if probe.force is not None:
+            said = "is per point, and more points would dent tissue otherwise; set total, the whole tool's, in newtons"
+            yield Problem(("probes", index, "force"), said)
+
+
+def _map_problems(scene: Scene) -> Iterator[Problem]:
+    try:
+        factors(scene)
+    except SceneError as error:
+        key, said = error.lines[0].split(": ", 1)
+        yield Problem(tuple(key.split(".")), said)
+
+
+def _tissue_problems(scene: Scene) -> Iterator[Problem]:
+    tissue, sheet = scene.tissue, scene.sheet
+    if tissue is None:
+        return
+    dx, dy = spacing(sheet)
+    longest = max(dx, dy) / min(dx, dy)
+    if longest > LONGEST_CELL * (1 + 1e-9):
+        rows, cols = sheet.points
+        height, width = sheet.size
+        enough = (rows, math.ceil(width / dy / LONGEST_CELL) + 1), (math.ceil(height / dx / LONGEST_CELL) + 1, cols)
+        more = enough[0] if dx > dy else enough[1]
+        yield Problem(
+            ("sheet", "points"),
+            f"{list(sheet.points)} make cells {longest:.3g} times as long as wide, and tissue allows "
+            f"{LONGEST_CELL:.3g} times; try {list(more)}",
+        )
+    if tissue.pretension > 0:
+        if not has_fixed_border(scene):
+            said = f"{tissue.pretension:g} N/m needs every side fixed; set sheet.fixed: border, or pretension: 0"
+            yield Problem(("tissue", "pretension"), said)
+        softest = 1.0 if tissue.map is None else min(tissue.map.range)
+        most = 1.5 * tissue.young * tissue.thickness * softest
+        if tissue.pretension >= most:
+            said = f"{tissue.pretension:g} N/m leaves springs no length; take less than {most:.3g} N/m, or more young"
+            yield Problem(("tissue", "pretension"), said)

@@ -1,0 +1,121 @@
+"""The model once more: what the sheet is made of, put together cell by cell."""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from taichi_msm.physics.lattice import spacing
+from taichi_msm.physics.material import factors
+from taichi_msm.scene import Scene, Tissue
+
+Array = NDArray[np.float64]
+Window = tuple[slice, slice]
+
+
+class Springs(NamedTuple):
+    """All springs that lead down and right by so many points.
+
+    Attributes:
+        here, there: select the points at their ends; `there` is down or to the right of `here`.
+        offset: vector from here to there at rest [m], x right, y up, z.
+        length: at rest [m].
+        stiffness: k of each [N/m], shape as selected by `here`.
+        unstretched: length at which each does not pull [m]; that at rest, unless the sheet is under tension.
+    """
+
+    here: Window
+    there: Window
+    offset: Array
+    length: float
+    stiffness: Array
+    unstretched: Array
+
+
+class Sheet(NamedTuple):
+    """A sheet, point by point and spring by spring.
+
+    Attributes:
+        springs: along rows, along columns and along both diagonals, each spring once.
+        mass: of every point [kg], shape (rows, cols).
+        drag: C of every point [N s/m].
+        virtual: K of every point [N/m].
+        bending: D dx dy [N m3].
+    """
+
+    springs: tuple[Springs, ...]
+    mass: Array
+    drag: Array
+    virtual: Array
+    bending: float
+
+
+# Points from one end of a spring to the other, down and right.
+ALONG_ROW, ALONG_COLUMN, TO_RIGHT, TO_LEFT = (0, 1), (1, 0), (1, 1), (1, -1)
+
+
+def sheet(scene: Scene) -> Sheet:
+    """Put a scene's sheet together."""
+    rows, cols = scene.sheet.points
+    if scene.tissue is not None:
+        return _of_tissue(scene, scene.tissue)
+    assert scene.springs is not None
+    assert scene.sheet.mass is not None
+    factor = factors(scene)
+    cells = np.ones_like(factor)
+    structural, shear = scene.springs.structural, scene.springs.shear
+    stiffness = {
+        ALONG_ROW: structural * _rows_of(factor) / _rows_of(cells),
+        ALONG_COLUMN: structural * _columns_of(factor) / _columns_of(cells),
+        TO_RIGHT: shear * factor,
+        TO_LEFT: shear * factor,
+    }
+    every = np.ones((rows, cols))
+    springs = tuple(_springs(scene, ahead, k, 0 * k) for ahead, k in stiffness.items())
+    return Sheet(springs, scene.sheet.mass * every, scene.damping * every, scene.springs.virtual * every, 0.0)
+
+
+def _of_tissue(scene: Scene, tissue: Tissue) -> Sheet:
+    dx, dy = spacing(scene.sheet)
+    factor, membrane = factors(scene), tissue.young * tissue.thickness
+    cells = np.ones_like(factor)
+    along_row = membrane * (9 / 8 * dy / dx - 3 / 8 * dx / dy) / 2
+    along_column = membrane * (9 / 8 * dx / dy - 3 / 8 * dy / dx) / 2
+    diagonal = 3 / 16 * membrane * (dx**2 + dy**2) / (dx * dy)
+    stretch = tissue.pretension / (3 / 2 * membrane)
+    springs = (
+        _springs(scene, ALONG_ROW, along_row * _rows_of(factor), stretch * along_row * _rows_of(cells)),
+        _springs(scene, ALONG_COLUMN, along_column * _columns_of(factor), stretch * along_column * _columns_of(cells)),
+        _springs(scene, TO_RIGHT, diagonal * factor, stretch * diagonal * cells),
+        _springs(scene, TO_LEFT, diagonal * factor, stretch * diagonal * cells),
+    )
+    quarters = _rows_of(_columns_of(cells))
+    mass = tissue.density * tissue.thickness * dx * dy / 4 * quarters
+    plate = tissue.young * tissue.thickness**3 / 12 / (1 - 1 / 9)
+    bending = plate if tissue.bending == "plate" else float(tissue.bending)
+    virtual = tissue.foundation * dx * dy / 4 * quarters
+    return Sheet(springs, mass, tissue.damping * mass, virtual, bending * dx * dy)
+
+
+def _rows_of(cells: Array) -> Array:
+    """Add what cells give to the edges above and below them; one row more."""
+    return np.pad(cells, ((0, 1), (0, 0))) + np.pad(cells, ((1, 0), (0, 0)))
+
+
+def _columns_of(cells: Array) -> Array:
+    """Add what cells give to the edges at their left and right; one column more."""
+    return np.pad(cells, ((0, 0), (0, 1))) + np.pad(cells, ((0, 0), (1, 0)))
+
+
+def _springs(scene: Scene, ahead: tuple[int, int], stiffness: Array, pull: Array) -> Springs:
+    """Make the springs that lead down and right by so many points; `pull` is their force at rest by their length."""
+    (down, right), (dx, dy) = ahead, spacing(scene.sheet)
+    rows, cols = scene.sheet.points
+    here = slice(0, rows - down), slice(max(0, -right), cols - max(0, right))
+    there = slice(down, rows), slice(max(0, right), cols - max(0, -right))
+    length = math.hypot(right * dx, down * dy)
+    shorter = np.divide(pull * length, stiffness, out=np.zeros_like(stiffness), where=stiffness > 0)
+    return Springs(here, there, np.array([right * dx, -down * dy, 0.0]), length, stiffness, length - shorter)

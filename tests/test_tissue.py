@@ -1,0 +1,297 @@
+"""Tissue in both kernels against its twin, and what scenes of it may say."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from taichi_msm import reference
+from taichi_msm.errors import ArgumentError, SceneError
+from taichi_msm.physics import kernel_gpu
+from taichi_msm.physics.lattice import rest_positions
+from taichi_msm.physics.material import factors, material, stiffness
+from taichi_msm.physics.solver import Dynamics, structure
+from taichi_msm.physics.timestep import step, steps_per_frame
+from taichi_msm.scene import Scene
+from taichi_msm.scenefile.load import load_scene
+from taichi_msm.scenefile.validation import checked
+from taichi_msm.simulation import Simulation
+from taichi_msm.system.runtime import Device
+from tests.motion import frames
+from tests.scenes import random_tissue
+from tests.test_dynamics import as_on_a_gpu, simulate
+
+SCENE = """\
+sheet: {points: [13, 15], size: [0.1, 0.1]}
+tissue: {young: 3.0e4, thickness: 2.0e-3, density: 1050, foundation: 2.0e6, damping: 40}
+probes:
+  - total: [0, 0, -2]
+    radius: 0.01
+    falloff: 100
+    load: [[0, 0], [0.2, 100]]
+time: {duration: 0.4, frames_per_second: 10}
+output: []
+"""
+
+
+@pytest.fixture
+def image(tmp_path: Path) -> str:
+    """A map of noise."""
+    path = tmp_path / "map.png"
+    Image.fromarray(np.random.default_rng(1).integers(0, 256, (7, 9), dtype=np.uint8)).save(path)
+    return str(path)
+
+
+@pytest.fixture
+def load(tmp_path: Path, image: str) -> Any:
+    """Load the scene with other lines in it; a map lies beside it."""
+
+    def made(*overrides: str, text: str = SCENE) -> Scene:
+        (tmp_path / "s.yaml").write_text(text)
+        return load_scene(tmp_path / "s.yaml", overrides)
+
+    return made
+
+
+# Together they have every term, free and fixed edges, and both ways of a tool.
+SEEDS = [0, 1, 2, 4, 7, 9]
+
+
+@pytest.mark.parametrize(
+    "seed", [pytest.param(seed, marks=() if seed in SEEDS else pytest.mark.slow) for seed in range(24)]
+)
+def test_a_random_tissue_is_like_the_twin(seed: int, image: str, device: Device) -> None:
+    made = checked(random_tissue(seed, image))
+    twin = reference.simulate(made) - rest_positions(made.sheet)
+    np.testing.assert_allclose(simulate(made, device), twin, rtol=0, atol=1e-12 * np.abs(twin).max())
+
+
+@pytest.mark.parametrize(
+    "seed", [0, 4, pytest.param(7, marks=pytest.mark.fuzz), pytest.param(9, marks=pytest.mark.fuzz)]
+)
+def test_in_f32_it_is_like_the_twin_but_for_rounding(seed: int, image: str, device: Device) -> None:
+    made = checked(random_tissue(seed, image, "f32"))
+    twin = reference.simulate(made) - rest_positions(made.sheet)
+    np.testing.assert_allclose(simulate(made, device), twin, rtol=0, atol=2e-4 * np.abs(twin).max())
+
+
+def test_the_random_tissues_have_every_term(image: str, device: Device) -> None:
+    codes = [structure(random_tissue(seed, image), device).code for seed in SEEDS]
+    for term in ("mapped", "tense", "bending", "virtual", "damped", "open_edges", "by_area"):
+        assert len({getattr(code, term) for code in codes}) == 2, term
+    assert {moves for code in codes for moves in code.slots_move} == {False, True}
+    assert {by_area for code in codes for by_area in code.slots_by_area} == {False, True}
+
+
+@pytest.mark.parametrize(
+    "seed", [1, 5, pytest.param(2, marks=pytest.mark.fuzz), pytest.param(4, marks=pytest.mark.fuzz)]
+)
+def test_bands_do_not_change_the_bits(seed: int, image: str, device: Device) -> None:
+    made = random_tissue(seed, image)
+    layout = structure(made, device)
+    assert layout.code.mapped or layout.code.bending
+    plain = simulate(made, device)
+    assert simulate(made, device, replace(layout, workers=2)).tobytes() == plain.tobytes()
+    dynamics = Dynamics(made, device, replace(layout, workers=3))
+    for _ in range(made.time.frames * steps_per_frame(made)):
+        dynamics.advance(1)
+    assert dynamics.displacement().tobytes() == plain[-1].tobytes()
+    dynamics.close()
+
+
+@pytest.mark.parametrize("seed", [1, pytest.param(5, marks=pytest.mark.fuzz), pytest.param(0, marks=pytest.mark.fuzz)])
+def test_the_form_of_a_gpu_gives_the_same_bits(
+    seed: int, image: str, device: Device, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for module in ("kernel_gpu", "solver"):
+        monkeypatch.setattr(f"taichi_msm.physics.{module}.STEPS_PER_LAUNCH", 2)
+    kernel_gpu._kernels.cache_clear()
+    made = random_tissue(seed, image)
+    layout = structure(made, device)
+    assert simulate(made, device, as_on_a_gpu(layout)).tobytes() == simulate(made, device).tobytes()
+    kernel_gpu._kernels.cache_clear()
+
+
+@pytest.mark.parametrize("seed", [0, 1, 4, 7])
+def test_the_energy_is_that_of_the_twin(seed: int, image: str, device: Device) -> None:
+    made = random_tissue(seed, image)
+    dynamics = Dynamics(made, device)
+    dynamics.advance(2 * steps_per_frame(made))
+    state, reading = dynamics.state(), dynamics.read()
+    v = state.difference / step(made)
+    mass = reference.sheet(made).mass[..., None]
+    expected = float((mass * v * v).sum()) / 2 + reference.energy(made, state.displacement)
+    assert reading.energy == pytest.approx(expected, rel=1e-9)
+    assert reading.shortest_spring == pytest.approx(reference.shortest_spring(made, state.displacement), rel=1e-12)
+    assert reading.longest_spring == pytest.approx(reference.longest_spring(made, state.displacement), rel=1e-12)
+    dynamics.close()
+
+
+def test_a_map_of_springs_is_like_the_twin(load: Any, device: Device) -> None:
+    text = SCENE.replace("tissue: {young: 3.0e4, thickness: 2.0e-3, density: 1050, foundation: 2.0e6, damping: 40}", "")
+    made = load(
+        "springs={structural: 20, shear: 10, virtual: 1, map: {image: map.png, range: [0.5, 3]}}",
+        "sheet.mass=0.001",
+        "sheet.fixed=[top]",
+        "damping=0.01",
+        text=text,
+    )
+    twin = reference.simulate(made) - rest_positions(made.sheet)
+    np.testing.assert_allclose(simulate(made, device), twin, rtol=0, atol=1e-12 * np.abs(twin).max())
+    # A spring has the mean of its cells; at an edge it has one.
+    factor, (across, down, diagonal) = factors(made), stiffness(made)
+    np.testing.assert_allclose(across[[0, -1]], 20 * factor[[0, -1]], rtol=1e-15)
+    np.testing.assert_allclose(across[1:-1], 10 * (factor[1:] + factor[:-1]), rtol=1e-15)
+    np.testing.assert_allclose(down[:, 1:-1], 10 * (factor[:, 1:] + factor[:, :-1]), rtol=1e-15)
+    np.testing.assert_allclose(diagonal, 10 * factor, rtol=1e-15)
+
+
+def test_a_map_of_one_grey_changes_nothing(load: Any, tmp_path: Path, device: Device) -> None:
+    Image.new("L", (3, 3), 51).save(tmp_path / "map.png")
+    plain = load("tissue.young=6.0e4", "sheet.fixed=none")
+    mapped = load("tissue.map={image: map.png, range: [1, 6]}", "sheet.fixed=none")
+    np.testing.assert_allclose(frames(mapped, device), frames(plain, device, steps_per_frame(mapped)), rtol=1e-9)
+
+
+def test_a_changed_map_is_read_again(load: Any, tmp_path: Path) -> None:
+    made = load("tissue.map={image: map.png, range: [1, 2]}")
+    before = factors(made)
+    Image.new("L", (3, 3), 255).save(tmp_path / "map.png")
+    assert (factors(made) == 2).all()
+    assert not (before == 2).all()
+
+
+def test_where_the_tool_lets_go_a_tense_sheet_comes_back(load: Any, device: Device) -> None:
+    load_line = "probes.0.load=[[0, 0], [0.2, 100], [0.2, 0]]"
+    overrides = (
+        load_line,
+        "tissue.foundation=0",
+        "tissue.young=3000",
+        "time.duration=2",
+        "probes.0.total=[0, 0, -0.2]",
+    )
+
+    def left(*more: str) -> float:
+        found = np.abs(frames(load(*overrides, *more), device)).max(axis=(1, 2, 3))
+        return float(found[-1] / found.max())
+
+    assert left("tissue.pretension=1") < 0.01
+    assert left() > 0.05, "without tension a flat sheet has no stiffness out of its plane"
+
+
+BOTH = "tissue says already how stiff the sheet is; remove springs or tissue"
+NO_MASS = "tissue has the mass of density x thickness x area; remove mass"
+DRAG = "0.1 N s/m is per point; with tissue set tissue.damping, in 1/s"
+PER_POINT = "is per point, and more points would dent tissue otherwise; set total, the whole tool's, in newtons"
+LONG = "[13, 40] make cells 3.25 times as long as wide, and tissue allows 1.73 times; try [24, 40]"
+WIDE = "[40, 13] make cells 3.25 times as long as wide, and tissue allows 1.73 times; try [40, 24]"
+OPEN = "1 N/m needs every side fixed; set sheet.fixed: border, or pretension: 0"
+TIGHT = "90 N/m leaves springs no length; take less than 90 N/m, or more young"
+NO_MAP = "no such file or directory; name a picture that can be read"
+FLAT = "0 would spread total over an endless sheet; take a number above 0, in 1/m"
+
+
+@pytest.mark.parametrize(
+    ("override", "message"),
+    [
+        ("springs={structural: 1}", f"springs: {BOTH}"),
+        ("sheet.mass=1", f"sheet.mass: {NO_MASS}"),
+        ("damping=0.1", f"damping: {DRAG}"),
+        ("probes.0={force: [0, 0, 1]}", f"probes.0.force: {PER_POINT}"),
+        ("probes.0.force=[0, 0, 1]", "probes.0.force: stands beside total; remove one of them"),
+        ("probes.0.offset=3", "probes.0.offset: belongs to force, and total is the whole of it; remove offset"),
+        ("probes.0.falloff=0", f"probes.0.falloff: {FLAT}"),
+        ("sheet.points=[13, 40]", f"sheet.points: {LONG}"),
+        ("sheet.points=[40, 13]", f"sheet.points: {WIDE}"),
+        ("tissue.pretension=90", f"tissue.pretension: {TIGHT}"),
+        ("tissue.young=0", "tissue.young: 0 is not allowed; expected a number above 0, in Pa"),
+        (
+            "tissue.bending=thick",
+            'tissue.bending: "thick" is not allowed; expected plate, or a number, 0 or more, in N m',
+        ),
+        ("tissue.map={image: map.png}", "tissue.map.range: missing; expected two numbers above 0: [black, white]"),
+    ],
+)
+def test_what_cannot_be_is_refused_with_the_remedy(load: Any, override: str, message: str) -> None:
+    with pytest.raises(SceneError) as refused:
+        load(override)
+    assert list(refused.value.lines) == [f"--set {override}: {message}"]
+
+
+def test_the_points_that_would_do_do(load: Any) -> None:
+    assert load("sheet.points=[24, 40]").sheet.points == (24, 40)
+    assert load("sheet.points=[40, 24]").sheet.points == (40, 24)
+
+
+def test_all_that_is_wrong_comes_at_once(load: Any, tmp_path: Path) -> None:
+    with pytest.raises(SceneError) as refused:
+        load("tissue.pretension=1", "sheet.fixed=none", "tissue.map={image: no.png, range: [1, 2]}", "render.refine=-1")
+    assert [line.removeprefix("--set ") for line in refused.value.lines] == [
+        f"tissue.pretension=1: tissue.pretension: {OPEN}",
+        f"tissue.map={{image: no.png, range: [1, 2]}}: tissue.map.image: {tmp_path / 'no.png'}: {NO_MAP}",
+        "render.refine=-1: render.refine: -1 is not allowed; expected a whole number, 0 to 64",
+    ]
+
+
+@pytest.mark.parametrize(
+    ("override", "message"),
+    [
+        ("sheet.size=0", "sheet.size: 0 is not allowed; expected two numbers above 0: [height, width] in metres"),
+        ("tissue.density=0", "tissue.density: 0 is not allowed; expected a number above 0, in kg/m3"),
+    ],
+)
+def test_a_faulty_section_brings_no_false_faults(load: Any, override: str, message: str) -> None:
+    with pytest.raises(SceneError) as refused:
+        load(override, "time.step=0.0001")
+    assert list(refused.value.lines) == [f"--set {override}: {message}"]
+
+
+def test_a_map_from_elsewhere_is_not_read(load: Any, tmp_path: Path) -> None:
+    text = SCENE.replace("damping: 40", "damping: 40, map: {image: ../map.png, range: [1, 2]}")
+    with pytest.raises(SceneError, match=r"s.yaml:2:\d+: tissue.map.image: ../map.png is not below the scene's folder"):
+        load(text=text)
+
+
+def test_a_map_that_is_no_picture_is_named(load: Any, tmp_path: Path) -> None:
+    (tmp_path / "map.png").write_text("grey")
+    with pytest.raises(SceneError, match=r"tissue.map.image: .*map.png is not a PNG, JPEG"):
+        load("tissue.map={image: map.png, range: [1, 2]}")
+
+
+def test_the_numbers_of_the_sheet(load: Any) -> None:
+    made = material(load("tissue.bending=plate", "tissue.pretension=9"))
+    dx, dy = 0.1 / 14, 0.1 / 12
+    assert made.mass == pytest.approx(1050 * 2e-3 * dx * dy)
+    assert made.across == pytest.approx(60 * (9 / 8 * dy / dx - 3 / 8 * dx / dy))
+    assert made.down == pytest.approx(60 * (9 / 8 * dx / dy - 3 / 8 * dy / dx))
+    assert made.shear == pytest.approx(60 * 3 / 16 * (dx**2 + dy**2) / (dx * dy))
+    assert made.virtual == pytest.approx(2e6 * dx * dy)
+    assert made.bending == pytest.approx(3e4 * 2e-3**3 / (12 * (1 - 1 / 9)) * dx * dy)
+    assert (made.drag, made.tension) == pytest.approx((40, 0.1))
+    assert sum(made.stiffness) + sum(made.tensions) == pytest.approx(made.across + made.down + made.shear)
+
+
+def test_a_tool_with_a_total_is_steered_like_another(load: Any) -> None:
+    made = load()
+    with Simulation(made) as simulation:
+        simulation.advance()
+        simulation.steer([made.probes[0].model_copy(update={"total": (0, 0, 1)})])
+        simulation.advance(3)
+        assert simulation.positions()[..., 2].max() > 1e-4
+    free = load("sheet.fixed=none")
+    with Simulation(free) as simulation, pytest.raises(ArgumentError, match="restart with"):
+        simulation.steer([{"force": [0, 0, 1], "load": [[0, 100]]}])
+
+
+def test_a_sheet_that_folds_over_does_not_seem_to_explode(load: Any, device: Device) -> None:
+    # Hard, short and off the middle: the energies of tension and bending are part of what the load explains.
+    made = load("tissue.pretension=5", "tissue.bending=plate", "probes.0.total=[3, 1, -20]", "tissue.damping=0")
+    with Simulation(made) as simulation:
+        simulation.advance(made.time.frames)
+        assert math.isfinite(simulation.progress.energy)
