@@ -27,7 +27,7 @@ from taichi_msm.study.table import markdown
 ROOT = Path(__file__).parent.parent
 PAGE, TEMPLATE = ROOT / "docs" / "accuracy.md", ROOT / "docs" / "accuracy.template"
 IMAGES = ROOT / "docs" / "images"
-SCENES = ("press", "figure-3", "drag", "grasp", "two-tools")
+SCENES = ("press", "figure-3", "drag", "grasp", "two-tools", "tumour")
 HARD = sorted((ROOT / "tests" / "hard").glob("*.yaml"))
 TOLERANCE = 1e-3
 

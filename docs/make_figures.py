@@ -27,6 +27,7 @@ IMAGES = ROOT / "docs" / "images"
 
 # For every scene the moment that shows it best [s].
 MOMENTS = {"drag": 0.92, "grasp": 0.76, "two-tools": 0.84}
+PALPATION = 1.0
 
 # The stages of the paper's figure 3: at rest, pressed more and more, and let go.
 STAGES = (0.0, 0.16, 0.4, 0.64, 1.2)
@@ -82,6 +83,9 @@ def main() -> None:
     strip(frames(SCENES / "figure-3.yaml", STAGES, (400, 250))).save(IMAGES / "figure-3.png", optimize=True)
     stills = [frames(SCENES / f"{name}.yaml", (moment,), (400, 400))[0] for name, moment in MOMENTS.items()]
     strip(stills).save(IMAGES / "scenes.jpg", quality=90)
+    stiffness = Image.open(SCENES / "textures" / "tumour.png").convert("RGB").resize((400, 400))
+    palpation = frames(SCENES / "tumour.yaml", (0.0, PALPATION), (400, 400))
+    strip([*palpation, stiffness]).save(IMAGES / "tumour.jpg", quality=90)
     for path in sorted(IMAGES.iterdir()):
         print(f"{path.relative_to(ROOT)}  {path.stat().st_size / 1024:.0f} KiB  {np.array(Image.open(path)).shape}")
 

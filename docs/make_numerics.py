@@ -48,8 +48,8 @@ HALF = ((0, 1), (1, 0), (1, 1), (1, -1))
 
 
 def press(*overrides: str) -> Scene:
-    """Load the shipped press, without its pictures."""
-    return load_scene(ROOT / "scenes" / "press.yaml", ["output=[]", *overrides])
+    """Load the press in springs."""
+    return load_scene(ROOT / "docs" / "springs.yaml", ["output=[]", *overrides])
 
 
 def stiffer(times: int) -> Scene:
@@ -81,7 +81,7 @@ def truth(scene: Scene) -> Array:
 def silent_table() -> str:
     """Compare f32, the precision of `auto`, and the error that is told."""
     faint = load_scene(ROOT / "tests" / "hard" / "faint.yaml")
-    cases = {f"`press`, springs {times} × as stiff": stiffer(times) for times in STIFFER}
+    cases = {f"springs {times} × as stiff": stiffer(times) for times in STIFFER}
     cases |= {"`faint`, displacements of 10 nm": faint}
     rows = []
     for name, scene in cases.items():

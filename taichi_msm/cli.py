@@ -166,7 +166,8 @@ def check(scene: str, image: str | None, overrides: tuple[str, ...], as_json: bo
         return DONE
     import yaml
 
-    at_least = ", at least, as time.tolerance may ask for more" if loaded.time.tolerance is not None else ""
+    asking = [f"{name}.tolerance" for name in ("sheet", "time") if getattr(loaded, name).tolerance is not None]
+    at_least = f", at least, as {' and '.join(asking)} may ask for more" if asking else ""
     click.echo(yaml.safe_dump(facts["scene"], sort_keys=False, default_flow_style=None), nl=False)
     click.echo(
         f"\n{need.points} points, {need.frames} frames, {need.steps} steps of {facts['step']:.6g} s "

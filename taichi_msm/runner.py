@@ -23,7 +23,7 @@ from taichi_msm.errors import DamagedError, DeviceError, DivergedError, FilesErr
 from taichi_msm.physics import error_control
 from taichi_msm.physics.error_control import Estimate, Pilot
 from taichi_msm.physics.lattice import rest_positions
-from taichi_msm.physics.mesh_error import MeshPilot, coarser
+from taichi_msm.physics.mesh_error import MeshPilot, choose_points, coarser
 from taichi_msm.physics.probe_force import probe_records
 from taichi_msm.physics.run_progress import RunProgress
 from taichi_msm.physics.timestep import stable_step, step, steps_per_frame
@@ -111,6 +111,10 @@ def run(
     texture = load_texture(scene) if scene.draws else None
     watch.lap("startup")
     given, estimate = scene, None
+    if scene.sheet.tolerance is not None:
+        scene = choose_points(scene, device, partial(progress, "pilot"))
+        budget.require(scene, Path(directory))
+        watch.lap("pilot")
     if scene.time.tolerance is not None:
         scene, estimate = error_control.choose_step(scene, device, partial(progress, "pilot"))
         watch.lap("pilot")
@@ -317,6 +321,7 @@ def _facts(manifest: Manifest, progress: RunProgress, known: Known) -> dict[str,
         "scene": manifest.given.model_dump(mode="json"),
         "working_directory": manifest.folder,
         "overrides": list(manifest.overrides),
+        "points": list(scene.sheet.points),
         "step": step(scene),
         "stable_step": limit if limit < math.inf else None,
         "steps_per_frame": steps_per_frame(scene),

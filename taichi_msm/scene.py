@@ -44,6 +44,7 @@ Number = Annotated[float, Field(strict=True, allow_inf_nan=False, ge=-LARGEST, l
 Positive = Annotated[float, Field(strict=True, allow_inf_nan=False, ge=SMALLEST, le=LARGEST)]
 NotNegative = Annotated[Number, Field(ge=0)]
 Whole = Annotated[int, Field(strict=True)]
+Tolerance = Annotated[Number, Field(ge=SMALLEST_TOLERANCE, le=LARGEST_TOLERANCE)]
 Count = Annotated[Whole, Field(ge=2, le=MAX_POINTS)]
 Pixels = Annotated[Whole, Field(ge=1, le=MAX_PIXELS)]
 Byte = Annotated[Whole, Field(ge=0, le=255)]
@@ -113,6 +114,12 @@ class Sheet(Section):
         "border",
         means="the points that never move",
         expects="border, corners, none, or a list of top, bottom, left, right",
+    )
+    tolerance: Tolerance | None = key(
+        None,
+        means="with tissue: largest error that the number of points may make, as a fraction of the largest "
+        "displacement; pilot runs find how many more points are needed",
+        expects=f"a number, {SMALLEST_TOLERANCE:g} to {LARGEST_TOLERANCE:g}",
     )
 
 
@@ -284,7 +291,7 @@ class Time(Section):
         means="time step [s], a whole fraction of a frame; auto: half the stability limit or less",
         expects="auto, or a number above 0, in seconds",
     )
-    tolerance: Annotated[Number, Field(ge=SMALLEST_TOLERANCE, le=LARGEST_TOLERANCE)] | None = key(
+    tolerance: Tolerance | None = key(
         None,
         means="largest error of any frame, as a fraction of the largest displacement, that step: auto may make; "
         "pilot runs find the step",

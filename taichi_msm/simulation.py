@@ -15,6 +15,7 @@ from taichi_msm.physics.diagnosis import Diagnosis, diagnose
 from taichi_msm.physics.divergence import Watch, farthest
 from taichi_msm.physics.error_control import choose_step
 from taichi_msm.physics.lattice import axes
+from taichi_msm.physics.mesh_error import choose_points
 from taichi_msm.physics.run_progress import RunProgress, Saved
 from taichi_msm.physics.solver import Dynamics
 from taichi_msm.physics.state import Reading
@@ -42,7 +43,7 @@ class Simulation:
 
     Args:
         scene: what `load_scene` returned, or the same as a mapping; where it has a tolerance, pilot runs choose the
-            step first.
+            points or the step first.
         arch: cpu, cuda or vulkan.
         threads: number of CPU threads; None takes every core.
         texture: the picture on the sheet, shape (height, width, 3); None: the scene's own, read when it is drawn.
@@ -81,7 +82,9 @@ class Simulation:
         self._drawing: Drawing | None = None
 
     def _resolved(self, scene: Scene) -> Scene:
-        """Choose what the scene leaves open: the step for a tolerance, and the precision."""
+        """Choose what the scene leaves open: the points and the step for a tolerance, and the precision."""
+        if scene.sheet.tolerance is not None:
+            scene = choose_points(scene, self.device)
         if scene.time.tolerance is not None:
             return choose_step(scene, self.device)[0]
         return with_precision(scene, self.device.arch)

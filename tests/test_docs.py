@@ -17,7 +17,7 @@ from taichi_msm.system import resources
 from taichi_msm.system.runtime import Device
 from taichi_msm.viewer.script import load_script
 
-SCENES = ["press", "figure-3", "drag", "grasp", "two-tools"]
+SCENES = ["press", "figure-3", "drag", "grasp", "two-tools", "tumour"]
 
 
 def blocks(root: Path, language: str) -> list[str]:
@@ -48,9 +48,9 @@ def test_the_python_shown_runs(root: Path, tmp_path: Path) -> None:
     first, second = blocks(root, "python")
     shown = "print(position.shape, picture.shape, record['status'])\n"
     (tmp_path / "scenes").symlink_to(root / "scenes")
-    (tmp_path / "example.py").write_text(first + shown + second + "print(f'{depth:.2f}')\n")
+    (tmp_path / "example.py").write_text(first + shown + second + "print(f'{depth:.4f}')\n")
     done = subprocess.run([sys.executable, "example.py"], cwd=tmp_path, check=True, capture_output=True, text=True)
-    assert done.stdout == "(41, 41, 3) (512, 512, 3) complete\n0.03\n"
+    assert done.stdout == "(41, 41, 3) (512, 512, 3) complete\n0.0060\n"
     assert (tmp_path / "output" / "from-python" / "animation.gif").exists()
 
 
@@ -76,7 +76,7 @@ def test_the_notebook_runs(
     assert film.count("data:image/jpeg;base64,") == 17
     assert "0.6 s, 61 × 61 points" not in still
     assert "1.6 s, 61 × 61 points" in result
-    assert capsys.readouterr().out.startswith("30.0")
+    assert capsys.readouterr().out.startswith("6.00 mm deep")
 
 
 @pytest.mark.parametrize("name", SCENES)
@@ -86,12 +86,17 @@ def test_shipped_scenes_are_valid(name: str, root: Path) -> None:
 
 
 def test_every_link_of_the_readme_leads_somewhere(root: Path) -> None:
-    text = (root / "README.md").read_text(encoding="utf-8")
-    headings = {"#" + title.lower().replace(" ", "-") for title in re.findall(r"^#+ (.*)$", text, flags=re.MULTILINE)}
-    links = [link for link in re.findall(r"\]\(([^)]+)\)", text) if "://" not in link]
+    def anchors(path: Path) -> set[str]:
+        titles = re.findall(r"^#+ (.*)$", path.read_text(encoding="utf-8"), flags=re.MULTILINE)
+        return {title.lower().replace(" ", "-") for title in titles}
+
+    readme = root / "README.md"
+    links = [link for link in re.findall(r"\]\(([^)]+)\)", readme.read_text(encoding="utf-8")) if "://" not in link]
     assert links
     for link in links:
-        assert link in headings or (root / link).exists(), link
+        name, _, anchor = link.partition("#")
+        assert (root / name).exists(), link
+        assert not anchor or anchor in anchors(root / (name or "README.md")), link
 
 
 def test_every_promise_has_its_test(root: Path) -> None:

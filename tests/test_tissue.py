@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from contextlib import closing
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -12,19 +13,24 @@ import pytest
 from PIL import Image
 
 from taichi_msm import reference
-from taichi_msm.errors import ArgumentError, SceneError
+from taichi_msm.console import summary
+from taichi_msm.errors import ArgumentError, FilesError, SceneError
 from taichi_msm.physics import kernel_gpu
+from taichi_msm.physics.error_control import longest
 from taichi_msm.physics.lattice import rest_positions
 from taichi_msm.physics.material import factors, material, stiffness
+from taichi_msm.physics.mesh_error import FEWEST, CubicSampling, MeshPilot, choose_points, coarser
 from taichi_msm.physics.solver import Dynamics, structure
 from taichi_msm.physics.timestep import step, steps_per_frame
+from taichi_msm.runner import resume, run
 from taichi_msm.scene import Scene
 from taichi_msm.scenefile.load import load_scene
 from taichi_msm.scenefile.validation import checked
 from taichi_msm.simulation import Simulation
 from taichi_msm.system.runtime import Device
 from tests.motion import frames
-from tests.scenes import random_tissue
+from tests.outputs import results
+from tests.scenes import random_scene, random_tissue
 from tests.test_dynamics import as_on_a_gpu, simulate
 
 SCENE = """\
@@ -295,3 +301,109 @@ def test_a_sheet_that_folds_over_does_not_seem_to_explode(load: Any, device: Dev
     with Simulation(made) as simulation:
         simulation.advance(made.time.frames)
         assert math.isfinite(simulation.progress.energy)
+
+
+SMOOTH = ("probes.0.radius=0.01", "probes.0.falloff=100", "tissue.pretension=5", "tissue.bending=plate", "output=[]")
+
+
+@pytest.mark.parametrize("count", [25, 24, pytest.param(31, marks=pytest.mark.slow)])
+def test_the_mesh_error_is_about_that_of_the_points(count: int, load: Any, device: Device) -> None:
+    made = load(f"sheet.points=[{count}, {count}]", *SMOOTH)
+    coarse = coarser(made)
+    assert coarse is not None
+    with closing(MeshPilot(made, coarse, device)) as pilot:
+        for u in (found := frames(made, device)):
+            pilot.follow(u, lambda: None)
+    fine = frames(load(f"sheet.points=[{4 * count - 3}, {4 * count - 3}]", *SMOOTH), device)[:, ::4, ::4]
+    error = longest(found - fine) / longest(fine)
+    assert 0.5 * error < pilot.error < 4 * error
+    assert 1e-3 < error < 0.05
+
+
+def test_the_pilot_of_the_points_samples_cubics_exactly() -> None:
+    def surface(rows: int, cols: int) -> Any:
+        x, y = np.arange(cols) / (cols - 1), np.arange(rows)[:, None] / (rows - 1)
+        return np.stack([(x**3 - 2 * x) * y, y**3 + 0 * x, x * x * y * y], axis=-1)
+
+    sampled = CubicSampling((5, 8), (9, 13)).at(surface(5, 8))
+    np.testing.assert_allclose(sampled, surface(9, 13), atol=1e-14)
+
+
+def test_few_points_and_springs_have_no_mesh_error(load: Any, image: str) -> None:
+    assert coarser(load(f"sheet.points=[{FEWEST}, 9]", "sheet.size=[0.1, 0.13]")) is not None
+    assert coarser(load(f"sheet.points=[{FEWEST - 1}, 7]", "sheet.size=[0.1, 0.13]")) is None
+    assert coarser(random_scene(1)) is None
+
+
+def test_a_tolerance_of_the_points_chooses_them(load: Any, device: Device, tmp_path: Path) -> None:
+    made = load("sheet.tolerance=0.02", *SMOOTH)
+    record = run(made, tmp_path / "out", threads=device.threads)
+    assert record["error_estimate"] is not None
+    assert 0.005 < (record["error_estimate"]["mesh_error"] or 0) <= 0.02
+    assert record["scene"]["sheet"]["tolerance"] == 0.02, "as it was given"
+    assert record["points"] == list(choose_points(made, device).sheet.points)
+    assert record["points"] > [13, 15]
+    with Simulation(made, threads=device.threads) as simulation:
+        assert simulation.positions().shape[:2] == tuple(record["points"])
+
+
+def test_a_tolerance_that_no_points_meet_is_refused(load: Any, device: Device, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("taichi_msm.physics.mesh_error.MAX_POINTS", 40)
+    with pytest.raises(SceneError, match=r"sheet.tolerance: 0.0001 is out of reach: with \d+ x \d+ points the error"):
+        choose_points(load("sheet.tolerance=0.0001"), device)
+
+
+def test_a_run_says_what_its_tool_and_its_points_do(load: Any, device: Device, tmp_path: Path) -> None:
+    record = run(load(), tmp_path / "out", threads=device.threads)
+    (probe,) = record["probes"]
+    assert probe["total_force"] == pytest.approx(2, rel=0.05)
+    # Whole pressure acts on the flat end.
+    assert probe["largest_pressure"] == pytest.approx(
+        2 / (math.pi * (0.01**2 + 2 * (0.01 / 100 + 1 / 100**2))), rel=1e-6
+    )
+    assert any(note.startswith("so few points make the run about") for note in record["notes"])
+    assert "of the points" in record["notes"][0]
+    assert f"probes.0: {probe['total_force']:.3g} N in all, at most 4.07 kPa" in summary(record, tmp_path)
+
+
+def test_a_run_that_stretches_too_far_says_so(load: Any, device: Device, tmp_path: Path) -> None:
+    record = run(load("probes.0.total=[0, 0, -60]", "tissue.foundation=0"), tmp_path / "out", threads=device.threads)
+    assert record["longest_spring"] > 2
+    assert any("times its length, which no tissue bears" in note for note in record["notes"])
+
+
+def test_a_run_with_a_map_goes_on_from_elsewhere(
+    load: Any, tmp_path: Path, device: Device, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    text = SCENE.replace("damping: 40}", "damping: 40, map: {image: map.png, range: [1, 2]}}").replace(
+        "[]", "[trajectory]"
+    )
+    (tmp_path / "s.yaml").write_text(text)
+    made = load_scene("s.yaml")
+
+    def stop(stage: str, done: int, total: int) -> None:
+        if stage == "frames" and done == 2:
+            raise KeyboardInterrupt
+
+    whole = run(made, "whole", threads=device.threads)
+    assert run(made, "parts", threads=device.threads, progress=stop)["status"] == "interrupted"
+    monkeypatch.chdir(tmp_path / "whole")
+    record = resume("../parts", threads=device.threads)
+    assert record["status"] == "complete"
+    assert record["scene"] == whole["scene"]
+    assert record["error_estimate"] == whole["error_estimate"]
+    assert results(tmp_path / "parts") == results(tmp_path / "whole")
+
+
+def test_a_run_does_not_go_on_with_another_map(load: Any, tmp_path: Path, device: Device) -> None:
+    made = load("tissue.map={image: map.png, range: [1, 2]}", "output=[trajectory]")
+
+    def stop(stage: str, done: int, total: int) -> None:
+        if stage == "frames" and done == 2:
+            raise KeyboardInterrupt
+
+    run(made, tmp_path / "out", threads=device.threads, progress=stop)
+    Image.new("L", (3, 3), 99).save(tmp_path / "map.png")
+    with pytest.raises(FilesError, match=r"map.png is another picture than when the run began"):
+        resume(tmp_path / "out", threads=device.threads)

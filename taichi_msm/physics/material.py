@@ -274,6 +274,9 @@ def _kind_problems(scene: Scene) -> Iterator[Problem]:
             yield Problem(("tissue",), said)
         elif sheet.mass is None:
             yield Problem(("sheet", "mass"), "missing; with springs expected a number above 0, in kg")
+        if sheet.tolerance is not None:
+            said = f"{sheet.tolerance:g} needs tissue: with springs other points make another sheet; remove tolerance"
+            yield Problem(("sheet", "tolerance"), said)
         return
     if scene.springs is not None:
         yield Problem(("springs",), "tissue says already how stiff the sheet is; remove springs or tissue")

@@ -11,20 +11,30 @@ With `springs` a sheet is another one with other points, and nothing can be told
 from __future__ import annotations
 
 import math
+from contextlib import closing
+from functools import partial
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from taichi_msm.errors import SceneError
 from taichi_msm.physics.error_control import longest
 from taichi_msm.physics.solver import Dynamics
 from taichi_msm.physics.timestep import steps_per_frame, with_steps, with_time
-from taichi_msm.progress import Pause
-from taichi_msm.scene import Scene
+from taichi_msm.progress import Count, Pause
+from taichi_msm.scene import MAX_POINTS, Scene
 from taichi_msm.system.runtime import Device
 
+# The runs of one search, how much finer each may be than the one before, and how much finer it is at least.
+MOST_TRIALS = 10
+LARGEST_CUT, LEAST_CUT = 4.0, 1.1
+
+# The points found are the fewest but for some: their error is to be this share of the tolerance.
+CLOSE = 0.8
+
 # With fewer points a side than this nothing is left to compare with.
-FEWEST = 5
+FEWEST = 7
 
 
 def coarser(scene: Scene) -> Scene | None:
@@ -32,8 +42,7 @@ def coarser(scene: Scene) -> Scene | None:
     if scene.tissue is None or min(scene.sheet.points) < FEWEST:
         return None
     rows, cols = (round((count - 1) / 2) + 1 for count in scene.sheet.points)
-    sheet = scene.sheet.model_copy(update={"points": (rows, cols)})
-    return with_steps(with_time(scene.model_copy(update={"sheet": sheet}), precision="f64"), steps_per_frame(scene))
+    return with_steps(with_time(with_points(scene, (rows, cols)), precision="f64"), steps_per_frame(scene))
 
 
 class MeshPilot:
@@ -52,9 +61,9 @@ class MeshPilot:
     def __init__(self, scene: Scene, coarse: Scene, device: Device, cores: int | None = None) -> None:
         self._steps = steps_per_frame(scene)
         self._dynamics = Dynamics(coarse, device, cores=cores)
-        cells = [(of - 1, to - 1) for of, to in zip(scene.sheet.points, coarse.sheet.points, strict=True)]
-        self._samples = [_Cubic(of, to) for of, to in cells]
-        self._divisor = min(of / to for of, to in cells) ** 2 - 1
+        self._between = CubicSampling(coarse.sheet.points, scene.sheet.points)
+        cells = zip(scene.sheet.points, coarse.sheet.points, strict=True)
+        self._divisor = min((own - 1) / (other - 1) for own, other in cells) ** 2 - 1
         self._difference = self._largest = 0.0
 
     def compile(self) -> None:
@@ -69,10 +78,9 @@ class MeshPilot:
             pause: called some times a second; what it raises stops the pilot for good.
         """
         self._dynamics.advance(self._steps, pause)
-        rows, cols = self._samples
-        seen = cols.at(rows.at(displacement).swapaxes(0, 1)).swapaxes(0, 1)
         with np.errstate(all="ignore"):
-            self._difference = max(self._difference, longest(seen - self._dynamics.displacement()))
+            coarse = self._between.at(self._dynamics.displacement())
+            self._difference = max(self._difference, longest(displacement - coarse))
         self._largest = max(self._largest, longest(displacement))
 
     @property
@@ -86,6 +94,76 @@ class MeshPilot:
     def close(self) -> None:
         """Free the memory."""
         self._dynamics.close()
+
+
+def with_points(scene: Scene, points: tuple[int, int]) -> Scene:
+    """Give the sheet of a scene so many points; what they were to be chosen by is done with."""
+    return scene.model_copy(update={"sheet": scene.sheet.model_copy(update={"points": points, "tolerance": None})})
+
+
+def choose_points(scene: Scene, device: Device, progress: Count = lambda done, total: None) -> Scene:
+    """Find the fewest points, but for some, of which the error is within the sheet's tolerance.
+
+    Args:
+        scene: a checked scene; its points are the fewest that are tried.
+        device: what `runtime.start` returned.
+        progress: called with the frames done and the frames in all of each pilot run.
+
+    Returns:
+        The scene with these points.
+
+    Raises:
+        SceneError: when so many points as there may be are too few, or they do not fit in memory.
+    """
+    tolerance, given = scene.sheet.tolerance, scene.sheet.points
+    assert tolerance is not None
+    tried = with_points(scene, (max(FEWEST, given[0]), max(FEWEST, given[1])))
+    for _ in range(MOST_TRIALS):
+        error = _error(tried, device, progress)
+        if error <= tolerance:
+            return tried
+        cut = min(LARGEST_CUT, max(LEAST_CUT, math.sqrt(error / (CLOSE * tolerance))))
+        rows, cols = (math.ceil((count - 1) * cut) + 1 for count in tried.sheet.points)
+        if max(rows, cols) > MAX_POINTS:
+            break
+        tried = with_points(tried, (rows, cols))
+    rows, cols = tried.sheet.points
+    raise SceneError(
+        [
+            f"sheet.tolerance: {tolerance:g} is out of reach: with {rows} x {cols} points the error is still "
+            f"{error:.2g}; take a wider tool (probes.N.radius, a smaller falloff) or a larger tolerance"
+        ]
+    )
+
+
+def _error(scene: Scene, device: Device, progress: Count) -> float:
+    """Run a scene and its pilot, in float64."""
+    exact, coarse = with_time(scene, precision="f64"), coarser(scene)
+    assert coarse is not None
+    frames = scene.time.frames
+    with closing(Dynamics(exact, device)) as own, closing(MeshPilot(exact, coarse, device)) as pilot:
+        for frame in range(frames):
+            pause = partial(progress, frame, frames)
+            pause()
+            own.advance(steps_per_frame(exact), pause)
+            pilot.follow(own.displacement(), pause)
+        return pilot.error
+
+
+class CubicSampling:
+    """Samples displacements of one lattice at the points of another one over the same sheet, by cubics.
+
+    Args:
+        of: rows, columns of points whose displacements are given; 4 or more.
+        to: rows, columns of points at which they are asked for.
+    """
+
+    def __init__(self, of: tuple[int, int], to: tuple[int, int]) -> None:
+        self._rows, self._cols = (_Cubic(given - 1, asked - 1) for given, asked in zip(of, to, strict=True))
+
+    def at(self, displacement: NDArray[Any]) -> NDArray[np.float64]:
+        """Sample displacements, shape (rows, cols, 3)."""
+        return self._cols.at(self._rows.at(displacement).swapaxes(0, 1)).swapaxes(0, 1)
 
 
 class _Cubic:

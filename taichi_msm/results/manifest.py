@@ -73,7 +73,9 @@ class Manifest:
             FilesError: when the picture or a version is another one.
         """
         if picture != self.picture:
-            raise FilesError(f"{self.scene.image} is another picture than when the run began; run the scene again")
+            names = [self.scene.image if self.scene.draws else None, getattr(self.scene.stiffness_map, "image", None)]
+            named = " or ".join(name for name in names if name)
+            raise FilesError(f"{named} is another picture than when the run began; run the scene again")
         others = [f"{key} {self.versions.get(key)}" for key in versions if versions[key] != self.versions.get(key)]
         if others:
             raise FilesError(f"the run was begun with {', '.join(others)}; take these, or run the scene again")

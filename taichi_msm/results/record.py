@@ -37,6 +37,7 @@ class RunRecord(TypedDict, total=False):
         scene: as it was loaded.
         working_directory: from which the scene's image is found.
         overrides: what made the scene beside its file.
+        points: rows and columns of mass points.
         step, stable_step: the step, and the largest stable one [s]; None: every one is.
         steps_per_frame, steps: steps of a frame, and of the run so far.
         precision: that was stepped in.
@@ -58,6 +59,7 @@ class RunRecord(TypedDict, total=False):
     scene: dict[str, Any]
     working_directory: str
     overrides: list[str]
+    points: list[int]
     step: float
     stable_step: float | None
     steps_per_frame: int

@@ -32,6 +32,7 @@ PIXEL_FILE_BYTES = {"png": 2, "gif": 1}
 
 # Numbers for each mass point: displacement and difference; and the copies made at the start and for output.
 STATE_NUMBERS = 6
+MAP_NUMBERS = 6  # the stiffness of three springs, and what it is made from
 OUTPUT_NUMBERS = 15
 
 
@@ -76,7 +77,7 @@ def estimate(scene: Scene) -> Budget:
     points = rows * cols
     frames, pixels = scene.time.frames + 1, math.prod(scene.render.size)
     positions = frames * points * 3 * _number_bytes(scene)
-    numbers = STATE_NUMBERS + OUTPUT_NUMBERS + len(scene.probes)
+    numbers = STATE_NUMBERS + OUTPUT_NUMBERS + len(scene.probes) + (MAP_NUMBERS if scene.stiffness_map else 0)
     # A pilot is up to two more sheets, in f64.
     pilot = scene.time.tolerance is not None or affords_pilot(scene, 2)
     sheets = _number_bytes(scene) + (2 * 8 if pilot else 0)
@@ -97,6 +98,21 @@ def problems(scene: Scene) -> Iterator[Problem]:
     """Say what makes the scene too large, with the numbers and the key to change."""
     yield from _step_problems(scene)
     yield from _memory_problems(scene)
+
+
+def require(scene: Scene, directory: Path) -> None:
+    """Make sure that a scene whose points were chosen can be run.
+
+    Args:
+        scene: the scene with these points.
+        directory: where its results are to go.
+
+    Raises:
+        SceneError: when it takes too many steps, or too much memory or disk.
+    """
+    if too_large := [str(problem) for problem in problems(scene)]:
+        raise SceneError(too_large)
+    require_disk(scene, directory)
 
 
 def require_disk(scene: Scene, directory: Path) -> None:
