@@ -26,6 +26,7 @@ STAGES = {
     "stepping": "measuring the stepping",
     "dop853": "measuring DOP853",
     "drawing": "measuring the drawing",
+    "points": "measuring other numbers of points",
     "terms": "measuring every term",
     "write": "writing",
     "film": "filming",

@@ -113,6 +113,25 @@ def test_the_same_bytes_while_bounds_are_checked(runs: Runs, root: Path, tmp_pat
     assert results(tmp_path / "out") == results(runs.folder / "here" / NAMES[0])
 
 
+@pytest.mark.slow
+@pytest.mark.parametrize("fixed", ["border", "[left]"])
+def test_tissue_gives_the_same_bytes_while_bounds_are_checked(fixed: str, root: Path, tmp_path: Path) -> None:
+    """A map, bending, bands, edges that move and a tool that moves."""
+    settings = [
+        "sheet.points=[33, 35]",
+        f"sheet.fixed={fixed}",
+        f"tissue.pretension={1 if fixed == 'border' else 0}",
+        "probes.0.at=[[0, 0.1, 0.1], [0.05, 0.9, 0.95]]",
+        "time.duration=0.08",
+        "output=[trajectory]",
+    ]
+    overrides = [word for setting in settings for word in ("--set", setting)]
+    command = [sys.executable, "-m", "taichi_msm", "run", str(root / "scenes" / "tumour.yaml"), *overrides]
+    for debug in ("0", "1"):
+        subprocess.run([*command, "--out", str(tmp_path / debug)], env={**os.environ, "TI_DEBUG": debug}, check=True)
+    assert results(tmp_path / "0") == results(tmp_path / "1")
+
+
 def test_any_name_in_any_locale(runs: Runs) -> None:
     # click takes a terminal that is said to know ASCII alone for one that is set up wrongly, and speaks UTF-8 to it.
     assert runs.printed[0].decode().startswith(f"{NAMES[0]}: 3 frames, ")

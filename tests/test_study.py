@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from contextlib import closing
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -11,11 +12,16 @@ from pydantic import BaseModel
 
 from taichi_msm import reference
 from taichi_msm.physics.lattice import rest_positions
-from taichi_msm.physics.solver import structure
-from taichi_msm.physics.timestep import stable_step, step, steps_per_frame, with_time
-from taichi_msm.study import pictures
+from taichi_msm.physics.mesh_error import with_points
+from taichi_msm.physics.solver import Dynamics, structure
+from taichi_msm.physics.timestep import stable_step, step, steps_per_frame, with_steps, with_time
+from taichi_msm.runner import run
+from taichi_msm.scene import Scene
+from taichi_msm.study import measure, pictures
 from taichi_msm.study.peer import TooSlowError, solve
 from taichi_msm.study.pictures import PictureStudy
+from taichi_msm.study.points import ROUNDS as POINTS_ROUNDS
+from taichi_msm.study.points import PointStudy, lattices
 from taichi_msm.study.result import Drawn, Stepping, Study, Timing
 from taichi_msm.study.stepping import MARGIN, ROUNDS, SteppingStudy, observed_orders
 from taichi_msm.study.terms import TermStudy, variants
@@ -162,6 +168,131 @@ def test_terms_are_timed(device: Device) -> None:
     measured.run()
     assert [term.without for term in measured.points()] == ["", "springs.shear", "probes.0"]
     assert all(1e-8 < term.seconds.median < 1e-2 and term.seconds.runs == 9 for term in measured.points())
+
+
+def tissue(points: tuple[int, int] = (33, 33), **time: Any) -> Scene:
+    """A tense sheet under a tool that covers it, whose displacement is smooth: (S / K)^(1/2) = 16 mm are many cells."""
+    return Scene(
+        sheet={"points": points, "size": [0.1, 0.1]},
+        tissue={
+            "young": 3e3,
+            "thickness": 2e-3,
+            "density": 1050,
+            "foundation": 2e4,
+            "damping": 40,
+            "pretension": 5,
+        },
+        probes=[{"total": [0, 0, -0.2], "radius": 0.2, "falloff": 100, "load": [[0, 0], [0.2, 100]]}],
+        time={"duration": 0.2, "frames_per_second": 25, "precision": "f64", **time},
+        output=[],
+    )
+
+
+@pytest.fixture(scope="module")
+def points(device: Device) -> PointStudy:
+    measured = PointStudy(tissue(), device, 2.0, nothing)
+    measured.run()
+    return measured
+
+
+def test_the_error_of_points_is_of_order_2(points: PointStudy) -> None:
+    found = points.points()
+    assert points.notes == []
+    assert [one.name for one in found] == ["9 x 9", "17 x 17", "33 x 33", "65 x 65"]
+    assert [one.known for one in found[:3]] == [True] * 3
+    errors = [one.error or 0.0 for one in found]
+    # Between 9 points a side the cubics are wrong besides, by terms of order 4.
+    assert np.log2(errors[1] / errors[2]) == pytest.approx(2, abs=0.2)
+    assert errors[0] / errors[1] > 4
+    assert all(one.seconds.runs == POINTS_ROUNDS for one in found)
+    # The largest stable step is as long as a cell.
+    assert found[3].steps_per_frame / found[2].steps_per_frame == pytest.approx(2, abs=0.05)
+
+
+def test_the_error_of_points_is_that_against_many_more(points: PointStudy, device: Device) -> None:
+    many = tissue((65, 65))
+    steps = steps_per_frame(many)
+
+    def displacements(count: int) -> Any:
+        with closing(Dynamics(with_steps(with_points(many, (count, count)), steps), device)) as sheet:
+            frames = []
+            for _ in range(many.time.frames):
+                sheet.advance(steps)
+                frames.append(sheet.displacement())
+        return np.array(frames)
+
+    exact = displacements(65)
+    largest = np.linalg.norm(exact, axis=-1).max()
+    for found in points.points()[1:3]:
+        stride = 64 // (found.rows - 1)
+        apart = np.linalg.norm(displacements(found.rows) - exact[:, ::stride, ::stride], axis=-1).max() / largest
+        # 65 x 65 have 1/4 of the error of 33 x 33 themselves; and between the points it may be somewhat larger.
+        assert apart <= (found.error or 0.0) < 1.6 * apart
+
+
+def test_the_estimate_beside_it_is_that_of_a_run(points: PointStudy, device: Device, tmp_path: Path) -> None:
+    found = points.points()[1]
+    record = run(tissue((17, 17)), tmp_path / "out", threads=device.threads, estimate_error=True)
+    estimate = record["error_estimate"]
+    assert estimate is not None
+    assert estimate["mesh_error"] == pytest.approx(found.estimate, rel=1e-9)
+
+
+def test_without_time_for_more_points_the_error_of_the_finest_is_a_bound(points: PointStudy, device: Device) -> None:
+    measured = PointStudy(tissue(), device, 1e-6, nothing)
+    measured.run()
+    found, better = measured.points(), points.points()
+    assert measured.notes == ["65 x 65 points were not measured: time or memory"]
+    assert [one.name for one in found] == ["9 x 9", "17 x 17", "33 x 33"]
+    assert found[0].known
+    assert not found[2].known
+    assert (found[2].error or 0.0) > (better[2].error or 1.0)
+
+
+def test_where_the_finest_is_the_reference_its_error_is_never_known(device: Device) -> None:
+    # At the border the displacement jumps, by far more than the extrapolation there may be wrong.
+    made = tissue((13, 13))
+    assert made.tissue is not None
+    slack = made.model_copy(update={"tissue": made.tissue.model_copy(update={"pretension": 0.0, "foundation": 2e6})})
+    measured = PointStudy(slack, device, 1e-6, nothing)
+    measured.run()
+    assert [one.known for one in measured.points()] == [True, False]
+
+
+def test_points_are_quarters_and_halves_of_the_cells() -> None:
+    assert list(lattices(tissue((31, 31)))) == [(9, 9), (16, 16), (31, 31)]
+    assert list(lattices(tissue((41, 25)))) == [(11, 7), (21, 13), (41, 25)]
+    # Too few to be compared with half as many; and cells that would be too long.
+    assert list(lattices(tissue((13, 15)))) == [(7, 8), (13, 15)]
+    assert list(lattices(tissue((6, 6)))) == []
+    assert list(lattices(tissue((46, 27)))) == [(23, 14), (46, 27)]
+
+
+def test_a_sheet_of_too_few_points_is_left_out(device: Device) -> None:
+    measured = PointStudy(tissue((6, 6)), device, 1.0, nothing)
+    measured.run()
+    assert measured.points() == []
+    assert measured.notes == ["points were not measured: with fewer than 7 a side they cannot be compared"]
+
+
+def test_springs_have_no_part_of_points(device: Device) -> None:
+    made = Study("press", scene().model_dump(), "complete", 1e-3, {})
+    measure._measure_points(scene(), device, measure.QUICK, made, lambda stage, done, total: None)
+    assert (made.points, made.notes) == ([], [])
+
+
+def test_an_interruption_leaves_the_points_that_were_timed(device: Device) -> None:
+    made = Study("press", tissue((13, 13)).model_dump(), "complete", 1e-3, {})
+
+    def stop(stage: str, done: int, total: int) -> None:
+        # The estimates and the errors of three are done, and one was timed once.
+        if done == 2 * 3 + 1 + 1:
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        measure._measure_points(tissue((13, 13)), device, measure.QUICK, made, stop)
+    assert [(one.name, one.seconds.runs) for one in made.points] == [("7 x 7", 1)]
+    assert made.points[0].error is not None
 
 
 def test_pictures_are_judged_by_a_finer_one(device: Device, monkeypatch: pytest.MonkeyPatch) -> None:

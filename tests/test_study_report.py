@@ -21,7 +21,7 @@ from rich.console import Console
 
 from taichi_msm.errors import FilesError
 from taichi_msm.study.report import COLUMNS, WITHOUT_MATPLOTLIB, as_record, write_report
-from taichi_msm.study.result import Drawn, Peer, Reference, Stepping, Study, Term, Timing
+from taichi_msm.study.result import Drawn, Peer, Points, Reference, Stepping, Study, Term, Timing
 from taichi_msm.study.table import duration, number, print_summary, timing
 from tests.scenes import scene
 
@@ -98,6 +98,25 @@ def realistic() -> Study:
     return found
 
 
+def of_tissue() -> Study:
+    """With points, as tissue has them: orders 1 and 2, and a bound where there was no finer one to compare with."""
+    found = realistic()
+    found.settings["sheet"]["points"] = [31, 31]
+    found.points = [
+        Points(9, 9, 58, 0.191, True, 0.0511, spread(0.00227)),
+        Points(16, 16, 88, 0.0836, True, None, spread(0.00293)),
+        Points(31, 31, 162, 0.0209, True, 0.0217, spread(0.0112)),
+        Points(61, 61, 317, 0.0105, False, 0.0114, spread(0.0484)),
+    ]
+    return found
+
+
+def tissue_alone() -> Study:
+    """Without a picture to draw; the coarsest sheet diverged."""
+    found = of_tissue()
+    return replace(found, drawing=[], points=[replace(found.points[0], error=None), *found.points[1:]])
+
+
 def interrupted() -> Study:
     """Stopped before the reference was there."""
     return Study("press", realistic().settings, "interrupted", 1e-3, MACHINE, notes=["interrupted: what was measured"])
@@ -145,6 +164,8 @@ def on_a_gpu() -> Study:
 
 CASES = [
     realistic,
+    of_tissue,
+    tissue_alone,
     interrupted,
     halfway,
     diverged,
@@ -277,6 +298,54 @@ def test_the_page_has_all_tables(tmp_path: Path) -> None:
 
 
 @pytest.mark.usefixtures("no_picture")
+def test_points_are_reported_beside_their_estimates(tmp_path: Path) -> None:
+    found = of_tissue()
+    write_report(found, tmp_path)
+    text = page(tmp_path)
+    assert text.index("## Drawing") < text.index("## Points") < text.index("## Terms")
+    part = text.split("## Points")[1].split("## Terms")[0]
+    rows = [[cell.strip() for cell in line.strip("|").split("|")] for line in part.splitlines() if line.startswith("|")]
+    assert rows[2:] == [
+        ["9 x 9", "58", "0.191", "0.0511", "2.27 ms (2.04 to 2.95)", ""],
+        ["16 x 16", "88", "0.0836", "not known", "2.93 ms (2.64 to 3.81)", ""],
+        ["31 x 31", "162", "0.0209", "0.0217", "11.2 ms (10.1 to 14.6)", "of the scene"],
+        ["61 x 61", "317", "< 0.0105", "0.0114", "48.4 ms (43.6 to 62.9)", ""],
+    ]
+    assert "An error with < is at most about that" in part
+    with (tmp_path / "study.csv").open(encoding="utf-8", newline="") as file:
+        flat = [row for row in csv.DictReader(file) if row["part"] == "points"]
+    assert [(row["rows"], row["cols"], row["known"]) for row in flat][2:] == [
+        ("31", "31", "True"),
+        ("61", "61", "False"),
+    ]
+    assert [row["estimate"] for row in flat] == ["0.0511", "", "0.0217", "0.0114"]
+    assert float(flat[0]["error"]) == found.points[0].error
+    record = json.loads((tmp_path / "study.json").read_text(encoding="utf-8"))
+    assert [Points(**{**one, "seconds": Timing(**one["seconds"])}) for one in record["points"]] == found.points
+    printed = [" ".join(line.split()) for line in terminal(found).splitlines()]
+    assert "61 x 61 317 < 0.0105 0.0114 48.4 ms (43.6 to 62.9)" in printed
+    assert "9 x 9 58 diverged 0.0511 2.27 ms (2.04 to 2.95)" in [
+        " ".join(line.split()) for line in terminal(tissue_alone()).splitlines()
+    ]
+
+
+def test_every_number_of_points_is_named_in_the_picture(tmp_path: Path) -> None:
+    style = pytest.importorskip("matplotlib.style")
+    from taichi_msm.study.plot import STYLE, _figure
+
+    with style.context(STYLE, after_reset=True):
+        figure = _figure(of_tissue())
+    axes = {one.get_title(loc="left"): one for one in figure.axes}
+    assert list(axes) == ["Stepping", "Drawing", "Points", "Terms"]
+    figure.canvas.draw()
+    labels = [text for text in axes["Points"].texts if " x " in text.get_text()]
+    assert [text.get_text() for text in labels] == ["9 x 9", "16 x 16", "31 x 31", "61 x 61"]
+    assert [text.get_fontweight() for text in labels] == ["normal", "normal", "bold", "normal"]
+    boxes = [text.get_window_extent() for text in labels]
+    assert not any(box.count_overlaps(boxes[:number]) for number, box in enumerate(boxes))
+
+
+@pytest.mark.usefixtures("no_picture")
 def test_a_page_without_upper_bounds_does_not_explain_them(tmp_path: Path) -> None:
     write_report(one_point(), tmp_path)
     assert "<" not in page(tmp_path)
@@ -298,7 +367,9 @@ def test_the_page_says_that_no_step_is_good_enough(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     "made",
     [
-        pytest.param(made, marks=pytest.mark.fuzz if made in (halfway, diverged, without_reference) else ())
+        pytest.param(
+            made, marks=pytest.mark.fuzz if made in (tissue_alone, halfway, diverged, without_reference) else ()
+        )
         for made in CASES[:-1]
     ],
     ids=lambda made: made.__name__,
@@ -313,7 +384,7 @@ def test_the_picture_is_readable_and_keeps_inside(made: Callable[[], Study], tmp
     height, width, _ = picture.shape
     # One panel alone is narrower, so that parts that are missing leave no hole.
     assert width == (1200 if made in (halfway, motionless) else 1800)
-    assert 700 <= height <= 1300
+    assert 700 <= height <= (1700 if made is of_tissue else 1300)
     assert (picture == 255).all(axis=-1).mean() > 0.7
     assert len(np.unique(picture @ (1 << 16, 1 << 8, 1))) > 100
     # Nothing is cut off.

@@ -307,17 +307,19 @@ SMOOTH = ("probes.0.radius=0.01", "probes.0.falloff=100", "tissue.pretension=5",
 
 
 @pytest.mark.parametrize("count", [25, 24, pytest.param(31, marks=pytest.mark.slow)])
-def test_the_mesh_error_is_about_that_of_the_points(count: int, load: Any, device: Device) -> None:
-    made = load(f"sheet.points=[{count}, {count}]", *SMOOTH)
+def test_the_mesh_error_is_that_of_the_points(count: int, load: Any, device: Device) -> None:
+    # With its control point beyond the edge, a tool is smooth all over the sheet.
+    tense = ("tissue.pretension=20", "tissue.foundation=0")
+    smooth = (*tense, "probes.0.radius=0", "probes.0.at=[-0.3, 0.4]", "probes.0.falloff=10")
+    made = load(f"sheet.points=[{count}, {count}]", *smooth)
     coarse = coarser(made)
     assert coarse is not None
     with closing(MeshPilot(made, coarse, device)) as pilot:
         for u in (found := frames(made, device)):
             pilot.follow(u, lambda: None)
-    fine = frames(load(f"sheet.points=[{4 * count - 3}, {4 * count - 3}]", *SMOOTH), device)[:, ::4, ::4]
+    fine = frames(load(f"sheet.points=[{4 * count - 3}, {4 * count - 3}]", *smooth), device)[:, ::4, ::4]
     error = longest(found - fine) / longest(fine)
-    assert 0.5 * error < pilot.error < 4 * error
-    assert 1e-3 < error < 0.05
+    assert 0.8 * error < pilot.error < 1.5 * error
 
 
 def test_the_pilot_of_the_points_samples_cubics_exactly() -> None:
@@ -363,7 +365,7 @@ def test_a_run_says_what_its_tool_and_its_points_do(load: Any, device: Device, t
     )
     assert any(note.startswith("so few points make the run about") for note in record["notes"])
     assert "of the points" in record["notes"][0]
-    assert f"probes.0: {probe['total_force']:.3g} N in all, at most 4.07 kPa" in summary(record, tmp_path)
+    assert f"probes.0: {probe['total_force']:.3g} N in all, at most 1.27 kPa" in summary(record, tmp_path)
 
 
 def test_a_run_that_stretches_too_far_says_so(load: Any, device: Device, tmp_path: Path) -> None:

@@ -216,14 +216,13 @@ def highest_frequency(scene: Scene) -> float:
 
     and nor has the sheet. Where factors differ, cells share the mass of a point as they share its stiffness: then
     the largest mean of the factors around a point stands before the maximum. Bending adds the square of the largest
-    Laplacian, (4 / dx^2 + 4 / dy^2)^2 D dx dy / m; by Gershgorin (1 + sqrt 2) / 2 times that where edges are free.
+    Laplacian, (4 / dx^2 + 4 / dy^2)^2 D dx dy / m; at free edges, too, where a point has half the mass and is, with the
+    moments mirrored in the edge, one of a sheet without edges.
     """
     made, (dx, dy) = material(scene), spacing(scene.sheet)
     pairs = (made.across + made.down, made.across + 2 * made.shear, made.down + 2 * made.shear)
     springs = 4 * max(pairs) * _largest_factor(scene)
     bending = made.bending * (4 / dx**2 + 4 / dy**2) ** 2
-    if not has_fixed_border(scene):
-        bending *= (1 + math.sqrt(2)) / 2
     return math.sqrt((springs + made.virtual + bending) / made.mass)
 
 

@@ -1,9 +1,9 @@
-"""How much the number of points changes a run of tissue, by a run with half the points a side beside it.
+"""How much the number of points changes a run of tissue, by runs with half and a quarter of the cells a side.
 
-The lattice is of second order in the length of its cells where the displacement is smooth, so that with r times longer
-cells the displacement u_c tells the error of u by Richardson's extrapolation: |u - u_c| / (r^2 - 1). It is not smooth
-at the rim of a tool's flat end, at an edge in a map and where tissue folds; and a tool that is narrower than the longer
-cells is not seen by them. The error told there is mostly too large.
+With r times longer cells the displacement u_c tells the error of u by Richardson's extrapolation: it is
+|u - u_c| / (r^p - 1). The lattice is of order p = 2 in the length of its cells where the displacement is smooth, and
+less at the rim of a tool's flat end, at an edge in a map, at a fixed edge without tension and in wrinkles. So p is what
+the third run shows, at most 2 and at least 1; and 1 where there are too few points for a third run.
 
 With `springs` a sheet is another one with other points, and nothing can be told.
 """
@@ -11,8 +11,9 @@ With `springs` a sheet is another one with other points, and nothing can be told
 from __future__ import annotations
 
 import math
-from contextlib import closing
+from contextlib import ExitStack, closing
 from functools import partial
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
@@ -46,7 +47,7 @@ def coarser(scene: Scene) -> Scene | None:
 
 
 class MeshPilot:
-    """Runs beside another run, in float64, with half the points a side.
+    """Runs in float64 beside another run, with half the cells a side and, where there are enough, with a quarter.
 
     Args:
         scene: what is run, with its step.
@@ -60,15 +61,20 @@ class MeshPilot:
 
     def __init__(self, scene: Scene, coarse: Scene, device: Device, cores: int | None = None) -> None:
         self._steps = steps_per_frame(scene)
-        self._dynamics = Dynamics(coarse, device, cores=cores)
-        self._between = CubicSampling(coarse.sheet.points, scene.sheet.points)
-        cells = zip(scene.sheet.points, coarse.sheet.points, strict=True)
-        self._divisor = min((own - 1) / (other - 1) for own, other in cells) ** 2 - 1
-        self._difference = self._largest = 0.0
+        coarsest = coarser(coarse)
+        scenes = [coarse] if coarsest is None else [coarse, coarsest]
+        with ExitStack() as opened:
+            self._sheets = [opened.enter_context(closing(Dynamics(one, device, cores=cores))) for one in scenes]
+            self._open = opened.pop_all()
+        points = [one.sheet.points for one in (scene, *scenes)]
+        self._samplings = [CubicSampling(after, before) for before, after in pairwise(points)]
+        self._ratio = min((own - 1) / (other - 1) for own, other in zip(*points[:2], strict=True))
+        self._differences = [0.0 for _ in scenes]
+        self._largest = 0.0
 
     def compile(self) -> None:
         """Compile now what would be compiled by the first frame."""
-        self._dynamics.compile()
+        self._sheets[0].compile()
 
     def follow(self, displacement: NDArray[Any], pause: Pause) -> None:
         """Take the next frame, and compare.
@@ -77,23 +83,34 @@ class MeshPilot:
             displacement: of the run at that frame, shape (rows, cols, 3).
             pause: called some times a second; what it raises stops the pilot for good.
         """
-        self._dynamics.advance(self._steps, pause)
-        with np.errstate(all="ignore"):
-            coarse = self._between.at(self._dynamics.displacement())
-            self._difference = max(self._difference, longest(displacement - coarse))
         self._largest = max(self._largest, longest(displacement))
+        finer = displacement
+        for n, (sheet, sampling) in enumerate(zip(self._sheets, self._samplings, strict=True)):
+            sheet.advance(self._steps, pause)
+            found = sheet.displacement()
+            with np.errstate(all="ignore"):
+                self._differences[n] = max(self._differences[n], longest(finer - sampling.at(found)))
+            finer = found
 
     @property
     def error(self) -> float:
         """What is known by the frames so far, as a fraction of the largest displacement; infinite: not known."""
         if self._largest == 0:
             return 0.0
-        relative = self._difference / self._divisor / self._largest
+        relative = self._differences[0] / (self._ratio**self.order - 1) / self._largest
         return relative if relative < math.inf else math.inf
+
+    @property
+    def order(self) -> float:
+        """Order in the length of the cells that the frames so far show, 1 to 2."""
+        first, *others = self._differences
+        if not others or not 0 < first < others[0] < math.inf:
+            return 1.0
+        return min(2.0, max(1.0, math.log(others[0] / first) / math.log(self._ratio)))
 
     def close(self) -> None:
         """Free the memory."""
-        self._dynamics.close()
+        self._open.close()
 
 
 def with_points(scene: Scene, points: tuple[int, int]) -> Scene:

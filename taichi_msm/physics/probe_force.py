@@ -81,7 +81,8 @@ def control_points(probe: Probe, sheet: Sheet) -> tuple[Array, Array]:
 def spread(probe: Probe) -> float:
     """Integrate the decay of a probe with `total` over an endless sheet: W [m2]."""
     reach = 1 / probe.falloff
-    return math.pi * probe.radius**2 + 2 * math.pi * (probe.radius * reach + reach**2)
+    # Products and no powers, which raise where a product is infinite.
+    return math.pi * (probe.radius * probe.radius + 2 * (probe.radius * reach + reach * reach))
 
 
 class ProbeRecord(TypedDict):

@@ -11,6 +11,7 @@ from collections.abc import Iterator
 
 from taichi_msm.errors import Problem
 from taichi_msm.physics.lattice import spacing
+from taichi_msm.physics.loads import probe_slots
 from taichi_msm.physics.material import material
 from taichi_msm.physics.timestep import step, steps_per_frame, with_time
 from taichi_msm.scene import Scene
@@ -23,6 +24,9 @@ START = 4e8
 
 # A step of a point in f64.
 DOUBLE = 2.0
+
+# What a control point that moves and bending add to a step, as shares of it.
+MOVING, BENDING = 1.2, 0.5
 
 # Encoding a pixel, and drawing a sample of it.
 ENCODING, SAMPLE = 40.0, 6.0
@@ -82,8 +86,8 @@ def affords_pilot(scene: Scene, ratio: int) -> bool:
         ratio: how many times as many steps the pilot takes.
     """
     steps = _steps(scene)
-    # With tissue there is one with a quarter of the points besides.
-    coarse = 0.0 if scene.tissue is None else DOUBLE * steps / 4
+    # With tissue there are two with a quarter and a sixteenth of the points besides.
+    coarse = 0.0 if scene.tissue is None else DOUBLE * steps * 5 / 16
     if precision(scene) == "f64":
         own, pilot = DOUBLE * steps, DOUBLE * ratio * steps + coarse
     else:
@@ -92,7 +96,9 @@ def affords_pilot(scene: Scene, ratio: int) -> bool:
 
 
 def _steps(scene: Scene) -> float:
-    return float(scene.time.frames) * steps_per_frame(scene) * math.prod(scene.sheet.points)
+    moving = sum(slot.moves for slot in probe_slots(scene))
+    cost = 1 + MOVING * moving + BENDING * (material(scene).bending > 0)
+    return cost * scene.time.frames * steps_per_frame(scene) * math.prod(scene.sheet.points)
 
 
 def _other(scene: Scene) -> float:

@@ -1,4 +1,4 @@
-"""A whole study: stepping, SciPy beside it, drawing, terms; what is done stays when it is interrupted."""
+"""A whole study: stepping, SciPy beside it, drawing, points, terms; what is done stays when it is interrupted."""
 
 from __future__ import annotations
 
@@ -18,6 +18,7 @@ from taichi_msm.runner import versions
 from taichi_msm.scene import Scene
 from taichi_msm.study.peer import TooSlowError, solve
 from taichi_msm.study.pictures import PictureStudy
+from taichi_msm.study.points import PointStudy
 from taichi_msm.study.result import Peer, Study, Timing
 from taichi_msm.study.stepping import SteppingStudy, observed_orders
 from taichi_msm.study.terms import TermStudy
@@ -101,6 +102,7 @@ def study(
                 found.orders = observed_orders(found.stepping)
         _measure_peer(scene, stepping, effort, found, progress)
         _measure_pictures(scene, stepping, texture, effort, found, progress)
+        _measure_points(scene, device, effort, found, progress)
         terms = TermStudy(scene, device, effort.sample, partial(progress, "terms"))
         try:
             terms.run()
@@ -177,3 +179,15 @@ def _measure_pictures(
     finally:
         found.drawing = pictures.points()
         found.notes += pictures.notes
+
+
+def _measure_points(scene: Scene, device: Device, effort: Effort, found: Study, progress: Progress) -> None:
+    """Change the number of points of tissue; with springs other points make another sheet."""
+    if scene.tissue is None:
+        return
+    points = PointStudy(scene, device, effort.longest_run, partial(progress, "points"))
+    try:
+        points.run()
+    finally:
+        found.points = points.points()
+        found.notes += points.notes

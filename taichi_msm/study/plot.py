@@ -1,4 +1,4 @@
-"""A study as a picture: work against precision of the stepping, the same of the drawing, and what every term costs."""
+"""A study as a picture: work against precision of stepping, drawing and points, and what every term costs."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
 from matplotlib.transforms import Bbox, offset_copy
 from numpy.typing import NDArray
 
-from taichi_msm.study.result import Drawn, Peer, Stepping, Study, Timing
+from taichi_msm.study.result import Drawn, Peer, Points, Stepping, Study, Timing
 from taichi_msm.study.table import duration, number, shown, unit, where
 
 # The colours of Okabe and Ito, which everybody can tell apart.
@@ -44,6 +44,8 @@ RING: dict[str, Any] = {
     "markeredgewidth": 1,
     "zorder": 5,
 }
+POINTS_LINE: dict[str, Any] = {"color": BLUE, "linestyle": "-", "marker": "o", "markersize": 4.5}
+ESTIMATE: dict[str, Any] = {"color": ORANGE, "linestyle": "none", "marker": "D", "markersize": 3.8}
 HOLLOW: dict[str, Any] = {"markerfacecolor": "white"}
 HALF: dict[str, Any] = {"fillstyle": "bottom", "markerfacecoloralt": "white"}
 SUPERSAMPLES = (SKY, BLUE, GREEN, ORANGE, PURPLE, VERMILION)
@@ -82,8 +84,10 @@ WIDE, NARROW, HEADER = 9.0, 6.0, 0.72  # [in]: with two columns, with one, the l
 BLANK: dict[str, Any] = {"facecolor": "white", "edgecolor": "none", "pad": 1}
 LABEL: dict[str, Any] = {"textcoords": "offset points", "size": 7, "color": GREY}
 
+AT_MOST = "at most this error"
+
 Panel = Callable[[Axes, Study], None]
-Point = Stepping | Peer
+Point = Stepping | Peer | Points
 
 
 def plot(study: Study, path: Path) -> None:
@@ -105,6 +109,8 @@ def panels(study: Study) -> Iterator[tuple[str, Panel]]:
         yield "stepping", _plot_stepping
     if any(_drawable(drawn.psnr) for drawn in study.drawing):
         yield "drawing", _plot_drawing
+    if any(_drawable(points.error) for points in study.points):
+        yield "points", _plot_points
     if study.terms:
         yield "terms", _plot_terms
 
@@ -118,12 +124,16 @@ def _figure(study: Study) -> Figure:
     shown = dict(panels(study))
     names = list(shown)
     bars = 1.0 + 0.2 * len(study.terms)
-    if len(names) == 3:
-        layout: list[Any] = [[names[0], names[1]], [names[0], names[2]]]
-        rows = [3.0, bars]
+    last = bars if names[-1] == "terms" else 0.0
+    if len(names) == 4:
+        layout: list[Any] = [names[:2], names[2:]]
+        rows = [4.4, max(3.0, last)]
+    elif len(names) == 3:
+        layout = [[names[0], names[1]], [names[0], names[2]]]
+        rows = [3.0, last or 3.0]
     else:
         layout = [names]
-        rows = [max(4.4 if "stepping" in names else 3.4, bars if "terms" in names else 0)]
+        rows = [max(4.4 if "stepping" in names else 3.4, last)]
     width, height = WIDE if len(names) > 1 else NARROW, sum(rows) + HEADER
     layout_engine = ConstrainedLayoutEngine(rect=(0.01, 0.01, 0.98, 0.99 - HEADER / height), wspace=0.06, hspace=0.06)
     figure = Figure(figsize=(width, height), dpi=DPI, layout=layout_engine)
@@ -138,6 +148,8 @@ def _figure(study: Study) -> Figure:
     figure.set_layout_engine("none")
     if "drawing" in axes:
         _label_refinements(axes["drawing"], study)
+    if "points" in axes:
+        _label_points(axes["points"], study)
     return figure
 
 
@@ -248,7 +260,7 @@ def _marks(study: Study) -> Iterator[Line2D]:
     if any(point.known and _mostly_rounding(point) for point in points):
         yield Line2D([], [], **dot, **HALF, label="mostly rounding")
     if not all(point.known for point in points):
-        yield Line2D([], [], **dot, **HOLLOW, label="at most this error")
+        yield Line2D([], [], **dot, **HOLLOW, label=AT_MOST)
     if any(point.error is None for point in study.stepping):
         yield Line2D([], [], **dot | {"marker": "x"}, label="diverged")
 
@@ -330,6 +342,54 @@ def _dots(path: NDArray[np.float64]) -> Iterator[NDArray[np.float64]]:
     yield path[0]
     for start, end in pairwise(path):
         yield from np.linspace(start, end, 2 + int(np.linalg.norm(end - start) / 2))
+
+
+def _plot_points(axes: Axes, study: Study) -> None:
+    points = [one for one in study.points if _drawable(one.error)]
+    estimated = [one for one in points if _drawable(one.estimate)]
+    axes.set(title="Points", xscale="log", yscale="log", ylabel="time of the scene [s]")
+    axes.set_xlabel("error, as a fraction of the largest displacement")
+    errors = [*(one.error or 0.0 for one in points), *(one.estimate or 0.0 for one in estimated)]
+    _span(axes.set_xlim, errors, 2)
+    _span(axes.set_ylim, _extremes(points), 1)
+    axes.xaxis.set_minor_formatter(NullFormatter())
+    _tick_plainly(axes.yaxis)
+    handles = [_plot_series(axes, points, POINTS_LINE, "error")]
+    for one in estimated:
+        height = one.seconds.median
+        axes.plot([one.error or 0.0, one.estimate or 0.0], [height] * 2, color=ORANGE, linewidth=0.7)
+        axes.plot([one.estimate or 0.0], [height], **ESTIMATE)
+    if estimated:
+        handles.append(Line2D([], [], **ESTIMATE, label="estimated by run"))
+    if not all(one.known for one in points):
+        handles.append(Line2D([], [], **POINTS_LINE | {"color": GREY, "linestyle": "none"} | HOLLOW, label=AT_MOST))
+    axes.legend(handles=handles, loc="upper right", handlelength=2.2)
+
+
+def _label_points(axes: Axes, study: Study) -> None:
+    """Write their number beside the points where nothing else is, that of the scene bold."""
+    points = [one for one in study.points if _drawable(one.error)]
+    places = [(one.error or 0.0, one.seconds.median) for one in points]
+    estimates = [(one.estimate or error, height) for one, (error, height) in zip(points, places, strict=True)]
+    # Places are in points of print.
+    spreads = [(error, time) for (error, _), one in zip(places, points, strict=True) for time in _extremes([one])]
+    path, ends, spread = (axes.transData.transform(each) * 72 / DPI for each in (places, estimates, spreads))
+    strokes = [*zip(path, ends, strict=True), *zip(spread[::2], spread[1::2], strict=True)]
+    dots = chain(_dots(path), *(_dots(np.array(stroke)) for stroke in strokes))
+    taken = [Bbox.from_bounds(x - 2.5, y - 2.5, 5, 5) for x, y in dots]
+    for one, place, (x, y), (end, _) in zip(points, places, path, ends, strict=True):
+        own = [one.rows, one.cols] == list(study.settings["sheet"]["points"])
+        width = (4.3 if own else 4.0) * len(one.name)
+        right, left = max(x, end) - x + 6, min(x, end) - x - 6
+        sides = [(right, 0, "left"), (4, 8, "left"), (-4, -8, "right"), (left, 0, "right")]
+        for across, up, side in sides:
+            box = Bbox.from_bounds(x + across - (width if side == "right" else 0), y + up - 3.5, width, 7)
+            inside = box.x1 * DPI / 72 <= axes.bbox.x1 and box.x0 * DPI / 72 >= axes.bbox.x0
+            if inside and not box.count_overlaps(taken):
+                look = {**LABEL, "weight": "bold", "color": INK} if own else LABEL
+                axes.annotate(one.name, place, (across, up), **look, ha=side, va="center")
+                taken.append(box)
+                break
 
 
 def _plot_terms(axes: Axes, study: Study) -> None:

@@ -7,14 +7,25 @@ import io
 import json
 import math
 import tempfile
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
 from taichi_msm.errors import writing
-from taichi_msm.study.result import Peer, Stepping, Study, Timing
-from taichi_msm.study.table import decibels, duration, markdown, number, shortfall, shown, timing, where, wrong
+from taichi_msm.study.result import Peer, Points, Stepping, Study, Timing
+from taichi_msm.study.table import (
+    decibels,
+    duration,
+    estimated,
+    markdown,
+    number,
+    shortfall,
+    shown,
+    timing,
+    where,
+    wrong,
+)
 
 PICTURE, FLAT, PAGE, RECORD = "study.png", "study.csv", "study.md", "study.json"
 
@@ -31,10 +42,13 @@ COLUMNS = (
     "evaluations",
     "refine",
     "supersample",
+    "rows",
+    "cols",
     "without",
     "error",
     "rounding",
     "known",
+    "estimate",
     "psnr",
     "largest_error",
     "seconds_median",
@@ -142,7 +156,7 @@ def _flat(study: Study) -> str:
 
 def _rows(study: Study) -> Iterator[Row]:
     record = as_record(study)
-    parts = {"stepping": "stepping", "peers": "dop853", "drawing": "drawing", "terms": "term"}
+    parts = {"stepping": "stepping", "peers": "dop853", "drawing": "drawing", "points": "points", "terms": "term"}
     for key, part in parts.items():
         for found in record[key]:
             seconds = found.pop("seconds")
@@ -162,6 +176,7 @@ def _page(study: Study) -> str:
         "Times are medians, with the fastest and the slowest in brackets.",
         *_stepping(study),
         *_drawing(study),
+        *_points(study),
         *_terms(study),
     ]
     if study.notes:
@@ -208,8 +223,12 @@ def _stepping(study: Study) -> Iterator[str]:
         yield "SciPy's DOP853 on the same equations:"
         peers = [(f"{one.rtol:g}", wrong(one), str(one.evaluations), timing(one.seconds)) for one in study.peers]
         yield markdown(("rtol", "error", "evaluations", "time of the scene"), peers)
-    every: list[Stepping | Peer] = [*study.stepping, *study.peers]
-    if any(wrong(one).startswith("<") for one in every):
+    yield from _bounds([*study.stepping, *study.peers])
+
+
+def _bounds(points: Sequence[Stepping | Peer | Points]) -> Iterator[str]:
+    """Explain the errors that are upper bounds, if there are any."""
+    if any(wrong(one).startswith("<") for one in points):
         yield "An error with < is at most about that; the reference is not exact enough to tell it."
 
 
@@ -234,6 +253,33 @@ def _drawing(study: Study) -> Iterator[str]:
         for one in study.drawing
     ]
     yield markdown(("refine", "supersample", "PSNR", "largest error", "time of a frame", ""), rows, left=(5,))
+
+
+def _points(study: Study) -> Iterator[str]:
+    if not study.points:
+        return
+    yield "## Points"
+    yield (
+        "An error is what the number of points makes, at the points and between them, where the displacement is taken "
+        "from cubics: the largest of any place at any frame, as a fraction of the largest displacement. The reference "
+        "is the extrapolation, of order 2, of the two finest sheets; all are stepped in f64 with the same step. "
+        "The estimate is that of `run`, which has a sheet with half as many points a side beside it. "
+        "Times are with the automatic step of each."
+    )
+    own = tuple(study.settings["sheet"]["points"])
+    rows = [
+        (
+            one.name,
+            str(one.steps_per_frame),
+            wrong(one),
+            estimated(one),
+            timing(one.seconds),
+            "of the scene" if (one.rows, one.cols) == own else "",
+        )
+        for one in study.points
+    ]
+    yield markdown(("points", "steps/frame", "error", "estimate", "time of the scene", ""), rows, left=(5,))
+    yield from _bounds(study.points)
 
 
 def _terms(study: Study) -> Iterator[str]:

@@ -114,6 +114,34 @@ class Drawn:
 
 
 @dataclass(frozen=True)
+class Points:
+    """A sheet of tissue with more or fewer points, in f64.
+
+    Attributes:
+        rows, cols: of points.
+        steps_per_frame: that the automatic step makes with so many points.
+        error: that the number of points makes: the largest of any point at any frame, as a fraction of the largest
+            displacement; None: it diverged.
+        known: as above.
+        estimate: of this error by the pilot that `run` has beside it; None: it is not known.
+        seconds: of stepping through the whole scene, compiled and warm.
+    """
+
+    rows: int
+    cols: int
+    steps_per_frame: int
+    error: float | None
+    known: bool
+    estimate: float | None
+    seconds: Timing
+
+    @property
+    def name(self) -> str:
+        """Name it, such as 31 x 31."""
+        return f"{self.rows} x {self.cols}"
+
+
+@dataclass(frozen=True)
 class Term:
     """What a step costs without one term of the model.
 
@@ -141,6 +169,7 @@ class Study:
         orders: of every method, by regression over the points above the rounding floor; None: too few of them.
         peers: DOP853 at several tolerances.
         drawing: in the order of supersample and refine; empty where the scene has no picture.
+        points: with tissue, from few to many; empty where the scene has springs.
         terms: the first of them leaves nothing out.
         notes: what a reader must know, such as parts left out and why.
     """
@@ -155,6 +184,7 @@ class Study:
     orders: dict[str, float | None] = field(default_factory=dict)
     peers: list[Peer] = field(default_factory=list)
     drawing: list[Drawn] = field(default_factory=list)
+    points: list[Points] = field(default_factory=list)
     terms: list[Term] = field(default_factory=list)
     notes: list[str] = field(default_factory=list)
 

@@ -12,7 +12,7 @@ from rich.console import Console
 from rich.table import Table
 from rich.text import Text
 
-from taichi_msm.study.result import Drawn, Peer, Stepping, Study, Timing
+from taichi_msm.study.result import Drawn, Peer, Points, Stepping, Study, Timing
 
 UNITS = ((1, "s"), (1e3, "ms"), (1e6, "us"))
 
@@ -44,10 +44,15 @@ def timing(seconds: Timing) -> str:
     return f"{duration(seconds.median)} ({spread})"
 
 
-def wrong(point: Stepping | Peer) -> str:
+def wrong(point: Stepping | Peer | Points) -> str:
     """Write an error; where the reference cannot tell it, what it is below."""
     size = _size(point)
     return f"{'' if point.known else '< '}{number(size)}" if size < math.inf else "diverged"
+
+
+def estimated(points: Points) -> str:
+    """Write what `run` estimates of an error."""
+    return "not known" if points.estimate is None else number(points.estimate)
 
 
 def shown(text: str) -> str:
@@ -97,6 +102,8 @@ def print_summary(study: Study, console: Console) -> None:
         console.print(_stepping_table(study))
     if study.drawing:
         console.print(_drawing_table(study))
+    if study.points:
+        console.print(_points_table(study))
     for note in study.notes:
         say(f"note: {shown(note)}")
     if (reason := shortfall(study)) is not None:
@@ -149,6 +156,14 @@ def _drawing_table(study: Study) -> Table:
     return table
 
 
+def _points_table(study: Study) -> Table:
+    table = _table("points", "steps/frame", "error", "estimate", "time (spread)")
+    for points in study.points:
+        cells = points.name, str(points.steps_per_frame), wrong(points), estimated(points), timing(points.seconds)
+        _add(table, False, *cells)
+    return table
+
+
 def decibels(drawn: Drawn) -> str:
     """Write how close a picture is to the truth."""
     return "equal" if drawn.psnr is None else f"{drawn.psnr:.1f} dB"
@@ -171,7 +186,7 @@ def _best(points: Sequence[Point], tolerance: float) -> Point | None:
     return min(points, key=_size, default=None)
 
 
-def _size(point: Stepping | Peer) -> float:
+def _size(point: Stepping | Peer | Points) -> float:
     return math.inf if point.error is None or math.isnan(point.error) else point.error
 
 

@@ -55,9 +55,11 @@ class Captures:
             return self._place(draft, "picture", ".png")
 
     def keep_scene(self, scene: Scene) -> Path:
-        """Save a scene, and beside it a copy of its picture, which a scene file needs near itself; returns its file."""
-        data = scene.model_dump(mode="json", exclude_none=True)
+        """Save a scene, and copies of its pictures beside it, as a scene file needs them near; returns its file."""
         with _draft(self.folder) as draft:
+            if scene.stiffness_map is not None:
+                scene = scene.with_map_image(self._copied(Path(scene.stiffness_map.image)).name)
+            data = scene.model_dump(mode="json", exclude_none=True)
             if scene.image is not None:
                 data["image"] = self._copied(Path(scene.image)).name
             text = yaml.dump(

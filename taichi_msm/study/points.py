@@ -1,0 +1,261 @@
+"""Work and precision of the number of points: tissue with a quarter, half and twice as many cells a side."""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Iterator
+from contextlib import ExitStack, closing
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from taichi_msm.physics import material
+from taichi_msm.physics.divergence import farthest_displacement
+from taichi_msm.physics.error_control import longest
+from taichi_msm.physics.mesh_error import FEWEST, CubicSampling, MeshPilot, coarser, with_points
+from taichi_msm.physics.solver import Dynamics
+from taichi_msm.physics.timestep import steps_per_frame, with_steps, with_time
+from taichi_msm.progress import Count
+from taichi_msm.scene import MAX_POINTS, Scene
+from taichi_msm.scenefile import budget
+from taichi_msm.study.result import Points, Timing
+from taichi_msm.system.runtime import Device
+
+# How many times as many cells a side as the scene has.
+COARSER = (1 / 4, 1 / 2)
+FINER = 2
+
+# Every number of points is timed so often, all of them in turn.
+ROUNDS = 5
+
+# An error is known when it is so many times what the reference's own may be at most.
+MARGIN = 5
+
+Field = NDArray[Any]
+Lattice = tuple[int, int]
+
+
+@dataclass
+class _Trial:
+    """One number of points, and what is known of it so far."""
+
+    scene: Scene
+    dynamics: Dynamics
+    estimate: float = math.inf
+    error: float = math.inf
+    known: bool = False
+    samples: list[float] = field(default_factory=list)
+
+    @property
+    def points(self) -> Lattice:
+        """Give the rows and columns."""
+        return self.scene.sheet.points
+
+
+class PointStudy:
+    """Measures how exact a sheet of tissue is with more or fewer points, and how fast, in f64.
+
+    Errors are those of runs with the same steps, which are alike in what the step makes wrong; times are those of runs
+    with the automatic step, which is longer where there are fewer points.
+
+    The reference is a sheet with more points than all that are listed, if it can be afforded; else it is the finest of
+    them, of which only a bound of the error is known then.
+
+    Args:
+        scene: a checked scene with tissue.
+        device: what `runtime.start` returned.
+        longest_run: a run is to take no longer than about this [s]; the reference, which is run but once, as long as
+            all the runs by which another is timed.
+        progress: called with the work done and all of it; may raise KeyboardInterrupt, which leaves what is done.
+
+    Attributes:
+        notes: what was left out.
+    """
+
+    def __init__(self, scene: Scene, device: Device, longest_run: float, progress: Count) -> None:
+        self.notes: list[str] = []
+        self._scene = with_points(with_time(scene, step="auto", tolerance=None, precision="f64"), scene.sheet.points)
+        self._device = device
+        self._longest_run = longest_run
+        self._progress = progress
+        self._trials: list[_Trial] = []
+        self._done = 0
+
+    def run(self) -> None:
+        """Make the estimates, then the errors, then the times."""
+        with ExitStack() as opened:
+            seconds = 0.0
+            for points in lattices(self._scene):
+                seconds = self._try(points, opened)
+            if not self._trials:
+                self.notes.append(f"points were not measured: with fewer than {FEWEST} a side they cannot be compared")
+                return
+            finer = self._finer(self._scene, seconds, self._longest_run)
+            if finer is None:
+                rows, cols = _scaled(self._scene, FINER)
+                self.notes.append(f"{rows} x {cols} points were not measured: time or memory")
+            else:
+                seconds = self._try(finer.sheet.points, opened)
+                finer = self._finer(finer, seconds, ROUNDS * self._longest_run)
+            if len(self._trials) < 2:
+                return
+            self._measure_errors(finer)
+            for _ in range(ROUNDS):
+                for trial in self._trials:
+                    trial.samples.append(self._step_through(trial))
+
+    def points(self) -> list[Points]:
+        """Give what is known so far, the fewest points first."""
+        return [self._point(trial) for trial in self._trials if trial.samples]
+
+    def _try(self, points: Lattice, opened: ExitStack) -> float:
+        """Run so many points with their own step and the pilot that `run` has beside it; gives the seconds it takes."""
+        scene = with_points(self._scene, points)
+        trial = _Trial(scene, Dynamics(scene, self._device))
+        opened.callback(trial.dynamics.close)
+        coarse = coarser(scene)
+        assert coarse is not None
+        self._trials.append(trial)
+        self._tick()
+        trial.dynamics.compile()
+        with closing(MeshPilot(scene, coarse, self._device)) as pilot:
+            pilot.compile()
+            first = self._step_through(trial, pilot)
+            trial.estimate = pilot.error
+        # What disturbs one run does not disturb the other.
+        return min(first, self._step_through(trial))
+
+    def _finer(self, scene: Scene, seconds: float, longest_run: float) -> Scene | None:
+        """Give a scene more points; None where they cannot be afforded.
+
+        Args:
+            scene: what is to be finer.
+            seconds: that stepping through it took.
+            longest_run: that it may take then.
+        """
+        points = _scaled(scene, FINER)
+        if max(points) > MAX_POINTS:
+            return None
+        finer = with_points(scene, points)
+        work = [math.prod(one.sheet.points) * steps_per_frame(one) for one in (scene, finer)]
+        return None if seconds * work[1] / work[0] > longest_run or any(budget.problems(finer)) else finer
+
+    def _measure_errors(self, finer: Scene | None) -> None:
+        """Step through the scene with all numbers of points side by side, and compare them frame by frame.
+
+        Args:
+            finer: the scene with more points yet, for the reference; None: they cannot be afforded.
+        """
+        finest = self._trials[-1].scene if finer is None else finer
+        steps = steps_per_frame(finest)
+        with ExitStack() as opened:
+            sheets = [trial.dynamics for trial in self._trials]
+            if finer is not None:
+                sheets.append(opened.enter_context(closing(Dynamics(finer, self._device))))
+                sheets[-1].compile()
+            for sheet in sheets:
+                sheet.restart(with_steps(sheet.scene, steps))
+            errors, own_error, largest = [0.0] * len(sheets), 0.0, 0.0
+            for _ in range(finest.time.frames):
+                for sheet in sheets:
+                    self._tick()
+                    sheet.advance(steps)
+                fields = [sheet.displacement() for sheet in sheets]
+                with np.errstate(all="ignore"):
+                    exact, bound = _reference(fields)
+                    apart = [longest(_sampled(one, exact) - exact) for one in fields[:-1]]
+                    # Between the points of the finest nothing is known of it; but of order 1 or more, it is as near
+                    # to what is exact as to what is twice as coarse.
+                    apart.append(longest(_sampled(fields[-2], fields[-1]) - fields[-1]))
+                errors = [max(pair) for pair in zip(errors, apart, strict=True)]
+                own_error, largest = max(own_error, bound), max(largest, longest(exact))
+            self._done += 1
+        farthest = farthest_displacement(finest, finest.time.duration)
+        for trial, error in zip(self._trials, errors, strict=False):
+            if largest > farthest:
+                continue
+            if trial.scene is not finest:
+                trial.known = error >= MARGIN * own_error
+                error += 0.0 if trial.known else own_error
+            trial.error = error / largest if largest > 0 else 0.0
+
+    def _step_through(self, trial: _Trial, pilot: MeshPilot | None = None) -> float:
+        """Step through the scene with its own step; returns the seconds of stepping alone."""
+        steps = steps_per_frame(trial.scene)
+        trial.dynamics.restart(trial.scene)
+        seconds = 0.0
+        for _ in range(trial.scene.time.frames):
+            self._tick()
+            start = time.perf_counter()
+            trial.dynamics.advance(steps)
+            seconds += time.perf_counter() - start
+            displacement = trial.dynamics.displacement()
+            if pilot is not None:
+                pilot.follow(displacement, self._tick)
+        self._done += 1
+        return seconds
+
+    def _tick(self) -> None:
+        # The estimate, another run and the rounds of each; and the errors of all.
+        self._progress(self._done, 1 + (2 + ROUNDS) * len(self._trials))
+
+    def _point(self, trial: _Trial) -> Points:
+        rows, cols = trial.points
+        return Points(
+            rows=rows,
+            cols=cols,
+            steps_per_frame=steps_per_frame(trial.scene),
+            error=trial.error if trial.error < math.inf else None,
+            known=trial.known,
+            estimate=trial.estimate if trial.estimate < math.inf else None,
+            seconds=Timing.of(trial.samples),
+        )
+
+
+def lattices(scene: Scene) -> Iterator[Lattice]:
+    """List the numbers of points to compare that the scene allows, its own the last."""
+    for points in (*(_scaled(scene, share) for share in COARSER), scene.sheet.points):
+        if min(points) >= FEWEST and not any(material.problems(with_points(scene, points))):
+            yield points
+
+
+def _scaled(scene: Scene, factor: float) -> Lattice:
+    """Give the sheet so many times as many cells a side."""
+    rows, cols = (round((count - 1) * factor) + 1 for count in scene.sheet.points)
+    return rows, cols
+
+
+def _reference(fields: list[Field]) -> tuple[Field, float]:
+    """Extrapolate the two finest by Richardson, where the error is of second order in the length of cells.
+
+    u* = u + (u - u_r) / (r^2 - 1), where u_r is of r times longer cells. What is added is found at their points, and
+    sampled at those of u. It is wrong by its distance from the same of the next two, or of u from u_r, at most about.
+
+    Args:
+        fields: displacements, the fewest points first, two or more; each of shape (rows, cols, 3).
+
+    Returns:
+        u* at the points of the finest, and how wrong it is at most about [m].
+    """
+    exact = fields[-1] + _sampled(_correction(fields[-1], fields[-2]), fields[-1])
+    if len(fields) > 2:
+        before = fields[-2] + _sampled(_correction(fields[-2], fields[-3]), fields[-2])
+    else:
+        before = _sampled(fields[-1], fields[-2])
+    return exact, longest(_sampled(exact, before) - before)
+
+
+def _correction(fine: Field, coarse: Field) -> Field:
+    """Give what Richardson's extrapolation adds to the fine field, at the points of the coarse one."""
+    ratio = min((of - 1) / (to - 1) for of, to in zip(fine.shape[:2], coarse.shape[:2], strict=True))
+    correction: Field = (_sampled(fine, coarse) - coarse) / (ratio**2 - 1)
+    return correction
+
+
+def _sampled(values: Field, like: Field) -> Field:
+    """Sample a field at the points of another one."""
+    (rows, cols), (to_rows, to_cols) = values.shape[:2], like.shape[:2]
+    return CubicSampling((rows, cols), (to_rows, to_cols)).at(values)

@@ -1,0 +1,503 @@
+"""Tissue against the physics that it stands for: plane stress, plates, membranes, conservation, stability.
+
+Static shapes come from the linear stiffness, which is put together here and compared with the forces of the twin; the
+kernel must rest in them.
+"""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+from PIL import Image
+from scipy import sparse
+from scipy.integrate import quad
+from scipy.sparse.linalg import eigsh, spsolve
+from skfem import Basis, BilinearForm, ElementQuad2, ElementVector, LinearForm, MeshQuad, condense, solve
+from skfem.helpers import dot
+from skfem.models.elasticity import linear_elasticity, plane_stress
+
+from taichi_msm import reference
+from taichi_msm.physics.lattice import fixed_points, rest_positions, spacing
+from taichi_msm.physics.loads import loads_at
+from taichi_msm.physics.material import factors, highest_frequency
+from taichi_msm.physics.probe_force import spread
+from taichi_msm.physics.solver import Dynamics
+from taichi_msm.physics.state import State
+from taichi_msm.physics.timestep import stable_step, step, steps_per_frame
+from taichi_msm.reference.sheet import sheet as assembled
+from taichi_msm.scene import Probe, Scene
+from taichi_msm.system.runtime import Device
+from tests.scenes import random_tissue, speckle
+from tests.scenes import scene as scene_of_springs
+
+Array = NDArray[np.float64]
+
+YOUNG, THICKNESS, DENSITY = 3e4, 2e-3, 1050.0
+MEMBRANE = YOUNG * THICKNESS
+PLATE = YOUNG * THICKNESS**3 / (12 * (1 - 1 / 9))
+
+# Points along each side; the coarsest are among those of the others.
+MESHES = (31, 61, 121)
+
+# Decays over half of the sheet. The force is not smooth at the control point: its sum over the points has an error of
+# order 3, with which a narrow tool would hide the order 2 of all else.
+WIDE = {"at": [0.4, 0.6], "falloff": 20}
+
+# A flat end that covers the sheet: the same pressure everywhere.
+EVERYWHERE = {"falloff": 100, "radius": 0.2}
+
+
+def tissue(
+    points: tuple[int, int],
+    size: tuple[float, float] = (0.1, 0.1),
+    fixed: Any = "border",
+    probes: Any = (),
+    time: Any = None,
+    **terms: Any,
+) -> Scene:
+    """A sheet of tissue in f64 that simulates only."""
+    return Scene(
+        sheet={"points": points, "size": size, "fixed": fixed},
+        tissue={"young": YOUNG, "thickness": THICKNESS, "density": DENSITY, **terms},
+        probes=probes,
+        time={"duration": 0.4, "precision": "f64", **(time or {})},
+        output=[],
+    )
+
+
+def picture(folder: Path) -> str:
+    """A map of random grey."""
+    Image.fromarray(speckle(7, 5)[..., 0]).save(folder / "map.png")
+    return str(folder / "map.png")
+
+
+def stiffness(made: Scene, displacement: Array | None = None) -> Any:
+    """Differentiate all forces but the tools', with the foundation: sparse, shape (3 points, 3 points).
+
+    A spring between points at the distance l, whose direction is n, has  k (1 - L0 / l) (1 - n n^T) + k n n^T.
+    """
+    rows, cols = made.sheet.points
+    (dx, dy), parts, size = spacing(made.sheet), assembled(made), 3 * rows * cols
+    u = np.zeros((rows, cols, 3)) if displacement is None else displacement
+    number = np.arange(size).reshape(rows, cols, 3)
+    total = sparse.diags_array(np.repeat(parts.virtual.ravel(), 3)).tocsc()
+    for springs in parts.springs:
+        between = u[springs.there] - u[springs.here] + springs.offset
+        length = np.linalg.norm(between, axis=-1)[..., None, None]
+        slack = springs.unstretched[..., None, None] / length
+        along = between[..., :, None] * between[..., None, :] / length**2
+        block = springs.stiffness[..., None, None] * ((1 - slack) * np.eye(3) + slack * along)
+        here, there = number[springs.here], number[springs.there]
+        for sign, one, other in ((1, here, here), (1, there, there), (-1, here, there), (-1, there, here)):
+            row, column = np.broadcast_arrays(one[..., :, None], other[..., None, :])
+            entries = (sign * block).ravel(), (row.ravel(), column.ravel())
+            total += sparse.coo_array(entries, shape=(size, size)).tocsc()
+    laplacian = sparse.kron(_inner(rows), _second(cols)) / dx**2 + sparse.kron(_second(rows), _inner(cols)) / dy**2
+    return total + sparse.kron(parts.bending * laplacian.T @ laplacian, sparse.eye_array(3)).tocsc()
+
+
+def _inner(count: int) -> Any:
+    """Those of so many values that have two neighbours."""
+    return sparse.eye_array(count - 2, count, k=1)
+
+
+def _second(count: int) -> Any:
+    """Their second differences."""
+    return sparse.diags_array([1.0, -2.0, 1.0], offsets=[0, 1, 2], shape=(count - 2, count))
+
+
+def moving(made: Scene, directions: tuple[int, ...] = (0, 1, 2)) -> NDArray[np.intp]:
+    """The numbers of these directions of the points that move."""
+    chosen = np.zeros((*made.sheet.points, 3), bool)
+    chosen[..., directions] = ~fixed_points(made.sheet)[..., None]
+    return np.flatnonzero(chosen)
+
+
+def tool_forces(made: Scene, time: float = 0.01) -> Array:
+    return reference.surgical_force(made, loads_at(made, np.array([time])), 0)
+
+
+def at_rest(made: Scene, directions: tuple[int, ...]) -> Array:
+    """Where a small load moves the sheet in these directions; shape (rows, cols, 3)."""
+    free, u = moving(made, directions), np.zeros((*made.sheet.points, 3))
+    u.ravel()[free] = spsolve(stiffness(made)[free][:, free], tool_forces(made).ravel()[free])
+    return u
+
+
+def assert_rests(made: Scene, displacement: Array, directions: tuple[int, ...], device: Device) -> None:
+    """From there its small load moves the sheet in these directions as good as not, by a step of the kernel."""
+    dynamics = Dynamics(made, device)
+    dynamics.advance(1)
+    thrown = np.abs(dynamics.state().difference).max()
+    dynamics.restart(made, State(1, displacement, np.zeros_like(displacement)))
+    dynamics.advance(1)
+    # What is not linear in strains of 1e-6 and less.
+    assert np.abs(dynamics.state().difference[..., directions]).max() < 1e-5 * thrown
+    dynamics.close()
+
+
+def error_at(coarse: Array, found: Array) -> float:
+    """The difference at the points of the coarsest sheet by the displacements there, both root mean squares."""
+    every = (len(found) - 1) // (len(coarse) - 1)
+    return float(np.linalg.norm(found[::every, ::every] - coarse) / np.linalg.norm(coarse))
+
+
+def order(errors: list[float]) -> float:
+    """The power of the cells' size with which the errors of the meshes fall."""
+    return -float(np.polyfit(np.log2([points - 1 for points in MESHES]), np.log2(errors), 1)[0])
+
+
+def weight(probe: Probe) -> float:
+    """Integrate the decay of a tool over the plane, ring by ring [m2]."""
+
+    def ring(distance: float) -> float:
+        return 2 * math.pi * distance * math.exp(-probe.falloff * max(distance - probe.radius, 0))
+
+    flat, around = (quad(ring, *ends, epsabs=0)[0] for ends in ((0, probe.radius), (probe.radius, math.inf)))
+    return float(flat + around)
+
+
+def pressure(made: Scene, x: Array, y: Array) -> Array:
+    """Force of the first tool by area at points of the sheet [Pa], shape (3, ...)."""
+    (height, width), probe = made.sheet.size, made.probes[0]
+    across, down = np.array(probe.at, float)
+    distance = np.hypot(x - (across - 0.5) * width, y - (0.5 - down) * height)
+    decay = np.exp(-probe.falloff * np.maximum(distance - probe.radius, 0))
+    return np.multiply.outer(np.array(probe.total, float), decay) / weight(probe)
+
+
+@pytest.mark.parametrize("seed", range(12))
+def test_the_linear_stiffness_is_that_of_the_forces(seed: int, tmp_path: Path) -> None:
+    """Of a deformed sheet, so that every term of it counts."""
+    made = random_tissue(seed, picture(tmp_path))
+    rng, shape = np.random.default_rng(seed), (*made.sheet.points, 3)
+    here, way, small = 1e-3 * rng.normal(size=shape), rng.normal(size=shape), 1e-7
+    # At the end, when all tools press and so the foundation acts.
+    loads = loads_at(made, np.array([made.time.duration]))
+    ends = [reference.force(made, here + sign * small * way, loads, 0) for sign in (1, -1)]
+    found = (ends[1] - ends[0]).ravel() / (2 * small)
+    expected = stiffness(made, here) @ way.ravel()
+    # Of central differences over 1e-5 of a cell: its square, and the rounding of lengths over it.
+    np.testing.assert_allclose(found, expected, rtol=0, atol=1e-9 * np.abs(expected).max())
+
+
+@pytest.mark.parametrize("ratio", [1.0, 1.2, 1 / 1.5, math.sqrt(3), 1 / math.sqrt(3)])
+def test_uniform_strains_have_the_energy_of_plane_stress(ratio: float, device: Device) -> None:
+    made = tissue((5, 6), size=(4 * 0.01, 5 * 0.01 * ratio), fixed="none")
+    x, y = rest_positions(made.sheet)[..., 0], rest_positions(made.sheet)[..., 1]
+    none, area = np.zeros_like(x), math.prod(made.sheet.size)
+    strains = [np.stack(one, axis=-1) for one in ([x, none, none], [none, y, none], [y / 2, x / 2, none])]
+    flat = np.array(strains).reshape(3, -1)
+    found = flat @ (stiffness(made) @ flat.T) / area
+    expected = MEMBRANE * np.array([[9, 3, 0], [3, 9, 0], [0, 0, 3]]) / 8
+    # Sums over some 100 springs.
+    np.testing.assert_allclose(found, expected, rtol=0, atol=1e-13 * MEMBRANE)
+    # Of the twin and of the kernel it is the same up to the strain's third power.
+    strain, dynamics = 1e-5, Dynamics(made, device)
+    for number, one in enumerate(strains):
+        density = expected[number, number] * strain**2 / 2
+        assert reference.energy(made, strain * one) / area == pytest.approx(density, rel=10 * strain)
+        dynamics.restart(made, State(1, strain * one, np.zeros_like(one)))
+        assert dynamics.read().energy / area == pytest.approx(density, rel=10 * strain)
+    dynamics.close()
+
+
+def test_the_tension_at_rest_is_the_same_in_all_directions(tmp_path: Path) -> None:
+    """And the same everywhere, whatever the map: the sum of o o^T tau over the springs is S times the area."""
+    stiff = {"image": picture(tmp_path), "range": [0.5, 4]}
+    made = tissue((8, 6), size=(0.07, 0.06), pretension=12.5, map=stiff)
+    stress = np.zeros((3, 3))
+    for springs in assembled(made).springs:
+        tension = springs.stiffness * (springs.length - springs.unstretched) / springs.length
+        stress += tension.sum() * np.outer(springs.offset, springs.offset)
+    expected = 12.5 * np.diag([1, 1, 0])
+    np.testing.assert_allclose(stress / math.prod(made.sheet.size), expected, rtol=0, atol=1e-13 * 12.5)
+    # Points that move are in balance, and by their springs alone.
+    inner = np.zeros((8, 6, 3))
+    for springs in assembled(made).springs:
+        pull = springs.stiffness * (springs.length - springs.unstretched) / springs.length
+        inner[springs.here] += pull[..., None] * springs.offset
+        inner[springs.there] -= pull[..., None] * springs.offset
+    assert np.abs(inner[1:-1, 1:-1]).max() < 1e-13 * np.abs(inner).max()
+
+
+def finite_elements(made: Scene) -> Array:
+    """Solve plane stress with biquadratic elements, half as wide as the cells of the coarsest sheet.
+
+    Returns:
+        Displacements of the points of the coarsest sheet [m], shape (31, 31, 2).
+    """
+    assert made.tissue is not None
+    (height, width), foundation = made.sheet.size, made.tissue.foundation
+    count = 2 * (MESHES[0] - 1)
+    mesh = MeshQuad.init_tensor(*(np.linspace(-side / 2, side / 2, count + 1) for side in (width, height)))
+    basis = Basis(mesh, ElementVector(ElementQuad2()), intorder=6)
+    lame = (THICKNESS * one for one in plane_stress(YOUNG, 1 / 3))
+    matrix = linear_elasticity(*lame).assemble(basis)
+    matrix += BilinearForm(lambda u, v, _: foundation * dot(u, v)).assemble(basis)
+    load = LinearForm(lambda v, at: dot(pressure(made, *at.x)[:2], v)).assemble(basis)
+    u = solve(*condense(matrix, load, D=basis.get_dofs()))
+    by_rows = np.lexsort((mesh.p[0], -mesh.p[1]))
+    found: Array = u[basis.nodal_dofs[:, by_rows]].T.reshape(count + 1, count + 1, 2)
+    return found[::2, ::2]
+
+
+@pytest.mark.parametrize(("size", "foundation"), [((0.1, 0.1), 0), ((0.08, 0.1), 2e6)])
+def test_a_load_in_the_plane_moves_it_like_finite_elements(
+    size: tuple[float, float], foundation: float, device: Device
+) -> None:
+    def made(points: int) -> Scene:
+        probe = {**WIDE, "total": [2e-6, -1e-6, 0]}
+        return tissue((points, points), size=size, foundation=foundation, probes=[probe])
+
+    expected = finite_elements(made(MESHES[0]))
+    found = [at_rest(made(points), (0, 1)) for points in MESHES]
+    errors = [error_at(expected, one[..., :2]) for one in found]
+    assert errors[-1] < 5e-4
+    assert abs(order(errors) - 2) < 0.1
+    assert_rests(made(MESHES[0]), found[0], (0, 1), device)
+
+
+def series(made: Scene) -> Array:
+    """Navier's double series for a sheet held at every edge, free to turn there, under a small load from above.
+
+    D Laplacian^2 u - S Laplacian u + foundation u = pressure: each product of sines has its own amplitude.
+
+    Returns:
+        Displacements of the points of the coarsest sheet along z [m], shape (31, 31).
+    """
+    (height, width), parts = made.sheet.size, made.tissue
+    assert parts is not None
+    modes, samples = 150, 900
+    middles, waves = (np.arange(samples) + 0.5) / samples, np.arange(1, modes + 1)
+    load = pressure(made, *np.meshgrid((middles - 0.5) * width, (0.5 - middles) * height))[2]
+    # Means over as many parts of each side, in each of which the pressure counts as constant.
+    sines = np.sin(np.pi * np.outer(waves, middles)) * np.sinc(waves / (2 * samples))[:, None]
+    amplitude = 4 / samples**2 * sines @ load @ sines.T
+    squares = (np.pi * waves[:, None] / height) ** 2 + (np.pi * waves / width) ** 2
+    bending = PLATE if parts.bending == "plate" else parts.bending
+    amplitude /= bending * squares**2 + parts.pretension * squares + parts.foundation
+    at_points = np.sin(np.pi * np.outer(np.linspace(0, 1, MESHES[0]), waves))
+    return at_points @ amplitude @ at_points.T
+
+
+@pytest.mark.parametrize("tool", [pytest.param(EVERYWHERE, id="everywhere"), pytest.param(WIDE, id="tool")])
+@pytest.mark.parametrize(
+    "terms",
+    [
+        pytest.param({"bending": "plate"}, id="plate"),
+        pytest.param({"bending": 2e-4, "foundation": 1e4}, id="plate on a foundation"),
+        pytest.param({"pretension": 5}, id="membrane"),
+        pytest.param({"pretension": 5, "foundation": 1e4}, id="membrane on a foundation"),
+        pytest.param({"pretension": 0.5, "bending": "plate"}, id="plate under tension"),
+    ],
+)
+def test_a_load_from_above_bends_it_like_the_double_series(
+    terms: dict[str, Any], tool: dict[str, Any], device: Device
+) -> None:
+    def made(points: int) -> Scene:
+        return tissue((points, points), size=(0.08, 0.1), probes=[{**tool, "total": [0, 0, -1e-7]}], **terms)
+
+    expected = series(made(MESHES[0]))
+    found = [at_rest(made(points), (2,)) for points in MESHES]
+    errors = [error_at(expected, one[..., 2]) for one in found]
+    assert errors[1] < 1e-3
+    assert abs(order(errors) - 2) < 0.1
+    assert_rests(made(MESHES[0]), found[0], (2,), device)
+
+
+def depth(points: int, device: Device) -> float:
+    """How deep a tool has pressed a sheet after a second [m]."""
+    probe = {"total": [0, 0, -2], "radius": 0.004, "falloff": 300, "load": [[0, 0], [0.5, 100]]}
+    time = {"duration": 1.0, "frames_per_second": 25}
+    made = tissue((points, points), foundation=2e6, damping=40, probes=[probe], time=time)
+    dynamics = Dynamics(made, device)
+    dynamics.advance(made.time.frames * steps_per_frame(made))
+    found = -dynamics.displacement()[..., 2].min()
+    dynamics.close()
+    return float(found)
+
+
+def test_a_tool_presses_as_deep_at_any_number_of_points(device: Device) -> None:
+    coarse, middle, fine = (depth(points, device) for points in MESHES)
+    assert coarse == pytest.approx(fine, rel=0.01)
+    assert middle == pytest.approx(fine, rel=0.01)
+
+
+@pytest.mark.parametrize("term", ["none", "bending", "map"])
+def test_a_thrown_sheet_keeps_its_momenta(term: str, device: Device, tmp_path: Path) -> None:
+    stiff = {"image": picture(tmp_path), "range": [0.5, 3]}
+    terms: dict[str, dict[str, Any]] = {"none": {}, "bending": {"bending": "plate"}, "map": {"map": stiff}}
+    thrown = {"at": [0.3, 0.2], "total": [0.2, -0.1, 0.4], "falloff": 40, "load": [[0, 100], [0.04, 100], [0.04, 0]]}
+    made = tissue((9, 11), size=(0.08, 0.13), fixed="none", probes=[thrown], **terms[term])
+    mass, rest, h = assembled(made).mass[..., None], rest_positions(made.sheet), step(made)
+    dynamics = Dynamics(made, device)
+
+    def momenta() -> Array:
+        """The momentum and its moment about the origin, sum of m d / h and of x times that: both kept by the steps."""
+        state = dynamics.state()
+        momentum = mass * state.difference / h
+        turning = np.cross(rest + state.displacement, momentum)
+        return np.array([momentum.sum(axis=(0, 1)), turning.sum(axis=(0, 1))])
+
+    found = []
+    for _ in range(made.time.frames):
+        dynamics.advance(steps_per_frame(made))
+        found.append(momenta())
+    dynamics.close()
+    # The tool lets go at the end of the first frame. From then on each step rounds once.
+    rounding = made.time.frames * steps_per_frame(made) * 2.0**-53
+    for one in found[2:]:
+        for before, after in zip(found[1], one, strict=True):
+            np.testing.assert_allclose(after, before, rtol=0, atol=rounding * np.abs(before).max())
+    impulse = 0.04 * tool_forces(made, 0.02).sum(axis=(0, 1))
+    np.testing.assert_allclose(found[1][0], impulse, rtol=0, atol=rounding * np.abs(impulse).max())
+
+
+# Terms of tissue, and how many times the highest frequency the bound may be.
+LIMITED: dict[str, tuple[dict[str, Any], float]] = {
+    "uniform": ({}, 1.25),
+    "oblong": ({"size": (0.08, 0.15)}, 1.25),
+    "free": ({"fixed": "none"}, 1.25),
+    "foundation": ({"foundation": 1e7}, 1.25),
+    "pretension": ({"pretension": 20}, 1.25),
+    "plate": ({"bending": "plate"}, 1.25),
+    "stiff plate": ({"bending": 1e-2}, 1.25),
+    "stiff free plate": ({"bending": 1e-2, "fixed": "none"}, 1.25),
+    "map": ({"range": (0.2, 5)}, 1.6),
+    "map, pretension, bending": ({"range": (5, 0.2), "pretension": 10, "bending": 1e-3}, 1.6),
+    "map, bending, free edges": ({"range": (0.2, 5), "bending": 1e-3, "fixed": ["left"]}, 1.6),
+}
+
+
+def limited(name: str, folder: Path, **more: Any) -> Scene:
+    terms = {"size": (0.08, 0.1), "foundation": 1e5, **LIMITED[name][0], **more}
+    if "range" in terms:
+        terms["map"] = {"image": picture(folder), "range": terms.pop("range")}
+    return tissue((9, 11), foundation_active="always", **terms)
+
+
+def frequency(made: Scene, displacement: Array | None = None) -> float:
+    """The highest angular frequency of small motions [rad/s]; of a crumpled sheet, maybe of one that grows."""
+    free = moving(made)
+    scale = 1 / np.sqrt(np.repeat(assembled(made).mass.ravel(), 3)[free])
+    weights = sparse.diags_array(scale)
+    matrix = weights @ stiffness(made, displacement)[free][:, free] @ weights
+    largest = eigsh(matrix, 1, v0=np.random.default_rng(0).normal(size=len(free)), return_eigenvectors=False)
+    return math.sqrt(abs(largest[0]))
+
+
+@pytest.mark.parametrize("name", LIMITED)
+def test_the_bound_of_the_frequency_holds_and_is_near(name: str, tmp_path: Path) -> None:
+    made = limited(name, tmp_path)
+    assert 1 <= highest_frequency(made) / frequency(made) < LIMITED[name][1]
+
+
+def test_the_bound_holds_where_a_corner_is_stiff(tmp_path: Path) -> None:
+    """A corner that moves has the mass and the stiffness of one cell."""
+    grey = np.zeros((8, 10), np.uint8)
+    grey[0, 0] = 255
+    Image.fromarray(grey).save(tmp_path / "corner.png")
+    made = tissue((9, 11), fixed="none", map={"image": str(tmp_path / "corner.png"), "range": [1, 30]})
+    assert 1 <= highest_frequency(made) / frequency(made) < 1.6
+
+
+@pytest.mark.parametrize("seed", range(16))
+def test_the_bound_holds_for_any_tissue(seed: int, tmp_path: Path) -> None:
+    """At rest and as long as no spring is below half its length."""
+    made, rng = random_tissue(seed, picture(tmp_path)), np.random.default_rng(seed)
+    crumpled = 0.15 * min(spacing(made.sheet)) * rng.uniform(-1, 1, (*made.sheet.points, 3))
+    assert reference.shortest_spring(made, crumpled) > 0.5
+    for displacement in (np.zeros_like(crumpled), crumpled):
+        assert frequency(made, displacement) <= highest_frequency(made)
+
+
+@pytest.mark.parametrize(
+    "name", ["uniform", "pretension", "stiff free plate", "map, pretension, bending", "map, bending, free edges"]
+)
+def test_just_under_the_limit_tissue_stays_bounded(name: str, device: Device, tmp_path: Path) -> None:
+    """Kicked at random places in the first step, and then left alone for 10^5."""
+    rng, h = np.random.default_rng(1), 0.99 * stable_step(limited(name, tmp_path))
+    kicks = [
+        {
+            "at": list(rng.random(2)),
+            "total": list(1e-2 * rng.normal(size=3)),
+            "falloff": 200,
+            "load": [[0, 100], [h, 0]],
+        }
+        for _ in range(8)
+    ]
+    time = {"duration": 100_000 * h, "frames_per_second": 1 / (1000 * h), "step": h}
+    dynamics = Dynamics(limited(name, tmp_path, probes=kicks, time=time), device)
+    energies = []
+    for _ in range(100):
+        dynamics.advance(1000)
+        energies.append(dynamics.read().energy)
+    dynamics.close()
+    # All of it but that of the foundation, with which it comes and goes.
+    assert min(energies) > 0
+    assert max(energies) < 4 * energies[0]
+
+
+@pytest.mark.parametrize("tool", [{"falloff": 300}, {"falloff": 300, "radius": 0.004}, {"falloff": 40, "radius": 0.05}])
+def test_the_weight_of_a_tool_is_its_integral_over_the_plane(tool: dict[str, Any]) -> None:
+    probe = Probe(total=[0, 0, 1], **tool)
+    assert spread(probe) == pytest.approx(weight(probe), rel=1e-7)
+
+
+@pytest.mark.parametrize("fixed", ["border", "none"])
+def test_a_wide_sheet_gets_the_whole_of_a_tool(fixed: str, device: Device) -> None:
+    """Of tissue and of springs, as the twin has it and as the first step of the kernel moves it."""
+    total = [0.3, -0.2, -1.0]
+    probe = {"at": [0.45, 0.52], "total": total, "radius": 0.006, "falloff": 300}
+    sheet = {"points": [121, 121], "size": [0.1, 0.1], "mass": 1e-5, "fixed": fixed}
+    for made in (tissue((121, 121), fixed=fixed, probes=[probe]), scene_of_springs(sheet=sheet, probes=[probe])):
+        np.testing.assert_allclose(tool_forces(made).sum(axis=(0, 1)), total, rtol=1e-3)
+        dynamics = Dynamics(made, device)
+        dynamics.advance(1)
+        # u_1 = h^2 F / m / 2.
+        force = 2 / step(made) ** 2 * assembled(made).mass[..., None] * dynamics.displacement()
+        dynamics.close()
+        np.testing.assert_allclose(force.sum(axis=(0, 1)), total, rtol=1e-3)
+
+
+@pytest.mark.parametrize(("at", "share"), [([0.5, 0.0], 1 / 2), ([0.0, 0.5], 1 / 2), ([1.0, 1.0], 1 / 4)])
+def test_an_edge_gets_its_share_of_a_tool(at: list[float], share: float) -> None:
+    """Half of it, and a corner a quarter, are all of the tool that is above the sheet."""
+    made = tissue((121, 121), fixed="none", probes=[{"at": at, "total": [0, 0, 1], "falloff": 200}])
+    assert tool_forces(made)[..., 2].sum() == pytest.approx(share, rel=1e-3)
+
+
+def sampled(grey: NDArray[Any], rows: int, cols: int, black: float, white: float) -> Array:
+    """The factor at the centre of every cell, texel by texel."""
+    height, width = grey.shape
+    found = np.zeros((rows, cols))
+    for i in range(rows):
+        for j in range(cols):
+            down, across = (i + 0.5) / rows * height - 0.5, (j + 0.5) / cols * width - 0.5
+            for b in (math.floor(down), math.floor(down) + 1):
+                for a in (math.floor(across), math.floor(across) + 1):
+                    near = (1 - abs(down - b)) * (1 - abs(across - a))
+                    found[i, j] += near * grey[min(max(b, 0), height - 1), min(max(a, 0), width - 1)]
+    return black + (white - black) * found / 255
+
+
+@pytest.mark.parametrize("texels", [(7, 5), (40, 60), (1, 3), (8, 11)])
+@pytest.mark.parametrize("kind", ["grey", "rgb", "16 bit"])
+def test_a_map_is_sampled_at_the_centres_of_cells(texels: tuple[int, int], kind: str, tmp_path: Path) -> None:
+    grey, file = speckle(*texels)[..., 0], tmp_path / "map.png"
+    if kind == "rgb":
+        Image.fromarray(np.repeat(grey[..., None], 3, axis=-1)).save(file)
+    else:
+        # 257 g of 65535 are g of 255.
+        Image.fromarray(grey.astype(np.uint16) * 257 if kind == "16 bit" else grey).save(file)
+    stiff = {"image": str(file), "range": [6, 0.5]}
+    sheet = {"points": [9, 12], "size": [0.1, 0.1], "mass": 1e-3}
+    of_springs = scene_of_springs(sheet=sheet, springs={"structural": 20, "map": stiff})
+    for made in (tissue((9, 12), map=stiff), of_springs):
+        np.testing.assert_allclose(factors(made), sampled(grey, 8, 11, 6, 0.5), rtol=0, atol=1e-14 * 6)
