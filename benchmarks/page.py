@@ -8,7 +8,7 @@ from importlib import metadata
 from pathlib import Path
 from typing import Any
 
-from benchmarks import bounds, native, whole_run
+from benchmarks import bounds, native, terms, whole_run
 from benchmarks.drawing.measure import WANTED
 from benchmarks.parts import NARROW, PIXELS, READY, REFINE
 from benchmarks.process import ROOT
@@ -76,6 +76,7 @@ def tables(results: Results) -> dict[str, str]:
         "lit_table": ("drawing", lambda: drawing_table(results["drawing"]["lit"])),
         "flat_table": ("drawing", lambda: drawing_table(results["drawing"]["flat"])),
         "whole_run_table": ("whole_run", lambda: whole_run_table(results["whole_run"])),
+        "terms_table": ("terms", lambda: terms_table(results["terms"])),
         "size_table": ("size", lambda: size_table(results["size"])),
         "threads_table": ("threads", lambda: threads_table(results["threads"])),
         "machine_table": ("bounds", lambda: machine_table(results["bounds"])),
@@ -226,6 +227,17 @@ def whole_run_table(measured: dict[str, dict[str, list[float]]]) -> str:
         for kind, times in measured.items()
     ]
     return table(["[s]", *stages], rows)
+
+
+def terms_table(measured: dict[str, dict[str, list[float]]]) -> str:
+    """Show the time of a step of every kind of sheet, and how many times that of one in springs it is."""
+    medians = {size: {name: Timing.of(times).median for name, times in own.items()} for size, own in measured.items()}
+    names = next(iter(medians.values()))
+    rows = [
+        [name, *(f"{duration(own[name])} ({own[name] / own[terms.SPRINGS]:.2f})" for own in medians.values())]
+        for name in names
+    ]
+    return table(["a step", *medians], rows)
 
 
 def size_table(measured: dict[str, list[Entry]]) -> str:

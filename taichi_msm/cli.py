@@ -138,7 +138,7 @@ def run(
 @json_option
 def check(scene: str, image: str | None, overrides: tuple[str, ...], as_json: bool) -> int:
     """Validate SCENE and print the steps, memory and disk space it needs; compute nothing."""
-    from taichi_msm.physics import timestep, workload
+    from taichi_msm.physics import probe_force, timestep, workload
     from taichi_msm.physics.probe_force import in_words, probe_records
     from taichi_msm.scenefile import budget
     from taichi_msm.scenefile.load import load_scene
@@ -177,6 +177,8 @@ def check(scene: str, image: str | None, overrides: tuple[str, ...], as_json: bo
     )
     for index, probe in enumerate(facts["probes"]):
         click.echo(f"probes.{index}: {in_words(probe)}")
+    for note in probe_force.notes(loaded):
+        click.echo(note)
     return DONE
 
 

@@ -78,11 +78,11 @@ def _bar() -> Bar:
 
 def summary(record: Mapping[str, Any], directory: Path) -> str:
     """Say in a few lines what a run did, how wrong it may be, and how long it took."""
-    times = record["timings"]
+    times, (rows, cols) = record["timings"], record["points"]
     stages = ", ".join(f"{stage} {seconds:.2f}" for stage, seconds in times.items() if stage != "total")
     lines = [
         f"{printable(str(directory))}: {record['frames']} frames, {record['steps']} steps of {record['step']:.4g} s in "
-        f"{record['precision']}, largest displacement {record['max_displacement']:.4g} m",
+        f"{record['precision']}, {rows} x {cols} points, largest displacement {record['max_displacement']:.4g} m",
         *([f"the first {record['resumed']} frames were simulated by an earlier run"] if record["resumed"] else []),
         *(f"probes.{index}: {in_words(probe)}" for index, probe in enumerate(record["probes"])),
         *record["notes"],

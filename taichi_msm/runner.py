@@ -31,7 +31,7 @@ from taichi_msm.physics.warnings import notes
 from taichi_msm.physics.workload import ENCODING, affords_pilot, with_precision
 from taichi_msm.progress import Progress
 from taichi_msm.render.texture import load_texture
-from taichi_msm.results.manifest import Manifest, digest, read_manifest
+from taichi_msm.results.manifest import Manifest, digest, map_digest, read_manifest
 from taichi_msm.results.record import RunRecord
 from taichi_msm.results.writer import ResultWriter
 from taichi_msm.scene import Scene
@@ -110,10 +110,10 @@ def run(
     device = runtime.start(arch, threads)
     texture = load_texture(scene) if scene.draws else None
     watch.lap("startup")
-    given, estimate = scene, None
+    given, estimate, mesh_error = scene, None, None
     if scene.sheet.tolerance is not None:
-        scene = choose_points(scene, device, partial(progress, "pilot"))
-        budget.require(scene, Path(directory))
+        scene, mesh_error = choose_points(scene, device, checked, partial(progress, "pilot"))
+        budget.require_disk(scene, Path(directory))
         watch.lap("pilot")
     if scene.time.tolerance is not None:
         scene, estimate = error_control.choose_step(scene, device, partial(progress, "pilot"))
@@ -123,7 +123,17 @@ def run(
     with writing(directory):
         here = str(Path.cwd())
     manifest = Manifest(
-        given, scene, tuple(overrides), estimate, estimate_error, here, arch, digest(texture, scene), versions()
+        given,
+        scene,
+        tuple(overrides),
+        estimate,
+        mesh_error,
+        estimate_error,
+        here,
+        arch,
+        digest(texture),
+        map_digest(scene),
+        versions(),
     )
     if _is_begun(manifest, Path(directory)):
         with suppress(DamagedError):
@@ -135,7 +145,7 @@ def _is_begun(manifest: Manifest, directory: Path) -> bool:
     """Tell whether the unfinished run into a directory, if there is one, gives the bits of this one."""
     try:
         return manifest.gives_the_bits_of(read_manifest(directory))
-    except FilesError:
+    except (FilesError, SceneError):
         return False
 
 
@@ -158,7 +168,7 @@ def resume(
         What `run` does.
 
     Raises:
-        SceneError: when the scene's picture cannot be decoded.
+        SceneError: when the scene's picture or map cannot be decoded.
         DeviceError: when the arch is not there.
         FilesError: when there is nothing to resume, or what there is cannot be used; and as for `run`.
         KeyboardInterrupt: when interrupted before there is a frame more; all is as it was then.
@@ -169,7 +179,7 @@ def resume(
     if too_large := [str(problem) for problem in budget.problems(manifest.scene)]:
         raise SceneError(too_large)
     texture = manifest.load_texture()
-    manifest.require_same(digest(texture, manifest.scene), versions())
+    manifest.require_same(digest(texture), map_digest(manifest.scene), versions())
     device = runtime.start(manifest.arch, threads)
     watch.lap("startup")
     return _carry_out(manifest, Path(directory), device, texture, watch, progress, resumes=True)
@@ -265,9 +275,9 @@ def _carry_out(
         progress("write", writer.frames, frames)
         writer.finish()
         estimate = manifest.estimate if pilot is None else pilot.estimate
-        known = Known(estimate, reason, None if mesh is None else mesh.error)
+        known = Known(estimate, reason, manifest.mesh_error if mesh is None else mesh.error)
         record = {**ending, **_facts(manifest, simulation.progress, known), "resumed": resumed}
-        stages = ["startup", *(["pilot"] if estimate is not None else []), "compile", "simulate", "render"]
+        stages = ["startup", *(["pilot"] if "pilot" in watch.seconds else []), "compile", "simulate", "render"]
         seconds = {stage: watch.seconds.get(stage, 0.0) for stage in stages}
         record["timings"] = {**seconds, "encode": writer.encode_seconds, "total": watch.total()}
         record |= {"arch": device.arch, "device": device.name, "threads": device.threads, "lanes": simulation.lanes}
@@ -295,7 +305,7 @@ def _pilot(manifest: Manifest, device: Device, cores: int, *, resumed: bool) -> 
 
 
 def _mesh_pilot(manifest: Manifest, device: Device, cores: int, reason: str) -> MeshPilot | None:
-    """Begin the run with half the points a side, where the error is estimated at all."""
+    """Begin the runs with half and a quarter of the cells a side, where the error is estimated at all."""
     coarse = None if reason or manifest.asks_estimate is False else coarser(manifest.scene)
     return None if coarse is None else MeshPilot(manifest.scene, coarse, device, cores)
 

@@ -234,13 +234,15 @@ class Probe(Section):
     @field_validator("force", mode="after")
     @classmethod
     def _one_force(cls, force: Vector | None, info: ValidationInfo) -> Vector | None:
-        total = info.data.get("total", force)
+        if "total" not in info.data:
+            return force  # A fault of its own.
+        total = info.data["total"]
         if force is None and total is None:
             said = (
                 "missing; expected total, the whole tool's, or with springs force, on one point: [x, y, z] in newtons"
             )
             raise PydanticCustomError(REFUSED, said)
-        if "total" in info.data and force is not None and total is not None:
+        if force is not None and total is not None:
             raise PydanticCustomError(REFUSED, "stands beside total; remove one of them")
         return force
 
@@ -248,8 +250,8 @@ class Probe(Section):
     @classmethod
     def _fit_total(cls, value: float, info: ValidationInfo) -> float:
         if info.data.get("total") is not None:
-            if info.field_name == "falloff" and value == 0:
-                said = "0 would spread total over an endless sheet; take a number above 0, in 1/m"
+            if info.field_name == "falloff" and value < SMALLEST:
+                said = f"{value:g} would spread total over an endless sheet; take a number above 0, in 1/m"
                 raise PydanticCustomError(REFUSED, said)
             if info.field_name == "offset" and value != DEFAULT_OFFSET:
                 said = "belongs to force, and total is the whole of it; remove offset"
@@ -432,6 +434,11 @@ class Scene(Section):
     def draws(self) -> bool:
         """Whether any output is a picture."""
         return "png" in self.output or "gif" in self.output
+
+    @property
+    def kind(self) -> Literal["tissue", "springs"]:
+        """The section that says what the sheet is made of."""
+        return "springs" if self.tissue is None else "tissue"
 
     @property
     def stiffness_map(self) -> StiffnessMap | None:

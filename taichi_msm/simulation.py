@@ -84,7 +84,7 @@ class Simulation:
     def _resolved(self, scene: Scene) -> Scene:
         """Choose what the scene leaves open: the points and the step for a tolerance, and the precision."""
         if scene.sheet.tolerance is not None:
-            scene = choose_points(scene, self.device)
+            scene, _ = choose_points(scene, self.device, checked)
         if scene.time.tolerance is not None:
             return choose_step(scene, self.device)[0]
         return with_precision(scene, self.device.arch)

@@ -277,7 +277,7 @@ def test_the_error_in_f64_is_that_of_the_step(device: Device) -> None:
     (said,) = notes(made, MOVED, single)
     assert f"(step {double.error:.1g}, rounding {single.rounding:.1g})" in said
     (said,) = notes(made, MOVED, double)
-    assert said.endswith("(of the step)")
+    assert said.endswith(f"(step {single.in_f64:.1g})")
 
 
 @pytest.mark.parametrize("ends", [(0.0044889, 0.0121111), pytest.param((0.0067778, 0.0164444), marks=pytest.mark.slow)])

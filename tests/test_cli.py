@@ -34,7 +34,7 @@ def own_process(*arguments: str, **options: Any) -> subprocess.CompletedProcess[
 def test_run_writes_everything(small: Path) -> None:
     done = own_process("run", "small.yaml", "--threads", "2")
     assert (done.returncode, done.stderr) == (0, "")
-    assert done.stdout.startswith("output/small: 5 frames, 164 steps of 0.002439 s in f64, largest displacement 0.0")
+    assert done.stdout.startswith("output/small: 5 frames, 164 steps of 0.002439 s in f64, 9 x 11 points, largest displacement 0.0")
 
     out = small / "output" / "small"
     assert sorted(path.name for path in out.iterdir()) == ["animation.gif", "frames", "run.json", "trajectory.npz"]
@@ -91,7 +91,7 @@ def test_a_tolerance_chooses_the_step_and_is_reported(small: Path, program: Prog
     estimate = record["error_estimate"]
     assert set(estimate) == {"error", "rounding", "in_f64", "order"}
     assert 0 == estimate["rounding"] < estimate["error"] <= 1e-4
-    assert f"error {estimate['error']:.1g} of the largest displacement (of the step)" in done.stdout
+    assert f"error {estimate['error']:.1g} of the largest displacement (step {estimate['in_f64']:.1g})" in done.stdout
     assert record["timings"]["pilot"] > 0
     # The step as run.json gives it makes the same run without pilot runs, whose error it is.
     settings = ["--set", "output=[]", "--set", f"time.step={record['step']!r}"]

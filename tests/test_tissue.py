@@ -21,7 +21,7 @@ from taichi_msm.physics.lattice import rest_positions
 from taichi_msm.physics.material import factors, material, stiffness
 from taichi_msm.physics.mesh_error import FEWEST, CubicSampling, MeshPilot, choose_points, coarser
 from taichi_msm.physics.solver import Dynamics, structure
-from taichi_msm.physics.timestep import step, steps_per_frame
+from taichi_msm.physics.timestep import stable_step, step, steps_per_frame
 from taichi_msm.runner import resume, run
 from taichi_msm.scene import Scene
 from taichi_msm.scenefile.load import load_scene
@@ -165,12 +165,18 @@ def test_a_map_of_one_grey_changes_nothing(load: Any, tmp_path: Path, device: De
     np.testing.assert_allclose(frames(mapped, device), frames(plain, device, steps_per_frame(mapped)), rtol=1e-9)
 
 
-def test_a_changed_map_is_read_again(load: Any, tmp_path: Path) -> None:
-    made = load("tissue.map={image: map.png, range: [1, 2]}")
-    before = factors(made)
-    Image.new("L", (3, 3), 255).save(tmp_path / "map.png")
-    assert (factors(made) == 2).all()
-    assert not (before == 2).all()
+def test_a_map_is_read_when_a_scene_is_loaded(load: Any, tmp_path: Path) -> None:
+    mapped = "tissue.map={image: map.png, range: [1, 2]}"
+    made = load(mapped)
+    before, limit = factors(made).copy(), stable_step(made)
+    Image.new("L", (3, 3), 51).save(tmp_path / "map.png")
+    assert (factors(made) == before).all()
+    assert stable_step(made) == limit
+    (tmp_path / "map.png").rename(tmp_path / "other.png")
+    assert (factors(made) == before).all(), "a run goes on"
+    (tmp_path / "other.png").rename(tmp_path / "map.png")
+    np.testing.assert_allclose(factors(load(mapped)), 1.2)
+    assert stable_step(load(mapped)) > limit
 
 
 def test_where_the_tool_lets_go_a_tense_sheet_comes_back(load: Any, device: Device) -> None:
@@ -343,7 +349,7 @@ def test_a_tolerance_of_the_points_chooses_them(load: Any, device: Device, tmp_p
     assert record["error_estimate"] is not None
     assert 0.005 < (record["error_estimate"]["mesh_error"] or 0) <= 0.02
     assert record["scene"]["sheet"]["tolerance"] == 0.02, "as it was given"
-    assert record["points"] == list(choose_points(made, device).sheet.points)
+    assert record["points"] == list(choose_points(made, device, checked)[0].sheet.points)
     assert record["points"] > [13, 15]
     with Simulation(made, threads=device.threads) as simulation:
         assert simulation.positions().shape[:2] == tuple(record["points"])
@@ -352,7 +358,7 @@ def test_a_tolerance_of_the_points_chooses_them(load: Any, device: Device, tmp_p
 def test_a_tolerance_that_no_points_meet_is_refused(load: Any, device: Device, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("taichi_msm.physics.mesh_error.MAX_POINTS", 40)
     with pytest.raises(SceneError, match=r"sheet.tolerance: 0.0001 is out of reach: with \d+ x \d+ points the error"):
-        choose_points(load("sheet.tolerance=0.0001"), device)
+        choose_points(load("sheet.tolerance=0.0001"), device, checked)
 
 
 def test_a_run_says_what_its_tool_and_its_points_do(load: Any, device: Device, tmp_path: Path) -> None:
@@ -363,9 +369,12 @@ def test_a_run_says_what_its_tool_and_its_points_do(load: Any, device: Device, t
     assert probe["largest_pressure"] == pytest.approx(
         2 / (math.pi * (0.01**2 + 2 * (0.01 / 100 + 1 / 100**2))), rel=1e-6
     )
-    assert any(note.startswith("so few points make the run about") for note in record["notes"])
-    assert "of the points" in record["notes"][0]
-    assert f"probes.0: {probe['total_force']:.3g} N in all, at most 1.27 kPa" in summary(record, tmp_path)
+    assert any(note.startswith("so few points make the run up to") for note in record["notes"])
+    assert ", points 0.0" in record["notes"][0]
+    assert (
+        f"probes.0: {probe['total_force']:.3g} N in all, 0.4 N of it under the flat end, at most 1.27 kPa"
+        in summary(record, tmp_path)
+    )
 
 
 def test_a_run_that_stretches_too_far_says_so(load: Any, device: Device, tmp_path: Path) -> None:
@@ -407,5 +416,5 @@ def test_a_run_does_not_go_on_with_another_map(load: Any, tmp_path: Path, device
 
     run(made, tmp_path / "out", threads=device.threads, progress=stop)
     Image.new("L", (3, 3), 99).save(tmp_path / "map.png")
-    with pytest.raises(FilesError, match=r"map.png is another picture than when the run began"):
+    with pytest.raises(FilesError, match=r"map.png is another map than when the run began"):
         resume(tmp_path / "out", threads=device.threads)

@@ -20,17 +20,17 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
-from functools import lru_cache
-from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
 from taichi_msm.errors import Problem, SceneError
+from taichi_msm.physics import stiffness_map
 from taichi_msm.physics.lattice import fixed_points, spacing
-from taichi_msm.picture import PictureError, read_rgb
-from taichi_msm.scene import Scene, Sheet, StiffnessMap
+from taichi_msm.picture import PictureError
+from taichi_msm.scene import MAX_POINTS, Scene, Sheet, StiffnessMap
 
 # Of a lattice of springs between nearest and diagonal neighbours.
 POISSON = 1 / 3
@@ -147,39 +147,19 @@ def factors(scene: Scene) -> Array:
         SceneError: when the map cannot be read.
     """
     rows, cols = scene.sheet.points
-    stiffness_map = scene.stiffness_map
-    if stiffness_map is None:
+    if scene.stiffness_map is None:
         return np.ones((rows - 1, cols - 1))
+    with _naming_the_map(scene):
+        return stiffness_map.factors(scene.stiffness_map, rows - 1, cols - 1)
+
+
+@contextmanager
+def _naming_the_map(scene: Scene) -> Iterator[None]:
+    """Name the key of the map in an error of its file."""
     try:
-        return _sampled(stiffness_map, rows - 1, cols - 1, _stamp(stiffness_map))
+        yield
     except PictureError as error:
-        section = "springs" if scene.tissue is None else "tissue"
-        raise SceneError([f"{section}.map.image: {error}"]) from None
-
-
-def _stamp(stiffness_map: StiffnessMap) -> int:
-    """Tell a file that was changed from what it was."""
-    file = Path(stiffness_map.image)
-    return file.stat().st_mtime_ns if file.is_file() else 0
-
-
-@lru_cache(maxsize=8)
-def _sampled(stiffness_map: StiffnessMap, rows: int, cols: int, stamp: int) -> Array:
-    """Sample a map at the centres of cells: bilinear between the texels' centres, held beyond them."""
-    del stamp
-    grey = np.asarray(read_rgb(stiffness_map.image, (0, 0, 0)).convert("L"), float)
-    height, width = grey.shape
-    row = np.clip((np.arange(rows) + 0.5) / rows * height - 0.5, 0, height - 1)
-    column = np.clip((np.arange(cols) + 0.5) / cols * width - 0.5, 0, width - 1)
-    top, left = row.astype(int), column.astype(int)
-    bottom, right = np.minimum(top + 1, height - 1), np.minimum(left + 1, width - 1)
-    down, across = (row - top)[:, None], column - left
-    above = grey[np.ix_(top, left)] * (1 - across) + grey[np.ix_(top, right)] * across
-    below = grey[np.ix_(bottom, left)] * (1 - across) + grey[np.ix_(bottom, right)] * across
-    black, white = stiffness_map.range
-    found = black + (white - black) / 255 * (above * (1 - down) + below * down)
-    found.flags.writeable = False
-    return found
+        raise SceneError([f"{scene.kind}.map.image: {error}"]) from None
 
 
 def stiffness(scene: Scene) -> Stiffness:
@@ -226,6 +206,12 @@ def highest_frequency(scene: Scene) -> float:
     return math.sqrt((springs + made.virtual + bending) / made.mass)
 
 
+def cell_ratio(sheet: Sheet) -> float:
+    """Tell how many times as long as wide the cells are."""
+    dx, dy = spacing(sheet)
+    return max(dx, dy) / min(dx, dy)
+
+
 def has_fixed_border(scene: Scene) -> bool:
     """Tell whether every point at an edge is fixed."""
     fixed = fixed_points(scene.sheet)
@@ -234,25 +220,13 @@ def has_fixed_border(scene: Scene) -> bool:
 
 def _largest_factor(scene: Scene) -> float:
     """Find the largest mean of the factors of the cells around a point; without shares of area the largest factor."""
-    stiffness_map, (rows, cols) = scene.stiffness_map, scene.sheet.points
-    if stiffness_map is None:
+    if scene.stiffness_map is None:
         return 1.0
     if not material(scene).by_area:
         return float(factors(scene).max())
-    factors(scene)  # Says what is wrong with the map.
-    return _largest_mean(stiffness_map, rows - 1, cols - 1, _stamp(stiffness_map))
-
-
-@lru_cache(maxsize=8)
-def _largest_mean(stiffness_map: StiffnessMap, rows: int, cols: int, stamp: int) -> float:
-    """Find the largest mean of the factors of the cells around a point."""
-    found = _sampled(stiffness_map, rows, cols, stamp)
-    around, cells = np.pad(found, 1), np.pad(np.ones_like(found), 1)
-
-    def at_points(values: Array) -> Array:
-        return values[:-1, :-1] + values[:-1, 1:] + values[1:, :-1] + values[1:, 1:]
-
-    return float((at_points(around) / at_points(cells)).max())
+    rows, cols = scene.sheet.points
+    with _naming_the_map(scene):
+        return stiffness_map.largest_mean(scene.stiffness_map, rows - 1, cols - 1)
 
 
 def problems(scene: Scene) -> Iterator[Problem]:
@@ -260,8 +234,9 @@ def problems(scene: Scene) -> Iterator[Problem]:
     kinds = list(_kind_problems(scene))
     yield from kinds
     if not kinds:
-        yield from _map_problems(scene)
-        yield from _tissue_problems(scene)
+        unreadable = list(_map_problems(scene))
+        yield from unreadable
+        yield from _tissue_problems(scene, softest=1.0 if unreadable else float(factors(scene).min()))
 
 
 def _kind_problems(scene: Scene) -> Iterator[Problem]:
@@ -290,34 +265,33 @@ def _kind_problems(scene: Scene) -> Iterator[Problem]:
 
 
 def _map_problems(scene: Scene) -> Iterator[Problem]:
+    if scene.stiffness_map is None:
+        return
     try:
-        factors(scene)
-    except SceneError as error:
-        key, said = error.lines[0].split(": ", 1)
-        yield Problem(tuple(key.split(".")), said)
+        stiffness_map.read(scene.stiffness_map)
+    except PictureError as error:
+        yield Problem((scene.kind, "map", "image"), str(error))
 
 
-def _tissue_problems(scene: Scene) -> Iterator[Problem]:
+def _tissue_problems(scene: Scene, softest: float) -> Iterator[Problem]:
     tissue, sheet = scene.tissue, scene.sheet
     if tissue is None:
         return
-    dx, dy = spacing(sheet)
-    longest = max(dx, dy) / min(dx, dy)
+    longest = cell_ratio(sheet)
     if longest > LONGEST_CELL * (1 + 1e-9):
-        rows, cols = sheet.points
-        height, width = sheet.size
+        (dx, dy), (rows, cols), (height, width) = spacing(sheet), sheet.points, sheet.size
         enough = (rows, math.ceil(width / dy / LONGEST_CELL) + 1), (math.ceil(height / dx / LONGEST_CELL) + 1, cols)
         more = enough[0] if dx > dy else enough[1]
+        remedy = f"try {list(more)}" if max(more) <= MAX_POINTS else "take another sheet.size"
         yield Problem(
             ("sheet", "points"),
             f"{list(sheet.points)} make cells {longest:.3g} times as long as wide, and tissue allows "
-            f"{LONGEST_CELL:.3g} times; try {list(more)}",
+            f"{LONGEST_CELL:.3g} times; {remedy}",
         )
     if tissue.pretension > 0:
         if not has_fixed_border(scene):
             said = f"{tissue.pretension:g} N/m needs every side fixed; set sheet.fixed: border, or pretension: 0"
             yield Problem(("tissue", "pretension"), said)
-        softest = 1.0 if tissue.map is None else min(tissue.map.range)
         most = 1.5 * tissue.young * tissue.thickness * softest
         if tissue.pretension >= most:
             said = f"{tissue.pretension:g} N/m leaves springs no length; take less than {most:.3g} N/m, or more young"

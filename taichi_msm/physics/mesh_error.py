@@ -5,15 +5,19 @@ With r times longer cells the displacement u_c tells the error of u by Richardso
 less at the rim of a tool's flat end, at an edge in a map, at a fixed edge without tension and in wrinkles. So p is what
 the third run shows, at most 2 and at least 1; and 1 where there are too few points for a third run.
 
+A tool that is not much wider than a cell presses with more or less than its total, as the points happen to lie. The
+other runs press as hard as the first, and what that lacks of the total is added to the error.
+
 With `springs` a sheet is another one with other points, and nothing can be told.
 """
 
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from contextlib import ExitStack, closing
 from functools import partial
-from itertools import pairwise
+from itertools import pairwise, product
 from typing import Any
 
 import numpy as np
@@ -21,29 +25,65 @@ from numpy.typing import NDArray
 
 from taichi_msm.errors import SceneError
 from taichi_msm.physics.error_control import longest
+from taichi_msm.physics.material import LONGEST_CELL, cell_ratio
+from taichi_msm.physics.probe_force import probe_records, total_on_points
 from taichi_msm.physics.solver import Dynamics
 from taichi_msm.physics.timestep import steps_per_frame, with_steps, with_time
 from taichi_msm.progress import Count, Pause
-from taichi_msm.scene import MAX_POINTS, Scene
+from taichi_msm.scene import MAX_POINTS, Probe, Scene
 from taichi_msm.system.runtime import Device
 
 # The runs of one search, how much finer each may be than the one before, and how much finer it is at least.
 MOST_TRIALS = 10
-LARGEST_CUT, LEAST_CUT = 4.0, 1.1
+LARGEST_CUT, LEAST_CUT = 2.0, 1.1
 
 # The points found are the fewest but for some: their error is to be this share of the tolerance.
 CLOSE = 0.8
+
+# The force of a tool is summed over no more points than this to know what it is.
+MOST_SUMMED = 4_000_000
 
 # With fewer points a side than this nothing is left to compare with.
 FEWEST = 7
 
 
 def coarser(scene: Scene) -> Scene | None:
-    """Give the scene half as many cells a side and the same steps; None where there are too few, or no tissue."""
+    """Give the scene half as many cells a side, the same steps, and tools that press as hard in all.
+
+    None where there are too few points, or there is no tissue.
+    """
     if scene.tissue is None or min(scene.sheet.points) < FEWEST:
         return None
-    rows, cols = (round((count - 1) / 2) + 1 for count in scene.sheet.points)
-    return with_steps(with_time(with_points(scene, (rows, cols)), precision="f64"), steps_per_frame(scene))
+    # Rounded either way, so that cells do not get too long.
+    ways = product(*({count // 2 + 1, (count - 1) // 2 + 1} for count in scene.sheet.points))
+    tried = [with_points(scene, (rows, cols)) for rows, cols in ways]
+    coarse = min(tried, key=lambda one: (cell_ratio(one.sheet) > LONGEST_CELL, one.sheet.points))
+    if cell_ratio(coarse.sheet) > LONGEST_CELL:
+        return None
+    sums = zip(scene.probes, probe_records(scene), probe_records(coarse), strict=True)
+    probes = tuple(
+        _pressing(probe, own["total_force"] / other["total_force"] if other["total_force"] > 0 else 1.0)
+        for probe, own, other in sums
+    )
+    coarse = coarse.model_copy(update={"probes": probes})
+    return with_steps(with_time(coarse, precision="f64"), steps_per_frame(scene))
+
+
+def _pressing(probe: Probe, times: float) -> Probe:
+    """Give a probe so many times its total, unless that is another tool altogether."""
+    if probe.total is None or not 0.5 < times < 2:
+        return probe
+    return probe.model_copy(update={"total": tuple(times * part for part in probe.total)})
+
+
+def missing_force(scene: Scene) -> float:
+    """Tell by which share the forces of any tool's total on the points differ in sum from those on a finer sheet."""
+    points = math.prod(scene.sheet.points)
+    cut = max(2, min(8, math.isqrt(MOST_SUMMED // points)))
+    totals = [probe for probe in scene.probes if probe.total is not None]
+    exact = [total_on_points(probe, scene.sheet, cut) for probe in totals]
+    own = [total_on_points(probe, scene.sheet) for probe in totals]
+    return max((abs(one / true - 1) for one, true in zip(own, exact, strict=True) if true > 0), default=0.0)
 
 
 class MeshPilot:
@@ -70,6 +110,7 @@ class MeshPilot:
         self._samplings = [CubicSampling(after, before) for before, after in pairwise(points)]
         self._ratio = min((own - 1) / (other - 1) for own, other in zip(*points[:2], strict=True))
         self._differences = [0.0 for _ in scenes]
+        self._missing = missing_force(scene)
         self._largest = 0.0
 
     def compile(self) -> None:
@@ -98,7 +139,7 @@ class MeshPilot:
         if self._largest == 0:
             return 0.0
         relative = self._differences[0] / (self._ratio**self.order - 1) / self._largest
-        return relative if relative < math.inf else math.inf
+        return relative + self._missing if relative < math.inf else math.inf
 
     @property
     def order(self) -> float:
@@ -118,37 +159,48 @@ def with_points(scene: Scene, points: tuple[int, int]) -> Scene:
     return scene.model_copy(update={"sheet": scene.sheet.model_copy(update={"points": points, "tolerance": None})})
 
 
-def choose_points(scene: Scene, device: Device, progress: Count = lambda done, total: None) -> Scene:
+def choose_points(
+    scene: Scene,
+    device: Device,
+    check: Callable[[Scene], object],
+    progress: Count = lambda done, total: None,
+) -> tuple[Scene, float]:
     """Find the fewest points, but for some, of which the error is within the sheet's tolerance.
 
     Args:
-        scene: a checked scene; its points are the fewest that are tried.
+        scene: a checked scene; its points are the fewest that are tried, and its cells keep their shape.
         device: what `runtime.start` returned.
+        check: raises SceneError where a scene with other points cannot be run.
         progress: called with the frames done and the frames in all of each pilot run.
 
     Returns:
-        The scene with these points.
+        The scene with these points, and its error.
 
     Raises:
-        SceneError: when so many points as there may be are too few, or they do not fit in memory.
+        SceneError: when so many points as there may be are too few, or cannot be run.
     """
     tolerance, given = scene.sheet.tolerance, scene.sheet.points
     assert tolerance is not None
-    tried = with_points(scene, (max(FEWEST, given[0]), max(FEWEST, given[1])))
+    times, most = 1.0, (MAX_POINTS - 1) / (max(given) - 1)
     for _ in range(MOST_TRIALS):
-        error = _error(tried, device, progress)
-        if error <= tolerance:
-            return tried
-        cut = min(LARGEST_CUT, max(LEAST_CUT, math.sqrt(error / (CLOSE * tolerance))))
-        rows, cols = (math.ceil((count - 1) * cut) + 1 for count in tried.sheet.points)
-        if max(rows, cols) > MAX_POINTS:
+        rows, cols = (max(FEWEST - 1, round((count - 1) * times)) + 1 for count in given)
+        tried = with_points(scene, (rows, cols))
+        try:
+            check(tried)
+        except SceneError as error:
+            asked = f"with the {rows} x {cols} points that sheet.tolerance: {tolerance:g} asks for"
+            raise SceneError([f"{line} ({asked})" for line in error.lines]) from None
+        found = _error(tried, device, progress)
+        if found <= tolerance:
+            return tried, found
+        if times >= most:
             break
-        tried = with_points(tried, (rows, cols))
-    rows, cols = tried.sheet.points
+        times = min(most, times * min(LARGEST_CUT, max(LEAST_CUT, math.sqrt(found / (CLOSE * tolerance)))))
     raise SceneError(
         [
             f"sheet.tolerance: {tolerance:g} is out of reach: with {rows} x {cols} points the error is still "
-            f"{error:.2g}; take a wider tool (probes.N.radius, a smaller falloff) or a larger tolerance"
+            f"{found:.2g}; take a wider tool (probes.N.radius, a smaller falloff), more tissue.pretension or bending "
+            "where it wrinkles, or a larger tolerance"
         ]
     )
 

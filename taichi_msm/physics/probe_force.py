@@ -14,6 +14,7 @@ where W is the integral of w over an endless sheet, and R the radius of the tool
 from __future__ import annotations
 
 import math
+from collections.abc import Iterator
 from typing import NamedTuple
 
 import numpy as np
@@ -25,6 +26,9 @@ from taichi_msm.physics.material import area_shares
 from taichi_msm.scene import Probe, Scene, Sheet
 
 Array = NDArray[np.float64]
+
+# Less of a tool's total than this share on the sheet, or as much more, is remarkable.
+LEAST_REACHING = 0.8
 
 
 class ProbeForce(NamedTuple):
@@ -85,33 +89,60 @@ def spread(probe: Probe) -> float:
     return math.pi * (probe.radius * probe.radius + 2 * (probe.radius * reach + reach * reach))
 
 
+def total_on_points(probe: Probe, sheet: Sheet, finer: int = 1) -> float:
+    """Add up the forces of a probe at 100 % on all points of a sheet, or of one with cells a whole number finer [N]."""
+    acts, (at_x, at_y) = probe_force(probe, sheet), control_points(probe, sheet)[1][0]
+    (rows, cols), (height, width) = ((count - 1) * finer for count in sheet.points), sheet.size
+    x, y = (np.arange(cols + 1) / cols - 0.5) * width, (0.5 - np.arange(rows + 1)[:, None] / rows) * height
+    forces = acts.decay(np.hypot(x - at_x, y - at_y))
+    if acts.by_area:
+        forces[[0, -1]] /= 2
+        forces[:, [0, -1]] /= 2
+    return math.hypot(*acts.force) * float(forces.sum()) / finer**2
+
+
 class ProbeRecord(TypedDict):
     """What a probe does at 100 %, at the first place of its control point.
 
     Attributes:
         total_force: on all points together [N].
+        flat_end_force: the part of a `total` that acts under the tool's flat end, on a wide sheet [N].
         largest_pressure: force on a point by the area that belongs to it [Pa].
     """
 
     total_force: float
+    flat_end_force: float
     largest_pressure: float
 
 
 def probe_records(scene: Scene) -> list[ProbeRecord]:
     """Add up what every probe of a scene does."""
-    (x, y), (dx, dy) = axes(scene.sheet), spacing(scene.sheet)
-    shares = area_shares(scene.sheet)
-    found = []
+    (dx, dy), found = spacing(scene.sheet), []
     for probe in scene.probes:
         acts, (at_x, at_y) = probe_force(probe, scene.sheet), control_points(probe, scene.sheet)[1][0]
-        decay = acts.decay(np.hypot(x - at_x, y - at_y))
-        weight = decay * shares if acts.by_area else decay
-        force = math.hypot(*acts.force)
-        total, largest = force * float(weight.sum()), force * float((weight / shares).max()) / (dx * dy)
-        found.append(ProbeRecord(total_force=total, largest_pressure=largest))
+        x, y = axes(scene.sheet)
+        force = math.hypot(*acts.force) * acts.decay(np.hypot(x - at_x, y - at_y)).max()
+        largest = force / (dx * dy if acts.by_area else float(area_shares(scene.sheet).max()) * dx * dy)
+        flat = 0.0
+        if probe.total is not None:
+            flat = math.hypot(*probe.total) * math.pi * probe.radius * probe.radius / spread(probe)
+        total = total_on_points(probe, scene.sheet)
+        found.append(ProbeRecord(total_force=total, flat_end_force=flat, largest_pressure=float(largest)))
     return found
 
 
 def in_words(record: ProbeRecord) -> str:
     """Say what a probe does."""
-    return f"{record['total_force']:.3g} N in all, at most {record['largest_pressure'] / 1000:.3g} kPa"
+    flat = f", {record['flat_end_force']:.3g} N of it under the flat end" if record["flat_end_force"] > 0 else ""
+    return f"{record['total_force']:.3g} N in all{flat}, at most {record['largest_pressure'] / 1000:.3g} kPa"
+
+
+def notes(scene: Scene) -> Iterator[str]:
+    """Say of which tool most does not reach the sheet, or more than its total, as there are too few points."""
+    for index, (probe, record) in enumerate(zip(scene.probes, probe_records(scene), strict=True)):
+        asked = math.hypot(*probe.total) if probe.total is not None else 0.0
+        if asked > 0 and not LEAST_REACHING < record["total_force"] / asked < 1 / LEAST_REACHING:
+            yield (
+                f"probes.{index}: {record['total_force']:.3g} N of its {asked:.3g} N reach the sheet; is it beside it, "
+                "wider than the sheet, or narrower than a cell?"
+            )

@@ -43,7 +43,7 @@ def notes(
     if mesh_error is not None and WRONG < mesh_error < math.inf:
         wrong, cut = float(f"{100 * mesh_error:.2g}"), math.sqrt(mesh_error / (WRONG / 2))
         finer = [min(MAX_POINTS, math.ceil((count - 1) * cut) + 1) for count in scene.sheet.points]
-        yield f"so few points make the run about {wrong:g} % wrong; try sheet.points: {finer}"
+        yield f"so few points make the run up to {wrong:g} % wrong; try sheet.points: {finer}"
     if progress.max_displacement == 0 and progress.frame > 0:
         yield "nothing moved: does a probe press where and when it should?"
     if progress.longest_spring > LONGEST:
@@ -69,13 +69,11 @@ def error(estimate: Estimate, mesh_error: float | None = None) -> str:
     """Say how wrong a run is."""
     if estimate.error == math.inf:
         return "error not known: a pilot run diverged, or a step is longer than the damping"
-    parts = f"step {estimate.in_f64:.1g}, rounding {estimate.rounding:.1g}" if estimate.rounding else "of the step"
-    said = f"error {estimate.error:.1g} of the largest displacement ({parts})"
+    parts = f"step {estimate.in_f64:.1g}" + (f", rounding {estimate.rounding:.1g}" if estimate.rounding else "")
     if mesh_error is None:
-        return said
-    return (
-        f"{said}, and of the points {mesh_error:.1g}" if mesh_error < math.inf else f"{said}, of the points not known"
-    )
+        return f"error {estimate.error:.1g} of the largest displacement ({parts})"
+    points = f"{mesh_error:.2g}" if mesh_error < math.inf else "not known"
+    return f"error, as a share of the largest displacement: {parts}, points {points}"
 
 
 def _remedy(scene: Scene, estimate: Estimate) -> str:

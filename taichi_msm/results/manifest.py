@@ -36,10 +36,12 @@ class Manifest:
         scene: the scene with the step that was chosen.
         overrides: what made the scene, beside its file.
         estimate: of the error, if a tolerance wanted it before the run.
+        mesh_error: of the points, if a tolerance of the sheet wanted it before the run.
         asks_estimate: whether an estimate is wanted beside the run; None: where it is cheap.
         folder: the current directory, from which the scene's picture is found.
         arch: cpu, cuda or vulkan.
-        picture: the digest of the picture on the sheet and of the map.
+        picture: the digest of the picture on the sheet.
+        map: the digest of the map's factors.
         versions: what the results depend on besides.
     """
 
@@ -47,10 +49,12 @@ class Manifest:
     scene: Scene
     overrides: tuple[str, ...]
     estimate: Estimate | None
+    mesh_error: float | None
     asks_estimate: bool | None
     folder: str
     arch: str
     picture: str
+    map: str
     versions: Mapping[str, str]
 
     def as_json(self) -> dict[str, Any]:
@@ -66,16 +70,17 @@ class Manifest:
         image = str(Path(self.folder) / str(self.scene.image))
         return load_texture(self.scene.model_copy(update={"image": image}))
 
-    def require_same(self, picture: str, versions: Mapping[str, str]) -> None:
+    def require_same(self, picture: str, map_: str, versions: Mapping[str, str]) -> None:
         """Make sure that what follows has the bits of one run.
 
         Raises:
-            FilesError: when the picture or a version is another one.
+            FilesError: when the picture, the map or a version is another one.
         """
         if picture != self.picture:
-            names = [self.scene.image if self.scene.draws else None, getattr(self.scene.stiffness_map, "image", None)]
-            named = " or ".join(name for name in names if name)
-            raise FilesError(f"{named} is another picture than when the run began; run the scene again")
+            raise FilesError(f"{self.scene.image} is another picture than when the run began; run the scene again")
+        if map_ != self.map:
+            image = getattr(self.scene.stiffness_map, "image", None)
+            raise FilesError(f"{image} is another map than when the run began; run the scene again")
         others = [f"{key} {self.versions.get(key)}" for key in versions if versions[key] != self.versions.get(key)]
         if others:
             raise FilesError(f"the run was begun with {', '.join(others)}; take these, or run the scene again")
@@ -85,7 +90,10 @@ class Manifest:
         renamed = other.scene.model_copy(update={"image": self.scene.image})
         if self.scene.stiffness_map is not None:
             renamed = renamed.with_map_image(self.scene.stiffness_map.image)
-        mine, its = (self.arch, self.picture, self.versions), (other.arch, other.picture, other.versions)
+        mine, its = (
+            (self.arch, self.picture, self.map, self.versions),
+            (other.arch, other.picture, other.map, other.versions),
+        )
         return self.scene == renamed and mine == its
 
 
@@ -98,6 +106,7 @@ def read_manifest(directory: Path) -> Manifest:
     Raises:
         FilesError: when there is none.
         DamagedError: when it cannot be understood.
+        SceneError: when the map of its scene cannot be read.
     """
     path = directory / STAGING / CHECKPOINT / MANIFEST
     try:
@@ -110,6 +119,7 @@ def read_manifest(directory: Path) -> Manifest:
         raise FilesError(f"{path}: {(error.strerror or str(error)).lower()}") from None
     except ValueError:  # pydantic's too
         raise DamagedError(f"{path} is damaged; run the scene again") from None
+    factors(manifest.scene)
     # Anybody may have written it.
     numbers = () if manifest.estimate is None else asdict(manifest.estimate).values()
     possible = manifest.arch in ARCHS and all(number >= 0 for number in numbers)
@@ -128,21 +138,19 @@ def _found_from_here(manifest: Manifest) -> Manifest:
     return replace(manifest, scene=manifest.scene.with_map_image(image))
 
 
-def digest(picture: NDArray[np.uint8] | None, scene: Scene) -> str:
-    """Tell pictures and maps apart; empty where there is none.
+def digest(array: NDArray[Any] | None) -> str:
+    """Tell arrays apart; empty where there is none."""
+    if array is None:
+        return ""
+    found = hashlib.sha256(repr(array.shape).encode())
+    found.update(np.ascontiguousarray(array).data)
+    return found.hexdigest()
 
-    Args:
-        picture: on the sheet, if it is drawn.
-        scene: whose map it is.
+
+def map_digest(scene: Scene) -> str:
+    """Tell maps apart by their factors.
 
     Raises:
         SceneError: when the map cannot be read.
     """
-    arrays: list[NDArray[Any]] = [] if picture is None else [picture]
-    if scene.stiffness_map is not None:
-        arrays.append(factors(scene))
-    found = hashlib.sha256()
-    for array in arrays:
-        found.update(repr(array.shape).encode())
-        found.update(np.ascontiguousarray(array).data)
-    return found.hexdigest() if arrays else ""
+    return digest(None if scene.stiffness_map is None else factors(scene))

@@ -100,21 +100,6 @@ def problems(scene: Scene) -> Iterator[Problem]:
     yield from _memory_problems(scene)
 
 
-def require(scene: Scene, directory: Path) -> None:
-    """Make sure that a scene whose points were chosen can be run.
-
-    Args:
-        scene: the scene with these points.
-        directory: where its results are to go.
-
-    Raises:
-        SceneError: when it takes too many steps, or too much memory or disk.
-    """
-    if too_large := [str(problem) for problem in problems(scene)]:
-        raise SceneError(too_large)
-    require_disk(scene, directory)
-
-
 def require_disk(scene: Scene, directory: Path) -> None:
     """Make sure that there is room for the results.
 

@@ -12,12 +12,14 @@ from numpy.typing import NDArray
 from taichi_msm.errors import DivergedError, SceneError
 from taichi_msm.physics.error_control import choose_step
 from taichi_msm.physics.lattice import rest_positions
+from taichi_msm.physics.mesh_error import choose_points
 from taichi_msm.physics.probe_force import probe_force
 from taichi_msm.physics.timestep import steps_per_frame, with_time
 from taichi_msm.physics.workload import with_precision
 from taichi_msm.render.texture import load_texture
 from taichi_msm.results.gif import Picture
 from taichi_msm.scene import MAX_PROBES, Camera, Scene
+from taichi_msm.scenefile.validation import checked
 from taichi_msm.scenefile.yaml_reader import MAX_NODES
 from taichi_msm.simulation import Simulation
 from taichi_msm.system import runtime
@@ -103,6 +105,8 @@ class Session:
         progress("start")
         device = runtime.start(arch, threads)
         given, texture = scene, load_texture(scene)
+        if scene.sheet.tolerance is not None:
+            scene, _ = choose_points(scene, device, checked, lambda done, total: progress("pilot"))
         scene, self.parts = with_live_frames(scene)
         if scene.time.tolerance is not None:
             scene, _ = choose_step(scene, device, lambda done, total: progress("pilot"))

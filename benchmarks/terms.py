@@ -1,0 +1,86 @@
+"""What a step costs with each term of tissue, beside a sheet in springs; all in turn in one process."""
+
+from __future__ import annotations
+
+import tempfile
+import time
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from PIL import Image
+
+from benchmarks.process import call
+from benchmarks.race import Progress
+from taichi_msm.physics.material import material
+from taichi_msm.physics.solver import Dynamics
+from taichi_msm.scene import Scene
+from taichi_msm.system import runtime
+from taichi_msm.system.resources import available_threads
+
+POINTS = (61, 331, 1024)
+PRECISIONS = ("f32", "f64")
+
+SPRINGS = "springs"
+
+# Steps of points of one sample: some 30 ms.
+POINT_STEPS = 10_000_000
+
+TISSUE = {"young": 3e4, "thickness": 2e-3, "density": 1050, "foundation": 2e6, "damping": 40}
+BENDING = {"bending": 1e-7}
+PRETENSION = {"pretension": 5}
+
+
+def variants(points: int, precision: str, image: str) -> dict[str, Scene]:
+    """Make the scenes: the same tissue, with one term more or with all."""
+    stiffness_map = {"map": {"image": image, "range": [1, 1.5]}}
+
+    def scene(sheet: dict[str, Any], **others: Any) -> Scene:
+        return Scene(
+            sheet={"points": [points, points], "size": [0.1, 0.1], **sheet},
+            probes=[{"total": [0, 0, -2], "radius": 0.004, "falloff": 300}],
+            time={"duration": 1000, "precision": precision},
+            output=[],
+            **others,
+        )
+
+    plain = material(scene({}, tissue=TISSUE))
+    springs = {"structural": plain.across, "shear": plain.shear, "virtual": plain.virtual}
+    return {
+        SPRINGS: scene({"mass": plain.mass}, springs=springs, damping=plain.drag * plain.mass),
+        "tissue": scene({}, tissue=TISSUE),
+        "tissue, free edges": scene({"fixed": "none"}, tissue=TISSUE),
+        "tissue, pretension": scene({}, tissue={**TISSUE, **PRETENSION}),
+        "tissue, map": scene({}, tissue={**TISSUE, **stiffness_map}),
+        "tissue, bending": scene({}, tissue={**TISSUE, **BENDING}),
+        "tissue, all but free edges": scene({}, tissue={**TISSUE, **PRETENSION, **stiffness_map, **BENDING}),
+    }
+
+
+def cost(points: int, precision: str, rounds: int) -> dict[str, list[float]]:
+    """Time a step of every variant [s], in turn."""
+    device = runtime.start("cpu", available_threads())
+    count = max(1, POINT_STEPS // points**2)
+    with tempfile.TemporaryDirectory() as folder:
+        image = Path(folder) / "map.png"
+        Image.fromarray(np.random.default_rng(0).integers(0, 256, (64, 64), dtype=np.uint8)).save(image)
+        sheets = {name: Dynamics(scene, device) for name, scene in variants(points, precision, str(image)).items()}
+    samples: dict[str, list[float]] = {name: [] for name in sheets}
+    for _ in range(1 + rounds):
+        for name, sheet in sheets.items():
+            start = time.perf_counter()
+            sheet.advance(count)
+            samples[name].append((time.perf_counter() - start) / count)
+    # In the first round kernels are compiled.
+    return {name: times[1:] for name, times in samples.items()}
+
+
+def measure(rounds: int, progress: Progress) -> dict[str, dict[str, list[float]]]:
+    """Time all variants of every size and precision; the keys are such as "331 × 331, f32"."""
+    found = {}
+    for precision in PRECISIONS:
+        for points in POINTS:
+            progress(f"{points} x {points}, {precision}")
+            name = f"{points} × {points}, {precision}"
+            found[name] = call("benchmarks.terms:cost", points=points, precision=precision, rounds=4 * rounds)
+    return found

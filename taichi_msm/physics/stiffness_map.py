@@ -1,0 +1,83 @@
+"""The map of a sheet: how many times as stiff it is from place to place.
+
+A map's file is read when a scene is checked, and not again, so that a run is of one map even where its file is changed
+or removed meanwhile.
+"""
+
+from __future__ import annotations
+
+from functools import lru_cache
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from taichi_msm.picture import read_rgb
+from taichi_msm.scene import StiffnessMap
+
+Array = NDArray[np.float64]
+
+# What was read of so many files is kept.
+MOST_KEPT = 16
+
+# By the name of the file: when it was changed, and its grey, 0 to 255, shape (height, width).
+_kept: dict[str, tuple[int, NDArray[np.uint8]]] = {}
+
+
+def read(stiffness_map: StiffnessMap) -> None:
+    """Read the file of a map, unless it is what was read last.
+
+    Raises:
+        PictureError: when it cannot be used.
+    """
+    image = stiffness_map.image
+    changed = Path(image).stat().st_mtime_ns if Path(image).is_file() else 0
+    if image in _kept and _kept[image][0] == changed:
+        return
+    grey = np.asarray(read_rgb(image, (0, 0, 0)).convert("L"))
+    _sampled.cache_clear()
+    largest_mean.cache_clear()
+    if len(_kept) >= MOST_KEPT:
+        del _kept[next(iter(_kept))]
+    _kept[image] = changed, grey
+
+
+def factors(stiffness_map: StiffnessMap, rows: int, cols: int) -> Array:
+    """Give the factors at the centres of so many cells, shape (rows, cols).
+
+    Raises:
+        PictureError: when the file cannot be used.
+    """
+    if stiffness_map.image not in _kept:
+        read(stiffness_map)
+    return _sampled(stiffness_map, rows, cols)
+
+
+@lru_cache(maxsize=8)
+def _sampled(stiffness_map: StiffnessMap, rows: int, cols: int) -> Array:
+    """Sample at the centres of cells: bilinear between the texels' centres, held beyond them."""
+    grey = _kept[stiffness_map.image][1].astype(float)
+    height, width = grey.shape
+    row = np.clip((np.arange(rows) + 0.5) / rows * height - 0.5, 0, height - 1)
+    column = np.clip((np.arange(cols) + 0.5) / cols * width - 0.5, 0, width - 1)
+    top, left = row.astype(int), column.astype(int)
+    bottom, right = np.minimum(top + 1, height - 1), np.minimum(left + 1, width - 1)
+    down, across = (row - top)[:, None], column - left
+    above = grey[np.ix_(top, left)] * (1 - across) + grey[np.ix_(top, right)] * across
+    below = grey[np.ix_(bottom, left)] * (1 - across) + grey[np.ix_(bottom, right)] * across
+    black, white = stiffness_map.range
+    found = black + (white - black) / 255 * (above * (1 - down) + below * down)
+    found.flags.writeable = False
+    return found
+
+
+@lru_cache(maxsize=8)
+def largest_mean(stiffness_map: StiffnessMap, rows: int, cols: int) -> float:
+    """Find the largest mean of the factors of the cells around a point, of so many cells."""
+    found = factors(stiffness_map, rows, cols)
+    around, cells = np.pad(found, 1), np.pad(np.ones_like(found), 1)
+
+    def at_points(values: Array) -> Array:
+        return values[:-1, :-1] + values[:-1, 1:] + values[1:, :-1] + values[1:, 1:]
+
+    return float((at_points(around) / at_points(cells)).max())
