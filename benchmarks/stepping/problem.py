@@ -66,7 +66,7 @@ class Problem:
                 "springs": {"structural": 20, "shear": 15, "virtual": 10, "virtual_active": "always"},
                 "damping": 0.01,
                 "probes": [{"force": FORCE, "falloff": 2 * DECAY / side, "offset": 0}],
-                "time": {"duration": 1, "step": 0.002},
+                "time": {"duration": 1, "step": 0.002, "precision": "f32"},
                 "output": [],
             }
         )
