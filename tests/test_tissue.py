@@ -270,6 +270,12 @@ def test_a_map_from_elsewhere_is_not_read(load: Any, tmp_path: Path) -> None:
         load(text=text)
 
 
+@pytest.mark.parametrize("name", ["f" * 400 + ".png", "a\\0b.png", ".", "no.png"])
+def test_a_map_that_cannot_be_opened_is_refused(name: str, load: Any) -> None:
+    with pytest.raises(SceneError, match=r"tissue.map.image: "):
+        load(f'tissue.map={{image: "{name}", range: [1, 2]}}')
+
+
 def test_a_map_that_is_no_picture_is_named(load: Any, tmp_path: Path) -> None:
     (tmp_path / "map.png").write_text("grey")
     with pytest.raises(SceneError, match=r"tissue.map.image: .*map.png is not a PNG, JPEG"):

@@ -6,6 +6,7 @@ or removed meanwhile.
 
 from __future__ import annotations
 
+from contextlib import suppress
 from functools import lru_cache
 from pathlib import Path
 
@@ -31,7 +32,10 @@ def read(stiffness_map: StiffnessMap) -> None:
         PictureError: when it cannot be used.
     """
     image = stiffness_map.image
-    changed = Path(image).stat().st_mtime_ns if Path(image).is_file() else 0
+    changed = 0
+    # What is wrong with the file, reading it says.
+    with suppress(OSError, ValueError):
+        changed = Path(image).stat().st_mtime_ns
     if image in _kept and _kept[image][0] == changed:
         return
     grey = np.asarray(read_rgb(image, (0, 0, 0)).convert("L"))
