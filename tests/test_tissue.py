@@ -15,7 +15,7 @@ from PIL import Image
 from taichi_msm import reference
 from taichi_msm.console import summary
 from taichi_msm.errors import ArgumentError, FilesError, SceneError
-from taichi_msm.physics import kernel_gpu
+from taichi_msm.physics import kernel_gpu, probe_force, stiffness_map
 from taichi_msm.physics.error_control import longest
 from taichi_msm.physics.lattice import rest_positions
 from taichi_msm.physics.material import factors, material, stiffness
@@ -206,6 +206,11 @@ WIDE = "[40, 13] make cells 3.25 times as long as wide, and tissue allows 1.73 t
 OPEN = "1 N/m needs every side fixed; set sheet.fixed: border, or pretension: 0"
 TIGHT = "90 N/m leaves springs no length; take less than 90 N/m, or more young"
 NO_MAP = "no such file or directory; name a picture that can be read"
+SIZE = (
+    "sheet.points: [13, 15] make cells 1.17e+05 times as long as wide, and tissue allows 1.73 times; "
+    "take another sheet.size"
+)
+WRONG = "5 is not allowed; expected three numbers: [x, y, z] in newtons"
 FLAT = "0 would spread total over an endless sheet; take a number above 0, in 1/m"
 
 
@@ -221,6 +226,8 @@ FLAT = "0 would spread total over an endless sheet; take a number above 0, in 1/
         ("probes.0.falloff=0", f"probes.0.falloff: {FLAT}"),
         ("sheet.points=[13, 40]", f"sheet.points: {LONG}"),
         ("sheet.points=[40, 13]", f"sheet.points: {WIDE}"),
+        ("sheet={points: [13, 15], size: [100, 0.001]}", SIZE),
+        ("probes.0.total=5", f"probes.0.total: {WRONG}"),
         ("tissue.pretension=90", f"tissue.pretension: {TIGHT}"),
         ("tissue.young=0", "tissue.young: 0 is not allowed; expected a number above 0, in Pa"),
         (
@@ -424,3 +431,43 @@ def test_a_run_does_not_go_on_with_another_map(load: Any, tmp_path: Path, device
     Image.new("L", (3, 3), 99).save(tmp_path / "map.png")
     with pytest.raises(FilesError, match=r"map.png is another map than when the run began"):
         resume(tmp_path / "out", threads=device.threads)
+
+
+def test_the_cells_keep_their_shape_while_points_are_chosen(load: Any, device: Device) -> None:
+    oblong = ("sheet.points=[5, 13]", "sheet.size=[0.04, 0.12]", "sheet.tolerance=0.05", *SMOOTH)
+    rows, cols = choose_points(load(*oblong), device, checked)[0].sheet.points
+    assert (cols - 1) / (rows - 1) == pytest.approx(3, rel=0.1)
+    assert cols > 13
+
+
+def test_points_for_which_a_given_step_is_too_long_are_refused(load: Any, device: Device) -> None:
+    limit = stable_step(load())
+    made = load("sheet.tolerance=0.001", f"time.step={0.1 / math.ceil(0.1 / limit)!r}")
+    with pytest.raises(
+        SceneError, match=r"time.step: .* above the stability limit .* points that sheet.tolerance: 0.001"
+    ):
+        choose_points(made, device, checked)
+
+
+@pytest.mark.parametrize("setting", ["probes.0.at=[1.9, 0.5]", "probes.0={total: [0, 0, 1], falloff: 5000}"])
+def test_a_tool_that_does_not_reach_the_sheet_is_told_of(setting: str, load: Any) -> None:
+    assert not list(probe_force.notes(load()))
+    (said,) = probe_force.notes(load(setting))
+    assert said.startswith("probes.0: ")
+    assert "reach the sheet" in said
+
+
+def test_a_run_whose_map_is_gone_says_so(load: Any, tmp_path: Path, device: Device) -> None:
+    made = load("tissue.map={image: map.png, range: [1, 2]}", "output=[trajectory]")
+
+    def stop(stage: str, done: int, total: int) -> None:
+        if stage == "frames" and done == 2:
+            raise KeyboardInterrupt
+
+    run(made, tmp_path / "out", threads=device.threads, progress=stop)
+    (tmp_path / "map.png").rename(tmp_path / "away.png")
+    stiffness_map._kept.clear()
+    with pytest.raises(SceneError, match=r"tissue.map.image: .*map.png: no such file"):
+        resume(tmp_path / "out", threads=device.threads)
+    (tmp_path / "away.png").rename(tmp_path / "map.png")
+    assert resume(tmp_path / "out", threads=device.threads)["status"] == "complete"

@@ -2,7 +2,7 @@
 
 A probe with `force` gives a point at the distance d from its control point (eq. 5)
 
-    F = force exp(-falloff d - offset)
+    F = force exp(-falloff max(d - radius, 0) - offset)
 
 and one with `total`, whatever the points, the share of the sheet's area that belongs to the point times
 
@@ -37,7 +37,7 @@ class ProbeForce(NamedTuple):
     Attributes:
         force: [N] at 100 %, before the decay.
         falloff: [1/m].
-        shift: exponent at d = 0 if the flat end had no area.
+        shift: offset - falloff radius, so that the exponent is that of the flat end up to its rim.
         offset: exponent on the flat end.
         by_area: whether a point gets its share of a cell's area.
     """
