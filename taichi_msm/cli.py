@@ -177,7 +177,7 @@ def check(scene: str, image: str | None, overrides: tuple[str, ...], as_json: bo
     )
     for index, probe in enumerate(facts["probes"]):
         click.echo(f"probes.{index}: {in_words(probe)}")
-    for note in probe_force.notes(loaded):
+    for note in probe_force.notes(loaded, facts["probes"]):
         click.echo(note)
     return DONE
 

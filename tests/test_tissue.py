@@ -65,6 +65,12 @@ def load(tmp_path: Path, image: str) -> Any:
     return made
 
 
+def stop_at_the_second_frame(stage: str, done: int, total: int) -> None:
+    """Interrupt a run that tells its progress."""
+    if stage == "frames" and done == 2:
+        raise KeyboardInterrupt
+
+
 # Together they have every term, free and fixed edges, and both ways of a tool.
 SEEDS = [0, 1, 2, 4, 7, 9]
 
@@ -406,12 +412,8 @@ def test_a_run_with_a_map_goes_on_from_elsewhere(
     (tmp_path / "s.yaml").write_text(text)
     made = load_scene("s.yaml")
 
-    def stop(stage: str, done: int, total: int) -> None:
-        if stage == "frames" and done == 2:
-            raise KeyboardInterrupt
-
     whole = run(made, "whole", threads=device.threads)
-    assert run(made, "parts", threads=device.threads, progress=stop)["status"] == "interrupted"
+    assert run(made, "parts", threads=device.threads, progress=stop_at_the_second_frame)["status"] == "interrupted"
     monkeypatch.chdir(tmp_path / "whole")
     record = resume("../parts", threads=device.threads)
     assert record["status"] == "complete"
@@ -423,11 +425,7 @@ def test_a_run_with_a_map_goes_on_from_elsewhere(
 def test_a_run_does_not_go_on_with_another_map(load: Any, tmp_path: Path, device: Device) -> None:
     made = load("tissue.map={image: map.png, range: [1, 2]}", "output=[trajectory]")
 
-    def stop(stage: str, done: int, total: int) -> None:
-        if stage == "frames" and done == 2:
-            raise KeyboardInterrupt
-
-    run(made, tmp_path / "out", threads=device.threads, progress=stop)
+    run(made, tmp_path / "out", threads=device.threads, progress=stop_at_the_second_frame)
     Image.new("L", (3, 3), 99).save(tmp_path / "map.png")
     with pytest.raises(FilesError, match=r"map.png is another map than when the run began"):
         resume(tmp_path / "out", threads=device.threads)
@@ -451,20 +449,25 @@ def test_points_for_which_a_given_step_is_too_long_are_refused(load: Any, device
 
 @pytest.mark.parametrize("setting", ["probes.0.at=[1.9, 0.5]", "probes.0={total: [0, 0, 1], falloff: 5000}"])
 def test_a_tool_that_does_not_reach_the_sheet_is_told_of(setting: str, load: Any) -> None:
-    assert not list(probe_force.notes(load()))
-    (said,) = probe_force.notes(load(setting))
+    def notes(made: Scene) -> list[str]:
+        return list(probe_force.notes(made, probe_force.probe_records(made)))
+
+    assert not notes(load())
+    (said,) = notes(load(setting))
     assert said.startswith("probes.0: ")
     assert "reach the sheet" in said
+
+
+def test_a_run_tells_of_a_tool_that_does_not_reach_it(load: Any, tmp_path: Path, device: Device) -> None:
+    made = load("probes.0.at=[1.9, 0.5]")
+    assert any("reach the sheet" in note for note in run(made, tmp_path / "out", threads=device.threads)["notes"])
+    assert not any("reach the sheet" in note for note in run(load(), tmp_path / "out", threads=device.threads)["notes"])
 
 
 def test_a_run_whose_map_is_gone_says_so(load: Any, tmp_path: Path, device: Device) -> None:
     made = load("tissue.map={image: map.png, range: [1, 2]}", "output=[trajectory]")
 
-    def stop(stage: str, done: int, total: int) -> None:
-        if stage == "frames" and done == 2:
-            raise KeyboardInterrupt
-
-    run(made, tmp_path / "out", threads=device.threads, progress=stop)
+    run(made, tmp_path / "out", threads=device.threads, progress=stop_at_the_second_frame)
     (tmp_path / "map.png").rename(tmp_path / "away.png")
     stiffness_map._kept.clear()
     with pytest.raises(SceneError, match=r"tissue.map.image: .*map.png: no such file"):

@@ -269,6 +269,16 @@ def spring_forces(code: Code) -> tuple[Callable[..., Any], Callable[..., Any]]:
         return stiffness * longer / (square + length * ti.sqrt(square))
 
     @ti.func
+    def along_vector(force, to_x, to_y, to_z, tension, x, y, z):
+        """Force along the spring as it is now, and what a tension adds for the difference (x, y, z)."""
+        force_x, force_y, force_z = force * to_x, force * to_y, force * to_z
+        if ti.static(tense):
+            force_x += tension * x
+            force_y += tension * y
+            force_z += tension * z
+        return force_x, force_y, force_z
+
+    @ti.func
     def along(x, y, z, dx, stiffness, tension, exists):
         """Force by the right neighbour, whose displacement is (x, y, z) more; exists: 0 where there is none."""
         to_x = x + dx
@@ -276,12 +286,7 @@ def spring_forces(code: Code) -> tuple[Callable[..., Any], Callable[..., Any]]:
         force = pull(x * (to_x + dx) + rest, to_x * to_x + rest + tiny, dx, stiffness)
         if ti.static(open_edges):
             force *= exists
-        force_x, force_y, force_z = force * to_x, force * y, force * z
-        if ti.static(tense):
-            force_x += tension * x
-            force_y += tension * y
-            force_z += tension * z
-        return force_x, force_y, force_z
+        return along_vector(force, to_x, y, z, tension, x, y, z)
 
     @ti.func
     def to_other_row(x, y, z, right: ti.template(), dx, dy, length, stiffness, tension, exists):
@@ -295,12 +300,7 @@ def spring_forces(code: Code) -> tuple[Callable[..., Any], Callable[..., Any]]:
         force = pull(longer, to_x * to_x + to_y * to_y + z * z + tiny, length, stiffness)
         if ti.static(open_edges):
             force *= exists
-        force_x, force_y, force_z = force * to_x, force * to_y, force * z
-        if ti.static(tense):
-            force_x += tension * x
-            force_y += tension * y
-            force_z += tension * z
-        return force_x, force_y, force_z
+        return along_vector(force, to_x, to_y, z, tension, x, y, z)
 
     return along, to_other_row
 

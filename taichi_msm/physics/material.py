@@ -22,6 +22,7 @@ import math
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -88,14 +89,18 @@ class Material:
         return max(self.across, self.down, self.shear) > 0
 
 
-class Stiffness(tuple[Array, Array, Array]):
+class Stiffness(NamedTuple):
     """Stiffness k of every spring [N/m].
 
-    Along rows, shape (rows, cols - 1); along columns, (rows - 1, cols); along both diagonals of a cell, (rows - 1,
-    cols - 1).
+    Attributes:
+        across: along rows, shape (rows, cols - 1).
+        down: along columns, shape (rows - 1, cols).
+        shear: along both diagonals of a cell, shape (rows - 1, cols - 1).
     """
 
-    __slots__ = ()
+    across: Array
+    down: Array
+    shear: Array
 
 
 def material(scene: Scene) -> Material:
@@ -176,7 +181,7 @@ def stiffness(scene: Scene) -> Stiffness:
         # A spring at an edge is like any other: it has the mean of its cells, of which there is one.
         across[[0, -1]] *= 2
         down[:, [0, -1]] *= 2
-    return Stiffness((across, down, made.shear * factor))
+    return Stiffness(across, down, made.shear * factor)
 
 
 def area_shares(sheet: Sheet) -> Array:
@@ -222,11 +227,10 @@ def _largest_factor(scene: Scene) -> float:
     """Find the largest mean of the factors of the cells around a point; without shares of area the largest factor."""
     if scene.stiffness_map is None:
         return 1.0
-    if not material(scene).by_area:
-        return float(factors(scene).max())
     rows, cols = scene.sheet.points
+    largest = stiffness_map.largest_mean if material(scene).by_area else stiffness_map.largest
     with _naming_the_map(scene):
-        return stiffness_map.largest_mean(scene.stiffness_map, rows - 1, cols - 1)
+        return largest(scene.stiffness_map, rows - 1, cols - 1)
 
 
 def problems(scene: Scene) -> Iterator[Problem]:
@@ -236,7 +240,7 @@ def problems(scene: Scene) -> Iterator[Problem]:
     if not kinds:
         unreadable = list(_map_problems(scene))
         yield from unreadable
-        yield from _tissue_problems(scene, softest=1.0 if unreadable else float(factors(scene).min()))
+        yield from _tissue_problems(scene, has_map=scene.stiffness_map is not None and not unreadable)
 
 
 def _kind_problems(scene: Scene) -> Iterator[Problem]:
@@ -273,7 +277,7 @@ def _map_problems(scene: Scene) -> Iterator[Problem]:
         yield Problem((scene.kind, "map", "image"), str(error))
 
 
-def _tissue_problems(scene: Scene, softest: float) -> Iterator[Problem]:
+def _tissue_problems(scene: Scene, *, has_map: bool) -> Iterator[Problem]:
     tissue, sheet = scene.tissue, scene.sheet
     if tissue is None:
         return
@@ -292,6 +296,7 @@ def _tissue_problems(scene: Scene, softest: float) -> Iterator[Problem]:
         if not has_fixed_border(scene):
             said = f"{tissue.pretension:g} N/m needs every side fixed; set sheet.fixed: border, or pretension: 0"
             yield Problem(("tissue", "pretension"), said)
+        softest = float(factors(scene).min()) if has_map else 1.0
         most = 1.5 * tissue.young * tissue.thickness * softest
         if tissue.pretension >= most:
             said = f"{tissue.pretension:g} N/m leaves springs no length; take less than {most:.3g} N/m, or more young"

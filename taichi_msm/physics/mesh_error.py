@@ -26,11 +26,11 @@ from numpy.typing import NDArray
 from taichi_msm.errors import SceneError
 from taichi_msm.physics.error_control import longest
 from taichi_msm.physics.material import LONGEST_CELL, cell_ratio
-from taichi_msm.physics.probe_force import probe_records, total_on_points
+from taichi_msm.physics.probe_force import sums
 from taichi_msm.physics.solver import Dynamics
 from taichi_msm.physics.timestep import steps_per_frame, with_steps, with_time
 from taichi_msm.progress import Count, Pause
-from taichi_msm.scene import MAX_POINTS, Probe, Scene
+from taichi_msm.scene import MAX_POINTS, Probe, Scene, Sheet
 from taichi_msm.system.runtime import Device
 
 # The runs of one search, how much finer each may be than the one before, and how much finer it is at least.
@@ -60,30 +60,27 @@ def coarser(scene: Scene) -> Scene | None:
     coarse = min(tried, key=lambda one: (cell_ratio(one.sheet) > LONGEST_CELL, one.sheet.points))
     if cell_ratio(coarse.sheet) > LONGEST_CELL:
         return None
-    sums = zip(scene.probes, probe_records(scene), probe_records(coarse), strict=True)
-    probes = tuple(
-        _pressing(probe, own["total_force"] / other["total_force"] if other["total_force"] > 0 else 1.0)
-        for probe, own, other in sums
-    )
+    probes = tuple(_pressing_alike(probe, scene.sheet, coarse.sheet) for probe in scene.probes)
     coarse = coarse.model_copy(update={"probes": probes})
     return with_steps(with_time(coarse, precision="f64"), steps_per_frame(scene))
 
 
-def _pressing(probe: Probe, times: float) -> Probe:
-    """Give a probe so many times its total, unless that is another tool altogether."""
-    if probe.total is None or not 0.5 < times < 2:
+def _pressing_alike(probe: Probe, sheet: Sheet, other: Sheet) -> Probe:
+    """Change the total of a probe, but for twice or half, so that it presses another sheet as hard as this one."""
+    own, there = sums(probe, sheet).total, sums(probe, other).total
+    if probe.total is None or not 0.5 * there < own < 2 * there:
         return probe
-    return probe.model_copy(update={"total": tuple(times * part for part in probe.total)})
+    return probe.model_copy(update={"total": tuple(own / there * part for part in probe.total)})
 
 
 def missing_force(scene: Scene) -> float:
     """Tell by which share the forces of any tool's total on the points differ in sum from those on a finer sheet."""
-    points = math.prod(scene.sheet.points)
-    cut = max(2, min(8, math.isqrt(MOST_SUMMED // points)))
-    totals = [probe for probe in scene.probes if probe.total is not None]
-    exact = [total_on_points(probe, scene.sheet, cut) for probe in totals]
-    own = [total_on_points(probe, scene.sheet) for probe in totals]
-    return max((abs(one / true - 1) for one, true in zip(own, exact, strict=True) if true > 0), default=0.0)
+    finer = min(8, math.isqrt(MOST_SUMMED // math.prod(scene.sheet.points)))
+    if finer < 2:
+        return 0.0  # No tool is as narrow as cells of so many points.
+    probes = [probe for probe in scene.probes if probe.total is not None]
+    pairs = [(sums(probe, scene.sheet).total, sums(probe, scene.sheet, finer).total) for probe in probes]
+    return max((abs(own / exact - 1) for own, exact in pairs if exact > 0), default=0.0)
 
 
 class MeshPilot:

@@ -14,18 +14,20 @@ where W is the integral of w over an endless sheet, and R the radius of the tool
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 from typing_extensions import TypedDict
 
-from taichi_msm.physics.lattice import axes, spacing
-from taichi_msm.physics.material import area_shares
+from taichi_msm.physics.lattice import spacing
 from taichi_msm.scene import Probe, Scene, Sheet
 
 Array = NDArray[np.float64]
+
+# Forces are summed up for so many points at a time.
+BLOCK = 1 << 20
 
 # Less of a tool's total than this share on the sheet, or as much more, is remarkable.
 LEAST_REACHING = 0.8
@@ -89,16 +91,35 @@ def spread(probe: Probe) -> float:
     return math.pi * (probe.radius * probe.radius + 2 * (probe.radius * reach + reach * reach))
 
 
-def total_on_points(probe: Probe, sheet: Sheet, finer: int = 1) -> float:
-    """Add up the forces of a probe at 100 % on all points of a sheet, or of one with cells a whole number finer [N]."""
+class Sums(NamedTuple):
+    """What a probe does to all points of a sheet at 100 %, at the first place of its control point.
+
+    Attributes:
+        total: of the forces [N].
+        pressure: the largest force on a point by the area that belongs to it [Pa].
+    """
+
+    total: float
+    pressure: float
+
+
+def sums(probe: Probe, sheet: Sheet, finer: int = 1) -> Sums:
+    """Sum up a probe on the points of a sheet, or on those of one with cells so many times as short."""
     acts, (at_x, at_y) = probe_force(probe, sheet), control_points(probe, sheet)[1][0]
     (rows, cols), (height, width) = ((count - 1) * finer for count in sheet.points), sheet.size
-    x, y = (np.arange(cols + 1) / cols - 0.5) * width, (0.5 - np.arange(rows + 1)[:, None] / rows) * height
-    forces = acts.decay(np.hypot(x - at_x, y - at_y))
-    if acts.by_area:
-        forces[[0, -1]] /= 2
-        forces[:, [0, -1]] /= 2
-    return math.hypot(*acts.force) * float(forces.sum()) / finer**2
+    x, y = (np.arange(cols + 1) / cols - 0.5) * width, (0.5 - np.arange(rows + 1) / rows) * height
+    along, down = np.ones(cols + 1), np.ones(rows + 1)
+    along[[0, -1]], down[[0, -1]] = 0.5, 0.5
+    total, largest = 0.0, 0.0
+    # So many rows at a time that memory does not count.
+    block = max(1, BLOCK // (cols + 1))
+    for first in range(0, rows + 1, block):
+        part = slice(first, first + block)
+        decay, share = acts.decay(np.hypot(x - at_x, y[part, None] - at_y)), down[part, None] * along
+        total += float((decay * share if acts.by_area else decay).sum())
+        largest = max(largest, float((decay if acts.by_area else decay / share).max()))
+    force, (dx, dy) = math.hypot(*acts.force), spacing(sheet)
+    return Sums(force * total / finer**2, force * largest / (dx * dy))
 
 
 class ProbeRecord(TypedDict):
@@ -117,17 +138,12 @@ class ProbeRecord(TypedDict):
 
 def probe_records(scene: Scene) -> list[ProbeRecord]:
     """Add up what every probe of a scene does."""
-    (dx, dy), found = spacing(scene.sheet), []
+    found = []
     for probe in scene.probes:
-        acts, (at_x, at_y) = probe_force(probe, scene.sheet), control_points(probe, scene.sheet)[1][0]
-        x, y = axes(scene.sheet)
-        force = math.hypot(*acts.force) * acts.decay(np.hypot(x - at_x, y - at_y)).max()
-        largest = force / (dx * dy if acts.by_area else float(area_shares(scene.sheet).max()) * dx * dy)
-        flat = 0.0
+        flat, (total, pressure) = 0.0, sums(probe, scene.sheet)
         if probe.total is not None:
             flat = math.hypot(*probe.total) * math.pi * probe.radius * probe.radius / spread(probe)
-        total = total_on_points(probe, scene.sheet)
-        found.append(ProbeRecord(total_force=total, flat_end_force=flat, largest_pressure=float(largest)))
+        found.append(ProbeRecord(total_force=total, flat_end_force=flat, largest_pressure=pressure))
     return found
 
 
@@ -137,9 +153,14 @@ def in_words(record: ProbeRecord) -> str:
     return f"{record['total_force']:.3g} N in all{flat}, at most {record['largest_pressure'] / 1000:.3g} kPa"
 
 
-def notes(scene: Scene) -> Iterator[str]:
-    """Say of which tool most does not reach the sheet, or more than its total, as there are too few points."""
-    for index, (probe, record) in enumerate(zip(scene.probes, probe_records(scene), strict=True)):
+def notes(scene: Scene, records: Sequence[ProbeRecord]) -> Iterator[str]:
+    """Tell of probes whose forces do not add up to their total on this sheet.
+
+    Args:
+        scene: a checked scene.
+        records: of its probes.
+    """
+    for index, (probe, record) in enumerate(zip(scene.probes, records, strict=True)):
         asked = math.hypot(*probe.total) if probe.total is not None else 0.0
         if asked > 0 and not LEAST_REACHING < record["total_force"] / asked < 1 / LEAST_REACHING:
             yield (

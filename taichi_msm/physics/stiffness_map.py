@@ -39,8 +39,8 @@ def read(stiffness_map: StiffnessMap) -> None:
     if image in _kept and _kept[image][0] == changed:
         return
     grey = np.asarray(read_rgb(image, (0, 0, 0)).convert("L"))
-    _sampled.cache_clear()
-    largest_mean.cache_clear()
+    for found in (_sampled, largest, largest_mean):
+        found.cache_clear()
     if len(_kept) >= MOST_KEPT:
         del _kept[next(iter(_kept))]
     _kept[image] = changed, grey
@@ -73,6 +73,12 @@ def _sampled(stiffness_map: StiffnessMap, rows: int, cols: int) -> Array:
     found = black + (white - black) / 255 * (above * (1 - down) + below * down)
     found.flags.writeable = False
     return found
+
+
+@lru_cache(maxsize=8)
+def largest(stiffness_map: StiffnessMap, rows: int, cols: int) -> float:
+    """Find the largest factor of so many cells."""
+    return float(factors(stiffness_map, rows, cols).max())
 
 
 @lru_cache(maxsize=8)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator
 
+from taichi_msm.physics import probe_force
 from taichi_msm.physics.error_control import Estimate
 from taichi_msm.physics.material import material
 from taichi_msm.physics.run_progress import RunProgress
@@ -39,7 +40,9 @@ def notes(
             wrong = float(f"{100 * estimate.error:.2g}")
             yield f"the run is about {wrong:g} % wrong; {_remedy(scene, estimate)}"
     elif reason:
-        yield f"error not estimated: {reason}"
+        points = "" if mesh_error is None else f"; of the points {mesh_error:.2g}"
+        yield f"error not estimated: {reason}{points}"
+    yield from probe_force.notes(scene, probe_force.probe_records(scene))
     if mesh_error is not None and WRONG < mesh_error < math.inf:
         wrong, cut = float(f"{100 * mesh_error:.2g}"), math.sqrt(mesh_error / (WRONG / 2))
         finer = [min(MAX_POINTS, math.ceil((count - 1) * cut) + 1) for count in scene.sheet.points]

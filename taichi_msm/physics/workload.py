@@ -26,7 +26,7 @@ START = 4e8
 DOUBLE = 2.0
 
 # What a control point that moves and bending add to a step, as shares of it.
-MOVING, BENDING = 1.2, 0.5
+MOVING, BENDING = 1.2, 1.0
 
 # Encoding a pixel, and drawing a sample of it.
 ENCODING, SAMPLE = 40.0, 6.0

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from taichi_msm.physics.lattice import fixed_points, rest_positions, spacing
 from taichi_msm.physics.loads import Schedule, probe_slots, schedule
 from taichi_msm.physics.timestep import step, steps_per_frame
-from taichi_msm.reference.sheet import sheet
+from taichi_msm.reference.sheet import Springs, sheet
 from taichi_msm.scene import Scene
 
 Array = NDArray[np.float64]
@@ -28,8 +28,7 @@ def elastic_force(scene: Scene, displacement: Array) -> Array:
     """
     force = np.zeros_like(displacement)
     for springs in sheet(scene).springs:
-        between = displacement[springs.there] - displacement[springs.here] + springs.offset
-        length = np.linalg.norm(between, axis=-1)
+        between, length = _ends_apart(springs, displacement)
         pull = np.divide(length - springs.unstretched, length, out=np.zeros_like(length), where=length > 0)
         found = (springs.stiffness * pull)[..., None] * between
         at_rest = springs.stiffness * (springs.length - springs.unstretched) / springs.length
@@ -37,6 +36,18 @@ def elastic_force(scene: Scene, displacement: Array) -> Array:
         force[springs.here] += found
         force[springs.there] -= found
     return force
+
+
+def _ends_apart(springs: Springs, displacement: Array) -> tuple[Array, Array]:
+    """Give the vectors from one end of springs to the other, and their lengths [m]."""
+    between = displacement[springs.there] - displacement[springs.here] + springs.offset
+    return between, np.linalg.norm(between, axis=-1)
+
+
+def _laplacian(scene: Scene, u: Array) -> Array:
+    """Give the five-point Laplacian at the points that have four neighbours [1/m]."""
+    (dx, dy), inner = spacing(scene.sheet), u[1:-1, 1:-1]
+    return (u[1:-1, 2:] - 2 * inner + u[1:-1, :-2]) / dx**2 + (u[2:, 1:-1] - 2 * inner + u[:-2, 1:-1]) / dy**2
 
 
 def bending_force(scene: Scene, displacement: Array) -> Array:
@@ -49,10 +60,8 @@ def bending_force(scene: Scene, displacement: Array) -> Array:
     Returns:
         Force [N], shape (rows, cols, 3).
     """
-    (dx, dy), u, force = spacing(scene.sheet), displacement, np.zeros_like(displacement)
-    inner = u[1:-1, 1:-1]
-    curvature = (u[1:-1, 2:] - 2 * inner + u[1:-1, :-2]) / dx**2 + (u[2:, 1:-1] - 2 * inner + u[:-2, 1:-1]) / dy**2
-    moment = sheet(scene).bending * curvature
+    (dx, dy), force = spacing(scene.sheet), np.zeros_like(displacement)
+    moment = sheet(scene).bending * _laplacian(scene, displacement)
     force[1:-1, 1:-1] += (2 / dx**2 + 2 / dy**2) * moment
     force[1:-1, 2:] -= moment / dx**2
     force[1:-1, :-2] -= moment / dx**2
@@ -81,24 +90,19 @@ def longest_spring(scene: Scene, displacement: Array) -> float:
 
 def _strains(scene: Scene, displacement: Array) -> Iterator[Array]:
     for springs in sheet(scene).springs:
-        between = displacement[springs.there] - displacement[springs.here] + springs.offset
-        yield (np.linalg.norm(between, axis=-1) / springs.length)[springs.stiffness > 0]
+        yield (_ends_apart(springs, displacement)[1] / springs.length)[springs.stiffness > 0]
 
 
 def energy(scene: Scene, displacement: Array) -> float:
     """Add up what springs and bending hold more than at rest [J], without the virtual springs."""
-    held, (dx, dy) = 0.0, spacing(scene.sheet)
+    held = 0.0
     for springs in sheet(scene).springs:
-        between = displacement[springs.there] - displacement[springs.here] + springs.offset
-        length = np.linalg.norm(between, axis=-1)
+        between, length = _ends_apart(springs, displacement)
         rest = springs.length - springs.unstretched
         # What is linear in the displacements cancels in the sum over a sheet that is in balance at rest.
         linear = (between - springs.offset) @ springs.offset * rest / springs.length
         held += float((springs.stiffness * ((length - springs.unstretched) ** 2 / 2 - rest**2 / 2 - linear)).sum())
-    u = displacement
-    inner = u[1:-1, 1:-1]
-    curvature = (u[1:-1, 2:] - 2 * inner + u[1:-1, :-2]) / dx**2 + (u[2:, 1:-1] - 2 * inner + u[:-2, 1:-1]) / dy**2
-    return held + sheet(scene).bending / 2 * float((curvature**2).sum())
+    return held + sheet(scene).bending / 2 * float((_laplacian(scene, displacement) ** 2).sum())
 
 
 def surgical_force(scene: Scene, loads: Schedule, n: int) -> Array:

@@ -78,14 +78,14 @@ def estimate(scene: Scene) -> Budget:
     frames, pixels = scene.time.frames + 1, math.prod(scene.render.size)
     positions = frames * points * 3 * _number_bytes(scene)
     numbers = STATE_NUMBERS + OUTPUT_NUMBERS + len(scene.probes) + (MAP_NUMBERS if scene.stiffness_map else 0)
-    # A pilot is up to two more sheets, in f64.
+    # A pilot is up to two more sheets, in f64; with tissue there are two smaller ones.
     pilot = scene.time.tolerance is not None or affords_pilot(scene, 2)
-    sheets = _number_bytes(scene) + (2 * 8 if pilot else 0)
+    sheets = _number_bytes(scene) + (8 * (2 + (scene.tissue is not None) * 5 / 16) if pilot else 0)
     return Budget(
         points=points,
         steps=scene.time.frames * timestep.steps_per_frame(scene),
         frames=frames,
-        simulation_bytes=points * sheets * numbers,
+        simulation_bytes=round(points * sheets * numbers),
         drawing_bytes=drawing_bytes(scene) if scene.draws else 0,
         picture_bytes=frames * sum(pixels * PIXEL_FILE_BYTES.get(kind, 0) for kind in set(scene.output)),
         trajectory_bytes=positions if "trajectory" in scene.output else 0,
