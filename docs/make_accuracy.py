@@ -246,6 +246,7 @@ def main() -> None:
         TEMPLATE.read_text(encoding="utf-8").format(
             cpu=machine["cpu"],
             threads=machine["threads"],
+            vectors=machine["vectors"],
             taichi=versions["taichi"],
             python=versions["python"],
             margin=MARGIN,

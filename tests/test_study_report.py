@@ -35,7 +35,7 @@ VERSIONS = {
     "pillow": "12.2.0",
     "platform": "linux x86_64",
 }
-MACHINE = {"cpu": "AMD EPYC 7R13", "cores": 4, "arch": "cpu", "threads": 2, "versions": VERSIONS}
+MACHINE = {"cpu": "AMD EPYC 7R13", "cores": 4, "arch": "cpu", "threads": 2, "vectors": 512, "versions": VERSIONS}
 
 # The floor that rounding makes in f32, as a fraction of the largest displacement.
 FLOOR = 3e-6
@@ -274,7 +274,7 @@ def test_the_page_has_all_tables(tmp_path: Path) -> None:
         "## Notes",
         "## Recommendation",
     ]
-    assert "AMD EPYC 7R13, 2 threads" in text
+    assert "AMD EPYC 7R13, 2 threads, vectors of 512 bits" in text
     assert "Taichi 1.7.4" in text
     assert "its own error is about 1.00e-07" in text
     rows = [[cell.strip() for cell in line.strip("|").split("|")] for line in text.splitlines() if line.startswith("|")]
@@ -495,7 +495,9 @@ def test_the_summary_of_a_method_that_diverged() -> None:
 
 
 def test_names_are_printed_as_they_are() -> None:
-    assert terminal(oddly_named()).startswith("[bold]$x$ 呼 \\udcff | :smile: on AMD EPYC 7R13, 2 threads\n")
+    assert terminal(oddly_named()).startswith(
+        "[bold]$x$ 呼 \\udcff | :smile: on AMD EPYC 7R13, 2 threads, vectors of 512 bits\n"
+    )
 
 
 @pytest.mark.parametrize(

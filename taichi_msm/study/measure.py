@@ -121,6 +121,7 @@ def machine(device: Device) -> dict[str, Any]:
         "cores": os.cpu_count(),
         "arch": device.arch,
         "threads": device.threads,
+        "vectors": runtime.vector_bits(),
         "versions": versions(),
     }
 

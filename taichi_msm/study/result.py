@@ -163,7 +163,7 @@ class Study:
         settings: the scene as resolved.
         status: complete or interrupted.
         tolerance: the error that is allowed, as a fraction of the largest displacement.
-        machine: cpu, cores, arch, threads and versions.
+        machine: cpu, cores, arch, threads, bits of a vector and versions.
         reference: None where the study was interrupted before.
         stepping: in the order of methods and, within one, of falling steps.
         orders: of every method, by regression over the points above the rounding floor; None: too few of them.

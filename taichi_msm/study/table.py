@@ -63,7 +63,7 @@ def shown(text: str) -> str:
 def where(study: Study) -> str:
     """Name the machine."""
     threads = study.machine["threads"]
-    used = f"{threads} thread{'' if threads == 1 else 's'}"
+    used = f"{threads} thread{'' if threads == 1 else 's'}, vectors of {study.machine['vectors']} bits"
     return f"{study.machine['cpu']}, {used if study.machine['arch'] == 'cpu' else study.machine['arch']}"
 
 
