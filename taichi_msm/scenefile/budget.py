@@ -27,8 +27,12 @@ BAND_ROWS = 16  # rows of samples that a thread keeps at a time
 PIXEL_BYTES = 3 * 12  # colours of one pixel, from sums to bytes
 PICTURE_PIXEL_BYTES = 20  # of the file, while it is decoded and converted; its texture takes less
 
-# Bytes of a pixel in a file.
-PIXEL_FILE_BYTES = {"png": 2, "gif": 1}
+# Bytes of a pixel in a file; masks are compressed.
+PIXEL_FILE_BYTES = {"png": 2, "gif": 1, "coordinates": 8, "depth": 4, "flow": 8, "occlusion": 0.05, "instrument": 0.05}
+
+# Bytes of a pixel while its labels are found and written; and of a tracked point in a frame, held until the end.
+LABEL_PIXEL_BYTES = 60
+TRACK_BYTES = 9
 
 # Numbers for each mass point: displacement and difference; and the copies made at the start and for output.
 STATE_NUMBERS = 6
@@ -46,7 +50,7 @@ class Budget:
         frames: frames in all, the one at rest included.
         simulation_bytes: memory for the state of the sheet and its output.
         drawing_bytes: memory for a frame and the texture; 0 where nothing is drawn.
-        picture_bytes: size of the files with pictures, about.
+        picture_bytes: size of the files with pictures and labels, about.
         trajectory_bytes: size of the trajectory.
         working_bytes: disk space that is taken besides until the run ends.
     """
@@ -77,6 +81,7 @@ def estimate(scene: Scene) -> Budget:
     points = rows * cols
     frames, pixels = scene.time.frames + 1, math.prod(scene.render.size)
     positions = frames * points * 3 * _number_bytes(scene)
+    tracks = frames * scene.render.tracks**2 * TRACK_BYTES if "tracks" in scene.output else 0
     numbers = STATE_NUMBERS + OUTPUT_NUMBERS + len(scene.probes) + (MAP_NUMBERS if scene.stiffness_map else 0)
     # A pilot is up to two more sheets, in f64; with tissue there are two smaller ones.
     pilot = scene.time.tolerance is not None or affords_pilot(scene, 2)
@@ -86,8 +91,9 @@ def estimate(scene: Scene) -> Budget:
         steps=scene.time.frames * timestep.steps_per_frame(scene),
         frames=frames,
         simulation_bytes=round(points * sheets * numbers),
-        drawing_bytes=drawing_bytes(scene) if scene.draws else 0,
-        picture_bytes=frames * sum(pixels * PIXEL_FILE_BYTES.get(kind, 0) for kind in set(scene.output)),
+        drawing_bytes=(drawing_bytes(scene) if scene.renders else 0) + tracks,
+        picture_bytes=round(frames * sum(pixels * PIXEL_FILE_BYTES.get(kind, 0) for kind in set(scene.output)))
+        + tracks,
         trajectory_bytes=positions if "trajectory" in scene.output else 0,
         # Two of the states with which a run can go on, and all its positions.
         working_bytes=2 * points * STATE_NUMBERS * _number_bytes(scene) + (positions if scene.output else 0),
@@ -142,7 +148,8 @@ def drawing_bytes(scene: Scene) -> int:
     factor = scene.render.supersample
     band_rows = min(height * factor, BAND_ROWS * (os.cpu_count() or 1))
     samples = band_rows * width * factor * SAMPLE_BYTES
-    return rows * cols * POINT_BYTES + samples + width * height * PIXEL_BYTES + picture * PICTURE_PIXEL_BYTES
+    pixel = PIXEL_BYTES + (LABEL_PIXEL_BYTES if scene.labels_pixels else 0)
+    return rows * cols * POINT_BYTES + samples + width * height * pixel + picture * PICTURE_PIXEL_BYTES
 
 
 def _step_problems(scene: Scene) -> Iterator[Problem]:
