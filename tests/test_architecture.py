@@ -21,7 +21,7 @@ LAYERS = [
     {"scenefile", "reference"},
     {"simulation", "results"},
     {"runner", "console"},
-    {"study", "viewer"},
+    {"export", "study", "viewer"},
     {"cli"},
     {"__main__", "__init__"},
 ]
