@@ -109,7 +109,8 @@ def test_a_picture_that_is_gone_is_named(results: Path, program: Program) -> Non
     (results / "run.json").write_text(json.dumps(record))
     done = program("export", str(results), "--format", "gltf")
     gone = Path(record["working_directory"]) / "gone.png"
-    error = f"{results}: image: {gone}: no such file or directory; name a picture that can be read\n"
+    remedy = "put back the picture that it was run with, or run the scene again"
+    error = f"{results}: image: {gone}: no such file or directory; {remedy}\n"
     assert (done.returncode, done.stderr) == (4, error)
 
 

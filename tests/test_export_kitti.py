@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+import json
 import shutil
 import struct
 from pathlib import Path
@@ -135,6 +136,15 @@ def test_what_is_not_there_is_left_out_and_said(labelled: Path) -> None:
         f"flow_noc is left out: occlusion {again} 'occlusion' in output",
         f"image_2 is left out: frames {again} 'png' in output",
     ]
+
+
+def test_one_frame_has_no_flow(labelled: Path) -> None:
+    record = json.loads((labelled / "run.json").read_text())
+    (labelled / "run.json").write_text(json.dumps(record | {"frames": 1}))
+    with pytest.raises(FilesError) as caught:
+        convert(labelled, "kitti", labelled / "out")
+    said = "has one frame, and flow is from one to the next; run the scene to its end"
+    assert str(caught.value) == f"{labelled}: {said}"
 
 
 def whole_flow() -> bytes:

@@ -43,6 +43,9 @@ def convert(run: Path, name: str, directory: Path, progress: Count = lambda done
         with staging(directory, wanted.files) as staged:
             notes = wanted.write(finished, staged, progress)
             files = sorted(path.relative_to(staged).as_posix() for path in staged.rglob("*") if path.is_file())
-    except SceneError as error:  # a picture that the run had is gone, or another now
-        raise FilesError(f"{run}: {error.lines[0]}") from None
+    except SceneError as error:
+        # What a scene would have to name is here what it had.
+        fault = error.lines[0].partition(";")[0]
+        said = f"{run}: {fault}; put back the picture that it was run with, or run the scene again"
+        raise FilesError(said) from None
     return Exported(files, notes)

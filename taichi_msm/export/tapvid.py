@@ -17,6 +17,7 @@ from __future__ import annotations
 import pickle
 import zipfile
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -34,8 +35,17 @@ TRACKS = "tracks.npz"
 FILE = "tapvid.pkl"
 FILES: Tree = {r"tapvid\.pkl": None}
 
-# Every Python from 3.4 on reads this one; later ones name functions of NumPy that its older versions lack.
+# Every Python from 3.4 on reads this one.
 PROTOCOL = 4
+
+
+class _Pickler(pickle.Pickler):
+    """Pickles arrays so that every NumPy reads them: those of NumPy 2 name a module that 1.26.0 and before lack."""
+
+    def reducer_override(self, value: Any) -> Any:
+        if isinstance(value, np.ndarray):
+            return np.ndarray, ((0,),), value.__reduce__()[2]
+        return NotImplemented
 
 
 def write_tapvid(run: FinishedRun, folder: Path, progress: Count) -> list[str]:
@@ -46,8 +56,8 @@ def write_tapvid(run: FinishedRun, folder: Path, progress: Count) -> list[str]:
     """
     width, height = run.scene.render.size
     points, occluded = read_tracks(run)
-    # All of it is in memory at once, here and wherever it is read.
-    need, free = 3 * run.frames * height * width, available_memory()
+    # All of it is in memory at once, wherever it is read; while it is written, twice.
+    need, free = 2 * 3 * run.frames * height * width, available_memory()
     if need > free:
         raise FilesError(
             f"{run.directory}: its video takes {need / 2**30:.1f} GiB of memory, and {free / 2**30:.1f} are free; "
@@ -60,7 +70,7 @@ def write_tapvid(run: FinishedRun, folder: Path, progress: Count) -> list[str]:
     scaled = (points / (width, height)).astype(np.float32)
     with (folder / FILE).open("wb") as file:
         name = run.directory.resolve().name
-        pickle.dump({name: {"video": video, "points": scaled, "occluded": occluded}}, file, PROTOCOL)
+        _Pickler(file, PROTOCOL).dump({name: {"video": video, "points": scaled, "occluded": occluded}})
     return []
 
 
