@@ -142,8 +142,10 @@ def test_what_no_export_has_written_is_not_touched(name: str, results: Path, pro
     out = results / "here"
     (out / name).parent.mkdir(parents=True)
     (out / name).write_text("mine")
+    calls = []
     with pytest.raises(ForeignError) as refused:
-        exported(results, out)
+        convert(results, "obj", out, lambda done, total: calls.append(done))
+    assert calls == [0], "before anything is made"
     assert str(refused.value).startswith(f"{out / name.partition('/')[0]}: a f")
     assert files(out) == {name: b"mine"}
     assert program("export", str(results), "--format", "obj", "--out", str(results)).returncode == 4

@@ -133,6 +133,12 @@ def test_the_material_shows_the_picture_on_both_sides(glb: Path) -> None:
     np.testing.assert_array_equal(picture, speckle(30, 40))
 
 
+def test_normals_are_never_0() -> None:
+    """Where neighbours are in one place there is none, and a mesh must have one."""
+    found = unit_normals(np.zeros((3, 4, 3), np.float32))
+    np.testing.assert_array_equal(found, np.tile([0, 0, 1], (12, 1)))
+
+
 def test_accessors_tell_their_bounds(glb: Path) -> None:
     found = read_glb(glb)
     told = [number for number, one in enumerate(found.document["accessors"]) if "min" in one]
