@@ -39,14 +39,14 @@ class Binary:
         self.views: list[dict[str, Any]] = []
         self.accessors: list[dict[str, Any]] = []
         self._parts: list[bytes | memoryview] = []
-        self.length = 0
+        self._length = 0
 
     def view(self, data: bytes | memoryview, target: int | None = None) -> int:
         """Add bytes, and give the number of their view; `target`: what they are for."""
-        place = {"buffer": 0, "byteOffset": self.length, "byteLength": len(data)}
+        place = {"buffer": 0, "byteOffset": self._length, "byteLength": len(data)}
         self.views.append(place if target is None else {**place, "target": target})
         self._parts += [data, _padding(len(data), b"\0")]
-        self.length += _padded(len(data))
+        self._length += _padded(len(data))
         return len(self.views) - 1
 
     def accessor(self, values: NDArray[Any], target: int | None = None, *, bounds: bool = False) -> int:
@@ -71,13 +71,13 @@ class Binary:
 
     def container(self, document: dict[str, Any]) -> Iterator[bytes | memoryview]:
         """Give the parts of the file of a document, which leads into this."""
-        own = {"accessors": self.accessors, "bufferViews": self.views, "buffers": [{"byteLength": self.length}]}
+        own = {"accessors": self.accessors, "bufferViews": self.views, "buffers": [{"byteLength": self._length}]}
         text = json.dumps({**document, **own}, separators=(",", ":"), allow_nan=False).encode()
         text += _padding(len(text), b" ")
-        yield struct.pack("<4sII", MAGIC, VERSION, 12 + 8 + len(text) + 8 + self.length)
+        yield struct.pack("<4sII", MAGIC, VERSION, 12 + 8 + len(text) + 8 + self._length)
         yield struct.pack("<I4s", len(text), JSON)
         yield text
-        yield struct.pack("<I4s", self.length, BINARY)
+        yield struct.pack("<I4s", self._length, BINARY)
         yield from self._parts
 
 

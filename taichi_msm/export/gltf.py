@@ -39,8 +39,6 @@ VERTEX_BYTES = 2 * 3 * 4
 # OpenGL's numbers for how a picture is filtered, and that it ends at its edge.
 LINEAR, MIPMAPS, CLAMPED = 9729, 9987, 33071
 
-Vectors = NDArray[np.float32]
-
 
 def write_gltf(run: FinishedRun, folder: Path, progress: Count) -> list[str]:
     """Write the surface of a run, with its picture.
@@ -105,7 +103,7 @@ def _target(first: NDArray[np.floating], position: NDArray[np.floating], binary:
     }
 
 
-def _animation(times: Vectors, binary: Binary) -> dict[str, Any]:
+def _animation(times: NDArray[np.float32], binary: Binary) -> dict[str, Any]:
     """Make the weights of all targets at all key frames: at its own frame each has 1, the first frame has none."""
     weights = np.eye(len(times), dtype=np.float32)[:, 1:].reshape(-1)
     sampler = {
