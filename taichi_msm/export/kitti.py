@@ -79,8 +79,8 @@ def encode(flow: NDArray[np.float32], seen: NDArray[np.bool_] | None = None) -> 
     Returns:
         Red, green and blue, shape (height, width, 3).
     """
-    # In float64, where a sum of 2^15 and 1/64 of any float32 that fits is exact to far less than 1/2.
-    scaled = np.rint(flow * np.float64(SCALE) + ZERO)
+    # In double precision, so that nothing but this rounds.
+    scaled = np.rint(flow.astype(np.float64) * SCALE + ZERO)
     valid = ((scaled >= 0) & (scaled <= LARGEST)).all(axis=-1)
     if seen is not None:
         valid &= seen
