@@ -21,8 +21,8 @@ LAYERS = [
     {"render"},
     {"scenefile", "reference"},
     {"simulation", "results"},
-    {"runner", "console"},
-    {"study", "viewer"},
+    {"runner", "playback", "console"},
+    {"export", "study", "viewer"},
     {"cli"},
     {"__main__", "__init__"},
 ]

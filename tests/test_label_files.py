@@ -11,7 +11,7 @@ import pytest
 from numpy.typing import NDArray
 from PIL import Image
 
-from taichi_msm import ArgumentError, FilesError, Simulation, resume, run
+from taichi_msm import ArgumentError, FilesError, Playback, Simulation, resume, run
 from taichi_msm.reference import labels as twin
 from taichi_msm.render.instrument import rods
 from taichi_msm.scene import PIXEL_LABELS, Scene
@@ -181,6 +181,23 @@ def test_labels_and_flow_from_python(small: Path, device: Device) -> None:
     assert good.sum() > 5
     # The flow changes by less than its own size from pixel to pixel, here over 0.05 px.
     assert np.abs(flow[inside][good] + returned[good]).max() < 0.05 * np.abs(flow).max() + 0.01
+
+
+def test_a_run_is_played_back(small: Path, device: Device) -> None:
+    done, trajectory = made("out", device, OBLIQUE, ROD)
+    with Playback(done, threads=device.threads) as playback:
+        np.testing.assert_array_equal(playback.positions, trajectory["position"])
+        np.testing.assert_array_equal(playback.time, trajectory["time"])
+        with Image.open(done / "frames/0002.png") as image:
+            np.testing.assert_array_equal(playback.draw(2), np.array(image))
+        np.testing.assert_array_equal(playback.labels(3).coordinates, np.load(done / "coordinates/0003.npy"))
+        np.testing.assert_array_equal(playback.flow(1, 2).flow, read_flow(done / "flow/0001.flo"))
+        # Any two frames: what stays where it is flows nowhere.
+        still = playback.flow(4, 4).flow
+        assert np.abs(still[still[..., 0] < 1e9]).max() < 1e-3
+        for frame in (-1, 5, 1.0, True):
+            with pytest.raises(ArgumentError, match=r"frame: .*; take a whole number, 0 to 4"):
+                playback.draw(frame)  # type: ignore[arg-type]
 
 
 @pytest.mark.parametrize(

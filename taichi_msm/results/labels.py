@@ -13,7 +13,8 @@ from PIL import Image
 
 from taichi_msm.render.camera import calibration, view
 from taichi_msm.render.labels import Labels, Observed, Sight, track_grid
-from taichi_msm.results.folder import Folder, write_all
+from taichi_msm.results.flo import write_flo
+from taichi_msm.results.folder import Folder
 from taichi_msm.results.npz import write_array
 from taichi_msm.results.publication import (
     CAMERA,
@@ -30,9 +31,6 @@ from taichi_msm.scene import UNTIL_NEXT, Scene
 
 # Masks are few large areas, which the fastest compression makes small.
 COMPRESS_LEVEL = 1
-
-# The first number of a .flo file: "PIEH" in little-endian ASCII.
-FLO_MAGIC = 202021.25
 
 
 class LabelWriter:
@@ -107,12 +105,8 @@ def _write_instrument(file: BinaryIO, observed: Observed) -> None:
 
 
 def _write_flow(file: BinaryIO, observed: Observed) -> None:
-    """Write the Middlebury format: the magic number, width, height, then two floats a pixel; little-endian."""
     assert observed.flow is not None
-    flow = observed.flow.flow
-    height, width, _ = flow.shape
-    write_all(file, np.array([FLO_MAGIC], "<f4").tobytes() + np.array([width, height], "<i4").tobytes())
-    write_all(file, np.ascontiguousarray(flow, "<f4").data.cast("B"))
+    write_flo(file, observed.flow.flow)
 
 
 def _write_occlusion(file: BinaryIO, observed: Observed) -> None:

@@ -4,8 +4,11 @@ from __future__ import annotations
 
 import io
 import math
+import struct
 import zipfile
+import zlib
 from collections.abc import Iterable
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -49,16 +52,59 @@ def read_array(archive: zipfile.ZipFile, name: str, dtype: DTypeLike, shape: Sha
         ValueError: when it is another, before any memory is taken for it.
         Exception: whatever `zipfile` raises for an archive that is damaged.
     """
-    header, info = _header(dtype, shape), archive.getinfo(f"{name}.npy")
-    size = len(header) + math.prod(shape) * np.dtype(dtype).itemsize
-    # What is compressed may be of any size, whatever the archive says.
-    if info.compress_type != zipfile.ZIP_STORED or (info.file_size, info.compress_size) != (size, size):
-        raise ValueError(name)
+    header, info = _header(dtype, shape), _entry(archive, name, dtype, shape)
     # Checks the CRC-32.
     data = archive.read(info)
     if data[: len(header)] != header:
         raise ValueError(name)
     return np.frombuffer(data, dtype, offset=len(header)).reshape(shape)
+
+
+def read_rows(archive: zipfile.ZipFile, name: str, dtype: DTypeLike, row: Shape) -> NDArray[Any]:
+    """Read an array of any number of rows, each of a known shape; raises what `read_array` does."""
+    header, size = len(_header(dtype, (0, *row))), math.prod(row) * np.dtype(dtype).itemsize
+    rows = (archive.getinfo(f"{name}.npy").file_size - header) // size
+    return read_array(archive, name, dtype, (max(0, rows), *row))
+
+
+def map_array(path: Path, name: str, dtype: DTypeLike, shape: Shape) -> NDArray[Any]:
+    """Map an array that `write_array` wrote, which may be larger than memory, once its checksum was found right.
+
+    Args:
+        path: of the archive.
+        name: of the array.
+        dtype: what its numbers must be.
+        shape: what it must be, of at least one number.
+
+    Returns:
+        The array, read-only, which the system reads when it is looked at.
+
+    Raises:
+        ValueError: when it is another, or damaged.
+        Exception: whatever `zipfile` raises for an archive that is damaged.
+    """
+    header = _header(dtype, shape)
+    with path.open("rb") as file, zipfile.ZipFile(file) as archive:
+        info = _entry(archive, name, dtype, shape)
+        # Before the data there are the entry's own header, its name and further fields, whose lengths are at its end.
+        file.seek(info.header_offset + 26)
+        file.seek(sum(struct.unpack("<HH", file.read(4))), 1)
+        if file.read(len(header)) != header:
+            raise ValueError(name)
+        mapped = np.asarray(np.memmap(file, dtype, "r", file.tell(), shape))
+    if zlib.crc32(mapped.data.cast("B"), zlib.crc32(header)) != info.CRC:
+        raise ValueError(name)
+    return mapped
+
+
+def _entry(archive: zipfile.ZipFile, name: str, dtype: DTypeLike, shape: Shape) -> zipfile.ZipInfo:
+    """Find an array that is stored as it is and has the size that it must have; raises ValueError for any other."""
+    info = archive.getinfo(f"{name}.npy")
+    size = len(_header(dtype, shape)) + math.prod(shape) * np.dtype(dtype).itemsize
+    # What is compressed may be of any size, whatever the archive says.
+    if info.compress_type != zipfile.ZIP_STORED or (info.file_size, info.compress_size) != (size, size):
+        raise ValueError(name)
+    return info
 
 
 def _header(dtype: DTypeLike, shape: Shape) -> bytes:
