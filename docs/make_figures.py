@@ -29,8 +29,8 @@ IMAGES = ROOT / "docs" / "images"
 MOMENTS = {"drag": 0.92, "grasp": 0.76, "two-tools": 0.84}
 PALPATION = 1.0
 
-# The stages of the paper's figure 3: at rest, pressed more and more, and let go.
-STAGES = (0.0, 0.16, 0.4, 0.64, 1.2)
+# The stages of the paper's figure 3: at rest, pressed, pressed fully, let go.
+STAGES = (0.0, 0.2, 0.4, 0.64)
 
 # A fundus photograph, CC0, NHS Foundation Trust; it comes with scikit-image.
 RETINA = Path(skimage.__file__).parent / "data" / "retina.jpg"
@@ -65,12 +65,13 @@ def live(name: str, size: int, rate: float, seconds: float) -> None:
         record(session, IMAGES / f"{name}.gif", seconds, timed(script, session.rate, scene.render.size))
 
 
-def strip(pictures: list[Image.Image], gap: int = 6) -> Image.Image:
-    """Put pictures side by side on white."""
+def grid(pictures: list[Image.Image], columns: int, gap: int = 6) -> Image.Image:
+    """Put pictures side by side on white, so many in a row."""
     width, height = pictures[0].size
-    page = Image.new("RGB", (len(pictures) * (width + gap) - gap, height), "white")
+    rows = -(-len(pictures) // columns)
+    page = Image.new("RGB", (columns * (width + gap) - gap, rows * (height + gap) - gap), "white")
     for n, picture in enumerate(pictures):
-        page.paste(picture, (n * (width + gap), 0))
+        page.paste(picture, (n % columns * (width + gap), n // columns * (height + gap)))
     return page
 
 
@@ -80,12 +81,13 @@ def main() -> None:
     animation("press", 340)
     animation("retina", 320, "render.camera=oblique", image=RETINA)
     live("live", 250, 10, 4.8)
-    strip(frames(SCENES / "figure-3.yaml", STAGES, (400, 250))).save(IMAGES / "figure-3.png", optimize=True)
+    stages = frames(SCENES / "figure-3.yaml", STAGES, (560, 420))
+    grid(stages, 2).save(IMAGES / "figure-3.jpg", quality=90)
     stills = [frames(SCENES / f"{name}.yaml", (moment,), (400, 400))[0] for name, moment in MOMENTS.items()]
-    strip(stills).save(IMAGES / "scenes.jpg", quality=90)
+    grid(stills, 3).save(IMAGES / "scenes.jpg", quality=90)
     stiffness = Image.open(SCENES / "textures" / "tumour.png").convert("RGB").resize((400, 400))
     palpation = frames(SCENES / "tumour.yaml", (0.0, PALPATION), (400, 400))
-    strip([*palpation, stiffness]).save(IMAGES / "tumour.jpg", quality=90)
+    grid([*palpation, stiffness], 3).save(IMAGES / "tumour.jpg", quality=90)
     for path in sorted(IMAGES.iterdir()):
         print(f"{path.relative_to(ROOT)}  {path.stat().st_size / 1024:.0f} KiB  {np.array(Image.open(path)).shape}")
 

@@ -1,9 +1,9 @@
-"""Make the README's picture of labels, and check flow by what it is for: to warp one frame into another.
+"""Make the README's picture of labels and its line on flow, which is checked by what it is for: to warp a frame.
 
     PYTHONPATH=. python docs/make_labels.py
 
-What frame i + 1 shows where flow leads from a pixel of frame i is what frame i shows there, but for light: it is switched
-off for that. Left are the filter of the texture and, beside outlines, pixels that show both sides of them.
+What frame i + 1 shows where flow leads from a pixel of frame i is what frame i shows there, but for light, which is
+switched off for that. What is left comes from filtering, and beside outlines from pixels that show both sides of them.
 """
 
 from __future__ import annotations
@@ -19,6 +19,8 @@ from taichi_msm import Flow, Labels, Simulation, load_scene
 
 ROOT = Path(__file__).parent.parent
 PICTURE = ROOT / "docs" / "images" / "labels.jpg"
+README = ROOT / "README.md"
+START, END = "<!-- labels: made by docs/make_labels.py -->\n", "<!-- end of labels -->\n"
 
 # The frame before the fold of grasp.yaml drops, when everything moves.
 SCENE, FRAME = "grasp", 21
@@ -95,7 +97,7 @@ def page(panels: dict[str, Image8]) -> Image.Image:
 
 
 def main() -> None:
-    """Write the picture and tell what is left after warping."""
+    """Write the picture, and to the README what is left after warping."""
     settings = [f"render.size=[{SIZE},{SIZE}]", "render.supersample=3"]
     lit = load_scene(ROOT / "scenes" / f"{SCENE}.yaml", settings)
     plain = load_scene(ROOT / "scenes" / f"{SCENE}.yaml", [*settings, "render.shading=none"])
@@ -112,12 +114,19 @@ def main() -> None:
         f"frame {FRAME}": picture,
         "depth": shades(labels.depth),
         "flow": coloured(flow),
-        f"difference from frame {FRAME + 1} × {STRONGER}": difference(second.astype(float), first, known),
+        f"difference from frame {FRAME + 1} x {STRONGER}": difference(second.astype(float), first, known),
         "the same, warped by flow": difference(back, first, known),
         "instrument, and what it will hide": masks(labels, flow),
     }
     page(panels).save(PICTURE, quality=92)
-    print(f"mean difference {before:.2f} grey levels; warped by flow {after:.2f}")
+    said = (
+        f"The panels show it: frame {FRAME} of `{SCENE}.yaml` and the next, unlit, differ by {before:.2f} grey levels\n"
+        f"on average; the next one, fetched from where flow leads, by {after:.2f}, which is what filtering leaves\n"
+        "(`docs/make_labels.py`).\n"
+    )
+    begin, rest = README.read_text(encoding="utf-8").split(START)
+    README.write_text(begin + START + said + END + rest.split(END)[1], encoding="utf-8")
+    print(said, end="")
 
 
 if __name__ == "__main__":

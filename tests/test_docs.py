@@ -45,12 +45,17 @@ def test_the_shipped_script_is_valid(root: Path) -> None:
 
 
 def test_the_python_shown_runs(root: Path, tmp_path: Path) -> None:
-    first, second = blocks(root, "python")
+    labels, first, second = blocks(root, "python")
     shown = "print(position.shape, picture.shape, record['status'])\n"
     (tmp_path / "scenes").symlink_to(root / "scenes")
     (tmp_path / "example.py").write_text(first + shown + second + "print(f'{depth:.4f}')\n")
     done = subprocess.run([sys.executable, "example.py"], cwd=tmp_path, check=True, capture_output=True, text=True)
     assert done.stdout == "(41, 41, 3) (512, 512, 3) complete\n0.0060\n"
+    command = [sys.executable, "-m", "taichi_msm", "run", "scenes/grasp.yaml", "--set", "output=[trajectory]"]
+    subprocess.run(command, cwd=tmp_path, check=True, capture_output=True)
+    (tmp_path / "example.py").write_text(labels + "print(flow.shape, occlusion.max(), depth.shape)\n")
+    done = subprocess.run([sys.executable, "example.py"], cwd=tmp_path, check=True, capture_output=True, text=True)
+    assert done.stdout == "(512, 512, 2) 255 (512, 512)\n"
     assert (tmp_path / "output" / "from-python" / "animation.gif").exists()
 
 

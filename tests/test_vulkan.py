@@ -13,6 +13,7 @@ import pytest
 from PIL import Image
 
 from taichi_msm import run
+from taichi_msm.results.flo import read_flo
 from taichi_msm.scenefile.load import load_scene
 from taichi_msm.system.runtime import Device
 from tests.outputs import results
@@ -24,8 +25,9 @@ pytestmark = pytest.mark.skipif(not DRIVERS, reason="needs mesa-vulkan-drivers")
 SETTINGS = [
     "probes.0.at=[[0, 0.2, 0.5], [0.2, 0.8, 0.5], [0.2, 0.4, 0.4]]",
     "sheet.fixed=[top, left]",
-    "render={size: [80, 60], camera: oblique, wireframe: true}",
-    "output=[png, trajectory]",
+    "render={size: [80, 60], camera: oblique, wireframe: true, shading: tissue}",
+    "probes.0.instrument={radius: 0.01, shaft: [1, -0.4, 0.7], length: 0.1}",
+    "output=[png, trajectory, coordinates, depth, flow, occlusion]",
 ]
 
 # A run, one that is interrupted and resumed, and one that diverges, in one process.
@@ -76,6 +78,13 @@ def test_runs_on_a_gpu_are_those_on_the_cpu(small: Path, root: Path, device: Dev
         pictures = [np.asarray(Image.open(f"{name}/frames/{frame:04}.png")).astype(int) for name in ("whole", "cpu")]
         # A point that rounds otherwise may move an edge past a pixel's centre.
         assert (np.abs(pictures[0] - pictures[1]) > 1).mean() < 0.002
+        depths = [np.asarray(Image.open(f"{name}/depth/{frame:04}.tiff")) for name in ("whole", "cpu")]
+        assert (np.abs(depths[0] - depths[1]) > 1e-5).mean() < 0.002
+    for frame in range(len(here) - 1):
+        flows = [read_flo(small / f"{name}/flow/{frame:04}.flo", (80, 60)) for name in ("whole", "cpu")]
+        assert (np.abs(flows[0] - flows[1]).max(axis=-1) > 0.01).mean() < 0.002
+        masks = [np.asarray(Image.open(f"{name}/occlusion/{frame:04}.png")) for name in ("whole", "cpu")]
+        assert (masks[0] != masks[1]).mean() < 0.002
 
 
 def test_without_a_gpu_it_is_one_line(small: Path, root: Path) -> None:
