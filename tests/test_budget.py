@@ -10,9 +10,10 @@ import pytest
 from PIL import Image
 
 from taichi_msm.errors import SceneError
+from taichi_msm.physics.timestep import time_grid
 from taichi_msm.scene import Scene
 from taichi_msm.scenefile import budget
-from taichi_msm.scenefile.budget import estimate, problems, require_disk
+from taichi_msm.scenefile.budget import Budget, problems, require_disk
 from taichi_msm.system import resources
 from taichi_msm.system.resources import available_memory
 
@@ -32,6 +33,10 @@ def scene(**keys: Any) -> Scene:
             "time": {**TIME, **keys.get("time", {})},
         }
     )
+
+
+def estimate(scene: Scene) -> Budget:
+    return budget.estimate(scene, time_grid(scene))
 
 
 def faults(scene: Scene) -> list[str]:

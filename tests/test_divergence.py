@@ -14,10 +14,10 @@ from taichi_msm.physics.diagnosis import Diagnosis
 from taichi_msm.physics.divergence import farthest_displacement
 from taichi_msm.physics.run_progress import RunProgress, Saved
 from taichi_msm.physics.state import State
-from taichi_msm.physics.timestep import stable_step, steps_per_frame, with_steps
+from taichi_msm.physics.timestep import stable_step, time_grid
 from taichi_msm.scene import Scene
 from taichi_msm.system.runtime import Device
-from tests.scenes import SHEET, scene
+from tests.scenes import SHEET, scene, with_steps
 
 # Pressed for three frames.
 PRESS = {"force": [0, 300, -1000], "load": [[0, 100], [0.12, 100], [0.12, 0]], "falloff": 20}
@@ -82,7 +82,7 @@ def test_no_fault_is_found_where_there_is_none(precision: str, active: str, devi
         probes=[{**PRESS, "load": jumps}, {**PRESS, "at": [[0, -0.5, 0.5], [0.8, 1.5, 0.5]]}],
         time={"duration": 0.8, "precision": precision},
     )
-    for steps in (steps_per_frame(made), math.ceil(1 / 25 / stable_step(made) / 0.995)):
+    for steps in (time_grid(made).steps_per_frame, math.ceil(1 / 25 / stable_step(made) / 0.995)):
         with Simulation(with_steps(made, steps), threads=device.threads) as simulation:
             simulation.advance(20)
             assert simulation.progress.peak > 1e-3

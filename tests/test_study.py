@@ -13,8 +13,7 @@ from pydantic import BaseModel
 from taichi_msm import reference
 from taichi_msm.physics.lattice import rest_positions
 from taichi_msm.physics.mesh_error import with_points
-from taichi_msm.physics.solver import Dynamics, structure
-from taichi_msm.physics.timestep import stable_step, step, steps_per_frame, with_steps, with_time
+from taichi_msm.physics.timestep import stable_step, time_grid, with_time
 from taichi_msm.runner import run
 from taichi_msm.scene import Scene
 from taichi_msm.study import measure, pictures
@@ -26,6 +25,7 @@ from taichi_msm.study.result import Drawn, Stepping, Study, Timing
 from taichi_msm.study.stepping import MARGIN, ROUNDS, SteppingStudy, observed_orders
 from taichi_msm.study.terms import TermStudy, variants
 from taichi_msm.system.runtime import Device
+from tests.motion import frames_on, structure_of
 from tests.scenes import PRESS, SPRINGS, scene, speckle
 
 SOFT_PRESS = {**PRESS, "force": [0, 300, -1000]}
@@ -142,7 +142,7 @@ def test_dop853_gives_up_in_time() -> None:
 
 def test_terms_are_left_out_of_the_kernel(device: Device) -> None:
     made = scene(probes=[PRESS, PRESS])
-    shapes = {name: structure(variant, device).code for name, variant in variants(made)}
+    shapes = {name: structure_of(variant, device).code for name, variant in variants(made)}
     assert list(shapes) == [
         "",
         "springs.structural",
@@ -159,7 +159,6 @@ def test_terms_are_left_out_of_the_kernel(device: Device) -> None:
     assert not shapes["springs.virtual"].virtual
     assert not shapes["damping"].damped
     assert len(shapes["probes.1"].slots_move) == 1
-    assert {steps_per_frame(variant) for _, variant in variants(made)} == {steps_per_frame(made)}
     assert list(dict(variants(scene(springs={}, damping=0, probes=[])))) == [""]
 
 
@@ -211,15 +210,10 @@ def test_the_error_of_points_is_of_order_2(points: PointStudy) -> None:
 
 def test_the_error_of_points_is_that_against_many_more(points: PointStudy, device: Device) -> None:
     many = tissue((65, 65))
-    steps = steps_per_frame(many)
+    grid = time_grid(many)
 
     def displacements(count: int) -> Any:
-        with closing(Dynamics(with_steps(with_points(many, (count, count)), steps), device)) as sheet:
-            frames = []
-            for _ in range(many.time.frames):
-                sheet.advance(steps)
-                frames.append(sheet.displacement())
-        return np.array(frames)
+        return frames_on(with_points(many, (count, count)), grid, device)
 
     exact = displacements(65)
     largest = np.linalg.norm(exact, axis=-1).max()
@@ -374,8 +368,8 @@ def test_the_step_recommended_is_one_that_a_scene_takes() -> None:
     made = Study("press", scene().model_dump(), "complete", 1e-3, {})
     made.stepping = [stepping_point(1e-4, 1.0, step=1 / 25 / 77, steps_per_frame=77)]
     text = made.recommendation()[1].split(": ")[1]
-    assert steps_per_frame(with_time(scene(), step=float(text))) == 77
-    assert step(scene(time={"step": float(text)})) == 1 / (25 * 77)
+    assert time_grid(with_time(scene(), step=float(text))).steps_per_frame == 77
+    assert time_grid(scene(time={"step": float(text)})).step == 1 / (25 * 77)
 
 
 def test_of_one_method_the_largest_step_is_recommended() -> None:

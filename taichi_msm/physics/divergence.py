@@ -14,9 +14,9 @@ from taichi_msm.physics.material import material
 from taichi_msm.physics.probe_force import probe_force
 from taichi_msm.physics.run_progress import RunProgress
 from taichi_msm.physics.state import Reading
-from taichi_msm.physics.timestep import stable_step, step
-from taichi_msm.physics.workload import precision
+from taichi_msm.physics.timestep import stable_step
 from taichi_msm.scene import Scene
+from taichi_msm.timegrid import TimeGrid
 
 # Farther from rest than this many sheet sizes is no deformation any more; a sheet that nothing holds may fly besides.
 MOST_SHEET_SIZES = 10.0
@@ -75,26 +75,28 @@ class Watch:
 
     Args:
         scene: what is run.
+        grid: its steps.
         progress: of the frame where the watch begins.
 
     Attributes:
         progress: of the last frame that was fine.
     """
 
-    def __init__(self, scene: Scene, progress: RunProgress | None = None) -> None:
+    def __init__(self, scene: Scene, grid: TimeGrid, progress: RunProgress | None = None) -> None:
         self.progress = progress or RunProgress()
-        self._scene, self._material = scene, material(scene)
-        self._loads = Envelope(scene)
+        self._scene, self._grid, self._material = scene, grid, material(scene)
+        self._loads = Envelope(scene, grid.step)
         self._acceleration = _free_acceleration(scene)
-        self._shares = np.array([_share(slot, scene) for slot in probe_slots(scene)])
+        slots = probe_slots(scene.probes, scene.sheet, grid.step)
+        self._shares = np.array([_share(slot, scene) for slot in slots])
         limit = stable_step(scene)
-        self._swing = SWING / max(1e-9, 1 - (step(scene) / limit) ** 2)
-        self._least = _underflow(scene)
+        self._swing = SWING / max(1e-9, 1 - (grid.step / limit) ** 2)
+        self._least = _underflow(scene, grid)
 
     def steer(self, scene: Scene) -> None:
         """Expect other loads from here on; their control points move if they did."""
         self._scene = scene
-        self._loads = Envelope(scene)
+        self._loads = Envelope(scene, self._grid.step)
         self._acceleration = max(self._acceleration, _free_acceleration(scene))
 
     def follow(self, reading: Reading) -> str:
@@ -118,7 +120,7 @@ class Watch:
         return self._fault(reading, farthest(reading.displacement))
 
     def _fault(self, reading: Reading, where: Farthest) -> str:
-        begin, end = self.progress.frame / self._scene.time.frames_per_second, reading.steps * step(self._scene)
+        begin, end = self.progress.frame / self._grid.frames_per_second, self._grid.time(reading.steps)
         point, distance, energy = f"point ({where.row}, {where.column})", where.distance, reading.energy
         # Written so that NaN is found as well: it is not below anything.
         if not distance <= farthest_displacement(self._scene, end, self._acceleration):
@@ -173,19 +175,19 @@ def farthest(displacement: NDArray[np.floating]) -> Farthest:
         )
 
 
-def _underflow(scene: Scene) -> float:
+def _underflow(scene: Scene, grid: TimeGrid) -> float:
     """Tell the energy below which the squares that it is summed from have no digits [J]."""
-    tiny = float(np.finfo(np.float32 if precision(scene) == "f32" else np.float64).tiny)
+    tiny = float(np.finfo(np.float32 if grid.precision == "f32" else np.float64).tiny)
     dx, dy = spacing(scene.sheet)
     made = material(scene)
     stiffness = max(made.across, made.down) + made.shear
-    return math.prod(scene.sheet.points) * tiny * (made.mass / step(scene) ** 2 + stiffness * (dx**2 + dy**2))
+    return math.prod(scene.sheet.points) * tiny * (made.mass / grid.step**2 + stiffness * (dx**2 + dy**2))
 
 
 def _share(slot: ProbeSlot, scene: Scene) -> float:
     """Bound |F| over all points for a force of 1 N at the control point."""
     if not slot.moves:
-        return float(np.linalg.norm(decay(slot, scene)))
+        return float(np.linalg.norm(decay(scene.probes[slot.probe], scene.sheet)))
     # From anywhere the points are no nearer than from one of them, but for half a cell; and around one there are no
     # more than in four sheets that meet there.
     x, y = axes(scene.sheet)

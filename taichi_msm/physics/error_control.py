@@ -12,7 +12,7 @@ from __future__ import annotations
 
 import math
 from contextlib import ExitStack, closing
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from itertools import pairwise
 from typing import Any
@@ -25,11 +25,10 @@ from taichi_msm.physics.divergence import farthest_displacement
 from taichi_msm.physics.lattice import rest_positions
 from taichi_msm.physics.material import material
 from taichi_msm.physics.solver import Dynamics
-from taichi_msm.physics.timestep import step, steps_per_frame, with_steps, with_time
-from taichi_msm.physics.workload import precision, with_precision
 from taichi_msm.progress import Count, Pause
 from taichi_msm.scene import LARGEST_TOLERANCE, Scene
 from taichi_msm.system.runtime import Device
+from taichi_msm.timegrid import TimeGrid
 
 # The step found is the largest but for some 10 %: its error is at least this share of the tolerance.
 CLOSE = 0.75
@@ -67,53 +66,59 @@ def order(scene: Scene) -> int:
     return 2 if scene.time.damping_difference == "central" or material(scene).drag == 0 else 1
 
 
-def estimate_error(scene: Scene, device: Device, progress: Count = lambda done, total: None) -> Estimate:
-    """Estimate the error of the scene's own step.
+def estimate_error(
+    scene: Scene, grid: TimeGrid, device: Device, progress: Count = lambda done, total: None
+) -> Estimate:
+    """Estimate the error of a run.
 
     Args:
         scene: a checked scene.
+        grid: its steps.
         device: what `runtime.start` returned.
         progress: called with the frames done and the frames in all.
     """
-    with closing(Trials(with_precision(scene, device.arch), device)) as trials:
-        return trials.estimate(steps_per_frame(scene), progress)
+    with closing(Trials(scene, grid, device)) as trials:
+        return trials.estimate(grid.steps_per_frame, progress)
 
 
-def choose_step(scene: Scene, device: Device, progress: Count = lambda done, total: None) -> tuple[Scene, Estimate]:
+def choose_step(
+    scene: Scene, grid: TimeGrid, device: Device, progress: Count = lambda done, total: None
+) -> tuple[TimeGrid, Estimate]:
     """Find the largest stable step whose estimated error is within the scene's tolerance.
 
     Args:
         scene: a checked scene with a tolerance.
+        grid: its steps if it had none, which are the fewest that are tried.
         device: what `runtime.start` returned.
         progress: called with the frames done and the frames in all of each pilot run.
 
     Returns:
-        The scene with that step and the precision it is stepped in, and its error.
+        The grid with that step, and its error.
 
     Raises:
         SceneError: when no step is good enough; says which precision or which tolerance would do.
     """
-    scene = with_precision(scene, device.arch)
     assert scene.time.tolerance is not None
-    with closing(Trials(scene, device)) as trials:
-        found = _search(scene.time.tolerance, steps_per_frame(scene), trials, progress)
-    return with_steps(scene, found.steps_per_frame), found
+    with closing(Trials(scene, grid, device)) as trials:
+        found = _search(scene.time.tolerance, grid.steps_per_frame, trials, progress)
+    return replace(grid, steps_per_frame=found.steps_per_frame), found
 
 
-def refinement(scene: Scene) -> int:
+def refinement(scene: Scene, grid: TimeGrid) -> int:
     """Tell how much finer the other pilot must be: twice, where steps resolve the damping.
 
     Where g h / r > 1, with g = C / m, central differences make velocities change their sign at every step, in both
     pilots alike.
     """
-    return max(2, math.ceil(material(scene).drag * step(scene)))
+    return max(2, math.ceil(material(scene).drag * grid.step))
 
 
 class Pilot:
     """Runs in float64 beside another one that tell its error frame by frame: with finer steps, and with its own.
 
     Args:
-        scene: what is run, with its step.
+        scene: what is run.
+        grid: its steps.
         device: what `runtime.start` returned.
         cores: how many cores are free for it; None: all. With as many as the run has, nothing is compiled anew.
 
@@ -121,30 +126,29 @@ class Pilot:
         DeviceError: when the device cannot run it in float64.
     """
 
-    def __init__(self, scene: Scene, device: Device, cores: int | None = None) -> None:
-        exact = with_time(scene, precision="f64")
+    def __init__(self, scene: Scene, grid: TimeGrid, device: Device, cores: int | None = None) -> None:
+        self._scene, self._order = scene, order(scene)
         with ExitStack() as opened:
 
             def dynamics() -> Dynamics:
-                made = Dynamics(exact, device, cores=cores)
+                made = Dynamics(scene, replace(grid, precision="f64"), device, cores=cores)
                 opened.callback(made.close)
                 return made
 
             self._fine = dynamics()
             # What is run in float64 needs no other with its step.
-            self._coarse = None if precision(scene) == "f64" else dynamics()
+            self._coarse = None if grid.precision == "f64" else dynamics()
             self._open = opened.pop_all()
-        self.restart(scene)
+        self.restart(grid)
 
-    def restart(self, scene: Scene) -> None:
-        """Begin again beside another run of the same scene, with its step."""
-        self._scene = scene
-        self._steps, self._ratio, self._order = steps_per_frame(scene), refinement(scene), order(scene)
-        exact = with_time(scene, precision="f64")
+    def restart(self, grid: TimeGrid) -> None:
+        """Begin again beside another run of the same scene, with its steps."""
+        self._steps, self._ratio = grid.steps_per_frame, refinement(self._scene, grid)
+        exact = replace(grid, precision="f64")
         if self._ratio <= FINEST:
-            self._fine.restart(with_steps(exact, self._ratio * self._steps))
+            self._fine.restart(self._scene, replace(exact, steps_per_frame=self._ratio * self._steps))
             if self._coarse:
-                self._coarse.restart(with_steps(exact, self._steps))
+                self._coarse.restart(self._scene, exact)
         self._error = self._rounding = self._in_f64 = self._largest = 0.0
 
     def compile(self) -> None:
@@ -194,12 +198,12 @@ class Pilot:
 class Trials:
     """Runs of a scene with one step after another, each with a pilot beside it."""
 
-    def __init__(self, scene: Scene, device: Device) -> None:
-        self._scene = scene
+    def __init__(self, scene: Scene, grid: TimeGrid, device: Device) -> None:
+        self._scene, self._grid = scene, grid
         with ExitStack() as opened:
-            self._pilot = Pilot(scene, device)
+            self._pilot = Pilot(scene, grid, device)
             opened.callback(self._pilot.close)
-            self._own = Dynamics(scene, device)
+            self._own = Dynamics(scene, grid, device)
             opened.callback(self._own.close)
             self._open = opened.pop_all()
 
@@ -210,12 +214,11 @@ class Trials:
             steps: steps per frame.
             progress: called with the frames done and the frames in all.
         """
-        scene = with_steps(self._scene, steps)
-        self._pilot.restart(scene)
-        self._own.restart(scene)
-        frames = scene.time.frames
-        for frame in range(frames if refinement(scene) <= FINEST else 0):
-            pause = partial(progress, frame, frames)
+        grid = replace(self._grid, steps_per_frame=steps)
+        self._pilot.restart(grid)
+        self._own.restart(self._scene, grid)
+        for frame in range(grid.frames if refinement(self._scene, grid) <= FINEST else 0):
+            pause = partial(progress, frame, grid.frames)
             pause()
             self._own.advance(steps, pause)
             self._pilot.follow(self._as_written(self._own.displacement()), pause)
@@ -223,7 +226,7 @@ class Trials:
 
     def _as_written(self, displacement: NDArray[Any]) -> NDArray[Any]:
         """Round as the trajectory does, whose positions in f32 have the digits of the sheet's size."""
-        if "trajectory" not in self._scene.output or precision(self._scene) == "f64":
+        if "trajectory" not in self._scene.output or self._grid.precision == "f64":
             return displacement
         rest = rest_positions(self._scene.sheet)
         return (rest + displacement).astype(np.float32) - rest

@@ -12,6 +12,7 @@ averaged alike.
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -21,8 +22,8 @@ from numpy.typing import NDArray
 from taichi_msm.physics.lattice import axes
 from taichi_msm.physics.material import area_shares, material
 from taichi_msm.physics.probe_force import control_points, probe_force
-from taichi_msm.physics.timestep import step, steps_per_frame
-from taichi_msm.scene import Probe, Scene
+from taichi_msm.scene import Probe, Scene, Sheet
+from taichi_msm.timegrid import TimeGrid
 
 # A key that is nearer than this to an end of the hat, as a fraction of its half-width, is outside: what it would add
 # is less than rounding.
@@ -72,11 +73,6 @@ class ProbeSlot:
         return len(self.segments) > 1 or len(self.segments[0].times) > 1
 
     @property
-    def rest(self) -> Array:
-        """The first control point, x and y at rest [m]; of one that stands the only one."""
-        return self.segments[0].points[0]
-
-    @property
     def jumps(self) -> Array:
         """When the control point jumps [s]: at the first key of every segment but the first."""
         return np.array([segment.times[0] for segment in self.segments[1:]])
@@ -86,51 +82,56 @@ class Schedule(NamedTuple):
     """The loads at consecutive steps.
 
     Attributes:
+        slots: at which the probes act.
         strength: force at the control point before its decay [N], shape (steps, slots, 3).
         point: control point, x and y at rest [m], shape (steps, slots, 2).
         active: share of the virtual springs' stiffness, 0 to 1; shape (steps,).
     """
 
+    slots: tuple[ProbeSlot, ...]
     strength: Array
     point: Array
     active: Array
 
 
-def probe_slots(scene: Scene) -> tuple[ProbeSlot, ...]:
-    """List the slots of all probes."""
+def probe_slots(probes: Sequence[Probe], sheet: Sheet, h: float) -> tuple[ProbeSlot, ...]:
+    """List the slots of all probes.
+
+    Args:
+        probes: of the scene, in its order.
+        sheet: on which they act.
+        h: half-width of the hat, the step [s]; 0 where loads are not averaged, and every probe needs one slot.
+    """
     found = []
-    for index, probe in enumerate(scene.probes):
-        times, points = control_points(probe, scene.sheet)
+    for index, probe in enumerate(probes):
+        times, points = control_points(probe, sheet)
         jumps = np.flatnonzero((times[1:] == times[:-1]) & (points[1:] != points[:-1]).any(axis=1)) + 1
         parts = zip(np.split(times, jumps), np.split(points, jumps), strict=True)
         segments = tuple(ProbeSegment(*part) for part in parts)
         # As many as there are in the hat that has the most jumps.
         jumped = times[jumps]
-        within = np.searchsorted(jumped, jumped + 2 * step(scene) * (1 - EDGE), "left") - np.arange(len(jumped))
+        within = np.searchsorted(jumped, jumped + 2 * h * (1 - EDGE), "left") - np.arange(len(jumped))
         turns = 1 + int(within.max(initial=0))
         found += [ProbeSlot(index, segments, turn, turns) for turn in range(turns)]
     return tuple(found)
 
 
-def decay(slot: ProbeSlot, scene: Scene) -> Array:
-    """Evaluate the decay of a standing slot.
+def decay(probe: Probe, sheet: Sheet) -> Array:
+    """Evaluate the decay of a probe around the first place of its control point, for one that stands the only one.
 
     Returns:
         Share of the force that each point feels, shape (rows, cols).
     """
-    acts = probe_force(scene.probes[slot.probe], scene.sheet)
-    x, y = axes(scene.sheet)
-    shares = acts.decay(np.hypot(x - slot.rest[0], y - slot.rest[1]))
-    return shares * area_shares(scene.sheet) if acts.by_area else shares
+    acts, (at_x, at_y) = probe_force(probe, sheet), control_points(probe, sheet)[1][0]
+    x, y = axes(sheet)
+    shares = acts.decay(np.hypot(x - at_x, y - at_y))
+    return shares * area_shares(sheet) if acts.by_area else shares
 
 
-def schedule(scene: Scene, first: int, count: int) -> Schedule:
-    """Average the loads over the steps first, ..., first + count - 1.
-
-    The time of step n is n / (frames per second x steps per frame), never a sum of steps.
-    """
-    t = np.arange(first, first + count) / (scene.time.frames_per_second * steps_per_frame(scene))
-    h, parts = step(scene), probe_slots(scene)
+def schedule(scene: Scene, grid: TimeGrid, first: int, count: int) -> Schedule:
+    """Average the loads over the steps first, ..., first + count - 1 of a grid."""
+    t, h = np.arange(first, first + count) / grid.steps_per_second, grid.step
+    parts = probe_slots(scene.probes, scene.sheet, h)
     strength, point = np.zeros((count, len(parts), 3)), np.zeros((count, len(parts), 2))
     for index, probe in enumerate(scene.probes):
         own = [n for n, part in enumerate(parts) if part.probe == index]
@@ -146,22 +147,19 @@ def schedule(scene: Scene, first: int, count: int) -> Schedule:
             for number in np.unique(place):
                 chosen = place == number
                 point[chosen, n] = _held(segments[number], t[chosen])
-    return Schedule(strength, point, _activity(scene).averages(t, h))
+    return Schedule(parts, strength, point, _activity(scene).averages(t, h))
 
 
 def loads_at(scene: Scene, t: Array) -> Schedule:
     """Evaluate the loads at times on which no key falls, and not their averages [s], shape (times,)."""
-    parts = probe_slots(scene)
+    parts = probe_slots(scene.probes, scene.sheet, 0.0)
     strength, point = np.zeros((len(t), len(parts), 3)), np.zeros((len(t), len(parts), 2))
-    for n, part in enumerate(parts):
-        probe = scene.probes[part.probe]
-        line = _load(probe)
+    for n, (part, probe) in enumerate(zip(parts, scene.probes, strict=True)):
+        strength[:, n] = np.multiply.outer(_load(probe).values(t) / 100, probe_force(probe, scene.sheet).force)
         number = part.jumps.searchsorted(t, "right")
-        acts = number % part.turns == part.turn
-        strength[:, n] = np.multiply.outer(line.values(t) * acts / 100, probe_force(probe, scene.sheet).force)
         for segment in np.unique(number):
             point[number == segment, n] = _held(part.segments[segment], t[number == segment])
-    return Schedule(strength, point, _activity(scene).values(t))
+    return Schedule(parts, strength, point, _activity(scene).values(t))
 
 
 def key_times(scene: Scene) -> Array:
@@ -175,13 +173,14 @@ class Envelope:
 
     Args:
         scene: a checked scene.
+        h: the step [s].
     """
 
-    def __init__(self, scene: Scene) -> None:
-        self._h = step(scene)
+    def __init__(self, scene: Scene, h: float) -> None:
+        self._h = h
         self._lines = [_load(probe) for probe in scene.probes]
         self._forces = [math.hypot(*probe_force(probe, scene.sheet).force) / 100 for probe in scene.probes]
-        self._probes = [slot.probe for slot in probe_slots(scene)]
+        self._probes = [slot.probe for slot in probe_slots(scene.probes, scene.sheet, h)]
         self._activity = _activity(scene)
         self._begins = self._activity.times[self._activity.before < self._activity.after]
 

@@ -217,9 +217,9 @@ def cell_ratio(sheet: Sheet) -> float:
     return max(dx, dy) / min(dx, dy)
 
 
-def has_fixed_border(scene: Scene) -> bool:
+def has_fixed_border(sheet: Sheet) -> bool:
     """Tell whether every point at an edge is fixed."""
-    fixed = fixed_points(scene.sheet)
+    fixed = fixed_points(sheet)
     return bool(fixed[[0, -1]].all() and fixed[:, [0, -1]].all())
 
 
@@ -293,7 +293,7 @@ def _tissue_problems(scene: Scene, *, has_map: bool) -> Iterator[Problem]:
             f"{LONGEST_CELL:.3g} times; {remedy}",
         )
     if tissue.pretension > 0:
-        if not has_fixed_border(scene):
+        if not has_fixed_border(sheet):
             said = f"{tissue.pretension:g} N/m needs every side fixed; set sheet.fixed: border, or pretension: 0"
             yield Problem(("tissue", "pretension"), said)
         softest = float(factors(scene).min()) if has_map else 1.0

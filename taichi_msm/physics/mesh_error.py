@@ -16,6 +16,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from contextlib import ExitStack, closing
+from dataclasses import replace
 from functools import partial
 from itertools import pairwise, product
 from typing import Any
@@ -28,10 +29,11 @@ from taichi_msm.physics.error_control import longest
 from taichi_msm.physics.material import LONGEST_CELL, cell_ratio
 from taichi_msm.physics.probe_force import sums
 from taichi_msm.physics.solver import Dynamics
-from taichi_msm.physics.timestep import steps_per_frame, with_steps, with_time
+from taichi_msm.physics.timestep import time_grid
 from taichi_msm.progress import Count, Pause
 from taichi_msm.scene import MAX_POINTS, Probe, Scene, Sheet
 from taichi_msm.system.runtime import Device
+from taichi_msm.timegrid import TimeGrid
 
 # The runs of one search, how much finer each may be than the one before, and how much finer it is at least.
 MOST_TRIALS = 10
@@ -48,7 +50,7 @@ FEWEST = 7
 
 
 def coarser(scene: Scene) -> Scene | None:
-    """Give the scene half as many cells a side, the same steps, and tools that press as hard in all.
+    """Give the scene half as many cells a side, and tools that press as hard in all.
 
     None where there are too few points, or there is no tissue.
     """
@@ -61,8 +63,7 @@ def coarser(scene: Scene) -> Scene | None:
     if cell_ratio(coarse.sheet) > LONGEST_CELL:
         return None
     probes = tuple(_pressing_alike(probe, scene.sheet, coarse.sheet) for probe in scene.probes)
-    coarse = coarse.model_copy(update={"probes": probes})
-    return with_steps(with_time(coarse, precision="f64"), steps_per_frame(scene))
+    return coarse.model_copy(update={"probes": probes})
 
 
 def _pressing_alike(probe: Probe, sheet: Sheet, other: Sheet) -> Probe:
@@ -87,7 +88,8 @@ class MeshPilot:
     """Runs in float64 beside another run, with half the cells a side and, where there are enough, with a quarter.
 
     Args:
-        scene: what is run, with its step.
+        scene: what is run.
+        grid: its steps, which are also the pilot's.
         coarse: what `coarser` gave for it.
         device: what `runtime.start` returned.
         cores: how many cores are free for it; None: all.
@@ -96,12 +98,12 @@ class MeshPilot:
         DeviceError: when the device cannot run it in float64.
     """
 
-    def __init__(self, scene: Scene, coarse: Scene, device: Device, cores: int | None = None) -> None:
-        self._steps = steps_per_frame(scene)
-        coarsest = coarser(coarse)
+    def __init__(self, scene: Scene, grid: TimeGrid, coarse: Scene, device: Device, cores: int | None = None) -> None:
+        self._steps = grid.steps_per_frame
+        exact, coarsest = replace(grid, precision="f64"), coarser(coarse)
         scenes = [coarse] if coarsest is None else [coarse, coarsest]
         with ExitStack() as opened:
-            self._sheets = [opened.enter_context(closing(Dynamics(one, device, cores=cores))) for one in scenes]
+            self._sheets = [opened.enter_context(closing(Dynamics(one, exact, device, cores=cores))) for one in scenes]
             self._open = opened.pop_all()
         points = [one.sheet.points for one in (scene, *scenes)]
         self._samplings = [CubicSampling(after, before) for before, after in pairwise(points)]
@@ -204,14 +206,13 @@ def choose_points(
 
 def _error(scene: Scene, device: Device, progress: Count) -> float:
     """Run a scene and its pilot, in float64."""
-    exact, coarse = with_time(scene, precision="f64"), coarser(scene)
+    grid, coarse = replace(time_grid(scene, device.arch), precision="f64"), coarser(scene)
     assert coarse is not None
-    frames = scene.time.frames
-    with closing(Dynamics(exact, device)) as own, closing(MeshPilot(exact, coarse, device)) as pilot:
-        for frame in range(frames):
-            pause = partial(progress, frame, frames)
+    with closing(Dynamics(scene, grid, device)) as own, closing(MeshPilot(scene, grid, coarse, device)) as pilot:
+        for frame in range(grid.frames):
+            pause = partial(progress, frame, grid.frames)
             pause()
-            own.advance(steps_per_frame(exact), pause)
+            own.advance(grid.steps_per_frame, pause)
             pilot.follow(own.displacement(), pause)
         return pilot.error
 

@@ -15,13 +15,13 @@ which is the position form without its cancellation: in f32 it keeps the digits 
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from taichi_msm.errors import ArgumentError, DeviceError
-from taichi_msm.physics import workload
 from taichi_msm.physics.kernel import (
     ACROSS,
     AREA,
@@ -47,16 +47,16 @@ from taichi_msm.physics.kernel import (
 from taichi_msm.physics.kernel_cpu import Sweep
 from taichi_msm.physics.kernel_gpu import STEPS_PER_LAUNCH, Gather
 from taichi_msm.physics.lattice import axes, fixed_points, spacing
-from taichi_msm.physics.loads import decay, probe_slots, schedule
+from taichi_msm.physics.loads import ProbeSlot, decay, probe_slots, schedule
 from taichi_msm.physics.material import area_shares, has_fixed_border, material, stiffness
 from taichi_msm.physics.probe_force import probe_force
 from taichi_msm.physics.state import Reading, State
-from taichi_msm.physics.timestep import step, steps_per_frame
 from taichi_msm.physics.verlet import coefficients
 from taichi_msm.progress import Pause
 from taichi_msm.scene import Scene
 from taichi_msm.system.resources import available_threads
 from taichi_msm.system.runtime import Device, lanes
+from taichi_msm.timegrid import TimeGrid
 
 # Below this many points a worker costs more in waiting for the others than it saves.
 POINTS_PER_WORKER = 450
@@ -76,11 +76,12 @@ MAX_STEPS_PER_LAUNCH = 8192
 STEPS_PER_TABLE = 4096
 
 
-def structure(scene: Scene, device: Device, cores: int | None = None) -> Structure:
+def structure(scene: Scene, grid: TimeGrid, device: Device, cores: int | None = None) -> Structure:
     """Find out what the scene needs: absent terms are left out of the kernel.
 
     Args:
         scene: a checked scene.
+        grid: its steps.
         device: what `runtime.start` returned.
         cores: how many cores are free for it; None: all.
 
@@ -88,8 +89,8 @@ def structure(scene: Scene, device: Device, cores: int | None = None) -> Structu
         DeviceError: when the device cannot do what the scene needs.
     """
     rows, cols = scene.sheet.points
-    fixed, made, slots = fixed_points(scene.sheet), material(scene), probe_slots(scene)
-    precision, open_edges = workload.precision(scene, device.arch), not has_fixed_border(scene)
+    fixed, made, slots = fixed_points(scene.sheet), material(scene), _slots(scene, grid)
+    precision, open_edges = grid.precision, not has_fixed_border(scene.sheet)
     fixed_rows = bool(fixed[0].all()), bool(fixed[-1].all())
     if device.arch == "cpu":
         # Workers wait by spinning: more of them than cores would only keep each other from their work.
@@ -110,7 +111,7 @@ def structure(scene: Scene, device: Device, cores: int | None = None) -> Structu
         virtual=made.virtual > 0,
         damped=made.drag > 0,
         slots_move=tuple(slot.moves for slot in slots),
-        slots_by_area=_slots_by_area(scene),
+        slots_by_area=_slots_by_area(scene, slots),
     )
     if device.arch == "vulkan" and precision == "f64" and any(code.slots_move):
         raise DeviceError(
@@ -135,38 +136,48 @@ class Dynamics:
 
     Args:
         scene: a checked scene.
+        grid: its steps.
         device: what `runtime.start` returned.
         layout: another structure than the scene's own; for tests.
         cores: how many cores are free for it; None: all.
 
     Attributes:
+        scene: what is stepped.
+        grid: its steps.
         structure: what the kernels are compiled for.
         steps_done: number of steps taken.
         launches: number of launches of the kernel.
     """
 
-    def __init__(self, scene: Scene, device: Device, layout: Structure | None = None, cores: int | None = None) -> None:
-        self.scene = scene
+    def __init__(
+        self,
+        scene: Scene,
+        grid: TimeGrid,
+        device: Device,
+        layout: Structure | None = None,
+        cores: int | None = None,
+    ) -> None:
         self._device = device
         self._cores = cores
         self._layout = layout
         self.launches = 0
         self._sheet: Sweep | Gather | None = None
-        self.restart(scene)
+        self.restart(scene, grid)
 
-    def restart(self, scene: Scene, state: State | None = None) -> None:
+    def restart(self, scene: Scene, grid: TimeGrid, state: State | None = None) -> None:
         """Begin again, with the same scene or another; nothing is compiled where only numbers differ.
 
         Args:
             scene: a checked scene.
+            grid: its steps.
             state: where to begin, as `state` gave it with the same points and step; None: at rest.
         """
-        self.scene = scene
-        self.structure = self._layout or structure(scene, self._device, self._cores)
+        self.scene, self.grid = scene, grid
+        self.structure = self._layout or structure(scene, grid, self._device, self._cores)
         self._begin(state)
 
     def steer(self, scene: Scene) -> None:
-        """Go on from here with other loads.
+        """Go on from here with other loads and the same steps.
 
         Args:
             scene: the scene with other probes, of which each moves, jumps or stands as it did.
@@ -174,20 +185,21 @@ class Dynamics:
         Raises:
             ArgumentError: when it needs another kernel.
         """
-        moves = tuple(slot.moves for slot in probe_slots(scene))
+        slots = _slots(scene, self.grid)
+        moves = tuple(slot.moves for slot in slots)
         if moves != self.structure.code.slots_move:
             raise ArgumentError(
                 "probes: the scene's move, jump or stand otherwise (control points that move: "
                 f"{_in_words(self.structure.code.slots_move)}; now {_in_words(moves)}); "
                 "restart with a scene that has these"
             )
-        if _slots_by_area(scene) != self.structure.code.slots_by_area:
+        if _slots_by_area(scene, slots) != self.structure.code.slots_by_area:
             raise ArgumentError("probes: one that had force has total now, or the reverse; restart with such a scene")
-        if _standing(scene) != _standing(self.scene):
-            self._moving.set_decay(_standing_decays(scene))
+        if _standing(scene, slots) != _standing(self.scene, _slots(self.scene, self.grid)):
+            self._moving.set_decay(_standing_decays(scene, slots))
         self.scene = scene
         # Who steers does so again in a frame.
-        self._first_tabled, self._loads = self.steps_done, self._table(self.steps_done, steps_per_frame(scene))
+        self._first_tabled, self._loads = self.steps_done, self._table(self.steps_done, self.grid.steps_per_frame)
 
     def advance(self, steps: int, pause: Pause = lambda: None) -> None:
         """Take a number of steps.
@@ -236,7 +248,7 @@ class Dynamics:
         squares = np.array([dx**2, dy**2, dx**2 + dy**2])
         stiffness = np.ones(3) if made.map else np.array(made.stiffness)
         springs = (stiffness * sums[STRETCHED : STRETCHED + 3] + made.tensions * sums[TENSE : TENSE + 3]) @ squares
-        motion = made.mass * sums[MOTION] / step(self.scene) ** 2
+        motion = made.mass * sums[MOTION] / self.grid.step**2
         return Reading(
             self.steps_done, displacement, shortest, longest, float(springs + motion + made.bending * sums[BENT]) / 2
         )
@@ -262,16 +274,15 @@ class Dynamics:
         self._real = np.dtype(np.float32 if self.structure.code.precision == "f32" else np.float64)
         self.steps_done = 0 if state is None else state.steps
         self._material = material(self.scene)
+        self._verlet = coefficients(self._material, self.grid.step, self.scene.time.damping_difference)
         self._arguments = self._numbers()
         self._first_tabled, self._loads = self.steps_done, self._table(self.steps_done, STEPS_PER_TABLE)
         self._place(state)
 
     def _numbers(self) -> tuple[float, ...]:
         """Give the numbers of the scene in the order of the kernel's arguments."""
-        scene = self.scene
-        dx, dy = spacing(scene.sheet)
-        made, keep = self._material, coefficients(scene).keep
-        return keep, dx, dy, *made.stiffness, *made.tensions, made.bending, scene.sheet.size[0] / 2
+        made, sheet = self._material, self.scene.sheet
+        return self._verlet.keep, *spacing(sheet), *made.stiffness, *made.tensions, made.bending, sheet.size[0] / 2
 
     def _next_loads(self, count: int) -> NDArray[Any]:
         """Give the table of the loads of the next steps, shape (count, columns)."""
@@ -284,18 +295,16 @@ class Dynamics:
 
     def _table(self, first: int, count: int) -> NDArray[Any]:
         """Tabulate the loads of steps first, ..., first + count - 1, shape (count, columns)."""
-        scene, verlet = self.scene, coefficients(self.scene)
-        loads = schedule(scene, first, count)
-        parts = probe_slots(scene)
+        scene, loads = self.scene, schedule(self.scene, self.grid, first, count)
         table = np.empty((count, self.structure.code.load_columns))
-        table[:, 0] = verlet.gain
+        table[:, 0] = self._verlet.gain
         if first == 0:
-            table[0, 0] = verlet.first_gain
+            table[0, 0] = self._verlet.first_gain
         table[:, 1] = self._material.virtual * loads.active
-        slot = table[:, SLOT_COLUMN:].reshape(count, len(parts), SLOT_COLUMNS)
+        slot = table[:, SLOT_COLUMN:].reshape(count, len(loads.slots), SLOT_COLUMNS)
         slot[..., :3] = loads.strength
         slot[..., 3:5] = loads.point
-        for n, part in enumerate(parts):
+        for n, part in enumerate(loads.slots):
             acts = probe_force(scene.probes[part.probe], scene.sheet)
             slot[:, n, 5:] = acts.falloff, acts.shift, acts.offset
         # What is too large for f32 is infinite, and found when the sheet is read.
@@ -318,13 +327,18 @@ class Dynamics:
         self._sheet = None  # Its memory is free before there is another.
         kind = Sweep if s.workers else Gather
         begun = None if state is None else (state.displacement, state.difference)
-        self._sheet = kind(s, Start(by_column, _standing_decays(scene), _mapped_stiffness(scene), begun))
+        decays = _standing_decays(scene, _slots(scene, self.grid))
+        self._sheet = kind(s, Start(by_column, decays, _mapped_stiffness(scene), begun))
 
 
-def _slots_by_area(scene: Scene) -> tuple[bool, ...]:
+def _slots(scene: Scene, grid: TimeGrid) -> tuple[ProbeSlot, ...]:
+    return probe_slots(scene.probes, scene.sheet, grid.step)
+
+
+def _slots_by_area(scene: Scene, slots: Sequence[ProbeSlot]) -> tuple[bool, ...]:
     """Tell for every slot whether points at an edge move and get less of its force than others."""
-    open_edges = not has_fixed_border(scene)
-    return tuple(open_edges and scene.probes[slot.probe].total is not None for slot in probe_slots(scene))
+    open_edges = not has_fixed_border(scene.sheet)
+    return tuple(open_edges and scene.probes[slot.probe].total is not None for slot in slots)
 
 
 def _mapped_stiffness(scene: Scene) -> tuple[NDArray[Any], NDArray[Any], NDArray[Any]] | None:
@@ -341,15 +355,15 @@ def _mapped_stiffness(scene: Scene) -> tuple[NDArray[Any], NDArray[Any], NDArray
     )
 
 
-def _standing(scene: Scene) -> list[tuple[object, ...]]:
+def _standing(scene: Scene, slots: Sequence[ProbeSlot]) -> list[tuple[object, ...]]:
     """List all on which the decays of the slots that stand depend."""
-    probes = [scene.probes[slot.probe] for slot in probe_slots(scene) if not slot.moves]
+    probes = [scene.probes[slot.probe] for slot in slots if not slot.moves]
     return [(probe.at, probe_force(probe, scene.sheet)[1:]) for probe in probes]
 
 
-def _standing_decays(scene: Scene) -> NDArray[np.float64]:
+def _standing_decays(scene: Scene, slots: Sequence[ProbeSlot]) -> NDArray[np.float64]:
     """Give the decays of all slots that stand, shape (slots, rows, cols)."""
-    return np.array([decay(slot, scene) for slot in probe_slots(scene) if not slot.moves])
+    return np.array([decay(scene.probes[slot.probe], scene.sheet) for slot in slots if not slot.moves])
 
 
 def _in_words(moves: tuple[bool, ...]) -> str:

@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import Literal, NamedTuple
 
-from taichi_msm.physics.material import material
-from taichi_msm.physics.timestep import step
-from taichi_msm.scene import Scene
+from taichi_msm.physics.material import Material
 
 
 class Coefficients(NamedTuple):
@@ -23,14 +21,18 @@ class Coefficients(NamedTuple):
     first_gain: float
 
 
-def coefficients(scene: Scene) -> Coefficients:
-    """Find the coefficients of a scene's steps.
+def coefficients(made: Material, h: float, difference: Literal["central", "backward"]) -> Coefficients:
+    """Find the coefficients of a step.
 
     With g = C / m, the damping by central differences takes (1 - g h / 2) / (1 + g h / 2) of a difference, and by
     backward ones 1 - g h.
+
+    Args:
+        made: of the sheet; its mass and drag count.
+        h: the step [s].
+        difference: that stands for the velocity in the damping.
     """
-    h, made = step(scene), material(scene)
     g, whole = made.drag, h * h / made.mass
-    if scene.time.damping_difference == "central":
+    if difference == "central":
         return Coefficients((1 - g * h / 2) / (1 + g * h / 2), whole / (1 + g * h / 2), whole / 2)
     return Coefficients(1 - g * h, whole, whole / 2)

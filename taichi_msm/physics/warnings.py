@@ -4,15 +4,16 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator
+from dataclasses import replace
 
 from taichi_msm.physics import probe_force
 from taichi_msm.physics.error_control import Estimate
 from taichi_msm.physics.material import material
 from taichi_msm.physics.run_progress import RunProgress
-from taichi_msm.physics.timestep import step, steps_per_frame, with_steps
 from taichi_msm.scene import MAX_POINTS, Scene
+from taichi_msm.timegrid import TimeGrid
 
-# Down to this share of its rest length no spring shakes the limit of stability (see `timestep.highest_frequency`).
+# Down to this share of its rest length no spring shakes the limit of stability (see `material.highest_frequency`).
 SHORTEST = 0.5
 
 # Beyond so many times its rest length a spring is stretched more than any tissue.
@@ -23,12 +24,18 @@ WRONG = 0.01
 
 
 def notes(
-    scene: Scene, progress: RunProgress, estimate: Estimate | None, reason: str = "", mesh_error: float | None = None
+    scene: Scene,
+    grid: TimeGrid,
+    progress: RunProgress,
+    estimate: Estimate | None,
+    reason: str = "",
+    mesh_error: float | None = None,
 ) -> Iterator[str]:
     """Say what is remarkable about a run, one line each.
 
     Args:
-        scene: with the step that was taken.
+        scene: what was run.
+        grid: the steps that were taken.
         progress: of the last frame.
         estimate: of the error, if there is one.
         reason: why there is none.
@@ -38,7 +45,7 @@ def notes(
         yield error(estimate, mesh_error)
         if WRONG < estimate.error < math.inf:
             wrong = float(f"{100 * estimate.error:.2g}")
-            yield f"the run is about {wrong:g} % wrong; {_remedy(scene, estimate)}"
+            yield f"the run is about {wrong:g} % wrong; {_remedy(scene, grid, estimate)}"
     elif reason:
         points = "" if mesh_error is None else f"; of the points {mesh_error:.2g}"
         yield f"error not estimated: {reason}{points}"
@@ -59,12 +66,11 @@ def notes(
             f"a spring was pressed to {progress.shortest_spring:.2g} of its rest length: below {SHORTEST} the sheet "
             "folds over itself and small errors grow; press less"
         )
-    h = step(scene)
-    quick = material(scene).drag * h
+    quick = material(scene).drag * grid.step
     if quick > 2 and scene.time.damping_difference == "central":
         yield (
             f"the damping stops a point within 1/{quick:.3g} of a step: velocities change their sign at every step; "
-            f"take a time.step of at most {2 * h / quick:.2g} s"
+            f"take a time.step of at most {2 * grid.step / quick:.2g} s"
         )
 
 
@@ -79,7 +85,7 @@ def error(estimate: Estimate, mesh_error: float | None = None) -> str:
     return f"error, as a share of the largest displacement: {parts}, points {points}"
 
 
-def _remedy(scene: Scene, estimate: Estimate) -> str:
+def _remedy(scene: Scene, grid: TimeGrid, estimate: Estimate) -> str:
     """Say what would make it less wrong."""
     said = []
     if estimate.rounding > WRONG / 2:
@@ -88,6 +94,7 @@ def _remedy(scene: Scene, estimate: Estimate) -> str:
             support = "springs.virtual" if scene.tissue is None else "tissue.pretension or bending"
             said.append(f"more {support}, where the sheet buckles")
     if estimate.in_f64 > WRONG / 2:
-        needed = steps_per_frame(scene) * (estimate.in_f64 / (WRONG / 2)) ** (1 / estimate.order)
-        said.insert(0, f"time.step: {step(with_steps(scene, math.ceil(needed))):.9g}")
+        needed = grid.steps_per_frame * (estimate.in_f64 / (WRONG / 2)) ** (1 / estimate.order)
+        finer = replace(grid, steps_per_frame=math.ceil(needed))
+        said.insert(0, f"time.step: {finer.step:.9g}")
     return f"try {', or '.join(said)}"

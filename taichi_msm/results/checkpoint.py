@@ -22,8 +22,7 @@ from numpy.typing import NDArray
 from taichi_msm.errors import DamagedError
 from taichi_msm.physics.run_progress import RunProgress, Saved
 from taichi_msm.physics.state import State
-from taichi_msm.physics.timestep import steps_per_frame
-from taichi_msm.physics.workload import precision
+from taichi_msm.physics.timestep import time_grid
 from taichi_msm.results.folder import Folder, write_all
 from taichi_msm.results.npz import read_array, write_array
 from taichi_msm.results.publication import CHECKPOINT, CHECKPOINT_TREE, DRAFT, MANIFEST, POSITIONS, STATE
@@ -51,9 +50,9 @@ class Checkpoint:
     def __init__(self, staging: Folder, scene: Scene) -> None:
         self.frames = 0
         self._staging = staging
-        self._scene = scene
+        self._grid = time_grid(scene)
         self._shape = (*scene.sheet.points, 3)
-        self.precision = np.dtype(np.float32 if precision(scene) == "f32" else np.float64)
+        self.precision = np.dtype(np.float32 if self._grid.precision == "f32" else np.float64)
         self._frame_bytes = math.prod(self._shape) * self.precision.itemsize
         self._record_bytes = (DIGEST_BYTES + self._frame_bytes) if scene.output else 0
         self._due = 0.0
@@ -179,10 +178,10 @@ class Checkpoint:
             raise self._damaged(STATE) from None
         progress = RunProgress(**{field.name: found[field.name].item() for field in fields(RunProgress)})
         saved = Saved(State(int(found["steps"]), found["displacement"], found["difference"]), progress)
-        every = steps_per_frame(self._scene)
+        every = self._grid.steps_per_frame
         # Anybody may have written it.
         if not (
-            progress.frame <= self._scene.time.frames
+            progress.frame <= self._grid.frames
             and progress.frame * every <= saved.state.steps <= (progress.frame + 1) * every
             and all(np.isfinite(array).all() for array in found.values())
             and all(value >= 0 for value in asdict(progress).values())

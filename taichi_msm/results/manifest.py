@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from pydantic import TypeAdapter
 
 from taichi_msm.errors import DamagedError, FilesError
-from taichi_msm.physics import material, timestep, workload
+from taichi_msm.physics import material, timestep
 from taichi_msm.physics.error_control import Estimate
 from taichi_msm.physics.material import factors
 from taichi_msm.render import camera
@@ -123,7 +123,7 @@ def read_manifest(directory: Path) -> Manifest:
     # Anybody may have written it.
     numbers = () if manifest.estimate is None else asdict(manifest.estimate).values()
     possible = manifest.arch in ARCHS and all(number >= 0 for number in numbers)
-    checks = (material.problems, timestep.problems, workload.problems, camera.problems)
+    checks = (material.problems, timestep.problems, camera.problems)
     if not possible or any(list(check(manifest.scene)) for check in checks):
         raise DamagedError(f"{path} is of no scene that can be run; run another")
     return manifest

@@ -12,11 +12,12 @@ from pathlib import Path
 
 from taichi_msm.errors import Path as Key
 from taichi_msm.errors import Problem, SceneError
-from taichi_msm.physics import timestep
-from taichi_msm.physics.workload import affords_pilot, precision
+from taichi_msm.physics.timestep import time_grid
+from taichi_msm.physics.workload import affords_pilot
 from taichi_msm.render import texture
 from taichi_msm.scene import Scene
 from taichi_msm.system.resources import available_memory
+from taichi_msm.timegrid import TimeGrid
 
 MAX_STEPS = 10**12
 
@@ -71,33 +72,34 @@ class Budget:
         return self.picture_bytes + self.trajectory_bytes
 
 
-def estimate(scene: Scene) -> Budget:
-    """Estimate what the scene will need."""
+def estimate(scene: Scene, grid: TimeGrid) -> Budget:
+    """Estimate what the scene will need with the steps of a grid."""
     rows, cols = scene.sheet.points
-    points = rows * cols
-    frames, pixels = scene.time.frames + 1, math.prod(scene.render.size)
-    positions = frames * points * 3 * _number_bytes(scene)
+    points, number_bytes = rows * cols, 4 if grid.precision == "f32" else 8
+    frames, pixels = grid.frames + 1, math.prod(scene.render.size)
+    positions = frames * points * 3 * number_bytes
     numbers = STATE_NUMBERS + OUTPUT_NUMBERS + len(scene.probes) + (MAP_NUMBERS if scene.stiffness_map else 0)
     # A pilot is up to two more sheets, in f64; with tissue there are two smaller ones.
-    pilot = scene.time.tolerance is not None or affords_pilot(scene, 2)
-    sheets = _number_bytes(scene) + (8 * (2 + (scene.tissue is not None) * 5 / 16) if pilot else 0)
+    pilot = scene.time.tolerance is not None or affords_pilot(scene, grid, 2)
+    sheets = number_bytes + (8 * (2 + (scene.tissue is not None) * 5 / 16) if pilot else 0)
     return Budget(
         points=points,
-        steps=scene.time.frames * timestep.steps_per_frame(scene),
+        steps=grid.steps,
         frames=frames,
         simulation_bytes=round(points * sheets * numbers),
         drawing_bytes=drawing_bytes(scene) if scene.draws else 0,
         picture_bytes=frames * sum(pixels * PIXEL_FILE_BYTES.get(kind, 0) for kind in set(scene.output)),
         trajectory_bytes=positions if "trajectory" in scene.output else 0,
         # Two of the states with which a run can go on, and all its positions.
-        working_bytes=2 * points * STATE_NUMBERS * _number_bytes(scene) + (positions if scene.output else 0),
+        working_bytes=2 * points * STATE_NUMBERS * number_bytes + (positions if scene.output else 0),
     )
 
 
 def problems(scene: Scene) -> Iterator[Problem]:
     """Say what makes the scene too large, with the numbers and the key to change."""
-    yield from _step_problems(scene)
-    yield from _memory_problems(scene)
+    grid = time_grid(scene)
+    yield from _step_problems(scene, grid)
+    yield from _memory_problems(scene, estimate(scene, grid))
 
 
 def require_disk(scene: Scene, directory: Path) -> None:
@@ -110,7 +112,7 @@ def require_disk(scene: Scene, directory: Path) -> None:
     Raises:
         SceneError: when there is not, with the numbers and the key to change.
     """
-    budget, free = estimate(scene), _free_disk(directory)
+    budget, free = estimate(scene, time_grid(scene)), _free_disk(directory)
     needed = budget.disk_bytes + budget.working_bytes
     if needed <= free:
         return
@@ -129,10 +131,6 @@ def require_disk(scene: Scene, directory: Path) -> None:
     raise SceneError([f"{key}: {said}"])
 
 
-def _number_bytes(scene: Scene) -> int:
-    return 4 if precision(scene) == "f32" else 8
-
-
 def drawing_bytes(scene: Scene) -> int:
     """Estimate the memory for drawing a frame [bytes], whether the scene's output asks for it or not."""
     rows, cols = scene.sheet.points
@@ -145,11 +143,10 @@ def drawing_bytes(scene: Scene) -> int:
     return rows * cols * POINT_BYTES + samples + width * height * PIXEL_BYTES + picture * PICTURE_PIXEL_BYTES
 
 
-def _step_problems(scene: Scene) -> Iterator[Problem]:
-    steps = scene.time.frames * timestep.steps_per_frame(scene)
-    if steps <= MAX_STEPS:
+def _step_problems(scene: Scene, grid: TimeGrid) -> Iterator[Problem]:
+    if grid.steps <= MAX_STEPS:
         return
-    count = f"{scene.time.duration:g} s in steps of {timestep.step(scene):.6g} s is {steps:.3g} steps"
+    count = f"{scene.time.duration:g} s in steps of {grid.step:.6g} s is {grid.steps:.3g} steps"
     limit = f"more than the {MAX_STEPS:.0e} that can be taken"
     if scene.time.step == "auto":
         remedy = "take a shorter time, softer springs or more mass"
@@ -158,8 +155,8 @@ def _step_problems(scene: Scene) -> Iterator[Problem]:
         yield Problem(("time", "step"), f"{count}, {limit}; take a longer step or a shorter time")
 
 
-def _memory_problems(scene: Scene) -> Iterator[Problem]:
-    budget, available = estimate(scene), available_memory()
+def _memory_problems(scene: Scene, budget: Budget) -> Iterator[Problem]:
+    available = available_memory()
     if budget.memory_bytes <= available:
         return
     rows, cols = scene.sheet.points

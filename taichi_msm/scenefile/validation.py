@@ -9,7 +9,7 @@ from pydantic import ValidationError
 
 from taichi_msm import faults
 from taichi_msm.errors import ArgumentError, Problem, SceneError
-from taichi_msm.physics import material, timestep, workload
+from taichi_msm.physics import material, timestep
 from taichi_msm.render import camera, texture
 from taichi_msm.scene import Scene, Section
 from taichi_msm.scenefile import budget
@@ -19,7 +19,6 @@ Model = TypeVar("Model", bound=Section)
 # What one section cannot know: these see the whole scene, once `material` finds it to be one.
 CHECKS: tuple[Callable[[Scene], Iterable[Problem]], ...] = (
     timestep.problems,
-    workload.problems,
     camera.problems,
     texture.problems,
     budget.problems,

@@ -58,7 +58,8 @@ def solve(scene: Scene, rtol: float, atol: float, deadline: float, tick: Callabl
                 raise TooSlowError
             tick()
             share = (t - start) / (end - start)
-            loads = Schedule(*(each[:1] + share * (each[1:] - each[:1]) for each in ends))
+            between = (each[:1] + share * (each[1:] - each[:1]) for each in ends[1:])
+            loads = Schedule(ends.slots, *between)
             u, v = y.reshape(2, *shape)
             force = reference.force(scene, u, loads, 0) - made.drag[..., None] * v
             return np.concatenate([v.ravel(), (force / made.mass[..., None] * moves).ravel()])

@@ -17,12 +17,13 @@ from taichi_msm.physics.divergence import farthest_displacement
 from taichi_msm.physics.error_control import longest
 from taichi_msm.physics.mesh_error import FEWEST, CubicSampling, MeshPilot, coarser, with_points
 from taichi_msm.physics.solver import Dynamics
-from taichi_msm.physics.timestep import steps_per_frame, with_steps, with_time
+from taichi_msm.physics.timestep import time_grid, with_time
 from taichi_msm.progress import Count
 from taichi_msm.scene import MAX_POINTS, Scene
 from taichi_msm.scenefile import budget
 from taichi_msm.study.result import Points, Timing
 from taichi_msm.system.runtime import Device
+from taichi_msm.timegrid import TimeGrid
 
 # How many times as many cells a side as the scene has.
 COARSER = (1 / 4, 1 / 2)
@@ -43,6 +44,7 @@ class _Trial:
     """One number of points, and what is known of it so far."""
 
     scene: Scene
+    grid: TimeGrid
     dynamics: Dynamics
     estimate: float = math.inf
     error: float = math.inf
@@ -114,14 +116,15 @@ class PointStudy:
     def _try(self, points: Lattice, opened: ExitStack) -> float:
         """Run so many points with their own step and the pilot that `run` has beside it; gives the seconds it takes."""
         scene = with_points(self._scene, points)
-        trial = _Trial(scene, Dynamics(scene, self._device))
+        grid = time_grid(scene)
+        trial = _Trial(scene, grid, Dynamics(scene, grid, self._device))
         opened.callback(trial.dynamics.close)
         coarse = coarser(scene)
         assert coarse is not None
         self._trials.append(trial)
         self._tick()
         trial.dynamics.compile()
-        with closing(MeshPilot(scene, coarse, self._device)) as pilot:
+        with closing(MeshPilot(scene, grid, coarse, self._device)) as pilot:
             pilot.compile()
             first = self._step_through(trial, pilot)
             trial.estimate = pilot.error
@@ -140,7 +143,7 @@ class PointStudy:
         if max(points) > MAX_POINTS:
             return None
         finer = with_points(scene, points)
-        work = [math.prod(one.sheet.points) * steps_per_frame(one) for one in (scene, finer)]
+        work = [math.prod(one.sheet.points) * time_grid(one).steps_per_frame for one in (scene, finer)]
         return None if seconds * work[1] / work[0] > longest_run or any(budget.problems(finer)) else finer
 
     def _measure_errors(self, finer: Scene | None) -> None:
@@ -150,19 +153,19 @@ class PointStudy:
             finer: the scene with more points yet, for the reference; None: they cannot be afforded.
         """
         finest = self._trials[-1].scene if finer is None else finer
-        steps = steps_per_frame(finest)
+        grid = time_grid(finest)
         with ExitStack() as opened:
             sheets = [trial.dynamics for trial in self._trials]
             if finer is not None:
-                sheets.append(opened.enter_context(closing(Dynamics(finer, self._device))))
+                sheets.append(opened.enter_context(closing(Dynamics(finer, grid, self._device))))
                 sheets[-1].compile()
             for sheet in sheets:
-                sheet.restart(with_steps(sheet.scene, steps))
+                sheet.restart(sheet.scene, grid)
             errors, own_error, largest = [0.0] * len(sheets), 0.0, 0.0
-            for _ in range(finest.time.frames):
+            for _ in range(grid.frames):
                 for sheet in sheets:
                     self._tick()
-                    sheet.advance(steps)
+                    sheet.advance(grid.steps_per_frame)
                 fields = [sheet.displacement() for sheet in sheets]
                 with np.errstate(all="ignore"):
                     exact, bound = _reference(fields)
@@ -184,13 +187,12 @@ class PointStudy:
 
     def _step_through(self, trial: _Trial, pilot: MeshPilot | None = None) -> float:
         """Step through the scene with its own step; returns the seconds of stepping alone."""
-        steps = steps_per_frame(trial.scene)
-        trial.dynamics.restart(trial.scene)
+        trial.dynamics.restart(trial.scene, trial.grid)
         seconds = 0.0
-        for _ in range(trial.scene.time.frames):
+        for _ in range(trial.grid.frames):
             self._tick()
             start = time.perf_counter()
-            trial.dynamics.advance(steps)
+            trial.dynamics.advance(trial.grid.steps_per_frame)
             seconds += time.perf_counter() - start
             displacement = trial.dynamics.displacement()
             if pilot is not None:
@@ -207,7 +209,7 @@ class PointStudy:
         return Points(
             rows=rows,
             cols=cols,
-            steps_per_frame=steps_per_frame(trial.scene),
+            steps_per_frame=trial.grid.steps_per_frame,
             error=trial.error if trial.error < math.inf else None,
             known=trial.known,
             estimate=trial.estimate if trial.estimate < math.inf else None,

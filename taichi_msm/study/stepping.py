@@ -6,7 +6,7 @@ import math
 import time
 from collections.abc import Iterator
 from contextlib import ExitStack
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -15,13 +15,14 @@ from numpy.typing import NDArray
 from taichi_msm.physics.divergence import farthest_displacement
 from taichi_msm.physics.error_control import longest
 from taichi_msm.physics.solver import Dynamics
-from taichi_msm.physics.timestep import stable_step, step, with_steps, with_time
+from taichi_msm.physics.timestep import stable_step, time_grid, with_time
 from taichi_msm.progress import Count
 from taichi_msm.scene import Scene
 from taichi_msm.study.result import Reference, Stepping, Timing
 from taichi_msm.system.runtime import Device
+from taichi_msm.timegrid import Precision
 
-PRECISIONS = ("f64", "f32")
+PRECISIONS: tuple[Precision, ...] = ("f64", "f32")
 DIFFERENCES = ("central", "backward")
 
 # Every setting is timed so often, all of them in turn.
@@ -40,7 +41,7 @@ Frames = NDArray[Any]
 class _Trial:
     """One setting, and what is known of it so far."""
 
-    precision: str
+    precision: Precision
     difference: str
     steps: int
     error: float = math.inf
@@ -64,6 +65,7 @@ class SteppingStudy:
 
     def __init__(self, scene: Scene, device: Device, longest_run: float, progress: Count) -> None:
         self.scene = scene
+        self._grid = time_grid(scene, device.arch)
         self.frames: Frames | None = None
         self.reference: Reference | None = None
         self._longest_run = longest_run
@@ -72,9 +74,9 @@ class SteppingStudy:
         self._done = 0
         self._to_do = 1
         with ExitStack() as opened:
-            self._dynamics: dict[str, Dynamics] = {}
+            self._dynamics: dict[Precision, Dynamics] = {}
             for precision in PRECISIONS:
-                dynamics = self._dynamics[precision] = Dynamics(with_time(scene, precision=precision), device)
+                dynamics = self._dynamics[precision] = Dynamics(scene, replace(self._grid, precision=precision), device)
                 opened.callback(dynamics.close)
             self._open = opened.pop_all()
 
@@ -161,11 +163,12 @@ class SteppingStudy:
                 if trial.error < math.inf and (dominated or not self.known(trial.error)):
                     going.discard(precision)
 
-    def _run(self, precision: str, difference: str, steps: int, samples: list[float]) -> Frames:
+    def _run(self, precision: Precision, difference: str, steps: int, samples: list[float]) -> Frames:
         """Step through the scene; appends the seconds of stepping alone to the samples."""
         dynamics = self._dynamics[precision]
-        dynamics.restart(with_steps(with_time(self.scene, precision=precision, damping_difference=difference), steps))
-        frames = np.empty((self.scene.time.frames, *self.scene.sheet.points, 3), precision.replace("f", "float"))
+        grid = replace(self._grid, precision=precision, steps_per_frame=steps)
+        dynamics.restart(with_time(self.scene, damping_difference=difference), grid)
+        frames = np.empty((grid.frames, *self.scene.sheet.points, 3), precision.replace("f", "float"))
         seconds = 0.0
         for frame in frames:
             self._progress(self._done, self._to_do)
@@ -178,13 +181,12 @@ class SteppingStudy:
         return frames
 
     def _point(self, trial: _Trial) -> Stepping:
-        made = with_steps(self.scene, trial.steps)
         finite = trial.error < math.inf
         return Stepping(
             precision=trial.precision,
             damping_difference=trial.difference,
             steps_per_frame=trial.steps,
-            step=step(made),
+            step=replace(self._grid, steps_per_frame=trial.steps).step,
             error=trial.error if finite else None,
             rounding=trial.rounding if finite else None,
             known=finite and self.known(trial.error),

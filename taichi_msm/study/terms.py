@@ -7,7 +7,7 @@ from collections.abc import Iterator
 from contextlib import ExitStack
 
 from taichi_msm.physics.solver import Dynamics
-from taichi_msm.physics.timestep import steps_per_frame, with_steps
+from taichi_msm.physics.timestep import time_grid
 from taichi_msm.progress import Count
 from taichi_msm.scene import Scene
 from taichi_msm.study.result import Term, Timing
@@ -28,6 +28,8 @@ class TermStudy:
 
     def __init__(self, scene: Scene, device: Device, sample: float, progress: Count) -> None:
         self._device = device
+        # The whole scene's for all variants: without a spring the largest stable step is another.
+        self._grid = time_grid(scene, device.arch)
         self._variants = dict(variants(scene))
         self._samples: dict[str, list[float]] = {name: [] for name in self._variants}
         self._sample = sample
@@ -39,7 +41,7 @@ class TermStudy:
             sheets: dict[str, Dynamics] = {}
             for name, scene in self._variants.items():
                 self._progress(0, len(self._variants))
-                sheets[name] = Dynamics(scene, self._device)
+                sheets[name] = Dynamics(scene, self._grid, self._device)
                 opened.callback(sheets[name].close)
                 sheets[name].compile()
             frames = self._frames(sheets[""])
@@ -47,7 +49,7 @@ class TermStudy:
                 for number, (name, scene) in enumerate(self._variants.items()):
                     self._progress(round_ * len(sheets) + number, ROUNDS * len(sheets))
                     # From rest, so that all variants step through the same stretch of the scene.
-                    sheets[name].restart(scene)
+                    sheets[name].restart(scene, self._grid)
                     self._samples[name].append(_step_seconds(sheets[name], frames))
 
     def points(self) -> list[Term]:
@@ -56,8 +58,8 @@ class TermStudy:
 
     def _frames(self, whole: Dynamics) -> int:
         """Count the frames that a measurement takes."""
-        seconds = _step_seconds(whole, 1) * steps_per_frame(whole.scene)
-        return max(1, min(whole.scene.time.frames, round(self._sample / seconds)))
+        seconds = _step_seconds(whole, 1) * self._grid.steps_per_frame
+        return max(1, min(self._grid.frames, round(self._sample / seconds)))
 
 
 # The terms of a sheet that can be left out, and what stands for them then.
@@ -72,9 +74,7 @@ TISSUE_TERMS: dict[str, float | None] = {
 
 
 def variants(scene: Scene) -> Iterator[tuple[str, Scene]]:
-    """Leave out one term after another, at the same step; the first variant is the whole scene."""
-    # Fixed, as without a spring the largest stable step is another.
-    scene = with_steps(scene, steps_per_frame(scene))
+    """Leave out one term after another; the first variant is the whole scene."""
     yield "", scene
     section, terms = ("springs", SPRING_TERMS) if scene.tissue is None else ("tissue", TISSUE_TERMS)
     sheet = getattr(scene, section)
@@ -90,7 +90,7 @@ def variants(scene: Scene) -> Iterator[tuple[str, Scene]]:
 
 def _step_seconds(dynamics: Dynamics, frames: int) -> float:
     """Give the time of one step [s]."""
-    steps = frames * steps_per_frame(dynamics.scene)
+    steps = frames * dynamics.grid.steps_per_frame
     start = time.perf_counter()
     dynamics.advance(steps)
     return (time.perf_counter() - start) / steps
