@@ -13,10 +13,11 @@ from pydantic import BaseModel
 from taichi_msm import reference
 from taichi_msm.physics.lattice import rest_positions
 from taichi_msm.physics.mesh_error import with_points
+from taichi_msm.physics.solver import Dynamics
 from taichi_msm.physics.timestep import stable_step, time_grid, with_time
 from taichi_msm.runner import run
 from taichi_msm.scene import Scene
-from taichi_msm.study import measure, pictures
+from taichi_msm.study import measure, pictures, terms
 from taichi_msm.study.peer import TooSlowError, solve
 from taichi_msm.study.pictures import PictureStudy
 from taichi_msm.study.points import ROUNDS as POINTS_ROUNDS
@@ -25,6 +26,7 @@ from taichi_msm.study.result import Drawn, Stepping, Study, Timing
 from taichi_msm.study.stepping import MARGIN, ROUNDS, SteppingStudy, observed_orders
 from taichi_msm.study.terms import TermStudy, variants
 from taichi_msm.system.runtime import Device
+from taichi_msm.timegrid import TimeGrid
 from tests.motion import frames_on, structure_of
 from tests.scenes import PRESS, SPRINGS, scene, speckle
 
@@ -160,6 +162,22 @@ def test_terms_are_left_out_of_the_kernel(device: Device) -> None:
     assert not shapes["damping"].damped
     assert len(shapes["probes.1"].slots_move) == 1
     assert list(dict(variants(scene(springs={}, damping=0, probes=[])))) == [""]
+
+
+def test_all_terms_are_timed_on_the_grid_of_the_whole_scene(device: Device, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Without a stiff spring `auto` would take longer steps, and maybe others in f64."""
+    grids = []
+
+    class Recorded(Dynamics):
+        def __init__(self, scene: Scene, grid: TimeGrid, device: Device) -> None:
+            grids.append(grid)
+            super().__init__(scene, grid, device)
+
+    monkeypatch.setattr(terms, "Dynamics", Recorded)
+    made = scene(time={"precision": "auto"})
+    TermStudy(made, device, 0.0001, nothing).run()
+    assert len(grids) == len(list(variants(made)))
+    assert set(grids) == {time_grid(made)} != {time_grid(variant) for _, variant in variants(made)}
 
 
 def test_terms_are_timed(device: Device) -> None:
