@@ -42,7 +42,7 @@ def time_grid(scene: Scene, arch: str = "cpu") -> TimeGrid:
     grid = TimeGrid(time.frames_per_second, time.frames, _steps_per_frame(scene), "f64")
     if time.precision != "auto":
         return replace(grid, precision=time.precision)
-    # On a GPU f64 is slow or missing; a tolerance needs it.
+    # A tolerance asks for f64. On a GPU it is slow or missing.
     in_f64 = arch == "cpu" and (time.tolerance is not None or is_small_in_f64(scene, grid))
     return grid if in_f64 else replace(grid, precision="f32")
 

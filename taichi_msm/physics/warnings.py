@@ -1,4 +1,4 @@
-"""What one should know before trusting the result of a run."""
+"""What to know before trusting the result of a run."""
 
 from __future__ import annotations
 
@@ -13,13 +13,14 @@ from taichi_msm.physics.run_progress import RunProgress
 from taichi_msm.scene import MAX_POINTS, Scene
 from taichi_msm.timegrid import TimeGrid
 
-# Down to this share of its rest length no spring shakes the limit of stability (see `material.highest_frequency`).
+# The stability limit holds while no spring is compressed below this share of its rest length (see
+# `material.highest_frequency`).
 SHORTEST = 0.5
 
-# Beyond so many times its rest length a spring is stretched more than any tissue.
+# No tissue can be stretched to more than this many times its rest length.
 LONGEST = 2.0
 
-# An error above this share of the largest displacement is told with what would help.
+# If an error is above this share of the largest displacement, a remedy is named.
 WRONG = 0.01
 
 
@@ -31,15 +32,15 @@ def notes(
     reason: str = "",
     mesh_error: float | None = None,
 ) -> Iterator[str]:
-    """Say what is remarkable about a run, one line each.
+    """Say what is remarkable about a run, each in a line.
 
     Args:
         scene: what was run.
         grid: the steps that were taken.
         progress: of the last frame.
-        estimate: of the error, if there is one.
-        reason: why there is none.
-        mesh_error: of the number of points, if it was estimated; infinite: not known.
+        estimate: of the error; None: there is none.
+        reason: why there is no estimate.
+        mesh_error: error that the number of points makes; None: not estimated, infinite: not known.
     """
     if estimate is not None:
         yield error(estimate, mesh_error)
@@ -86,7 +87,7 @@ def error(estimate: Estimate, mesh_error: float | None = None) -> str:
 
 
 def _remedy(scene: Scene, grid: TimeGrid, estimate: Estimate) -> str:
-    """Say what would make it less wrong."""
+    """Say what would reduce the error."""
     said = []
     if estimate.rounding > WRONG / 2:
         said.append("time.precision: f64")

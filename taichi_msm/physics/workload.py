@@ -1,7 +1,7 @@
 """How much work a run is, and what follows from it: whether f64 is cheap enough for `auto`, and whether a pilot is.
 
-Counted in steps of one point in f32, by the scene alone, so that every machine decides alike; one takes 1 to 2 ns on
-two cores of 2024.
+The unit of work is a step of one point in f32, which takes 1 to 2 ns on two cores of 2024. It is counted from the scene
+alone, so that the decisions are the same on every machine.
 """
 
 from __future__ import annotations
@@ -13,31 +13,31 @@ from taichi_msm.physics.material import material
 from taichi_msm.scene import Scene
 from taichi_msm.timegrid import TimeGrid
 
-# Starting Python, Taichi and the kernels.
+# Work of starting Python and Taichi and of compiling the kernels.
 START = 4e8
 
-# A step of a point in f64.
+# Work of a step of a point in f64.
 DOUBLE = 2.0
 
-# What a control point that moves and bending add to a step, as shares of it.
+# Additional work of a step for a moving control point and for bending, relative to the step without them.
 MOVING, BENDING = 1.2, 1.0
 
-# Encoding a pixel, and drawing a sample of it.
+# Work of encoding a pixel, and of drawing one of its samples.
 ENCODING, SAMPLE = 40.0, 6.0
 
-# Stepping in f64 is a small part of a run up to this share of all else.
+# Stepping in f64 is a small part of a run if it takes at most this share of the time of everything else.
 SMALL = 0.25
 
-# Without a tolerance, a pilot is run only where it takes at most this share of the run.
+# Unless it is asked for, a pilot is run only if it takes at most this share of the run.
 MOST_FOR_PILOT = 1 / 3
 
 
 def is_small_in_f64(scene: Scene, grid: TimeGrid) -> bool:
-    """Tell whether stepping in f64 is a small part of a run, so that the precision `auto` takes it.
+    """Tell whether stepping in f64 is a small part of a run, so that `auto` chooses it.
 
     Args:
         scene: a checked scene.
-        grid: its steps, whatever their precision.
+        grid: its steps; their precision does not matter.
     """
     return DOUBLE * _steps(scene, grid) <= SMALL * _other(scene)
 
@@ -48,10 +48,10 @@ def affords_pilot(scene: Scene, grid: TimeGrid, ratio: int) -> bool:
     Args:
         scene: a checked scene.
         grid: its steps.
-        ratio: how many times as many steps the pilot takes.
+        ratio: steps of the pilot for each step of the run.
     """
     steps = _steps(scene, grid)
-    # With tissue there are two with a quarter and a sixteenth of the points besides.
+    # For tissue there are two further pilots, with a quarter and a sixteenth of the points.
     coarse = 0.0 if scene.tissue is None else DOUBLE * steps * 5 / 16
     if grid.precision == "f64":
         own, pilot = DOUBLE * steps, DOUBLE * ratio * steps + coarse
@@ -61,13 +61,13 @@ def affords_pilot(scene: Scene, grid: TimeGrid, ratio: int) -> bool:
 
 
 def _steps(scene: Scene, grid: TimeGrid) -> float:
-    """Count the steps of points, each by what it costs."""
+    """Count the work of stepping in f32."""
     moving = sum(slot.moves for slot in probe_slots(scene.probes, scene.sheet, grid.step))
     cost = 1 + MOVING * moving + BENDING * (material(scene).bending > 0)
     return cost * grid.steps * math.prod(scene.sheet.points)
 
 
 def _other(scene: Scene) -> float:
-    """Count the work beside stepping."""
+    """Count the work of everything but stepping."""
     pixels = (scene.time.frames + 1) * math.prod(scene.render.size) if scene.draws else 0
     return START + pixels * (ENCODING + SAMPLE * scene.render.supersample**2)
