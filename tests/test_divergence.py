@@ -174,8 +174,8 @@ def test_a_force_that_is_too_strong_is_named(device: Device) -> None:
     found = diagnosed(made, device)
     assert re.fullmatch(
         r"diverged at 0\.1\d* s, step \d+: point \(4, 5\) is [.\d]+ m from its rest position, and the sheet is 0\.4 m "
-        r"long; likely cause: probes\.1\.force, which reaches 454 N at this point; take less, as it diverges with every "
-        r"time\.step that was tried, down to [-.\de]+ s",
+        r"long; likely cause: probes\.1\.force, which reaches 454 N at this point; take less, as it diverges with "
+        r"every time\.step that was tried, down to [-.\de]+ s",
         found.message,
     )
     # The step named is the first: one less is fine, and it is not.
@@ -208,7 +208,9 @@ def test_a_machine_that_makes_errors_is_told_of(device: Device) -> None:
 
     made = pressed()
     found = diagnosed(made, device, flip)
-    assert found.message.endswith("but not when it was repeated, so the machine has made an error; continue with --resume")
+    assert found.message.endswith(
+        "but not when it was repeated, so the machine has made an error; continue with --resume"
+    )
     assert found.good
     assert found.good.progress.frame == 1, "where it was saved"
     with Simulation(made, threads=device.threads) as simulation:

@@ -428,7 +428,7 @@ def test_a_run_does_not_go_on_with_another_map(load: Any, tmp_path: Path, device
 
     run(made, tmp_path / "out", threads=device.threads, progress=stop_at_the_second_frame)
     Image.new("L", (3, 3), 99).save(tmp_path / "map.png")
-    with pytest.raises(FilesError, match=r"map.png is another map than when the run began"):
+    with pytest.raises(FilesError, match=r"map.png has changed since the run began"):
         resume(tmp_path / "out", threads=device.threads)
 
 

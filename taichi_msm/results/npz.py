@@ -1,4 +1,4 @@
-"""Arrays in .npz files: written piece by piece, and read without trusting what the file says of itself."""
+"""Arrays in .npz files: written piece by piece, and read without trusting the file's own headers."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ import numpy as np
 from numpy.lib import format as npy
 from numpy.typing import DTypeLike, NDArray
 
-# Zip files bear dates; this one, the earliest there is, makes equal arrays equal files.
+# Zip files contain dates. A fixed one, the earliest possible, makes files of equal arrays equal.
 EPOCH = (1980, 1, 1, 0, 0, 0)
 
 Shape = tuple[int, ...]
@@ -26,9 +26,9 @@ def write_array(
     Args:
         archive: open for writing.
         name: of the array.
-        dtype: of its numbers.
+        dtype: of the numbers.
         shape: of the array.
-        parts: its bytes in C order, in any number of pieces.
+        parts: the bytes of the array in C order, in any number of pieces.
     """
     with archive.open(zipfile.ZipInfo(f"{name}.npy", EPOCH), "w", force_zip64=True) as entry:
         entry.write(_header(dtype, shape))
@@ -42,16 +42,16 @@ def read_array(archive: zipfile.ZipFile, name: str, dtype: DTypeLike, shape: Sha
     Args:
         archive: open for reading.
         name: of the array.
-        dtype: what its numbers must be.
-        shape: what it must be.
+        dtype: that the numbers must have.
+        shape: that the array must have.
 
     Raises:
-        ValueError: when it is another, before any memory is taken for it.
-        Exception: whatever `zipfile` raises for an archive that is damaged.
+        ValueError: when dtype or shape differ; raised before memory is allocated for the array.
+        Exception: whatever `zipfile` raises for a damaged archive.
     """
     header, info = _header(dtype, shape), archive.getinfo(f"{name}.npy")
     size = len(header) + math.prod(shape) * np.dtype(dtype).itemsize
-    # What is compressed may be of any size, whatever the archive says.
+    # Compressed data might expand to any size, whatever the archive says.
     if info.compress_type != zipfile.ZIP_STORED or (info.file_size, info.compress_size) != (size, size):
         raise ValueError(name)
     # Checks the CRC-32.

@@ -1,4 +1,4 @@
-"""What a scene will need, before anything is computed."""
+"""The steps, memory and disk space that a scene needs, estimated before anything is computed."""
 
 from __future__ import annotations
 
@@ -21,35 +21,36 @@ from taichi_msm.timegrid import TimeGrid
 
 MAX_STEPS = 10**12
 
-# Bytes of the parts of a drawing.
-POINT_BYTES = 36  # a mass point, as it is seen, and its normal
-SAMPLE_BYTES = 32  # what is kept of a sample at most
-BAND_ROWS = 16  # rows of samples that a thread keeps at a time
-PIXEL_BYTES = 3 * 12  # colours of one pixel, from sums to bytes
-PICTURE_PIXEL_BYTES = 20  # of the file, while it is decoded and converted; its texture takes less
+# Memory for drawing [bytes].
+POINT_BYTES = 36  # per mass point: its projection and its normal
+SAMPLE_BYTES = 32  # per sample, at most
+BAND_ROWS = 16  # rows of samples that a thread holds at a time
+PIXEL_BYTES = 3 * 12  # per pixel of the frame: its colours, from sums to bytes
+PICTURE_PIXEL_BYTES = 20  # per pixel of the picture's file, while it is decoded and converted; its texture takes less
 
-# Bytes of a pixel in a file.
+# Size of a pixel in a file [bytes].
 PIXEL_FILE_BYTES = {"png": 2, "gif": 1}
 
-# Numbers for each mass point: displacement and difference; and the copies made at the start and for output.
+# Numbers per mass point: displacement and difference; with a map, the stiffness of three springs and what it is made
+# from; and the copies made at the start and for output.
 STATE_NUMBERS = 6
-MAP_NUMBERS = 6  # the stiffness of three springs, and what it is made from
+MAP_NUMBERS = 6
 OUTPUT_NUMBERS = 15
 
 
 @dataclass(frozen=True)
 class Budget:
-    """What a scene will need.
+    """What a scene needs.
 
     Attributes:
-        points: mass points.
-        steps: time steps in all.
-        frames: frames in all, the one at rest included.
+        points: number of mass points.
+        steps: number of time steps in all.
+        frames: number of frames in all, including that at rest.
         simulation_bytes: memory for the state of the sheet and its output.
-        drawing_bytes: memory for a frame and the texture; 0 where nothing is drawn.
-        picture_bytes: size of the files with pictures, about.
+        drawing_bytes: memory for a frame and the texture; 0 if nothing is drawn.
+        picture_bytes: approximate size of the files with pictures.
         trajectory_bytes: size of the trajectory.
-        working_bytes: disk space that is taken besides until the run ends.
+        working_bytes: additional disk space that is used until the run ends.
     """
 
     points: int
@@ -63,7 +64,7 @@ class Budget:
 
     @property
     def memory_bytes(self) -> int:
-        """Memory in use at one time. Trajectories do not count: they are streamed to disk."""
+        """Memory in use at one time. Trajectories do not count, because they are streamed to disk."""
         return self.simulation_bytes + self.drawing_bytes
 
     @property
@@ -73,13 +74,13 @@ class Budget:
 
 
 def estimate(scene: Scene, grid: TimeGrid) -> Budget:
-    """Estimate what the scene will need with the steps of a grid."""
+    """Estimate what a scene needs with the steps of a grid."""
     rows, cols = scene.sheet.points
     points, number_bytes = rows * cols, 4 if grid.precision == "f32" else 8
     frames, pixels = grid.frames + 1, math.prod(scene.render.size)
     positions = frames * points * 3 * number_bytes
     numbers = STATE_NUMBERS + OUTPUT_NUMBERS + len(scene.probes) + (MAP_NUMBERS if scene.stiffness_map else 0)
-    # A pilot is up to two more sheets, in f64; with tissue there are two smaller ones.
+    # Pilots are up to two more sheets in f64; with tissue also two smaller ones.
     pilot = scene.time.tolerance is not None or affords_pilot(scene, grid, 2)
     sheets = number_bytes + (8 * (2 + (scene.tissue is not None) * 5 / 16) if pilot else 0)
     return Budget(
@@ -90,27 +91,27 @@ def estimate(scene: Scene, grid: TimeGrid) -> Budget:
         drawing_bytes=drawing_bytes(scene) if scene.draws else 0,
         picture_bytes=frames * sum(pixels * PIXEL_FILE_BYTES.get(kind, 0) for kind in set(scene.output)),
         trajectory_bytes=positions if "trajectory" in scene.output else 0,
-        # Two of the states with which a run can go on, and all its positions.
+        # Two saved states from which the run could continue, and all positions so far.
         working_bytes=2 * points * STATE_NUMBERS * number_bytes + (positions if scene.output else 0),
     )
 
 
 def problems(scene: Scene) -> Iterator[Problem]:
-    """Say what makes the scene too large, with the numbers and the key to change."""
+    """Find what makes a scene too large, with the numbers and the key to change."""
     grid = time_grid(scene)
     yield from _step_problems(scene, grid)
     yield from _memory_problems(scene, estimate(scene, grid))
 
 
 def require_disk(scene: Scene, directory: Path) -> None:
-    """Make sure that there is room for the results.
+    """Make sure that the disk has room for the results.
 
     Args:
         scene: a checked scene.
-        directory: where they are to go; it may not be there yet.
+        directory: of the results; it need not exist yet.
 
     Raises:
-        SceneError: when there is not, with the numbers and the key to change.
+        SceneError: when there is too little room; has the numbers and the key to change.
     """
     budget, free = estimate(scene, time_grid(scene)), _free_disk(directory)
     needed = budget.disk_bytes + budget.working_bytes
@@ -132,10 +133,10 @@ def require_disk(scene: Scene, directory: Path) -> None:
 
 
 def drawing_bytes(scene: Scene) -> int:
-    """Estimate the memory for drawing a frame [bytes], whether the scene's output asks for it or not."""
+    """Estimate the memory for drawing a frame [bytes], even if the scene's output has no pictures."""
     rows, cols = scene.sheet.points
     width, height = scene.render.size
-    # The whole picture is decoded, whatever the region.
+    # The whole picture is decoded, even if only a region of it is used.
     picture = math.prod(texture.image_size(scene) or (0,))
     factor = scene.render.supersample
     band_rows = min(height * factor, BAND_ROWS * (os.cpu_count() or 1))
@@ -174,7 +175,7 @@ def _memory_problems(scene: Scene, budget: Budget) -> Iterator[Problem]:
 
 
 def _free_disk(directory: Path) -> int:
-    """Tell how much may be written to a directory [bytes]; sys.maxsize where the system does not tell."""
+    """Give the free disk space for a directory [bytes]; sys.maxsize if the system does not report it."""
     for path in (directory, *directory.absolute().parents):
         try:
             return shutil.disk_usage(path).free

@@ -1,4 +1,4 @@
-"""Work and precision of the stepping: every precision and damping difference, from the largest stable step down."""
+"""Work and precision of stepping: every precision and damping difference, from the largest stable step downwards."""
 
 from __future__ import annotations
 
@@ -25,13 +25,13 @@ from taichi_msm.timegrid import Precision
 PRECISIONS: tuple[Precision, ...] = ("f64", "f32")
 DIFFERENCES = ("central", "backward")
 
-# Every setting is timed so often, all of them in turn.
+# How many times every setting is timed; all settings take turns.
 ROUNDS = 5
 
-# An error is known when the reference is so many times more exact.
+# An error counts as known if it is at least this many times that of the reference.
 MARGIN = 20
 
-# The steps of a series below the largest stable one, whatever they cost.
+# How many times the largest stable step is halved at least, whatever it costs.
 LEAST_HALVINGS = 2
 
 Frames = NDArray[Any]
@@ -39,7 +39,7 @@ Frames = NDArray[Any]
 
 @dataclass
 class _Trial:
-    """One setting, and what is known of it so far."""
+    """One setting, and what is known about it so far."""
 
     precision: Precision
     difference: str
@@ -55,12 +55,12 @@ class SteppingStudy:
     Args:
         scene: a checked scene.
         device: what `runtime.start` returned.
-        longest_run: a run is to take no longer than about this [s].
-        progress: called with the runs done and the runs in all; may raise KeyboardInterrupt, which leaves what is done.
+        longest_run: approximate time that a run may take [s].
+        progress: called with the runs done and the runs in all; may raise KeyboardInterrupt: what is done is kept.
 
     Attributes:
         frames: displacements of the reference at every frame but the first [m], shape (F, rows, cols, 3).
-        reference: what is known of it.
+        reference: the facts about it.
     """
 
     def __init__(self, scene: Scene, device: Device, longest_run: float, progress: Count) -> None:
@@ -81,7 +81,7 @@ class SteppingStudy:
             self._open = opened.pop_all()
 
     def run(self) -> None:
-        """Make the reference, then the errors, then the times."""
+        """Compute the reference, then the errors, then measure the times."""
         for dynamics in self._dynamics.values():
             self._progress(0, self._to_do)
             dynamics.compile()
@@ -97,12 +97,12 @@ class SteppingStudy:
                 self._run(trial.precision, trial.difference, trial.steps, trial.samples)
 
     def points(self) -> list[Stepping]:
-        """Give what is known so far, in the order of methods and of falling steps."""
+        """Give the results so far, ordered by method and by falling step."""
         ordered = sorted(self._trials, key=lambda one: (one.precision, one.difference != "central", one.steps))
         return [self._point(trial) for trial in ordered if trial.samples]
 
     def relative(self, frames: Frames) -> float:
-        """Give the largest error of frames against the reference, as a fraction of the largest displacement."""
+        """Give the largest error of frames relative to the reference, as a fraction of the largest displacement."""
         assert self.frames is not None
         assert self.reference is not None
         return longest(frames - self.frames) / self.reference.largest if self.reference.largest > 0 else 0.0
@@ -117,7 +117,7 @@ class SteppingStudy:
         self._open.close()
 
     def _series(self, difference: str) -> Iterator[int]:
-        """Count the steps a frame, from the largest stable step down by halvings to what may be afforded."""
+        """Give the steps per frame of a series: of the largest stable step, doubled until a run would take too long."""
         limit = stable_step(with_time(self.scene, damping_difference=difference))
         steps = max(1, math.ceil(1 / self.scene.time.frames_per_second / limit * (1 - 1e-12)))
         samples: list[float] = []
@@ -131,7 +131,7 @@ class SteppingStudy:
     def _make_reference(self, finest: int) -> None:
         """Extrapolate central differences from steps well below the finest that is measured.
 
-        u* = u_{h/2} + (u_{h/2} - u_h) / 3; its error is at most about its distance from the same at twice the step.
+        u* = u_{h/2} + (u_{h/2} - u_h) / 3. Its error is at most about its distance from the same with 2 h for h.
         """
         coarse, middle, fine = (self._run("f64", "central", finest * 2**halving, []) for halving in range(3))
         before = middle + (middle - coarse) / 3
@@ -141,7 +141,7 @@ class SteppingStudy:
         self.reference = Reference(4 * finest, error, largest)
 
     def _measure_errors(self, difference: str, counts: list[int]) -> None:
-        """Run every step once, in f32 until rounding dominates and in f64 until the reference is not exact enough."""
+        """Run every step once: in f32 until rounding dominates, in f64 until the reference is not exact enough."""
         assert self.reference is not None
         going = set(PRECISIONS)
         for steps in counts:
@@ -164,7 +164,7 @@ class SteppingStudy:
                     going.discard(precision)
 
     def _run(self, precision: Precision, difference: str, steps: int, samples: list[float]) -> Frames:
-        """Step through the scene; appends the seconds of stepping alone to the samples."""
+        """Step through the scene, and append the time of stepping alone [s] to the samples."""
         dynamics = self._dynamics[precision]
         grid = replace(self._grid, precision=precision, steps_per_frame=steps)
         dynamics.restart(with_time(self.scene, damping_difference=difference), grid)
@@ -195,7 +195,7 @@ class SteppingStudy:
 
 
 def observed_orders(points: list[Stepping]) -> dict[str, float | None]:
-    """Fit the order of every method over the points where the step, and not rounding, makes the error."""
+    """Fit the order of every method over the points where the error comes from the step, not from rounding."""
     orders: dict[str, float | None] = {}
     for method in dict.fromkeys(point.method for point in points):
         fit = [
