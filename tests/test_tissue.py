@@ -204,14 +204,14 @@ def test_where_the_tool_lets_go_a_tense_sheet_comes_back(load: Any, device: Devi
     assert left() > 0.05, "without tension a flat sheet has no stiffness out of its plane"
 
 
-BOTH = "tissue says already how stiff the sheet is; remove springs or tissue"
+BOTH = "tissue already gives the stiffness of the sheet; remove springs or tissue"
 NO_MASS = "tissue has the mass of density x thickness x area; remove mass"
 DRAG = "0.1 N s/m is per point; with tissue set tissue.damping, in 1/s"
-PER_POINT = "is per point, and more points would dent tissue otherwise; set total, the whole tool's, in newtons"
+PER_POINT = "is per point, so that more points would be pressed deeper; set total, of the whole tool, in newtons"
 LONG = "[13, 40] make cells 3.25 times as long as wide, and tissue allows 1.73 times; try [24, 40]"
 WIDE = "[40, 13] make cells 3.25 times as long as wide, and tissue allows 1.73 times; try [40, 24]"
 OPEN = "1 N/m needs every side fixed; set sheet.fixed: border, or pretension: 0"
-TIGHT = "90 N/m leaves springs no length; take less than 90 N/m, or more young"
+TIGHT = "90 N/m needs springs without length; take less than 90 N/m, or a larger young"
 NO_MAP = "no such file or directory; name a picture that can be read"
 SIZE = (
     "sheet.points: [13, 15] make cells 1.17e+05 times as long as wide, and tissue allows 1.73 times; "
@@ -400,7 +400,7 @@ def test_a_run_says_what_its_tool_and_its_points_do(load: Any, device: Device, t
 def test_a_run_that_stretches_too_far_says_so(load: Any, device: Device, tmp_path: Path) -> None:
     record = run(load("probes.0.total=[0, 0, -60]", "tissue.foundation=0"), tmp_path / "out", threads=device.threads)
     assert record["longest_spring"] > 2
-    assert any("times its length, which no tissue bears" in note for note in record["notes"])
+    assert any("times its rest length, which no tissue withstands" in note for note in record["notes"])
 
 
 def test_a_run_with_a_map_goes_on_from_elsewhere(

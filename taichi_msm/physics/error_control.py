@@ -301,7 +301,7 @@ def _out_of_reach(tolerance: float, failures: list[Estimate]) -> str:
     if best.error == math.inf:
         return (
             f"time.tolerance: {tolerance:g} is out of reach: with {last.steps_per_frame} steps a frame the error is "
-            "not known yet, as runs diverge or a step is longer than the damping; take a weaker load or less damping"
+            "not known, as runs diverge or steps do not resolve the damping; take a weaker load or less damping"
         )
     if last.rounding > CLOSE * tolerance:
         return (
@@ -313,5 +313,5 @@ def _out_of_reach(tolerance: float, failures: list[Estimate]) -> str:
         remedy += f", or a tolerance of {_above(best.error):g}"
     return (
         f"time.tolerance: {tolerance:g} is out of reach: with {last.steps_per_frame} steps a frame the error is still "
-        f"{last.error:.2g}, and it hardly falls any more; {remedy}"
+        f"{last.error:.2g}, and finer steps hardly reduce it; {remedy}"
     )

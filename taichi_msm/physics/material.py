@@ -257,14 +257,14 @@ def _kind_problems(scene: Scene) -> Iterator[Problem]:
             yield Problem(("sheet", "tolerance"), said)
         return
     if scene.springs is not None:
-        yield Problem(("springs",), "tissue says already how stiff the sheet is; remove springs or tissue")
+        yield Problem(("springs",), "tissue already gives the stiffness of the sheet; remove springs or tissue")
     if sheet.mass is not None:
         yield Problem(("sheet", "mass"), "tissue has the mass of density x thickness x area; remove mass")
     if scene.damping:
         yield Problem(("damping",), f"{scene.damping:g} N s/m is per point; with tissue set tissue.damping, in 1/s")
     for index, probe in enumerate(scene.probes):
         if probe.force is not None:
-            said = "is per point, and more points would dent tissue otherwise; set total, the whole tool's, in newtons"
+            said = "is per point, so that more points would be pressed deeper; set total, of the whole tool, in newtons"
             yield Problem(("probes", index, "force"), said)
 
 
@@ -299,5 +299,8 @@ def _tissue_problems(scene: Scene, *, has_map: bool) -> Iterator[Problem]:
         softest = float(factors(scene).min()) if has_map else 1.0
         most = 1.5 * tissue.young * tissue.thickness * softest
         if tissue.pretension >= most:
-            said = f"{tissue.pretension:g} N/m leaves springs no length; take less than {most:.3g} N/m, or more young"
-            yield Problem(("tissue", "pretension"), said)
+            yield Problem(
+                ("tissue", "pretension"),
+                f"{tissue.pretension:g} N/m needs springs without length; take less than {most:.3g} N/m, or a larger "
+                "young",
+            )

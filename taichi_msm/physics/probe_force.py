@@ -170,6 +170,6 @@ def notes(scene: Scene, records: Sequence[ProbeRecord]) -> Iterator[str]:
         asked = math.hypot(*probe.total) if probe.total is not None else 0.0
         if asked > 0 and not LEAST_REACHING < record["total_force"] / asked < 1 / LEAST_REACHING:
             yield (
-                f"probes.{index}: {record['total_force']:.3g} N of its {asked:.3g} N reach the sheet; is it beside it, "
-                "wider than the sheet, or narrower than a cell?"
+                f"probes.{index}: {record['total_force']:.3g} N of its {asked:.3g} N reach the sheet; is the tool "
+                "beside the sheet, wider than the sheet, or narrower than a cell?"
             )

@@ -59,8 +59,8 @@ def notes(
         yield "nothing moved: does a probe press where and when it should?"
     if progress.longest_spring > LONGEST:
         yield (
-            f"a spring was stretched to {progress.longest_spring:.2g} times its length, which no tissue bears: press "
-            "less, or with a wider tool"
+            f"a spring was stretched to {progress.longest_spring:.2g} times its rest length, which no tissue "
+            "withstands: press less, or with a wider tool"
         )
     if progress.shortest_spring < SHORTEST:
         yield (
@@ -78,7 +78,7 @@ def notes(
 def error(estimate: Estimate, mesh_error: float | None = None) -> str:
     """Say how wrong a run is."""
     if estimate.error == math.inf:
-        return "error not known: a pilot run diverged, or a step is longer than the damping"
+        return "error not known: a pilot run diverged, or steps do not resolve the damping"
     parts = f"step {estimate.in_f64:.1g}" + (f", rounding {estimate.rounding:.1g}" if estimate.rounding else "")
     if mesh_error is None:
         return f"error {estimate.error:.1g} of the largest displacement ({parts})"

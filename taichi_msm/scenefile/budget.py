@@ -126,7 +126,7 @@ def require_disk(scene: Scene, directory: Path) -> None:
     size, key, name = max(parts)
     said = (
         f"{budget.frames} frames need {_in_words(needed)} on disk, {_in_words(size)} of it for {name}, but "
-        f"{_in_words(free)} is free for {directory}; take less, fewer time.frames_per_second, less output or "
+        f"{_in_words(free)} is free for {directory}; reduce it, time.frames_per_second or output, or choose "
         "another --out"
     )
     raise SceneError([f"{key}: {said}"])
@@ -170,7 +170,7 @@ def _memory_problems(scene: Scene, budget: Budget) -> Iterator[Problem]:
     yield Problem(
         key,
         f"the scene needs {_in_words(budget.memory_bytes)} of memory, {_in_words(size)} of it for {name}, "
-        f"but {_in_words(available)} is free; take less",
+        f"but {_in_words(available)} is free; reduce it",
     )
 
 
