@@ -9,9 +9,11 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from taichi_msm.errors import ArgumentError, DeviceError, DivergedError, FilesError, MsmError, SceneError
+    from taichi_msm.playback import Playback
+    from taichi_msm.render.labels import Flow, Labels, Sight
     from taichi_msm.render.surface import Surface
     from taichi_msm.runner import resume, run
-    from taichi_msm.scene import Camera, Probe, Render, Scene, Sheet, Springs, Time
+    from taichi_msm.scene import Camera, Instrument, Light, Probe, Render, Scene, Sheet, Springs, Time
     from taichi_msm.scenefile.load import load_scene
     from taichi_msm.simulation import Simulation
 
@@ -21,7 +23,9 @@ _HOMES = {
     **dict.fromkeys(
         ("ArgumentError", "DeviceError", "DivergedError", "FilesError", "MsmError", "SceneError"), "errors"
     ),
-    **dict.fromkeys(("Camera", "Probe", "Render", "Scene", "Sheet", "Springs", "Time"), "scene"),
+    **dict.fromkeys(("Camera", "Instrument", "Light", "Probe", "Render", "Scene", "Sheet", "Springs", "Time"), "scene"),
+    **dict.fromkeys(("Flow", "Labels", "Sight"), "render.labels"),
+    "Playback": "playback",
     "Simulation": "simulation",
     "Surface": "render.surface",
     "load_scene": "scenefile.load",
@@ -34,12 +38,18 @@ __all__ = [
     "DeviceError",
     "DivergedError",
     "FilesError",
+    "Flow",
+    "Instrument",
+    "Labels",
+    "Light",
     "MsmError",
+    "Playback",
     "Probe",
     "Render",
     "Scene",
     "SceneError",
     "Sheet",
+    "Sight",
     "Simulation",
     "Springs",
     "Surface",

@@ -20,7 +20,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from taichi_msm import __version__
-from taichi_msm.errors import DeviceError, FilesError, SceneError, printable
+from taichi_msm.errors import DeviceError, FilesError, NotInstalledError, SceneError, printable
 from taichi_msm.system.signals import Interruption
 from taichi_msm.system.streams import mute, tell
 
@@ -30,6 +30,9 @@ if TYPE_CHECKING:
 DONE, BUG, WRONG_INPUT, DIVERGED, FILES = 0, 1, 2, 3, 4
 # What may be typed beside --resume.
 RESUMABLE = ("resume", "threads", "quiet", "as_json")
+
+# What results can be converted to.
+FORMATS = ("kitti", "tapvid", "vtk", "gltf", "obj")
 
 EXIT_CODES = {"complete": DONE, "diverged": DIVERGED}
 
@@ -345,6 +348,45 @@ def view(
     return DIVERGED if record is not None and session.fault else DONE
 
 
+@program.command()
+@click.argument("directory", metavar="DIR")
+@click.option(
+    "--format",
+    "name",
+    type=click.Choice(FORMATS),
+    metavar="FORMAT",
+    required=True,
+    help="kitti: optical flow; tapvid: tracks of points; vtk: for ParaView; gltf: for Blender and browsers; "
+    "obj: for other programs with surfaces.",
+)
+@click.option("--out", metavar="DIR2", help="Directory for the files.  [default: DIR/export-FORMAT]")
+@click.option("--quiet", is_flag=True, help="No progress and no summary.")
+@json_option
+def export(directory: str, name: str, out: str | None, quiet: bool, as_json: bool) -> int:
+    """Convert the results of a run, in DIR, to files of other programs."""
+    run = result_directory(directory, option="DIR")
+    folder = without_link(run / f"export-{name}", "--out") if out is None else result_directory(out)
+
+    from taichi_msm.console import Progress
+    from taichi_msm.export.convert import convert
+
+    interruption = Interruption()
+    with Progress(quiet=quiet or as_json) as bar:
+        try:
+            done = convert(run, name, folder, partial(interruptible(bar, interruption), "export"))
+        except KeyboardInterrupt:
+            report("interrupted", ["interrupted; nothing was written"], as_json)
+            return interruption.code
+    if as_json:
+        print_json({"directory": str(folder), "format": name, **done._asdict()})
+    elif not quiet:
+        files = done.files[0] if len(done.files) == 1 else f"{len(done.files)} files"
+        click.echo(printable(f"{folder}: {files}"))
+        for note in done.notes:
+            click.echo(printable(note))
+    return DONE
+
+
 def unfinished(context: click.Context, directory: str) -> Path:
     """Make sure that there is a run to resume in a directory, and that no other scene or settings were typed."""
     for option in context.command.params:
@@ -464,7 +506,7 @@ def _run(words: list[str]) -> tuple[int, Sequence[str]]:
         raise BrokenPipeError from None
     except SceneError as error:
         return WRONG_INPUT, error.lines
-    except DeviceError as error:
+    except (DeviceError, NotInstalledError) as error:
         return WRONG_INPUT, [str(error)]
     except FilesError as error:
         return FILES, [str(error)]

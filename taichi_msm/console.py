@@ -30,6 +30,7 @@ STAGES = {
     "terms": "measuring every term",
     "write": "writing",
     "film": "filming",
+    "export": "exporting",
 }
 
 

@@ -48,6 +48,10 @@ class DeviceError(MsmError):
     """The arch or thread count asked for cannot be had."""
 
 
+class NotInstalledError(MsmError):
+    """A package that is needed only for what was asked for is not installed; the message says how to install it."""
+
+
 class ArgumentError(MsmError, ValueError):
     """An argument of a call is wrong; the message names it, its value and what it may be."""
 

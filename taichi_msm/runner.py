@@ -30,6 +30,7 @@ from taichi_msm.physics.timestep import stable_step, time_grid, with_grid
 from taichi_msm.physics.warnings import notes
 from taichi_msm.physics.workload import ENCODING, affords_pilot
 from taichi_msm.progress import Progress
+from taichi_msm.render.labels import Observed
 from taichi_msm.render.texture import load_texture
 from taichi_msm.results.manifest import Manifest, digest, map_digest, read_manifest
 from taichi_msm.results.record import RunRecord
@@ -238,6 +239,7 @@ def _carry_out(
                 for one in pilots:
                     one.follow(writer.position(frame) - rest, partial(progress, "pilot", frame, frames))
                 watch.lap("pilot")
+            observed = Observed()
             for frame in range(writer.frames, frames):
                 progress("frames", frame, frames)
                 watch.lap("hand over")
@@ -245,9 +247,9 @@ def _carry_out(
                     simulation.advance(pause=pause)
                 watch.lap("simulate")
                 position = writer.position(frame) if frame < resumed else simulation.positions()
-                picture = simulation.draw(positions=position) if scene.draws else None
+                observed = simulation.observe(observed.labels, position, frame / scene.time.frames_per_second)
                 watch.lap("render")
-                writer.add(position, picture, partial(progress, "frames", frame, frames))
+                writer.add(position, observed, partial(progress, "frames", frame, frames))
                 watch.lap("hand over")
                 for one in pilots if frame > 0 else ():
                     one.follow(position - rest, partial(progress, "frames", frame, frames))

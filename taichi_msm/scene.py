@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal, get_args
 
 from pydantic import (
     BaseModel,
@@ -26,6 +26,8 @@ MAX_POINTS = 4096
 MAX_PROBES = 16
 MAX_PIXELS = 8192
 MAX_REFINE = 64
+MAX_TRACKS = 256
+MAX_RELIEF = 10
 
 # Systems have a limit near this for the path of a file.
 MAX_PATH = 4096
@@ -49,10 +51,20 @@ Count = Annotated[Whole, Field(ge=2, le=MAX_POINTS)]
 Pixels = Annotated[Whole, Field(ge=1, le=MAX_PIXELS)]
 Byte = Annotated[Whole, Field(ge=0, le=255)]
 FilePath = Annotated[str, Field(strict=True, min_length=1, max_length=MAX_PATH)]
+Share = Annotated[Number, Field(ge=0, le=1)]
+Output = Literal["png", "gif", "trajectory", "coordinates", "depth", "flow", "occlusion", "instrument", "tracks"]
 Side = Literal["top", "bottom", "left", "right"]
 Vector = tuple[Number, Number, Number]
 # A tool may come from beyond the edge, but pixels are no fractions.
 Fraction = Annotated[Number, Field(ge=-1, le=2)]
+
+OUTPUTS: tuple[str, ...] = get_args(Output)
+
+# The outputs that tell something of every pixel.
+PIXEL_LABELS = ("coordinates", "depth", "flow", "occlusion", "instrument")
+# Of these, the ones of what happens until the next frame.
+UNTIL_NEXT = ("flow", "occlusion")
+NEED_CAMERA = ("coordinates", "depth", "flow", "tracks")
 
 
 def key(default: Any = ..., *, means: str, expects: str) -> Any:
@@ -190,6 +202,21 @@ class Tissue(Section):
     )
 
 
+class Instrument(Section):
+    """The rod that is drawn as a probe: metal, with a rounded tip that touches the sheet at the control point."""
+
+    radius: Positive = key(means="radius of the rod [m]", expects="a number above 0, in metres")
+    shaft: Vector = key(means="direction from the tip along the rod", expects="three numbers, not all 0: [x, y, z]")
+    length: Positive = key(means="length of the rod [m]", expects="a number above 0, in metres")
+
+    @field_validator("shaft", mode="after")
+    @classmethod
+    def _leads_somewhere(cls, shaft: Vector) -> Vector:
+        if not any(abs(number) >= SMALLEST for number in shaft):
+            raise PydanticCustomError(REFUSED, "has no direction; take one such as [0.3, -0.5, 1]")
+        return shaft
+
+
 class Probe(Section):
     """A tool: where it acts, how hard, and when (eq. 5)."""
 
@@ -229,6 +256,9 @@ class Probe(Section):
         DEFAULT_OFFSET,
         means="exponent subtracted at the control point itself; with force only",
         expects="a number, -50 to 1000",
+    )
+    instrument: Instrument | None = key(
+        None, means="the rod that is drawn for the tool", expects="a mapping with radius, shaft and length"
     )
 
     @field_validator("force", mode="after")
@@ -363,6 +393,19 @@ class Camera(Section):
     )
 
 
+class Light(Section):
+    """How shading: tissue lights the sheet, from beside the camera."""
+
+    ambient: Share = key(0.2, means="share of the light that comes from everywhere", expects="a number, 0 to 1")
+    gloss: Share = key(0.4, means="brightness of the wet highlight, as a fraction of white", expects="a number, 0 to 1")
+    relief: Annotated[Number, Field(ge=-MAX_RELIEF, le=MAX_RELIEF)] = key(
+        0.0,
+        means="height of what is bright in the picture over what is dark, in percent of the sheet's larger side",
+        expects=f"a number, -{MAX_RELIEF} to {MAX_RELIEF}",
+    )
+    vignette: Share = key(0.0, means="how much darker the picture's corners are", expects="a number, 0 to 1")
+
+
 class Render(Section):
     """How a frame is drawn."""
 
@@ -379,17 +422,22 @@ class Render(Section):
         means="top: straight down, to scale; oblique: tilted, shows depth; or a pinhole camera",
         expects="top, oblique, or {eye: [x, y, z], target: [x, y, z], up: [x, y, z], fov: degrees}",
     )
-    shading: Literal["none", "headlight"] = key(
+    shading: Literal["none", "headlight", "tissue"] = key(
         "headlight",
-        means="none: the picture's own colours; headlight: lit from the camera",
-        expects="none or headlight",
+        means="none: the picture's own colours; headlight: lit from the camera; tissue: wet tissue in the light of an "
+        "endoscope",
+        expects="none, headlight or tissue",
     )
+    light: Light = key(Light(), means="with shading: tissue", expects="a mapping")
     wireframe: StrictBool = key(False, means="draw the mass-point mesh over the surface", expects="true or false")
     supersample: Annotated[Whole, Field(ge=1, le=4)] = key(
         1, means="samples per pixel along each axis", expects="a whole number, 1 to 4"
     )
     background: tuple[Byte, Byte, Byte] = key(
         (0, 0, 0), means="colour where no surface is", expects="three whole numbers, 0 to 255: [red, green, blue]"
+    )
+    tracks: Annotated[Whole, Field(ge=1, le=MAX_TRACKS)] = key(
+        16, means="material points along each side of the grid of tracks", expects=f"a whole number, 1 to {MAX_TRACKS}"
     )
 
 
@@ -424,16 +472,36 @@ class Scene(Section):
     )
     time: Time = key(means="time span, frames and steps", expects="a mapping with at least duration")
     render: Render = key(Render(), means="how a frame is drawn", expects="a mapping")
-    output: tuple[Literal["png", "gif", "trajectory"], ...] = key(
+    output: tuple[Output, ...] = key(
         ("png", "gif", "trajectory"),
         means="what is written besides run.json; [] simulates only",
-        expects="a list of png, gif, trajectory",
+        expects=f"a list of {', '.join(OUTPUTS)}",
     )
 
     @property
     def draws(self) -> bool:
         """Whether any output is a picture."""
         return "png" in self.output or "gif" in self.output
+
+    @property
+    def labels_pixels(self) -> bool:
+        """Whether any output is a label of every pixel."""
+        return any(kind in PIXEL_LABELS for kind in self.output)
+
+    @property
+    def renders(self) -> bool:
+        """Whether any output is of what the camera sees."""
+        return self.draws or self.labels_pixels or "tracks" in self.output
+
+    @property
+    def output_camera(self) -> bool:
+        """Whether an output is of use only with the camera's numbers."""
+        return any(kind in NEED_CAMERA for kind in self.output)
+
+    @property
+    def has_instruments(self) -> bool:
+        """Whether any probe is drawn."""
+        return any(probe.instrument is not None for probe in self.probes)
 
     @property
     def kind(self) -> Literal["tissue", "springs"]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from types import TracebackType
 from typing import TYPE_CHECKING, Any
@@ -22,17 +23,19 @@ from taichi_msm.physics.state import Reading
 from taichi_msm.physics.timestep import time_grid, with_grid
 from taichi_msm.progress import Pause
 from taichi_msm.render.camera import View, view
+from taichi_msm.render.instrument import Rod, rods
+from taichi_msm.render.labels import Flow, Labels, Observed, Sight, flow_between, track_grid
 from taichi_msm.render.picking import pick
 from taichi_msm.render.surface import Surface, surface
 from taichi_msm.render.texture import load_texture, require_texture
-from taichi_msm.scene import Camera, Probe, Scene
+from taichi_msm.scene import UNTIL_NEXT, Camera, Probe, Scene
 from taichi_msm.scenefile.validation import checked
 from taichi_msm.system import runtime
 from taichi_msm.timegrid import TimeGrid
 
 if TYPE_CHECKING:
     from taichi_msm.notebook import Player
-    from taichi_msm.render.rasterizer import Drawing
+    from taichi_msm.render.rasterizer import Drawing, Drawn
 
 # A camera as a scene has it; None: the scene's own. A `View` is one that was set up already.
 CameraLike = str | Mapping[str, Any] | Camera | View | None
@@ -79,7 +82,8 @@ class Simulation:
         self._position = self._place(self._dynamics.displacement())
         self._texture = texture
         self._own_texture = texture is None
-        self._drawing: Drawing | None = None
+        # By whether they give a picture, and labels.
+        self._drawings: dict[tuple[bool, bool], Drawing] = {}
 
     def _resolved(self, scene: Scene) -> tuple[Scene, TimeGrid]:
         """Choose what the scene leaves open: the points and the step for a tolerance, and the precision."""
@@ -179,7 +183,7 @@ class Simulation:
         self._watch = Watch(self.scene, self._grid)
         self._diverged = False
         self._dynamics.restart(self.scene, self._grid)
-        self._drawing = None
+        self._drawings.clear()
         self._position = self._place(self._dynamics.displacement())
 
     def save(self) -> Saved:
@@ -274,12 +278,15 @@ class Simulation:
             raise MsmError("this simulation has not diverged; there is nothing to find out")
         return diagnose(self._dynamics, start, pause)
 
-    def draw(self, camera: CameraLike = None, positions: NDArray[Any] | None = None) -> NDArray[np.uint8]:
-        """Draw the sheet as it is now.
+    def draw(
+        self, camera: CameraLike = None, positions: NDArray[Any] | None = None, time: float | None = None
+    ) -> NDArray[np.uint8]:
+        """Draw the sheet as it is now, and the probes' instruments.
 
         Args:
             camera: another than the scene's: "top", "oblique", a `Camera` or its keys.
             positions: other positions of the points [m], such as those of an earlier frame, shape (rows, cols, 3).
+            time: of these positions [s], where control points move; None: now.
 
         Returns:
             Colours, shape (height, width, 3).
@@ -288,13 +295,102 @@ class Simulation:
             ArgumentError: when the positions are of another shape.
             SceneError: when the scene's picture cannot be read, or the camera is none.
         """
-        self._require_open()
-        if positions is not None:
-            positions = as_array(positions, "positions")
-            found, expected = positions.shape, self._position.shape
-            if found != expected or positions.dtype.kind not in "fiu":
-                raise ArgumentError(f"positions: {positions.dtype} of shape {found}; take numbers of shape {expected}")
-        return self._drawn().draw(self._position if positions is None else positions, self._view(camera))
+        picture = self._look(camera, positions, time, picture=True, labels=False).picture
+        assert picture is not None
+        return picture
+
+    def labels(
+        self, camera: CameraLike = None, positions: NDArray[Any] | None = None, time: float | None = None
+    ) -> Labels:
+        """Give what each pixel shows at its centre: the material point, the depth, whether it is an instrument.
+
+        Args:
+            camera: as for `draw`.
+            positions: as for `draw`.
+            time: as for `draw`.
+
+        Raises:
+            ArgumentError: as for `draw`.
+            SceneError: when the camera is none.
+        """
+        labels = self._look(camera, positions, time, picture=False, labels=True).labels
+        assert labels is not None
+        return labels
+
+    def flow(
+        self,
+        before: Labels,
+        camera: CameraLike = None,
+        positions: NDArray[Any] | None = None,
+        time: float | None = None,
+    ) -> Flow:
+        """Give how what an earlier or later frame shows has moved in the picture until now, and what of it is hidden.
+
+        Args:
+            before: what `labels` gave of the other frame, with the same size of the picture.
+            camera: as for `draw`.
+            positions: as for `draw`.
+            time: as for `draw`.
+
+        Raises:
+            ArgumentError: as for `draw`, and when `before` is of another size.
+            SceneError: when the camera is none.
+        """
+        width, height = self.scene.render.size
+        if not isinstance(before, Labels) or before.coordinates.shape != (height, width, 2):
+            raise ArgumentError(f"before: take what `labels` gave for a picture of {width} x {height} pixels")
+        points = before.coordinates.reshape(-1, 2)
+        return flow_between(before, self._find(points, camera, positions, time, moved=True))
+
+    def locate(
+        self,
+        coordinates: NDArray[Any],
+        camera: CameraLike = None,
+        positions: NDArray[Any] | None = None,
+        time: float | None = None,
+    ) -> Sight:
+        """Find where material points are seen, and whether anything hides them; the way back from `pick`.
+
+        Args:
+            coordinates: fractions of the sheet's width from its left and of its height from its top, 0 to 1, shape
+                (n, 2).
+            camera: as for `draw`.
+            positions: as for `draw`.
+            time: as for `draw`.
+
+        Raises:
+            ArgumentError: as for `draw`, and when the coordinates are none.
+            SceneError: when the camera is none.
+        """
+        found = as_array(coordinates, "coordinates")
+        numbers = found.dtype.kind in "fiu" and found.ndim == 2 and found.shape[1] == 2
+        if not numbers or not ((found >= 0) & (found <= 1)).all():
+            raise ArgumentError(
+                f"coordinates: {found.dtype} of shape {found.shape}; take numbers from 0 to 1 of shape (n, 2)"
+            )
+        return self._find(found, camera, positions, time)
+
+    def observe(self, before: Labels | None, positions: NDArray[Any], time: float) -> Observed:
+        """Give all that the scene's output asks for of one frame.
+
+        Args:
+            before: what the frame before showed; None: there was none.
+            positions: of the points [m], shape (rows, cols, 3).
+            time: of the frame [s].
+        """
+        scene = self.scene
+        # With several samples a pixel none of them is at its centre.
+        together = scene.render.supersample == 1
+        picture = labels = flow = tracks = None
+        if scene.draws:
+            picture, labels = self._look(None, positions, time, picture=True, labels=scene.labels_pixels and together)
+        if scene.labels_pixels and labels is None:
+            labels = self.labels(None, positions, time)
+        if before is not None and any(kind in UNTIL_NEXT for kind in scene.output):
+            flow = self.flow(before, None, positions, time)
+        if "tracks" in scene.output:
+            tracks = self.locate(track_grid(scene.render.tracks), None, positions, time)
+        return Observed(picture, labels, flow, tracks)
 
     def play(self, frames: int, camera: CameraLike = None) -> Player:
         """Simulate and draw a number of frames, the present one before them, and give them to look at in a notebook.
@@ -338,15 +434,16 @@ class Simulation:
         self._require_open()
         self._dynamics.compile()
         pause()
-        if self.scene.draws:
-            self.draw()
+        if self.scene.renders:
+            first = self.observe(None, self._position, self.time)
+            self.observe(first.labels, self._position, self.time)
 
     def close(self) -> None:
         """Free the memory. `positions` still gives the last frame."""
         runtime.require_here()
         self._closed = True
         self._dynamics.close()
-        self._drawing = None
+        self._drawings.clear()
 
     def __enter__(self) -> Simulation:
         return self
@@ -371,14 +468,53 @@ class Simulation:
         render = {**dict(self.scene.render), "camera": camera}
         return view(self.scene.model_copy(update={"render": render}))
 
-    def _drawn(self) -> Drawing:
-        if self._drawing is None:
-            from taichi_msm.render.rasterizer import Drawing
+    def _look(
+        self, camera: CameraLike, positions: NDArray[Any] | None, time: float | None, *, picture: bool, labels: bool
+    ) -> Drawn:
+        from taichi_msm.render.rasterizer import Drawing, structure
 
-            if self._texture is None:
-                self._texture = load_texture(self.scene)
-            self._drawing = Drawing(self.scene, self._texture)
-        return self._drawing
+        positions, rods = self._placed(positions, time)
+        view = self._view(camera)
+        if (picture, labels) not in self._drawings:
+            code = structure(self.scene, picture=picture, labels=labels)
+            self._drawings[picture, labels] = Drawing(self.scene, self._require_texture(picture=picture), code)
+        return self._drawings[picture, labels].look(positions, view, rods)
+
+    def _find(
+        self,
+        coordinates: NDArray[Any],
+        camera: CameraLike,
+        positions: NDArray[Any] | None,
+        time: float | None,
+        *,
+        moved: bool = False,
+    ) -> Sight:
+        from taichi_msm.render.tracking import find
+
+        positions, rods = self._placed(positions, time)
+        return find(self.scene, coordinates, positions, self._view(camera), rods, moved=moved)
+
+    def _placed(self, positions: NDArray[Any] | None, time: float | None) -> tuple[NDArray[Any], list[Rod]]:
+        """Check positions, and place the instruments on the sheet."""
+        self._require_open()
+        if positions is None:
+            positions = self._position
+        else:
+            positions = as_array(positions, "positions")
+            found, expected = positions.shape, self._position.shape
+            if found != expected or positions.dtype.kind not in "fiu":
+                raise ArgumentError(f"positions: {positions.dtype} of shape {found}; take numbers of shape {expected}")
+        if time is not None and not (isinstance(time, int | float) and math.isfinite(time)):
+            raise ArgumentError(f"time: {time!r}; take a number, in seconds, or None for now")
+        return positions, rods(self.scene, positions, self.time if time is None else time)
+
+    def _require_texture(self, *, picture: bool) -> NDArray[np.uint8]:
+        """Give the picture on the sheet; one of a single texel where it is not seen."""
+        if not picture:
+            return np.zeros((1, 1, 3), np.uint8)
+        if self._texture is None:
+            self._texture = load_texture(self.scene)
+        return self._texture
 
     def _read(self) -> NDArray[Any]:
         """Read where the points are, if the simulation has not gone wrong since the last frame."""

@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import os
+import shutil
 import signal
 import subprocess
 from collections.abc import Callable
@@ -10,6 +11,8 @@ import pytest
 from PIL import Image
 
 from taichi_msm.cli import main
+from taichi_msm.runner import run
+from taichi_msm.scenefile.load import load_scene
 from taichi_msm.system import runtime
 from taichi_msm.system.signals import SIGNALS
 from tests.scenes import SMALL, speckle
@@ -44,6 +47,22 @@ def small(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     return tmp_path
 
 
+@pytest.fixture(scope="session")
+def ran(device: runtime.Device, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The results of a run of small.yaml, in `output/small` beside its scene; to be read only."""
+    here = tmp_path_factory.mktemp("ran")
+    Image.fromarray(speckle(30, 40)).save(here / "speckle.png")
+    (here / "small.yaml").write_text(SMALL)
+    run(load_scene(here / "small.yaml"), here / "output" / "small", threads=device.threads, estimate_error=False)
+    return here / "output" / "small"
+
+
+@pytest.fixture
+def results(ran: Path, tmp_path: Path) -> Path:
+    """A copy of these results, to be changed."""
+    return Path(shutil.copytree(ran, tmp_path / "results"))
+
+
 Program = Callable[..., subprocess.CompletedProcess[str]]
 
 
@@ -51,7 +70,7 @@ Program = Callable[..., subprocess.CompletedProcess[str]]
 def program(device: runtime.Device, capfd: pytest.CaptureFixture[str]) -> Program:
     """The program in this process, for what needs none of its own."""
 
-    def run(*arguments: str) -> subprocess.CompletedProcess[str]:
+    def call(*arguments: str) -> subprocess.CompletedProcess[str]:
         takes_threads = arguments[0] in ("run", "study", "view")
         before = {number: signal.getsignal(number) for number in SIGNALS}
         capfd.readouterr()
@@ -63,4 +82,4 @@ def program(device: runtime.Device, capfd: pytest.CaptureFixture[str]) -> Progra
         said = capfd.readouterr()
         return subprocess.CompletedProcess(arguments, code, said.out, said.err)
 
-    return run
+    return call

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from taichi_msm import reference
 from taichi_msm.physics.lattice import rest_positions
 from taichi_msm.render.camera import view
+from taichi_msm.render.instrument import rods
 from taichi_msm.render.rasterizer import Drawing, structure
 from taichi_msm.scene import Scene
 from taichi_msm.system.runtime import Device
@@ -36,6 +37,15 @@ def dented(made: Scene, seed: int = 1) -> NDArray[np.float64]:
     return position + np.random.default_rng(seed).normal(0, 0.004, position.shape)
 
 
+def with_instruments(made: Scene) -> Scene:
+    """Two rods, one of which lies almost along the view from the top."""
+    probes = [
+        {"force": [0, 0, -1], "at": [0.4, 0.4], "instrument": {"radius": 0.02, "shaft": [1, -0.4, 0.7], "length": 0.2}},
+        {"force": [0, 0, -1], "at": [0.7, 0.8], "instrument": {"radius": 0.03, "shaft": [0, 0.01, 1], "length": 0.05}},
+    ]
+    return made.model_copy(update={"probes": probes})
+
+
 def difference(a: NDArray[np.uint8], b: NDArray[np.uint8]) -> NDArray[np.int_]:
     """Largest difference of the three channels, shape (height, width)."""
     return np.abs(a.astype(int) - b.astype(int)).max(axis=-1)
@@ -50,8 +60,10 @@ def difference(a: NDArray[np.uint8], b: NDArray[np.uint8]) -> NDArray[np.int_]:
         {"camera": "oblique", "wireframe": True, "supersample": 3, "refine": 0},
         {"camera": NEAR, "refine": 1},
         {"camera": {"eye": [0.1, 0.2, -0.4], "up": [1, 0, 0]}, "size": [31, 97]},
+        {"camera": "top", "shading": "tissue", "light": {"relief": -0.2, "vignette": 0.3}},
+        {"camera": NEAR, "shading": "tissue", "supersample": 2, "wireframe": True},
     ],
-    ids=["top", "unlit", "oblique", "supersampled", "inside", "from-behind"],
+    ids=["top", "unlit", "oblique", "supersampled", "inside", "from-behind", "tissue", "tissue-near"],
 )
 def test_picture_is_like_the_twin(render: dict[str, Any], device: Device) -> None:
     made = drawable(**render)
@@ -69,12 +81,62 @@ def test_the_shape_of_a_tile_does_not_change_the_bits(lanes: int, device: Device
     renders: list[dict[str, Any]] = [
         {"size": [31, 57], "wireframe": True},
         {"supersample": 3, "camera": "oblique"},
+        {"size": [31, 57], "shading": "tissue", "light": {"relief": 1}},
     ]
     for render in renders:
-        made, texture = drawable(**render), speckle(50, 70)
-        expected = draw(made, dented(made), texture)
-        alone = Drawing(made, texture, replace(structure(made), lanes=lanes))
-        assert (alone.draw(dented(made)) == expected).all()
+        made, texture = with_instruments(drawable(**render)), speckle(300, 200)
+        position, code = dented(made), structure(made, labels="supersample" not in render)
+        placed = rods(made, position, 0)
+        expected = Drawing(made, texture, code).look(position, rods=placed)
+        alone = Drawing(made, texture, replace(code, lanes=lanes)).look(position, rods=placed)
+        np.testing.assert_array_equal(alone.picture, expected.picture)
+        for label, other in zip(alone.labels or (), expected.labels or (), strict=True):
+            np.testing.assert_array_equal(label, other)
+
+
+@pytest.mark.parametrize("camera", ["top", "oblique", NEAR])
+@pytest.mark.parametrize("shading", ["none", "headlight", "tissue"])
+def test_instruments_are_like_the_twin(shading: str, camera: Any, device: Device) -> None:
+    made = with_instruments(drawable(camera=camera, shading=shading))
+    position, texture = dented(made), np.full((9, 9, 3), 120, np.uint8)
+    placed = rods(made, position, 0)
+    drawn = Drawing(made, texture).draw(position, rods=placed)
+    apart = difference(drawn, reference.draw(made, position, texture, placed))
+    assert (apart > 1).mean() < 0.005, "but for outlines"
+    bare = reference.draw(made, position, texture)
+    assert (difference(drawn, bare) > 30).mean() > 0.02, "instruments are seen"
+
+
+def test_an_instrument_touches_the_sheet_at_the_control_point(device: Device) -> None:
+    made = with_instruments(drawable(refine=4))
+    position = dented(made)
+    for placed, (across, down) in zip(rods(made, position, 0), ((0.4, 0.4), (0.7, 0.8)), strict=True):
+        rows, cols = made.sheet.points
+        patch = reference.refine(position, 4)
+        near = patch[round(down * (rows - 1) * 5), round(across * (cols - 1) * 5)]
+        # These places are vertices of the refined surface.
+        assert np.linalg.norm(placed.tip - near) == pytest.approx(placed.radius, rel=1e-9)
+        assert (placed.tip - near) @ placed.axis > 0, "on the side from which it comes"
+
+
+def test_tissue_far_away_shows_the_mean_of_its_texels(device: Device) -> None:
+    # A fine checkerboard: without filtering its pixels are black or white.
+    board = (np.indices((660, 880)).sum(axis=0) % 2 * 255).astype(np.uint8)[..., None].repeat(3, axis=-1)
+    made = drawable(shading="tissue", light={"ambient": 1, "gloss": 0})
+    picture = draw(made, rest_positions(made.sheet), board)
+    # Eleven texels a pixel: between the levels of 8 and of 16, where the mean 127.5 was rounded once.
+    assert np.abs(picture.astype(int) - 128).max() <= 1
+    assert np.abs(draw(drawable(shading="none"), rest_positions(made.sheet), board).astype(int) - 128).max() > 100
+
+
+def test_tissue_is_nowhere_black(device: Device) -> None:
+    made = drawable(shading="tissue", light={"gloss": 0})
+    position = rest_positions(made.sheet)
+    position[..., 2] = position[..., 0] * np.tan(np.radians(85))  # away from the light
+    picture = draw(made, position, np.full((4, 4, 3), 200, np.uint8))
+    assert picture.max() > 0
+    lit = picture[picture.any(axis=-1)]
+    assert lit.min() >= 0.2 * 200 - 1, "the ambient share is left"
 
 
 @pytest.mark.parametrize("far", [1e3, 1e5, 1e7, 1e30, np.nan, np.inf])
@@ -220,5 +282,5 @@ def test_wireframe_draws_the_mass_point_mesh(device: Device) -> None:
 
 
 def test_only_what_the_picture_needs_is_compiled(device: Device) -> None:
-    assert structure(drawable(shading="none")).lit is False
+    assert structure(drawable(shading="none")).layout == {}
     assert structure(drawable()) == structure(drawable((5, 6), camera="oblique", background=[1, 1, 1], size=[9, 9]))

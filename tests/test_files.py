@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from taichi_msm.errors import FilesError
+from taichi_msm.render.labels import Observed
 from taichi_msm.results.encoder import Encoder
 from taichi_msm.results.folder import Folder
 from taichi_msm.results.writer import ResultWriter
@@ -33,12 +34,13 @@ ENDLESS = """
 import itertools
 import sys
 from pathlib import Path
+from taichi_msm.render.labels import Observed
 from taichi_msm.results.writer import ResultWriter
 from tests.test_files import picture, position, small_scene
 
 with ResultWriter(Path(sys.argv[1]), small_scene()) as writer:
     for frame in itertools.count():
-        writer.add(position(frame), picture(frame))
+        writer.add(position(frame), Observed(picture(frame)))
         if frame == 10:
             print(writer._encoder._process.pid, flush=True)
 """
@@ -65,7 +67,7 @@ def picture(frame: int) -> NDArray[np.uint8]:
 def write(directory: Path, frames: int, scene: Scene) -> list[str]:
     with ResultWriter(directory, scene) as writer:
         for frame in range(frames):
-            writer.add(position(frame), picture(frame) if scene.draws else None)
+            writer.add(position(frame), Observed(picture(frame) if scene.draws else None))
         names: list[str] = writer.publish({})["outputs"]
         assert writer.frames == frames
     return names
@@ -143,8 +145,8 @@ def test_the_animation_is_like_its_frames(tmp_path: Path, light: float) -> None:
     background = (1, 99, 255)
     first[:, 0] = later[:, 0] = background
     with ResultWriter(tmp_path, small_scene("gif", background=background, size=[16, 16])) as writer:
-        writer.add(position(0), first)
-        writer.add(position(1), later)
+        writer.add(position(0), Observed(first))
+        writer.add(position(1), Observed(later))
         writer.publish({})
     with Image.open(tmp_path / "animation.gif") as image:
         image.seek(1)
@@ -159,7 +161,7 @@ def test_leaving_without_publishing_leaves_what_was_there(tmp_path: Path) -> Non
     before = files(tmp_path / "out")
     for directory in (tmp_path / "out", tmp_path / "fresh"):
         with ResultWriter(directory, small_scene()) as writer:
-            writer.add(position(9), picture(9))
+            writer.add(position(9), Observed(picture(9)))
     assert files(tmp_path / "out") == before
     assert not (tmp_path / "fresh").exists()
 
@@ -178,11 +180,11 @@ def test_an_interrupted_hand_over_leaves_whole_frames(
 
     add = Encoder.add
     with ResultWriter(tmp_path / "interrupted", small_scene()) as writer:
-        writer.add(position(0), picture(0))
+        writer.add(position(0), Observed(picture(0)))
         with monkeypatch.context() as patch:
             patch.setattr(Encoder, "add", interrupted)
             with pytest.raises(KeyboardInterrupt):
-                writer.add(position(1), picture(1))
+                writer.add(position(1), Observed(picture(1)))
         writer.finish()
         assert writer.frames == frames
         writer.publish({})
@@ -196,7 +198,7 @@ def test_in_a_hurry_frames_are_given_up_and_those_left_are_whole(tmp_path: Path)
     large = [speckle(1000, 1500, frame) for frame in range(7)]
     with ResultWriter(tmp_path, made) as writer:
         for frame, shown in enumerate(large):
-            writer.add(position(frame), shown)
+            writer.add(position(frame), Observed(shown))
         writer.finish(hurry=True)
         writer.publish({})
         frames = writer.frames
@@ -229,7 +231,7 @@ def test_who_waits_for_a_stopped_encoder_can_stop_waiting(tmp_path: Path) -> Non
         assert writer._encoder
         os.kill(writer._encoder._process.pid, signal.SIGSTOP)
         for frame in range(3):
-            writer.add(position(frame), picture(frame))
+            writer.add(position(frame), Observed(picture(frame)))
         with pytest.raises(KeyboardInterrupt):
             writer.finish(stop)
         writer.finish(hurry=True)
@@ -239,7 +241,7 @@ def test_who_waits_for_a_stopped_encoder_can_stop_waiting(tmp_path: Path) -> Non
 
 def test_the_time_spent_encoding_is_told(tmp_path: Path) -> None:
     with ResultWriter(tmp_path, small_scene()) as writer:
-        writer.add(position(0), picture(0))
+        writer.add(position(0), Observed(picture(0)))
         writer.finish()
         assert 0 < writer.encode_seconds < 60
 
@@ -305,7 +307,7 @@ def test_positions_that_cannot_be_written(tmp_path: Path, points: int, limit: in
     def run() -> None:
         with ResultWriter(tmp_path, scene(sheet=sheet, output=["trajectory"])) as writer:
             resource.setrlimit(resource.RLIMIT_FSIZE, (limit, hard))
-            writer.add(np.zeros((points, points, 3)), None)
+            writer.add(np.zeros((points, points, 3)), Observed())
             writer.publish({})
 
     try:
@@ -323,7 +325,7 @@ def refused(directory: Path, meanwhile: Callable[[ResultWriter], None] = lambda 
         with ResultWriter(directory, small_scene()) as writer:
             meanwhile(writer)
             for frame in range(1000):
-                writer.add(position(frame), picture(frame))
+                writer.add(position(frame), Observed(picture(frame)))
             writer.publish({})
 
     with pytest.raises(FilesError) as told:

@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 
 from taichi_msm.errors import FilesError
+from taichi_msm.render.labels import Observed
 from taichi_msm.results.manifest import read_manifest
 from taichi_msm.results.publication import MANIFEST, is_unfinished
 from taichi_msm.results.writer import ResultWriter
@@ -47,7 +48,7 @@ def write(directory: Path, *, resumes: bool = False) -> None:
     made = small_scene()
     with ResultWriter(directory, made, {}, resumes=resumes) as writer:
         for frame in range(made.time.frames + 1):
-            writer.add(np.zeros((3, 4, 3)), speckle(6, 8, frame))
+            writer.add(np.zeros((3, 4, 3)), Observed(speckle(6, 8, frame)))
         writer.publish({"status": "complete"})
 
 
@@ -209,12 +210,12 @@ def test_a_folder_exchanged_for_a_link_meanwhile(treasure: Path) -> None:
     out, aside = treasure.parent / "out", treasure.parent / "aside"
     precious, made = snapshot(treasure), small_scene()
     with ResultWriter(out, made, {}) as writer:
-        writer.add(np.zeros((3, 4, 3)), speckle(6, 8, 0))
+        writer.add(np.zeros((3, 4, 3)), Observed(speckle(6, 8, 0)))
         shutil.move(out / ".partial", aside)
         (out / ".partial").symlink_to(treasure)
         (out / "frames").symlink_to(treasure)
         for frame in range(1, made.time.frames + 1):
-            writer.add(np.zeros((3, 4, 3)), speckle(6, 8, frame))
+            writer.add(np.zeros((3, 4, 3)), Observed(speckle(6, 8, frame)))
         with pytest.raises(FilesError, match="frames: a symbolic link"):
             writer.publish({"status": "complete"})
     assert snapshot(treasure) == precious

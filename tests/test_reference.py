@@ -2,16 +2,20 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import numpy as np
 import pytest
 from numpy.typing import NDArray
+from PIL import Image
 from scipy.integrate import solve_ivp
 
 from taichi_msm import reference
 from taichi_msm.physics.lattice import fixed_points, rest_positions
 from taichi_msm.physics.loads import loads_at
 from taichi_msm.physics.timestep import time_grid
-from tests.scenes import scene
+from taichi_msm.scene import Scene
+from tests.scenes import random_scene, random_tissue, scene, speckle
 
 # A 2 x 2 sheet without springs but virtual ones: four independent oscillators.
 ALONE = {
@@ -84,6 +88,25 @@ def test_a_spring_without_length_has_no_force() -> None:
     force = reference.elastic_force(made, u)
     assert np.isfinite(force).all()
     np.testing.assert_allclose(force, 0, atol=1e-15)
+
+
+@pytest.mark.parametrize("seed", range(6))
+def test_the_density_of_energy_adds_up_to_the_energy_of_the_springs(seed: int, tmp_path: Path) -> None:
+    """With a map, tension, free edges and cells that are not square; bending, which is no spring's, is left out."""
+    Image.fromarray(speckle(7, 5)).save(tmp_path / "map.png")
+    tissue = random_tissue(seed, str(tmp_path / "map.png"))
+    for made in (without_bending(tissue), random_scene(seed)):
+        displacement = np.random.default_rng(seed).normal(0, 1e-3, (*made.sheet.points, 3))
+        height, width = made.sheet.size
+        share = np.outer(*(np.r_[0.5, np.ones(count - 2), 0.5] / (count - 1) for count in made.sheet.points))
+        total = (reference.energy_density(made, displacement) * share).sum() * height * width
+        # Sums over less than 2000 springs, of which those under tension hold numbers of both signs.
+        assert total == pytest.approx(reference.energy(made, displacement), rel=1e-11)
+
+
+def without_bending(scene: Scene) -> Scene:
+    assert scene.tissue is not None
+    return scene.model_copy(update={"tissue": scene.tissue.model_copy(update={"bending": 0.0})})
 
 
 def test_agrees_with_dop853() -> None:

@@ -50,6 +50,9 @@ NO_PICTURE = "image: a picture is needed to draw png or gif; name one, or set ou
 
 Load = Callable[..., Scene]
 
+# The kinds of output, as errors list them.
+OUTPUTS = "png, gif, trajectory, coordinates, depth, flow, occlusion, instrument, tracks"
+
 
 @pytest.fixture
 def load(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Load:
@@ -240,7 +243,7 @@ WRONG_VALUES = {
     ),
     "text with a control character": (
         GOOD + 'render: {shading: "\\e[31m"}\n',
-        ['s.yaml:11:10: render.shading: "\\u001b[31m" is not allowed; expected none or headlight'],
+        ['s.yaml:11:10: render.shading: "\\u001b[31m" is not allowed; expected none, headlight or tissue'],
     ),
     "yes, which is text in YAML 1.2": (
         GOOD + "render: {wireframe: yes}\n",
@@ -252,11 +255,23 @@ WRONG_VALUES = {
     ),
     "one output without a list": (
         GOOD.replace("[]", "png"),
-        ['s.yaml:10:1: output: "png" is not allowed; expected a list of png, gif, trajectory'],
+        [f's.yaml:10:1: output: "png" is not allowed; expected a list of {OUTPUTS}'],
     ),
     "unknown output": (
         GOOD.replace("[]", "[trajectory, mp4]"),
-        ['s.yaml:10:22: output.1: "mp4" is not allowed; expected a list of png, gif, trajectory'],
+        [f's.yaml:10:22: output.1: "mp4" is not allowed; expected a list of {OUTPUTS}'],
+    ),
+    "an instrument without a direction": (
+        GOOD + "probes: [{force: [0, 0, 1], instrument: {radius: 0.01, shaft: [0, 0, 0], length: 0.1}}]\n",
+        ["s.yaml:11:56: probes.0.instrument.shaft: has no direction; take one such as [0.3, -0.5, 1]"],
+    ),
+    "light beyond its range": (
+        GOOD + "render: {shading: tissue, light: {ambient: 2}}\n",
+        ["s.yaml:11:35: render.light.ambient: 2 is not allowed; expected a number, 0 to 1"],
+    ),
+    "tracks of no point": (
+        GOOD + "render: {tracks: 0}\n",
+        ["s.yaml:11:10: render.tracks: 0 is not allowed; expected a whole number, 1 to 256"],
     ),
     "too many probes": (
         GOOD + "probes:\n" + "  - {force: [0, 0, 1]}\n" * (MAX_PROBES + 1),
@@ -588,7 +603,7 @@ def test_a_faulty_section_brings_up_no_other_error(load: Load) -> None:
         "s.yaml:11:1: image: 3 is not allowed; expected the path of a picture"
     ]
     assert lines(load, GOOD.replace("[]", "[pngs]")) == [
-        's.yaml:10:10: output.0: "pngs" is not allowed; expected a list of png, gif, trajectory'
+        f's.yaml:10:10: output.0: "pngs" is not allowed; expected a list of {OUTPUTS}'
     ]
 
 

@@ -24,7 +24,7 @@ from taichi_msm.system.runtime import Device
 from taichi_msm.viewer import captures
 from taichi_msm.viewer import session as live_session
 from taichi_msm.viewer.captures import Captures
-from taichi_msm.viewer.events import KEYS, Drag, Event, Harder, Key, Percent, Press, Release, Turn
+from taichi_msm.viewer.events import KEYS, Drag, Event, Harder, Key, Percent, Point, Press, Release, Turn
 from taichi_msm.viewer.recorder import record
 from taichi_msm.viewer.session import Session, with_live_frames
 from tests.outputs import duration
@@ -521,3 +521,45 @@ def test_scenes_that_nobody_can_press(overrides: dict[str, Any], play: bool, exp
 )
 def test_lengths_are_said_in_a_legible_unit(metres: float, said: str) -> None:
     assert live_session.length(metres) == said
+
+
+ROD = {"probes.0.instrument": {"radius": 0.01, "shaft": [0.3, -0.2, 1], "length": 0.2}}
+
+
+def rod_pixels(session: Session) -> set[tuple[int, int]]:
+    """The pixels that an instrument changes."""
+    bare = session.viewport.draw(session.positions())
+    session.handle(Key("i"))  # no figures
+    changed = (session.picture() != bare).any(axis=-1)
+    session.handle(Key("i"))
+    return {(int(x), int(y)) for y, x in np.argwhere(changed)}
+
+
+def test_the_instrument_is_under_the_pointer(begin: Begin) -> None:
+    session = begin({**TILTED, **ROD})
+    for x, y in ((40, 60), (80, 50)):
+        session.handle(Point(x, y))
+        pixels = rod_pixels(session)
+        assert any(abs(column - x) <= 3 and abs(row - y) <= 3 for column, row in pixels), "the tip is there"
+        assert 20 < len(pixels) < 3000
+    session.handle(Press(60, 55))
+    session.advance()
+    session.handle(Point(20, 20))
+    held = rod_pixels(session)
+    assert any(abs(column - 60) <= 4 and abs(row - 55) <= 4 for column, row in held), "while it presses it stays"
+
+
+def test_without_an_instrument_the_pointer_changes_nothing(begin: Begin) -> None:
+    session = begin(TILTED)
+    before = session.picture()
+    session.handle(Point(40, 60))
+    np.testing.assert_array_equal(session.picture(), before)
+
+
+def test_the_light_goes_back_to_that_of_the_scene(begin: Begin) -> None:
+    session = begin({**TILTED, "render.shading": "tissue"})
+    before = session.picture()
+    session.handle(Key("l"))
+    assert session.viewport.render.shading == "none"
+    session.handle(Key("l"))
+    np.testing.assert_array_equal(session.picture(), before)

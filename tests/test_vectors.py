@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from taichi_msm.system.runtime import Device, our_compilation, ti
 
-NUMBERS, WHOLE = 27, 6
+NUMBERS, WHOLE = 28, 7
 
 
 def operations(precision: str, lanes: int) -> Callable[..., None]:
@@ -72,12 +72,14 @@ def operations(precision: str, lanes: int) -> Callable[..., None]:
             if scalar > 0.0:
                 carried = b
             numbers[at + 26] = carried
+            numbers[at + 27] = ti.select((a > b) | (b > 5.0), a, scalar)
             whole[n * WHOLE] = index + 3
             whole[n * WHOLE + 1] = (index + 1) * 7
             whole[n * WHOLE + 2] = ti.min(index, 4)
             whole[n * WHOLE + 3] = ti.max(index - 2, 0)
             whole[n * WHOLE + 4] = index * 3 + index
             whole[n * WHOLE + 5] = ti.max(ti.min(index + 1, 5), 0)
+            whole[n * WHOLE + 6] = ti.select(a > b, n, index)
 
     return apply
 

@@ -24,7 +24,7 @@ from taichi_msm.errors import SceneError
 from taichi_msm.results.folder import Folder
 from taichi_msm.scene import Scene
 from taichi_msm.system.runtime import ti
-from taichi_msm.viewer.events import Drag, Harder, Key, Percent, Press, Release, Turn
+from taichi_msm.viewer.events import Drag, Harder, Key, Percent, Point, Press, Release, Turn
 from taichi_msm.viewer.film import Film
 from taichi_msm.viewer.pacing import LONGEST, Pacing
 from taichi_msm.viewer.script import load_script, timed
@@ -292,10 +292,10 @@ def test_what_the_hand_does() -> None:
 
     assert understood(event(press, "LMB", 0, 0)) == [Press(0, 0)]
     assert understood(event(motion, "Motion", 399, 299)) == [Drag(399, 299)]
-    assert understood(event(release, "LMB", 20, 30), event(motion, "Motion", 30, 30)) == [Release()]
+    assert understood(event(release, "LMB", 20, 30), event(motion, "Motion", 30, 30)) == [Release(), Point(30, 30)]
     assert understood(event(press, "LMB", 200, 149, shift=True)) == [Press(200, 149, pull=True)]
     understood(event(release, "LMB"))
-    one, other = understood(
+    one, other, after = understood(
         event(press, "RMB", 100, 99),
         event(motion, "Motion", 110, 99),
         event(motion, "Motion", 115, 89),
@@ -303,6 +303,7 @@ def test_what_the_hand_does() -> None:
         event(motion, "Motion", 300, 10),
     )
     assert (one, other) == (pytest.approx(Turn(10, 0)), pytest.approx(Turn(5, -10)))
+    assert after == pytest.approx(Point(300, 10))
     assert understood(event(motion, "Wheel", wheel=120), event(release, "Button4")) == [Harder(5)]
     assert understood(event(motion, "Wheel", wheel=-120)) == [Harder(-5)]
     for key, name in [(" ", "space"), ("m", "m"), ("=", "up"), ("KP_Add", "up"), ("Down", "down"), ("Escape", "q")]:

@@ -24,6 +24,9 @@ from typing_extensions import TypedDict
 from taichi_msm.physics.lattice import spacing
 from taichi_msm.scene import Probe, Scene, Sheet
 
+# Times that differ by less are one [s, or of the time].
+SAME_TIME = 1e-12
+
 Array = NDArray[np.float64]
 
 # Forces are summed for this many points at a time.
@@ -82,6 +85,17 @@ def control_points(probe: Probe, sheet: Sheet) -> tuple[Array, Array]:
     time, across, down = np.array(keys, dtype=float).T
     height, width = sheet.size
     return time, np.stack([(across - 0.5) * width, (0.5 - down) * height], axis=1)
+
+
+def control_point(probe: Probe, sheet: Sheet, time: float) -> Array:
+    """Give a probe's control point at a time, x and y at rest [m], shape (2,); where it jumps, the one it jumps to."""
+    times, points = control_points(probe, sheet)
+    # Times of frames are rounded.
+    after = int(np.searchsorted(times, time + SAME_TIME * max(1.0, abs(time)), side="right"))
+    if after in (0, len(times)):
+        return points[min(after, len(times) - 1)]
+    share = min(1.0, (time - times[after - 1]) / (times[after] - times[after - 1]))
+    return points[after - 1] + share * (points[after] - points[after - 1])
 
 
 def spread(probe: Probe) -> float:

@@ -69,5 +69,5 @@ def _steps(scene: Scene, grid: TimeGrid) -> float:
 
 def _other(scene: Scene) -> float:
     """Count the work of everything but stepping."""
-    pixels = (scene.time.frames + 1) * math.prod(scene.render.size) if scene.draws else 0
+    pixels = (scene.time.frames + 1) * math.prod(scene.render.size) if scene.renders else 0
     return START + pixels * (ENCODING + SAMPLE * scene.render.supersample**2)

@@ -2,11 +2,16 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator, Sequence
+from typing import NamedTuple
+
 import numpy as np
 from numpy.typing import NDArray
 
+from taichi_msm.reference.shading import headlight, meet, metal, normals, normals_at, sample, tissue
 from taichi_msm.render import style
 from taichi_msm.render.camera import view
+from taichi_msm.render.instrument import Rod
 from taichi_msm.scene import Scene
 
 Array = NDArray[np.float64]
@@ -29,67 +34,6 @@ def refine(values: Array, n: int) -> Array:
         share = (place - low).reshape((-1, 1, 1) if axis == 0 else (1, -1, 1))
         values = np.take(values, low, axis) * (1 - share) + np.take(values, low + 1, axis) * share
     return values
-
-
-def normals(position: Array) -> Array:
-    """Give unit normals from central differences, one-sided ones at the edges.
-
-    Args:
-        position: positions [m], shape (rows, cols, 3).
-
-    Returns:
-        Unit normals, toward the viewer at rest, shape (rows, cols, 3).
-    """
-    right = np.gradient(position, axis=1)
-    up = -np.gradient(position, axis=0)
-    normal = np.cross(right, up)
-    length = np.linalg.norm(normal, axis=-1, keepdims=True)
-    return np.divide(normal, length, out=np.zeros_like(normal), where=length > 0)
-
-
-def headlight(normal: Array, u: Array, v: Array, toward: Array) -> Array:
-    """Give the cosine between the direction of the light and the normal, interpolated bilinearly between mass points.
-
-    Args:
-        normal: unit normals of the mass points, shape (rows, cols, 3).
-        u: 0 at the left edge to 1 at the right one, any shape.
-        v: 0 at the top edge to 1 at the bottom one, the same shape.
-        toward: unit vector toward the light, shape (3,).
-
-    Returns:
-        Share of the colour that is seen, 0 to 1, the shape of u.
-    """
-    place = [v * (normal.shape[0] - 1), u * (normal.shape[1] - 1)]
-    i, j = (np.clip(np.floor(p).astype(int), 0, count - 2) for p, count in zip(place, normal.shape, strict=False))
-    s, t = (place[1] - j)[..., None], (place[0] - i)[..., None]
-    upper = normal[i, j] * (1 - s) + normal[i, j + 1] * s
-    lower = normal[i + 1, j] * (1 - s) + normal[i + 1, j + 1] * s
-    here = upper * (1 - t) + lower * t
-    return np.asarray(np.abs(here @ toward) / np.maximum(np.linalg.norm(here, axis=-1), 1e-30))
-
-
-def sample(texture: NDArray[np.uint8], u: Array, v: Array) -> Array:
-    """Filter the texture bilinearly, clamped at its edge; texel (a, b) has its centre at ((a + 1/2)/w, (b + 1/2)/h).
-
-    Args:
-        texture: colours, shape (height, width, 3).
-        u: 0 at the left edge to 1 at the right one, any shape.
-        v: 0 at the top edge to 1 at the bottom one, the same shape.
-
-    Returns:
-        Colours 0 to 255, shape (*u.shape, 3).
-    """
-    height, width, _ = texture.shape
-    x, y = u * width - 0.5, v * height - 0.5
-    a, b = np.floor(x).astype(int), np.floor(y).astype(int)
-
-    def texel(a: NDArray[np.int_], b: NDArray[np.int_]) -> Array:
-        return texture[np.clip(b, 0, height - 1), np.clip(a, 0, width - 1)].astype(float)
-
-    across, down = (x - a)[..., None], (y - b)[..., None]
-    upper = texel(a, b) * (1 - across) + texel(a + 1, b) * across
-    lower = texel(a, b + 1) * (1 - across) + texel(a + 1, b + 1) * across
-    return upper * (1 - down) + lower * down
 
 
 def weights(triangle: Array, x: Array, y: Array) -> Array:
@@ -138,55 +82,119 @@ def wire_share(scene: Scene, triangle: Array, x: Array, y: Array) -> Array:
     return np.asarray(style.WIRE_OPACITY * np.clip(half + 0.5 - distance.min(axis=0), 0, 1))
 
 
-def draw(scene: Scene, position: Array, texture: NDArray[np.uint8]) -> NDArray[np.uint8]:
-    """Draw one frame: refine, project, and of every pixel keep the nearest triangle.
+class Seen(NamedTuple):
+    """What the samples of a picture show; each of shape (height, width), of samples.
+
+    Attributes:
+        depth: along the direction of view [m]; infinite where nothing is.
+        u, v: the material point, fractions of the sheet's width and height from its upper left; NaN where none is.
+        wire: share of the mesh lines in the colour.
+        footprint: the larger of a sample's width and height on the texture [texels].
+    """
+
+    depth: Array
+    u: Array
+    v: Array
+    wire: Array
+    footprint: Array
+
+
+def look(scene: Scene, position: Array, factor: int = 1, texels: tuple[int, int] = (1, 1)) -> Seen:
+    """Find what every sample shows: refine, project, and of every sample keep the nearest triangle.
+
+    Args:
+        scene: the scene.
+        position: positions of the mass points [m], shape (rows, cols, 3).
+        factor: samples of a pixel along each axis.
+        texels: width and height of the texture.
+    """
+    rows, cols = scene.sheet.points
+    width, height = (size * factor for size in scene.render.size)
+    camera = view(scene)
+    matrix = camera.matrix * np.array([[factor], [factor], [1], [1]])
+    projected = np.concatenate([position, np.ones((rows, cols, 1))], axis=-1) @ matrix.T
+    u, v = np.meshgrid(np.arange(cols) / (cols - 1), np.arange(rows) / (rows - 1))
+    surface = refine(np.concatenate([projected, u[..., None], v[..., None]], axis=-1), scene.render.refine)
+
+    seen = Seen(*(np.full((height, width), value) for value in (np.inf, np.nan, np.nan, 0.0, 0.0)))
+    for triangle in triangles(surface):
+        if (triangle[:, 2] > camera.near).all():
+            corner = triangle[:, :2] / triangle[:, 2:3] - 0.5
+            left, top = np.maximum(np.floor(corner.min(axis=0)), 0).astype(int)
+            right, bottom = np.minimum(np.ceil(corner.max(axis=0)), [width - 1, height - 1]).astype(int)
+        else:
+            left, top, right, bottom = 0, 0, width - 1, height - 1
+        if right < left or bottom < top:
+            continue
+        box = np.s_[top : bottom + 1, left : right + 1]
+        y, x = np.mgrid[box].astype(float) + 0.5
+        share = weights(triangle, x, y)
+        w, depth, u, v = np.tensordot(triangle[:, 2:].T, share, 1)
+        here = (share >= -1e-12).all(axis=0) & (w > camera.near) & (depth < seen.depth[box])
+        wire = wire_share(scene, triangle, x, y) if scene.render.wireframe else np.zeros_like(x)
+        found = Seen(depth, u, v, wire, footprint(triangle, x, y, texels))
+        for kept, new in zip(seen, found, strict=True):
+            kept[box][here] = new[here]
+    return seen
+
+
+def triangles(surface: Array) -> Iterator[Array]:
+    """List the triangles of refined vertices, shape (rows, cols, k), each with shape (3, k)."""
+    for r, c in np.ndindex(surface.shape[0] - 1, surface.shape[1] - 1):
+        corners = surface[r, c], surface[r + 1, c], surface[r + 1, c + 1], surface[r, c + 1]
+        yield np.array(corners[:3])
+        yield np.array([corners[0], *corners[2:]])
+
+
+def footprint(triangle: Array, x: Array, y: Array, texels: tuple[int, int]) -> Array:
+    """Give the larger of a sample's width and height on the texture, by differences over a thousandth of a sample.
+
+    Args:
+        triangle: corners (X, Y, w, depth, u, v), shape (3, 6).
+        x: sample, right, any shape.
+        y: sample, down, the same shape.
+        texels: width and height of the texture.
+    """
+    step = 1e-3
+
+    def place(x: Array, y: Array) -> Array:
+        u, v = np.tensordot(triangle[:, 4:6].T, weights(triangle, x, y), 1)
+        return np.array([u * texels[0], v * texels[1]])
+
+    right = place(x + step, y) - place(x - step, y)
+    down = place(x, y + step) - place(x, y - step)
+    return np.asarray(np.maximum(np.hypot(*right), np.hypot(*down)) / (2 * step))
+
+
+def draw(scene: Scene, position: Array, texture: NDArray[np.uint8], rods: Sequence[Rod] = ()) -> NDArray[np.uint8]:
+    """Draw one frame.
 
     Args:
         scene: the scene.
         position: positions of the mass points [m], shape (rows, cols, 3).
         texture: the picture on the sheet, shape (height, width, 3).
+        rods: the instruments.
 
     Returns:
         Colours, shape (height, width, 3).
     """
-    rows, cols = scene.sheet.points
-    factor = scene.render.supersample
-    width, height = (size * factor for size in scene.render.size)
-    camera = view(scene)
-    matrix = camera.matrix * np.array([[factor], [factor], [1], [1]])
-
-    projected = np.concatenate([position, np.ones((rows, cols, 1))], axis=-1) @ matrix.T
-    u, v = np.meshgrid(np.arange(cols) / (cols - 1), np.arange(rows) / (rows - 1))
-    surface = refine(np.concatenate([projected, u[..., None], v[..., None]], axis=-1), scene.render.refine)
-    normal = normals(position)
-
-    colour = np.empty((height, width, 3))
-    colour[:] = scene.render.background
-    nearest = np.full((height, width), np.inf)
-    for r, c in np.ndindex(surface.shape[0] - 1, surface.shape[1] - 1):
-        corners = surface[r, c], surface[r + 1, c], surface[r + 1, c + 1], surface[r, c + 1]
-        for triangle in (np.array(corners[:3]), np.array([corners[0], *corners[2:]])):
-            if (triangle[:, 2] > camera.near).all():
-                corner = triangle[:, :2] / triangle[:, 2:3] - 0.5
-                left, top = np.maximum(np.floor(corner.min(axis=0)), 0).astype(int)
-                right, bottom = np.minimum(np.ceil(corner.max(axis=0)), [width - 1, height - 1]).astype(int)
-            else:
-                left, top, right, bottom = 0, 0, width - 1, height - 1
-            if right < left or bottom < top:
-                continue
-            box = np.s_[top : bottom + 1, left : right + 1]
-            y, x = np.mgrid[box].astype(float) + 0.5
-            share = weights(triangle, x, y)
-            w, depth, u, v = np.tensordot(triangle[:, 2:].T, share, 1)
-            seen = (share >= -1e-12).all(axis=0) & (w > camera.near) & (depth < nearest[box])
-            nearest[box][seen] = depth[seen]
-            u, v = np.where(seen, u, 0), np.where(seen, v, 0)
-            lit = sample(texture, u, v)
-            if scene.render.shading == "headlight":
-                lit *= headlight(normal, u, v, camera.toward)[..., None]
-            if scene.render.wireframe:
-                wire = wire_share(scene, triangle, x, y)[..., None]
-                lit = lit * (1 - wire) + np.array(style.WIRE_COLOUR) * wire
-            colour[box][seen] = lit[seen]
-    colour = colour.reshape(height // factor, factor, width // factor, factor, 3).mean(axis=(1, 3))
+    factor, camera = scene.render.supersample, view(scene)
+    seen = look(scene, position, factor, (texture.shape[1], texture.shape[0]))
+    sheet = np.isfinite(seen.depth)
+    u, v = np.where(sheet, seen.u, 0), np.where(sheet, seen.v, 0)
+    normal = normals_at(normals(position), u, v)
+    if scene.render.shading == "tissue":
+        lit = tissue(scene, camera, texture, normal, seen.depth, (u, v, seen.footprint), rods)
+    else:
+        lit = sample(texture, u, v)
+    if scene.render.shading == "headlight":
+        lit *= headlight(normal, camera.toward)[..., None]
+    wire = seen.wire[..., None]
+    lit = lit * (1 - wire) + np.array(style.WIRE_COLOUR) * wire
+    colour = np.where(sheet[..., None], lit, np.array(scene.render.background, float))
+    depth, outward = meet(rods, camera, scene.render.size, factor)
+    nearer = depth < seen.depth
+    colour[nearer] = metal(camera, factor, depth, outward)[nearer]
+    height, width = (size // factor for size in seen.depth.shape)
+    colour = colour.reshape(height, factor, width, factor, 3).mean(axis=(1, 3))
     return np.floor(colour + 0.5).astype(np.uint8)

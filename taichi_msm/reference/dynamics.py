@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from taichi_msm.physics.lattice import fixed_points, rest_positions, spacing
 from taichi_msm.physics.loads import Schedule, schedule
+from taichi_msm.physics.material import area_shares
 from taichi_msm.physics.timestep import time_grid
 from taichi_msm.reference.sheet import Springs, sheet
 from taichi_msm.scene import Scene
@@ -96,14 +97,38 @@ def _strains(scene: Scene, displacement: Array) -> Iterator[Array]:
 
 def energy(scene: Scene, displacement: Array) -> float:
     """Add up what springs and bending hold more than at rest [J], without the virtual springs."""
-    held = 0.0
+    held = sum(float(held.sum()) for _, held in _held(scene, displacement))
+    return held + sheet(scene).bending / 2 * float((_laplacian(scene, displacement) ** 2).sum())
+
+
+def energy_density(scene: Scene, displacement: Array) -> Array:
+    """Tell what springs hold more than at rest by area, without bending and the virtual springs.
+
+    Each end of a spring gets half of what it holds, and a point has the share of the sheet's area at rest that
+    `area_shares` gives it, so that the sum of density times area is the energy of all springs.
+
+    Args:
+        scene: the scene.
+        displacement: x - X [m], shape (rows, cols, 3).
+
+    Returns:
+        Energy by area at rest [J/m2], shape (rows, cols).
+    """
+    at_points, (dx, dy) = np.zeros(displacement.shape[:2]), spacing(scene.sheet)
+    for springs, held in _held(scene, displacement):
+        at_points[springs.here] += held / 2
+        at_points[springs.there] += held / 2
+    return at_points / (dx * dy * area_shares(scene.sheet))
+
+
+def _held(scene: Scene, displacement: Array) -> Iterator[tuple[Springs, Array]]:
+    """Give what every spring holds more than at rest [J], with the springs."""
     for springs in sheet(scene).springs:
         between, length = _ends_apart(springs, displacement)
         rest = springs.length - springs.unstretched
         # What is linear in the displacements cancels in the sum over a sheet that is in balance at rest.
         linear = (between - springs.offset) @ springs.offset * rest / springs.length
-        held += float((springs.stiffness * ((length - springs.unstretched) ** 2 / 2 - rest**2 / 2 - linear)).sum())
-    return held + sheet(scene).bending / 2 * float((_laplacian(scene, displacement) ** 2).sum())
+        yield springs, springs.stiffness * ((length - springs.unstretched) ** 2 / 2 - rest**2 / 2 - linear)
 
 
 def surgical_force(scene: Scene, loads: Schedule, n: int) -> Array:

@@ -26,16 +26,55 @@ NEAR = 1e-6
 class View(NamedTuple):
     """How points become pixels.
 
+    A point's place in the camera's frame is (right, up, -depth) [m] from the eye. It is seen at
+
+        x = centre_x + right / w scale,    y = centre_y - up / w scale    [px]
+
+    with w = depth for a pinhole, and w = 1 for the orthographic camera, whose eye is anywhere on its plane.
+
     Attributes:
         matrix: takes (x, y, z, 1) [m] to (X, Y, w, depth), shape (4, 4): the point is at X / w, Y / w [px], x right
             and y down from the picture's top-left corner; of two points the one of smaller depth [m] is nearer.
-        toward: unit vector toward the camera, shape (3,); also the direction of the headlight.
         near: nothing with a w of this or less is drawn [m].
+        axes: unit vectors to the right, up and toward the camera, as rows, shape (3, 3); the last is also the direction
+            of the headlight.
+        eye: where depth and the camera's frame begin [m], shape (3,).
+        scale: pixels of a metre at w = 1.
+        centre: the middle of the picture [px], shape (2,).
+        distance: from the eye to what is looked at [m].
+        pinhole: whether it is one.
     """
 
     matrix: Array
-    toward: Array
     near: float
+    axes: Array
+    eye: Array
+    scale: float
+    centre: Array
+    distance: float
+    pinhole: bool
+
+    @property
+    def toward(self) -> Array:
+        """Unit vector toward the camera, shape (3,)."""
+        return self.axes[2]
+
+
+def calibration(camera: View) -> dict[str, list[list[float]]]:
+    """Write a camera down as other programs take it.
+
+    Returns:
+        projection: 3 x 4, with pixel = (P [x y z 1])_12 / (P [x y z 1])_3 from the picture's upper left corner. For a
+        pinhole also, in OpenCV's convention (x right, y down, z forward): intrinsics, 3 x 3; pose, 3 x 4, from the
+        world to the camera.
+    """
+    found = {"projection": camera.matrix[:3].tolist()}
+    if camera.pinhole:
+        turn = camera.axes * np.array([[1.0], [-1.0], [-1.0]])
+        x, y = camera.centre.tolist()
+        found["intrinsics"] = [[camera.scale, 0.0, x], [0.0, camera.scale, y], [0.0, 0.0, 1.0]]
+        found["pose"] = np.concatenate([turn, -turn @ camera.eye[:, None]], axis=1).tolist()
+    return found
 
 
 def view(scene: Scene) -> View:
@@ -109,10 +148,14 @@ def _top_scale(scene: Scene) -> float:
 
 
 def _top(scene: Scene) -> View:
-    """Look straight down, the rest rectangle fitted into the picture at one scale and centred."""
-    (columns, lines), scale = scene.render.size, _top_scale(scene)
-    matrix = np.array([[scale, 0, 0, columns / 2], [0, -scale, 0, lines / 2], [0, 0, 0, 1], [0, 0, -1, 0]], dtype=float)
-    return View(matrix, np.array([0.0, 0.0, 1.0]), 0.0)
+    """Look straight down, the rest rectangle fitted into the picture at one scale and centred.
+
+    Depth begins at the larger side of the sheet above it.
+    """
+    (columns, lines), scale, distance = scene.render.size, _top_scale(scene), max(scene.sheet.size)
+    rows = [[scale, 0, 0, columns / 2], [0, -scale, 0, lines / 2], [0, 0, 0, 1], [0, 0, -1, distance]]
+    centre, eye = np.array([columns / 2, lines / 2]), np.array([0.0, 0.0, distance])
+    return View(np.array(rows, dtype=float), 0.0, np.eye(3), eye, scale, centre, distance, pinhole=False)
 
 
 def _axes(camera: Camera) -> Array:
@@ -133,7 +176,8 @@ def _pinhole(camera: Camera, scene: Scene) -> View:
     focal = lines / 2 / np.tan(np.radians(camera.fov) / 2)
     rows = [focal * right + columns / 2 * depth, -focal * up + lines / 2 * depth, depth, depth]
     matrix = np.array([[*row, -row @ eye] for row in rows])
-    return View(matrix, axes[2], NEAR * math.hypot(*scene.sheet.size))
+    near, distance = NEAR * math.hypot(*scene.sheet.size), math.dist(camera.eye, camera.target)
+    return View(matrix, near, axes, eye, focal, np.array([columns / 2, lines / 2]), distance, pinhole=True)
 
 
 def _oblique(scene: Scene) -> Camera:

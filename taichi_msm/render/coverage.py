@@ -1,14 +1,8 @@
 """What every sample of the picture shows: the nearest point of the surface, and where on the sheet it is.
 
-A point of the surface is carried as (X, Y, w, depth), what the camera's matrix makes of it. That map is linear, so
-refining the projected mass points is refining the surface, and the perspective needs no special case: within a cell,
-the surface between four mass points, with s to the right and t down,
-
-    P(s, t) = A + B s + C t + D s t,    seen at sample (x, y) where    X - x w = 0,  Y - y w = 0.
-
-No vertex is stored. A sample inside the outline of a cell solves these two equations, which tells the small quad, its
-side of the diagonal the triangle, and the triangle's own two linear equations the place on it. A cell that is folded or
-reaches behind the camera is drawn triangle by triangle instead.
+No vertex is stored. A sample inside the outline of a cell solves the two equations of patch.py, which tells the small
+quad, its side of the diagonal the triangle, and the triangle's own two linear equations the place on it. A cell that is
+folded or reaches behind the camera is drawn triangle by triangle instead.
 """
 
 # No `from __future__ import annotations` here: Taichi reads the annotations of a kernel.
@@ -18,6 +12,7 @@ from functools import cache
 from typing import Any, NamedTuple
 
 from taichi_msm.render import style
+from taichi_msm.render.patch import Plane, edge, on_triangle, small_quad, turn
 from taichi_msm.render.samples import DEPTH, INFINITY, TEXEL_X, TEXEL_Y, Code
 from taichi_msm.system.runtime import ti
 
@@ -31,6 +26,9 @@ FARTHEST = float(1 << 16)
 
 # What is kept of a mass point: (X, Y, w, depth), its place in the picture [samples], its unit normal.
 SEEN, NORMAL, POINT_NUMBERS = 4, 6, 9
+
+# So many texels squared are all of any texture.
+LARGEST_FOOTPRINT = 1e12
 
 vec4 = ti.types.vector(4, ti.f32)
 
@@ -63,7 +61,7 @@ class Band(NamedTuple):
         top, bottom: first row of samples, and the row after the last.
         width, height: of the picture [samples].
         near: what is not farther than this is not drawn.
-        toward: direction to the headlight.
+        axes: the camera's, of which the last is the direction to the headlight.
     """
 
     samples: Any
@@ -74,7 +72,7 @@ class Band(NamedTuple):
     width: Any
     height: Any
     near: Any
-    toward: Any
+    axes: Any
 
 
 class Cell(NamedTuple):
@@ -88,6 +86,8 @@ class Cell(NamedTuple):
         texel_x, texel_y: whole texels to that point.
         rest_x, rest_y: what is left of a texel there.
         step_x, step_y: texels of the cell.
+        i, j: its row and column.
+        cells_down, cells_across: cells of the sheet.
     """
 
     a: Any
@@ -103,20 +103,10 @@ class Cell(NamedTuple):
     rest_y: Any
     step_x: Any
     step_y: Any
-
-
-class Plane(NamedTuple):
-    """The triangle P + R s + D t of a small quad that a sample is on, each of them (X, Y, w)."""
-
-    p_x: Any
-    p_y: Any
-    p_w: Any
-    r_x: Any
-    r_y: Any
-    r_w: Any
-    d_x: Any
-    d_y: Any
-    d_w: Any
+    i: Any
+    j: Any
+    cells_down: Any
+    cells_across: Any
 
 
 @cache
@@ -135,23 +125,6 @@ def covering(code: Code) -> Callable[..., Any]:
         return ti.max(values, values * (-1.0))
 
     @ti.func
-    def on_triangle(x, y, plane: ti.template()):
-        """Find (s, t) where the triangle is seen at (x, y)."""
-        p_1 = plane.p_x - x * plane.p_w
-        r_1 = plane.r_x - x * plane.r_w
-        d_1 = plane.d_x - x * plane.d_w
-        p_2 = plane.p_y - y * plane.p_w
-        r_2 = plane.r_y - y * plane.r_w
-        d_2 = plane.d_y - y * plane.d_w
-        share = 1.0 / (r_1 * d_2 - r_2 * d_1)
-        return (p_2 * d_1 - p_1 * d_2) * share, (p_1 * r_2 - p_2 * r_1) * share
-
-    @ti.func
-    def edge(p_x, p_y, q_x, q_y, x, y):
-        """Twice the area of p, q and (x, y), of one sign on each side; the same bits for both cells of an edge."""
-        return (q_x - p_x) * (y - p_y) - (q_y - p_y) * (x - p_x)
-
-    @ti.func
     def largest_edge(p_x, p_y, q_x, q_y, x, y, side):
         """The largest `edge` times side of a tile whose upper left sample is at (x, y), rounded alike."""
         right, down = (q_x - p_x) * side, (q_y - p_y) * side
@@ -160,39 +133,8 @@ def covering(code: Code) -> Callable[..., Any]:
         return right * (y - p_y) - down * (x - p_x)
 
     @ti.func
-    def turn(p_x, p_y, q_x, q_y, r_x, r_y):
-        return (q_x - p_x) * (r_y - q_y) - (q_y - p_y) * (r_x - q_x)
-
-    @ti.func
-    def small_quad(x, y, inside, parts, cell: ti.template()):
-        """Find column and line of the small quads of the cell that are seen at (x, y)."""
-        a, b, c, d = ti.static((cell.a, cell.b, cell.c, cell.d))
-        a_1 = a[0] - x * a[2]
-        b_1 = b[0] - x * b[2]
-        c_1 = c[0] - x * c[2]
-        d_1 = d[0] - x * d[2]
-        a_2 = a[1] - y * a[2]
-        b_2 = b[1] - y * b[2]
-        c_2 = c[1] - y * c[2]
-        d_2 = d[1] - y * d[2]
-        # Without t the two equations are bd s^2 + (ad + bc) s + ac = 0; without s they have the same discriminant.
-        ad = a_1 * d_2 - d_1 * a_2
-        bc = b_1 * c_2 - c_1 * b_2
-        ac = a_1 * c_2 - c_1 * a_2
-        ab = a_1 * b_2 - b_1 * a_2
-        bd = b_1 * d_2 - d_1 * b_2
-        linear = ad + bc
-        root = ti.sqrt(ti.max(linear * linear - 4.0 * bd * ac, 0.0)) * cell.side
-        s = ti.select(inside, -2.0 * ac / (linear + root), 0.0)
-        t = ti.select(inside, -2.0 * ab / (ad - bc - root), 0.0)
-        return (
-            ti.max(ti.min(ti.floor(s * parts), parts - 1.0), 0.0),
-            ti.max(ti.min(ti.floor(t * parts), parts - 1.0), 0.0),
-        )
-
-    @ti.func
-    def light(surface: ti.template(), cell: ti.template(), toward: ti.template(), across, along):
-        """Share of the headlight that comes back: the cosine between the normal and the direction to the light."""
+    def normal_at(surface: ti.template(), cell: ti.template(), across, along):
+        """Interpolate the normals of the mass points; of no length in particular."""
         normal = [floats(0) for _ in ti.static(range(3))]
         corner = cell.corner + NORMAL
         below = corner + surface.cols * POINT_NUMBERS
@@ -200,11 +142,30 @@ def covering(code: Code) -> Callable[..., Any]:
             n_a, n_b = surface.point[corner + n], surface.point[corner + POINT_NUMBERS + n]
             n_c, n_d = surface.point[below + n], surface.point[below + POINT_NUMBERS + n]
             normal[n] = n_a + (n_b - n_a) * across + (n_c - n_a + (n_d - n_b - (n_c - n_a)) * across) * along
-        n_x, n_y, n_z = normal[0], normal[1], normal[2]
+        return normal[0], normal[1], normal[2]
+
+    @ti.func
+    def light(surface: ti.template(), cell: ti.template(), axes: ti.template(), across, along):
+        """Share of the headlight that comes back: the cosine between the normal and the direction to the light."""
+        n_x, n_y, n_z = normal_at(surface, cell, across, along)
         length = ti.sqrt(n_x * n_x + n_y * n_y + n_z * n_z)
-        cosine = absolute(n_x * toward[0] + n_y * toward[1] + n_z * toward[2]) / ti.max(length, 1e-30)
+        cosine = absolute(n_x * axes[2, 0] + n_y * axes[2, 1] + n_z * axes[2, 2]) / ti.max(length, 1e-30)
         # The normal of a point that is infinitely far, or nowhere, is none.
         return ti.max(ti.min(cosine, 1.0), 0.0)
+
+    @ti.func
+    def footprint(x, y, s, t, texels_x, texels_y, plane: ti.template()):
+        """Square of the larger of a sample's width and height on the texture, in texels.
+
+        With x = X / w the derivatives of (x, y) by (s, t) are (R_1, D_1; R_2, D_2) / w, where R_1 = R_x - x R_w and so
+        on; those of (s, t) by (x, y) are the inverse.
+        """
+        r_1 = (plane.r_x - x * plane.r_w) * texels_y
+        d_1 = (plane.d_x - x * plane.d_w) * texels_x
+        r_2 = (plane.r_y - y * plane.r_w) * texels_y
+        d_2 = (plane.d_y - y * plane.d_w) * texels_x
+        w = (plane.p_w + plane.r_w * s + plane.d_w * t) * (texels_x * texels_y) / (r_1 * d_2 - r_2 * d_1)
+        return ti.min(ti.max(r_1 * r_1 + d_1 * d_1, r_2 * r_2 + d_2 * d_2) * (w * w), LARGEST_FOOTPRINT)
 
     @ti.func
     def wire_share(across, down, right_across, right_down, below_across, below_down):
@@ -281,9 +242,19 @@ def covering(code: Code) -> Callable[..., Any]:
         keep(at + DEPTH, visible, z, band.samples)
         keep(at + TEXEL_X, visible, cell.rest_x + across * cell.step_x + cell.texel_x, band.samples)
         keep(at + TEXEL_Y, visible, cell.rest_y + along * cell.step_y + cell.texel_y, band.samples)
-        if ti.static(code.lit):
-            keep(at + code.light, visible, light(surface, cell, band.toward, across, along), band.samples)
-        if ti.static(code.wireframe):
+        if ti.static(code.labels):
+            keep(at + code.layout["across"], visible, (cell.j + across) / cell.cells_across, band.samples)
+            keep(at + code.layout["down"], visible, (cell.i + along) / cell.cells_down, band.samples)
+        if ti.static(code.headlit):
+            keep(at + code.layout["light"], visible, light(surface, cell, band.axes, across, along), band.samples)
+        if ti.static(code.tissue):
+            n_x, n_y, n_z = normal_at(surface, cell, across, along)
+            keep(at + code.layout["normal_x"], visible, n_x, band.samples)
+            keep(at + code.layout["normal_y"], visible, n_y, band.samples)
+            keep(at + code.layout["normal_z"], visible, n_z, band.samples)
+            size = footprint(x, y, s, t, cell.step_x * part, cell.step_y * part, plane)
+            keep(at + code.layout["footprint"], visible, size, band.samples)
+        if ti.static(code.wires):
             s_right, t_right = on_triangle(x + 1.0, y, plane)
             s_below, t_below = on_triangle(x, y + 1.0, plane)
             wire = wire_share(
@@ -291,7 +262,7 @@ def covering(code: Code) -> Callable[..., Any]:
                 (column + s_right) * part, (line + t_right) * part,
                 (column + s_below) * part, (line + t_below) * part,
             )  # fmt: skip
-            keep(at + code.wire, visible, wire, band.samples)
+            keep(at + code.layout["wire"], visible, wire, band.samples)
 
     @ti.func
     def cover(i, j, surface: ti.template(), band: ti.template()):
@@ -331,7 +302,14 @@ def covering(code: Code) -> Callable[..., Any]:
         rest_x, rest_y = ti.cast(texel_x - whole_x, ti.f32), ti.cast(texel_y - whole_y, ti.f32)
         step_x = ti.cast(surface.texture_width, ti.f32) / (surface.cols - 1)
         step_y = ti.cast(surface.texture_height, ti.f32) / (surface.rows - 1)
-        cell = ti.static(Cell(a, b, c, d, whole, side, corner, first_x, first_y, rest_x, rest_y, step_x, step_y))
+        cells_down, cells_across = ti.cast(surface.rows - 1, ti.f32), ti.cast(surface.cols - 1, ti.f32)
+        cell_i, cell_j = ti.cast(i, ti.f32), ti.cast(j, ti.f32)
+        cell = ti.static(
+            Cell(
+                a, b, c, d, whole, side, corner, first_x, first_y, rest_x, rest_y, step_x, step_y,
+                cell_i, cell_j, cells_down, cells_across,
+            )
+        )  # fmt: skip
         count = ti.cast(surface.parts, ti.i32)
         part = 1.0 / surface.parts
 
@@ -406,7 +384,9 @@ def covering(code: Code) -> Callable[..., Any]:
                                 & (edge(c_x, c_y, d_x, d_y, x, y) * side < 0.0)
                             )
                             if ti.static(code.refined):
-                                column, line = small_quad(x, y, inside, surface.parts, cell)
+                                column, line = small_quad(
+                                    x, y, inside, surface.parts, cell.side, cell.a, cell.b, cell.c, cell.d
+                                )
                         cover_tile(
                             band.first + (tile_line * band.across + tile) * planes, x, y, inside, column, line,
                             lower, overstep, cell, surface, band,

@@ -1,35 +1,62 @@
 """Kernel 2: bilinear refinement, projection, rasterisation of textured triangles, shading.
 
-The picture is cut into bands of rows. A worker takes the next band, finds what each of its samples shows (coverage.py),
-shades them and gives out the pixels (shading.py). As in kernel 1, vectors stay vectors down to the machine code
+The picture is cut into bands of rows. A worker takes the next band, finds what each of its samples shows: the sheet
+(coverage.py) or an instrument before it (instrument.py). From that it gives out the colours of pixels, their labels, or
+both (shading.py). As in kernel 1, vectors stay vectors down to the machine code
 (docs/decisions/0010); casts, and floor and abs of vectors, are written so that they can.
 """
 
 # No `from __future__ import annotations` here: Taichi reads the annotations of a kernel.
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from functools import cache
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from taichi_msm.render.camera import View, view
 from taichi_msm.render.coverage import NORMAL, POINT_NUMBERS, SEEN, Band, Surface, covering
+from taichi_msm.render.instrument import Rod
+from taichi_msm.render.instrument_coverage import instruments, rod_numbers
+from taichi_msm.render.labels import Labels
+from taichi_msm.render.lighting import light_numbers
+from taichi_msm.render.pyramid import pyramid
 from taichi_msm.render.samples import DEPTH, INFINITY, Code
-from taichi_msm.render.shading import Texture, packed, resolving
+from taichi_msm.render.shading import Out, Texture, resolving
 from taichi_msm.scene import Scene
 from taichi_msm.system.runtime import ITERATIONS_PER_THREAD, Memory, lanes, our_compilation, started, ti
 
 
-def structure(scene: Scene) -> Code:
-    """Find out what the scene's picture needs."""
+class Drawn(NamedTuple):
+    """What was drawn of one frame.
+
+    Attributes:
+        picture: colours, shape (height, width, 3); None where only labels are drawn.
+        labels: what each pixel sees; None where only the picture is drawn.
+    """
+
+    picture: NDArray[np.uint8] | None
+    labels: Labels | None
+
+
+def structure(scene: Scene, *, picture: bool = True, labels: bool = False) -> Code:
+    """Find out what drawing a scene needs.
+
+    Args:
+        scene: the scene.
+        picture: whether colours are wanted.
+        labels: whether labels are; with both, a pixel has one sample.
+    """
     render = scene.render
     return Code(
         refined=render.refine > 0,
-        supersample=render.supersample,
-        lit=render.shading == "headlight",
+        supersample=render.supersample if picture else 1,
+        shading=render.shading,
         wireframe=render.wireframe,
+        instruments=scene.has_instruments,
+        picture=picture,
+        labels=labels,
         lanes=lanes("f32"),
     )
 
@@ -40,7 +67,7 @@ class Drawing:
     Args:
         scene: a checked scene.
         texture: the picture on the sheet, shape (height, width, 3).
-        code: another than the scene's own; for tests.
+        code: another than that of the scene's picture.
     """
 
     def __init__(self, scene: Scene, texture: NDArray[np.uint8], code: Code | None = None) -> None:
@@ -57,37 +84,52 @@ class Drawing:
         self._reach = memory.array("f32", 0, rows * 2)
         self._samples = memory.array("f32", self.code.lanes, self._workers * self.code.band_vectors(width))
         self._background = np.array(scene.render.background, np.float32)
-        self._texels: Any = packed(texture).ravel()
         self._texture_size = texture.shape[1], texture.shape[0]
+        texels, self._levels = pyramid(texture, minified=self.code.tissue)
+        self._texels: Any = texels
         if started().arch != "cpu":
             # Kept there, or it would travel there and back with every picture.
-            texels, self._texels = self._texels, ti.ndarray(ti.f32, self._texels.size)
+            self._texels = ti.ndarray(ti.f32, texels.size)
             self._texels.from_numpy(texels)
 
-    def draw(self, position: NDArray[Any], camera: View | None = None) -> NDArray[np.uint8]:
-        """Draw the sheet.
+    def draw(self, position: NDArray[Any], camera: View | None = None, rods: Sequence[Rod] = ()) -> NDArray[np.uint8]:
+        """Draw the sheet, where the code has a picture.
 
         Args:
             position: positions of the mass points [m], shape (rows, cols, 3).
             camera: another view than the scene's.
+            rods: the instruments.
 
         Returns:
             Colours, shape (height, width, 3).
         """
-        camera = camera or self._view
-        (rows, cols), (width, height), factor = self.scene.sheet.points, self.scene.render.size, self.code.supersample
+        picture = self.look(position, camera, rods).picture
+        assert picture is not None
+        return picture
+
+    def look(self, position: NDArray[Any], camera: View | None = None, rods: Sequence[Rod] = ()) -> Drawn:
+        """Draw whatever the code has; as for `draw`."""
+        camera, code = camera or self._view, self.code
+        (rows, cols), (width, height), factor = self.scene.sheet.points, self.scene.render.size, code.supersample
         scale = np.array([[factor], [factor], [1], [1]])
-        across = self.code.tiles_across(width)
         # Whole tiles are given out, of which the last may be wider than the picture.
-        stride = across * self.code.tile_width if self.code.in_words else width
-        out = np.empty((height, stride, 3), np.uint8)
+        stride = code.tiles_across(width) * code.tile_width if code.in_words else width
+        picture = np.empty((height, stride, 3) if code.picture else (1, 4, 3), np.uint8)
+        pixels = (height, width) if code.labels else (1, 1)
+        coordinates, depth = np.empty((*pixels, 2), np.float32), np.empty(pixels, np.float32)
+        instrument = np.zeros(pixels, np.uint8)
+        light = light_numbers(camera, self.scene.render.light, factor, self.scene.sheet.size, self._texture_size)
         with our_compilation(optimised=False):
             self._draw(
                 np.ascontiguousarray(position, np.float32),
                 self._texels,
+                self._levels,
                 np.ascontiguousarray(camera.matrix * scale, np.float32),
-                np.ascontiguousarray(camera.toward, np.float32),
+                np.ascontiguousarray(camera.axes, np.float32),
                 self._background,
+                light.astype(np.float32),
+                rod_numbers(rods, camera, factor).astype(np.float32),
+                len(rods),
                 camera.near,
                 self.scene.render.refine + 1,
                 rows,
@@ -100,27 +142,33 @@ class Drawing:
                 self._point,
                 self._reach,
                 self._samples,
-                out.ravel().view(np.int32) if self.code.in_words else out.ravel(),
+                picture.ravel().view(np.int32) if code.in_words else picture.ravel(),
+                coordinates.ravel(),
+                depth.ravel(),
+                instrument.ravel(),
             )
-        return out if stride == width else np.ascontiguousarray(out[:, :width])
+        seen = np.ascontiguousarray(picture[:, :width]) if code.picture else None
+        return Drawn(seen, Labels(coordinates, depth, instrument) if code.labels else None)
 
 
 @cache
 def _kernel(code: Code) -> Callable[..., None]:
     """Make the kernel of one code."""
     factor, floats = code.supersample, code.floats
-    cover, resolve = covering(code), resolving(code)
+    cover, cover_rods, resolve = covering(code), instruments(code), resolving(code)
 
     @ti.func
-    def project(position: ti.template(), matrix: ti.template(), point: ti.template(), i, j, rows, cols):
-        """Note where mass point (i, j) is seen, and its normal."""
+    def project(
+        position: ti.template(), matrix: ti.template(), axes: ti.template(), point: ti.template(), i, j, rows, cols
+    ):
+        """Note where mass point (i, j) is seen, and its normal; of tissue in the camera's frame."""
         here = (i * cols + j) * POINT_NUMBERS
         x, y, z = position[i, j, 0], position[i, j, 1], position[i, j, 2]
         for n in ti.static(range(4)):
             point[here + n] = matrix[n, 0] * x + matrix[n, 1] * y + matrix[n, 2] * z + matrix[n, 3]
         point[here + SEEN] = point[here] / point[here + 2]
         point[here + SEEN + 1] = point[here + 1] / point[here + 2]
-        if ti.static(code.lit):
+        if ti.static(code.headlit or code.tissue):
             i0, i1 = ti.max(i - 1, 0), ti.min(i + 1, rows - 1)
             j0, j1 = ti.max(j - 1, 0), ti.min(j + 1, cols - 1)
             r_x = position[i, j1, 0] - position[i, j0, 0]
@@ -133,9 +181,14 @@ def _kernel(code: Code) -> Callable[..., None]:
             n_y = r_z * u_x - r_x * u_z
             n_z = r_x * u_y - r_y * u_x
             length = ti.max(ti.sqrt(n_x * n_x + n_y * n_y + n_z * n_z), 1e-30)
-            point[here + NORMAL] = n_x / length
-            point[here + NORMAL + 1] = n_y / length
-            point[here + NORMAL + 2] = n_z / length
+            n_x, n_y, n_z = n_x / length, n_y / length, n_z / length
+            if ti.static(code.tissue):
+                for n in ti.static(range(3)):
+                    point[here + NORMAL + n] = axes[n, 0] * n_x + axes[n, 1] * n_y + axes[n, 2] * n_z
+            else:
+                point[here + NORMAL] = n_x
+                point[here + NORMAL + 1] = n_y
+                point[here + NORMAL + 2] = n_z
 
     @ti.func
     def draw_band(surface: ti.template(), band: ti.template(), reach: ti.template()):
@@ -143,6 +196,8 @@ def _kernel(code: Code) -> Callable[..., None]:
         lines = (band.bottom - band.top + code.tile_height - 1) // code.tile_height
         for tile in range(lines * band.across):
             band.samples[band.first + tile * code.planes + DEPTH] = floats(INFINITY)
+            if ti.static(code.instruments):
+                band.samples[band.first + tile * code.planes + ti.static(code.layout["instrument"])] = floats(0)
         for i in range(surface.rows - 1):
             low = ti.min(reach[2 * i], reach[2 * i + 2])
             high = ti.max(reach[2 * i + 1], reach[2 * i + 3])
@@ -154,9 +209,13 @@ def _kernel(code: Code) -> Callable[..., None]:
     def draw(
         position: ti.types.ndarray(dtype=ti.f32, ndim=3),
         texels: ti.types.ndarray(dtype=ti.f32, ndim=1),
+        levels: ti.types.ndarray(dtype=ti.i32, ndim=2),
         matrix: ti.types.ndarray(dtype=ti.f32, ndim=2),
-        toward: ti.types.ndarray(dtype=ti.f32, ndim=1),
+        axes: ti.types.ndarray(dtype=ti.f32, ndim=2),
         background: ti.types.ndarray(dtype=ti.f32, ndim=1),
+        light: ti.types.ndarray(dtype=ti.f32, ndim=1),
+        rods: ti.types.ndarray(dtype=ti.f32, ndim=2),
+        rod_count: ti.i32,
         near: ti.f32,
         parts: ti.f32,
         rows: ti.i32,
@@ -170,14 +229,17 @@ def _kernel(code: Code) -> Callable[..., None]:
         point: ti.types.ndarray(dtype=ti.f32, ndim=1),
         reach: ti.types.ndarray(dtype=ti.f32, ndim=1),
         samples: ti.types.ndarray(dtype=floats, ndim=1),
-        out: ti.types.ndarray(dtype=ti.i32 if code.in_words else ti.u8, ndim=1),
+        colours: ti.types.ndarray(dtype=ti.i32 if code.in_words else ti.u8, ndim=1),
+        coordinates: ti.types.ndarray(dtype=ti.f32, ndim=1),
+        depth: ti.types.ndarray(dtype=ti.f32, ndim=1),
+        instrument: ti.types.ndarray(dtype=ti.u8, ndim=1),
     ):
         for index in range(rows * ITERATIONS_PER_THREAD):
             if index % ITERATIONS_PER_THREAD == 0:
                 i = index // ITERATIONS_PER_THREAD
                 low, high = INFINITY, -INFINITY
                 for j in range(cols):
-                    project(position, matrix, point, i, j, rows, cols)
+                    project(position, matrix, axes, point, i, j, rows, cols)
                     here = (i * cols + j) * POINT_NUMBERS
                     if point[here + 2] > near:
                         low = ti.min(low, point[here + SEEN + 1])
@@ -192,7 +254,10 @@ def _kernel(code: Code) -> Callable[..., None]:
                 across = (width * factor + code.tile_width - 1) // code.tile_width
                 first = index // ITERATIONS_PER_THREAD * across * (code.band_lines * code.planes)
                 surface = ti.static(Surface(point, rows, cols, parts, texture_width, texture_height))
-                texture = ti.static(Texture(texels, texture_width, texture_height, background))
+                texture = ti.static(
+                    Texture(texels, levels, texture_width, texture_height, background, light, rods, rod_count)
+                )
+                out = ti.static(Out(colours, coordinates, depth, instrument))
                 samples_width, samples_height = width * factor, height * factor
                 # A worker that another program holds up leaves the bands to the others.
                 taking = True
@@ -203,9 +268,11 @@ def _kernel(code: Code) -> Callable[..., None]:
                         end_row = ti.min(row + code.band_rows, height)
                         top, bottom = row * factor, end_row * factor
                         band = ti.static(
-                            Band(samples, first, across, top, bottom, samples_width, samples_height, near, toward)
+                            Band(samples, first, across, top, bottom, samples_width, samples_height, near, axes)
                         )
                         draw_band(surface, band, reach)
+                        if ti.static(code.instruments):
+                            cover_rods(rod_count, rods, light, band)
                         resolve(samples, first, row, end_row, across, width, texture, out)
 
     return draw

@@ -19,9 +19,9 @@ BAND_ROWS = 16
 # Samples of a row of a tile, where there are as many lanes.
 TILE_WIDTH = 4
 
-# Planes of every tile: the depth of what is seen, and its place in the texture [texels]; then, where the code has
-# them, the share of light, the share of the mesh's lines, and the shaded colour.
-DEPTH, TEXEL_X, TEXEL_Y, FIRST_OPTIONAL = 0, 1, 2, 3
+# Planes of every tile: the depth of what is seen, and its place in the texture [texels]. Other planes follow where the
+# code has them (`Code.layout`).
+DEPTH, TEXEL_X, TEXEL_Y = 0, 1, 2
 
 # Farther than anything that is drawn.
 INFINITY = 3e38
@@ -34,15 +34,21 @@ class Code:
     Attributes:
         refined: whether vertices are inserted between mass points.
         supersample: samples of a pixel along each axis.
-        lit: whether there is a headlight.
+        shading: none, headlight or tissue.
         wireframe: whether the mass-point mesh is drawn.
+        instruments: whether there are any.
+        picture: whether colours are given out.
+        labels: whether what each pixel sees is given out; of one sample a pixel.
         lanes: samples of a tile.
     """
 
     refined: bool
     supersample: int
-    lit: bool
+    shading: str
     wireframe: bool
+    instruments: bool
+    picture: bool
+    labels: bool
     lanes: int
 
     @property
@@ -56,24 +62,43 @@ class Code:
         return self.lanes // self.tile_width
 
     @property
-    def light(self) -> int:
-        """Plane of the light."""
-        return FIRST_OPTIONAL
+    def headlit(self) -> bool:
+        """Whether the sheet is lit by the headlight."""
+        return self.picture and self.shading == "headlight"
 
     @property
-    def wire(self) -> int:
-        """Plane of the mesh's lines."""
-        return FIRST_OPTIONAL + self.lit
+    def tissue(self) -> bool:
+        """Whether the sheet is shaded as wet tissue."""
+        return self.picture and self.shading == "tissue"
 
     @property
-    def colour(self) -> int:
-        """First of the three planes of the colour, which is kept where samples are averaged."""
-        return FIRST_OPTIONAL + self.lit + self.wireframe
+    def wires(self) -> bool:
+        """Whether the mesh is drawn over the sheet."""
+        return self.picture and self.wireframe
+
+    @property
+    def metal(self) -> bool:
+        """Whether instruments are shaded."""
+        return self.picture and self.instruments
+
+    @cached_property
+    def layout(self) -> dict[str, int]:
+        """Name the planes that follow the first, and say which vector of a tile each is."""
+        wanted = {
+            "light": self.headlit,  # share of the headlight that comes back
+            "wire": self.wires,  # share of the mesh's lines in the colour
+            **dict.fromkeys(("across", "down"), self.labels),  # the material point, fractions of the sheet
+            "instrument": self.instruments,  # 1 where an instrument is seen, else 0
+            **dict.fromkeys(("normal_x", "normal_y", "normal_z"), self.tissue or self.metal),  # in the camera's frame
+            "footprint": self.tissue,  # square of the texels of a sample's longer side
+            **dict.fromkeys(("red", "green", "blue"), self.picture and self.supersample > 1),  # to be averaged
+        }
+        return {name: TEXEL_Y + 1 + n for n, name in enumerate(name for name, there in wanted.items() if there)}
 
     @property
     def planes(self) -> int:
         """Vectors that are kept of a tile."""
-        return self.colour + (3 if self.supersample > 1 else 0)
+        return TEXEL_Y + 1 + len(self.layout)
 
     @property
     def band_rows(self) -> int:

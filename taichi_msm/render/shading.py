@@ -1,37 +1,58 @@
-"""The colours of samples, from what they show, and the colours of pixels, which are given out."""
+"""The colours of samples, from what they show, and what is given out of pixels: their colours and their labels."""
 
 # No `from __future__ import annotations` here: Taichi reads the annotations of a kernel.
 
+import math
 from collections.abc import Callable
 from functools import cache
 from typing import Any, NamedTuple
 
-import numpy as np
-from numpy.typing import NDArray
-
 from taichi_msm.render import style
+from taichi_msm.render.lighting import ACROSS, SLOPE_X, SLOPE_Y, UP, Ray, lighting
 from taichi_msm.render.samples import DEPTH, INFINITY, TEXEL_X, TEXEL_Y, Code
 from taichi_msm.system.runtime import ti
 
+# No material point: the coordinate of a pixel that shows none.
+NOTHING = math.nan
+
 
 class Texture(NamedTuple):
-    """The picture on the sheet.
+    """The picture on the sheet, and what it is shaded with.
 
     Attributes:
-        texels: as `packed` makes them, row after row.
-        width, height: number of them.
+        texels: as in a `Pyramid`.
+        levels: likewise.
+        width, height: of the first level.
         background: red, green and blue of samples that show nothing.
+        light: as `light_numbers` makes them.
+        rods: as `rod_numbers` makes them.
+        rod_count: how many there are.
     """
 
     texels: Any
+    levels: Any
     width: Any
     height: Any
     background: Any
+    light: Any
+    rods: Any
+    rod_count: Any
 
 
-def packed(colours: NDArray[Any]) -> NDArray[np.float32]:
-    """Make one number of each colour, red + 256 green + 65536 blue, for which f32 has places."""
-    return colours.astype(np.float32) @ np.array([1, 1 << 8, 1 << 16], np.float32)
+class Out(NamedTuple):
+    """What is given out.
+
+    Attributes:
+        colours: of the pixels, as words or bytes.
+        coordinates: of the material points, two for each pixel.
+        depth: of every pixel.
+        instrument: 255 where one is seen, for each pixel.
+    """
+
+    colours: Any
+    coordinates: Any
+    depth: Any
+    instrument: Any
 
 
 @cache
@@ -42,6 +63,9 @@ def shading(code: Code) -> Callable[..., Any]:
         code: what it is compiled for.
     """
     lanes, floats, integers = code.lanes, code.floats, code.integers
+    rays, shaded, tissue, metal = lighting(code)
+    columns = [lane % code.tile_width + 0.5 for lane in range(lanes)]
+    lines = [lane // code.tile_width + 0.5 for lane in range(lanes)]
 
     @ti.func
     def whole_numbers(values):
@@ -63,39 +87,148 @@ def shading(code: Code) -> Callable[..., Any]:
         return up + (low - up) * v
 
     @ti.func
-    def shade(samples: ti.template(), at, texture: ti.template()):
-        """Shade a tile: the texture, lit, and the mesh drawn over it.
+    def fetch(first, width, height, x, y, texture: ti.template()):
+        """Filter a level bilinearly at (x, y) of its texels.
 
-        Args:
-            samples: what is kept of the tiles.
-            at: entry where the tile begins.
-            texture: the texture.
+        Returns:
+            Red, green and blue; and where tissue is shaded how its grey rises from texel to texel.
         """
-        seen = samples[at + DEPTH] < INFINITY
         # Beyond the middle of its outermost texels the texture does not change.
-        texel_x = ti.max(ti.min(ti.select(seen, samples[at + TEXEL_X], 0.0), texture.width - 1.0), 0.0)
-        texel_y = ti.max(ti.min(ti.select(seen, samples[at + TEXEL_Y], 0.0), texture.height - 1.0), 0.0)
+        texel_x = ti.max(ti.min(x, width - 1.0), 0.0)
+        texel_y = ti.max(ti.min(y, height - 1.0), 0.0)
         floor_x, floor_y = ti.floor(texel_x), ti.floor(texel_y)
         u, v = texel_x - floor_x, texel_y - floor_y
         left, row = whole_numbers(floor_x), whole_numbers(floor_y)
-        right = ti.min(left + 1, texture.width - 1)
-        upper = row * texture.width
-        under = ti.min(row + 1, texture.height - 1) * texture.width
+        right = ti.min(left + 1, width - 1)
+        upper = row * width + first
+        under = ti.min(row + 1, height - 1) * width + first
         red_ul, green_ul, blue_ul = channels(texture.texels, upper + left)
         red_ur, green_ur, blue_ur = channels(texture.texels, upper + right)
         red_ll, green_ll, blue_ll = channels(texture.texels, under + left)
         red_lr, green_lr, blue_lr = channels(texture.texels, under + right)
-        red = between(red_ul, red_ur, red_ll, red_lr, u, v)
-        green = between(green_ul, green_ur, green_ll, green_lr, u, v)
-        blue = between(blue_ul, blue_ur, blue_ll, blue_lr, u, v)
-        if ti.static(code.lit):
-            light = samples[at + code.light]
+        rise_x, rise_y = u, v
+        if ti.static(code.tissue):
+            grey_ul = red_ul + green_ul + blue_ul
+            grey_ur = red_ur + green_ur + blue_ur
+            grey_ll = red_ll + green_ll + blue_ll
+            grey_lr = red_lr + green_lr + blue_lr
+            rise_x = (grey_ur - grey_ul + (grey_lr - grey_ll - (grey_ur - grey_ul)) * v) * (1.0 / 3.0)
+            rise_y = (grey_ll - grey_ul + (grey_lr - grey_ur - (grey_ll - grey_ul)) * u) * (1.0 / 3.0)
+        return (
+            between(red_ul, red_ur, red_ll, red_lr, u, v),
+            between(green_ul, green_ur, green_ll, green_lr, u, v),
+            between(blue_ul, blue_ur, blue_ll, blue_lr, u, v),
+            rise_x,
+            rise_y,
+        )
+
+    @ti.func
+    def sample(samples: ti.template(), at, seen, texture: ti.template()):
+        """Filter the texture for a tile; returns what `fetch` does."""
+        x = ti.select(seen, samples[at + TEXEL_X], 0.0)
+        y = ti.select(seen, samples[at + TEXEL_Y], 0.0)
+        first, width, height = integers(0), integers(texture.width), integers(texture.height)
+        first_far, width_far, height_far = first, width, height
+        texel, footprint, most = floats(1), floats(0), 0.0
+        if ti.static(code.tissue):
+            footprint = ti.select(seen, samples[at + ti.static(code.layout["footprint"])], 0.0)
+            most = footprint.max()
+            if most > 1.0:
+                # Of every sample the level whose texels are not larger than it, and the next one, which are mixed.
+                last = texture.levels.shape[0] - 1
+                level, bound = 0, 1.0
+                while level <= last and most >= bound:
+                    larger = footprint >= bound
+                    far = ti.min(level + 1, last)
+                    if level > 0:
+                        texel = ti.select(larger, texel * 2.0, texel)
+                        first = ti.select(larger, texture.levels[level, 0], first)
+                        width = ti.select(larger, texture.levels[level, 1], width)
+                        height = ti.select(larger, texture.levels[level, 2], height)
+                    first_far = ti.select(larger, texture.levels[far, 0], first_far)
+                    width_far = ti.select(larger, texture.levels[far, 1], width_far)
+                    height_far = ti.select(larger, texture.levels[far, 2], height_far)
+                    bound = bound * 4.0
+                    level += 1
+                x = (x + 0.5) / texel - 0.5
+                y = (y + 0.5) / texel - 0.5
+        red, green, blue, rise_x, rise_y = fetch(first, width, height, x, y, texture)
+        if ti.static(code.tissue):  # noqa: SIM102  (decided when it is compiled)
+            if most > 1.0:
+                x = x * 0.5 - 0.25
+                y = y * 0.5 - 0.25
+                red_far, green_far, blue_far, far_x, far_y = fetch(first_far, width_far, height_far, x, y, texture)
+                share = ti.max(ti.min(ti.sqrt(footprint) / texel - 1.0, 1.0), 0.0)
+                red += (red_far - red) * share
+                green += (green_far - green) * share
+                blue += (blue_far - blue) * share
+                rise_x = (rise_x + (far_x * 0.5 - rise_x) * share) / texel
+                rise_y = (rise_y + (far_y * 0.5 - rise_y) * share) / texel
+        return red, green, blue, rise_x, rise_y
+
+    @ti.func
+    def shade(samples: ti.template(), at, left, top, texture: ti.template()):
+        """Shade a tile: the texture, lit, the mesh drawn over it, and instruments.
+
+        Args:
+            samples: what is kept of the tiles.
+            at: entry where the tile begins.
+            left: its first column of samples.
+            top: its first row.
+            texture: the texture and the light.
+        """
+        seen = samples[at + DEPTH] < INFINITY
+        red, green, blue, rise_x, rise_y = sample(samples, at, seen, texture)
+        if ti.static(code.headlit):
+            light = samples[at + ti.static(code.layout["light"])]
             red, green, blue = red * light, green * light, blue * light
-        if ti.static(code.wireframe):
-            wire = samples[at + code.wire]
+        light = ti.static(texture.light)
+        x = floats(columns) + ti.cast(left, ti.f32)
+        y = floats(lines) + ti.cast(top, ti.f32)
+        if ti.static(code.tissue):
+            n_x = samples[at + ti.static(code.layout["normal_x"])]
+            n_y = samples[at + ti.static(code.layout["normal_y"])]
+            n_z = samples[at + ti.static(code.layout["normal_z"])]
+            length = 1.0 / ti.max(ti.sqrt(n_x * n_x + n_y * n_y + n_z * n_z), 1e-30)
+            n_x, n_y, n_z = n_x * length, n_y * length, n_z * length
+            # Where the picture rises the normal leans back.
+            a_x, a_y, a_z = light[ACROSS], light[ACROSS + 1], light[ACROSS + 2]
+            b_x, b_y, b_z = light[UP], light[UP + 1], light[UP + 2]
+            slope_x, slope_y = rise_x * light[SLOPE_X], rise_y * light[SLOPE_Y]
+            along = slope_x * (a_x * n_x + a_y * n_y + a_z * n_z) + slope_y * (b_x * n_x + b_y * n_y + b_z * n_z)
+            r_x = n_x * (along + 1.0) - slope_x * a_x - slope_y * b_x
+            r_y = n_y * (along + 1.0) - slope_x * a_y - slope_y * b_y
+            r_z = n_z * (along + 1.0) - slope_x * a_z - slope_y * b_z
+            n_x, n_y, n_z, l_x, l_y, l_z, v_x, v_y, v_z, nearness = rays(
+                x, y, samples[at + DEPTH], r_x, r_y, r_z, light
+            )
+            ray = ti.static(Ray(n_x, n_y, n_z, l_x, l_y, l_z, v_x, v_y, v_z, nearness))
+            share, gloss = tissue(x, y, ray, light)
+            if ti.static(code.instruments):
+                left_over = shaded(x, y, samples[at + DEPTH], texture.rod_count, texture.rods, light)
+                share, gloss = share * left_over, gloss * left_over
+            red = ti.min(red * share + gloss, 255.0)
+            green = ti.min(green * share + gloss, 255.0)
+            blue = ti.min(blue * share + gloss, 255.0)
+        if ti.static(code.wires):
+            wire = samples[at + ti.static(code.layout["wire"])]
             red += (style.WIRE_COLOUR[0] - red) * wire
             green += (style.WIRE_COLOUR[1] - green) * wire
             blue += (style.WIRE_COLOUR[2] - blue) * wire
+        if ti.static(code.metal):
+            is_metal = samples[at + ti.static(code.layout["instrument"])] > 0.5
+            if ti.select(is_metal, 1.0, 0.0).max() > 0.0:
+                m_x = samples[at + ti.static(code.layout["normal_x"])]
+                m_y = samples[at + ti.static(code.layout["normal_y"])]
+                m_z = samples[at + ti.static(code.layout["normal_z"])]
+                m_x, m_y, m_z, l_x, l_y, l_z, v_x, v_y, v_z, nearness = rays(
+                    x, y, samples[at + DEPTH], m_x, m_y, m_z, light
+                )
+                ray = ti.static(Ray(m_x, m_y, m_z, l_x, l_y, l_z, v_x, v_y, v_z, nearness))
+                metal_red, metal_green, metal_blue = metal(ray)
+                red = ti.select(is_metal, metal_red, red)
+                green = ti.select(is_metal, metal_green, green)
+                blue = ti.select(is_metal, metal_blue, blue)
         return (
             ti.select(seen, red, floats(texture.background[0])),
             ti.select(seen, green, floats(texture.background[1])),
@@ -107,7 +240,7 @@ def shading(code: Code) -> Callable[..., Any]:
 
 @cache
 def resolving(code: Code) -> Callable[..., Any]:
-    """Make Taichi's function that shades the samples of a band and gives out the colours of its pixels.
+    """Make Taichi's function that shades the samples of a band and gives out its pixels.
 
     Args:
         code: what it is compiled for.
@@ -117,7 +250,7 @@ def resolving(code: Code) -> Callable[..., Any]:
     shade = shading(code)
 
     @ti.func
-    def give_tile(red, green, blue, row, end_row, tile, across, out: ti.template()):
+    def give_tile(red, green, blue, row, end_row, tile, across, colours: ti.template()):
         """Give out the colours of a tile whose samples are pixels."""
         colour = ti.floor(red + 0.5) + ti.floor(green + 0.5) * 256.0 + ti.floor(blue + 0.5) * 65536.0
         for line in ti.static(range(tile_height)):
@@ -126,15 +259,15 @@ def resolving(code: Code) -> Callable[..., Any]:
                 if ti.static(code.in_words):
                     # Four pixels, a byte for each channel, fill three words.
                     word = ((row + line) * across + tile) * 3
-                    out[word] = pixels[0] | (pixels[1] << 24)
-                    out[word + 1] = (pixels[1] >> 8) | (pixels[2] << 16)
-                    out[word + 2] = (pixels[2] >> 16) | (pixels[3] << 8)
+                    colours[word] = pixels[0] | (pixels[1] << 24)
+                    colours[word + 1] = (pixels[1] >> 8) | (pixels[2] << 16)
+                    colours[word + 2] = (pixels[2] >> 16) | (pixels[3] << 8)
                 else:
                     for n in ti.static(range(3)):
-                        out[((row + line) * across + tile) * 3 + n] = ti.cast((pixels[0] >> (8 * n)) & 255, ti.u8)
+                        colours[((row + line) * across + tile) * 3 + n] = ti.cast((pixels[0] >> (8 * n)) & 255, ti.u8)
 
     @ti.func
-    def give_means(samples: ti.template(), first, row, end_row, across, width, out: ti.template()):
+    def give_means(samples: ti.template(), first, row, end_row, across, width, colours: ti.template()):
         """Give out the colours of pixels, each the mean of its samples."""
         for y in range(row, end_row):
             for x in range(width):
@@ -144,11 +277,36 @@ def resolving(code: Code) -> Callable[..., Any]:
                         line, column = (y - row) * factor + v, x * factor + u
                         tile = (line // tile_height) * across + column // tile_width
                         lane = (line % tile_height) * tile_width + column % tile_width
-                        total += samples[first + tile * planes + code.colour + n][lane]
-                    out[(y * width + x) * 3 + n] = ti.cast(ti.cast(total / (factor * factor) + 0.5, ti.i32), ti.u8)
+                        total += samples[first + tile * planes + ti.static(code.layout["red"]) + n][lane]
+                    colours[(y * width + x) * 3 + n] = ti.cast(ti.cast(total / (factor * factor) + 0.5, ti.i32), ti.u8)
 
     @ti.func
-    def resolve(samples: ti.template(), first, row, end_row, across, width, texture: ti.template(), out: ti.template()):
+    def give_labels(samples: ti.template(), at, left, row, end_row, width, out: ti.template()):
+        """Give out what the pixels of a tile see."""
+        depth = samples[at + DEPTH]
+        across, down = samples[at + ti.static(code.layout["across"])], samples[at + ti.static(code.layout["down"])]
+        sheet = depth < INFINITY
+        if ti.static(code.instruments):
+            sheet = sheet & (samples[at + ti.static(code.layout["instrument"])] < 0.5)
+        across = ti.select(sheet, across, NOTHING)
+        down = ti.select(sheet, down, NOTHING)
+        depth = ti.select(depth < INFINITY, depth, 0.0)
+        for line in ti.static(range(tile_height)):
+            for n in ti.static(range(tile_width)):
+                if row + line < end_row and left + n < width:
+                    pixel = (row + line) * width + left + n
+                    lane = ti.static(line * tile_width + n)
+                    out.coordinates[2 * pixel] = across[lane]
+                    out.coordinates[2 * pixel + 1] = down[lane]
+                    out.depth[pixel] = depth[lane]
+                    if ti.static(code.instruments):
+                        mark = samples[at + ti.static(code.layout["instrument"])][lane]
+                        out.instrument[pixel] = ti.cast(mark * 255.0, ti.u8)
+
+    @ti.func
+    def resolve(
+        samples: ti.template(), first, row, end_row, across, width, texture: ti.template(), out: ti.template()
+    ):  # fmt: skip
         """Shade the samples of a band and give out its pixels.
 
         Args:
@@ -158,21 +316,25 @@ def resolving(code: Code) -> Callable[..., Any]:
             end_row: the row after its last.
             across: tiles of a row of them.
             width: of the picture [px].
-            texture: the texture.
-            out: the picture.
+            texture: the texture and the light.
+            out: the colours and the labels.
         """
         lines = ((end_row - row) * factor + tile_height - 1) // tile_height
         for line in range(lines):
             for tile in range(across):
                 at = first + (line * across + tile) * planes
-                red, green, blue = shade(samples, at, texture)
-                if ti.static(factor == 1):
-                    give_tile(red, green, blue, row + line * tile_height, end_row, tile, across, out)
-                else:
-                    samples[at + code.colour] = red
-                    samples[at + code.colour + 1] = green
-                    samples[at + code.colour + 2] = blue
-        if ti.static(factor > 1):
-            give_means(samples, first, row, end_row, across, width, out)
+                left, top = tile * tile_width, line * tile_height
+                if ti.static(code.labels):
+                    give_labels(samples, at, left, row + top, end_row, width, out)
+                if ti.static(code.picture):
+                    red, green, blue = shade(samples, at, left, row * factor + top, texture)
+                    if ti.static(factor == 1):
+                        give_tile(red, green, blue, row + top, end_row, tile, across, out.colours)
+                    else:
+                        samples[at + ti.static(code.layout["red"])] = red
+                        samples[at + ti.static(code.layout["green"])] = green
+                        samples[at + ti.static(code.layout["blue"])] = blue
+        if ti.static(code.picture and factor > 1):
+            give_means(samples, first, row, end_row, across, width, out.colours)
 
     return resolve

@@ -29,7 +29,7 @@ from taichi_msm.errors import FilesError
 from taichi_msm.progress import Pause
 from taichi_msm.results.folder import Folder
 from taichi_msm.results.gif import GifWriter, Palette, Picture, shades
-from taichi_msm.results.publication import ANIMATION, FRAMES, frame_file
+from taichi_msm.results.publication import ANIMATION, FRAMES, series_file
 
 # Level 1 takes a fifth of the time of the default (18 against 93 ms) for 10 % more bytes.
 COMPRESS_LEVEL = 1
@@ -255,7 +255,7 @@ def encode(job: Job, source: BinaryIO, hurry: Event) -> Report:
                 seconds += task.result()
                 frames += 1
     for number in range(frames, begun) if job.png else ():
-        folder.remove(frame_file(number))
+        folder.remove(series_file(FRAMES, number))
     seconds += _seconds(film.close)
     return Report(frames, seconds)
 
@@ -295,7 +295,7 @@ def _pictures(source: BinaryIO, size: tuple[int, int]) -> Iterator[Picture]:
 
 
 def _write_png(picture: Picture, folder: Folder, number: int) -> None:
-    with folder.create(frame_file(number)) as file:
+    with folder.create(series_file(FRAMES, number)) as file:
         Image.fromarray(picture).save(file, "PNG", compress_level=COMPRESS_LEVEL)
 
 

@@ -4,8 +4,11 @@ from __future__ import annotations
 
 import io
 import math
+import struct
 import zipfile
+import zlib
 from collections.abc import Iterable
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -49,16 +52,59 @@ def read_array(archive: zipfile.ZipFile, name: str, dtype: DTypeLike, shape: Sha
         ValueError: when dtype or shape differ; raised before memory is allocated for the array.
         Exception: whatever `zipfile` raises for a damaged archive.
     """
-    header, info = _header(dtype, shape), archive.getinfo(f"{name}.npy")
-    size = len(header) + math.prod(shape) * np.dtype(dtype).itemsize
-    # Compressed data might expand to any size, whatever the archive says.
-    if info.compress_type != zipfile.ZIP_STORED or (info.file_size, info.compress_size) != (size, size):
-        raise ValueError(name)
+    header, info = _header(dtype, shape), _entry(archive, name, dtype, shape)
     # Checks the CRC-32.
     data = archive.read(info)
     if data[: len(header)] != header:
         raise ValueError(name)
     return np.frombuffer(data, dtype, offset=len(header)).reshape(shape)
+
+
+def read_rows(archive: zipfile.ZipFile, name: str, dtype: DTypeLike, row: Shape) -> NDArray[Any]:
+    """Read an array of any number of rows, each of a known shape; raises what `read_array` does."""
+    header, size = len(_header(dtype, (0, *row))), math.prod(row) * np.dtype(dtype).itemsize
+    rows = (archive.getinfo(f"{name}.npy").file_size - header) // size
+    return read_array(archive, name, dtype, (max(0, rows), *row))
+
+
+def map_array(path: Path, name: str, dtype: DTypeLike, shape: Shape) -> NDArray[Any]:
+    """Map an array that `write_array` wrote, which may be larger than memory, after its checksum was verified.
+
+    Args:
+        path: of the archive.
+        name: of the array.
+        dtype: that the numbers must have.
+        shape: that the array must have; not empty.
+
+    Returns:
+        The array, read-only; the system reads it when it is accessed.
+
+    Raises:
+        ValueError: when dtype or shape differ, or the array is damaged.
+        Exception: whatever `zipfile` raises for a damaged archive.
+    """
+    header = _header(dtype, shape)
+    with path.open("rb") as file, zipfile.ZipFile(file) as archive:
+        info = _entry(archive, name, dtype, shape)
+        # The data follow the entry's header, its name and its extra field; the header ends with the lengths of both.
+        file.seek(info.header_offset + 26)
+        file.seek(sum(struct.unpack("<HH", file.read(4))), 1)
+        if file.read(len(header)) != header:
+            raise ValueError(name)
+        mapped = np.asarray(np.memmap(file, dtype, "r", file.tell(), shape))
+    if zlib.crc32(mapped.data.cast("B"), zlib.crc32(header)) != info.CRC:
+        raise ValueError(name)
+    return mapped
+
+
+def _entry(archive: zipfile.ZipFile, name: str, dtype: DTypeLike, shape: Shape) -> zipfile.ZipInfo:
+    """Find an array that is stored uncompressed and has the expected size; raises ValueError if it does not."""
+    info = archive.getinfo(f"{name}.npy")
+    size = len(_header(dtype, shape)) + math.prod(shape) * np.dtype(dtype).itemsize
+    # Compressed data might expand to any size, whatever the archive says.
+    if info.compress_type != zipfile.ZIP_STORED or (info.file_size, info.compress_size) != (size, size):
+        raise ValueError(name)
+    return info
 
 
 def _header(dtype: DTypeLike, shape: Shape) -> bytes:

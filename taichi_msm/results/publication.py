@@ -23,11 +23,21 @@ from typing import BinaryIO
 from taichi_msm.errors import DamagedError, FilesError, ForeignError
 from taichi_msm.results.folder import FILE, HAS_DESCRIPTORS, INHERITS, Folder, Tree
 from taichi_msm.results.sealed import seal, unseal
+from taichi_msm.scene import UNTIL_NEXT
 
-FRAMES = "frames"
-ANIMATION = "animation.gif"
-TRAJECTORY = "trajectory.npz"
+FRAMES, COORDINATES, DEPTH, FLOW, OCCLUSION, INSTRUMENT = SERIES_NAMES = (
+    "frames",
+    "coordinates",
+    "depth",
+    "flow",
+    "occlusion",
+    "instrument",
+)
+ANIMATION, TRAJECTORY, TRACKS, CAMERA = FILE_NAMES = "animation.gif", "trajectory.npz", "tracks.npz", "camera.json"
 RECORD = "run.json"
+
+# Folders with a file for every frame, and the kind of it.
+SERIES = dict(zip(SERIES_NAMES, ("png", "npy", "tiff", "flo", "png", "png"), strict=True))
 
 # What makes a checkpoint one: a run's manifest. Besides there are the positions of its frames, and its last state.
 MANIFEST, POSITIONS, STATE = "manifest.json", "positions", "state.npz"
@@ -37,7 +47,10 @@ LOCK, MARKER, DRAFT = "lock", "complete", "draft"
 
 # All that a run ever puts below a directory until it publishes its results.
 CHECKPOINT_TREE: Tree = dict.fromkeys((MANIFEST, POSITIONS, re.escape(STATE), DRAFT))
-NEW_TREE: Tree = {FRAMES: {r"[0-9]{4,}\.png": None}, **dict.fromkeys((ANIMATION, TRAJECTORY, RECORD))}
+NEW_TREE: Tree = {
+    **{folder: {rf"[0-9]{{4,}}\.{kind}": None} for folder, kind in SERIES.items()},
+    **{re.escape(name): None for name in (*FILE_NAMES, RECORD)},
+}
 STAGING_TREE: Tree = {**dict.fromkeys((LOCK, MARKER, DRAFT)), NEW: NEW_TREE, CHECKPOINT: CHECKPOINT_TREE}
 
 # How often a directory is tried that other runs are leaving; after that it is itself gone.
@@ -62,21 +75,29 @@ def is_unfinished(directory: Path) -> bool:
         return False
 
 
-def frame_file(number: int) -> str:
-    """Name the picture of a frame within its folder."""
-    return f"{number:04}.png"
+def series_file(folder: str, number: int) -> str:
+    """Name the file of a frame within its folder."""
+    return f"{number:04}.{SERIES[folder]}"
+
+
+def series_length(folder: str, frames: int) -> int:
+    """Count the files in a folder of results of so many frames."""
+    return max(0, frames - 1) if folder in UNTIL_NEXT else frames
 
 
 def result_names(outputs: Iterable[str], frames: int) -> list[str]:
     """List the files of results, with their folder.
 
     Args:
-        outputs: names of files, and FRAMES for the pictures of all frames.
+        outputs: names of files and of folders with a file for every frame.
         frames: how many frames.
     """
     names = []
     for output in outputs:
-        names += [f"{FRAMES}/{frame_file(n)}" for n in range(frames)] if output == FRAMES else [output]
+        if output in SERIES:
+            names += [f"{output}/{series_file(output, n)}" for n in range(series_length(output, frames))]
+        else:
+            names.append(output)
     return names
 
 
@@ -171,19 +192,16 @@ class Publication:
             outputs, frames = set(record["outputs"]), int(record["frames"])
         except (ValueError, KeyError, TypeError, RecursionError, OverflowError):
             raise ForeignError.at(self._path / RECORD, "a file") from None
-        return {
-            name
-            for name in _results(self._here)
-            if (_number(name) < frames and FRAMES in outputs if "/" in name else name in outputs)
-        }
+        return {name for name in _results(self._here) if _belongs(name, outputs, frames)}
 
     def _require_free(self, names: Collection[str], earlier: Collection[str]) -> None:
         """Make sure that results can be put in place, and that nothing is there but earlier ones."""
         with ExitStack() as opened:
             here = _Files(self._here, opened)
             # Before the run rather than halfway through the moves.
-            if here.has_folder(FRAMES) and not self._here.is_writable(FRAMES):
-                raise PermissionError(errno.EACCES, f"{FRAMES} is no directory that can be written")
+            for folder in {name.partition("/")[0] for name in names if "/" in name}:
+                if here.has_folder(folder) and not self._here.is_writable(folder):
+                    raise PermissionError(errno.EACCES, f"{folder} is no directory that can be written")
             for name in names:
                 kind = here.kind(name)
                 if kind is not None and (kind != FILE or name not in earlier):
@@ -219,9 +237,9 @@ class Publication:
             gone = [name for name in set(earlier).difference(names) if here.kind(name) == FILE]
             for name in gone:
                 here.remove(name)
-            if any("/" in name for name in gone):
+            for folder in {name.partition("/")[0] for name in gone if "/" in name}:
                 with suppress(OSError):  # not empty
-                    self._here.remove_folder(FRAMES)
+                    self._here.remove_folder(folder)
             staged.replace(RECORD, here)
 
     def _clear(self) -> None:
@@ -312,9 +330,9 @@ class _Files:
 def _results(directory: Folder) -> Iterator[str]:
     """List the files in a directory whose names are those of results."""
     for name, kind in directory.entries():
-        if name == FRAMES:
-            with directory.folder(FRAMES) as frames:
-                names = [f"{FRAMES}/{name}" for name, kind in frames.entries() if kind == FILE]
+        if name in SERIES:
+            with directory.folder(name) as series:
+                names = [f"{name}/{inner}" for inner, kind in series.entries() if kind == FILE]
             yield from filter(is_result, names)
         elif kind == FILE and is_result(name):
             yield name
@@ -322,12 +340,21 @@ def _results(directory: Folder) -> Iterator[str]:
 
 def is_result(name: object) -> bool:
     """Tell whether this is the name of a result."""
-    if not isinstance(name, str):
-        return False
-    return name in (ANIMATION, TRAJECTORY, RECORD) or _number(name) >= 0
+    return isinstance(name, str) and (name in (*FILE_NAMES, RECORD) or _frame(name) is not None)
 
 
-def _number(name: str) -> int:
-    """Give the number of a frame's picture, or -1 for another name."""
-    found = re.fullmatch(rf"{FRAMES}/([0-9]{{4,15}})\.png", name)
-    return int(found[1]) if found and name == f"{FRAMES}/{frame_file(int(found[1]))}" else -1
+def _belongs(name: str, outputs: Collection[str], frames: int) -> bool:
+    """Tell whether a result is one of so many frames with some outputs."""
+    frame = _frame(name)
+    if frame is None:
+        return name in outputs
+    folder, number = frame
+    return folder in outputs and number < series_length(folder, frames)
+
+
+def _frame(name: str) -> tuple[str, int] | None:
+    """Give the folder of a frame's file, and its number; None for another name."""
+    found = re.fullmatch(r"([a-z]+)/([0-9]{4,15})\.[a-z]+", name)
+    if not found or found[1] not in SERIES or name != f"{found[1]}/{series_file(found[1], int(found[2]))}":
+        return None
+    return found[1], int(found[2])

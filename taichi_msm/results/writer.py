@@ -14,10 +14,21 @@ from numpy.typing import NDArray
 from taichi_msm.errors import writing
 from taichi_msm.physics.run_progress import Saved
 from taichi_msm.progress import Pause
+from taichi_msm.render.labels import Observed
 from taichi_msm.results.checkpoint import Checkpoint
 from taichi_msm.results.encoder import Encoder, Job
-from taichi_msm.results.gif import Picture
-from taichi_msm.results.publication import ANIMATION, FRAMES, RECORD, TRAJECTORY, Publication, result_names
+from taichi_msm.results.labels import LabelWriter
+from taichi_msm.results.publication import (
+    ANIMATION,
+    CAMERA,
+    FRAMES,
+    RECORD,
+    SERIES,
+    TRACKS,
+    TRAJECTORY,
+    Publication,
+    result_names,
+)
 from taichi_msm.results.trajectory import write_trajectory
 from taichi_msm.scene import Scene
 
@@ -53,6 +64,7 @@ class ResultWriter:
         self._resumes = resumes
         self._publication = Publication(directory, self._names(scene.time.frames + 1))
         self._checkpoint: Checkpoint
+        self._labels: LabelWriter
         self._encoder: Encoder | None = None
         self._open = ExitStack()
         self._frames = 0
@@ -79,12 +91,12 @@ class ResultWriter:
         with writing(self._directory):
             return self._checkpoint.position(frame)
 
-    def add(self, position: NDArray[Any], picture: Picture | None, pause: Pause = lambda: None) -> None:
+    def add(self, position: NDArray[Any], observed: Observed, pause: Pause = lambda: None) -> None:
         """Add the next frame.
 
         Args:
             position: positions [m], shape (rows, cols, 3).
-            picture: colours, shape (height, width, 3); None where none is wanted.
+            observed: what is seen of it, as far as it is wanted.
             pause: called some times a second while the encoder takes no more; what it raises gives the picture up.
         """
         with writing(self._directory):
@@ -95,8 +107,9 @@ class ResultWriter:
             if self._frames == self.stored:
                 self._checkpoint.add(position)
                 self._publication.keep = self._plan is not None
-            if self._encoder and picture is not None:
-                self._encoder.add(picture, pause)
+            self._labels.add(self._frames, observed)
+            if self._encoder and observed.picture is not None:
+                self._encoder.add(observed.picture, pause)
             self._frames += 1
 
     @property
@@ -128,6 +141,7 @@ class ResultWriter:
             if self._encoder:
                 report = self._encoder.finish(pause, hurry=hurry)
                 self._frames, self._encode_seconds = report.frames, report.seconds
+            self._labels.finish(self._frames)
             if TRAJECTORY in self._outputs(self._frames):
                 scene = self._scene
                 with self._publication.staged.create(TRAJECTORY) as file:
@@ -164,8 +178,12 @@ class ResultWriter:
 
     def _outputs(self, frames: int) -> list[str]:
         """List what results of so many frames consist of, the record last."""
-        kinds = {"png": FRAMES, "gif": ANIMATION, "trajectory": TRAJECTORY} if frames else {}
-        return [*(name for kind, name in kinds.items() if kind in self._scene.output), RECORD]
+        kinds = {"png": FRAMES, "gif": ANIMATION, "trajectory": TRAJECTORY, "tracks": TRACKS}
+        wanted = [kinds.get(kind, kind) for kind in self._scene.output] if frames else []
+        if frames and self._scene.output_camera:
+            wanted.append(CAMERA)
+        order = (*SERIES, ANIMATION, TRAJECTORY, TRACKS, CAMERA)
+        return [*(name for name in order if name in wanted), RECORD]
 
     def _names(self, frames: int) -> list[str]:
         """List the files of results of so many frames."""
@@ -176,6 +194,7 @@ class ResultWriter:
         with writing(self._directory), ExitStack() as opened:
             opened.enter_context(self._publication)
             self._checkpoint = Checkpoint(self._publication.staging, scene)
+            self._labels = LabelWriter(self._publication.staged, scene)
             if scene.draws:
                 job = Job(
                     folder=self._publication.staged,
@@ -190,7 +209,7 @@ class ResultWriter:
             opened.callback(self._checkpoint.close)
             if self._resumes:
                 self.saved = self._checkpoint.go_on()
-            self._frames = 0 if scene.draws else self.stored
+            self._frames = 0 if scene.renders else self.stored
             self._open = opened.pop_all()
         return self
 

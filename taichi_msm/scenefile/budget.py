@@ -28,8 +28,12 @@ BAND_ROWS = 16  # rows of samples that a thread holds at a time
 PIXEL_BYTES = 3 * 12  # per pixel of the frame: its colours, from sums to bytes
 PICTURE_PIXEL_BYTES = 20  # per pixel of the picture's file, while it is decoded and converted; its texture takes less
 
-# Size of a pixel in a file [bytes].
-PIXEL_FILE_BYTES = {"png": 2, "gif": 1}
+# Size of a pixel in a file [bytes]; masks are compressed.
+PIXEL_FILE_BYTES = {"png": 2, "gif": 1, "coordinates": 8, "depth": 4, "flow": 8, "occlusion": 0.05, "instrument": 0.05}
+
+# Bytes of a pixel while its labels are found and written; and of a tracked point in a frame, held until the end.
+LABEL_PIXEL_BYTES = 60
+TRACK_BYTES = 9
 
 # Numbers per mass point: displacement and difference; with a map, the stiffness of three springs and what it is made
 # from; and the copies made at the start and for output.
@@ -48,7 +52,7 @@ class Budget:
         frames: number of frames in all, including that at rest.
         simulation_bytes: memory for the state of the sheet and its output.
         drawing_bytes: memory for a frame and the texture; 0 if nothing is drawn.
-        picture_bytes: approximate size of the files with pictures.
+        picture_bytes: approximate size of the files with pictures and labels.
         trajectory_bytes: size of the trajectory.
         working_bytes: additional disk space that is used until the run ends.
     """
@@ -79,6 +83,7 @@ def estimate(scene: Scene, grid: TimeGrid) -> Budget:
     points, number_bytes = rows * cols, 4 if grid.precision == "f32" else 8
     frames, pixels = grid.frames + 1, math.prod(scene.render.size)
     positions = frames * points * 3 * number_bytes
+    tracks = frames * scene.render.tracks**2 * TRACK_BYTES if "tracks" in scene.output else 0
     numbers = STATE_NUMBERS + OUTPUT_NUMBERS + len(scene.probes) + (MAP_NUMBERS if scene.stiffness_map else 0)
     # Pilots are up to two more sheets in f64; with tissue also two smaller ones.
     pilot = scene.time.tolerance is not None or affords_pilot(scene, grid, 2)
@@ -88,8 +93,9 @@ def estimate(scene: Scene, grid: TimeGrid) -> Budget:
         steps=grid.steps,
         frames=frames,
         simulation_bytes=round(points * sheets * numbers),
-        drawing_bytes=drawing_bytes(scene) if scene.draws else 0,
-        picture_bytes=frames * sum(pixels * PIXEL_FILE_BYTES.get(kind, 0) for kind in set(scene.output)),
+        drawing_bytes=(drawing_bytes(scene) if scene.renders else 0) + tracks,
+        picture_bytes=round(frames * sum(pixels * PIXEL_FILE_BYTES.get(kind, 0) for kind in set(scene.output)))
+        + tracks,
         trajectory_bytes=positions if "trajectory" in scene.output else 0,
         # Two saved states from which the run could continue, and all positions so far.
         working_bytes=2 * points * STATE_NUMBERS * number_bytes + (positions if scene.output else 0),
@@ -141,7 +147,8 @@ def drawing_bytes(scene: Scene) -> int:
     factor = scene.render.supersample
     band_rows = min(height * factor, BAND_ROWS * (os.cpu_count() or 1))
     samples = band_rows * width * factor * SAMPLE_BYTES
-    return rows * cols * POINT_BYTES + samples + width * height * PIXEL_BYTES + picture * PICTURE_PIXEL_BYTES
+    pixel = PIXEL_BYTES + (LABEL_PIXEL_BYTES if scene.labels_pixels else 0)
+    return rows * cols * POINT_BYTES + samples + width * height * pixel + picture * PICTURE_PIXEL_BYTES
 
 
 def _step_problems(scene: Scene, grid: TimeGrid) -> Iterator[Problem]:

@@ -27,6 +27,7 @@ class Controller:
         # A place of the tool, and the point on the plane at rest that was under the pointer then.
         self._held: tuple[Place, NDArray[np.floating] | None] | None = None
         self._pointer = (0.0, 0.0)
+        self._hovering: tuple[float, float] | None = None
 
     def press(self, position: NDArray[np.floating], x: float, y: float, direction: int) -> bool:
         """Press, 1, or pull, -1, what is seen at a pixel; tells whether there is anything."""
@@ -37,6 +38,16 @@ class Controller:
         self._pointer = x, y
         self._held = place, on_rest_plane(self._viewport.view, (x, y))
         return True
+
+    def over(self, position: NDArray[np.floating]) -> Place | None:
+        """Find the place on the sheet that is under a pointer which presses nothing; None where there is none."""
+        if self._tool.held or self._tool.percent != 0 or self._hovering is None:
+            return None
+        return pick(position, self._refine, self._viewport.view, self._hovering)
+
+    def point(self, x: float, y: float) -> None:
+        """Follow a pointer that presses nothing."""
+        self._hovering = x, y
 
     def drag(self, x: float, y: float) -> None:
         """Move the control point as far over the sheet at rest as the pointer went.
@@ -54,7 +65,7 @@ class Controller:
 
     def release(self) -> None:
         """Let go."""
-        self._held = None
+        self._held = self._hovering = None
         if self._tool.held:
             self._tool.release()
 
@@ -66,4 +77,4 @@ class Controller:
     def forget(self) -> None:
         """Put the tool at rest."""
         self._tool.rest()
-        self._held = None
+        self._held = self._hovering = None

@@ -5,6 +5,13 @@ from __future__ import annotations
 from typing import NamedTuple
 
 
+class Point(NamedTuple):
+    """The pointer is over a pixel, and nothing is pressed."""
+
+    x: float
+    y: float
+
+
 class Press(NamedTuple):
     """The tool touches the tissue at a pixel; `pull` turns its force around."""
 
@@ -49,7 +56,7 @@ class Key(NamedTuple):
     name: str
 
 
-Event = Press | Drag | Release | Turn | Percent | Harder | Key
+Event = Point | Press | Drag | Release | Turn | Percent | Harder | Key
 
 # What a notch of the wheel and the keys up and down change [percent].
 NOTCH = 5.0

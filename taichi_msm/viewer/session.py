@@ -13,8 +13,9 @@ from taichi_msm.errors import DivergedError, SceneError
 from taichi_msm.physics.error_control import choose_step
 from taichi_msm.physics.lattice import rest_positions
 from taichi_msm.physics.mesh_error import choose_points
-from taichi_msm.physics.probe_force import probe_force
+from taichi_msm.physics.probe_force import control_point, probe_force
 from taichi_msm.physics.timestep import time_grid, with_grid, with_time
+from taichi_msm.render.instrument import rod
 from taichi_msm.render.texture import load_texture
 from taichi_msm.results.gif import Picture
 from taichi_msm.scene import MAX_PROBES, Camera, Scene
@@ -25,7 +26,20 @@ from taichi_msm.system import runtime
 from taichi_msm.viewer import hud
 from taichi_msm.viewer.captures import Captures, values
 from taichi_msm.viewer.controller import Controller
-from taichi_msm.viewer.events import KEYS, NOTCH, POINTER, Drag, Event, Harder, Key, Percent, Press, Release, Turn
+from taichi_msm.viewer.events import (
+    KEYS,
+    NOTCH,
+    POINTER,
+    Drag,
+    Event,
+    Harder,
+    Key,
+    Percent,
+    Point,
+    Press,
+    Release,
+    Turn,
+)
 from taichi_msm.viewer.recording import Recording
 from taichi_msm.viewer.tool import Tool
 from taichi_msm.viewer.viewport import Viewport
@@ -134,7 +148,7 @@ class Session:
         self._simulation = Simulation(self.scene.model_copy(update={"output": ()}), arch, threads)
         self._simulation.compile(lambda: progress("compile"))
         self._beginning = self._simulation.save()
-        self.viewport.draw(self.positions())
+        self._draw()
 
     @property
     def rate(self) -> float:
@@ -171,6 +185,8 @@ class Session:
             FilesError: when something to be kept cannot be written.
         """
         match event:
+            case Point(x, y):
+                self._controller.point(x, y)
             case Press(x, y, pull):
                 if self._controller.press(self.positions(), x, y, -1 if pull else 1):
                     self._notice_until = 0
@@ -217,8 +233,8 @@ class Session:
         Returns:
             Colours, shape (height, width, 3).
         """
-        picture = self.viewport.draw(self.positions())
-        if self.tool.percent != 0:
+        picture = self._draw()
+        if self.tool.percent != 0 and self.tool.instrument is None:
             seen = self.viewport.pixel(_between(self.positions(), *self.tool.place))
             if seen is not None:
                 hud.mark(picture, seen, pulls=self._pulls)
@@ -256,6 +272,21 @@ class Session:
             self._warned = True
             self.say("soon this session will be too long for a scene: write it now (w), then reset it (r)")
 
+    def _draw(self) -> Picture:
+        """Draw the tissue and the instruments, the tool's where it acts or would."""
+        positions, rate = self.positions(), self.rate
+        placed = [
+            rod(probe.instrument, self.scene, positions, control_point(probe, self.scene.sheet, self.frame / rate))
+            for probe in self._others
+            if probe.instrument is not None
+        ]
+        if (instrument := self.tool.instrument) is not None:
+            across, down = self._controller.over(positions) or self.tool.place
+            height, width = self.scene.sheet.size
+            rest = np.array([(across - 0.5) * width, (0.5 - down) * height])
+            placed.append(rod(instrument, self.scene, positions, rest))
+        return self.viewport.draw(positions, placed)
+
     def _look(self, camera: str | Camera) -> None:
         self.viewport.look(camera)
         self._controller.hold_on()
@@ -287,7 +318,7 @@ class Session:
                 self._warned = False
                 self.fault = ""
             case "p":
-                self.say(f"saved {self._captures.keep_picture(self.viewport.draw(self.positions()))}")
+                self.say(f"saved {self._captures.keep_picture(self._draw())}")
             case "g":
                 if self._recording.on:
                     self._tell(self._recording.end())

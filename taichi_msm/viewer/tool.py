@@ -6,7 +6,7 @@ from collections import deque
 from collections.abc import Sequence
 from typing import TypeVar
 
-from taichi_msm.scene import Probe
+from taichi_msm.scene import Instrument, Probe
 
 # A hand needs some time to press: from nothing to the full force [s]. It lets go at once.
 RISE = 0.2
@@ -55,6 +55,11 @@ class Tool:
         self._given: tuple[float, Place] | None = None
         self._load: list[tuple[float, float]] = [(0.0, 0.0)]
         self._at: list[tuple[float, float, float]] = [(0.0, *self.place)]
+
+    @property
+    def instrument(self) -> Instrument | None:
+        """What it looks like."""
+        return self._probe.instrument
 
     @property
     def goal(self) -> Place:

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from taichi_msm.render.camera import View, pinhole, turned, view
+from taichi_msm.render.instrument import Rod
 from taichi_msm.render.rasterizer import Drawing
 from taichi_msm.results.gif import Picture
 from taichi_msm.scene import Camera, Render, Scene
@@ -49,18 +51,20 @@ class Viewport:
         self.look(turned(pinhole(self._seen()), -right * angle, down * angle))
 
     def light(self) -> None:
-        """Switch the headlight on or off."""
-        self._change(shading="none" if self.render.shading == "headlight" else "headlight")
+        """Switch the light off, or on again: the scene's, if it has one."""
+        lit = self._scene.render.shading if self._scene.render.shading != "none" else "headlight"
+        self._change(shading="none" if self.render.shading != "none" else lit)
 
     def mesh(self) -> None:
         """Show the mesh, or hide it."""
         self._change(wireframe=not self.render.wireframe)
 
-    def draw(self, position: NDArray[Any]) -> Picture:
+    def draw(self, position: NDArray[Any], rods: Sequence[Rod] = ()) -> Picture:
         """Draw the sheet; the kernel is compiled when it is first wanted.
 
         Args:
             position: positions of the mass points [m], shape (rows, cols, 3).
+            rods: the instruments.
 
         Returns:
             Colours, shape (height, width, 3).
@@ -68,7 +72,7 @@ class Viewport:
         wanted = self.render.shading, self.render.wireframe
         if not self.compiled:
             self._drawings[wanted] = Drawing(self._seen(), self._texture)
-        return self._drawings[wanted].draw(position, self.view)
+        return self._drawings[wanted].draw(position, self.view, rods)
 
     def pixel(self, point: NDArray[np.floating]) -> tuple[float, float] | None:
         """Find where a point [m] is seen; None if it is behind the camera."""

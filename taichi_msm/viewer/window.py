@@ -15,7 +15,7 @@ from taichi_msm.progress import Pause
 from taichi_msm.results.gif import Picture
 from taichi_msm.system.runtime import open_window, ti
 from taichi_msm.viewer import hud
-from taichi_msm.viewer.events import NOTCH, Drag, Event, Harder, Key, Press, Release, Turn
+from taichi_msm.viewer.events import NOTCH, Drag, Event, Harder, Key, Point, Press, Release, Turn
 from taichi_msm.viewer.pacing import Pacing
 from taichi_msm.viewer.session import Session
 
@@ -115,6 +115,8 @@ class Hand:
         elif event.key == ti.GUI.MOVE:
             if self._pressing:
                 yield Drag(x, y)
+            elif self._turning is None:
+                yield Point(x, y)
             if self._turning is not None:
                 yield Turn(x - self._turning[0], y - self._turning[1])
                 self._turning = (x, y)

@@ -1,0 +1,1 @@
+"""The results of a run in the files of other programs."""

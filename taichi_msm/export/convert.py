@@ -1,0 +1,51 @@
+"""From the folder of a run to a folder of another program's files."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import NamedTuple
+
+from taichi_msm.errors import FilesError, SceneError
+from taichi_msm.export.formats import FORMATS
+from taichi_msm.export.staging import staging
+from taichi_msm.progress import Count
+from taichi_msm.results.finished_run import read_run
+
+
+class Exported(NamedTuple):
+    """What was written.
+
+    Attributes:
+        files: names in the folder, with slashes.
+        notes: what one should know of them.
+    """
+
+    files: list[str]
+    notes: list[str]
+
+
+def convert(run: Path, name: str, directory: Path, progress: Count = lambda done, total: None) -> Exported:
+    """Convert the results of a run, and put the files in the place of an earlier export.
+
+    Args:
+        run: the folder of the run's results.
+        name: of the format, one of `FORMATS`.
+        directory: where the files go; made where it does not exist.
+        progress: called with the frames done and the frames in all; what it raises stops here and changes nothing.
+
+    Raises:
+        FilesError: when a file that is needed is missing or damaged, or the directory cannot be written.
+        NotInstalledError: when a package that writes the format is not installed.
+    """
+    finished, wanted = read_run(run), FORMATS[name]
+    progress(0, finished.frames)
+    try:
+        with staging(directory, wanted.files) as staged:
+            notes = wanted.write(finished, staged, progress)
+            files = sorted(path.relative_to(staged).as_posix() for path in staged.rglob("*") if path.is_file())
+    except SceneError as error:
+        # What a scene would have to name is here what it had.
+        fault = error.lines[0].partition(";")[0]
+        said = f"{run}: {fault}; put back the picture that it was run with, or run the scene again"
+        raise FilesError(said) from None
+    return Exported(files, notes)

@@ -1,0 +1,34 @@
+"""The formats by name: the files of each, and the function that writes them."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import NamedTuple
+
+from taichi_msm.export import gltf, kitti, obj, tapvid, vtk
+from taichi_msm.progress import Count
+from taichi_msm.results.finished_run import FinishedRun
+from taichi_msm.results.folder import Tree
+
+
+class Format(NamedTuple):
+    """A format.
+
+    Attributes:
+        files: what is in its folder, by patterns of names.
+        write: writes the files of a run into an empty folder, telling how far it is, and returns what one should know
+            of them.
+    """
+
+    files: Tree
+    write: Callable[[FinishedRun, Path, Count], list[str]]
+
+
+FORMATS = {
+    "kitti": Format(kitti.FILES, kitti.write_kitti),
+    "tapvid": Format(tapvid.FILES, tapvid.write_tapvid),
+    "vtk": Format(vtk.FILES, vtk.write_vtk),
+    "gltf": Format(gltf.FILES, gltf.write_gltf),
+    "obj": Format(obj.FILES, obj.write_obj),
+}

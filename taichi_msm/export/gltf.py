@@ -1,0 +1,134 @@
+"""The surface in motion as glTF 2.0, in one file with its picture.
+
+The mesh is that of the first frame. Every other frame is a morph target, which says how far each vertex and its normal
+are from there; an animation gives the target of a frame the weight 1 at its time and 0 at those of the frames beside
+it, linear between. Metres, y up and texture coordinates from the picture's upper left are those of this program.
+
+Browsers hold the targets in a texture of as many layers, of which WebGL 2 has 256. A run of more frames, or of so many
+points that the file were too large, is told by key frames, and the largest error that this makes is said.
+
+Source: the glTF 2.0 specification of Khronos, sections 3.7.2.2 (morph targets) and 3.11 (animations).
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from taichi_msm import __version__
+from taichi_msm.export.glb import INDICES, VERTICES, Binary
+from taichi_msm.export.keyframes import key_frames
+from taichi_msm.export.mesh import REFINE, picture_png, unit_normals
+from taichi_msm.progress import Count
+from taichi_msm.render.surface import surface
+from taichi_msm.results.finished_run import FinishedRun
+from taichi_msm.results.folder import Tree
+
+FILE = "surface.glb"
+FILES: Tree = {r"surface\.glb": None}
+
+# Morph targets: MAX_ARRAY_TEXTURE_LAYERS, which every WebGL 2 has, and what is left to load of them.
+MOST_TARGETS = 256
+MOST_BYTES = 1 << 28
+# Of a vertex in a target: the differences of its position and of its normal.
+VERTEX_BYTES = 2 * 3 * 4
+
+# OpenGL's numbers for how a picture is filtered, and that it ends at its edge.
+LINEAR, MIPMAPS, CLAMPED = 9729, 9987, 33071
+
+
+def write_gltf(run: FinishedRun, folder: Path, progress: Count) -> list[str]:
+    """Write the surface of a run, with its picture.
+
+    Raises:
+        FilesError: when the run has no trajectory, or it is damaged.
+        SceneError: when the picture is gone.
+    """
+    positions, picture, binary = run.positions(), picture_png(run), Binary()
+    most = max(1, min(MOST_TARGETS, MOST_BYTES // (VERTEX_BYTES * positions[0, ..., 0].size)))
+    keys = key_frames(positions, 1 + most, progress)
+    primitive = _surface(positions[0], picture is not None, binary)
+    targets = []
+    for count, frame in enumerate(keys.frames[1:]):
+        progress(count, len(keys.frames))
+        targets.append(_target(positions[0], positions[frame], binary))
+    document: dict[str, Any] = {
+        "asset": {"version": "2.0", "generator": f"taichi_msm {__version__}"},
+        "scene": 0,
+        "scenes": [{"nodes": [0]}],
+        "nodes": [{"mesh": 0, "name": "sheet"}],
+        "materials": [_material(picture is not None)],
+        **(_texture(picture, binary) if picture is not None else {}),
+    }
+    mesh: dict[str, Any] = {"name": "sheet", "primitives": [{**primitive, "material": 0}]}
+    if targets:
+        times = run.time[keys.frames]
+        mesh["primitives"][0]["targets"] = targets
+        mesh["weights"] = [0.0] * len(targets)
+        mesh["extras"] = {"targetNames": [f"{time:g} s" for time in times[1:]], "error": keys.error}
+        document["animations"] = [_animation(times.astype(np.float32), binary)]
+    with (folder / FILE).open("wb") as file:
+        file.writelines(binary.container({**document, "meshes": [mesh]}))
+    if len(keys.frames) == run.frames:
+        return []
+    return [
+        f"{len(keys.frames)} of {run.frames} frames are key frames; between them no point is farther than "
+        f"{keys.error:.2g} m from where it was"
+    ]
+
+
+def _surface(position: NDArray[np.floating], has_picture: bool, binary: Binary) -> dict[str, Any]:
+    """Make the triangles of the first frame, with the place of each vertex in the picture if there is one."""
+    first = surface(position, REFINE)
+    attributes = {
+        "POSITION": binary.accessor(first.vertices.astype(np.float32), VERTICES, bounds=True),
+        "NORMAL": binary.accessor(unit_normals(position).astype(np.float32), VERTICES),
+    }
+    if has_picture:
+        attributes["TEXCOORD_0"] = binary.accessor(first.texture_coordinates.astype(np.float32), VERTICES)
+    indices = first.triangles.reshape(-1).astype(np.uint32)
+    return {"attributes": attributes, "indices": binary.accessor(indices, INDICES)}
+
+
+def _target(first: NDArray[np.floating], position: NDArray[np.floating], binary: Binary) -> dict[str, int]:
+    """Make the morph target of a frame."""
+    moved = (position.astype(np.float64) - first).reshape(-1, 3).astype(np.float32)
+    turned = (unit_normals(position) - unit_normals(first)).astype(np.float32)
+    return {
+        "POSITION": binary.accessor(moved, VERTICES, bounds=True),
+        "NORMAL": binary.accessor(turned, VERTICES),
+    }
+
+
+def _animation(times: NDArray[np.float32], binary: Binary) -> dict[str, Any]:
+    """Make the weights of all targets at all key frames: at its own frame each has 1, the first frame has none."""
+    weights = np.eye(len(times), dtype=np.float32)[:, 1:].reshape(-1)
+    sampler = {
+        "input": binary.accessor(times, bounds=True),
+        "interpolation": "LINEAR",
+        "output": binary.accessor(weights),
+    }
+    return {
+        "name": "motion",
+        "samplers": [sampler],
+        "channels": [{"sampler": 0, "target": {"node": 0, "path": "weights"}}],
+    }
+
+
+def _material(has_picture: bool) -> dict[str, Any]:
+    """Make a rough material, so that a light shows the relief."""
+    colour = {"baseColorTexture": {"index": 0}} if has_picture else {}
+    rough = {"metallicFactor": 0.0, "roughnessFactor": 1.0}
+    return {"name": "sheet", "doubleSided": True, "pbrMetallicRoughness": {**colour, **rough}}
+
+
+def _texture(picture: bytes, binary: Binary) -> dict[str, Any]:
+    """Make the picture a texture of the document."""
+    return {
+        "textures": [{"source": 0, "sampler": 0}],
+        "images": [{"name": "picture", "mimeType": "image/png", "bufferView": binary.view(picture)}],
+        "samplers": [{"magFilter": LINEAR, "minFilter": MIPMAPS, "wrapS": CLAMPED, "wrapT": CLAMPED}],
+    }

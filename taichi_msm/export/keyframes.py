@@ -1,0 +1,76 @@
+"""Frames that stand for a motion: between two of them every point goes in a straight line at a constant speed."""
+
+from __future__ import annotations
+
+import heapq
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from taichi_msm.progress import Count
+
+
+class KeyFrames(NamedTuple):
+    """Key frames of a motion.
+
+    Attributes:
+        frames: their numbers, in order; the first and the last frame are among them.
+        error: the largest distance between a point in any frame and where the key frames beside it place it [m].
+    """
+
+    frames: list[int]
+    error: float
+
+
+def key_frames(position: NDArray[np.floating], most: int, progress: Count = lambda done, total: None) -> KeyFrames:
+    """Choose the frames that stand for a motion: all of them, where they are not too many.
+
+    Else, beginning with the first and the last, the frame that is farthest from its place becomes a key frame, again
+    and again. So keys are close together where the motion is sudden.
+
+    Args:
+        position: positions [m] at equal distances in time, shape (frames, rows, cols, 3).
+        most: number of key frames, at most; 2 or more.
+        progress: called with the key frames that were chosen, and their number in the end.
+
+    Source: Douglas and Peucker 1973, with all points in the place of one and a number in the place of a tolerance.
+    """
+    count = len(position)
+    if count <= most:
+        return KeyFrames(list(range(count)), 0.0)
+    chosen = [0, count - 1]
+    spans = [_farthest(position, 0, count - 1)]
+    while len(chosen) < most and -spans[0].error > 0:
+        progress(len(chosen), most)
+        span = heapq.heappop(spans)
+        chosen.append(span.frame)
+        heapq.heappush(spans, _farthest(position, span.first, span.frame))
+        heapq.heappush(spans, _farthest(position, span.frame, span.last))
+    return KeyFrames(sorted(chosen), -spans[0].error)
+
+
+class _Span(NamedTuple):
+    """The frames from one key frame to the next; the worst sorts first.
+
+    Attributes:
+        error: minus the largest distance of a point from its place in any of them [m].
+        frame: that has it.
+        first, last: the key frames.
+    """
+
+    error: float
+    frame: int
+    first: int
+    last: int
+
+
+def _farthest(position: NDArray[np.floating], first: int, last: int) -> _Span:
+    """Find the frame between two key frames that is farthest from the straight line between them."""
+    start, end = position[first].astype(np.float64), position[last].astype(np.float64)
+    worst = _Span(0.0, first, first, last)
+    for frame in range(first + 1, last):
+        share = (frame - first) / (last - first)
+        apart = position[frame] - (start + share * (end - start))
+        worst = min(worst, _Span(-float(np.linalg.norm(apart, axis=-1).max()), frame, first, last))
+    return worst

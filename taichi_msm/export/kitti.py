@@ -1,0 +1,97 @@
+"""Optical flow as KITTI 2015 has it.
+
+Every pair of frames f and f + 1 is a scene of KITTI: `image_2/NNNNNN_10.png` and `_11.png`, and its flow in
+`flow_occ/NNNNNN_10.png`, valid wherever the sheet is, and `flow_noc/NNNNNN_10.png`, valid only where what is seen in f
+is seen in f + 1 too. All are in a folder `training`, as loaders of KITTI look for it. A flow (u, v) [px] is a PNG of 16
+bits a channel,
+
+    red = 64 u + 2^15,   green = 64 v + 2^15,   blue = 1: valid,
+
+and all are 0 where it is not valid: on the background, and where red or green would not fit, that is beyond -512 and
++511.98 px. Rounded to the nearest, flow is exact to 1/128 px.
+
+Source: the development kit of KITTI's scene flow benchmark 2015, readme.txt and cpp/io_flow.h.
+"""
+
+from __future__ import annotations
+
+import shutil
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from taichi_msm.errors import FilesError
+from taichi_msm.export.frames import frame_path, read_picture
+from taichi_msm.export.png16 import png16
+from taichi_msm.progress import Count
+from taichi_msm.results.finished_run import FinishedRun
+from taichi_msm.results.flo import read_flo
+from taichi_msm.results.folder import Tree
+from taichi_msm.results.publication import FLOW, FRAMES, OCCLUSION, series_file
+
+ROOT, PICTURES, ALL, SEEN = "training", "image_2", "flow_occ", "flow_noc"
+FIRST = {r"[0-9]{6,}_10\.png": None}
+FILES: Tree = {ROOT: {PICTURES: {r"[0-9]{6,}_1[01]\.png": None}, ALL: FIRST, SEEN: FIRST}}
+
+SCALE, ZERO, LARGEST = 64.0, 32768.0, 65535.0
+
+
+def write_kitti(run: FinishedRun, folder: Path, progress: Count) -> list[str]:
+    """Write the flow of a run, and its frames and occlusion if it has them.
+
+    Raises:
+        FilesError: when the run has no flow, or a file is missing or damaged.
+    """
+    size, pairs = run.scene.render.size, run.frames - 1
+    if pairs == 0:
+        raise FilesError(f"{run.directory}: has one frame, and flow is from one to the next; run the scene to its end")
+    has = {output: run.has(output) for output in (OCCLUSION, FRAMES)}
+    wanted = [ALL, *([SEEN] if has[OCCLUSION] else []), *([PICTURES] if has[FRAMES] else [])]
+    for name in wanted:
+        (folder / ROOT / name).mkdir(parents=True)
+    for pair in range(pairs):
+        progress(pair, pairs)
+        flow, name = read_flo(run.result(f"{FLOW}/{series_file(FLOW, pair)}", FLOW), size), f"{pair:06}_10.png"
+        (folder / ROOT / ALL / name).write_bytes(png16(encode(flow)))
+        if has[OCCLUSION]:
+            hidden = (
+                read_picture(run.result(f"{OCCLUSION}/{series_file(OCCLUSION, pair)}", OCCLUSION), size)[..., 0] > 0
+            )
+            (folder / ROOT / SEEN / name).write_bytes(png16(encode(flow, ~hidden)))
+        for number in (0, 1) if has[FRAMES] else ():
+            _copy(run, pair + number, folder / ROOT / PICTURES / f"{pair:06}_1{number}.png")
+    left_out = [(OCCLUSION, OCCLUSION, SEEN), (FRAMES, "png", PICTURES)]
+    return [
+        f"{name} is left out: {output} is not among the results; run the scene again with '{key}' in output"
+        for output, key, name in left_out
+        if not has[output]
+    ]
+
+
+def encode(flow: NDArray[np.float32], seen: NDArray[np.bool_] | None = None) -> NDArray[np.uint16]:
+    """Turn flow into the colours of KITTI.
+
+    Args:
+        flow: to the right and down [px], shape (height, width, 2); anything that does not fit is not valid.
+        seen: where else it is not valid, shape (height, width); None: nowhere.
+
+    Returns:
+        Red, green and blue, shape (height, width, 3).
+    """
+    # In double precision, so that nothing but this rounds.
+    scaled = np.rint(flow.astype(np.float64) * SCALE + ZERO)
+    valid = ((scaled >= 0) & (scaled <= LARGEST)).all(axis=-1)
+    if seen is not None:
+        valid &= seen
+    colours = np.zeros((*valid.shape, 3), np.uint16)
+    colours[valid, :2] = scaled[valid]
+    colours[valid, 2] = 1
+    return colours
+
+
+def _copy(run: FinishedRun, number: int, path: Path) -> None:
+    """Copy a frame, once it was found to be a whole picture of the right size."""
+    source = frame_path(run, number)
+    read_picture(source, run.scene.render.size)
+    shutil.copyfile(source, path)

@@ -1,0 +1,67 @@
+"""The surface as Wavefront OBJ: one file for every frame, all with one material and the picture.
+
+Texture coordinates are counted from the picture's lower left. Every vertex of a face has its position, texture
+coordinate and normal under one number.
+
+Source: Wavefront's Advanced Visualizer manual, appendix B1 (OBJ) and its specification of materials (MTL).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from taichi_msm.export.mesh import PICTURE, REFINE, picture_png, unit_normals
+from taichi_msm.progress import Count
+from taichi_msm.render.surface import surface
+from taichi_msm.results.finished_run import FinishedRun
+from taichi_msm.results.folder import Tree
+
+MATERIAL = "surface.mtl"
+FILES: Tree = dict.fromkeys((r"[0-9]{4,}\.obj", r"surface\.mtl", r"picture\.png"))
+
+# As many digits as tell a number of single precision from any other.
+EXACT = "%.9g"
+
+
+def write_obj(run: FinishedRun, folder: Path, progress: Count) -> list[str]:
+    """Write the surface of every frame, its material and the picture.
+
+    Raises:
+        FilesError: when the run has no trajectory, or it is damaged.
+        SceneError: when the picture is gone.
+    """
+    positions, picture = run.positions(), picture_png(run)
+    if picture is not None:
+        (folder / PICTURE).write_bytes(picture)
+    (folder / MATERIAL).write_text("\n".join(_material(picture is not None)) + "\n")
+    first = surface(positions[0], REFINE)
+    from_below = first.texture_coordinates * (1, -1) + (0, 1)
+    coordinates = _lines("vt", from_below)
+    corners = np.repeat(first.triangles + 1, 3, axis=1)
+    faces = ("f %d/%d/%d %d/%d/%d %d/%d/%d\n" * len(corners)) % tuple(corners.ravel().tolist())
+    for frame, position in enumerate(positions):
+        progress(frame, run.frames)
+        with (folder / f"{frame:04}.obj").open("w", encoding="ascii", newline="") as file:
+            file.write(f"# {run.time[frame]:g} s, in metres\nmtllib {MATERIAL}\n")
+            file.write(_lines("v", position.reshape(-1, 3)))
+            file.write(coordinates)
+            file.write(_lines("vn", unit_normals(position)))
+            file.write(f"usemtl sheet\n{faces}")
+    return []
+
+
+def _lines(key: str, rows: NDArray[np.floating]) -> str:
+    """Write a line for every row of numbers."""
+    line = " ".join([key, *[EXACT] * rows.shape[1]]) + "\n"
+    return (line * len(rows)) % tuple(rows.ravel().tolist())
+
+
+def _material(has_picture: bool) -> Iterable[str]:
+    """Write a material without highlights."""
+    yield from ("newmtl sheet", "Kd 1 1 1", "Ks 0 0 0", "illum 1")
+    if has_picture:
+        yield f"map_Kd {PICTURE}"

@@ -1,0 +1,140 @@
+"""The surface for ParaView: an unstructured grid for every frame (.vtu), and a collection of them by time (.pvd).
+
+Points are the mass points, row after row from the top left; the triangles between them are those that the picture
+shows. At the points there are
+
+    displacement     from rest [m]
+    speed            [m/s], from the frames beside it: the displacement of two frames over their time
+    energy_density   elastic energy of the springs by area at rest [J/m2]; that of bending and of the virtual springs
+                     is not in it
+    texture          texture coordinates, from the picture's lower left; the picture is beside the files
+
+Source: VTK's own writer; the collection as ParaView's guide has it.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+from xml.etree import ElementTree
+
+import numpy as np
+from numpy.typing import NDArray
+
+from taichi_msm.errors import NotInstalledError
+from taichi_msm.export.mesh import PICTURE, REFINE, picture_png
+from taichi_msm.physics.lattice import rest_positions
+from taichi_msm.progress import Count
+from taichi_msm.reference import energy_density
+from taichi_msm.render.surface import surface
+from taichi_msm.results.finished_run import FinishedRun
+from taichi_msm.results.folder import Tree
+
+COLLECTION = "surface.pvd"
+FILES: Tree = dict.fromkeys((r"[0-9]{4,}\.vtu", r"surface\.pvd", r"picture\.png"))
+
+DISPLACEMENT, SPEED, ENERGY = "displacement", "speed", "energy_density"
+UNITS = {DISPLACEMENT: "m", SPEED: "m/s", ENERGY: "J/m2"}
+
+Array = NDArray[np.floating]
+
+
+def write_vtk(run: FinishedRun, folder: Path, progress: Count) -> list[str]:
+    """Write the surface of every frame, their times and the picture.
+
+    Raises:
+        FilesError: when the run has no trajectory, or it is damaged.
+        SceneError: when the picture or the map is gone.
+        NotInstalledError: when VTK is not installed.
+    """
+    try:
+        import vtkmodules.vtkIOXML  # noqa: F401
+    except ImportError:
+        said = '--format vtk: needs VTK, which is not installed; pip install "taichi-msm[export]"'
+        raise NotInstalledError(said) from None
+    positions, picture = run.positions(), picture_png(run)
+    rest = rest_positions(run.scene.sheet)
+    for frame in range(run.frames):
+        progress(frame, run.frames)
+        displacement = positions[frame] - rest
+        values = {
+            DISPLACEMENT: displacement.reshape(-1, 3),
+            SPEED: speed(positions, run.time, frame).ravel(),
+            ENERGY: energy_density(run.scene, displacement).ravel(),
+        }
+        _write_grid(folder / _name(frame), positions[frame], values)
+    if picture is not None:
+        (folder / PICTURE).write_bytes(picture)
+    _write_collection(folder / COLLECTION, run.time)
+    return []
+
+
+def speed(positions: Array, time: Array, frame: int) -> Array:
+    """Tell how fast the points are, by the difference of the frames on either side; 0 in the first, which is at rest.
+
+    Args:
+        positions: of every frame [m], shape (frames, rows, cols, 3).
+        time: of every frame [s], shape (frames,).
+        frame: which one.
+
+    Returns:
+        Speed [m/s], shape (rows, cols).
+
+    Order: 2 in the time of a frame; 1 in the last frame, and wherever the load jumps.
+    """
+    if frame == 0:
+        return np.zeros(positions.shape[1:3])
+    after = min(frame + 1, len(positions) - 1)
+    moved = positions[after].astype(np.float64) - positions[frame - 1]
+    return np.linalg.norm(moved, axis=-1) / (time[after] - time[frame - 1])
+
+
+def _name(frame: int) -> str:
+    return f"{frame:04}.vtu"
+
+
+def _write_grid(path: Path, position: Array, values: dict[str, Array]) -> None:
+    """Write a surface with what is known at its points."""
+    from vtkmodules.util.numpy_support import numpy_to_vtk, numpy_to_vtkIdTypeArray
+    from vtkmodules.vtkCommonCore import vtkDataArray, vtkPoints
+    from vtkmodules.vtkCommonDataModel import VTK_TRIANGLE, vtkCellArray, vtkUnstructuredGrid
+    from vtkmodules.vtkIOXML import vtkXMLUnstructuredGridWriter
+
+    def named(name: str, data: Array) -> Any:
+        # In the precision of the run.
+        array = numpy_to_vtk(np.ascontiguousarray(data, position.dtype), deep=True)
+        array.SetName(name)
+        if name in UNITS:
+            array.GetInformation().Set(vtkDataArray.UNITS_LABEL(), UNITS[name])
+        return array
+
+    shown = surface(position, REFINE)
+    points, cells, grid = vtkPoints(), vtkCellArray(), vtkUnstructuredGrid()
+    points.SetData(named("points", shown.vertices))
+    starts = np.arange(0, shown.triangles.size + 1, 3)
+    cells.SetData(
+        numpy_to_vtkIdTypeArray(starts, deep=True),
+        numpy_to_vtkIdTypeArray(shown.triangles.reshape(-1).astype(np.int64), deep=True),
+    )
+    grid.SetPoints(points)
+    grid.SetCells(VTK_TRIANGLE, cells)
+    for name, data in values.items():
+        grid.GetPointData().AddArray(named(name, data))
+    grid.GetPointData().SetActiveVectors(DISPLACEMENT)
+    grid.GetPointData().SetTCoords(named("texture", shown.texture_coordinates * (1, -1) + (0, 1)))
+    # As text, so that it is Python that finds a disk to be full: VTK would say so itself.
+    writer = vtkXMLUnstructuredGridWriter()
+    writer.WriteToOutputStringOn()
+    writer.SetInputData(grid)
+    writer.Write()
+    path.write_text(writer.GetOutputString(), encoding="ascii", newline="")
+
+
+def _write_collection(path: Path, time: Array) -> None:
+    """Write which file is of which time."""
+    root = ElementTree.Element("VTKFile", type="Collection", version="0.1")
+    collection = ElementTree.SubElement(root, "Collection")
+    for frame, seconds in enumerate(time.tolist()):
+        ElementTree.SubElement(collection, "DataSet", timestep=repr(seconds), part="0", file=_name(frame))
+    ElementTree.indent(root)
+    ElementTree.ElementTree(root).write(path, encoding="utf-8", xml_declaration=True)

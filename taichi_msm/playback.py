@@ -1,0 +1,74 @@
+"""A run that has ended, to be drawn and labelled again: any frame, any camera, and flow between any two frames."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from types import TracebackType
+
+import numpy as np
+from numpy.typing import NDArray
+
+from taichi_msm.errors import ArgumentError
+from taichi_msm.render.labels import Flow, Labels
+from taichi_msm.results.finished_run import read_run
+from taichi_msm.scene import Scene
+from taichi_msm.simulation import CameraLike, Simulation
+
+
+class Playback:
+    """The frames of a run, by number. Usable in a with statement, which frees its memory.
+
+    Args:
+        directory: where its results are, the trajectory among them.
+        arch: as for `Simulation`.
+        threads: as for `Simulation`.
+
+    Raises:
+        ArgumentError: here and in all methods, when an argument is not what it must be.
+        DeviceError: as for `Simulation`.
+        FilesError: when there is no trajectory of a run, or it is damaged.
+
+    Attributes:
+        scene: as it was run, with the points, the step and the precision that were chosen.
+        time: of every frame [s], shape (frames,).
+        positions: of the points in every frame [m], shape (frames, rows, cols, 3); not to be written to.
+    """
+
+    scene: Scene
+    time: NDArray[np.float64]
+    positions: NDArray[np.floating]
+
+    def __init__(self, directory: str | Path, arch: str = "cpu", threads: int | None = None) -> None:
+        run = read_run(directory)
+        self.scene, self.time, self.positions = run.scene, run.time, run.positions()
+        self._simulation = Simulation(run.scene, arch, threads)
+
+    def draw(self, frame: int, camera: CameraLike = None) -> NDArray[np.uint8]:
+        """Draw a frame; as `Simulation.draw`."""
+        return self._simulation.draw(camera, *self._at(frame))
+
+    def labels(self, frame: int, camera: CameraLike = None) -> Labels:
+        """Give what each pixel of a frame shows; as `Simulation.labels`."""
+        return self._simulation.labels(camera, *self._at(frame))
+
+    def flow(self, first: int, second: int, camera: CameraLike = None) -> Flow:
+        """Give how what one frame shows moves until another, before or after it, and what of it is hidden there."""
+        return self._simulation.flow(self.labels(first, camera), camera, *self._at(second))
+
+    def close(self) -> None:
+        """Free the memory."""
+        self._simulation.close()
+
+    def __enter__(self) -> Playback:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.close()
+
+    def _at(self, frame: int) -> tuple[NDArray[np.floating], float]:
+        """Give the positions and the time of a frame."""
+        if type(frame) is not int or not 0 <= frame < len(self.time):
+            raise ArgumentError(f"frame: {frame!r}; take a whole number, 0 to {len(self.time) - 1}")
+        return self.positions[frame], float(self.time[frame])

@@ -1,0 +1,73 @@
+"""What is known of every pixel once more: every point against every triangle."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from taichi_msm.reference.drawing import look, refine, triangles, weights
+from taichi_msm.reference.shading import meet
+from taichi_msm.render.camera import view
+from taichi_msm.render.instrument import Rod
+from taichi_msm.scene import Scene
+
+Array = NDArray[np.float64]
+
+# Nearer than this fraction of the sheet's larger side is the surface at the point itself.
+TOUCHING = 1e-9
+
+
+def labels(scene: Scene, position: Array, rods: Sequence[Rod] = ()) -> tuple[Array, Array, NDArray[np.bool_]]:
+    """Find what each pixel shows at its centre.
+
+    Args:
+        scene: the scene.
+        position: positions of the mass points [m], shape (rows, cols, 3).
+        rods: the instruments.
+
+    Returns:
+        Coordinates of the material points, shape (height, width, 2), NaN where there is none; depth [m], 0 where there
+        is nothing; whether an instrument is seen.
+    """
+    seen = look(scene, position)
+    depth, _ = meet(rods, view(scene), scene.render.size, 1)
+    nearer = depth < seen.depth
+    coordinates = np.where(nearer[..., None], np.nan, np.stack([seen.u, seen.v], axis=-1))
+    depth = np.minimum(depth, seen.depth)
+    return coordinates, np.where(np.isfinite(depth), depth, 0), nearer
+
+
+def find(scene: Scene, coordinates: Array, position: Array) -> tuple[Array, NDArray[np.bool_]]:
+    """Find where material points are seen, and whether the sheet hides them or they are outside the picture.
+
+    Args:
+        scene: the scene.
+        coordinates: fractions of the sheet's width from its left and of its height from its top, shape (n, 2).
+        position: positions of the mass points [m], shape (rows, cols, 3).
+
+    Returns:
+        Pixels, shape (n, 2), NaN behind the eye; and what is hidden, shape (n,).
+    """
+    camera, (width, height) = view(scene), scene.render.size
+    points = np.concatenate([position, np.ones((*position.shape[:2], 1))], axis=-1) @ camera.matrix.T
+    surface = refine(points, scene.render.refine)
+    rows, cols = surface.shape[:2]
+    # The vertices up and to the left of a point, and its place in their small quad.
+    across, down = coordinates[:, 0] * (cols - 1), coordinates[:, 1] * (rows - 1)
+    j, i = (np.clip(p.astype(int), 0, count - 2) for p, count in ((across, cols), (down, rows)))
+    s, t = (across - j)[:, None], (down - i)[:, None]
+    upper = surface[i, j] * (1 - s) + surface[i, j + 1] * (s - t) + surface[i + 1, j + 1] * t
+    lower = surface[i, j] * (1 - t) + surface[i + 1, j] * (t - s) + surface[i + 1, j + 1] * s
+    found = np.where(t > s, lower, upper)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        pixels = np.where(found[:, 2:3] > camera.near, found[:, :2] / found[:, 2:3], np.nan)
+    x, y = pixels.T
+    hidden = ~((x >= 0) & (y >= 0) & (x < width) & (y < height))
+    limit = found[:, 3] - TOUCHING * max(scene.sheet.size)
+    for triangle in triangles(surface):
+        share = weights(triangle, x, y)
+        w, depth = np.tensordot(triangle[:, 2:].T, share, 1)
+        hidden |= (share >= 0).all(axis=0) & (w > camera.near) & (depth < limit)
+    return pixels, hidden

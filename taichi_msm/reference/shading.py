@@ -1,0 +1,299 @@
+"""The colours of the picture once more: the texture, and the light on tissue and on metal."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from taichi_msm.render import style
+from taichi_msm.render.camera import View
+from taichi_msm.render.instrument import Rod
+from taichi_msm.scene import Scene
+
+Array = NDArray[np.float64]
+
+
+def normals(position: Array) -> Array:
+    """Give unit normals from central differences, one-sided ones at the edges.
+
+    Args:
+        position: positions [m], shape (rows, cols, 3).
+
+    Returns:
+        Unit normals, toward the viewer at rest, shape (rows, cols, 3).
+    """
+    right = np.gradient(position, axis=1)
+    up = -np.gradient(position, axis=0)
+    normal = np.cross(right, up)
+    length = np.linalg.norm(normal, axis=-1, keepdims=True)
+    return np.divide(normal, length, out=np.zeros_like(normal), where=length > 0)
+
+
+def normals_at(normal: Array, u: Array, v: Array) -> Array:
+    """Interpolate normals bilinearly between mass points.
+
+    Args:
+        normal: unit normals of the mass points, shape (rows, cols, 3).
+        u: 0 at the left edge to 1 at the right one, any shape.
+        v: 0 at the top edge to 1 at the bottom one, the same shape.
+
+    Returns:
+        Normals of any length, shape (*u.shape, 3).
+    """
+    place = [v * (normal.shape[0] - 1), u * (normal.shape[1] - 1)]
+    i, j = (np.clip(np.floor(p).astype(int), 0, count - 2) for p, count in zip(place, normal.shape, strict=False))
+    s, t = (place[1] - j)[..., None], (place[0] - i)[..., None]
+    upper = normal[i, j] * (1 - s) + normal[i, j + 1] * s
+    lower = normal[i + 1, j] * (1 - s) + normal[i + 1, j + 1] * s
+    return upper * (1 - t) + lower * t
+
+
+def headlight(normal: Array, toward: Array) -> Array:
+    """Give the cosine between the direction of the light and the normal, 0 to 1.
+
+    Args:
+        normal: of any length, shape (..., 3).
+        toward: unit vector toward the light, shape (3,).
+    """
+    return np.asarray(np.abs(normal @ toward) / np.maximum(np.linalg.norm(normal, axis=-1), 1e-30))
+
+
+def sample(texture: NDArray[np.uint8], u: Array, v: Array) -> Array:
+    """Filter the texture bilinearly, clamped at its edge; texel (a, b) has its centre at ((a + 1/2)/w, (b + 1/2)/h).
+
+    Args:
+        texture: colours, shape (height, width, 3).
+        u: 0 at the left edge to 1 at the right one, any shape.
+        v: 0 at the top edge to 1 at the bottom one, the same shape.
+
+    Returns:
+        Colours 0 to 255, shape (*u.shape, 3).
+    """
+    height, width, _ = texture.shape
+    x, y = u * width - 0.5, v * height - 0.5
+    a, b = np.floor(x).astype(int), np.floor(y).astype(int)
+
+    def texel(a: NDArray[np.int_], b: NDArray[np.int_]) -> Array:
+        return texture[np.clip(b, 0, height - 1), np.clip(a, 0, width - 1)].astype(float)
+
+    across, down = (x - a)[..., None], (y - b)[..., None]
+    upper = texel(a, b) * (1 - across) + texel(a + 1, b) * across
+    lower = texel(a, b + 1) * (1 - across) + texel(a + 1, b + 1) * across
+    return upper * (1 - down) + lower * down
+
+
+def mean_of_fours(texture: NDArray[np.uint8]) -> NDArray[np.uint8]:
+    """Halve a texture: each texel the mean of 2 x 2, rounded; beyond an edge are the texels at it."""
+    rows, cols = (np.minimum(np.arange(size + size % 2), size - 1) for size in texture.shape[:2])
+    even = texture[rows][:, cols].astype(float)
+    mean = (even[::2, ::2] + even[1::2, ::2] + even[::2, 1::2] + even[1::2, 1::2]) / 4
+    return np.floor(mean + 0.5).astype(np.uint8)
+
+
+def minified(texture: NDArray[np.uint8], u: Array, v: Array, footprint: Array) -> tuple[Array, Array]:
+    """Filter a texture over samples that may each show many of its texels.
+
+    Args:
+        texture: colours, shape (height, width, 3).
+        u: 0 at the left edge to 1 at the right one, any shape.
+        v: 0 at the top edge to 1 at the bottom one, the same shape.
+        footprint: the larger of a sample's width and height on the texture [texels], the same shape.
+
+    Returns:
+        Colours, shape (*u.shape, 3); and how the grey rises from texel to texel of the texture to the right and down,
+        shape (*u.shape, 2).
+    """
+    levels = [texture]
+    while levels[-1].shape[:2] != (1, 1):
+        levels.append(mean_of_fours(levels[-1]))
+    lower = np.floor(np.log2(np.maximum(footprint, 1))).astype(int)
+    share = np.clip(footprint / 2.0**lower - 1, 0, 1)[..., None]
+    height, width, _ = texture.shape
+    # Of every level, at the places of all samples; a halved texel begins where its first half does.
+    colours, rises = [], []
+    for n, level in enumerate(levels):
+        across, down = u * width / 2**n / level.shape[1], v * height / 2**n / level.shape[0]
+        colours.append(sample(level, across, down))
+        rises.append(rise(level, across, down) / 2**n)
+    last = len(levels) - 1
+    found = []
+    for values in (np.array(colours), np.array(rises)):
+        near, far = (
+            np.take_along_axis(values, np.minimum(lower + more, last)[None, ..., None], axis=0)[0] for more in (0, 1)
+        )
+        found.append(near + (far - near) * share)
+    return found[0], found[1]
+
+
+def rise(texture: NDArray[np.uint8], u: Array, v: Array) -> Array:
+    """Differentiate the filtered grey of a texture to the right and down [grey / texel], shape (*u.shape, 2)."""
+    height, width, _ = texture.shape
+    x, y = np.clip(u * width - 0.5, 0, width - 1), np.clip(v * height - 0.5, 0, height - 1)
+    a, b = np.floor(x).astype(int), np.floor(y).astype(int)
+    grey = texture.mean(axis=-1)
+    right, below = np.minimum(a + 1, width - 1), np.minimum(b + 1, height - 1)
+    to_right = (grey[b, right] - grey[b, a]) * (1 - y + b) + (grey[below, right] - grey[below, a]) * (y - b)
+    down = (grey[below, a] - grey[b, a]) * (1 - x + a) + (grey[below, right] - grey[b, right]) * (x - a)
+    return np.stack([to_right, down], axis=-1)
+
+
+def unit(vector: Array) -> Array:
+    """Give vectors length 1, shape (..., 3)."""
+    return np.asarray(vector / np.maximum(np.linalg.norm(vector, axis=-1, keepdims=True), 1e-30))
+
+
+def points(camera: View, factor: int, depth: Array) -> Array:
+    """Find what the samples of a picture show, in space [m], shape (height, width, 3); where nothing is, anything.
+
+    Args:
+        camera: the camera.
+        factor: samples of a pixel along each axis.
+        depth: along the direction of view [m], shape (height, width).
+    """
+    right, up, toward = camera.axes
+    y, x = (np.mgrid[: depth.shape[0], : depth.shape[1]] + 0.5) / factor
+    depth = np.where(np.isfinite(depth), depth, camera.distance)
+    w = (depth if camera.pinhole else np.ones_like(depth))[..., None]
+    across = ((x - camera.centre[0]) / camera.scale)[..., None] * right
+    along = ((camera.centre[1] - y) / camera.scale)[..., None] * up
+    return np.asarray(camera.eye + (across + along) * w - depth[..., None] * toward)
+
+
+def illuminate(camera: View, factor: int, depth: Array, normal: Array) -> tuple[Array, Array, Array, Array]:
+    """Find what lights the samples of a picture, in space.
+
+    Args:
+        camera: the camera.
+        factor: samples of a pixel along each axis.
+        depth: along the direction of view [m], shape (height, width).
+        normal: of any length, to either side, shape (height, width, 3).
+
+    Returns:
+        Unit vectors: the normal on the camera's side, to the light, to the eye; and the distance from the light to what
+        is in the middle of the picture over that to the sample.
+    """
+    right, up, toward = camera.axes
+    point = points(camera, factor, depth)
+    light = camera.eye + camera.distance * (style.LIGHT_RIGHT * right + style.LIGHT_UP * up)
+    to_eye = unit(camera.eye - point) if camera.pinhole else np.broadcast_to(toward, point.shape)
+    normal = unit(normal) * np.where((normal * to_eye).sum(axis=-1, keepdims=True) < 0, -1, 1)
+    middle = np.linalg.norm(light - (camera.eye - camera.distance * toward))
+    nearness = np.minimum(middle / np.linalg.norm(light - point, axis=-1), 4)
+    return normal, unit(light - point), to_eye, nearness
+
+
+def highlight(normal: Array, to_light: Array, to_eye: Array) -> Array:
+    """Give Blinn's highlight, 0 to 1."""
+    cosine = (normal * unit(to_light + to_eye)).sum(axis=-1)
+    return np.asarray(np.clip(cosine, 0, 1) ** 2**style.SHARPNESS)
+
+
+def tissue(
+    scene: Scene,
+    camera: View,
+    texture: NDArray[np.uint8],
+    normal: Array,
+    depth: Array,
+    place: tuple[Array, Array, Array],
+    rods: Sequence[Rod],
+) -> Array:
+    """Shade wet tissue; see `render/lighting.py`.
+
+    Args:
+        scene: the scene.
+        camera: its camera.
+        texture: the picture on the sheet, shape (height, width, 3).
+        normal: of the sheet, of any length, shape (height, width, 3).
+        depth: along the direction of view [m], shape (height, width).
+        place: u, v and footprint of the samples, as for `minified`.
+        rods: the instruments.
+
+    Returns:
+        Colours, shape (height, width, 3).
+    """
+    light, factor = scene.render.light, scene.render.supersample
+    colour, rises = minified(texture, *place)
+    # Where the picture rises the normal leans back, along the sheet.
+    upward = light.relief / 100 * max(scene.sheet.size) / 255
+    sizes = texture.shape[1] / scene.sheet.size[1], texture.shape[0] / scene.sheet.size[0]
+    normal = unit(normal)
+    slope = np.concatenate([rises * upward * sizes * (1, -1), np.zeros_like(rises[..., :1])], axis=-1)
+    leaning = normal - slope + (slope * normal).sum(axis=-1, keepdims=True) * normal
+    facing, to_light, to_eye, nearness = illuminate(camera, factor, depth, leaning)
+    wrapped = np.maximum((facing * to_light).sum(axis=-1) + style.WRAP, 0) / (1 + style.WRAP) * nearness
+    aside = np.hypot(style.LIGHT_RIGHT, style.LIGHT_UP)
+    wrapped /= (1 / np.hypot(1, aside) + style.WRAP) / (1 + style.WRAP)
+    share = light.ambient + (1 - light.ambient) * wrapped
+    gloss = 255 * light.gloss * highlight(facing, to_light, to_eye) * nearness
+    for rod in rods:
+        away = points(camera, factor, depth) - rod.tip
+        foot = np.clip(away @ rod.axis, 0, rod.length)[..., None] * rod.axis
+        ratio = np.maximum(np.linalg.norm(away - foot, axis=-1) / rod.radius, 1)
+        share, gloss = (value * (1 - style.SHADE / ratio**2) for value in (share, gloss))
+    y, x = (np.mgrid[: depth.shape[0], : depth.shape[1]] + 0.5) / factor
+    off = np.hypot(x - camera.centre[0], y - camera.centre[1]) / np.hypot(*camera.centre)
+    rim = (1 - light.vignette * off**2)[..., None]
+    return np.asarray(np.minimum((colour * share[..., None] + gloss[..., None]) * rim, 255))
+
+
+def metal(camera: View, factor: int, depth: Array, normal: Array) -> Array:
+    """Shade metal, which mirrors a room that is bright above and dark below; colours, shape (height, width, 3)."""
+    facing, to_light, to_eye, _ = illuminate(camera, factor, depth, normal)
+    cosine = np.maximum((facing * to_light).sum(axis=-1), 0)
+    mirrored = 2 * (facing * to_eye).sum(axis=-1, keepdims=True) * facing - to_eye
+    bright = np.maximum(mirrored @ camera.axes[1], 0)
+    share = style.METAL_AMBIENT + style.METAL_DIFFUSE * cosine + style.METAL_MIRROR * bright**2
+    gloss = 255 * style.METAL_GLOSS * highlight(facing, to_light, to_eye)
+    return np.asarray(np.minimum(share[..., None] * np.array(style.METAL) + gloss[..., None], 255))
+
+
+def meet(rods: Sequence[Rod], camera: View, size: tuple[int, int], factor: int) -> tuple[Array, Array]:
+    """Find the instruments that samples show, by halving: the distance to a rod is convex along a line of sight.
+
+    Args:
+        rods: the instruments.
+        camera: the camera.
+        size: width and height of the picture [px].
+        factor: samples of a pixel along each axis.
+
+    Returns:
+        Depths [m], infinite where there is none, shape (height, width); and normals of any length, shape (height,
+        width, 3).
+    """
+    width, height = size[0] * factor, size[1] * factor
+    y, x = (np.mgrid[:height, :width] + 0.5) / factor
+    right, up, toward = camera.axes
+    aside = ((x - camera.centre[0])[..., None] * right + (camera.centre[1] - y)[..., None] * up) / camera.scale
+    nearest, normal = np.full((height, width), np.inf), np.zeros((height, width, 3))
+
+    def sight(depth: Array) -> Array:
+        w = depth[..., None] if camera.pinhole else 1.0
+        return np.asarray(camera.eye + aside * w - depth[..., None] * toward)
+
+    for rod in rods:
+
+        def outward(depth: Array, rod: Rod = rod) -> Array:
+            point = sight(depth) - rod.tip
+            foot = np.clip(point @ rod.axis, 0, rod.length)
+            return np.asarray(point - foot[..., None] * rod.axis)
+
+        ends = np.array([(camera.eye - rod.tip - n * rod.length * rod.axis) @ toward for n in (0, 1)])
+        reach = rod.radius * 1.01
+        low, high = np.full_like(x, ends.min() - reach), np.full_like(x, ends.max() + reach)
+        first = np.copy(low)
+        for _ in range(200):  # nearest to the rod: the interval shrinks to two thirds
+            a, b = low + (high - low) / 3, high - (high - low) / 3
+            left = np.linalg.norm(outward(a), axis=-1) < np.linalg.norm(outward(b), axis=-1)
+            low, high = np.where(left, low, a), np.where(left, b, high)
+        middle = (low + high) / 2
+        met = np.linalg.norm(outward(middle), axis=-1) <= rod.radius
+        low, high = first, middle
+        for _ in range(60):  # where it is entered
+            half = (low + high) / 2
+            inside = np.linalg.norm(outward(half), axis=-1) <= rod.radius
+            low, high = np.where(inside, low, half), np.where(inside, half, high)
+        nearer = met & (high < nearest) & ((high if camera.pinhole else 1.0) > camera.near)
+        nearest[nearer], normal[nearer] = high[nearer], outward(high)[nearer]
+    return nearest, normal

@@ -1,0 +1,174 @@
+"""The samples that show an instrument.
+
+A rod is all that is within its radius of the line from the middle A of its tip to the other end, A + U length. The line
+of sight through a sample is P = O + D t with t the depth; at the rod's side the part of P - A across U has the radius
+as its length, which is a quadratic equation; beyond A and the other end, spheres about them are met instead.
+"""
+
+# No `from __future__ import annotations` here: Taichi reads the annotations of a kernel.
+
+from collections.abc import Callable, Sequence
+from functools import cache
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from taichi_msm.render.camera import View
+from taichi_msm.render.instrument import Rod
+from taichi_msm.render.lighting import (
+    AXIS,
+    BOTTOM,
+    CENTRE_X,
+    CENTRE_Y,
+    LEFT,
+    LENGTH,
+    PINHOLE,
+    RADIUS,
+    RIGHT,
+    ROD_NUMBERS,
+    SPREAD,
+    TOP,
+)
+from taichi_msm.render.samples import DEPTH, INFINITY, Code
+from taichi_msm.system.runtime import ti
+
+Array = NDArray[np.float64]
+
+
+def rod_numbers(placed: Sequence[Rod], view: View, factor: int) -> Array:
+    """Put together what the kernel knows of the rods, shape (rods or 1, ROD_NUMBERS).
+
+    Args:
+        placed: the rods.
+        view: the camera.
+        factor: samples of a pixel along each axis.
+    """
+    numbers = np.zeros((max(1, len(placed)), ROD_NUMBERS))
+    for row, rod in zip(numbers, placed, strict=False):
+        ends = np.stack([rod.tip, rod.tip + rod.axis * rod.length])
+        row[:AXIS] = view.axes @ (rod.tip - view.eye)
+        row[AXIS:LENGTH] = view.axes @ rod.axis
+        row[[LENGTH, RADIUS]] = rod.length, rod.radius
+        # The picture of a box around each end holds that of the end.
+        corner = np.array(np.meshgrid(*[(-rod.radius, rod.radius)] * 3)).reshape(3, -1).T @ view.axes
+        boxes = (ends[:, None] + corner).reshape(-1, 3)
+        x, y, w = view.matrix[:3, :3] @ boxes.T + view.matrix[:3, 3:]
+        if (w > view.near).all():
+            bounds = np.array([(x / w).min(), (y / w).min(), (x / w).max(), (y / w).max()])
+        else:
+            bounds = np.array([0, 0, *2 * view.centre])
+        row[LEFT:] = np.clip(bounds, 0, np.tile(2 * view.centre, 2)) * factor
+    return numbers
+
+
+@ti.func
+def dot(a_x, a_y, a_z, b_x, b_y, b_z):
+    """Multiply two vectors."""
+    return a_x * b_x + a_y * b_y + a_z * b_z
+
+
+@ti.func
+def meet(x, y, n, rods: ti.template(), light: ti.template()):
+    """Find where lines of sight meet rod n first.
+
+    Args:
+        x: column of the samples.
+        y: their row.
+        n: number of the rod.
+        rods: as `rod_numbers` makes them.
+        light: as `light_numbers` makes them; only what the camera is.
+
+    Returns:
+        The depth, INFINITY where they miss the rod, and the normal times the radius.
+    """
+    u_x, u_y, u_z = rods[n, AXIS], rods[n, AXIS + 1], rods[n, AXIS + 2]
+    length, radius = rods[n, LENGTH], rods[n, RADIUS]
+    # The line of sight P = O + D t from where it is as deep as the tip, which is at 0.
+    start = rods[n, 2] * (-1.0)
+    across = (x - light[CENTRE_X]) * light[SPREAD]
+    up = (light[CENTRE_Y] - y) * light[SPREAD]
+    d_x, d_y, d_z = across * light[PINHOLE], up * light[PINHOLE], -1.0
+    w = start * light[PINHOLE] + (1.0 - light[PINHOLE])
+    o_x, o_y, o_z = across * w - rods[n, 0], up * w - rods[n, 1], 0.0
+    # The side of the rod: a t^2 + 2 b t + c = 0.
+    d_d = dot(d_x, d_y, d_z, d_x, d_y, d_z)
+    d_u = dot(d_x, d_y, d_z, u_x, u_y, u_z)
+    o_u = dot(o_x, o_y, o_z, u_x, u_y, u_z)
+    o_d = dot(o_x, o_y, o_z, d_x, d_y, d_z)
+    o_o = dot(o_x, o_y, o_z, o_x, o_y, o_z)
+    a = ti.max(d_d - d_u * d_u, 1e-12)
+    b = o_d - o_u * d_u
+    c = o_o - o_u * o_u - radius * radius
+    inner = b * b - a * c
+    t_side = (ti.sqrt(ti.max(inner, 0.0)) + b) * (-1.0) / a
+    along = o_u + t_side * d_u
+    # The sphere about the end where the side is left.
+    end = ti.select(along < length * 0.5, 0.0, length)
+    b_end = o_d - end * d_u
+    c_end = o_o - 2.0 * end * o_u + end * end - radius * radius
+    inner_end = b_end * b_end - d_d * c_end
+    t_end = (ti.sqrt(ti.max(inner_end, 0.0)) + b_end) * (-1.0) / d_d
+    on_side = (along >= 0.0) & (along <= length)
+    t = ti.select(on_side, t_side, t_end)
+    met = (inner >= 0.0) & (on_side | (inner_end >= 0.0))
+    foot = ti.max(ti.min(o_u + t * d_u, length), 0.0)
+    return (
+        ti.select(met, start + t, INFINITY),
+        o_x + d_x * t - u_x * foot,
+        o_y + d_y * t - u_y * foot,
+        d_z * t - u_z * foot,
+    )
+
+
+@cache
+def instruments(code: Code) -> Callable[..., Any]:
+    """Make Taichi's function that covers the samples of a band with the instruments.
+
+    Args:
+        code: what it is compiled for.
+    """
+    floats = code.floats
+    columns = [lane % code.tile_width + 0.5 for lane in range(code.lanes)]
+    lines = [lane // code.tile_width + 0.5 for lane in range(code.lanes)]
+
+    @ti.func
+    def cover_tile(at, x, y, n, rods: ti.template(), light: ti.template(), band: ti.template()):
+        """Cover a tile of samples with rod n."""
+        depth, n_x, n_y, n_z = meet(x, y, n, rods, light)
+        samples = ti.static(band.samples)
+        in_front = depth * light[PINHOLE] + (1.0 - light[PINHOLE]) > band.near
+        visible = in_front & (depth < samples[at + DEPTH])
+        samples[at + DEPTH] = ti.select(visible, depth, samples[at + DEPTH])
+        mask = at + ti.static(code.layout["instrument"])
+        samples[mask] = ti.select(visible, 1.0, samples[mask])
+        if ti.static(code.metal):
+            for name, value in ti.static((("normal_x", n_x), ("normal_y", n_y), ("normal_z", n_z))):
+                plane = at + ti.static(code.layout[name])
+                samples[plane] = ti.select(visible, value, samples[plane])
+
+    @ti.func
+    def cover(count, rods: ti.template(), light: ti.template(), band: ti.template()):
+        """Cover a band with the instruments.
+
+        Args:
+            count: how many there are.
+            rods: as `rod_numbers` makes them.
+            light: as `light_numbers` makes them.
+            band: the band.
+        """
+        for n in range(count):
+            if rods[n, TOP] < band.bottom and rods[n, BOTTOM] > band.top:
+                first_row = ti.cast(ti.max(ti.floor(rods[n, TOP]), band.top), ti.i32)
+                end_row = ti.cast(ti.min(ti.ceil(rods[n, BOTTOM]), band.bottom), ti.i32)
+                first_line = (first_row - band.top) // code.tile_height
+                end_line = (end_row - band.top + (code.tile_height - 1)) // code.tile_height
+                first_tile = ti.cast(ti.floor(rods[n, LEFT]), ti.i32) // code.tile_width
+                end_tile = (ti.cast(ti.ceil(rods[n, RIGHT]), ti.i32) + (code.tile_width - 1)) // code.tile_width
+                for line in range(first_line, end_line):
+                    for tile in range(first_tile, end_tile):
+                        x = floats(columns) + ti.cast(tile * code.tile_width, ti.f32)
+                        y = floats(lines) + ti.cast(band.top + line * code.tile_height, ti.f32)
+                        cover_tile(band.first + (line * band.across + tile) * code.planes, x, y, n, rods, light, band)
+
+    return cover

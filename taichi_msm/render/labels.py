@@ -1,0 +1,90 @@
+"""What is known of every pixel: values, without Taichi."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+
+class Labels(NamedTuple):
+    """What each pixel of a frame shows at its centre.
+
+    Attributes:
+        coordinates: of the material point, fractions of the sheet's width from its left and of its height from its top,
+            shape (height, width, 2); NaN where no sheet is seen.
+        depth: along the direction of view, from the eye [m], shape (height, width); 0 where nothing is seen. The
+            orthographic camera's eye is as far above the sheet at rest as the sheet's larger side is long.
+        instrument: 255 where an instrument is seen, else 0, shape (height, width).
+    """
+
+    coordinates: NDArray[np.float32]
+    depth: NDArray[np.float32]
+    instrument: NDArray[np.uint8]
+
+
+class Flow(NamedTuple):
+    """How the material that one frame shows moves in the picture until another.
+
+    Attributes:
+        flow: to the right and down [px], shape (height, width, 2); NO_FLOW where no sheet is seen, and where it goes
+            behind the eye.
+        occlusion: 255 where the sheet is seen in the one frame, but in the other something is in front of it or it is
+            outside the picture; else 0; shape (height, width).
+    """
+
+    flow: NDArray[np.float32]
+    occlusion: NDArray[np.uint8]
+
+
+class Sight(NamedTuple):
+    """Where material points are seen.
+
+    Attributes:
+        pixels: x to the right and y down from the picture's upper left corner [px], shape (n, 2); NaN behind the eye.
+        hidden: whether something is in front of a point, or it is outside the picture, shape (n,).
+    """
+
+    pixels: NDArray[np.float32]
+    hidden: NDArray[np.bool_]
+
+
+class Observed(NamedTuple):
+    """What is written of one frame, as far as it is asked for.
+
+    Attributes:
+        picture: colours, shape (height, width, 3).
+        labels: what each pixel shows.
+        flow: of what the frame before showed, until this one.
+        tracks: where the tracked points are.
+    """
+
+    picture: NDArray[np.uint8] | None = None
+    labels: Labels | None = None
+    flow: Flow | None = None
+    tracks: Sight | None = None
+
+
+def track_grid(count: int) -> NDArray[np.float32]:
+    """Give the coordinates of points in the middle of equal fields of the sheet, shape (count^2, 2), row after row."""
+    middle = (np.arange(count) + 0.5) / count
+    down, across = np.meshgrid(middle, middle, indexing="ij")
+    return np.stack([across, down], axis=-1).reshape(-1, 2).astype(np.float32)
+
+
+def flow_between(before: Labels, sight: Sight) -> Flow:
+    """Put flow together.
+
+    Args:
+        before: what the earlier frame shows.
+        sight: how far what its pixels show has moved, and what is hidden.
+    """
+    shape = before.depth.shape
+    nowhere = np.isnan(sight.pixels[:, :1])
+    flow = np.where(nowhere, np.float32(NO_FLOW), sight.pixels).reshape(*shape, 2)
+    return Flow(flow, sight.hidden.reshape(shape).view(np.uint8) * np.uint8(255))
+
+
+# What the Middlebury format has where there is no flow.
+NO_FLOW = 1e10

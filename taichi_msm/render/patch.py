@@ -1,0 +1,94 @@
+"""A cell of the surface as the camera sees it, for one sample or a vector of them, in any precision.
+
+A point of the surface is carried as (X, Y, w, depth), what the camera's matrix makes of it. That map is linear, so
+refining the projected mass points is refining the surface, and the perspective needs no special case: within a cell,
+the surface between four mass points, with s to the right and t down,
+
+    P(s, t) = A + B s + C t + D s t,    seen at sample (x, y) where    X - x w = 0,  Y - y w = 0.
+"""
+
+# No `from __future__ import annotations` here: Taichi reads the annotations of a kernel.
+
+from typing import Any, NamedTuple
+
+from taichi_msm.system.runtime import ti
+
+
+class Plane(NamedTuple):
+    """The triangle P + R s + D t of a small quad that a sample is on, each of them (X, Y, w)."""
+
+    p_x: Any
+    p_y: Any
+    p_w: Any
+    r_x: Any
+    r_y: Any
+    r_w: Any
+    d_x: Any
+    d_y: Any
+    d_w: Any
+
+
+@ti.func
+def on_triangle(x, y, plane: ti.template()):
+    """Find (s, t) where the triangle is seen at (x, y)."""
+    p_1 = plane.p_x - x * plane.p_w
+    r_1 = plane.r_x - x * plane.r_w
+    d_1 = plane.d_x - x * plane.d_w
+    p_2 = plane.p_y - y * plane.p_w
+    r_2 = plane.r_y - y * plane.r_w
+    d_2 = plane.d_y - y * plane.d_w
+    share = 1.0 / (r_1 * d_2 - r_2 * d_1)
+    return (p_2 * d_1 - p_1 * d_2) * share, (p_1 * r_2 - p_2 * r_1) * share
+
+
+@ti.func
+def edge(p_x, p_y, q_x, q_y, x, y):
+    """Twice the area of p, q and (x, y), of one sign on each side; the same bits for both cells of an edge."""
+    return (q_x - p_x) * (y - p_y) - (q_y - p_y) * (x - p_x)
+
+
+@ti.func
+def turn(p_x, p_y, q_x, q_y, r_x, r_y):
+    """Twice the area of p, q and r: above 0 where the way from p over q to r turns to the right in the picture."""
+    return (q_x - p_x) * (r_y - q_y) - (q_y - p_y) * (r_x - q_x)
+
+
+@ti.func
+def small_quad(
+    x, y, inside, parts, side, a: ti.template(), b: ti.template(), c: ti.template(), d: ti.template()
+):  # fmt: skip
+    """Find column and line of the small quads of a cell A + B s + C t + D s t that are seen at (x, y).
+
+    Args:
+        x: column of the samples.
+        y: their row.
+        inside: which of them the cell covers.
+        parts: small quads along a side of the cell.
+        side: 1 where its front is seen, else -1.
+        a: coefficient A, (X, Y, w, ...).
+        b: likewise B.
+        c: likewise C.
+        d: likewise D.
+    """
+    a_1 = a[0] - x * a[2]
+    b_1 = b[0] - x * b[2]
+    c_1 = c[0] - x * c[2]
+    d_1 = d[0] - x * d[2]
+    a_2 = a[1] - y * a[2]
+    b_2 = b[1] - y * b[2]
+    c_2 = c[1] - y * c[2]
+    d_2 = d[1] - y * d[2]
+    # Without t the two equations are bd s^2 + (ad + bc) s + ac = 0; without s they have the same discriminant.
+    ad = a_1 * d_2 - d_1 * a_2
+    bc = b_1 * c_2 - c_1 * b_2
+    ac = a_1 * c_2 - c_1 * a_2
+    ab = a_1 * b_2 - b_1 * a_2
+    bd = b_1 * d_2 - d_1 * b_2
+    linear = ad + bc
+    root = ti.sqrt(ti.max(linear * linear - 4.0 * bd * ac, 0.0)) * side
+    s = ti.select(inside, -2.0 * ac / (linear + root), 0.0)
+    t = ti.select(inside, -2.0 * ab / (ad - bc - root), 0.0)
+    return (
+        ti.max(ti.min(ti.floor(s * parts), parts - 1.0), 0.0),
+        ti.max(ti.min(ti.floor(t * parts), parts - 1.0), 0.0),
+    )

@@ -1,0 +1,51 @@
+"""The texture at half, a quarter, ... of its size, so that a sample that shows many texels shows their mean."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+
+class Pyramid(NamedTuple):
+    """Levels of a texture, the first its own size, the last one texel.
+
+    Attributes:
+        texels: of all levels, as `packed` makes them, one row after another.
+        levels: of every level where it begins in `texels`, its width and its height, shape (levels, 3).
+    """
+
+    texels: NDArray[np.float32]
+    levels: NDArray[np.int32]
+
+
+def packed(colours: NDArray[np.uint8]) -> NDArray[np.float32]:
+    """Make one number of each colour, red + 256 green + 65536 blue, for which f32 has places."""
+    return colours.astype(np.float32) @ np.array([1, 1 << 8, 1 << 16], np.float32)
+
+
+def pyramid(texture: NDArray[np.uint8], *, minified: bool) -> Pyramid:
+    """Make the levels of a texture.
+
+    Args:
+        texture: colours, shape (height, width, 3).
+        minified: False makes the first alone.
+    """
+    level, texels, levels, first = texture, [], [], 0
+    while True:
+        height, width, _ = level.shape
+        texels.append(packed(level).ravel())
+        levels.append((first, width, height))
+        first += width * height
+        if not minified or width == height == 1:
+            return Pyramid(np.concatenate(texels), np.array(levels, np.int32))
+        level = halved(level)
+
+
+def halved(colours: NDArray[np.uint8]) -> NDArray[np.uint8]:
+    """Give means of 2 x 2 texels; the last row and column of an odd number count twice."""
+    height, width, _ = colours.shape
+    even = np.pad(colours, ((0, height % 2), (0, width % 2), (0, 0)), "edge").astype(np.uint16)
+    sums = even[::2, ::2] + even[1::2, ::2] + even[::2, 1::2] + even[1::2, 1::2]
+    return ((sums + 2) // 4).astype(np.uint8)

@@ -1,0 +1,93 @@
+"""Where material points are seen, and whether anything is in front of them: exactly, not by a picture of depths.
+
+A point is taken to where it is on the drawn surface, and projected. It is hidden if another part of the surface, or an
+instrument, is nearer on the same line of sight. Which cells may be there is told by bins: squares of the picture, each
+with a list of the cells whose outlines reach it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from taichi_msm.render.camera import View
+from taichi_msm.render.instrument import Rod
+from taichi_msm.render.instrument_coverage import rod_numbers
+from taichi_msm.render.labels import Sight
+from taichi_msm.render.lighting import light_numbers
+from taichi_msm.render.tracking_kernel import CELL_NUMBERS, POINT_NUMBERS, count, fill, project, search
+from taichi_msm.scene import Scene
+from taichi_msm.system.runtime import our_compilation
+
+# What is in front of a point by less than this fraction of the sheet's larger side is the surface at the point itself.
+TOUCHING = 1e-9
+
+# A bin is at least so many pixels wide. There are at most so many entries of cells in bins for each cell and bin.
+SMALLEST_BIN = 4
+MOST_ENTRIES = 64
+
+
+def find(
+    scene: Scene,
+    coordinates: NDArray[np.floating],
+    position: NDArray[np.floating],
+    view: View,
+    rods: Sequence[Rod] = (),
+    *,
+    moved: bool = False,
+) -> Sight:
+    """Find material points.
+
+    Args:
+        scene: a checked scene; `runtime.start` comes first.
+        coordinates: fractions of the sheet's width from its left and of its height from its top, shape (n, 2). NaN
+            is no point, which is nowhere and not hidden.
+        position: positions of the mass points [m], shape (rows, cols, 3).
+        view: the camera.
+        rods: the instruments.
+        moved: whether points are those at the centres of all pixels, one row after another, and `pixels` is to
+            tell how far they are from these.
+    """
+    (rows, cols), (width, height), parts = scene.sheet.points, scene.render.size, scene.render.refine + 1
+    cells = (rows - 1) * (cols - 1)
+    point, cell = np.empty(rows * cols * POINT_NUMBERS), np.empty(cells * CELL_NUMBERS)
+    bin_size = max(SMALLEST_BIN, round((width * height / cells) ** 0.5))
+    with our_compilation(optimised=False):
+        project(np.ascontiguousarray(position, np.float64), view.matrix, view.near, rows, cols, point, cell)
+        while True:
+            across, down = -(-width // bin_size), -(-height // bin_size)
+            ends = np.zeros(across * down + 1, np.int32)
+            count(cell, cells, bin_size, across, down, ends)
+            starts = np.cumsum(ends, dtype=np.int64)
+            if starts[-1] <= MOST_ENTRIES * (cells + across * down):
+                break
+            bin_size *= 2
+        entries = np.empty(max(1, starts[-1]), np.int32)
+        fill(cell, cells, bin_size, across, down, starts[:-1].astype(np.int32), entries)
+        pixels, hidden = np.empty((len(coordinates), 2), np.float32), np.empty(len(coordinates), np.uint8)
+        search(
+            np.ascontiguousarray(coordinates, np.float32).ravel(),
+            len(coordinates),
+            width if moved else 0,
+            point,
+            cell,
+            rows,
+            cols,
+            float(parts),
+            view.near,
+            width,
+            height,
+            bin_size,
+            across,
+            starts.astype(np.int32),
+            entries,
+            TOUCHING * max(scene.sheet.size),
+            light_numbers(view, scene.render.light, 1, scene.sheet.size, (1, 1)),
+            rod_numbers(rods, view, 1),
+            len(rods),
+            pixels.ravel(),
+            hidden,
+        )
+    return Sight(pixels, hidden.view(np.bool_))

@@ -1,0 +1,287 @@
+"""The kernels of tracking.py, in f64: cells and their bins, and the search for what hides a point."""
+
+# No `from __future__ import annotations` here: Taichi reads the annotations of a kernel.
+
+import math
+
+from taichi_msm.render.instrument_coverage import meet
+from taichi_msm.render.lighting import PINHOLE
+from taichi_msm.render.patch import Plane, edge, on_triangle, small_quad, turn
+from taichi_msm.system.runtime import ti
+
+# Numbers of a mass point: (X, Y, w, depth), its place in the picture; and of a cell: its bounds there, its least depth,
+# and 1 or -1 where it is drawn as a whole and its front or its back is seen, else 0.
+SEEN, POINT_NUMBERS = 4, 6
+LEFT, TOP, RIGHT, BOTTOM, NEAREST, SIDE, CELL_NUMBERS = range(7)
+
+# Where a point is seen that is not.
+NOWHERE = math.nan
+
+vec4 = ti.types.vector(4, ti.f64)
+
+
+@ti.kernel
+def project(
+    position: ti.types.ndarray(dtype=ti.f64, ndim=3),
+    matrix: ti.types.ndarray(dtype=ti.f64, ndim=2),
+    near: ti.f64,
+    rows: ti.i32,
+    cols: ti.i32,
+    point: ti.types.ndarray(dtype=ti.f64, ndim=1),
+    cell: ti.types.ndarray(dtype=ti.f64, ndim=1),
+):
+    """Project the mass points, and find the outlines of the cells."""
+    for index in range(rows * cols):
+        i, j, here = index // cols, index % cols, index * POINT_NUMBERS
+        for n in ti.static(range(4)):
+            value = matrix[n, 3]
+            for axis in ti.static(range(3)):
+                value += matrix[n, axis] * position[i, j, axis]
+            point[here + n] = value
+        point[here + SEEN] = point[here] / point[here + 2]
+        point[here + SEEN + 1] = point[here + 1] / point[here + 2]
+
+    for index in range((rows - 1) * (cols - 1)):
+        a = (index // (cols - 1) * cols + index % (cols - 1)) * POINT_NUMBERS
+        b, c = a + POINT_NUMBERS, a + cols * POINT_NUMBERS
+        d = c + POINT_NUMBERS
+        a_x, a_y, b_x, b_y = point[a + SEEN], point[a + SEEN + 1], point[b + SEEN], point[b + SEEN + 1]
+        c_x, c_y, d_x, d_y = point[c + SEEN], point[c + SEEN + 1], point[d + SEEN], point[d + SEEN + 1]
+        abd, bdc = turn(a_x, a_y, b_x, b_y, d_x, d_y), turn(b_x, b_y, d_x, d_y, c_x, c_y)
+        dca, cab = turn(d_x, d_y, c_x, c_y, a_x, a_y), turn(c_x, c_y, a_x, a_y, b_x, b_y)
+        here = index * CELL_NUMBERS
+        cell[here + NEAREST] = ti.min(point[a + 3], point[b + 3], point[c + 3], point[d + 3])
+        least, most = ti.min(abd, bdc, dca, cab), ti.max(abd, bdc, dca, cab)
+        cell[here + SIDE] = ti.select(least > 0, 1.0, ti.select(most < 0, -1.0, 0.0))
+        if point[a + 2] > near and point[b + 2] > near and point[c + 2] > near and point[d + 2] > near:
+            cell[here + LEFT], cell[here + RIGHT] = ti.min(a_x, b_x, c_x, d_x), ti.max(a_x, b_x, c_x, d_x)
+            cell[here + TOP], cell[here + BOTTOM] = ti.min(a_y, b_y, c_y, d_y), ti.max(a_y, b_y, c_y, d_y)
+        elif point[a + 2] <= near and point[b + 2] <= near and point[c + 2] <= near and point[d + 2] <= near:
+            cell[here + LEFT], cell[here + RIGHT] = 1.0, -1.0
+            cell[here + TOP], cell[here + BOTTOM] = 1.0, -1.0
+        else:
+            cell[here + SIDE] = 0.0
+            cell[here + LEFT], cell[here + RIGHT] = -1e9, 1e9
+            cell[here + TOP], cell[here + BOTTOM] = -1e9, 1e9
+
+
+@ti.func
+def _bins(here, bin_size, across, down, cell: ti.template()):
+    """Give the bins that a cell reaches: first and end of their columns, first and end of their rows."""
+    size = ti.cast(bin_size, ti.f64)
+    left = ti.cast(ti.floor(ti.math.clamp(cell[here + LEFT] / size, 0.0, 1e6)), ti.i32)
+    right = ti.cast(ti.floor(ti.math.clamp(cell[here + RIGHT] / size, -1.0, 1e6)), ti.i32) + 1
+    top = ti.cast(ti.floor(ti.math.clamp(cell[here + TOP] / size, 0.0, 1e6)), ti.i32)
+    bottom = ti.cast(ti.floor(ti.math.clamp(cell[here + BOTTOM] / size, -1.0, 1e6)), ti.i32) + 1
+    return left, ti.min(right, across), top, ti.min(bottom, down)
+
+
+@ti.kernel
+def count(
+    cell: ti.types.ndarray(dtype=ti.f64, ndim=1),
+    cells: ti.i32,
+    bin_size: ti.i32,
+    across: ti.i32,
+    down: ti.i32,
+    ends: ti.types.ndarray(dtype=ti.i32, ndim=1),
+):
+    """Count the cells of every bin, one entry after its own."""
+    ti.loop_config(serialize=True)
+    for index in range(cells):
+        left, right, top, bottom = _bins(index * CELL_NUMBERS, bin_size, across, down, cell)
+        for row in range(top, bottom):
+            for column in range(left, right):
+                ends[row * across + column + 1] += 1
+
+
+@ti.kernel
+def fill(
+    cell: ti.types.ndarray(dtype=ti.f64, ndim=1),
+    cells: ti.i32,
+    bin_size: ti.i32,
+    across: ti.i32,
+    down: ti.i32,
+    ends: ti.types.ndarray(dtype=ti.i32, ndim=1),
+    entries: ti.types.ndarray(dtype=ti.i32, ndim=1),
+):
+    """List the cells of every bin; `ends`, where each list begins, becomes where it ends."""
+    ti.loop_config(serialize=True)
+    for index in range(cells):
+        left, right, top, bottom = _bins(index * CELL_NUMBERS, bin_size, across, down, cell)
+        for row in range(top, bottom):
+            for column in range(left, right):
+                entries[ends[row * across + column]] = index
+                ends[row * across + column] += 1
+
+
+@ti.func
+def _corners(index, cols, point: ti.template()):
+    """Give the coefficients A, B, C, D of a cell, each (X, Y, w, depth)."""
+    at = (index // (cols - 1) * cols + index % (cols - 1)) * POINT_NUMBERS
+    below = at + cols * POINT_NUMBERS
+    a = vec4([point[at + n] for n in ti.static(range(4))])
+    right = vec4([point[at + POINT_NUMBERS + n] for n in ti.static(range(4))])
+    down = vec4([point[below + n] for n in ti.static(range(4))])
+    far = vec4([point[below + POINT_NUMBERS + n] for n in ti.static(range(4))])
+    return a, right - a, down - a, far - right - down + a
+
+
+@ti.func
+def _triangle(x, y, s0, t0, lower, part, near, a, b, c, d):
+    """Find the depth at which the plane of a small triangle is seen at (x, y), and whether that is on the triangle.
+
+    Args:
+        x: place in the picture, to the right [px].
+        y: likewise, down.
+        s0: upper left corner of its small quad, to the right in the cell.
+        t0: likewise, down.
+        lower: whether it is the one below the diagonal.
+        part: side of a small quad, by that of the cell.
+        near: what is not farther than this is not seen.
+        a: coefficient A of the cell.
+        b: likewise B.
+        c: likewise C.
+        d: likewise D.
+    """
+    p = a + b * s0 + (c + d * s0) * t0
+    twist = d * (part * part)
+    r = (b + d * t0) * part + ti.select(lower, twist, twist * 0.0)
+    e = (c + d * s0) * part + ti.select(lower, twist * 0.0, twist)
+    plane = ti.static(Plane(p[0], p[1], p[2], r[0], r[1], r[2], e[0], e[1], e[2]))
+    s, t = on_triangle(x, y, plane)
+    larger, smaller = ti.select(lower, t, s), ti.select(lower, s, t)
+    inside = (smaller >= 0.0) & (larger <= 1.0) & (smaller <= larger) & (p[2] + r[2] * s + e[2] * t > near)
+    return p[3] + r[3] * s + e[3] * t, inside
+
+
+@ti.func
+def _is_below(x, y, s0, t0, part, side, a, b, c, d):
+    """Tell whether (x, y) is below the diagonal of a small quad that faces one way."""
+    p = a + b * s0 + (c + d * s0) * t0
+    s1, t1 = s0 + part, t0 + part
+    f = a + b * s1 + (c + d * s1) * t1
+    return ((p[0] - x * p[2]) * (f[1] - y * f[2]) - (p[1] - y * p[2]) * (f[0] - x * f[2])) * side >= 0.0
+
+
+@ti.func
+def _hides(x, y, depth, index, own, own_triangle, cols, parts, near, point: ti.template(), cell: ti.template()):
+    """Tell whether a cell is seen at (x, y) before `depth`.
+
+    Args:
+        x: place in the picture, to the right [px].
+        y: likewise, down.
+        depth: of the point [m].
+        index: of the cell.
+        own: the cell that the point is on.
+        own_triangle: the small triangle of it.
+        cols: of mass points.
+        parts: small quads along a side of a cell.
+        near: what is not farther than this is not seen.
+        point: as `project` makes it.
+        cell: likewise.
+    """
+    here, part = index * CELL_NUMBERS, 1.0 / parts
+    side = cell[here + SIDE]
+    hides = False
+    # A cell that is drawn as a whole has every place of the picture once.
+    possible = cell[here + NEAREST] < depth and not (index == own and side != 0.0)
+    if (
+        possible
+        and x >= cell[here + LEFT]
+        and x <= cell[here + RIGHT]
+        and y >= cell[here + TOP]
+        and y <= cell[here + BOTTOM]
+    ):
+        a, b, c, d = _corners(index, cols, point)
+        if side != 0.0:
+            at = (index // (cols - 1) * cols + index % (cols - 1)) * POINT_NUMBERS + SEEN
+            below = at + cols * POINT_NUMBERS
+            a_x, a_y, b_x, b_y = point[at], point[at + 1], point[at + POINT_NUMBERS], point[at + POINT_NUMBERS + 1]
+            c_x, c_y, d_x, d_y = (
+                point[below], point[below + 1], point[below + POINT_NUMBERS], point[below + POINT_NUMBERS + 1]
+            )  # fmt: skip
+            if (
+                edge(a_x, a_y, c_x, c_y, x, y) * side <= 0.0
+                and edge(b_x, b_y, d_x, d_y, x, y) * side >= 0.0
+                and edge(a_x, a_y, b_x, b_y, x, y) * side >= 0.0
+                and edge(c_x, c_y, d_x, d_y, x, y) * side <= 0.0
+            ):
+                column, line = small_quad(x, y, True, parts, side, a, b, c, d)
+                s0, t0 = column * part, line * part
+                lower = _is_below(x, y, s0, t0, part, side, a, b, c, d)
+                seen, _ = _triangle(x, y, s0, t0, lower, part, near, a, b, c, d)
+                hides = seen < depth
+        else:
+            count = ti.cast(parts, ti.i32)
+            for triangle in range(2 * count * count):
+                if not hides and not (index == own and triangle == own_triangle):
+                    quad = triangle // 2
+                    s0, t0 = ti.cast(quad % count, ti.f64) * part, ti.cast(quad // count, ti.f64) * part
+                    seen, inside = _triangle(x, y, s0, t0, triangle % 2 == 1, part, near, a, b, c, d)
+                    hides = inside and seen < depth
+    return hides
+
+
+@ti.kernel
+def search(
+    coordinates: ti.types.ndarray(dtype=ti.f32, ndim=1),
+    count: ti.i32,
+    row: ti.i32,
+    point: ti.types.ndarray(dtype=ti.f64, ndim=1),
+    cell: ti.types.ndarray(dtype=ti.f64, ndim=1),
+    rows: ti.i32,
+    cols: ti.i32,
+    parts: ti.f64,
+    near: ti.f64,
+    width: ti.i32,
+    height: ti.i32,
+    bin_size: ti.i32,
+    across: ti.i32,
+    starts: ti.types.ndarray(dtype=ti.i32, ndim=1),
+    entries: ti.types.ndarray(dtype=ti.i32, ndim=1),
+    touching: ti.f64,
+    light: ti.types.ndarray(dtype=ti.f64, ndim=1),
+    rods: ti.types.ndarray(dtype=ti.f64, ndim=2),
+    rod_count: ti.i32,
+    pixels: ti.types.ndarray(dtype=ti.f32, ndim=1),
+    hidden: ti.types.ndarray(dtype=ti.u8, ndim=1),
+):
+    """Find points, of which `row` fill a row of pixels; 0: they are no pixels."""
+    for k in range(count):
+        u, v = coordinates[2 * k], coordinates[2 * k + 1]
+        x, y, out_of_sight = ti.cast(NOWHERE, ti.f64), ti.cast(NOWHERE, ti.f64), False
+        if abs(u) < 2.0:  # no NaN
+            s = ti.math.clamp(ti.cast(u, ti.f64), 0.0, 1.0) * (cols - 1)
+            t = ti.math.clamp(ti.cast(v, ti.f64), 0.0, 1.0) * (rows - 1)
+            j, i = ti.min(ti.cast(s, ti.i32), cols - 2), ti.min(ti.cast(t, ti.i32), rows - 2)
+            s, t = s - j, t - i
+            own, part = i * (cols - 1) + j, 1.0 / parts
+            column, line = ti.min(ti.floor(s * parts), parts - 1.0), ti.min(ti.floor(t * parts), parts - 1.0)
+            s0, t0 = column * part, line * part
+            s1, t1 = s - s0, t - t0
+            own_triangle = 2 * ti.cast(line * parts + column, ti.i32) + ti.cast(t1 > s1, ti.i32)
+            a, b, c, d = _corners(own, cols, point)
+            # On the small quad D s t becomes linear on either side of its diagonal.
+            p = a + b * s + c * t + d * (s0 * t0 + s1 * t0 + s0 * t1 + ti.min(s1, t1) * part)
+            out_of_sight = True
+            if p[2] > near:
+                x, y = p[0] / p[2], p[1] / p[2]
+                if x >= 0.0 and y >= 0.0 and x < width and y < height:
+                    out_of_sight = False
+                    depth = p[3] - touching
+                    square = ti.cast(y, ti.i32) // bin_size * across + ti.cast(x, ti.i32) // bin_size
+                    for n in range(starts[square], starts[square + 1]):
+                        if not out_of_sight:
+                            out_of_sight = _hides(
+                                x, y, depth, entries[n], own, own_triangle, cols, parts, near, point, cell
+                            )
+                    for n in range(rod_count):
+                        met, _, _, _ = meet(x, y, n, rods, light)
+                        if met < depth and met * light[PINHOLE] + (1.0 - light[PINHOLE]) > near:
+                            out_of_sight = True
+        if row > 0:
+            x -= ti.cast(k % row, ti.f64) + 0.5
+            y -= ti.cast(k // row, ti.f64) + 0.5
+        pixels[2 * k] = ti.cast(x, ti.f32)
+        pixels[2 * k + 1] = ti.cast(y, ti.f32)
+        hidden[k] = ti.cast(out_of_sight, ti.u8)

@@ -1,0 +1,49 @@
+"""Optical flow as Middlebury's .flo has it: a magic number, width, height, then two floats a pixel; little-endian."""
+
+from __future__ import annotations
+
+import struct
+from pathlib import Path
+from typing import BinaryIO
+
+import numpy as np
+from numpy.typing import NDArray
+
+from taichi_msm.results.finished_run import damaged, reading
+from taichi_msm.results.folder import write_all
+
+MAGIC = b"PIEH"
+
+
+def write_flo(file: BinaryIO, flow: NDArray[np.float32]) -> None:
+    """Write flow to the right and down [px], shape (height, width, 2)."""
+    height, width, _ = flow.shape
+    write_all(file, _header(width, height))
+    write_all(file, np.ascontiguousarray(flow, "<f4").data.cast("B"))
+
+
+def read_flo(path: Path, size: tuple[int, int]) -> NDArray[np.float32]:
+    """Read a file of flow.
+
+    Args:
+        path: of the file.
+        size: width, height that it must have [px].
+
+    Returns:
+        Flow to the right and down [px], shape (height, width, 2).
+
+    Raises:
+        FilesError: when it cannot be read, or is none of that size.
+    """
+    width, height = size
+    header, length = _header(width, height), 8 * width * height
+    with reading(path), path.open("rb") as file:
+        # Another size in the file takes no more memory.
+        found, data, rest = file.read(len(header)), file.read(length), file.read(1)
+    if found != header or len(data) != length or rest:
+        raise damaged(path)
+    return np.frombuffer(data, "<f4").reshape(height, width, 2)
+
+
+def _header(width: int, height: int) -> bytes:
+    return struct.pack("<4sii", MAGIC, width, height)

@@ -1,0 +1,297 @@
+"""The .glb holds the motion and the picture of a run, and Khronos's validator finds nothing wrong with it."""
+
+from __future__ import annotations
+
+import io
+import json
+import shutil
+import struct
+import subprocess
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+from PIL import Image
+
+from taichi_msm.export import gltf
+from taichi_msm.export.convert import convert
+from taichi_msm.export.keyframes import key_frames
+from taichi_msm.export.mesh import unit_normals
+from tests.scenes import speckle
+
+Array = NDArray[Any]
+
+# Half the distance of neighbouring numbers of single precision, as a fraction of them.
+ROUNDING = 2.0**-24
+
+# Reads a .glb from stdin; its package is found where NODE_PATH says. .ci/run installs it.
+VALIDATE = """
+const validator = require("gltf-validator");
+validator.validateBytes(new Uint8Array(require("fs").readFileSync(0)))
+    .then(report => console.log(JSON.stringify(report)), error => console.log(JSON.stringify({error: `${error}`})));
+"""
+
+
+class Glb(NamedTuple):
+    """A .glb, taken apart by its specification."""
+
+    document: dict[str, Any]
+    binary: bytes
+
+    def view(self, number: int) -> bytes:
+        view = self.document["bufferViews"][number]
+        return self.binary[view["byteOffset"] : view["byteOffset"] + view["byteLength"]]
+
+    def accessor(self, number: int) -> Array:
+        accessor = self.document["accessors"][number]
+        dtype = {5126: "<f4", 5125: "<u4"}[accessor["componentType"]]
+        size = {"SCALAR": 1, "VEC2": 2, "VEC3": 3}[accessor["type"]]
+        return np.frombuffer(self.view(accessor["bufferView"]), dtype).reshape(accessor["count"], size)
+
+    @property
+    def primitive(self) -> dict[str, Any]:
+        (mesh,) = self.document["meshes"]
+        (primitive,) = mesh["primitives"]
+        return dict(primitive)
+
+    def attribute(self, name: str) -> Array:
+        return self.accessor(self.primitive["attributes"][name])
+
+    def at(self, time: float, name: str = "POSITION") -> Array:
+        """The vertices or normals at a time, as a viewer finds them."""
+        (animation,) = self.document["animations"]
+        (sampler,), (channel,) = animation["samplers"], animation["channels"]
+        assert channel == {"sampler": 0, "target": {"node": 0, "path": "weights"}}
+        times, targets = self.accessor(sampler["input"])[:, 0], self.primitive["targets"]
+        weights = self.accessor(sampler["output"]).reshape(len(times), len(targets))
+        found = self.attribute(name).astype(float)
+        for number, target in enumerate(targets):
+            found += np.interp(time, times, weights[:, number]) * self.accessor(target[name])
+        return found
+
+
+def read_glb(path: Path) -> Glb:
+    data = path.read_bytes()
+    magic, version, length = struct.unpack_from("<4sII", data)
+    assert (magic, version, length) == (b"glTF", 2, len(data))
+    text_length, text_kind = struct.unpack_from("<I4s", data, 12)
+    binary_length, binary_kind = struct.unpack_from("<I4s", data, 20 + text_length)
+    assert (text_kind, binary_kind) == (b"JSON", b"BIN\0")
+    assert length == 28 + text_length + binary_length
+    return Glb(json.loads(data[20 : 20 + text_length]), data[28 + text_length :])
+
+
+@pytest.fixture(scope="module")
+def glb(ran: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    out = tmp_path_factory.mktemp("gltf")
+    assert convert(ran, "gltf", out).notes == []
+    return out / "surface.glb"
+
+
+def positions(ran: Path) -> Array:
+    return np.asarray(np.load(ran / "trajectory.npz")["position"])
+
+
+def test_every_frame_is_where_the_run_had_it(ran: Path, glb: Path) -> None:
+    found, expected = read_glb(glb), positions(ran)
+    largest = np.abs(expected).max()
+    for frame, position in enumerate(expected):
+        # Position and difference are rounded to single precision.
+        np.testing.assert_allclose(found.at(frame / 10), position.reshape(-1, 3), rtol=0, atol=3 * ROUNDING * largest)
+        np.testing.assert_allclose(found.at(frame / 10, "NORMAL"), unit_normals(position), rtol=0, atol=4 * ROUNDING)
+    between = (expected[2] + expected[3]) / 2
+    # The times are rounded too: by some 1e-8 s, in which a point goes that part of its way in 0.1 s.
+    atol = (3 * ROUNDING + 1e-6) * largest
+    np.testing.assert_allclose(found.at(0.25), between.reshape(-1, 3), rtol=0, atol=atol)
+
+
+def test_the_surface_faces_the_viewer_and_has_the_picture_upright(glb: Path) -> None:
+    found = read_glb(glb)
+    corners = found.attribute("POSITION")[found.accessor(found.primitive["indices"]).reshape(-1, 3)]
+    assert len(corners) == 2 * 8 * 10
+    area = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    assert (area[:, 2] > 0).all(), "counter-clockwise from above"
+    np.testing.assert_array_equal(found.attribute("NORMAL"), np.tile([0, 0, 1], (99, 1)))
+    # From the upper left, like the picture's rows.
+    places = dict(zip(map(tuple, found.attribute("TEXCOORD_0").tolist()), found.attribute("POSITION"), strict=True))
+    np.testing.assert_allclose(places[0.0, 0.0], [-0.2, 0.15, 0], atol=ROUNDING)
+    np.testing.assert_allclose(places[1.0, 0.0], [0.2, 0.15, 0], atol=ROUNDING)
+    np.testing.assert_allclose(places[0.0, 1.0], [-0.2, -0.15, 0], atol=ROUNDING)
+
+
+def test_the_material_shows_the_picture_on_both_sides(glb: Path) -> None:
+    found = read_glb(glb)
+    (material,), (texture,) = found.document["materials"], found.document["textures"]
+    (image,), (sampler,) = found.document["images"], found.document["samplers"]
+    assert material["doubleSided"]
+    assert material["pbrMetallicRoughness"]["baseColorTexture"] == {"index": 0}
+    assert (texture["source"], texture["sampler"], found.primitive["material"]) == (0, 0, 0)
+    assert (image["mimeType"], sampler["wrapS"], sampler["wrapT"]) == ("image/png", 33071, 33071)
+    picture = np.asarray(Image.open(io.BytesIO(found.view(image["bufferView"]))))
+    np.testing.assert_array_equal(picture, speckle(30, 40))
+
+
+def test_normals_are_never_0() -> None:
+    """Where neighbours are in one place there is none, and a mesh must have one."""
+    found = unit_normals(np.zeros((3, 4, 3), np.float32))
+    np.testing.assert_array_equal(found, np.tile([0, 0, 1], (12, 1)))
+
+
+def test_accessors_tell_their_bounds(glb: Path) -> None:
+    found = read_glb(glb)
+    told = [number for number, one in enumerate(found.document["accessors"]) if "min" in one]
+    assert len(told) == 1 + 4 + 1, "of positions, of every target, of times"
+    for number in told:
+        accessor, values = found.document["accessors"][number], found.accessor(number)
+        assert accessor["min"] == values.min(axis=0).tolist()
+        assert accessor["max"] == values.max(axis=0).tolist()
+    assert {view["byteOffset"] % 4 for view in found.document["bufferViews"]} == {0}
+
+
+def changed(results: Path, **sections: Any) -> None:
+    """Change keys of run.json, and of the scene in it."""
+    record = json.loads((results / "run.json").read_text())
+    record["scene"] |= sections.pop("scene", {})
+    (results / "run.json").write_text(json.dumps(record | sections))
+
+
+def test_the_part_of_the_picture_that_the_sheet_has(results: Path) -> None:
+    changed(results, scene={"region": [5, 7, 20, 10]})
+    convert(results, "gltf", results / "out")
+    found = read_glb(results / "out" / "surface.glb")
+    (image,) = found.document["images"]
+    picture = np.asarray(Image.open(io.BytesIO(found.view(image["bufferView"]))))
+    np.testing.assert_array_equal(picture, speckle(30, 40)[7:17, 5:25])
+
+
+def without_picture(results: Path) -> Path:
+    changed(results, scene={"image": None, "output": ["trajectory"]})
+    convert(results, "gltf", results / "bare")
+    return results / "bare" / "surface.glb"
+
+
+def with_one_frame(results: Path) -> Path:
+    first = positions(results)[:1]
+    np.savez(results / "trajectory.npz", time=np.zeros(1), position=first)
+    changed(results, frames=1)
+    convert(results, "gltf", results / "still")
+    return results / "still" / "surface.glb"
+
+
+def test_a_run_without_a_picture_or_a_motion(results: Path) -> None:
+    bare = read_glb(without_picture(results)).document
+    assert {"images", "textures", "samplers"}.isdisjoint(bare)
+    still = read_glb(with_one_frame(results))
+    assert "animations" not in still.document
+    assert "targets" not in still.primitive
+
+
+def validate(data: bytes) -> dict[str, Any]:
+    """Ask Khronos's validator."""
+    node = shutil.which("node")
+    if node is None:
+        pytest.skip("needs node")
+    done = subprocess.run([node, "-e", VALIDATE], input=data, capture_output=True, check=False)
+    if done.returncode != 0 and b"Cannot find module 'gltf-validator'" in done.stderr:
+        pytest.skip("needs the npm package gltf-validator, in NODE_PATH")
+    assert done.returncode == 0, done.stderr
+    report: dict[str, Any] = json.loads(done.stdout)
+    return report
+
+
+def test_the_validator_finds_nothing(glb: Path, results: Path) -> None:
+    moving = validate(glb.read_bytes())
+    assert moving["info"]["animationCount"] == 1
+    assert moving["info"]["hasMorphTargets"]
+    assert moving["info"]["totalTriangleCount"] == 160
+    for data in (glb.read_bytes(), without_picture(results).read_bytes(), with_one_frame(results).read_bytes()):
+        issues = validate(data)["issues"]
+        # Only that the picture's sides are no powers of two, which WebGL 2 does not mind.
+        assert {issue["code"] for issue in issues["messages"]} <= {"IMAGE_NPOT_DIMENSIONS"}
+        assert (issues["numErrors"], issues["numWarnings"], issues["numHints"]) == (0, 0, 0)
+
+
+def test_the_validator_finds_what_is_broken(glb: Path) -> None:
+    """So that what finds nothing looks."""
+    whole = glb.read_bytes()
+    found = read_glb(glb)
+    most = b'"max":[' + json.dumps(found.document["accessors"][0]["max"][0]).encode()
+    start = found.document["bufferViews"][found.primitive["attributes"]["NORMAL"]]["byteOffset"] + 28 + 8
+    start += struct.unpack_from("<I", whole, 12)[0]
+    long = whole[:start] + struct.pack("<f", 2.0) + whole[start + 4 :]
+    for data, code in (
+        (whole[:-4], "GLB_UNEXPECTED_END_OF_CHUNK_DATA"),
+        (whole.replace(most, b'"max":[1'.ljust(len(most), b"0"), 1), "ACCESSOR_MAX_MISMATCH"),
+        (whole.replace(b'"count":99', b'"count":98', 1), "MESH_PRIMITIVE_UNEQUAL_ACCESSOR_COUNT"),
+        (long, "ACCESSOR_VECTOR3_NON_UNIT"),
+    ):
+        issues = validate(data)["issues"]
+        assert issues["numErrors"] > 0
+        assert code in {issue["code"] for issue in issues["messages"]}
+
+
+def motion(frames: int) -> Array:
+    """A sheet that goes up slowly, falls within a frame, and then rings."""
+    time = np.arange(frames) / frames
+    height = np.where(time < 0.4, time, 0.1 * np.sin(40 * time) * np.exp(-5 * time))
+    shape = np.random.default_rng(0).random((3, 4, 3))
+    return height[:, None, None, None] * shape
+
+
+def error_of(position: Array, frames: list[int]) -> float:
+    """The largest distance from straight lines between key frames, point by point."""
+    worst = 0.0
+    for index in np.ndindex(position.shape[1:3]):
+        path = position[:, index[0], index[1]]
+        lines = [np.interp(np.arange(len(path)), frames, path[frames, axis]) for axis in range(3)]
+        worst = max(worst, float(np.linalg.norm(path - np.stack(lines, axis=-1), axis=-1).max()))
+    return worst
+
+
+def test_all_frames_are_key_frames_where_they_are_few() -> None:
+    assert key_frames(motion(20), 20) == (list(range(20)), 0.0)
+
+
+def test_key_frames_are_where_the_motion_is_sudden() -> None:
+    position = motion(300)
+    found = key_frames(position, 25)
+    assert len(found.frames) == 25
+    assert found.frames == sorted(set(found.frames))
+    assert (found.frames[0], found.frames[-1]) == (0, 299)
+    assert {119, 120} <= set(found.frames), "before and after the fall"
+    # What is said of them is so, but for rounding.
+    assert found.error == pytest.approx(error_of(position, found.frames), rel=1e-12)
+    evenly = np.linspace(0, 299, 25).round().astype(int).tolist()
+    assert found.error < error_of(position, evenly) / 5
+
+
+def test_more_key_frames_than_are_needed_are_not_taken() -> None:
+    straight = np.linspace(0, 1, 50)[:, None, None, None] * np.ones((2, 2, 3))
+    still = np.zeros((50, 2, 2, 3))
+    assert key_frames(still, 10) == ([0, 49], 0.0)
+    found = key_frames(straight, 10)
+    assert found.error <= 2 * ROUNDING**2 * 50
+
+
+def test_a_run_of_many_frames_is_told_by_key_frames(ran: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(gltf, "MOST_TARGETS", 2)
+    done = convert(ran, "gltf", tmp_path)
+    found, expected = read_glb(tmp_path / "surface.glb"), positions(ran)
+    keys = key_frames(expected, 3)
+    assert len(found.primitive["targets"]) == 2
+    said = "3 of 5 frames are key frames; between them no point is farther than"
+    assert done.notes == [f"{said} {keys.error:.2g} m from where it was"]
+    apart = [found.at(frame / 10) - expected[frame].reshape(-1, 3) for frame in range(5)]
+    assert np.linalg.norm(apart, axis=-1).max() == pytest.approx(keys.error, rel=1e-5)
+
+
+def test_a_sheet_of_many_points_has_fewer_key_frames(
+    ran: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """So that a file stays of a size that browsers load."""
+    monkeypatch.setattr(gltf, "MOST_BYTES", 3 * 99 * 24)
+    convert(ran, "gltf", tmp_path)
+    targets = read_glb(tmp_path / "surface.glb").primitive["targets"]
+    assert len(targets) == 3

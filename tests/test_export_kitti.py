@@ -1,0 +1,196 @@
+"""KITTI's pictures hold the flow that a run wrote, as KITTI's own readers see it."""
+
+from __future__ import annotations
+
+import io
+import json
+import shutil
+import struct
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import png
+import pytest
+from numpy.typing import NDArray
+from PIL import Image
+
+from taichi_msm.errors import FilesError
+from taichi_msm.export.convert import convert
+from taichi_msm.export.kitti import encode
+from taichi_msm.export.png16 import png16
+from taichi_msm.results.flo import read_flo
+from tests.outputs import files
+
+WIDTH, HEIGHT, PAIRS = 40, 30, 4
+BACKGROUND = 1e10
+
+
+def made_up_flow(seed: int) -> NDArray[np.float32]:
+    """Flow of all sizes, with a background."""
+    rng = np.random.default_rng(seed)
+    flow = rng.normal(0, 1, (HEIGHT, WIDTH, 2)) * 10 ** rng.uniform(-3, 2.6, (HEIGHT, WIDTH, 1))
+    flow[rng.random((HEIGHT, WIDTH)) < 0.2] = BACKGROUND
+    return flow.astype(np.float32)
+
+
+def write_flo(path: Path, flow: NDArray[np.float32]) -> None:
+    """As Middlebury describes it, and apart from what reads it here."""
+    height, width, _ = flow.shape
+    path.write_bytes(np.float32(202021.25).tobytes() + struct.pack("<ii", width, height) + flow.astype("<f4").tobytes())
+
+
+@pytest.fixture
+def labelled(results: Path) -> Path:
+    """Results of which some flow is hidden."""
+    for name in ("flow", "occlusion"):
+        (results / name).mkdir()
+    for pair in range(PAIRS):
+        write_flo(results / "flow" / f"{pair:04}.flo", made_up_flow(pair))
+        Image.fromarray(hidden(pair).astype(np.uint8) * 255).save(results / "occlusion" / f"{pair:04}.png")
+    return results
+
+
+def hidden(pair: int) -> NDArray[np.bool_]:
+    return np.random.default_rng(100 + pair).random((HEIGHT, WIDTH)) < 0.3
+
+
+def read_png(path: Path) -> NDArray[np.uint16]:
+    """Read a PNG by a library of its own."""
+    width, height, rows, about = png.Reader(bytes=path.read_bytes()).read()
+    assert (about["bitdepth"], about["planes"]) == (16, 3)
+    return np.array([list(row) for row in rows], np.uint16).reshape(height, width, 3)
+
+
+def decode(colours: NDArray[np.uint16]) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
+    """As flow_read of KITTI's development kit does."""
+    return (colours[..., :2].astype(float) - 2**15) / 64, colours[..., 2] > 0
+
+
+def test_flow_comes_back(labelled: Path) -> None:
+    done = convert(labelled, "kitti", labelled / "out")
+    training = labelled / "out" / "training"
+    assert done.notes == []
+    for pair in range(PAIRS):
+        flow, name = made_up_flow(pair).astype(float), f"{pair:06}_10.png"
+        fits = ((flow >= -512) & (flow <= 511.98)).all(axis=-1)
+        assert 0.5 < fits.mean() < 0.8
+        found, valid = decode(read_png(training / "flow_occ" / name))
+        np.testing.assert_array_equal(valid, fits)
+        # To the nearest 1/64 px.
+        np.testing.assert_allclose(found[valid], flow[valid], rtol=0, atol=1 / 128)
+        seen, also_seen = decode(read_png(training / "flow_noc" / name))
+        np.testing.assert_array_equal(also_seen, fits & ~hidden(pair))
+        np.testing.assert_array_equal(seen[also_seen], found[also_seen])
+
+
+def test_every_pair_has_its_two_pictures(labelled: Path) -> None:
+    convert(labelled, "kitti", labelled / "out")
+    written = files(labelled / "out" / "training")
+    kinds = ["flow_noc/{}_10.png", "flow_occ/{}_10.png", "image_2/{}_10.png", "image_2/{}_11.png"]
+    assert sorted(written) == sorted(kind.format(f"{pair:06}") for pair in range(PAIRS) for kind in kinds)
+    frames = files(labelled / "frames")
+    for pair in range(PAIRS):
+        for number in (0, 1):
+            assert written[f"image_2/{pair:06}_1{number}.png"] == frames[f"{pair + number:04}.png"]
+
+
+@pytest.mark.parametrize(
+    ("flow", "colours"),
+    [
+        ((0, 0), (32768, 32768, 1)),
+        ((1, -2.5), (32832, 32608, 1)),
+        ((-512, 511.984375), (0, 65535, 1)),
+        # To the nearest, also at both ends.
+        ((0.0156, 0.0079), (32769, 32769, 1)),
+        ((-512.007, 511.99), (0, 65535, 1)),
+        ((-512.008, 0), (0, 0, 0)),
+        ((0, 511.993), (0, 0, 0)),
+        ((BACKGROUND, BACKGROUND), (0, 0, 0)),
+        ((np.nan, 0), (0, 0, 0)),
+        ((0, -np.inf), (0, 0, 0)),
+    ],
+)
+def test_what_a_flow_is_in_colours(flow: tuple[float, float], colours: tuple[int, ...]) -> None:
+    assert encode(np.array([[flow]], np.float32)).ravel().tolist() == list(colours)
+    assert encode(np.array([[flow]], np.float32), np.array([[False]])).ravel().tolist() == [0, 0, 0]
+
+
+@pytest.mark.parametrize("shape", [(1, 1), (1, 50), (50, 1), (37, 53)])
+def test_a_picture_of_16_bits_comes_back(shape: tuple[int, int], tmp_path: Path) -> None:
+    colours = np.random.default_rng(0).integers(0, 1 << 16, (*shape, 3)).astype(np.uint16)
+    data = png16(colours)
+    (tmp_path / "picture.png").write_bytes(data)
+    np.testing.assert_array_equal(read_png(tmp_path / "picture.png"), colours)
+    # Pillow keeps the higher byte, and checks every checksum.
+    np.testing.assert_array_equal(np.asarray(Image.open(io.BytesIO(data))), colours >> 8)
+
+
+def test_what_is_not_there_is_left_out_and_said(labelled: Path) -> None:
+    shutil.rmtree(labelled / "occlusion")
+    shutil.rmtree(labelled / "frames")
+    done = convert(labelled, "kitti", labelled / "out")
+    assert [path.name for path in (labelled / "out" / "training").iterdir()] == ["flow_occ"]
+    again = "is not among the results; run the scene again with"
+    assert done.notes == [
+        f"flow_noc is left out: occlusion {again} 'occlusion' in output",
+        f"image_2 is left out: frames {again} 'png' in output",
+    ]
+
+
+def test_one_frame_has_no_flow(labelled: Path) -> None:
+    record = json.loads((labelled / "run.json").read_text())
+    (labelled / "run.json").write_text(json.dumps(record | {"frames": 1}))
+    with pytest.raises(FilesError) as caught:
+        convert(labelled, "kitti", labelled / "out")
+    said = "has one frame, and flow is from one to the next; run the scene to its end"
+    assert str(caught.value) == f"{labelled}: {said}"
+
+
+def whole_flow() -> bytes:
+    return b"PIEH" + struct.pack("<ii", WIDTH, HEIGHT) + bytes(8 * WIDTH * HEIGHT)
+
+
+@pytest.mark.parametrize(
+    "data",
+    [
+        b"",
+        b"PIEH",
+        whole_flow()[:-1],
+        whole_flow() + b"\0",
+        whole_flow().replace(b"PIEH", b"HEIP"),
+        b"PIEH" + struct.pack("<ii", HEIGHT, WIDTH) + whole_flow()[12:],
+        b"PIEH" + struct.pack("<ii", 1 << 30, 1 << 30) + whole_flow()[12:],
+        b"PIEH" + struct.pack("<ii", -WIDTH, -HEIGHT) + whole_flow()[12:],
+    ],
+    ids=["empty", "cut in its header", "cut", "longer", "another kind", "turned", "huge", "negative"],
+)
+def test_damaged_flow_is_one_line(data: bytes, tmp_path: Path) -> None:
+    path = tmp_path / "0000.flo"
+    path.write_bytes(whole_flow())
+    assert read_flo(path, (WIDTH, HEIGHT)).shape == (HEIGHT, WIDTH, 2)
+    path.write_bytes(data)
+    with pytest.raises(FilesError) as caught:
+        read_flo(path, (WIDTH, HEIGHT))
+    assert str(caught.value) == f"{path}: damaged, or not of this run; run the scene again"
+
+
+@pytest.mark.parametrize(
+    ("name", "change", "said"),
+    [
+        ("flow/0002.flo", Path.unlink, "no such file; run the scene again"),
+        ("occlusion/0001.png", Path.unlink, "no such file; run the scene again"),
+        ("frames/0004.png", Path.unlink, "no such file; run the scene again"),
+        ("frames/0000.png", lambda path: Image.new("RGB", (8, 6)).save(path), "damaged, or not of this run; run the"),
+        ("occlusion/0000.png", lambda path: path.write_bytes(b"?"), " is not a PNG, JPEG, WebP, BMP or TIFF picture"),
+        ("frames/0001.png", lambda path: path.write_bytes(path.read_bytes()[:200]), " cannot be decoded"),
+    ],
+)
+def test_a_damaged_file_is_named_and_nothing_is_written(name: str, change: Any, said: str, labelled: Path) -> None:
+    change(labelled / name)
+    with pytest.raises(FilesError) as caught:
+        convert(labelled, "kitti", labelled / "out")
+    assert str(caught.value).startswith(str(labelled / name))
+    assert said in str(caught.value)
+    assert "run the scene again" in str(caught.value)
+    assert not (labelled / "out").exists()

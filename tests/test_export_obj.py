@@ -1,0 +1,65 @@
+"""The OBJ files hold the surface of every frame, with its picture."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from taichi_msm.export.convert import convert
+from taichi_msm.export.mesh import unit_normals
+from tests.scenes import speckle
+
+
+@pytest.fixture(scope="module")
+def out(ran: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    out = tmp_path_factory.mktemp("obj")
+    convert(ran, "obj", out)
+    return out
+
+
+def rows(path: Path, key: str) -> list[list[str]]:
+    """The lines of a file that begin with a key, without it."""
+    lines = (line.split() for line in path.read_text(encoding="ascii").splitlines())
+    return [words[1:] for words in lines if words and words[0] == key]
+
+
+def test_every_frame_is_where_the_run_had_it(ran: Path, out: Path) -> None:
+    expected = np.load(ran / "trajectory.npz")["position"]
+    assert sorted(path.name for path in out.glob("*.obj")) == [f"000{frame}.obj" for frame in range(5)]
+    for frame, position in enumerate(expected):
+        path = out / f"000{frame}.obj"
+        # Nine digits.
+        np.testing.assert_allclose(np.array(rows(path, "v"), float), position.reshape(-1, 3), rtol=5e-9)
+        np.testing.assert_allclose(np.array(rows(path, "vn"), float), unit_normals(position), rtol=5e-9)
+
+
+def test_the_surface_faces_the_viewer_and_has_the_picture_upright(out: Path) -> None:
+    path = out / "0000.obj"
+    corners = np.array([[corner.split("/") for corner in face] for face in rows(path, "f")], int)
+    assert corners.shape == (2 * 8 * 10, 3, 3)
+    assert (corners == corners[..., :1]).all(), "one number for position, texture and normal"
+    places, coordinates = np.array(rows(path, "v"), float), np.array(rows(path, "vt"), float)
+    a, b, c = np.moveaxis(places[corners[..., 0] - 1], 1, 0)
+    assert (np.cross(b - a, c - a)[:, 2] > 0).all(), "counter-clockwise from above"
+    # From the lower left.
+    np.testing.assert_allclose(coordinates, places[:, :2] / (0.4, 0.3) + 0.5, rtol=0, atol=1e-8)
+
+
+def test_all_files_share_a_material_with_the_picture(out: Path) -> None:
+    for path in out.glob("*.obj"):
+        assert rows(path, "mtllib") == [["surface.mtl"]]
+        assert rows(path, "usemtl") == rows(out / "surface.mtl", "newmtl") == [["sheet"]]
+    assert rows(out / "surface.mtl", "map_Kd") == [["picture.png"]]
+    np.testing.assert_array_equal(np.asarray(Image.open(out / "picture.png")), speckle(30, 40))
+
+
+def test_a_run_without_a_picture(results: Path) -> None:
+    record = json.loads((results / "run.json").read_text())
+    record["scene"] |= {"image": None, "output": ["trajectory"]}
+    (results / "run.json").write_text(json.dumps(record))
+    assert "picture.png" not in convert(results, "obj", results / "out").files
+    assert rows(results / "out" / "surface.mtl", "map_Kd") == []

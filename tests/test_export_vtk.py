@@ -1,0 +1,124 @@
+"""VTK reads the surface of every frame, and what is known at its points."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+from typing import Any
+from xml.etree import ElementTree
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from taichi_msm import reference
+from taichi_msm.export.convert import convert
+from taichi_msm.export.vtk import speed
+from taichi_msm.physics.lattice import rest_positions
+from taichi_msm.physics.material import area_shares
+from taichi_msm.results.finished_run import read_run
+from tests.conftest import Program
+
+
+@pytest.fixture(scope="module")
+def out(ran: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    pytest.importorskip("vtkmodules")
+    out = tmp_path_factory.mktemp("vtk")
+    convert(ran, "vtk", out)
+    return out
+
+
+def read(path: Path) -> tuple[Any, dict[str, NDArray[Any]]]:
+    """The grid of a file, and the arrays at its points by name."""
+    from vtkmodules.util.numpy_support import vtk_to_numpy
+    from vtkmodules.vtkIOXML import vtkXMLUnstructuredGridReader
+
+    reader = vtkXMLUnstructuredGridReader()
+    reader.SetFileName(str(path))
+    reader.Update()
+    grid = reader.GetOutput()
+    data = grid.GetPointData()
+    arrays = {data.GetArrayName(n): vtk_to_numpy(data.GetArray(n)) for n in range(data.GetNumberOfArrays())}
+    return grid, arrays | {"points": vtk_to_numpy(grid.GetPoints().GetData())}
+
+
+def test_every_frame_is_where_the_run_had_it(ran: Path, out: Path) -> None:
+    run = read_run(ran)
+    for frame, position in enumerate(run.positions()):
+        grid, found = read(out / f"000{frame}.vtu")
+        assert set(found) == {"points", "displacement", "speed", "energy_density", "texture"}
+        assert {array.dtype for array in found.values()} == {np.dtype(np.float64)}, "that of the run"
+        np.testing.assert_array_equal(found["points"], position.reshape(-1, 3))
+        displacement = position - rest_positions(run.scene.sheet)
+        np.testing.assert_array_equal(found["displacement"], displacement.reshape(-1, 3))
+        np.testing.assert_array_equal(found["speed"], speed(run.positions(), run.time, frame).ravel())
+        # The energy of all springs, by the twin.
+        area = area_shares(run.scene.sheet).ravel() * (0.3 / 8) * (0.4 / 10)
+        total = reference.energy(run.scene, displacement)
+        assert (found["energy_density"] * area).sum() == pytest.approx(total, rel=1e-12)
+        assert grid.GetNumberOfCells() == 2 * 8 * 10
+    assert total > 0
+
+
+def test_the_surface_faces_the_viewer_and_has_the_picture_upright(out: Path) -> None:
+    from vtkmodules.vtkFiltersCore import vtkPolyDataNormals
+    from vtkmodules.vtkFiltersGeometry import vtkGeometryFilter
+
+    grid, found = read(out / "0000.vtu")
+    assert grid.GetPointData().GetTCoords().GetName() == "texture"
+    assert grid.GetPointData().GetVectors().GetName() == "displacement"
+    np.testing.assert_allclose(found["texture"], found["points"][:, :2] / (0.4, 0.3) + 0.5, rtol=0, atol=1e-15)
+    shell, normals = vtkGeometryFilter(), vtkPolyDataNormals()
+    shell.SetInputData(grid)
+    normals.SetInputConnection(shell.GetOutputPort())
+    normals.ConsistencyOff()
+    normals.SplittingOff()
+    normals.Update()
+    data = normals.GetOutput().GetPointData().GetNormals()
+    assert [data.GetTuple(n) for n in range(data.GetNumberOfTuples())] == [(0, 0, 1)] * 99
+
+
+def test_arrays_know_their_units(out: Path) -> None:
+    data = read(out / "0001.vtu")[0].GetPointData()
+    for name, unit in (("displacement", "m"), ("speed", "m/s"), ("energy_density", "J/m2")):
+        array = data.GetArray(name)
+        assert array.GetInformation().Get(array.UNITS_LABEL()) == unit
+
+
+def test_the_collection_has_the_time_of_every_file(out: Path) -> None:
+    collection = ElementTree.parse(out / "surface.pvd").getroot()
+    assert (collection.tag, collection.get("type")) == ("VTKFile", "Collection")
+    found = {float(one.attrib["timestep"]): one.attrib["file"] for one in collection.iter("DataSet")}
+    assert found == {frame / 10: f"000{frame}.vtu" for frame in range(5)}
+    assert all((out / name).exists() for name in found.values())
+    assert (out / "picture.png").exists()
+
+
+def test_the_speed_is_of_order_2() -> None:
+    """Against that of a motion from rest whose speed is known."""
+    errors = []
+    for frames in (20, 40, 80):
+        time = np.linspace(0, 1, frames + 1)
+        position = (np.sin(time) ** 2)[:, None, None, None] * np.tile([3.0, 0, 4], (2, 2, 1))
+        exact = 5 * np.sin(2 * time)
+        assert (speed(position, time, 0) == 0).all()
+        errors.append(max(np.abs(speed(position, time, n) - exact[n]).max() for n in range(1, frames)))
+        # One-sided: half a frame's time the acceleration, and less.
+        assert np.abs(speed(position, time, frames) - exact[-1]).max() < 10 / frames / 2
+    # h^2 / 6 times the third derivative, 20 at most.
+    assert errors[0] < 20 / 20**2 / 6
+    assert np.log2(np.divide(errors[:-1], errors[1:])) == pytest.approx([2, 2], abs=0.05)
+
+
+def test_a_frame_alone_is_at_rest() -> None:
+    assert (speed(np.ones((1, 2, 3, 3)), np.zeros(1), 0) == 0).all()
+
+
+def test_without_vtk_there_is_one_line(
+    ran: Path, tmp_path: Path, program: Program, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setitem(sys.modules, "vtkmodules.vtkIOXML", None)
+    done = program("export", str(ran), "--format", "vtk", "--out", str(tmp_path / "out"))
+    error = '--format vtk: needs VTK, which is not installed; pip install "taichi-msm[export]"\n'
+    assert (done.returncode, done.stdout, done.stderr) == (2, "", error)
+    assert not (tmp_path / "out").exists()
