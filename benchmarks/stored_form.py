@@ -7,6 +7,7 @@ The paper's sheet (scenes/figure-3.yaml) at 18,000 steps a second, in NumPy.
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -15,10 +16,11 @@ from numpy.typing import NDArray
 
 from taichi_msm import load_scene
 from taichi_msm.physics.lattice import fixed_points, rest_positions, springs
-from taichi_msm.physics.loads import Schedule, decay, probe_slots, schedule
+from taichi_msm.physics.loads import Schedule, decay, schedule
 from taichi_msm.physics.material import material
-from taichi_msm.physics.timestep import step, steps_per_frame, with_steps
+from taichi_msm.physics.timestep import time_grid
 from taichi_msm.scene import Scene
+from taichi_msm.timegrid import TimeGrid
 
 SCENE = Path(__file__).parent.parent / "scenes" / "figure-3.yaml"
 STEPS_PER_SECOND = 18000
@@ -46,17 +48,17 @@ def elastic_force(scene: Scene, values: Array, form: str) -> Array:
     return force
 
 
-def displacements(scene: Scene, real: type[np.floating[Any]], form: str) -> Array:
+def displacements(scene: Scene, grid: TimeGrid, real: type[np.floating[Any]], form: str) -> Array:
     """Step the scene with its state stored in one form; gives the displacements of all frames."""
     made = material(scene)
-    h, m = step(scene), made.mass
+    h, m = grid.step, made.mass
     g = scene.damping / m
     keep = real((1 - g * h / 2) / (1 + g * h / 2))
     rest64 = rest_positions(scene.sheet)
     rest = rest64.astype(real)
     moves = ~fixed_points(scene.sheet)[..., None]
-    share = [decay(slot, scene).astype(real)[..., None] for slot in probe_slots(scene)]
-    loads: Schedule = schedule(scene, 0, scene.time.frames * steps_per_frame(scene))
+    share = [decay(probe, scene.sheet).astype(real)[..., None] for probe in scene.probes]
+    loads: Schedule = schedule(scene, grid, 0, grid.steps)
     now = rest.copy() if form == "positions" else np.zeros_like(rest)
     # The one before, or the difference from it.
     other = now.copy()
@@ -72,7 +74,7 @@ def displacements(scene: Scene, real: type[np.floating[Any]], form: str) -> Arra
             now = now + other
         else:
             now, other = now + keep * (now - other) + gain * force * moves, now
-        if (n + 1) % steps_per_frame(scene) == 0:
+        if (n + 1) % grid.steps_per_frame == 0:
             frames.append((now.astype(float) - rest64) if form == "positions" else now.astype(float))
     return np.array(frames)
 
@@ -80,11 +82,11 @@ def displacements(scene: Scene, real: type[np.floating[Any]], form: str) -> Arra
 def measure() -> dict[str, float]:
     """Give the rounding of every form as a fraction of the largest displacement."""
     scene = load_scene(SCENE, ["output=[]"])
-    scene = with_steps(scene, round(STEPS_PER_SECOND / scene.time.frames_per_second))
-    exact = displacements(scene, np.float64, "difference")
+    grid = replace(time_grid(scene), steps_per_frame=round(STEPS_PER_SECOND / scene.time.frames_per_second))
+    exact = displacements(scene, grid, np.float64, "difference")
     largest = np.linalg.norm(exact, axis=-1).max()
     return {
-        name: float(np.linalg.norm(displacements(scene, np.float32, form) - exact, axis=-1).max() / largest)
+        name: float(np.linalg.norm(displacements(scene, grid, np.float32, form) - exact, axis=-1).max() / largest)
         for name, form in FORMS.items()
     }
 

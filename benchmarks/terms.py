@@ -14,6 +14,7 @@ from benchmarks.process import call
 from benchmarks.race import Progress
 from taichi_msm.physics.material import material
 from taichi_msm.physics.solver import Dynamics
+from taichi_msm.physics.timestep import time_grid
 from taichi_msm.scene import Scene
 from taichi_msm.system import runtime
 from taichi_msm.system.resources import available_threads
@@ -64,7 +65,10 @@ def cost(points: int, precision: str, rounds: int) -> dict[str, list[float]]:
     with tempfile.TemporaryDirectory() as folder:
         image = Path(folder) / "map.png"
         Image.fromarray(np.random.default_rng(0).integers(0, 256, (64, 64), dtype=np.uint8)).save(image)
-        sheets = {name: Dynamics(scene, device) for name, scene in variants(points, precision, str(image)).items()}
+        sheets = {
+            name: Dynamics(scene, time_grid(scene), device)
+            for name, scene in variants(points, precision, str(image)).items()
+        }
     samples: dict[str, list[float]] = {name: [] for name in sheets}
     for _ in range(1 + rounds):
         for name, sheet in sheets.items():

@@ -8,6 +8,7 @@ It takes some minutes; nothing in it is timed.
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -22,15 +23,15 @@ from scipy.sparse.linalg import eigsh, spsolve
 from taichi_msm import Scene, load_scene
 from taichi_msm.physics.error_control import estimate_error, longest
 from taichi_msm.physics.lattice import fixed_points, rest_positions, spacing
-from taichi_msm.physics.loads import decay, loads_at, probe_slots
+from taichi_msm.physics.loads import decay, loads_at
 from taichi_msm.physics.material import material
 from taichi_msm.physics.solver import Dynamics
 from taichi_msm.physics.state import State
-from taichi_msm.physics.timestep import stable_step, step, steps_per_frame, with_steps, with_time
-from taichi_msm.physics.workload import precision
+from taichi_msm.physics.timestep import stable_step, time_grid
 from taichi_msm.study.plot import BLUE, DPI, GREY, STYLE, VERMILION, WIDE
 from taichi_msm.study.table import markdown
 from taichi_msm.system import runtime
+from taichi_msm.timegrid import Precision, TimeGrid
 
 ROOT = Path(__file__).parent.parent
 PAGE, TEMPLATE = ROOT / "docs" / "numerics.md", ROOT / "docs" / "numerics.template"
@@ -58,12 +59,12 @@ def stiffer(times: int) -> Scene:
     return press(f"springs.structural={times * sheet.across}", f"springs.shear={times * sheet.shear}")
 
 
-def motion(scene: Scene) -> Array:
+def motion(scene: Scene, grid: TimeGrid) -> Array:
     """Displacements of every frame but the first, as they are written."""
-    dynamics = Dynamics(scene, runtime.started())
+    dynamics = Dynamics(scene, grid, runtime.started())
     rest, frames = rest_positions(scene.sheet), []
-    for _ in range(scene.time.frames):
-        dynamics.advance(steps_per_frame(scene))
+    for _ in range(grid.frames):
+        dynamics.advance(grid.steps_per_frame)
         u = dynamics.displacement()
         # In f32 the trajectory has positions.
         frames.append((rest + u).astype(u.dtype) - rest)
@@ -71,10 +72,10 @@ def motion(scene: Scene) -> Array:
     return np.array(frames)
 
 
-def truth(scene: Scene) -> Array:
+def truth(scene: Scene, grid: TimeGrid) -> Array:
     """Extrapolate in float64, from displacements."""
-    exact = with_time(scene, precision="f64")
-    coarse, fine = (motion(with_steps(exact, n * steps_per_frame(scene))) for n in (8, 16))
+    counts = (n * grid.steps_per_frame for n in (8, 16))
+    coarse, fine = (motion(scene, replace(grid, steps_per_frame=count, precision="f64")) for count in counts)
     return fine + (fine - coarse) / 3
 
 
@@ -85,13 +86,13 @@ def silent_table() -> str:
     cases |= {"`faint`, displacements of 10 nm": faint}
     rows = []
     for name, scene in cases.items():
-        exact = truth(scene)
+        grid = time_grid(scene)
+        exact = truth(scene, grid)
         largest = longest(exact)
-        errors = [
-            longest(motion(with_time(scene, precision=kind)) - exact) / largest for kind in ("f32", precision(scene))
-        ]
-        told = estimate_error(with_time(scene, precision=precision(scene)), runtime.started()).error
-        rows.append([name, *(f"{error:.2g}" for error in errors), f"{told:.2g}", precision(scene)])
+        grids = replace(grid, precision="f32"), grid
+        errors = [longest(motion(scene, one) - exact) / largest for one in grids]
+        told = estimate_error(scene, grid, runtime.started()).error
+        rows.append([name, *(f"{error:.2g}" for error in errors), f"{told:.2g}", grid.precision])
     return markdown(["run", "error in f32", "error with auto", "error told", "auto takes"], rows, left=(0, 4))
 
 
@@ -143,8 +144,8 @@ def forces(scene: Scene, displacement: Array, t: float) -> Array:
         total[there] -= pull
     loads = loads_at(scene, np.array([t]))
     total -= loads.active[0] * material(scene).virtual * displacement
-    for n, slot in enumerate(probe_slots(scene)):
-        total += decay(slot, scene)[..., None] * loads.strength[0, n]
+    for n, probe in enumerate(scene.probes):
+        total += decay(probe, scene.sheet)[..., None] * loads.strength[0, n]
     return total[~fixed_points(scene.sheet)].ravel()
 
 
@@ -158,13 +159,14 @@ def lowest(matrix: csc_matrix, below: float, count: int = 1) -> tuple[Array, Arr
 
 def buckling() -> dict[str, Any]:
     """Follow the smallest eigenvalue through a stiffer press, and draw it and its mode."""
-    scene = with_time(stiffer(BUCKLING), precision="f64")
-    dynamics = Dynamics(scene, runtime.started())
+    scene = stiffer(BUCKLING)
+    grid = replace(time_grid(scene), precision="f64")
+    dynamics = Dynamics(scene, grid, runtime.started())
     moves = ~fixed_points(scene.sheet)
     times, values, modes = [], [], []
-    for frame in range(scene.time.frames + 1):
+    for frame in range(grid.frames + 1):
         if frame:
-            dynamics.advance(steps_per_frame(scene))
+            dynamics.advance(grid.steps_per_frame)
         t = frame / scene.time.frames_per_second
         active = float(loads_at(scene, np.array([t])).active[0])
         value, vector = lowest(stiffness(scene, dynamics.displacement(), active), below=-6.0)
@@ -223,8 +225,9 @@ def energy() -> dict[str, Any]:
         figure = Figure(figsize=(WIDE, 2.8), dpi=DPI, layout="constrained")
         FigureCanvasAgg(figure)
         axes = figure.subplots()
-        for kind, colour in (("f32", VERMILION), ("f64", BLUE)):
-            dynamics = Dynamics(with_time(made, precision=kind), runtime.started())
+        colours: dict[Precision, str] = {"f32": VERMILION, "f64": BLUE}
+        for kind, colour in colours.items():
+            dynamics = Dynamics(made, replace(time_grid(made), precision=kind), runtime.started())
             found = []
             for _ in range(ENERGY_STEPS // every):
                 dynamics.advance(every)
@@ -261,8 +264,9 @@ def static() -> dict[str, Any]:
     scene = press(
         "probes.0.load=[[0, 0], [0.36, 100]]", f"time.duration={seconds}", "damping=0.04", "time.precision=f64"
     )
-    dynamics = Dynamics(scene, runtime.started())
-    dynamics.advance(scene.time.frames * steps_per_frame(scene))
+    grid = time_grid(scene)
+    dynamics = Dynamics(scene, grid, runtime.started())
+    dynamics.advance(grid.steps)
     stepped = dynamics.displacement()
     dynamics.close()
     moves = ~fixed_points(scene.sheet)
@@ -282,20 +286,20 @@ def static() -> dict[str, Any]:
 def frequencies() -> dict[str, Any]:
     """Compare the phase of small motions with that of the modes."""
     scene = press("springs.virtual_active=always", "damping=0", "time.precision=f64", "probes=[]", "time.duration=0.8")
-    moves, h = ~fixed_points(scene.sheet), step(scene)
+    moves, grid = ~fixed_points(scene.sheet), time_grid(scene)
     values, vectors = lowest(stiffness(scene, np.zeros((*scene.sheet.points, 3)), 1.0), 0.0, MODES)
     rows = []
-    dynamics, steps = Dynamics(scene, runtime.started()), scene.time.frames * steps_per_frame(scene)
+    dynamics = Dynamics(scene, grid, runtime.started())
     for value, vector in zip(values, vectors.T, strict=True):
         w = math.sqrt(value / material(scene).mass)
-        theta = 2 * math.asin(w * h / 2)
+        theta = 2 * math.asin(w * grid.step / 2)
         shape = np.zeros((*scene.sheet.points, 3))
         shape[moves] = 1e-6 * spacing(scene.sheet)[0] * vector.reshape(-1, 3) / np.abs(vector).max()
         # Of u_n = cos(n theta) that is u_0, and the difference from u_{-1}. A first step from rest would be another.
-        dynamics.restart(scene, State(1, shape, shape * (1 - math.cos(theta))))
-        dynamics.advance(steps)
+        dynamics.restart(scene, grid, State(1, shape, shape * (1 - math.cos(theta))))
+        dynamics.advance(grid.steps)
         found = float((dynamics.displacement() * shape).sum() / (shape * shape).sum())
-        expected = math.cos(steps * theta)
+        expected = math.cos(grid.steps * theta)
         rows.append([f"{w / (2 * math.pi):.4f}", f"{expected:+.9f}", f"{found:+.9f}", f"{abs(found - expected):.0e}"])
     dynamics.close()
     head = ["frequency [Hz]", "cos(n theta)", "amplitude after n steps", "apart"]

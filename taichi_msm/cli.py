@@ -141,7 +141,7 @@ def run(
 @json_option
 def check(scene: str, image: str | None, overrides: tuple[str, ...], as_json: bool) -> int:
     """Validate SCENE and print the steps, memory and disk space it needs; compute nothing."""
-    from taichi_msm.physics import probe_force, timestep, workload
+    from taichi_msm.physics import probe_force, timestep
     from taichi_msm.physics.probe_force import in_words, probe_records
     from taichi_msm.scenefile import budget
     from taichi_msm.scenefile.load import load_scene
@@ -149,14 +149,14 @@ def check(scene: str, image: str | None, overrides: tuple[str, ...], as_json: bo
     loaded = load_scene(scene, overrides, image)
     with naming(scene):
         budget.require_disk(loaded, Path("output"))
-    need = budget.estimate(loaded)
-    limit = timestep.stable_step(loaded)
+    grid, limit = timestep.time_grid(loaded), timestep.stable_step(loaded)
+    need = budget.estimate(loaded, grid)
     facts: dict[str, Any] = {
         "scene": loaded.model_dump(mode="json"),
-        "step": timestep.step(loaded),
+        "step": grid.step,
         "stable_step": limit if limit < float("inf") else None,
-        "steps_per_frame": timestep.steps_per_frame(loaded),
-        "precision": workload.precision(loaded),
+        "steps_per_frame": grid.steps_per_frame,
+        "precision": grid.precision,
         "steps": need.steps,
         "frames": need.frames,
         "memory": need.memory_bytes,

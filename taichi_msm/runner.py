@@ -26,9 +26,9 @@ from taichi_msm.physics.lattice import rest_positions
 from taichi_msm.physics.mesh_error import MeshPilot, choose_points, coarser
 from taichi_msm.physics.probe_force import probe_records
 from taichi_msm.physics.run_progress import RunProgress
-from taichi_msm.physics.timestep import stable_step, step, steps_per_frame
+from taichi_msm.physics.timestep import stable_step, time_grid, with_grid
 from taichi_msm.physics.warnings import notes
-from taichi_msm.physics.workload import ENCODING, affords_pilot, with_precision
+from taichi_msm.physics.workload import ENCODING, affords_pilot
 from taichi_msm.progress import Progress
 from taichi_msm.render.labels import Observed
 from taichi_msm.render.texture import load_texture
@@ -41,6 +41,7 @@ from taichi_msm.scenefile.validation import checked
 from taichi_msm.simulation import Simulation
 from taichi_msm.system import resources, runtime
 from taichi_msm.system.runtime import Device
+from taichi_msm.timegrid import TimeGrid
 
 
 class Stopwatch:
@@ -116,11 +117,11 @@ def run(
         scene, mesh_error = choose_points(scene, device, checked, partial(progress, "pilot"))
         budget.require_disk(scene, Path(directory))
         watch.lap("pilot")
+    grid = time_grid(scene, device.arch)
     if scene.time.tolerance is not None:
-        scene, estimate = error_control.choose_step(scene, device, partial(progress, "pilot"))
+        grid, estimate = error_control.choose_step(scene, grid, device, partial(progress, "pilot"))
         watch.lap("pilot")
-    else:
-        scene = with_precision(scene, device.arch)
+    scene = with_grid(scene, grid)
     with writing(directory):
         here = str(Path.cwd())
     manifest = Manifest(
@@ -197,8 +198,8 @@ def _carry_out(
     resumes: bool,
 ) -> RunRecord:
     """Simulate and draw, from the beginning or what the unfinished run in the directory lacks."""
-    scene = manifest.scene
-    frames = scene.time.frames + 1
+    scene, grid = manifest.scene, time_grid(manifest.scene, device.arch)
+    frames = grid.frames + 1
     ending: dict[str, Any] = {"status": "complete"}
 
     def pause() -> None:
@@ -209,7 +210,7 @@ def _carry_out(
         watch.lap("hand over")
 
     progress("compile", 0, frames)
-    cores = free_cores(scene)
+    cores = free_cores(scene, grid)
     # In this order, so that the encoder starts up while kernels are compiled.
     with (
         ResultWriter(directory, scene, manifest.as_json(), resumes=resumes) as writer,
@@ -217,8 +218,8 @@ def _carry_out(
         ExitStack() as opened,
     ):
         resumed = writer.stored
-        pilot, reason = _pilot(manifest, device, cores, resumed=resumed > 0)
-        mesh = _mesh_pilot(manifest, device, cores, reason)
+        pilot, reason = _pilot(manifest, grid, device, cores, resumed=resumed > 0)
+        mesh = _mesh_pilot(manifest, grid, device, cores, reason)
         pilots = [one for one in (pilot, mesh) if one is not None]
         for one in pilots:
             opened.callback(one.close)
@@ -278,7 +279,7 @@ def _carry_out(
         writer.finish()
         estimate = manifest.estimate if pilot is None else pilot.estimate
         known = Known(estimate, reason, manifest.mesh_error if mesh is None else mesh.error)
-        record = {**ending, **_facts(manifest, simulation.progress, known), "resumed": resumed}
+        record = {**ending, **_facts(manifest, grid, simulation.progress, known), "resumed": resumed}
         stages = ["startup", *(["pilot"] if "pilot" in watch.seconds else []), "compile", "simulate", "render"]
         seconds = {stage: watch.seconds.get(stage, 0.0) for stage in stages}
         record["timings"] = {**seconds, "encode": writer.encode_seconds, "total": watch.total()}
@@ -287,7 +288,9 @@ def _carry_out(
         return cast(RunRecord, writer.publish(record))
 
 
-def _pilot(manifest: Manifest, device: Device, cores: int, *, resumed: bool) -> tuple[Pilot | None, str]:
+def _pilot(
+    manifest: Manifest, grid: TimeGrid, device: Device, cores: int, *, resumed: bool
+) -> tuple[Pilot | None, str]:
     """Begin the pilot of a run, or say why there is none."""
     scene = manifest.scene
     if manifest.estimate is not None:
@@ -296,20 +299,20 @@ def _pilot(manifest: Manifest, device: Device, cores: int, *, resumed: bool) -> 
         return None, "not asked for"
     if manifest.asks_estimate is None and device.arch != "cpu":
         return None, "on a GPU only --estimate-error asks for it"
-    if manifest.asks_estimate is None and not affords_pilot(scene, error_control.refinement(scene)):
+    if manifest.asks_estimate is None and not affords_pilot(scene, grid, error_control.refinement(scene, grid)):
         return None, "it would take more than a third of the run; --estimate-error asks for it"
     if resumed and not scene.output:
         return None, "the frames before the interruption were not kept"
     try:
-        return Pilot(scene, device, cores), ""
+        return Pilot(scene, grid, device, cores), ""
     except DeviceError:
         return None, f"{device.arch} cannot run this scene in f64"
 
 
-def _mesh_pilot(manifest: Manifest, device: Device, cores: int, reason: str) -> MeshPilot | None:
+def _mesh_pilot(manifest: Manifest, grid: TimeGrid, device: Device, cores: int, reason: str) -> MeshPilot | None:
     """Begin the runs with half and a quarter of the cells a side, where the error is estimated at all."""
     coarse = None if reason or manifest.asks_estimate is False else coarser(manifest.scene)
-    return None if coarse is None else MeshPilot(manifest.scene, coarse, device, cores)
+    return None if coarse is None else MeshPilot(manifest.scene, grid, coarse, device, cores)
 
 
 class Known(NamedTuple):
@@ -326,7 +329,7 @@ class Known(NamedTuple):
     mesh_error: float | None
 
 
-def _facts(manifest: Manifest, progress: RunProgress, known: Known) -> dict[str, Any]:
+def _facts(manifest: Manifest, grid: TimeGrid, progress: RunProgress, known: Known) -> dict[str, Any]:
     """Say what was run, and what is known of its last frame, for run.json."""
     scene, limit = manifest.scene, stable_step(manifest.scene)
     return {
@@ -334,27 +337,27 @@ def _facts(manifest: Manifest, progress: RunProgress, known: Known) -> dict[str,
         "working_directory": manifest.folder,
         "overrides": list(manifest.overrides),
         "points": list(scene.sheet.points),
-        "step": step(scene),
+        "step": grid.step,
         "stable_step": limit if limit < math.inf else None,
-        "steps_per_frame": steps_per_frame(scene),
-        "precision": scene.time.precision,
-        "steps": progress.frame * steps_per_frame(scene),
+        "steps_per_frame": grid.steps_per_frame,
+        "precision": grid.precision,
+        "steps": progress.frame * grid.steps_per_frame,
         "max_displacement": progress.max_displacement,
         "shortest_spring": progress.shortest_spring,
         "longest_spring": progress.longest_spring,
         "probes": probe_records(scene),
-        "notes": list(notes(scene, progress, *known)),
+        "notes": list(notes(scene, grid, progress, *known)),
         "error_estimate": None if known.estimate is None else error_record(known.estimate, known.mesh_error),
         **({"error_estimate_reason": known.reason} if known.estimate is None else {}),
     }
 
 
-def free_cores(scene: Scene) -> int:
+def free_cores(scene: Scene, grid: TimeGrid) -> int:
     """Count the cores that are free for stepping: the encoder needs one of them, unless it mostly waits for frames."""
     width, height = scene.render.size
     rows, cols = scene.sheet.points
     encoding = width * height * ENCODING if scene.draws else 0
-    busy = encoding > rows * cols * steps_per_frame(scene)
+    busy = encoding > rows * cols * grid.steps_per_frame
     return max(1, resources.available_threads() - busy)
 
 

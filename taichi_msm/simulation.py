@@ -20,8 +20,7 @@ from taichi_msm.physics.mesh_error import choose_points
 from taichi_msm.physics.run_progress import RunProgress, Saved
 from taichi_msm.physics.solver import Dynamics
 from taichi_msm.physics.state import Reading
-from taichi_msm.physics.timestep import step, steps_per_frame
-from taichi_msm.physics.workload import with_precision
+from taichi_msm.physics.timestep import time_grid, with_grid
 from taichi_msm.progress import Pause
 from taichi_msm.render.camera import View, view
 from taichi_msm.render.instrument import Rod, rods
@@ -32,6 +31,7 @@ from taichi_msm.render.texture import load_texture, require_texture
 from taichi_msm.scene import UNTIL_NEXT, Camera, Probe, Scene
 from taichi_msm.scenefile.validation import checked
 from taichi_msm.system import runtime
+from taichi_msm.timegrid import TimeGrid
 
 if TYPE_CHECKING:
     from taichi_msm.notebook import Player
@@ -75,23 +75,24 @@ class Simulation:
         scene = checked(scene)
         texture = None if texture is None else require_texture(texture)
         self.device = runtime.start(arch, threads)
-        self.scene = scene = self._resolved(scene)
-        self._watch = Watch(scene)
+        self.scene, self._grid = self._resolved(scene)
+        self._watch = Watch(self.scene, self._grid)
         self._closed = self._diverged = False
-        self._dynamics = Dynamics(scene, self.device, cores=cores)
+        self._dynamics = Dynamics(self.scene, self._grid, self.device, cores=cores)
         self._position = self._place(self._dynamics.displacement())
         self._texture = texture
         self._own_texture = texture is None
         # By whether they give a picture, and labels.
         self._drawings: dict[tuple[bool, bool], Drawing] = {}
 
-    def _resolved(self, scene: Scene) -> Scene:
+    def _resolved(self, scene: Scene) -> tuple[Scene, TimeGrid]:
         """Choose what the scene leaves open: the points and the step for a tolerance, and the precision."""
         if scene.sheet.tolerance is not None:
             scene, _ = choose_points(scene, self.device, checked)
+        grid = time_grid(scene, self.device.arch)
         if scene.time.tolerance is not None:
-            return choose_step(scene, self.device)[0]
-        return with_precision(scene, self.device.arch)
+            grid, _ = choose_step(scene, grid, self.device)
+        return with_grid(scene, grid), grid
 
     @property
     def frame(self) -> int:
@@ -139,7 +140,7 @@ class Simulation:
         require_frame_count(frames)
         self._require_open()
         for _ in range(frames):
-            end = (self.frame + 1) * steps_per_frame(self.scene)
+            end = (self.frame + 1) * self._grid.steps_per_frame
             self._dynamics.advance(end - self.steps, pause)
             self._position = self._read()
 
@@ -175,13 +176,13 @@ class Simulation:
         """
         self._require_open()
         if scene is not None:
-            scene = self._resolved(checked(scene))
+            scene, grid = self._resolved(checked(scene))
             if self._own_texture and (scene.image, scene.region) != (self.scene.image, self.scene.region):
                 self._texture = None
-            self.scene = scene
-        self._watch = Watch(self.scene)
+            self.scene, self._grid = scene, grid
+        self._watch = Watch(self.scene, self._grid)
         self._diverged = False
-        self._dynamics.restart(self.scene)
+        self._dynamics.restart(self.scene, self._grid)
         self._drawings.clear()
         self._position = self._place(self._dynamics.displacement())
 
@@ -207,7 +208,7 @@ class Simulation:
         self._require_open()
         if not isinstance(saved, Saved):
             raise ArgumentError(f"{type(saved).__name__} is nothing that `save` gave")
-        state, per_frame = saved.state, steps_per_frame(self.scene)
+        state, per_frame = saved.state, self._grid.steps_per_frame
         since = state.steps - saved.progress.frame * per_frame
         alike = (state.displacement.shape, state.displacement.dtype) == (self._position.shape, self._position.dtype)
         if not (alike and 0 <= since <= per_frame):
@@ -216,7 +217,7 @@ class Simulation:
                 f"{state.displacement.shape}; take what was saved with this scene's points, precision and step"
             )
         self._diverged = False
-        self._dynamics.restart(self.scene, saved.state)
+        self._dynamics.restart(self.scene, self._grid, saved.state)
         self._position = self._place(self._dynamics.displacement())
         self._watch.progress = saved.progress
 
@@ -235,7 +236,7 @@ class Simulation:
             Velocities [m/s], shape (rows, cols, 3), in the scene's precision; 0 at the start.
         """
         self._require_open()
-        return self._dynamics.state().difference / self._position.dtype.type(step(self.scene))
+        return self._dynamics.state().difference / self._position.dtype.type(self._grid.step)
 
     def surface(self) -> Surface:
         """Give the refined surface as textured triangles: vertices, triangles, texture coordinates."""
@@ -524,7 +525,7 @@ class Simulation:
     def _require_good(self, reading: Reading, wrong: str) -> None:
         if wrong:
             self._diverged = True
-            steps, time = reading.steps, reading.steps * step(self.scene)
+            steps, time = reading.steps, self._grid.time(reading.steps)
             point = farthest(reading.displacement)[:2]
             raise DivergedError(f"diverged before {time:g} s, step {steps}: {wrong}", steps, time, point)
 

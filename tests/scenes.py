@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from taichi_msm.physics.timestep import with_time
 from taichi_msm.scene import Scene
 
 SHEET = {"points": [9, 11], "size": [0.3, 0.4], "mass": 1e-3}
@@ -140,3 +141,8 @@ def random_tissue(seed: int, image: str, precision: str = "f64") -> Scene:
 def speckle(height: int, width: int, seed: int = 0) -> NDArray[np.uint8]:
     """A picture of random texels, the hardest to draw right."""
     return np.random.default_rng(seed).integers(0, 256, (height, width, 3), dtype=np.uint8)
+
+
+def with_steps(made: Scene, count: int) -> Scene:
+    """The scene with so many steps in a frame."""
+    return with_time(made, step=1 / made.time.frames_per_second / count, tolerance=None)

@@ -14,13 +14,14 @@ from taichi_msm.errors import SceneError
 from taichi_msm.physics import error_control
 from taichi_msm.physics.error_control import Estimate, Trials, choose_step, estimate_error, longest, order, refinement
 from taichi_msm.physics.run_progress import RunProgress
-from taichi_msm.physics.timestep import stable_step, step, steps_per_frame, with_steps, with_time
+from taichi_msm.physics.timestep import stable_step, time_grid, with_time
 from taichi_msm.physics.warnings import notes
 from taichi_msm.scene import Scene
 from taichi_msm.simulation import Simulation
 from taichi_msm.system.runtime import Device
+from taichi_msm.timegrid import TimeGrid
 from tests.motion import frames, true_error
-from tests.scenes import PRESS, SHEET, SPRINGS, scene
+from tests.scenes import PRESS, SHEET, SPRINGS, scene, with_steps
 
 # Of a run in which something moved.
 MOVED = RunProgress(1, 1.0)
@@ -50,20 +51,30 @@ SCENES: dict[str, Any] = {
 }
 
 
+def estimated(made: Scene, device: Device) -> Estimate:
+    """What is known of the error of a scene's own steps."""
+    return estimate_error(made, time_grid(made), device)
+
+
+def chosen(made: Scene, device: Device) -> tuple[TimeGrid, Estimate]:
+    """The steps for a scene's tolerance, and their error."""
+    return choose_step(made, time_grid(made), device)
+
+
 @pytest.mark.parametrize(("precision", "tolerance"), [("f32", 5e-4), pytest.param("f64", 5e-5, marks=pytest.mark.slow)])
 @pytest.mark.parametrize("kind", SCENES)
 def test_the_step_chosen_is_right_and_the_largest(kind: str, precision: str, tolerance: float, device: Device) -> None:
     sections = SCENES[kind]
     made = scene(**sections | {"time": {"precision": precision, "tolerance": tolerance, **sections.get("time", {})}})
-    chosen, estimate = choose_step(made, device)
+    grid, estimate = chosen(made, device)
     assert estimate.error <= tolerance
-    error = true_error(chosen, device, fine=12)
+    error = true_error(made, grid, device, fine=12)
     assert error <= 1.5 * tolerance, estimate
-    assert estimate.steps_per_frame == steps_per_frame(chosen) >= steps_per_frame(made)
-    if steps_per_frame(chosen) > steps_per_frame(made):
+    assert estimate.steps_per_frame == grid.steps_per_frame >= time_grid(made).steps_per_frame
+    if grid.steps_per_frame > time_grid(made).steps_per_frame:
         # Half as many steps would not have done.
-        with closing(Trials(chosen, device)) as trials:
-            assert trials.estimate(steps_per_frame(chosen) // 2, lambda done, total: None).error > tolerance
+        with closing(Trials(made, grid, device)) as trials:
+            assert trials.estimate(grid.steps_per_frame // 2, lambda done, total: None).error > tolerance
 
 
 @pytest.mark.parametrize("difference", ["central", "backward"])
@@ -71,9 +82,9 @@ def test_the_step_chosen_is_right_and_the_largest(kind: str, precision: str, tol
 def test_an_estimate_is_near_the_error(kind: str, difference: str, device: Device) -> None:
     sections = SCENES[kind]
     made = scene(**sections | {"time": {"damping_difference": difference, **sections.get("time", {})}})
-    estimate = estimate_error(made, device)
+    estimate = estimated(made, device)
     exact = with_time(made, damping_difference="central")
-    reference = frames(exact, device, cut=64 * steps_per_frame(made))
+    reference = frames(exact, device, cut=64 * time_grid(made).steps_per_frame)
     error = longest(frames(made, device) - reference) / longest(reference)
     assert error / 1.5 < estimate.error < 1.5 * error
     if difference == "central":
@@ -84,12 +95,12 @@ def test_an_estimate_is_near_the_error(kind: str, difference: str, device: Devic
 class Falling:
     """A stand-in for Dynamics, of every displacement of which h^p is wrong and no more."""
 
-    def __init__(self, p: int, made: Scene, device: Device, cores: int | None = None) -> None:
+    def __init__(self, p: int, made: Scene, grid: TimeGrid, device: Device, cores: int | None = None) -> None:
         self.p = p
-        self.restart(made)
+        self.restart(made, grid)
 
-    def restart(self, made: Scene) -> None:
-        self.h = step(made)
+    def restart(self, made: Scene, grid: TimeGrid) -> None:
+        self.h = grid.step
 
     def advance(self, steps: int, pause: object) -> None:
         pass
@@ -108,18 +119,20 @@ def test_an_error_that_is_a_power_of_the_step_is_told_exactly(
     monkeypatch.setattr(error_control, "Dynamics", partial(Falling, p))
     made = scene(probes=[SOFT_PRESS], time={"step": 0.005, "damping_difference": difference})
     # In numbers near 1 the error, 2.5e-5 or more, is rounded by 1e-11 of itself.
-    assert estimate_error(made, device).error == pytest.approx(0.005**p, rel=1e-9)
+    assert estimated(made, device).error == pytest.approx(0.005**p, rel=1e-9)
 
 
 def test_how_much_finer_the_other_pilot_is() -> None:
-    assert refinement(scene(**SCENES["release"])) == 2
-    assert refinement(scene(**SCENES["between"])) == 2
-    assert refinement(scene(damping=3.0, time={"step": 0.0025})) == 8, "g h is 7.5"
+    for kind in ("release", "between"):
+        made = scene(**SCENES[kind])
+        assert refinement(made, time_grid(made)) == 2
+    made = scene(damping=3.0, time={"step": 0.0025})
+    assert refinement(made, time_grid(made)) == 8, "g h is 7.5"
 
 
 def test_rounding_is_part_of_the_estimate(device: Device) -> None:
     made = with_steps(scene(probes=[SOFT_PRESS], damping=0.02, time={"precision": "f32"}), 2000)
-    estimate = estimate_error(made, device)
+    estimate = estimated(made, device)
     exact = frames(with_time(made, precision="f64"), device)
     rounding = longest(frames(made, device) - exact) / longest(exact)
     assert estimate.rounding == pytest.approx(rounding, rel=1e-3)
@@ -129,13 +142,13 @@ def test_rounding_is_part_of_the_estimate(device: Device) -> None:
     error = longest(frames(made, device) - truth) / longest(truth)
     assert estimate.error == pytest.approx(error, rel=0.02)
     assert estimate.error > 1.5 * estimate.in_f64
-    assert estimate_error(with_time(made, precision="f64"), device).rounding == 0
+    assert estimated(with_time(made, precision="f64"), device).rounding == 0
 
 
 def test_what_f32_cannot_reach_names_f64(device: Device) -> None:
     made = scene(probes=[SOFT_PRESS], damping=0.02, time={"precision": "f32", "tolerance": 1e-8})
     with pytest.raises(SceneError, match=r"^time.tolerance: 1e-08 is out of reach of f32, .* take time.precision: f64"):
-        choose_step(made, device)
+        chosen(made, device)
 
 
 def test_a_motion_that_does_not_converge_is_refused(device: Device) -> None:
@@ -143,18 +156,18 @@ def test_a_motion_that_does_not_converge_is_refused(device: Device) -> None:
     probe = {"force": [3e5, 1e5, -1e4], "falloff": 20}
     made = scene(probes=[probe], damping=0, time={"duration": 2.0, "tolerance": 1e-3})
     with pytest.raises(SceneError, match=r"^time.tolerance: 0.001 is out of reach: with \d+ steps a frame the error"):
-        choose_step(made, device)
+        chosen(made, device)
 
 
 def test_a_sheet_that_does_not_move_has_no_error(device: Device) -> None:
     made = scene(probes=[], time={"tolerance": 1e-6})
-    assert choose_step(made, device)[1] == Estimate(steps_per_frame(made), 0.0, 0.0, 0.0, 2)
+    assert chosen(made, device)[1] == Estimate(time_grid(made).steps_per_frame, 0.0, 0.0, 0.0, 2)
 
 
 def test_a_simulation_meets_the_tolerance_by_itself(device: Device) -> None:
     made = scene(probes=[SOFT_PRESS], damping=0.02, time={"tolerance": 5e-5})
     with Simulation(made, threads=2) as simulation:
-        assert step(simulation.scene) < step(made) <= stable_step(made) / 2
+        assert time_grid(simulation.scene).step < time_grid(made).step <= stable_step(made) / 2
 
 
 def test_progress_may_interrupt(device: Device) -> None:
@@ -164,7 +177,7 @@ def test_progress_may_interrupt(device: Device) -> None:
             raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):
-        estimate_error(scene(), device, stop)
+        estimate_error(scene(), time_grid(scene()), device, stop)
 
 
 # 25 frames a second in steps of 0.01 s.
@@ -208,52 +221,52 @@ def test_jumps_between_steps_leave_the_order_2(probe: dict[str, Any], device: De
 def test_damping_within_a_step_is_known_or_not_told(damping: float, device: Device) -> None:
     # g h = 7 and 47. A load that is there at once makes velocities change their sign at every step, at h and at h / 2.
     made = scene(probes=[{**SOFT_PRESS, "load": [[0, 100]]}], damping=damping)
-    estimate = estimate_error(made, device)
-    reference = frames(made, device, cut=128 * steps_per_frame(made))
+    estimate = estimated(made, device)
+    reference = frames(made, device, cut=128 * time_grid(made).steps_per_frame)
     error = longest(frames(made, device) - reference) / longest(reference)
     assert error / 1.5 < estimate.error < 1.5 * error
-    assert "velocities change their sign" in "".join(notes(made, MOVED, None))
+    assert "velocities change their sign" in "".join(notes(made, time_grid(made), MOVED, None))
 
 
 def test_damping_within_a_hundredth_of_a_step_has_no_estimate(device: Device) -> None:
     made = scene(probes=[{**SOFT_PRESS, "load": [[0, 100]]}], damping=100.0)
-    assert estimate_error(made, device).error == np.inf
-    assert next(notes(made, MOVED, estimate_error(made, device))).startswith("error not known")
+    assert estimated(made, device).error == np.inf
+    assert next(notes(made, time_grid(made), MOVED, estimated(made, device))).startswith("error not known")
 
 
 @pytest.mark.parametrize("pulse", [[0.2005, 0.2006], [0.2, 0.2 + 1e-9], [0.2021, 0.2032]])
 def test_the_error_of_a_load_shorter_than_a_step_is_known(pulse: list[float], device: Device) -> None:
     start, end = pulse
     made = scene(probes=[{**SOFT_PRESS, "load": [[start, 0], [start, 100], [end, 100], [end, 0]]}])
-    estimate = estimate_error(made, device)
-    exact = frames(made, device, cut=64 * steps_per_frame(made))
+    estimate = estimated(made, device)
+    exact = frames(made, device, cut=64 * time_grid(made).steps_per_frame)
     error = longest(frames(made, device) - exact) / longest(exact)
     assert error / 1.5 < estimate.error < 1.5 * error < 0.2
-    assert not list(notes(made, MOVED, None))
+    assert not list(notes(made, time_grid(made), MOVED, None))
 
 
 def test_a_scene_that_is_all_right_has_no_notes() -> None:
-    assert not list(notes(scene(), RunProgress(1, 1.0, 0.51), None))
-    assert next(notes(scene(), RunProgress(1, 0.0, 0.49), Estimate(40, 1e-3, 1e-4, 1e-3, 2))) == (
+    assert not list(notes(scene(), time_grid(scene()), RunProgress(1, 1.0, 0.51), None))
+    assert next(notes(scene(), time_grid(scene()), RunProgress(1, 0.0, 0.49), Estimate(40, 1e-3, 1e-4, 1e-3, 2))) == (
         "error 0.001 of the largest displacement (step 0.001, rounding 0.0001)"
     )
-    assert len(list(notes(scene(), RunProgress(1, 0.0, 0.49), None))) == 2
+    assert len(list(notes(scene(), time_grid(scene()), RunProgress(1, 0.0, 0.49), None))) == 2
 
 
 def test_positions_written_in_f32_have_the_digits_of_the_sheet(device: Device) -> None:
     # Points move by some 4 um on a sheet of 0.4 m, whose positions f32 rounds by up to 2^-27 m: half a unit at 0.2 m.
     faint = {"probes": [{**SOFT_PRESS, "force": [0, 0, -0.5]}], "time": {"precision": "f32"}}
     written = scene(**faint, output=["trajectory"])
-    estimate = estimate_error(written, device)
+    estimate = estimated(written, device)
     twin = frames(with_time(written, precision="f64"), device)
     assert 0.3 * 2**-27 < estimate.rounding * longest(twin) < 3**0.5 * 2**-27
-    assert estimate_error(scene(**faint), device).rounding < 1e-5
+    assert estimated(scene(**faint), device).rounding < 1e-5
     with pytest.raises(SceneError, match="out of reach of f32"):
-        choose_step(with_time(written, tolerance=estimate.rounding / 2), device)
+        chosen(with_time(written, tolerance=estimate.rounding / 2), device)
     # Where rounding alone nearly takes up the tolerance, a step is found or the reason told.
     for share in (1.0, 1.1, 1.3):
         with suppress(SceneError):
-            found = choose_step(with_time(written, tolerance=share * estimate.rounding), device)[1]
+            found = chosen(with_time(written, tolerance=share * estimate.rounding), device)[1]
             assert found.error <= share * estimate.rounding
 
 
@@ -263,7 +276,7 @@ def test_a_tighter_tolerance_takes_no_fewer_steps(difference: str, device: Devic
     probe = {**SOFT_PRESS, "load": [[0, 100], [0.13, 100], [0.13, 0]]}
     time = {"damping_difference": difference}
     made = scene(probes=[probe], damping=0.05, time=time)
-    found = [choose_step(with_time(made, tolerance=t), device)[1] for t in (3e-2, 1e-2, 3e-3, 1e-3)]
+    found = [chosen(with_time(made, tolerance=t), device)[1] for t in (3e-2, 1e-2, 3e-3, 1e-3)]
     steps = [one.steps_per_frame for one in found]
     assert steps == sorted(steps)
     assert {one.order for one in found} == {2 if difference == "central" else 1}
@@ -271,12 +284,12 @@ def test_a_tighter_tolerance_takes_no_fewer_steps(difference: str, device: Devic
 
 def test_the_error_in_f64_is_that_of_the_step(device: Device) -> None:
     made = with_steps(scene(probes=[SOFT_PRESS], damping=0.02, time={"precision": "f32"}), 2000)
-    single, double = estimate_error(made, device), estimate_error(with_time(made, precision="f64"), device)
+    single, double = estimated(made, device), estimated(with_time(made, precision="f64"), device)
     assert single.in_f64 == pytest.approx(double.error, rel=1e-9)
     assert double.in_f64 == double.error
-    (said,) = notes(made, MOVED, single)
+    (said,) = notes(made, time_grid(made), MOVED, single)
     assert f"(step {double.error:.1g}, rounding {single.rounding:.1g})" in said
-    (said,) = notes(made, MOVED, double)
+    (said,) = notes(made, time_grid(made), MOVED, double)
     assert said.endswith(f"(step {single.in_f64:.1g})")
 
 
@@ -293,7 +306,7 @@ def test_a_press_and_release_that_are_missed_alike_do_not_hide_each_other(
         time={"frames_per_second": 5},
     )
     for tolerance in (1e-2, 3e-3):
-        chosen, estimate = choose_step(with_time(made, tolerance=tolerance), device)
+        grid, estimate = chosen(with_time(made, tolerance=tolerance), device)
         truth = frames(made, device, cut=200_000)
-        error = longest(frames(chosen, device) - truth) / longest(truth)
+        error = longest(frames(made, device, cut=grid.steps_per_frame) - truth) / longest(truth)
         assert error <= 1.5 * tolerance, estimate

@@ -10,9 +10,10 @@ import pytest
 from PIL import Image
 
 from taichi_msm.errors import SceneError
+from taichi_msm.physics.timestep import time_grid
 from taichi_msm.scene import Scene
 from taichi_msm.scenefile import budget
-from taichi_msm.scenefile.budget import estimate, problems, require_disk
+from taichi_msm.scenefile.budget import Budget, problems, require_disk
 from taichi_msm.system import resources
 from taichi_msm.system.resources import available_memory
 
@@ -32,6 +33,10 @@ def scene(**keys: Any) -> Scene:
             "time": {**TIME, **keys.get("time", {})},
         }
     )
+
+
+def estimate(scene: Scene) -> Budget:
+    return budget.estimate(scene, time_grid(scene))
 
 
 def faults(scene: Scene) -> list[str]:
@@ -99,12 +104,12 @@ def test_an_ordinary_scene_has_no_problems() -> None:
         (
             {"sheet": {"points": [4096, 4096], "size": [1, 1], "mass": 1}},
             "sheet.points: the scene needs 1.31 GiB of memory, 1.31 GiB of it for 4096 x 4096 points, "
-            "but 512 MiB is free; take less",
+            "but 512 MiB is free; reduce it",
         ),
         (
             {"render": {"refine": 0, "size": [8192, 4096]}},
             "render.size: the scene needs 1.13 GiB of memory, 1.13 GiB of it for frames of 8192 x 4096 "
-            "pixels and their texture, but 512 MiB is free; take less",
+            "pixels and their texture, but 512 MiB is free; reduce it",
         ),
     ],
     ids=["points", "picture"],
@@ -209,7 +214,7 @@ def test_results_that_do_not_fit_on_the_disk_are_refused(tmp_path: Path, monkeyp
         require_disk(made, below)
     assert str(told.value) == (
         "sheet.points: 21 frames need 770 KiB on disk, 647 KiB of it for positions of 30 x 40 points, but "
-        f"770 KiB is free for {below}; take less, fewer time.frames_per_second, less output or another --out"
+        f"770 KiB is free for {below}; reduce it, time.frames_per_second or output, or choose another --out"
     )
     with pytest.raises(
         SceneError, match=r"^render.size: 21 frames need .* of it for pictures of 500 x 600 pixels, but"

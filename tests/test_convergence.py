@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from taichi_msm.physics.solver import Dynamics
-from taichi_msm.physics.timestep import steps_per_frame
+from taichi_msm.physics.timestep import time_grid
 from taichi_msm.system.runtime import Device
+from tests.motion import dynamics_of
 from tests.scenes import scene
 
 FRAME = 0.04
@@ -27,8 +27,8 @@ def final(device: Device, load: Any, cut: int, difference: str) -> NDArray[Any]:
         probes=[{"force": [0, 100, -300], "load": load, "falloff": 20, "at": [0.4, 0.6]}],
         time={"duration": 0.4, "step": FRAME / cut, "damping_difference": difference},
     )
-    dynamics = Dynamics(made, device)
-    dynamics.advance(made.time.frames * steps_per_frame(made))
+    dynamics = dynamics_of(made, device)
+    dynamics.advance(time_grid(made).steps)
     displacement = dynamics.displacement()
     dynamics.close()
     return displacement

@@ -14,10 +14,10 @@ from taichi_msm.physics.diagnosis import Diagnosis
 from taichi_msm.physics.divergence import farthest_displacement
 from taichi_msm.physics.run_progress import RunProgress, Saved
 from taichi_msm.physics.state import State
-from taichi_msm.physics.timestep import stable_step, steps_per_frame, with_steps
+from taichi_msm.physics.timestep import stable_step, time_grid
 from taichi_msm.scene import Scene
 from taichi_msm.system.runtime import Device
-from tests.scenes import SHEET, scene
+from tests.scenes import SHEET, scene, with_steps
 
 # Pressed for three frames.
 PRESS = {"force": [0, 300, -1000], "load": [[0, 100], [0.12, 100], [0.12, 0]], "falloff": 20}
@@ -82,7 +82,7 @@ def test_no_fault_is_found_where_there_is_none(precision: str, active: str, devi
         probes=[{**PRESS, "load": jumps}, {**PRESS, "at": [[0, -0.5, 0.5], [0.8, 1.5, 0.5]]}],
         time={"duration": 0.8, "precision": precision},
     )
-    for steps in (steps_per_frame(made), math.ceil(1 / 25 / stable_step(made) / 0.995)):
+    for steps in (time_grid(made).steps_per_frame, math.ceil(1 / 25 / stable_step(made) / 0.995)):
         with Simulation(with_steps(made, steps), threads=device.threads) as simulation:
             simulation.advance(20)
             assert simulation.progress.peak > 1e-3
@@ -174,8 +174,8 @@ def test_a_force_that_is_too_strong_is_named(device: Device) -> None:
     found = diagnosed(made, device)
     assert re.fullmatch(
         r"diverged at 0\.1\d* s, step \d+: point \(4, 5\) is [.\d]+ m from its rest position, and the sheet is 0\.4 m "
-        r"long; likely cause: probes\.1\.force, which reaches 454 N at this point; take less, as no time\.step of "
-        r"[-.\de]+ s or more goes well here",
+        r"long; likely cause: probes\.1\.force, which reaches 454 N at this point; take less, as it diverges with "
+        r"every time\.step that was tried, down to [-.\de]+ s",
         found.message,
     )
     # The step named is the first: one less is fine, and it is not.
@@ -196,7 +196,7 @@ def test_a_step_that_is_too_long_is_named(device: Device) -> None:
     made = with_steps(made, 9)
     found = diagnosed(made, device).message
     assert "; likely cause: time.step, 0.00444444 s; with 0.00" in found
-    finer = float(re.findall(r"with ([.\d]+) s it goes well here", found)[0])
+    finer = float(re.findall(r"with ([.\d]+) s it does not diverge here", found)[0])
     with Simulation(with_steps(made, round(1 / 25 / finer)), threads=device.threads) as simulation:
         simulation.advance(3)
 
@@ -208,7 +208,9 @@ def test_a_machine_that_makes_errors_is_told_of(device: Device) -> None:
 
     made = pressed()
     found = diagnosed(made, device, flip)
-    assert found.message.endswith("but not when it was repeated: this machine makes errors; go on with --resume")
+    assert found.message.endswith(
+        "but not when it was repeated, so the machine has made an error; continue with --resume"
+    )
     assert found.good
     assert found.good.progress.frame == 1, "where it was saved"
     with Simulation(made, threads=device.threads) as simulation:

@@ -17,22 +17,23 @@ from taichi_msm.physics import kernel_cpu, kernel_gpu
 from taichi_msm.physics.kernel import Structure
 from taichi_msm.physics.lattice import rest_positions
 from taichi_msm.physics.material import material
-from taichi_msm.physics.solver import POINTS_PER_WORKER, Dynamics, structure
-from taichi_msm.physics.timestep import stable_step, step, steps_per_frame, with_steps
+from taichi_msm.physics.solver import POINTS_PER_WORKER
+from taichi_msm.physics.timestep import stable_step, time_grid
 from taichi_msm.scene import Scene
 from taichi_msm.system.resources import available_threads
 from taichi_msm.system.runtime import Device, lanes
-from tests.scenes import PRESS, SHEET, SPRINGS, random_scene, scene
+from tests.motion import dynamics_of, structure_of
+from tests.scenes import PRESS, SHEET, SPRINGS, random_scene, scene, with_steps
 
 ROUNDING = {"f32": 2.0**-24, "f64": 2.0**-53}
 
 
 def simulate(made: Scene, device: Device, layout: Structure | None = None) -> NDArray[Any]:
     """Displacements of every frame, shape (F + 1, rows, cols, 3)."""
-    dynamics = Dynamics(made, device, layout)
+    grid, dynamics = time_grid(made), dynamics_of(made, device, layout)
     frames = [dynamics.displacement()]
-    for _ in range(made.time.frames):
-        dynamics.advance(steps_per_frame(made))
+    for _ in range(grid.frames):
+        dynamics.advance(grid.steps_per_frame)
         frames.append(dynamics.displacement())
     dynamics.close()
     return np.array(frames)
@@ -43,7 +44,7 @@ def assert_like_twin(made: Scene, device: Device, layout: Structure | None = Non
     # A rounding of a step, of the size of a rest length, is amplified by at most the number of steps squared;
     # in practice by far less. Chaos is kept away by small displacements and few steps.
     largest = max(np.abs(twin).max(), 1e-3 * max(made.sheet.size))
-    steps = made.time.frames * steps_per_frame(made)
+    steps = time_grid(made).steps
     tolerance = ROUNDING[made.time.precision] * steps**1.5 * largest
     np.testing.assert_allclose(simulate(made, device, layout), twin, rtol=0, atol=tolerance)
 
@@ -115,20 +116,21 @@ def short_launches(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
 @pytest.mark.usefixtures("short_launches")
 def test_the_plain_layout_of_a_gpu_gives_the_same(device: Device) -> None:
     made = scene(probes=[PRESS], time={"duration": 0.08})
-    layout = as_on_a_gpu(structure(made, device))
-    assert steps_per_frame(made) % kernel_gpu.STEPS_PER_LAUNCH != 0, "a launch that is not full is part of the test"
+    layout = as_on_a_gpu(structure_of(made, device))
+    count = time_grid(made).steps_per_frame
+    assert count % kernel_gpu.STEPS_PER_LAUNCH != 0, "a launch that is not full is part of the test"
     assert simulate(made, device, layout).tobytes() == simulate(made, device).tobytes()
 
 
 @pytest.mark.parametrize("fixed", [pytest.param("border", marks=pytest.mark.slow), ["top"]])
 def test_bands_and_passes_do_not_change_the_bits(fixed: Any, device: Device) -> None:
     made = scene(sheet={**SHEET, "points": [21, 19], "fixed": fixed}, time={"precision": "f32", "duration": 0.12})
-    whole = structure(made, device)
+    whole = structure_of(made, device)
     assert (whole.workers, whole.depth) == (1, 1)
     plain = simulate(made, device)
     # Also passes longer than a band has rows, and a last one that is not full.
     for workers, depth in ((1, 3), (2, 1), (2, 4), (2, 16)):
-        assert steps_per_frame(made) % depth != 0 or depth == 1
+        assert time_grid(made).steps_per_frame % depth != 0 or depth == 1
         layout = replace(whole, workers=workers, depth=depth)
         assert simulate(made, device, layout).tobytes() == plain.tobytes(), (workers, depth)
 
@@ -138,8 +140,8 @@ def test_more_bands_than_threads_give_the_same_bits(workers: int, device: Device
     # Bands that end at one border are those of the second and third worker, and it takes as many threads to step them
     # at one time; but one step a launch, nobody waits.
     made = scene(sheet={**SHEET, "points": [21, 19], "fixed": ["top"]}, time={"precision": "f32", "duration": 0.08})
-    dynamics = Dynamics(made, device, replace(structure(made, device), workers=workers))
-    for _ in range(made.time.frames * steps_per_frame(made)):
+    dynamics = dynamics_of(made, device, replace(structure_of(made, device), workers=workers))
+    for _ in range(time_grid(made).steps):
         dynamics.advance(1)
     assert dynamics.displacement().tobytes() == simulate(made, device)[-1].tobytes()
     dynamics.close()
@@ -148,7 +150,7 @@ def test_more_bands_than_threads_give_the_same_bits(workers: int, device: Device
 def test_the_depth_of_a_pass_is_chosen_from_the_size(device: Device) -> None:
     # 61 x 61 points are 132 kB and stay in the cache; of 331 x 331 some rows do; of 4096 x 4096 not two.
     depths = [
-        structure(scene(sheet={**SHEET, "points": [n, n]}, time={"precision": "f32"}), device).depth
+        structure_of(scene(sheet={**SHEET, "points": [n, n]}, time={"precision": "f32"}), device).depth
         for n in (61, 331, 1024, 4096)
     ]
     assert depths == [1, 8, 8, 1]
@@ -157,7 +159,7 @@ def test_the_depth_of_a_pass_is_chosen_from_the_size(device: Device) -> None:
 @pytest.mark.parametrize("widths", [(16, 2), pytest.param((16, 8, 4, 2), marks=pytest.mark.fuzz)])
 def test_lanes_do_not_change_the_bits(widths: tuple[int, ...], device: Device) -> None:
     made = scene(sheet={**SHEET, "points": [7, 13]}, time={"precision": "f32"})
-    whole = structure(made, device)
+    whole = structure_of(made, device)
     motions = [simulate(made, device, with_lanes(whole, width)).tobytes() for width in widths]
     assert len(set(motions)) == 1
 
@@ -166,18 +168,18 @@ def test_large_sheets_are_cut_into_bands(device: Device) -> None:
     side = int(np.sqrt(2 * POINTS_PER_WORKER)) + 1
     for count, workers in ((side, min(2, available_threads())), (side // 2, 1)):
         made = scene(sheet={**SHEET, "points": [count, count]}, time={"duration": 0.04})
-        assert structure(made, device).workers == workers
-        assert structure(made, device, cores=1).workers == 1
+        assert structure_of(made, device).workers == workers
+        assert structure_of(made, device, cores=1).workers == 1
         assert_like_twin(made, device)
 
 
 def test_a_launch_ends_soon(device: Device, monkeypatch: pytest.MonkeyPatch) -> None:
     """And between two launches the sheet can be stopped, and go on."""
     made = scene()
-    dynamics = Dynamics(made, device)
+    dynamics = dynamics_of(made, device)
     dynamics.advance(100)
     whole = dynamics.displacement()
-    dynamics.restart(made)
+    dynamics.restart(made, time_grid(made))
     monkeypatch.setattr("taichi_msm.physics.solver.POINT_STEPS_PER_LAUNCH", 12 * math.prod(made.sheet.points))
 
     def stop() -> None:
@@ -194,15 +196,15 @@ def test_a_launch_ends_soon(device: Device, monkeypatch: pytest.MonkeyPatch) -> 
 
 def test_a_frame_of_a_small_sheet_is_one_launch(device: Device) -> None:
     made = scene(sheet={**SHEET, "points": [31, 31]})
-    dynamics = Dynamics(made, device)
-    dynamics.advance(steps_per_frame(made))
-    assert steps_per_frame(made) > 1
+    dynamics = dynamics_of(made, device)
+    dynamics.advance(time_grid(made).steps_per_frame)
+    assert time_grid(made).steps_per_frame > 1
     assert dynamics.launches == 1
     dynamics.close()
 
 
 def test_absent_terms_are_left_out(device: Device) -> None:
-    bare = structure(scene(springs={"structural": 1}, probes=[]), device).code
+    bare = structure_of(scene(springs={"structural": 1}, probes=[]), device).code
     assert (bare.structural, bare.shear, bare.virtual, bare.open_edges, bare.slots_move) == (
         True,
         False,
@@ -210,9 +212,9 @@ def test_absent_terms_are_left_out(device: Device) -> None:
         False,
         (),
     )
-    assert not structure(scene(probes=[]), device).code.virtual, "loaded, but nothing ever loads"
-    assert structure(scene(), device).code.virtual
-    assert structure(scene(), device).code.lanes == lanes("f64")
+    assert not structure_of(scene(probes=[]), device).code.virtual, "loaded, but nothing ever loads"
+    assert structure_of(scene(), device).code.virtual
+    assert structure_of(scene(), device).code.lanes == lanes("f64")
 
 
 @pytest.mark.parametrize(
@@ -243,7 +245,7 @@ def test_the_shortest_spring_is_that_of_the_twin(springs: dict[str, Any], fixed:
             probes=[{"at": at, "force": force, "offset": 6, "falloff": 20}],
             time={"duration": 0.08},
         )
-        dynamics = Dynamics(made, device)
+        dynamics = dynamics_of(made, device)
         dynamics.advance(30)
         u = dynamics.displacement()
         assert dynamics.read().shortest_spring == pytest.approx(reference.shortest_spring(made, u), abs=1e-12)
@@ -266,7 +268,7 @@ def test_a_spring_that_is_pressed_to_a_point(ratio: float, precision: str, devic
         ],
         time={"duration": 2, "frames_per_second": 1, "step": 1, "precision": precision},
     )
-    dynamics = Dynamics(made, device)
+    dynamics = dynamics_of(made, device)
     dynamics.advance(2)
     twin = reference.simulate(made)[2] - rest_positions(made.sheet)
     np.testing.assert_allclose(dynamics.displacement(), twin, rtol=0, atol=8 * ROUNDING[precision])
@@ -292,9 +294,9 @@ def test_energy_does_not_drift(device: Device) -> None:
         probes=[{"force": [0, 0, -300], "load": [[0, 0], [0.04, 100], [0.04, 0]], "falloff": 20}],
         time={"duration": 24.0},
     )
-    h, steps = step(made), steps_per_frame(made)
+    h, steps = time_grid(made).step, time_grid(made).steps_per_frame
     assert made.time.frames * steps > 1e4
-    dynamics = Dynamics(made, device)
+    dynamics = dynamics_of(made, device)
     energies = []
     for _ in range(made.time.frames):
         dynamics.advance(steps - 1)
@@ -341,13 +343,13 @@ def test_a_state_is_gone_on_from_with_the_same_bits(change: dict[str, Any] | Non
         probes=[PRESS, {**PRESS, "at": [[0, 0.1, 0.1], [0.4, 0.9, 0.9]]}],
         time={"precision": "f32"},
     )
-    whole = structure(made, device)
-    dynamics = Dynamics(made, device, as_on_a_gpu(whole) if change is None else replace(whole, **change))
+    whole = structure_of(made, device)
+    dynamics = dynamics_of(made, device, as_on_a_gpu(whole) if change is None else replace(whole, **change))
     dynamics.advance(37)
     state, energy = dynamics.state(), dynamics.read().energy
     dynamics.advance(50)
     end = dynamics.state()
-    dynamics.restart(made, state)
+    dynamics.restart(made, time_grid(made), state)
     again = dynamics.state()
     assert dynamics.read().energy == energy
     dynamics.advance(50)
@@ -363,13 +365,13 @@ def test_a_state_is_gone_on_from_with_the_same_bits(change: dict[str, Any] | Non
 @pytest.mark.parametrize(("seed", "width"), [(0, 8), (3, 8), (4, 1)])
 def test_the_energy_is_that_of_motion_and_springs(seed: int, width: int, device: Device) -> None:
     made = random_scene(seed)
-    layout = structure(made, device)
-    dynamics = Dynamics(made, device, layout if width > 1 else as_on_a_gpu(layout))
+    layout = structure_of(made, device)
+    dynamics = dynamics_of(made, device, layout if width > 1 else as_on_a_gpu(layout))
     dynamics.advance(33)
     state = dynamics.state()
     assert made.springs is not None
     without_virtual = made.model_copy(update={"springs": made.springs.model_copy(update={"virtual": 0.0})})
-    expected = energy(without_virtual, state.displacement, state.difference / step(made))
+    expected = energy(without_virtual, state.displacement, state.difference / time_grid(made).step)
     assert dynamics.read().energy == pytest.approx(expected, rel=1e-12)
     assert dynamics.read().shortest_spring == pytest.approx(
         reference.shortest_spring(made, state.displacement), rel=1e-12
@@ -392,7 +394,7 @@ def test_just_under_the_limit_stays_bounded(difference: str, device: Device) -> 
             "damping_difference": difference,
         },
     )
-    dynamics = Dynamics(made, device)
+    dynamics = dynamics_of(made, device)
     for _ in range(frames):
         dynamics.advance(1000)
         largest = np.abs(dynamics.displacement()).max()
@@ -426,29 +428,30 @@ def test_symmetries(device: Device) -> None:
 
 def test_a_restart_is_a_new_start(device: Device) -> None:
     other = scene(probes=[{**PRESS, "at": [0.2, 0.3]}], damping=0.02, sheet={**SHEET, "size": [0.4, 0.2], "mass": 2e-3})
-    dynamics = Dynamics(scene(), device, replace(structure(scene(), device), workers=2))
+    dynamics = dynamics_of(scene(), device, replace(structure_of(scene(), device), workers=2))
     dynamics.advance(77)
     for made in (other, with_steps(other, 50), scene()):
-        dynamics.restart(made)
+        dynamics.restart(made, time_grid(made))
         frames = [dynamics.displacement()]
         for _ in range(made.time.frames):
-            dynamics.advance(steps_per_frame(made))
+            dynamics.advance(time_grid(made).steps_per_frame)
             frames.append(dynamics.displacement())
         np.testing.assert_array_equal(frames, simulate(made, device))
     dynamics.close()
 
 
 def test_a_restart_may_be_that_of_any_scene(device: Device) -> None:
-    dynamics = Dynamics(scene(), device)
+    dynamics = dynamics_of(scene(), device)
     other: list[dict[str, Any]] = [
         {"probes": []},
         {"time": {"precision": "f32"}},
         {"sheet": {**SHEET, "points": [9, 12]}},
     ]
     for changes in other:
-        dynamics.restart(scene(**changes))
+        made = scene(**changes)
+        dynamics.restart(made, time_grid(made))
         dynamics.advance(11)
-        fresh = Dynamics(scene(**changes), device)
+        fresh = dynamics_of(made, device)
         fresh.advance(11)
         assert dynamics.displacement().tobytes() == fresh.displacement().tobytes()
 
@@ -459,7 +462,7 @@ def test_workers_that_give_up_waiting_go_on_to_the_same_bits(
 ) -> None:
     """As where another program has a core: in launch after launch, and then by one worker for some time."""
     made = scene(sheet={**SHEET, "points": [21, 19], "fixed": ["top"]}, time={"precision": "f32"})
-    alone = Dynamics(made, device)
+    alone = dynamics_of(made, device)
     steps = (3, 200, 1, 77, 400, 5)
     for count in steps:
         alone.advance(count)
@@ -467,7 +470,11 @@ def test_workers_that_give_up_waiting_go_on_to_the_same_bits(
     monkeypatch.setattr(kernel_cpu, "SHORTEST_REST", 0.001)
     monkeypatch.setattr(kernel_cpu, "LONGEST_REST", 0.002)
     for workers, depth in ((2, 1), (2, 4), (3, 2)):
-        together = Dynamics(made, device, replace(structure(made, device), workers=workers, depth=depth))
+        together = dynamics_of(
+            made,
+            device,
+            replace(structure_of(made, device), workers=workers, depth=depth),
+        )
         for count in steps:
             together.advance(count)
             time.sleep(0.003)
@@ -478,19 +485,19 @@ def test_workers_that_give_up_waiting_go_on_to_the_same_bits(
 def test_a_second_sheet_of_the_same_terms_compiles_nothing(device: Device, monkeypatch: pytest.MonkeyPatch) -> None:
     """Whatever its size and its numbers."""
     first, other = scene(), scene(sheet={**SHEET, "points": [30, 17], "mass": 3e-3}, damping=0.5)
-    Dynamics(first, device).compile()
+    dynamics_of(first, device).compile()
 
     def compiled(*_: object, **__: object) -> None:
         raise AssertionError("compiled again")
 
     monkeypatch.setattr("taichi.lang.kernel_impl.transform_tree", compiled)
-    dynamics = Dynamics(other, device)
+    dynamics = dynamics_of(other, device)
     dynamics.advance(5)
     dynamics.displacement()
 
 
 def test_damping_of_0_is_left_out(device: Device) -> None:
     # Not multiplied by 1: what a scene does not use is not in its kernel.
-    assert not structure(scene(damping=0), device).code.damped
-    assert structure(scene(), device).code.damped
+    assert not structure_of(scene(damping=0), device).code.damped
+    assert structure_of(scene(), device).code.damped
     assert_like_twin(scene(damping=0, time={"duration": 0.08}), device)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -13,9 +14,9 @@ import pytest
 from taichi_msm import load_scene, resume, run, runner
 from taichi_msm.physics import workload
 from taichi_msm.physics.run_progress import RunProgress
-from taichi_msm.physics.timestep import steps_per_frame, with_time
+from taichi_msm.physics.timestep import time_grid, with_time
 from taichi_msm.physics.warnings import notes
-from taichi_msm.physics.workload import affords_pilot, precision
+from taichi_msm.physics.workload import affords_pilot
 from taichi_msm.results.record import RunRecord
 from taichi_msm.scene import Scene
 from taichi_msm.system.runtime import Device
@@ -54,8 +55,7 @@ def test_a_run_says_how_wrong_it_is(overrides: Sequence[str], small: Path, devic
     made = load_scene("small.yaml", [*SHORT, *overrides])
     record = run(made, "out", threads=device.threads)
     found = told(record)
-    with_it = with_time(made, precision=record["precision"])
-    error = true_error(with_it, device, fine=32)
+    error = true_error(made, time_grid(made), device, fine=32)
     # Outside, 0.89 to 1.5 were found over 98 scenes.
     assert 0.8 * error < found < 1.5 * error
     assert record["notes"][0].startswith(f"error {found:.1g} of the largest displacement")
@@ -67,7 +67,7 @@ def test_an_estimate_can_be_left_out_or_asked_for(small: Path, device: Device, m
     record = run(made, "out", threads=device.threads, estimate_error=False)
     assert (record["error_estimate"], record["error_estimate_reason"]) == (None, "not asked for")
     assert "pilot" not in record["timings"]
-    monkeypatch.setattr(runner, "affords_pilot", lambda scene, ratio: False)
+    monkeypatch.setattr(runner, "affords_pilot", lambda scene, grid, ratio: False)
     record = run(made, "out", threads=device.threads)
     assert record["error_estimate"] is None
     assert record["error_estimate_reason"].startswith("it would take more than a third of the run")
@@ -98,13 +98,14 @@ def test_a_run_that_is_wrong_says_what_helps() -> None:
     from taichi_msm.physics.error_control import Estimate
 
     def said(error: float, rounding: float, in_f64: float) -> list[str]:
-        return list(notes(scene(), MOVED, Estimate(10, error, rounding, in_f64, 2)))
+        return list(notes(scene(), time_grid(scene()), MOVED, Estimate(10, error, rounding, in_f64, 2)))
 
     assert len(said(0.009, 0.0, 0.009)) == 1
     (_, step) = said(0.04, 0.0, 0.04)
     # 24 steps a frame make a quarter of the error, and a third as many again half of that.
     found = float(step.removeprefix("the run is about 4 % wrong; try time.step: "))
-    assert steps_per_frame(with_time(scene(), step=found)) == math.ceil(steps_per_frame(scene()) * 8**0.5)
+    tried = time_grid(with_time(scene(), step=found))
+    assert tried.steps_per_frame == math.ceil(time_grid(scene()).steps_per_frame * 8**0.5)
     (first, rounding) = said(0.03, 0.03, 1e-4)
     assert first == "error 0.03 of the largest displacement (step 0.0001, rounding 0.03)"
     assert rounding == (
@@ -117,7 +118,11 @@ def test_a_small_run_is_in_f64_and_a_large_one_in_f32() -> None:
         time = {"duration": frames / 25, "precision": "auto"}
         return scene(sheet={"points": [points, points], "size": [0.3, 0.3], "mass": 1e-3}, time=time, **keys)
 
+    def precision(scene: Scene, arch: str = "cpu") -> str:
+        return time_grid(scene, arch).precision
+
     assert precision(made(61, 30)) == "f64"
+    assert precision(made(61, 30), "cuda") == "f32"
     assert precision(made(1024, 30)) == "f32"
     assert precision(with_time(made(61, 30), precision="f32")) == "f32"
     assert precision(with_time(made(1024, 30), tolerance=1e-3)) == "f64"
@@ -126,16 +131,16 @@ def test_a_small_run_is_in_f64_and_a_large_one_in_f32() -> None:
     drawn = made(edge, 30, image="a.png", output=["png"])
     assert precision(drawn) == "f64"
     # The work is counted, and not timed.
-    steps = 30 * steps_per_frame(made(edge, 30)) * edge**2
+    steps = 30 * time_grid(made(edge, 30)).steps_per_frame * edge**2
     assert workload.DOUBLE * steps > workload.SMALL * workload.START >= workload.DOUBLE * steps * (1 - 3 / edge)
 
 
 def test_a_pilot_is_taken_while_it_is_a_third_of_the_run() -> None:
     small = scene(probes=[PRESS], time={"precision": "auto"})
-    assert affords_pilot(small, 2)
+    assert affords_pilot(small, time_grid(small), 2)
     large = scene(sheet={"points": [2000, 2000], "size": [0.3, 0.3], "mass": 1e-3}, time={"precision": "auto"})
-    assert not affords_pilot(large, 2)
-    assert not affords_pilot(with_time(large, precision="f64"), 2)
+    assert not affords_pilot(large, time_grid(large), 2)
+    assert not affords_pilot(large, replace(time_grid(large), precision="f64"), 2)
 
 
 @pytest.mark.parametrize("difference", ["central", "backward"])
@@ -145,5 +150,5 @@ def test_a_tolerance_is_met_with_either_difference(difference: str, small: Path,
     assert told(record) <= 2e-3
     assert record["error_estimate"] is not None
     assert record["error_estimate"]["order"] == (2 if difference == "central" else 1)
-    chosen = with_time(made, step=record["step"], tolerance=None, precision=record["precision"])
-    assert true_error(chosen, device, fine=32) <= 3e-3
+    grid = replace(time_grid(made), steps_per_frame=record["steps_per_frame"])
+    assert true_error(made, grid, device, fine=32) <= 3e-3

@@ -19,12 +19,12 @@ from taichi_msm.physics.divergence import MOST_SHEET_SIZES
 from taichi_msm.physics.error_control import estimate_error
 from taichi_msm.physics.material import material
 from taichi_msm.physics.probe_force import probe_force
-from taichi_msm.physics.solver import Dynamics
-from taichi_msm.physics.timestep import stable_step, step, steps_per_frame, with_steps
+from taichi_msm.physics.timestep import stable_step, time_grid
 from taichi_msm.scene import Scene
 from taichi_msm.scenefile.load import load_scene
 from taichi_msm.simulation import Simulation
 from taichi_msm.system.runtime import Device
+from tests.motion import dynamics_of, frames
 
 Array = NDArray[np.float64]
 
@@ -53,17 +53,6 @@ def in_double(scene: Scene) -> Scene:
     return changed(scene, time={"precision": "f64"})
 
 
-def motion(scene: Scene, device: Device) -> Array:
-    """Displacements of every frame but that at rest, shape (F, rows, cols, 3)."""
-    dynamics = Dynamics(scene, device)
-    frames = []
-    for _ in range(scene.time.frames):
-        dynamics.advance(steps_per_frame(scene))
-        frames.append(dynamics.displacement().astype(float))
-    dynamics.close()
-    return np.array(frames)
-
-
 def longest(vectors: Array) -> float:
     return float(np.linalg.norm(vectors, axis=-1).max())
 
@@ -73,7 +62,7 @@ def truth(scene: Scene, cut: int, device: Device) -> tuple[Array, float]:
 
     The extrapolation's own error is of order 4: far below a third of this doubt, which is the error of the finer run.
     """
-    coarse, fine = (motion(with_steps(in_double(scene), n * cut), device) for n in (8, 16))
+    coarse, fine = (frames(in_double(scene), device, n * cut) for n in (8, 16))
     exact = fine + (fine - coarse) / 3
     return exact, longest(fine - coarse) / longest(exact)
 
@@ -83,7 +72,7 @@ def test_the_cases_are_as_hard_as_they_say(root: Path) -> None:
     assert (stiff.across, stiff.shear) == pytest.approx((1e4 * paper.across, 1e4 * paper.shear))
     assert max(percent for _, percent in hard("overload").probes[0].load) == 1000
     damped = hard("overdamped")
-    assert material(damped).drag * step(damped) > 2
+    assert material(damped).drag * time_grid(damped).step > 2
     assert damped.time.damping_difference == "central"
     for path in FOLDER.glob("*.yaml"):
         scene = load_scene(path)
@@ -93,9 +82,9 @@ def test_the_cases_are_as_hard_as_they_say(root: Path) -> None:
 @pytest.mark.parametrize("name", SHORT)
 def test_the_error_is_small_and_known(name: str, device: Device) -> None:
     scene = hard(name)
-    exact, doubt = truth(scene, steps_per_frame(scene), device)
-    error = longest(motion(scene, device) - exact) / longest(exact)
-    estimate = estimate_error(scene, device)
+    exact, doubt = truth(scene, time_grid(scene).steps_per_frame, device)
+    error = longest(frames(scene, device) - exact) / longest(exact)
+    estimate = estimate_error(scene, time_grid(scene), device)
     assert estimate.order == 2
     # At order 2 the runs at 8 and 16 times the steps differ by (1/64 - 1/256) of the error at once: 1/85.
     assert doubt < estimate.error / 16, "the reference has converged"
@@ -104,13 +93,13 @@ def test_the_error_is_small_and_known(name: str, device: Device) -> None:
     # Half a pixel where the sheet is 100 pixels wide and moves by a fifth of that: not to be seen.
     assert estimate.error < 0.025
     # A step in f32 rounds once the displacement, and the roundings of all steps to one side would be this.
-    assert estimate.rounding < F32 * scene.time.frames * steps_per_frame(scene)
+    assert estimate.rounding < F32 * time_grid(scene).steps
 
 
 @pytest.mark.parametrize("name", SHORT)
 def test_only_the_pinch_is_noted(name: str, device: Device) -> None:
     scene = hard(name)
-    largest = longest(motion(scene, device))
+    largest = longest(frames(scene, device))
     with Simulation(scene, device.arch, device.threads) as run:
         run.advance(scene.time.frames)
         assert (run.progress.shortest_spring < 0.5) == (name == "pinch")
@@ -122,9 +111,10 @@ def test_only_the_pinch_is_noted(name: str, device: Device) -> None:
 @pytest.mark.parametrize("name", SHORT)
 def test_the_kernel_is_like_the_twin(name: str, device: Device) -> None:
     scene = in_double(hard(name))
-    steps = min(scene.time.frames * steps_per_frame(scene), TWIN_STEPS_OF_POINTS // math.prod(scene.sheet.points))
-    twin = next(u for n, u in enumerate(reference.displacements(scene)) if n == steps)
-    dynamics = Dynamics(scene, device)
+    grid = time_grid(scene)
+    steps = min(grid.steps, TWIN_STEPS_OF_POINTS // math.prod(scene.sheet.points))
+    twin = next(u for n, u in enumerate(reference.displacements(scene, grid)) if n == steps)
+    dynamics = dynamics_of(scene, device)
     dynamics.advance(steps)
     difference = longest(dynamics.displacement() - twin)
     dynamics.close()
@@ -160,7 +150,7 @@ def test_other_units_give_the_same_bits(name: str, metres: float, seconds: float
             "probes": (probe.model_copy(update={"force": (0.0, 0.0, here), "falloff": there, "load": load}),),
         }
     )
-    plain, scaled = motion(scene, device), motion(other, device)
+    plain, scaled = frames(scene, device), frames(other, device)
     assert plain.any()
     assert (scaled / metres).tobytes() == plain.tobytes()
 
@@ -168,9 +158,9 @@ def test_other_units_give_the_same_bits(name: str, metres: float, seconds: float
 @pytest.mark.parametrize("name", ["on_point", "between_points"])
 def test_a_load_on_the_axes_keeps_the_sheet_symmetric(name: str, device: Device) -> None:
     scene = hard(name)
-    u = motion(scene, device)
+    u = frames(scene, device)
     # Forces are summed in another order on the other side: a rounding a step, at worst all to one side.
-    tolerance = F32 * scene.time.frames * steps_per_frame(scene) * longest(u)
+    tolerance = F32 * time_grid(scene).steps * longest(u)
     assert longest(u - u[:, :, ::-1] * [-1, 1, 1]) <= tolerance, "left and right"
     assert longest(u - u[:, ::-1] * [1, -1, 1]) <= tolerance, "top and bottom"
     assert longest(u + u.swapaxes(1, 2)[..., [1, 0, 2]] * [1, 1, -1]) <= tolerance, "rows and columns"
@@ -190,8 +180,8 @@ def test_adrift_moves_its_centre_of_mass_as_one_body(device: Device) -> None:
     pushed = np.minimum(t, probe.load[-1][0])
     way = a * pushed**2 / 2 + a * pushed * (t - pushed)
     assert way[-1] > MOST_SHEET_SIZES * max(scene.sheet.size), "would be taken for diverged if something held it"
-    centre = motion(scene, device).mean(axis=(1, 2))
-    rounding = F32 * scene.time.frames * steps_per_frame(scene) * way[-1]
+    centre = frames(scene, device).mean(axis=(1, 2))
+    rounding = F32 * time_grid(scene).steps * way[-1]
     np.testing.assert_allclose(centre[:, 0], way, rtol=0, atol=rounding)
     np.testing.assert_allclose(centre[:, 1:], 0, rtol=0, atol=rounding)
 
@@ -208,8 +198,8 @@ def test_jumping_is_one_tool_let_go_and_another_taken(device: Device) -> None:
         probe.model_copy(update={"at": one, "load": (*before, (at, 100.0), (at, 0.0))}),
         probe.model_copy(update={"at": two, "load": ((at, 0.0), (at, 100.0), *after)}),
     )
-    u = motion(scene, device)
-    assert u.tobytes() == motion(scene.model_copy(update={"probes": tools}), device).tobytes()
+    u = frames(scene, device)
+    assert u.tobytes() == frames(scene.model_copy(update={"probes": tools}), device).tobytes()
 
 
 def shadow_energy(scene: Scene, before: Array, after: Array) -> float:
@@ -217,7 +207,7 @@ def shadow_energy(scene: Scene, before: Array, after: Array) -> float:
 
     m v^2 / 2 + V(x) + h^2 (|F(x)|^2 / (12 m) - v V''(x) v / 24)    Hairer, Lubich, Wanner 2003, Acta Numerica 12
     """
-    h, m = step(scene), material(scene).mass
+    h, m = time_grid(scene).step, material(scene).mass
     v, middle = (after - before) / h, (before + after) / 2
 
     def force(u: Array) -> Array:
@@ -239,13 +229,13 @@ def shadow_energy(scene: Scene, before: Array, after: Array) -> float:
 @pytest.mark.parametrize("name", sorted(LONG))
 def test_a_million_steps_keep_the_energy(name: str, device: Device) -> None:
     scene = hard(name)
-    steps = steps_per_frame(scene)
-    assert scene.time.frames * steps == 10**6
-    assert step(scene) / stable_step(scene) == pytest.approx({"limit": 0.99, "undamped": 0.495}[name], rel=1e-4)
-    dynamics = Dynamics(scene, device)
+    grid, limit = time_grid(scene), stable_step(scene)
+    assert grid.steps == 10**6
+    assert grid.step / limit == pytest.approx({"limit": 0.99, "undamped": 0.495}[name], rel=1e-4)
+    dynamics = dynamics_of(scene, device)
     energy, reach = [], []
     for _ in range(scene.time.frames):
-        dynamics.advance(steps - 1)
+        dynamics.advance(grid.steps_per_frame - 1)
         before = dynamics.displacement().astype(float)
         dynamics.advance(1)
         after = dynamics.displacement().astype(float)
@@ -255,7 +245,7 @@ def test_a_million_steps_keep_the_energy(name: str, device: Device) -> None:
     # The shadow energy of a mode of frequency w swings by theta^4 / 24 / (1 - theta^2 / 4) with theta = w h: 5 %, far
     # below the limit, if all of the energy were in the highest mode.
     if name == "undamped":
-        theta = 2 * step(scene) / stable_step(scene)
+        theta = 2 * grid.step / limit
         assert max(energy) / min(energy) < 1 + theta**4 / 24 / (1 - theta**2 / 4)
     # At the limit it is no bound, but what is unstable grows in every step: here by less than ln 2 / (5 10^5).
     half = len(energy) // 2
@@ -263,4 +253,4 @@ def test_a_million_steps_keep_the_energy(name: str, device: Device) -> None:
         assert max(values[half:]) < 2 * max(values[:half])
     # Where single points are is not known after so long; and the estimate says so, already after a tenth.
     tenth = changed(scene, time={"duration": scene.time.duration / 10})
-    assert estimate_error(tenth, device).error > 0.5
+    assert estimate_error(tenth, time_grid(tenth), device).error > 0.5

@@ -19,11 +19,11 @@ import pytest
 from PIL import Image
 
 from taichi_msm.errors import SceneError
-from taichi_msm.physics.solver import Dynamics
 from taichi_msm.render.texture import image_size, load_texture
 from taichi_msm.scene import Scene
 from taichi_msm.scenefile.load import load_scene
 from taichi_msm.system.runtime import Device
+from tests.motion import dynamics_of
 from tests.mutation import damaged_picture, damaged_text
 from tests.scenes import SHEET, SPRINGS, speckle
 
@@ -229,7 +229,7 @@ def test_a_scene_that_keeps_every_rule_runs(tries: int, here: Path, device: Devi
     for _ in range(tries):
         text = write(valid_scene(rng))
         Path("valid.yaml").write_text(text)
-        dynamics = Dynamics(load_scene("valid.yaml"), device)
+        dynamics = dynamics_of(load_scene("valid.yaml"), device)
         dynamics.advance(3)
         displacement = dynamics.displacement()
         dynamics.close()

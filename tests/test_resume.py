@@ -155,7 +155,7 @@ def test_the_same_run_typed_again_goes_on(small: Path, device: Device) -> None:
     assert run(made, "parts", threads=device.threads)["resumed"] == left["frames"]
     assert results(small / "parts") == results(small / "whole")
     assert not (small / "parts" / ".partial").exists()
-    with pytest.raises(FilesError, match="parts: there is no unfinished run to go on with"):
+    with pytest.raises(FilesError, match="parts: there is no unfinished run to resume"):
         resume("parts", threads=device.threads)
 
 
@@ -218,10 +218,12 @@ def test_another_picture_or_version_is_not_gone_on_with(
     others = {**runner.versions(), "taichi": "1.7.99"}
     with monkeypatch.context() as patch:
         patch.setattr(runner, "versions", lambda: others)
-        with pytest.raises(FilesError, match=r"^the run was begun with taichi 1\.7\.\d; take these, or run the scene"):
+        with pytest.raises(
+            FilesError, match=r"^the run began with taichi 1\.7\.\d; use these versions, or run the scene"
+        ):
             resume("parts", threads=device.threads)
     Image.fromarray(speckle(30, 40, 1)).save(small / "speckle.png")
-    with pytest.raises(FilesError, match=r"^speckle\.png is another picture than when the run began; run the scene"):
+    with pytest.raises(FilesError, match=r"^speckle\.png has changed since the run began; run the scene"):
         resume("parts", threads=device.threads)
     assert files(small / "parts") == before
 

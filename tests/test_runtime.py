@@ -12,9 +12,9 @@ from typing import Any
 import pytest
 
 from taichi_msm.physics.lattice import rest_positions
-from taichi_msm.physics.solver import Dynamics
 from taichi_msm.render.rasterizer import Drawing
 from taichi_msm.system import resources, runtime
+from tests.motion import dynamics_of
 from tests.scenes import SHEET, scene, speckle
 
 # Start, make every thread of the pool work, and tell of each thread its processor time [ticks] and its cores.
@@ -79,7 +79,7 @@ def test_a_process_may_have_many_sheets_and_gets_their_memory_back(device: runti
     sizes = []
     for _ in range(3):
         for _ in range(100):
-            sheets.append(Dynamics(made, device))
+            sheets.append(dynamics_of(made, device))
             sheets.append(Drawing(made, texture))
         sheets[-2].advance(1)
         sheets[-1].draw(rest_positions(made.sheet))
@@ -94,6 +94,7 @@ def test_a_process_may_have_many_sheets_and_gets_their_memory_back(device: runti
 ELSEWHERE = """
 import os, threading, warnings
 from taichi_msm import MsmError, Simulation
+from tests.motion import dynamics_of
 from tests.scenes import scene
 
 simulation = Simulation(scene())

@@ -19,7 +19,7 @@ from taichi_msm import load_scene, run
 from taichi_msm.errors import FilesError, SceneError
 from taichi_msm.physics.lattice import rest_positions
 from taichi_msm.physics.loads import schedule
-from taichi_msm.physics.timestep import steps_per_frame
+from taichi_msm.physics.timestep import time_grid
 from taichi_msm.system.runtime import Device
 from taichi_msm.viewer import captures
 from taichi_msm.viewer import session as live_session
@@ -195,8 +195,8 @@ def test_virtual_springs_vanish_when_the_tool_is_released(begin: Begin) -> None:
     session.handle(Release())
     advance(session, 1)
     recorded = session.recorded()
-    count = steps_per_frame(recorded)
-    active = schedule(recorded, 0, 16 * count).active
+    count = time_grid(recorded).steps_per_frame
+    active = schedule(recorded, time_grid(recorded), 0, 16 * count).active
     assert (active[: 15 * count] == 1).all()
     assert active[15 * count] == 0.5, "the mean at the instant of the release"
     assert (active[15 * count + 1 :] == 0).all()
@@ -494,7 +494,7 @@ def test_a_given_step_stays(small: Path) -> None:
     scene = load_scene("small.yaml", {"time.frames_per_second": 20, "time.duration": 1, "time.step": 0.002})
     live, parts = with_live_frames(scene)
     assert parts == 1, "25 steps a frame cannot be cut into three frames, nor two"
-    assert steps_per_frame(live) == 25
+    assert time_grid(live).steps_per_frame == 25
 
 
 @pytest.mark.parametrize(

@@ -7,10 +7,9 @@ import numpy as np
 import pytest
 
 from taichi_msm import reference
-from taichi_msm.physics import workload
 from taichi_msm.physics.lattice import rest_positions
 from taichi_msm.physics.material import highest_frequency, material
-from taichi_msm.physics.timestep import problems, stable_step, step, steps_per_frame
+from taichi_msm.physics.timestep import problems, stable_step, time_grid
 from tests.scenes import SHEET, scene
 
 
@@ -30,7 +29,7 @@ def test_limit_of_backward_differences() -> None:
 
 def test_without_springs_nothing_limits_but_backward_damping() -> None:
     assert stable_step(scene(springs={})) == math.inf
-    assert steps_per_frame(scene(springs={})) == 1
+    assert time_grid(scene(springs={})).steps_per_frame == 1
     damped = scene(springs={}, sheet={**SHEET, "mass": 2}, damping=8.0, time={"damping_difference": "backward"})
     assert stable_step(damped) == pytest.approx(2 / (8.0 / 2), rel=1e-14)
 
@@ -54,8 +53,8 @@ def test_auto_is_the_largest_whole_fraction_within_half_the_limit(limit_per_fram
     # m = 8 k h^2 / 4 makes 2 / w = h; a frame is 1/25 s.
     h = 1 / 25 / limit_per_frame
     made = scene(sheet={**SHEET, "mass": 2 * 3.0 * h * h}, springs={"structural": 3.0})
-    n = steps_per_frame(made)
-    assert step(made) <= stable_step(made) / 2 * (1 + 1e-9)
+    n = time_grid(made).steps_per_frame
+    assert time_grid(made).step <= stable_step(made) / 2 * (1 + 1e-9)
     assert n == 1 or 1 / 25 / (n - 1) > stable_step(made) / 2
 
 
@@ -86,7 +85,7 @@ def test_what_f32_cannot_hold_is_refused(said: str, changes: dict[str, Any]) -> 
     sections = {"sheet": {**SHEET, "points": [11, 11], **changes}, "springs": {"structural": 3.0}}
     sections |= {"time": {"frames_per_second": 1e3, "step": 1e-3}} if "mass" in changes else {}
     single = scene(**sections | {"time": {**sections.get("time", {}), "precision": "f32"}})
-    (problem,) = workload.problems(single)
+    (problem,) = problems(single)
     assert str(problem).startswith(said)
     assert "f64" in str(problem)
-    assert not list(workload.problems(scene(**sections)))
+    assert not list(problems(scene(**sections)))

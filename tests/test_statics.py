@@ -11,11 +11,11 @@ from scipy.optimize import root
 from taichi_msm import reference
 from taichi_msm.physics.lattice import fixed_points
 from taichi_msm.physics.loads import loads_at
-from taichi_msm.physics.solver import Dynamics
 from taichi_msm.physics.state import State
-from taichi_msm.physics.timestep import step, steps_per_frame
+from taichi_msm.physics.timestep import time_grid
 from taichi_msm.scene import Scene
 from taichi_msm.system.runtime import Device
+from tests.motion import dynamics_of
 from tests.scenes import SPRINGS, scene
 
 SHEET = {"points": [6, 7], "size": [0.3, 0.4], "mass": 1e-3}
@@ -32,8 +32,8 @@ def residual(made: Scene, moving: NDArray[np.float64]) -> NDArray[np.float64]:
 def test_a_sheet_comes_to_rest_where_the_forces_balance(device: Device) -> None:
     probe = {"at": [0.4, 0.6], "force": [0.01, 0.02, -0.1], "load": [[0, 0], [0.1, 100]], "falloff": 20, "offset": 0}
     made = scene(sheet=SHEET, probes=[probe], damping=0.05, time={"duration": 12.0})
-    dynamics = Dynamics(made, device)
-    dynamics.advance(made.time.frames * steps_per_frame(made))
+    dynamics = dynamics_of(made, device)
+    dynamics.advance(time_grid(made).steps)
     u = dynamics.displacement()
     dynamics.close()
     moving = u[~fixed_points(made.sheet)].ravel()
@@ -47,19 +47,19 @@ def test_a_sheet_comes_to_rest_where_the_forces_balance(device: Device) -> None:
 def test_small_motions_have_the_frequencies_of_the_stiffness(device: Device) -> None:
     springs = {**SPRINGS, "virtual_active": "always"}
     made = scene(sheet=SHEET, springs=springs, probes=[], damping=0, time={"duration": 0.4})
-    free, h, m = ~fixed_points(made.sheet), step(made), made.sheet.mass
+    free, grid, m = ~fixed_points(made.sheet), time_grid(made), made.sheet.mass
     size, small = 3 * int(free.sum()), 1e-7
     rows = [(residual(made, small * one) - residual(made, -small * one)) / (2 * small) for one in np.eye(size)]
     stiffness = -np.array(rows)
     values, vectors = np.linalg.eigh((stiffness + stiffness.T) / 2)
-    dynamics, steps = Dynamics(made, device), made.time.frames * steps_per_frame(made)
+    dynamics = dynamics_of(made, device)
     for mode in (0, size // 2, size - 1):
-        theta = 2 * math.asin(math.sqrt(values[mode] / m) * h / 2)
+        theta = 2 * math.asin(math.sqrt(values[mode] / m) * grid.step / 2)
         shape = np.zeros((*made.sheet.points, 3))
         # So small that what is not linear in it is less than rounding, and far above that.
         shape[free] = 1e-9 * vectors[:, mode].reshape(-1, 3)
-        dynamics.restart(made, State(1, shape, shape * (1 - math.cos(theta))))
-        dynamics.advance(steps)
+        dynamics.restart(made, grid, State(1, shape, shape * (1 - math.cos(theta))))
+        dynamics.advance(grid.steps)
         found = float((dynamics.displacement() * shape).sum() / (shape * shape).sum())
-        assert abs(found - math.cos(steps * theta)) < 1e-5, mode
+        assert abs(found - math.cos(grid.steps * theta)) < 1e-5, mode
     dynamics.close()

@@ -13,11 +13,11 @@ from pydantic import BaseModel
 from taichi_msm import reference
 from taichi_msm.physics.lattice import rest_positions
 from taichi_msm.physics.mesh_error import with_points
-from taichi_msm.physics.solver import Dynamics, structure
-from taichi_msm.physics.timestep import stable_step, step, steps_per_frame, with_steps, with_time
+from taichi_msm.physics.solver import Dynamics
+from taichi_msm.physics.timestep import stable_step, time_grid, with_time
 from taichi_msm.runner import run
 from taichi_msm.scene import Scene
-from taichi_msm.study import measure, pictures
+from taichi_msm.study import measure, pictures, terms
 from taichi_msm.study.peer import TooSlowError, solve
 from taichi_msm.study.pictures import PictureStudy
 from taichi_msm.study.points import ROUNDS as POINTS_ROUNDS
@@ -26,6 +26,8 @@ from taichi_msm.study.result import Drawn, Stepping, Study, Timing
 from taichi_msm.study.stepping import MARGIN, ROUNDS, SteppingStudy, observed_orders
 from taichi_msm.study.terms import TermStudy, variants
 from taichi_msm.system.runtime import Device
+from taichi_msm.timegrid import TimeGrid
+from tests.motion import frames_on, structure_of
 from tests.scenes import PRESS, SPRINGS, scene, speckle
 
 SOFT_PRESS = {**PRESS, "force": [0, 300, -1000]}
@@ -142,7 +144,7 @@ def test_dop853_gives_up_in_time() -> None:
 
 def test_terms_are_left_out_of_the_kernel(device: Device) -> None:
     made = scene(probes=[PRESS, PRESS])
-    shapes = {name: structure(variant, device).code for name, variant in variants(made)}
+    shapes = {name: structure_of(variant, device).code for name, variant in variants(made)}
     assert list(shapes) == [
         "",
         "springs.structural",
@@ -159,8 +161,23 @@ def test_terms_are_left_out_of_the_kernel(device: Device) -> None:
     assert not shapes["springs.virtual"].virtual
     assert not shapes["damping"].damped
     assert len(shapes["probes.1"].slots_move) == 1
-    assert {steps_per_frame(variant) for _, variant in variants(made)} == {steps_per_frame(made)}
     assert list(dict(variants(scene(springs={}, damping=0, probes=[])))) == [""]
+
+
+def test_all_terms_are_timed_on_the_grid_of_the_whole_scene(device: Device, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Without a stiff spring `auto` would take longer steps, and maybe others in f64."""
+    grids = []
+
+    class Recorded(Dynamics):
+        def __init__(self, scene: Scene, grid: TimeGrid, device: Device) -> None:
+            grids.append(grid)
+            super().__init__(scene, grid, device)
+
+    monkeypatch.setattr(terms, "Dynamics", Recorded)
+    made = scene(time={"precision": "auto"})
+    TermStudy(made, device, 0.0001, nothing).run()
+    assert len(grids) == len(list(variants(made)))
+    assert set(grids) == {time_grid(made)} != {time_grid(variant) for _, variant in variants(made)}
 
 
 def test_terms_are_timed(device: Device) -> None:
@@ -211,15 +228,10 @@ def test_the_error_of_points_is_of_order_2(points: PointStudy) -> None:
 
 def test_the_error_of_points_is_that_against_many_more(points: PointStudy, device: Device) -> None:
     many = tissue((65, 65))
-    steps = steps_per_frame(many)
+    grid = time_grid(many)
 
     def displacements(count: int) -> Any:
-        with closing(Dynamics(with_steps(with_points(many, (count, count)), steps), device)) as sheet:
-            frames = []
-            for _ in range(many.time.frames):
-                sheet.advance(steps)
-                frames.append(sheet.displacement())
-        return np.array(frames)
+        return frames_on(with_points(many, (count, count)), grid, device)
 
     exact = displacements(65)
     largest = np.linalg.norm(exact, axis=-1).max()
@@ -374,8 +386,8 @@ def test_the_step_recommended_is_one_that_a_scene_takes() -> None:
     made = Study("press", scene().model_dump(), "complete", 1e-3, {})
     made.stepping = [stepping_point(1e-4, 1.0, step=1 / 25 / 77, steps_per_frame=77)]
     text = made.recommendation()[1].split(": ")[1]
-    assert steps_per_frame(with_time(scene(), step=float(text))) == 77
-    assert step(scene(time={"step": float(text)})) == 1 / (25 * 77)
+    assert time_grid(with_time(scene(), step=float(text))).steps_per_frame == 77
+    assert time_grid(scene(time={"step": float(text)})).step == 1 / (25 * 77)
 
 
 def test_of_one_method_the_largest_step_is_recommended() -> None:

@@ -284,7 +284,7 @@ def test_the_page_has_all_tables(tmp_path: Path) -> None:
     assert ["f32 central", "2.00 ms", "20", "0.000903", "3.00e-06", "30.0 ms (27.0 to 39.0)", "recommended"] in rows
     assert ["f64 central", "62.5 us", "640", "< 8.79e-07", "", "1.60 s (1.44 to 2.08)", ""] in rows
     assert ["1e-06", "< 1.00e-08", "5000", "9.00 s (once)"] in rows
-    assert "An error with < is at most about that" in text
+    assert "An error with < is an approximate upper bound" in text
     assert "Observed orders: f32 central 1.98, f32 backward 1.01" in text
     assert ["2", "1", "55.0 dB", "10", "10.0 ms (9.00 to 13.0)", "recommended"] in rows
     assert ["nothing", "23.0 us (20.7 to 29.9)", "100 %"] in rows
@@ -311,7 +311,7 @@ def test_points_are_reported_beside_their_estimates(tmp_path: Path) -> None:
         ["31 x 31", "162", "0.0209", "0.0217", "11.2 ms (10.1 to 14.6)", "of the scene"],
         ["61 x 61", "317", "< 0.0105", "0.0114", "48.4 ms (43.6 to 62.9)", ""],
     ]
-    assert "An error with < is at most about that" in part
+    assert "An error with < is an approximate upper bound" in part
     with (tmp_path / "study.csv").open(encoding="utf-8", newline="") as file:
         flat = [row for row in csv.DictReader(file) if row["part"] == "points"]
     assert [(row["rows"], row["cols"], row["known"]) for row in flat][2:] == [

@@ -20,15 +20,14 @@ from taichi_msm.physics.error_control import longest
 from taichi_msm.physics.lattice import rest_positions
 from taichi_msm.physics.material import factors, material, stiffness
 from taichi_msm.physics.mesh_error import FEWEST, CubicSampling, MeshPilot, choose_points, coarser
-from taichi_msm.physics.solver import Dynamics, structure
-from taichi_msm.physics.timestep import stable_step, step, steps_per_frame
+from taichi_msm.physics.timestep import stable_step, time_grid
 from taichi_msm.runner import resume, run
 from taichi_msm.scene import Scene
 from taichi_msm.scenefile.load import load_scene
 from taichi_msm.scenefile.validation import checked
 from taichi_msm.simulation import Simulation
 from taichi_msm.system.runtime import Device
-from tests.motion import frames
+from tests.motion import dynamics_of, frames, structure_of
 from tests.outputs import results
 from tests.scenes import random_scene, random_tissue
 from tests.test_dynamics import as_on_a_gpu, simulate
@@ -94,7 +93,7 @@ def test_in_f32_it_is_like_the_twin_but_for_rounding(seed: int, image: str, devi
 
 
 def test_the_random_tissues_have_every_term(image: str, device: Device) -> None:
-    codes = [structure(random_tissue(seed, image), device).code for seed in SEEDS]
+    codes = [structure_of(random_tissue(seed, image), device).code for seed in SEEDS]
     for term in ("mapped", "tense", "bending", "virtual", "damped", "open_edges", "by_area"):
         assert len({getattr(code, term) for code in codes}) == 2, term
     assert {moves for code in codes for moves in code.slots_move} == {False, True}
@@ -106,12 +105,12 @@ def test_the_random_tissues_have_every_term(image: str, device: Device) -> None:
 )
 def test_bands_do_not_change_the_bits(seed: int, image: str, device: Device) -> None:
     made = random_tissue(seed, image)
-    layout = structure(made, device)
+    layout = structure_of(made, device)
     assert layout.code.mapped or layout.code.bending
     plain = simulate(made, device)
     assert simulate(made, device, replace(layout, workers=2)).tobytes() == plain.tobytes()
-    dynamics = Dynamics(made, device, replace(layout, workers=3))
-    for _ in range(made.time.frames * steps_per_frame(made)):
+    dynamics = dynamics_of(made, device, replace(layout, workers=3))
+    for _ in range(time_grid(made).steps):
         dynamics.advance(1)
     assert dynamics.displacement().tobytes() == plain[-1].tobytes()
     dynamics.close()
@@ -125,7 +124,7 @@ def test_the_form_of_a_gpu_gives_the_same_bits(
         monkeypatch.setattr(f"taichi_msm.physics.{module}.STEPS_PER_LAUNCH", 2)
     kernel_gpu._kernels.cache_clear()
     made = random_tissue(seed, image)
-    layout = structure(made, device)
+    layout = structure_of(made, device)
     assert simulate(made, device, as_on_a_gpu(layout)).tobytes() == simulate(made, device).tobytes()
     kernel_gpu._kernels.cache_clear()
 
@@ -133,10 +132,10 @@ def test_the_form_of_a_gpu_gives_the_same_bits(
 @pytest.mark.parametrize("seed", [0, 1, 4, 7])
 def test_the_energy_is_that_of_the_twin(seed: int, image: str, device: Device) -> None:
     made = random_tissue(seed, image)
-    dynamics = Dynamics(made, device)
-    dynamics.advance(2 * steps_per_frame(made))
+    dynamics = dynamics_of(made, device)
+    dynamics.advance(2 * time_grid(made).steps_per_frame)
     state, reading = dynamics.state(), dynamics.read()
-    v = state.difference / step(made)
+    v = state.difference / time_grid(made).step
     mass = reference.sheet(made).mass[..., None]
     expected = float((mass * v * v).sum()) / 2 + reference.energy(made, state.displacement)
     assert reading.energy == pytest.approx(expected, rel=1e-9)
@@ -168,7 +167,9 @@ def test_a_map_of_one_grey_changes_nothing(load: Any, tmp_path: Path, device: De
     Image.new("L", (3, 3), 51).save(tmp_path / "map.png")
     plain = load("tissue.young=6.0e4", "sheet.fixed=none")
     mapped = load("tissue.map={image: map.png, range: [1, 6]}", "sheet.fixed=none")
-    np.testing.assert_allclose(frames(mapped, device), frames(plain, device, steps_per_frame(mapped)), rtol=1e-9)
+    np.testing.assert_allclose(
+        frames(mapped, device), frames(plain, device, time_grid(mapped).steps_per_frame), rtol=1e-9
+    )
 
 
 def test_a_map_is_read_when_a_scene_is_loaded(load: Any, tmp_path: Path) -> None:
@@ -203,14 +204,14 @@ def test_where_the_tool_lets_go_a_tense_sheet_comes_back(load: Any, device: Devi
     assert left() > 0.05, "without tension a flat sheet has no stiffness out of its plane"
 
 
-BOTH = "tissue says already how stiff the sheet is; remove springs or tissue"
+BOTH = "tissue already gives the stiffness of the sheet; remove springs or tissue"
 NO_MASS = "tissue has the mass of density x thickness x area; remove mass"
 DRAG = "0.1 N s/m is per point; with tissue set tissue.damping, in 1/s"
-PER_POINT = "is per point, and more points would dent tissue otherwise; set total, the whole tool's, in newtons"
+PER_POINT = "is per point, so that more points would be pressed deeper; set total, of the whole tool, in newtons"
 LONG = "[13, 40] make cells 3.25 times as long as wide, and tissue allows 1.73 times; try [24, 40]"
 WIDE = "[40, 13] make cells 3.25 times as long as wide, and tissue allows 1.73 times; try [40, 24]"
 OPEN = "1 N/m needs every side fixed; set sheet.fixed: border, or pretension: 0"
-TIGHT = "90 N/m leaves springs no length; take less than 90 N/m, or more young"
+TIGHT = "90 N/m needs springs without length; take less than 90 N/m, or a larger young"
 NO_MAP = "no such file or directory; name a picture that can be read"
 SIZE = (
     "sheet.points: [13, 15] make cells 1.17e+05 times as long as wide, and tissue allows 1.73 times; "
@@ -339,7 +340,7 @@ def test_the_mesh_error_is_that_of_the_points(count: int, load: Any, device: Dev
     made = load(f"sheet.points=[{count}, {count}]", *smooth)
     coarse = coarser(made)
     assert coarse is not None
-    with closing(MeshPilot(made, coarse, device)) as pilot:
+    with closing(MeshPilot(made, time_grid(made), coarse, device)) as pilot:
         for u in (found := frames(made, device)):
             pilot.follow(u, lambda: None)
     fine = frames(load(f"sheet.points=[{4 * count - 3}, {4 * count - 3}]", *smooth), device)[:, ::4, ::4]
@@ -399,7 +400,7 @@ def test_a_run_says_what_its_tool_and_its_points_do(load: Any, device: Device, t
 def test_a_run_that_stretches_too_far_says_so(load: Any, device: Device, tmp_path: Path) -> None:
     record = run(load("probes.0.total=[0, 0, -60]", "tissue.foundation=0"), tmp_path / "out", threads=device.threads)
     assert record["longest_spring"] > 2
-    assert any("times its length, which no tissue bears" in note for note in record["notes"])
+    assert any("times its rest length, which no tissue withstands" in note for note in record["notes"])
 
 
 def test_a_run_with_a_map_goes_on_from_elsewhere(
@@ -427,7 +428,7 @@ def test_a_run_does_not_go_on_with_another_map(load: Any, tmp_path: Path, device
 
     run(made, tmp_path / "out", threads=device.threads, progress=stop_at_the_second_frame)
     Image.new("L", (3, 3), 99).save(tmp_path / "map.png")
-    with pytest.raises(FilesError, match=r"map.png is another map than when the run began"):
+    with pytest.raises(FilesError, match=r"map.png has changed since the run began"):
         resume(tmp_path / "out", threads=device.threads)
 
 

@@ -26,12 +26,12 @@ from taichi_msm.physics.lattice import fixed_points, rest_positions, spacing
 from taichi_msm.physics.loads import loads_at
 from taichi_msm.physics.material import factors, highest_frequency
 from taichi_msm.physics.probe_force import spread
-from taichi_msm.physics.solver import Dynamics
 from taichi_msm.physics.state import State
-from taichi_msm.physics.timestep import stable_step, step, steps_per_frame
+from taichi_msm.physics.timestep import stable_step, time_grid
 from taichi_msm.reference.sheet import sheet as assembled
 from taichi_msm.scene import Probe, Scene
 from taichi_msm.system.runtime import Device
+from tests.motion import dynamics_of
 from tests.scenes import random_tissue, speckle
 from tests.scenes import scene as scene_of_springs
 
@@ -131,10 +131,10 @@ def at_rest(made: Scene, directions: tuple[int, ...]) -> Array:
 
 def assert_rests(made: Scene, displacement: Array, directions: tuple[int, ...], device: Device) -> None:
     """From there its small load moves the sheet in these directions as good as not, by a step of the kernel."""
-    dynamics = Dynamics(made, device)
+    dynamics = dynamics_of(made, device)
     dynamics.advance(1)
     thrown = np.abs(dynamics.state().difference).max()
-    dynamics.restart(made, State(1, displacement, np.zeros_like(displacement)))
+    dynamics.restart(made, time_grid(made), State(1, displacement, np.zeros_like(displacement)))
     dynamics.advance(1)
     # What is not linear in strains of 1e-6 and less.
     assert np.abs(dynamics.state().difference[..., directions]).max() < 1e-5 * thrown
@@ -198,14 +198,14 @@ def test_uniform_strains_have_the_energy_of_plane_stress(ratio: float, device: D
     # Sums over some 100 springs.
     np.testing.assert_allclose(found, expected, rtol=0, atol=1e-13 * MEMBRANE)
     # Of the twin and of the kernel it is the same up to the strain's third power.
-    strain, dynamics = 1e-5, Dynamics(made, device)
+    strain, dynamics = 1e-5, dynamics_of(made, device)
     for number, one in enumerate(strains):
         density = expected[number, number] * strain**2 / 2
         assert reference.energy(made, strain * one) / area == pytest.approx(density, rel=10 * strain)
         # Also at edges and corners, whose points have less of springs and of area.
         everywhere = np.full(made.sheet.points, density)
         np.testing.assert_allclose(reference.energy_density(made, strain * one), everywhere, rtol=10 * strain)
-        dynamics.restart(made, State(1, strain * one, np.zeros_like(one)))
+        dynamics.restart(made, time_grid(made), State(1, strain * one, np.zeros_like(one)))
         assert dynamics.read().energy / area == pytest.approx(density, rel=10 * strain)
     dynamics.close()
 
@@ -319,8 +319,8 @@ def depth(points: int, device: Device) -> float:
     probe = {"total": [0, 0, -2], "radius": 0.004, "falloff": 300, "load": [[0, 0], [0.5, 100]]}
     time = {"duration": 1.0, "frames_per_second": 25}
     made = tissue((points, points), foundation=2e6, damping=40, probes=[probe], time=time)
-    dynamics = Dynamics(made, device)
-    dynamics.advance(made.time.frames * steps_per_frame(made))
+    dynamics = dynamics_of(made, device)
+    dynamics.advance(time_grid(made).steps)
     found = -dynamics.displacement()[..., 2].min()
     dynamics.close()
     return float(found)
@@ -338,8 +338,8 @@ def test_a_thrown_sheet_keeps_its_momenta(term: str, device: Device, tmp_path: P
     terms: dict[str, dict[str, Any]] = {"none": {}, "bending": {"bending": "plate"}, "map": {"map": stiff}}
     thrown = {"at": [0.3, 0.2], "total": [0.2, -0.1, 0.4], "falloff": 40, "load": [[0, 100], [0.04, 100], [0.04, 0]]}
     made = tissue((9, 11), size=(0.08, 0.13), fixed="none", probes=[thrown], **terms[term])
-    mass, rest, h = assembled(made).mass[..., None], rest_positions(made.sheet), step(made)
-    dynamics = Dynamics(made, device)
+    mass, rest, h = assembled(made).mass[..., None], rest_positions(made.sheet), time_grid(made).step
+    dynamics = dynamics_of(made, device)
 
     def momenta() -> Array:
         """The momentum and its moment about the origin, sum of m d / h and of x times that: both kept by the steps."""
@@ -350,11 +350,11 @@ def test_a_thrown_sheet_keeps_its_momenta(term: str, device: Device, tmp_path: P
 
     found = []
     for _ in range(made.time.frames):
-        dynamics.advance(steps_per_frame(made))
+        dynamics.advance(time_grid(made).steps_per_frame)
         found.append(momenta())
     dynamics.close()
     # The tool lets go at the end of the first frame. From then on each step rounds once.
-    rounding = made.time.frames * steps_per_frame(made) * 2.0**-53
+    rounding = time_grid(made).steps * 2.0**-53
     for one in found[2:]:
         for before, after in zip(found[1], one, strict=True):
             np.testing.assert_allclose(after, before, rtol=0, atol=rounding * np.abs(before).max())
@@ -436,7 +436,7 @@ def test_just_under_the_limit_tissue_stays_bounded(name: str, device: Device, tm
         for _ in range(8)
     ]
     time = {"duration": 100_000 * h, "frames_per_second": 1 / (1000 * h), "step": h}
-    dynamics = Dynamics(limited(name, tmp_path, probes=kicks, time=time), device)
+    dynamics = dynamics_of(limited(name, tmp_path, probes=kicks, time=time), device)
     energies = []
     for _ in range(100):
         dynamics.advance(1000)
@@ -461,10 +461,10 @@ def test_a_wide_sheet_gets_the_whole_of_a_tool(fixed: str, device: Device) -> No
     sheet = {"points": [121, 121], "size": [0.1, 0.1], "mass": 1e-5, "fixed": fixed}
     for made in (tissue((121, 121), fixed=fixed, probes=[probe]), scene_of_springs(sheet=sheet, probes=[probe])):
         np.testing.assert_allclose(tool_forces(made).sum(axis=(0, 1)), total, rtol=1e-3)
-        dynamics = Dynamics(made, device)
+        dynamics = dynamics_of(made, device)
         dynamics.advance(1)
         # u_1 = h^2 F / m / 2.
-        force = 2 / step(made) ** 2 * assembled(made).mass[..., None] * dynamics.displacement()
+        force = 2 / time_grid(made).step ** 2 * assembled(made).mass[..., None] * dynamics.displacement()
         dynamics.close()
         np.testing.assert_allclose(force.sum(axis=(0, 1)), total, rtol=1e-3)
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from taichi_msm.physics.loads import Schedule, schedule
-from taichi_msm.physics.timestep import steps_per_frame
+from taichi_msm.physics.timestep import time_grid
 from taichi_msm.scene import Probe, Scene
 from taichi_msm.viewer.tool import RISE, Tool
 from tests.scenes import scene
@@ -23,13 +23,11 @@ def with_probe(probe: Probe, frames: int) -> Scene:
     return base.model_copy(update={"probes": (probe,)})
 
 
-def steps(probe: Probe) -> int:
-    return steps_per_frame(with_probe(probe, 1))
-
-
 def loads(probe: Probe, frame: int) -> Schedule:
     """The loads at the steps of a frame."""
-    return schedule(with_probe(probe, 1), frame * steps(probe), steps(probe))
+    made = with_probe(probe, 1)
+    grid = time_grid(made)
+    return schedule(made, grid, frame * grid.steps_per_frame, grid.steps_per_frame)
 
 
 def percents(hand: Tool, first: int, count: int) -> list[float]:

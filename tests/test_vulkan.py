@@ -37,7 +37,7 @@ from taichi_msm.physics import diagnosis
 from taichi_msm import load_scene, resume, run
 from tests.test_resume import Stop
 
-# Finer steps, of which none goes well, take long here.
+# Finer steps, with all of which it diverges, take long here.
 diagnosis.CUTS = (2,)
 settings = json.loads(sys.argv[1])
 made = load_scene("small.yaml", settings)

@@ -13,5 +13,6 @@ from taichi_msm.system import runtime
 def prepare(problem: Problem, threads: int | None) -> Stepper:
     """Set up the sheet at rest."""
     device = runtime.start("cpu", threads)
-    layout = structure(problem.scene, device)
-    return Dynamics(problem.scene, device, replace(layout, code=replace(layout.code, lanes=vector_bits() // 32)))
+    layout = structure(problem.scene, problem.grid, device)
+    layout = replace(layout, code=replace(layout.code, lanes=vector_bits() // 32))
+    return Dynamics(problem.scene, problem.grid, device, layout)

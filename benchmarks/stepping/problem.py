@@ -22,10 +22,11 @@ from numpy.typing import NDArray
 
 from taichi_msm import reference
 from taichi_msm.physics.lattice import Spring, springs
-from taichi_msm.physics.loads import decay, probe_slots
+from taichi_msm.physics.loads import decay
 from taichi_msm.physics.material import Material, material
-from taichi_msm.physics.timestep import step
+from taichi_msm.physics.timestep import time_grid
 from taichi_msm.scene import Scene
+from taichi_msm.timegrid import TimeGrid
 
 CELL = 0.01
 FORCE = (0.02, 0.01, -0.08)
@@ -72,6 +73,11 @@ class Problem:
         )
 
     @cached_property
+    def grid(self) -> TimeGrid:
+        """The steps."""
+        return time_grid(self.scene)
+
+    @cached_property
     def material(self) -> Material:
         """The numbers of the sheet."""
         return material(self.scene)
@@ -84,7 +90,7 @@ class Problem:
     @cached_property
     def load(self) -> Array:
         """Force on each point, constant in time [N], shape (3, n, n)."""
-        share = decay(probe_slots(self.scene)[0], self.scene)
+        share = decay(self.scene.probes[0], self.scene.sheet)
         return np.array(FORCE, np.float32)[:, None, None] * share.astype(np.float32)
 
     @property
@@ -96,17 +102,17 @@ class Problem:
     @property
     def gain(self) -> float:
         """Displacement for a force [m/N]."""
-        return step(self.scene) ** 2 / self.material.mass / (1 + self._drag)
+        return self.grid.step**2 / self.material.mass / (1 + self._drag)
 
     @property
     def first_gain(self) -> float:
         """The same of the first step."""
-        return step(self.scene) ** 2 / self.material.mass / 2
+        return self.grid.step**2 / self.material.mass / 2
 
     @property
     def _drag(self) -> float:
-        return self.material.drag * step(self.scene) / 2
+        return self.material.drag * self.grid.step / 2
 
     def answer(self, steps: int) -> NDArray[np.float64]:
         """Take the steps by the program's float64 twin; shape (n, n, 3)."""
-        return next(islice(reference.displacements(self.scene), steps, None))
+        return next(islice(reference.displacements(self.scene, self.grid), steps, None))

@@ -1,10 +1,10 @@
-"""Why a run went wrong, and which step would have gone right: it is repeated, and tried with finer steps."""
+"""Why a run diverged, and which step would not have: it is repeated, and then run with finer steps."""
 
 from __future__ import annotations
 
 import math
 import time
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -13,22 +13,22 @@ from taichi_msm.physics.lattice import axes
 from taichi_msm.physics.probe_force import control_points, probe_force
 from taichi_msm.physics.run_progress import RunProgress, Saved
 from taichi_msm.physics.solver import Dynamics
-from taichi_msm.physics.timestep import step, steps_per_frame, with_steps
 from taichi_msm.progress import Pause
 from taichi_msm.scene import Scene
+from taichi_msm.timegrid import TimeGrid
 
-# How much finer the steps are that are tried, and how long that may take in all [s].
+# How many times finer the steps are that are tried, and how long all trials together may take [s].
 CUTS = (2, 4, 8, 16, 32, 64)
 MOST_SECONDS = 10.0
 
 
 @dataclass(frozen=True)
 class Diagnosis:
-    """What is found about a divergence.
+    """What was found out about a divergence.
 
     Attributes:
-        message: the time, the step, the point, the key that most likely did it and the remedy.
-        good: where the run was when it was fine for the last time; None: nothing is known but the start.
+        message: the time, the step, the point, the key that is the most likely cause, and the remedy.
+        good: the last sound state of the run; None: only the start is known to be sound.
     """
 
     message: str
@@ -36,49 +36,48 @@ class Diagnosis:
 
 
 def diagnose(dynamics: Dynamics, start: Saved | None, pause: Pause) -> Diagnosis:
-    """Find out how a run went wrong in the frame at whose end, or within which, it is.
+    """Find out how a run diverged within the current frame.
 
     Args:
-        dynamics: of the run; where it is afterwards is of no use.
-        start: where the run was when it was fine; None: at rest.
-        pause: called often; what it raises stops the search.
+        dynamics: of the run; its state afterwards is arbitrary.
+        start: a sound state of the run; None: at rest.
+        pause: called often; an exception from it stops the search.
     """
-    scene, bad = dynamics.scene, dynamics.steps_done
+    scene, grid, bad = dynamics.scene, dynamics.grid, dynamics.steps_done
     state, progress = start or (None, RunProgress())
-    per_frame, watch = steps_per_frame(scene), Watch(scene, progress)
-    dynamics.restart(scene, state)
+    watch = Watch(scene, grid, progress)
+    dynamics.restart(scene, grid, state)
     low, wrong = dynamics.state(), ""
     while low.steps < bad:
-        dynamics.advance(min(bad, (watch.progress.frame + 1) * per_frame) - low.steps, pause)
+        dynamics.advance(min(bad, (watch.progress.frame + 1) * grid.steps_per_frame) - low.steps, pause)
         wrong = watch.follow(dynamics.read())
         if wrong:
             break
         low = dynamics.state()
     if not wrong:
-        said = "but not when it was repeated: this machine makes errors; go on with --resume"
-        return Diagnosis(f"diverged before {bad * step(scene):.6g} s, step {bad}, {said}", start)
+        said = "but not when it was repeated, so the machine has made an error; continue with --resume"
+        return Diagnosis(f"diverged before {grid.time(bad):.6g} s, step {bad}, {said}", start)
     high = dynamics.steps_done
     while high - low.steps > 1:
-        dynamics.restart(scene, low)
+        dynamics.restart(scene, grid, low)
         dynamics.advance((high - low.steps) // 2, pause)
         if watch.judge(dynamics.read()):
             high = dynamics.steps_done
         else:
             low = dynamics.state()
-    dynamics.restart(scene, low)
+    dynamics.restart(scene, grid, low)
     dynamics.advance(1)
     reading = dynamics.read()
     wrong = watch.judge(reading)
     cause = _cause(dynamics, high, farthest(reading.displacement)[:2], pause)
-    message = f"diverged at {high * step(scene):.6g} s, step {high}: {wrong}; {cause}"
+    message = f"diverged at {grid.time(high):.6g} s, step {high}: {wrong}; {cause}"
     return Diagnosis(message, Saved(low, watch.progress))
 
 
 def _cause(dynamics: Dynamics, bad: int, point: tuple[int, int], pause: Pause) -> str:
-    """Name the key that most likely did it: the step, if a finer one goes well, or else a force."""
-    scene = dynamics.scene
-    per_frame = steps_per_frame(scene)
-    frames = -(-bad // per_frame)
+    """Name the key that is the most likely cause: the step, if a finer one does not diverge, or else a force."""
+    scene, grid = dynamics.scene, dynamics.grid
+    frames = -(-bad // grid.steps_per_frame)
     tried, end = math.inf, time.monotonic() + MOST_SECONDS
 
     def pause_or_stop() -> None:
@@ -87,35 +86,35 @@ def _cause(dynamics: Dynamics, bad: int, point: tuple[int, int], pause: Pause) -
             raise TimeoutError
 
     for cut in CUTS:
-        finer = with_steps(scene, cut * per_frame)
+        finer = replace(grid, steps_per_frame=cut * grid.steps_per_frame)
         try:
-            went_well = _goes_well(dynamics, finer, frames, pause_or_stop)
+            went_well = _goes_well(dynamics, scene, finer, frames, pause_or_stop)
         except TimeoutError:
             break
         if went_well:
-            return f"likely cause: time.step, {step(scene):.6g} s; with {step(finer):.9g} s it goes well here"
-        tried = step(finer)
+            return f"likely cause: time.step, {grid.step:.6g} s; with {finer.step:.9g} s it does not diverge here"
+        tried = finer.step
     index, force = _strongest_probe(scene, point)
     name = "force" if scene.probes[index].total is None else "total"
     said = f"likely cause: probes.{index}.{name}, which reaches {force:.3g} N at this point"
     if tried < math.inf:
-        return f"{said}; take less, as no time.step of {tried:.3g} s or more goes well here"
-    return f"{said}; take less, or a time.step below {step(scene):.6g} s, of which none was tried, as that takes long"
+        return f"{said}; take less, as it diverges with every time.step that was tried, down to {tried:.3g} s"
+    return f"{said}; take less, or a time.step below {grid.step:.6g} s; finer steps would take too long to try here"
 
 
-def _goes_well(dynamics: Dynamics, scene: Scene, frames: int, pause: Pause) -> bool:
-    """Tell whether so many frames from rest go well."""
-    dynamics.restart(scene)
-    watch = Watch(scene)
+def _goes_well(dynamics: Dynamics, scene: Scene, grid: TimeGrid, frames: int, pause: Pause) -> bool:
+    """Tell whether a number of frames from rest are sound."""
+    dynamics.restart(scene, grid)
+    watch = Watch(scene, grid)
     for _ in range(frames):
-        dynamics.advance(steps_per_frame(scene), pause)
+        dynamics.advance(grid.steps_per_frame, pause)
         if watch.follow(dynamics.read()):
             return False
     return True
 
 
 def _strongest_probe(scene: Scene, point: tuple[int, int]) -> tuple[int, float]:
-    """Find the probe that pushes a point hardest at any time, and how hard [N]."""
+    """Find the probe with the largest force on a point at any time, and this force [N]."""
     x, y = axes(scene.sheet)
     rest = np.array([x[point[1]], y[point[0], 0]])
 

@@ -1,18 +1,18 @@
-"""How wrong a run is, by a pilot beside it, and the largest step that is right enough.
+"""The error of a run, estimated by a pilot beside it, and the largest step within a tolerance.
 
-The error of a displacement u_h is taken against Richardson's extrapolation of runs with steps h and h / r in float64:
+The error of a displacement u_h is its distance from Richardson's extrapolation of runs with steps h and h / r in f64:
 
     u* = u_{h/r} + (u_{h/r} - u_h) / (r^p - 1)        p: order of the method, r: `refinement`, mostly 2
 
-so that it holds the error of the scene's own precision too. An error is the largest of any point at any frame, over the
-largest displacement of any point at any frame.
+So it includes the rounding of the run's own precision. Errors are the largest of any point at any frame, relative to
+the largest displacement of any point at any frame.
 """
 
 from __future__ import annotations
 
 import math
 from contextlib import ExitStack, closing
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from itertools import pairwise
 from typing import Any
@@ -25,20 +25,20 @@ from taichi_msm.physics.divergence import farthest_displacement
 from taichi_msm.physics.lattice import rest_positions
 from taichi_msm.physics.material import material
 from taichi_msm.physics.solver import Dynamics
-from taichi_msm.physics.timestep import step, steps_per_frame, with_steps, with_time
-from taichi_msm.physics.workload import precision, with_precision
 from taichi_msm.progress import Count, Pause
 from taichi_msm.scene import LARGEST_TOLERANCE, Scene
 from taichi_msm.system.runtime import Device
+from taichi_msm.timegrid import TimeGrid
 
-# The step found is the largest but for some 10 %: its error is at least this share of the tolerance.
+# The search ends when the error is at least this share of the tolerance: the step is then within about 10 % of the
+# largest possible one.
 CLOSE = 0.75
 
-# The pilot runs of one search, and how much finer each may be than the one before.
+# The largest number of pilot runs in a search, and the largest factor by which steps get finer from one to the next.
 MOST_PILOTS = 12
 LARGEST_CUT = 8.0
 
-# How much finer the other pilot may be; where it must be finer yet, the error is not known.
+# The largest refinement of the fine pilot; if it would have to be finer, the error is not known.
 FINEST = 64
 
 
@@ -47,12 +47,12 @@ class Estimate:
     """What is known about the error of a step.
 
     Attributes:
-        steps_per_frame: the step, as a fraction of a frame.
-        error: largest error, as a fraction of the largest displacement; infinite where it is not known, because a
-            pilot diverged or the step does not resolve the damping.
-        rounding: the part of it that comes from f32, that of the positions in the trajectory included; 0 for f64.
+        steps_per_frame: of the step.
+        error: largest error, as a fraction of the largest displacement; infinite if it is not known because a pilot
+            diverged or the step does not resolve the damping.
+        rounding: the part of the error that comes from f32, including that of positions in the trajectory; 0 in f64.
         in_f64: the error of the same step in f64.
-        order: of the method in this scene and at this step.
+        order: of the method in this scene.
     """
 
     steps_per_frame: int
@@ -63,100 +63,105 @@ class Estimate:
 
 
 def order(scene: Scene) -> int:
-    """Tell the order of the method: 1 with backward differences of a damping, else 2."""
+    """Give the order of the method: 1 with a damping by backward differences, else 2."""
     return 2 if scene.time.damping_difference == "central" or material(scene).drag == 0 else 1
 
 
-def estimate_error(scene: Scene, device: Device, progress: Count = lambda done, total: None) -> Estimate:
-    """Estimate the error of the scene's own step.
+def estimate_error(
+    scene: Scene, grid: TimeGrid, device: Device, progress: Count = lambda done, total: None
+) -> Estimate:
+    """Estimate the error of a run.
 
     Args:
         scene: a checked scene.
+        grid: its steps.
         device: what `runtime.start` returned.
         progress: called with the frames done and the frames in all.
     """
-    with closing(Trials(with_precision(scene, device.arch), device)) as trials:
-        return trials.estimate(steps_per_frame(scene), progress)
+    with closing(Trials(scene, grid, device)) as trials:
+        return trials.estimate(grid.steps_per_frame, progress)
 
 
-def choose_step(scene: Scene, device: Device, progress: Count = lambda done, total: None) -> tuple[Scene, Estimate]:
+def choose_step(
+    scene: Scene, grid: TimeGrid, device: Device, progress: Count = lambda done, total: None
+) -> tuple[TimeGrid, Estimate]:
     """Find the largest stable step whose estimated error is within the scene's tolerance.
 
     Args:
         scene: a checked scene with a tolerance.
+        grid: the scene's steps without the tolerance; no fewer are tried.
         device: what `runtime.start` returned.
         progress: called with the frames done and the frames in all of each pilot run.
 
     Returns:
-        The scene with that step and the precision it is stepped in, and its error.
+        The grid with that step, and its error.
 
     Raises:
-        SceneError: when no step is good enough; says which precision or which tolerance would do.
+        SceneError: when no step meets the tolerance; names a precision or a tolerance that would do.
     """
-    scene = with_precision(scene, device.arch)
     assert scene.time.tolerance is not None
-    with closing(Trials(scene, device)) as trials:
-        found = _search(scene.time.tolerance, steps_per_frame(scene), trials, progress)
-    return with_steps(scene, found.steps_per_frame), found
+    with closing(Trials(scene, grid, device)) as trials:
+        found = _search(scene.time.tolerance, grid.steps_per_frame, trials, progress)
+    return replace(grid, steps_per_frame=found.steps_per_frame), found
 
 
-def refinement(scene: Scene) -> int:
-    """Tell how much finer the other pilot must be: twice, where steps resolve the damping.
+def refinement(scene: Scene, grid: TimeGrid) -> int:
+    """Tell how many times finer than the run the fine pilot must be: 2, unless the damping needs finer steps.
 
-    Where g h / r > 1, with g = C / m, central differences make velocities change their sign at every step, in both
-    pilots alike.
+    If g h / r > 1, with g = C / m, central differences make velocities change their sign at every step, and the
+    difference between the pilots does not show it.
     """
-    return max(2, math.ceil(material(scene).drag * step(scene)))
+    return max(2, math.ceil(material(scene).drag * grid.step))
 
 
 class Pilot:
-    """Runs in float64 beside another one that tell its error frame by frame: with finer steps, and with its own.
+    """Two runs in f64 beside another run, which give its error frame by frame: with finer steps, and with its own.
 
     Args:
-        scene: what is run, with its step.
+        scene: what is run.
+        grid: its steps.
         device: what `runtime.start` returned.
-        cores: how many cores are free for it; None: all. With as many as the run has, nothing is compiled anew.
+        cores: number of cores that stepping may use; None: all. With as many as the run has, its kernels are reused.
 
     Raises:
-        DeviceError: when the device cannot run it in float64.
+        DeviceError: when the device cannot run it in f64.
     """
 
-    def __init__(self, scene: Scene, device: Device, cores: int | None = None) -> None:
-        exact = with_time(scene, precision="f64")
+    def __init__(self, scene: Scene, grid: TimeGrid, device: Device, cores: int | None = None) -> None:
+        self._scene, self._order = scene, order(scene)
         with ExitStack() as opened:
 
             def dynamics() -> Dynamics:
-                made = Dynamics(exact, device, cores=cores)
+                made = Dynamics(scene, replace(grid, precision="f64"), device, cores=cores)
                 opened.callback(made.close)
                 return made
 
             self._fine = dynamics()
-            # What is run in float64 needs no other with its step.
-            self._coarse = None if precision(scene) == "f64" else dynamics()
+            # A run in f64 is itself the coarse pilot.
+            self._coarse = None if grid.precision == "f64" else dynamics()
             self._open = opened.pop_all()
-        self.restart(scene)
+        self.restart(grid)
 
-    def restart(self, scene: Scene) -> None:
-        """Begin again beside another run of the same scene, with its step."""
-        self._scene = scene
-        self._steps, self._ratio, self._order = steps_per_frame(scene), refinement(scene), order(scene)
-        exact = with_time(scene, precision="f64")
+    def restart(self, grid: TimeGrid) -> None:
+        """Begin again beside another run of the same scene, with its steps."""
+        self._steps, self._ratio = grid.steps_per_frame, refinement(self._scene, grid)
+        exact = replace(grid, precision="f64")
         if self._ratio <= FINEST:
-            self._fine.restart(with_steps(exact, self._ratio * self._steps))
+            self._fine.restart(self._scene, replace(exact, steps_per_frame=self._ratio * self._steps))
             if self._coarse:
-                self._coarse.restart(with_steps(exact, self._steps))
+                self._coarse.restart(self._scene, exact)
         self._error = self._rounding = self._in_f64 = self._largest = 0.0
 
     def compile(self) -> None:
-        """Compile now what would be compiled by the first frame."""
+        """Compile now what the first frame would compile."""
         self._fine.compile()
 
     def follow(self, displacement: NDArray[Any], pause: Pause) -> None:
-        """Take the next frame, and compare.
+        """Step to the next frame, and compare.
 
         Args:
-            displacement: of the run at that frame, shape (rows, cols, 3).
-            pause: called some times a second; what it raises stops the pilot for good.
+            displacement: of the run at that frame [m], shape (rows, cols, 3).
+            pause: called several times a second; after an exception from it the pilot cannot continue.
         """
         if self._ratio > FINEST:
             return
@@ -174,13 +179,13 @@ class Pilot:
 
     @property
     def estimate(self) -> Estimate:
-        """What is known by the frames so far."""
+        """What the frames so far show."""
         if self._ratio > FINEST:
             return Estimate(self._steps, math.inf, 0.0, math.inf, self._order)
         farthest = farthest_displacement(self._scene, self._scene.time.duration)
 
         def share(part: float) -> float:
-            # Nothing moves, nothing is wrong; and what is not finite is not known.
+            # If nothing moves, there is no error; an error that is not finite is not known.
             relative = part / self._largest if self._largest > 0 else 0.0
             return relative if relative < math.inf and self._largest <= farthest else math.inf
 
@@ -192,38 +197,37 @@ class Pilot:
 
 
 class Trials:
-    """Runs of a scene with one step after another, each with a pilot beside it."""
+    """Runs of a scene with different steps, one after the other, each with a pilot beside it."""
 
-    def __init__(self, scene: Scene, device: Device) -> None:
-        self._scene = scene
+    def __init__(self, scene: Scene, grid: TimeGrid, device: Device) -> None:
+        self._scene, self._grid = scene, grid
         with ExitStack() as opened:
-            self._pilot = Pilot(scene, device)
+            self._pilot = Pilot(scene, grid, device)
             opened.callback(self._pilot.close)
-            self._own = Dynamics(scene, device)
+            self._own = Dynamics(scene, grid, device)
             opened.callback(self._own.close)
             self._open = opened.pop_all()
 
     def estimate(self, steps: int, progress: Count) -> Estimate:
-        """Run the scene with so many steps a frame.
+        """Run the scene, and estimate its error.
 
         Args:
             steps: steps per frame.
             progress: called with the frames done and the frames in all.
         """
-        scene = with_steps(self._scene, steps)
-        self._pilot.restart(scene)
-        self._own.restart(scene)
-        frames = scene.time.frames
-        for frame in range(frames if refinement(scene) <= FINEST else 0):
-            pause = partial(progress, frame, frames)
+        grid = replace(self._grid, steps_per_frame=steps)
+        self._pilot.restart(grid)
+        self._own.restart(self._scene, grid)
+        for frame in range(grid.frames if refinement(self._scene, grid) <= FINEST else 0):
+            pause = partial(progress, frame, grid.frames)
             pause()
             self._own.advance(steps, pause)
             self._pilot.follow(self._as_written(self._own.displacement()), pause)
         return self._pilot.estimate
 
     def _as_written(self, displacement: NDArray[Any]) -> NDArray[Any]:
-        """Round as the trajectory does, whose positions in f32 have the digits of the sheet's size."""
-        if "trajectory" not in self._scene.output or precision(self._scene) == "f64":
+        """Round as positions in the trajectory are rounded: in f32, relative to the size of the sheet."""
+        if "trajectory" not in self._scene.output or self._grid.precision == "f64":
             return displacement
         rest = rest_positions(self._scene.sheet)
         return (rest + displacement).astype(np.float32) - rest
@@ -234,20 +238,20 @@ class Trials:
 
 
 def longest(vectors: NDArray[Any]) -> float:
-    """Give the length of the longest vector, shape (..., 3); infinite where one is not finite."""
+    """Give the length of the longest vector, shape (..., 3); infinite if one is not finite."""
     with np.errstate(all="ignore"):
         length = math.sqrt(np.einsum("...k,...k->...", vectors, vectors, dtype=np.float64).max())
     return length if length < math.inf else math.inf
 
 
 def _above(error: float) -> float:
-    """Round up to one digit, with some room."""
+    """Round up to one digit, with a margin of 20 %."""
     digit = 10.0 ** math.floor(math.log10(error))
     return float(f"{math.ceil(1.2 * error / digit) * digit:.3g}")
 
 
 def _search(tolerance: float, least: int, trials: Trials, progress: Count) -> Estimate:
-    """Narrow down the steps a frame between too few and enough."""
+    """Search between too few steps per frame and enough."""
     too_few, enough, failures = least - 1, None, []
     steps = least
     for _ in range(MOST_PILOTS):
@@ -270,11 +274,11 @@ def _search(tolerance: float, least: int, trials: Trials, progress: Count) -> Es
 
 
 def _next(found: Estimate, tolerance: float) -> int:
-    """Guess the steps a frame that are just enough, from an error that falls as the step to the power of its order."""
+    """Extrapolate the fewest steps per frame that are enough: the error falls with the order of the method."""
     if found.error == math.inf:
         cut = LARGEST_CUT
     else:
-        # What the step may make of it, beside rounding, and what it does.
+        # The error that the step may make, apart from rounding, and the error that it makes.
         allowed = max((1 + CLOSE) / 2 * tolerance - found.rounding, tolerance / 16)
         made = max(found.error - found.rounding, 0.0)
         cut = min((made / allowed) ** (1 / found.order), LARGEST_CUT)
@@ -282,7 +286,7 @@ def _next(found: Estimate, tolerance: float) -> int:
 
 
 def _stuck(failures: list[Estimate]) -> bool:
-    """Tell whether three times in a row much smaller steps hardly helped."""
+    """Tell whether much smaller steps hardly reduced the error, three times in a row."""
     if len(failures) < 4:
         return False
     return all(
@@ -297,7 +301,7 @@ def _out_of_reach(tolerance: float, failures: list[Estimate]) -> str:
     if best.error == math.inf:
         return (
             f"time.tolerance: {tolerance:g} is out of reach: with {last.steps_per_frame} steps a frame the error is "
-            "not known yet, as runs diverge or a step is longer than the damping; take a weaker load or less damping"
+            "not known, as runs diverge or steps do not resolve the damping; take a weaker load or less damping"
         )
     if last.rounding > CLOSE * tolerance:
         return (
@@ -309,5 +313,5 @@ def _out_of_reach(tolerance: float, failures: list[Estimate]) -> str:
         remedy += f", or a tolerance of {_above(best.error):g}"
     return (
         f"time.tolerance: {tolerance:g} is out of reach: with {last.steps_per_frame} steps a frame the error is still "
-        f"{last.error:.2g}, and it hardly falls any more; {remedy}"
+        f"{last.error:.2g}, and finer steps hardly reduce it; {remedy}"
     )

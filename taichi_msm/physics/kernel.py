@@ -1,19 +1,20 @@
-"""What both forms of kernel 1 are made of: the force of a spring, the step of a point, strains.
+"""What both forms of kernel 1 share: the force of a spring, the step of a point, the measures of a row.
 
-A value of the sheet is a vector of lanes, each of another column; on a GPU of one. Arrays are Taichi's ndarrays of such
-vectors, row after row, each of `width` entries: one for every column of a strip and a halo of one at both ends. The
-arrays are one-dimensional, as every index then takes a few instructions less:
+The values of the sheet are vectors of lanes, each lane of another column; on a GPU a vector has one lane. They lie in
+Taichi's ndarrays row after row. A row has `width` entries: one for every column of a strip, and a halo of one entry at
+both ends. The arrays are one-dimensional, which saves a few instructions for every index:
 
-    u, d         displacements and last differences, three arrays each, of x, y and z
-    by_column    of a first, middle and last row: 1 over the points' share of a cell's mass, 0 where they are fixed; and
-                 their share of its area. Their place across [m]; whether they have a left and a right neighbour
-    decay        of every standing slot, as many rows as the sheet has
-    stiffness    with a map: of every spring along a row, as many rows as the sheet has; of those along a column and of
-                 the diagonals, a row more, with a row of zeros first and last
-    moment       with bending: D dx dy times the Laplacian of u, of rows that are needed
+    u, d         displacements and last differences; three arrays each, for x, y and z
+    by_column    for a first, a middle and a last row: 1 over the points' share of a cell's mass, 0 if they are fixed;
+                 and their share of a cell's area. For all rows: x at rest [m]; whether there is a left neighbour;
+                 whether there is a right one
+    decay        of every standing slot; as many rows as the sheet has
+    stiffness    with a map, of every spring: along rows, as many rows as the sheet has; along columns and diagonals,
+                 one row more, the first and the last of them zeros
+    moment       with bending, D dx dy times the Laplacian of u; only the rows that are needed
 
-Vectors stay vectors down to the machine code (docs/decisions/0010), where some operations of Taichi's crash or are
-wrong: there are no unary minus, `-=`, abs, any and all of vectors here, and exp is taken lane by lane.
+Vectors stay vectors down to the machine code (docs/decisions/0010). There, some of Taichi's operations crash or give
+wrong results; so unary minus, `-=`, abs, any and all are not used on vectors, and exp is applied lane by lane.
 """
 
 # No `from __future__ import annotations` here: Taichi reads the annotations of a kernel.
@@ -28,16 +29,16 @@ from numpy.typing import NDArray
 
 from taichi_msm.system.runtime import Memory, our_compilation, ti
 
-# Rows of the array by_column; of MOVES and of AREA there are three, for a first, a middle and a last row.
+# Rows of the array by_column. MOVES and AREA have three each, for a first, a middle and a last row of the sheet.
 MOVES, AREA, ACROSS, HAS_LEFT, HAS_RIGHT, COLUMN_ROWS = 0, 3, 6, 7, 8, 9
 
 # Columns of the table of loads: gain, stiffness of the virtual springs, then for each slot force (3), point (2),
 # falloff, shift and offset.
 SLOT_COLUMN, SLOT_COLUMNS = 2, 8
 
-# What is read of every row of points: the least and the largest (L^2 - L0^2) / L0^2; sums over the springs along the
-# row, down and diagonal of (L / L0 - 1)^2, with a map times their stiffness, and under tension of |q|^2 / L0^2; the sum
-# of |d|^2 times the share of mass; with bending that of the Laplacian's square.
+# Measures of every row of points: the smallest and the largest (L^2 - L0^2) / L0^2; for the springs along the row, down
+# and diagonal each, the sum of (L / L0 - 1)^2, times the stiffness if there is a map, and then, under tension, the sum
+# of |q|^2 / L0^2; the sum of |d|^2 times the share of mass; with bending, the sum of the Laplacian's square.
 LEAST, MOST, STRETCHED, TENSE, MOTION, BENT, MEASURES = 0, 1, 2, 5, 8, 9, 10
 
 # Bytes of a number.
@@ -46,21 +47,21 @@ BYTES = {"f32": 4, "f64": 8}
 
 @dataclass(frozen=True)
 class Code:
-    """What a kernel is compiled for; all else is an argument.
+    """What a kernel is compiled for; everything else is an argument.
 
     Attributes:
         precision: f32 or f64.
-        lanes: strips of columns.
+        lanes: of a vector; columns are cut into as many strips.
         structural, shear: whether there are springs of that family.
         open_edges: whether a point at an edge moves, so that springs beyond the edge must be left out.
-        by_area: whether points and springs at such an edge have less than others, as they belong to fewer cells.
+        by_area: whether points and springs at such an edge get less than others, because they belong to fewer cells.
         mapped: whether the stiffness of every spring is read from an array.
         tense: whether the sheet is under tension at rest.
         bending: whether it resists bending.
         virtual: whether there are virtual springs.
         damped: whether there is damping.
-        slots_move: for every probe slot whether it moves.
-        slots_by_area: for every probe slot whether points at an open edge get less of its force.
+        slots_move: for every probe slot, whether it moves.
+        slots_by_area: for every probe slot, whether points at an open edge get less of its force.
     """
 
     precision: str
@@ -89,7 +90,7 @@ class Code:
 
     @property
     def border_rows(self) -> int:
-        """Rows beside a band of rows that it needs."""
+        """Number of rows on either side of a band that its steps depend on."""
         return 2 if self.bending else 1
 
     @property
@@ -100,13 +101,13 @@ class Code:
 
 @dataclass(frozen=True)
 class Structure:
-    """How a sheet lies in memory and is shared out, and the code that steps it.
+    """How a sheet is laid out in memory and shared out among workers, and the code that steps it.
 
     Attributes:
         rows, cols: points of the sheet.
-        workers: bands of rows that step side by side; 0 on a GPU, where every point does.
-        depth: steps that a band takes in one sweep.
-        fixed_rows: whether every point of the first row is fixed, and of the last.
+        workers: number of bands of rows that are stepped in parallel; 0 on a GPU, where all points are.
+        depth: number of steps that a band takes in one sweep.
+        fixed_rows: whether all points of the first row are fixed, and all of the last.
         code: what the kernels are compiled for.
     """
 
@@ -124,7 +125,7 @@ class Structure:
 
     @property
     def width(self) -> int:
-        """Entries of a row, the halo of its strips included."""
+        """Number of entries in a row, including the halo of its strips."""
         return self.strip + 2
 
 
@@ -132,11 +133,11 @@ class Start(NamedTuple):
     """What the arrays of a sheet hold at the start.
 
     Attributes:
-        by_column: of the array of that name, shape (COLUMN_ROWS, cols).
-        decay: likewise, shape (standing slots, rows, cols).
-        stiffness: of springs along rows, along columns and of diagonals, shapes (rows, cols) and twice (rows + 1,
-            cols); None without a map.
-        state: displacements and differences, each of shape (rows, cols, 3); None: at rest.
+        by_column: content of the array by_column, shape (COLUMN_ROWS, cols).
+        decay: of the standing slots, shape (standing slots, rows, cols).
+        stiffness: of springs along rows, shape (rows, cols), along columns and diagonals, shape (rows + 1, cols) each;
+            None without a map.
+        state: displacements and differences [m], each of shape (rows, cols, 3); None: at rest.
     """
 
     by_column: NDArray[Any]
@@ -146,12 +147,12 @@ class Start(NamedTuple):
 
 
 class ReadArguments(NamedTuple):
-    """What is read of a sheet, in the order of the kernel's arguments.
+    """What is read from a sheet, in the order of the kernel's arguments.
 
     Attributes:
-        differences: whether d is wanted, and not u.
-        out: filled with it, shape (rows, cols, 3).
-        measures: filled with those of every row of points, shape (rows, MEASURES).
+        differences: True: read d; False: read u.
+        out: receives it, shape (rows, cols, 3).
+        measures: receives the measures of every row of points, shape (rows, MEASURES).
     """
 
     differences: bool
@@ -167,8 +168,8 @@ def in_lanes(s: Structure, values: NDArray[Any]) -> NDArray[Any]:
         values: shape (..., cols).
 
     Returns:
-        Shape (entries, lanes), in the precision of the code; 0 where there is no column, infinite what is too large
-        for it.
+        Shape (entries, lanes), in the precision of the code. Entries without a column are 0, and values too large for
+        the precision infinite.
     """
     column = np.arange(s.code.lanes) * s.strip + np.arange(-1, s.strip + 1)[:, None]
     inside = (column >= 0) & (column < s.cols)
@@ -179,7 +180,7 @@ def in_lanes(s: Structure, values: NDArray[Any]) -> NDArray[Any]:
 
 
 def _fill_kernel(code: Code) -> Callable[..., None]:
-    """Make the kernel that copies numbers into the beginning of an array of vectors; their last axis is the lanes."""
+    """Make the kernel that copies numbers, shape (entries, lanes), to the beginning of an array of vectors."""
     vector, lanes = code.vector, code.lanes
 
     @ti.kernel
@@ -191,7 +192,7 @@ def _fill_kernel(code: Code) -> Callable[..., None]:
 
 
 def _clear_kernel(code: Code) -> Callable[..., None]:
-    """Make the kernel that puts zeros into the beginning of an array of vectors."""
+    """Make the kernel that sets the beginning of an array of vectors to zero."""
 
     @ti.kernel
     def clear(target: ti.types.ndarray(dtype=code.vector, ndim=1), length: ti.i32):
@@ -206,7 +207,7 @@ class SheetArrays:
 
     Args:
         s: the structure.
-        stored: of every stored row of displacements the row of the sheet that it holds, or -1 for none.
+        stored: for every stored row of displacements, the row of the sheet that it holds, or -1 for none.
         start: what the arrays hold at the start.
     """
 
@@ -235,13 +236,13 @@ class SheetArrays:
         self.set_decay(decay)
 
     def set_decay(self, decay: NDArray[Any]) -> None:
-        """Put the decays of other standing slots in the place of those that are there, shape (slots, rows, cols)."""
+        """Replace the decays of the standing slots, shape (slots, rows, cols)."""
         if len(decay):
             with our_compilation():
                 self._fill(self.decay, in_lanes(self._s, decay))
 
     def rows(self, count: int) -> Any:
-        """Take an array of so many rows, of whatever was in it."""
+        """Allocate an array of `count` rows; its content is arbitrary."""
         return self._memory.array(self._s.code.precision, self._s.code.lanes, count * self._s.width)
 
 
@@ -251,17 +252,17 @@ def _filling(code: Code) -> tuple[Callable[..., None], Callable[..., None]]:
 
 
 def spring_forces(code: Code) -> tuple[Callable[..., Any], Callable[..., Any]]:
-    """Make the functions that give the force of a spring along a row, and of one to the other row.
+    """Make the functions for the force of a spring along a row, and of a spring to the other row.
 
-    With q = u_Q - u_P and the rest vector o from P to Q, L^2 - L0^2 = q (q + 2 o), so that the force
+    With q = u_Q - u_P and the rest vector o from P to Q, L^2 - L0^2 = q (q + 2 o). In the form
 
         k (L - L0) (Q - P) / L = k (L^2 - L0^2) / (L^2 + L0 L) (o + q)                         (eq. 2)
 
-    keeps the digits of a small motion on a large sheet. Swapping P and Q changes its sign and not one bit more. Under
-    tension it is tau q more (see `material`).
+    the force keeps the digits of a small motion on a large sheet. Swapping P and Q changes its sign and no other bit.
+    Under tension tau q is added (see `material`).
     """
     open_edges, tense = code.open_edges and not code.mapped, code.tense
-    # Keeps L = 0 from dividing by 0: the force is then 0, as Q - P is. A literal in a kernel is f32, also among f64.
+    # Prevents a division by 0 at L = 0, where the force is then 0, as Q - P is. A literal in a kernel is always f32.
     tiny = 1e-36
 
     @ti.func
@@ -270,7 +271,7 @@ def spring_forces(code: Code) -> tuple[Callable[..., Any], Callable[..., Any]]:
 
     @ti.func
     def along_vector(force, to_x, to_y, to_z, tension, x, y, z):
-        """Force along the spring as it is now, and what a tension adds for the difference (x, y, z)."""
+        """Force along the deformed spring, and what the tension adds for the difference (x, y, z)."""
         force_x, force_y, force_z = force * to_x, force * to_y, force * to_z
         if ti.static(tense):
             force_x += tension * x
@@ -280,7 +281,7 @@ def spring_forces(code: Code) -> tuple[Callable[..., Any], Callable[..., Any]]:
 
     @ti.func
     def along(x, y, z, dx, stiffness, tension, exists):
-        """Force by the right neighbour, whose displacement is (x, y, z) more; exists: 0 where there is none."""
+        """Force of the right neighbour, displaced by (x, y, z) from the point; exists: 0 if there is none."""
         to_x = x + dx
         rest = y * y + z * z
         force = pull(x * (to_x + dx) + rest, to_x * to_x + rest + tiny, dx, stiffness)
@@ -290,7 +291,7 @@ def spring_forces(code: Code) -> tuple[Callable[..., Any], Callable[..., Any]]:
 
     @ti.func
     def to_other_row(x, y, z, right: ti.template(), dx, dy, length, stiffness, tension, exists):
-        """Force by the entry `right` of a row dy above, whose displacement is (x, y, z) more; exists: 0 for none."""
+        """Force of the neighbour `right` columns on in the row dy above, displaced by (x, y, z) from the point."""
         to_x = x
         to_y = y + dy
         longer = x * x + (y * (to_y + dy) + z * z)
@@ -308,7 +309,7 @@ def spring_forces(code: Code) -> tuple[Callable[..., Any], Callable[..., Any]]:
 def measuring(code: Code) -> Callable[..., Any]:
     """Make the function that measures an entry of the sheet: its springs to the right and to the row below, its motion.
 
-    The function gives vectors of lanes, as many as MEASURES and in their order.
+    It returns MEASURES vectors of lanes, in the order of the constants above.
     """
     real, vector, open_edges = code.real, code.vector, code.open_edges
     structural, shear = code.structural, code.shear
@@ -317,7 +318,7 @@ def measuring(code: Code) -> Callable[..., Any]:
 
     @ti.func
     def longer(u: ti.template(), by_column: ti.template(), width, p, q, b, right: ti.template(), x0, y0):
-        """(L^2 - L0^2) / L0^2 of the spring from entry b of row p to entry b + right of row q; with all its digits."""
+        """(L^2 - L0^2) / L0^2 and |q|^2 / L0^2 of the spring from entry b of row p to entry b + right of row q."""
         x = u[0][q * width + b + right] - u[0][p * width + b]
         y = u[1][q * width + b + right] - u[1][p * width + b]
         z = u[2][q * width + b + right] - u[2][p * width + b]
@@ -388,7 +389,7 @@ def measuring(code: Code) -> Callable[..., Any]:
         if ti.static(by_area):
             motion *= by_column[(AREA + kind) * width + b]
         if ti.static(bending):
-            # Only an inner row has one before it and one after it.
+            # Only an inner row has both a row before it and one after it.
             inside = by_column[HAS_LEFT * width + b] * by_column[HAS_RIGHT * width + b] * ti.cast(kind == 1, real)
             before, after = p - ti.cast(kind == 1, ti.i32), p + ti.cast(kind == 1, ti.i32)
             for c in ti.static(range(3)):
@@ -404,7 +405,7 @@ def five_point() -> Callable[..., Any]:
 
     @ti.func
     def laplacian(field: ti.template(), c: ti.template(), width, before, row, after, b, across, down):
-        """Of component c at entry b of a row, between the rows before and after; across, down: 1 / dx^2, 1 / dy^2."""
+        """Laplacian of component c at entry b of a row, between rows before and after; across: 1/dx^2, down: 1/dy^2."""
         here = field[c][row * width + b]
         beside = (field[c][row * width + b - 1] - here) + (field[c][row * width + b + 1] - here)
         over = (field[c][before * width + b] - here) + (field[c][after * width + b] - here)
@@ -414,7 +415,7 @@ def five_point() -> Callable[..., Any]:
 
 
 def point_step(code: Code) -> Callable[..., None]:
-    """Make the function that adds to the forces of springs those of the tissue and the probes, and steps a point.
+    """Make the function that adds the forces of bending, virtual springs and probes to those of springs, and steps.
 
     d_{n+1} = keep d_n + gain F_n,    u_{n+1} = u_n + d_{n+1}                                  (eq. 6 to 9)
     """
@@ -430,9 +431,10 @@ def point_step(code: Code) -> Callable[..., None]:
         moment: ti.template(), rows, width, q, i, b, kind, before, here, after,
         x, y, z, spring_x, spring_y, spring_z, keep, dx, dy, top, now,
     ):  # fmt: skip
-        """Step entry b of row i of the sheet, displaced by (x, y, z), into row q of u; now is a row of the loads.
+        """Step entry b of row i of the sheet, displaced by (x, y, z), and store it in row q of u.
 
-        The moments of the row and its neighbours are in rows before, here and after.
+        The moments of the row and of its neighbours are in rows before, here and after. `now` is a row of the table of
+        loads.
         """
         force_x, force_y, force_z = spring_x, spring_y, spring_z
         if ti.static(bending):

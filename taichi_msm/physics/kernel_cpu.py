@@ -1,28 +1,29 @@
-"""Kernel 1 on a CPU: rows are swept one after another, every spring is evaluated once, nothing is copied.
+"""Kernel 1 on a CPU: rows are swept one after another, every spring is evaluated once, and rows are stepped in place.
 
-Layout. Columns are cut into as many strips as a vector register has lanes; lane l of entry b of a row is column b - 1
-of strip l, so that the neighbours of an entry are the entries beside it and every operation is one vector instruction.
-The first and last entry of a row are a halo: the same strips moved by one lane.
+Layout. Columns are cut into as many strips as a vector register has lanes. Lane l of entry b of a row is column b - 1
+of strip l, so the neighbours of an entry are the entries beside it, and every operation is one vector instruction. The
+first and the last entry of a row are a halo: the entries at the other end of the strips, shifted by one lane.
 
-Sweep. The springs from a row to the other row, which is swept next, give their force to the row at once and carry it to
-the other row; the spring along the row carries it to the next entry. Then no row needs this one where it was, and it is
-stepped in place.
+Sweep. A sweep visits the rows in turn. The force of a spring between this row and the next one is added to this row at
+once and carried to the next; the force of a spring along the row is carried to the next entry. After that no other row
+depends on the old displacements of this row, so it is stepped in place.
 
-Passes. Two rows after the first step of a sweep can follow the second one, and so on: a pass takes `depth` steps while
-the rows are in the cache. Its k-th round brings row k from step n to n + 1, row k - 1 from n + 1 to n + 2, ...
+Passes. The second step can follow the first with a distance of one row, the third step the second, and so on: a pass
+takes `depth` steps while the rows are in the cache. Round k of a pass takes row k from step n to n + 1, row k - 1 from
+n + 1 to n + 2, and so on.
 
-Bands. Every worker has a band of rows. Neighbours sweep away from their common border, or toward it, so that they get
-there at the same time. There each needs the other's row as it was before the step: both put it, after every step, into
-one of two copies, and wait for the other's. The order in which forces are added does not depend on the way of a sweep;
-so the bits of a result do not depend on the number of workers.
+Bands. Every worker has a band of rows. Neighbouring workers sweep away from their common border or toward it, so that
+they arrive there at the same time. Each needs the other's row at the border as it was before the step: after every step
+both copy their row, into two copies by turns, and wait for the other's copy. The order in which forces are added does
+not depend on the direction of a sweep, so the bits of a result do not depend on the number of workers.
 
 Bending. A moment is the Laplacian of the displacements, and the force on a row is the Laplacian of the moments. So
-before a row is stepped, the moments of the row ahead of it are taken, which see one row more; a pass is one step; and
-neighbours have copies of two rows.
+before a row is stepped, the moments of the row ahead are computed, which depend on one row more. A pass is then one
+step, and neighbours copy two rows.
 
-Company. A worker that waits spins, for some time at most: its partner may have no core, as another program has it. Then
-it writes down where it is and ends, which gives its core away, and another launch goes on from there, until all
-have taken the same steps. Then a single worker takes over for some time.
+Giving up. A waiting worker spins, but not for long: another program may have taken its neighbour's core. It then
+records its place and ends, which frees its own core. Further launches continue from the recorded places until all
+workers have taken the same steps. After that a single worker takes over for some time.
 """
 
 # No `from __future__ import annotations` here: Taichi reads the annotations of a kernel.
@@ -63,16 +64,16 @@ PAGE = 4096
 # The borders of a band: where its worker begins and where it ends.
 BEGIN, END = 0, 1
 
-# A worker looks so often whether its partner is there: some 0.2 ms.
+# How many times a worker checks for its neighbour before it gives up: about 0.2 ms.
 PATIENCE = 40_000
 
-# After a launch in which one gave up a single worker steps for some time [s], the longer the more often it happens.
+# After a launch in which a worker gave up, a single worker steps for some time [s]; it grows each time this happens.
 SHORTEST_REST, LONGEST_REST = 0.002, 1.0
 
-# Where a worker is: pass, round and step of the round.
+# Numbers that record the place of a worker: pass, round and step of the round.
 PLACE = 3
 
-# Rows of moments that a worker needs at a time.
+# Number of rows of moments that a worker needs at a time.
 MOMENTS = 3
 
 
@@ -90,8 +91,8 @@ class Sweep:
     """The state of a sheet in the memory of a CPU, and its kernels.
 
     Args:
-        s: how it lies in memory.
-        start: what its arrays hold at the start.
+        s: how the sheet is laid out in memory.
+        start: what the arrays hold at the start.
     """
 
     def __init__(self, s: Structure, start: Start) -> None:
@@ -100,16 +101,16 @@ class Sweep:
         self._steps = 0
         self._rest, self._rests_until = SHORTEST_REST, 0.0
         self._first_row, self._end_row = int(s.fixed_rows[0]), s.rows - int(s.fixed_rows[1])
-        # Below the sheet's rows, for every worker and border, the two copies.
+        # Stored after the sheet's own rows: two copies for every border of every worker.
         self._borders = self._border_rows()
         stored = np.concatenate([np.arange(s.rows, dtype=np.int32), self._borders])
         self._arrays = SheetArrays(s, stored, start)
-        # Rows of `carried` that a worker has: its steps, then a page, over which one core's prefetcher does not reach.
+        # Rows of `carried` per worker: one for each step of a pass, and then a page, which no prefetcher crosses.
         self._carried_rows = s.depth - (-PAGE // (s.width * s.code.lanes * BYTES[s.code.precision]))
-        # For every worker and step of a pass the forces carried to a row, with the sign of those on the row before.
+        # Forces carried to the next row, for every worker and step of a pass; their sign is that for the row before.
         self._carried = [self._arrays.rows(s.workers * self._carried_rows) for _ in range(3)]
         self._moment = [self._arrays.rows(MOMENTS * s.workers if s.code.bending else 1) for _ in range(3)]
-        # The number of steps that each border of each worker has done.
+        # The number of steps taken at each border of each worker.
         self._done = np.zeros(2 * s.workers * COUNTER_STRIDE, np.int64)
 
     def advance(self, count: int, numbers: tuple[float, ...], table: NDArray[Any]) -> None:
@@ -117,7 +118,7 @@ class Sweep:
 
         Args:
             count: how many.
-            numbers: keep, dx, dy; stiffness of springs along rows, along columns and of diagonals, their tensions;
+            numbers: keep, dx, dy; stiffness and then tension of springs along rows, along columns and of diagonals;
                 D dx dy; y of the first row.
             table: of the loads, shape (count, columns).
         """
@@ -127,22 +128,22 @@ class Sweep:
             self._advance_alone(done, count, numbers, table)
 
     def compile(self, numbers: tuple[float, ...], table: NDArray[Any]) -> None:
-        """Compile all that steps may need, without taking one."""
+        """Compile everything that steps may need, without taking one."""
         self._rests_until = 0.0
         self.advance(0, numbers, table)
         if self._s.workers > 1:
             self._advance_alone(0, 0, numbers, table)
 
     def set_decay(self, decay: NDArray[Any]) -> None:
-        """Let standing slots act elsewhere, or otherwise; shape (slots, rows, cols)."""
+        """Replace the decays of the standing slots, shape (slots, rows, cols)."""
         self._arrays.set_decay(decay)
 
     def read(self, spacing: tuple[float, float], out: ReadArguments) -> None:
-        """Copy what is asked for, and measure every row.
+        """Copy displacements or differences, and measure every row.
 
         Args:
-            spacing: dx and dy.
-            out: what is filled.
+            spacing: dx and dy [m].
+            out: which of them, and where to.
         """
         s, arrays = self._s, self._arrays
         read = self._kernels.read_together if s.workers > 1 else self._kernels.read_alone
@@ -152,7 +153,7 @@ class Sweep:
             )  # fmt: skip
 
     def _advance_alone(self, done: int, count: int, numbers: tuple[float, ...], table: NDArray[Any]) -> None:
-        """Take the steps after those that are done with a single worker."""
+        """Take the remaining steps with a single worker."""
         self._launch(self._kernels.advance_alone, 1, done, count - done, numbers, table, np.array([0, -1, 0]))
         if self._s.workers > 1:
             with our_compilation():
@@ -160,7 +161,7 @@ class Sweep:
             self._done[:] = self._steps
 
     def _advance_together(self, count: int, numbers: tuple[float, ...], table: NDArray[Any]) -> int:
-        """Take steps with all workers; gives how many, which are fewer when there is company."""
+        """Take steps with all workers; returns how many, fewer than `count` if a worker gave up."""
         s = self._s
         places = np.tile(np.array([0, -1, 0]), s.workers)
         first = self._steps
@@ -171,7 +172,7 @@ class Sweep:
             return count
         self._rests_until = time.perf_counter() + self._rest
         self._rest = min(4 * self._rest, LONGEST_REST)
-        # All meet at the end of the pass that the first of them is in.
+        # All continue to the end of the pass that the foremost of them is in.
         count = min(count, int((passes + (rounds >= 0)).max()) * s.depth)
         while not (passes * s.depth >= count).all():
             self._steps = first
@@ -200,13 +201,13 @@ class Sweep:
         self._steps += count
 
     def _border_rows(self) -> NDArray[np.int32]:
-        """Tell which row of the sheet every copy at a border of a band is of."""
+        """List for every copy at a border of a band the row of the sheet that it is a copy of."""
         rows: list[int] = []
         first, end, workers = self._first_row, self._end_row, self._s.workers
         for worker in range(workers):
             low, high = (first + (end - first) * n // workers for n in (worker, worker + 1))
             near, far = (low, high - 1) if worker % 2 else (high - 1, low)
-            # The row at the border and, with bending, the one behind it; after even and after odd numbers of steps.
+            # The row at the border and, with bending, the one behind it; each after even and after odd steps.
             inward = 1 if worker % 2 else -1
             for border in ((near, near + inward), (far, far - inward)):
                 rows += [*border[: self._s.code.border_rows]] * 2
@@ -226,10 +227,10 @@ def _kernels(code: Code) -> Kernels:
 
 
 def _advance(code: Code, *, parallel: bool) -> Callable[..., None]:
-    """Make the kernel that takes steps, by one worker or several."""
+    """Make the kernel that takes steps, with one worker or several."""
     real, vector, lanes, columns = code.real, code.vector, code.lanes, code.load_columns
     structural_springs, shear_springs, bending = code.structural, code.shear, code.bending
-    # With a map there is no stiffness where there is no spring.
+    # With a map, the stiffness is 0 where there is no spring.
     mapped, open_edges = code.mapped, code.open_edges and not code.mapped
     by_area, border_rows = open_edges and code.by_area, code.border_rows
     along, to_other_row = spring_forces(code)
@@ -245,7 +246,7 @@ def _advance(code: Code, *, parallel: bool) -> Callable[..., None]:
 
     @ti.func
     def of_column(stiffness: ti.template(), by_column: ti.template(), width, between, b, uniform):
-        """Stiffness of the springs along the columns of entry b, those along an edge less."""
+        """Stiffness of the springs along the columns of entry b; it is less along an edge."""
         if ti.static(mapped):
             return stiffness[1][between + b]
         elif ti.static(by_area):  # noqa: RET505
@@ -260,21 +261,21 @@ def _advance(code: Code, *, parallel: bool) -> Callable[..., None]:
         carried_row, n, moving, moment_before, moment_here, moment_after,
         keep, dx, dy, k_across, k_down, k_shear, t_across, t_down, t_shear, top, up,
     ):  # fmt: skip
-        """Sweep row i of the sheet, stored in row p; row q is the other row, up above it; it is stepped if it moves."""
+        """Sweep row i of the sheet, stored in row p, and step it if `moving`; the next row, in row q, is `up` above."""
         width = strip + 2
         diagonal = ti.sqrt(dx * dx + dy * dy)
-        # Where in the arrays of stiffness the springs of the row are, and those between the rows.
+        # Where the arrays of stiffness have the springs along the row, and those between the two rows.
         own, between = i * width, (i + ti.select(up < 0, 1, 0)) * width
         # Springs along an edge belong to one cell.
         share = ti.cast(1, real)
         if ti.static(by_area):
             share = ti.select(kind == 1, ti.cast(1, real), ti.cast(0.5, real))
-        # Displacements of the entry, in its row and in the other row, of the one before it and the one after it.
+        # Displacements in this row: at this entry and the next. In the other row: before, beside and after this entry.
         here_x, here_y, here_z = u[0][p * width + 0], u[1][p * width + 0], u[2][p * width + 0]
         next_x, next_y, next_z = u[0][p * width + 1], u[1][p * width + 1], u[2][p * width + 1]
         before_x, before_y, before_z = u[0][q * width + 0], u[1][q * width + 0], u[2][q * width + 0]
         beside_x, beside_y, beside_z = u[0][q * width + 1], u[1][q * width + 1], u[2][q * width + 1]
-        # Force by the left neighbour, but for its sign.
+        # Force of the left neighbour, with the opposite sign.
         left_x, left_y, left_z = vector(0), vector(0), vector(0)
         # Forces carried to the other row: for the entry before this one, this one and the next one.
         last_x, last_y, last_z = vector(0), vector(0), vector(0)
@@ -294,7 +295,7 @@ def _advance(code: Code, *, parallel: bool) -> Callable[..., None]:
                 1, dx, up, diagonal, k, t_shear, has_right * exists,
             )  # fmt: skip
             coming_x, coming_y, coming_z = x, y, z
-        # Read once: the stores to the arrays could change the table, for all that the compiler knows.
+        # Read once, because the compiler must assume that stores to the arrays change the table.
         now = [loads[n, c] for c in ti.static(range(columns))]
         for b in range(1, strip + 1):
             here_x, here_y, here_z = next_x, next_y, next_z
@@ -346,7 +347,7 @@ def _advance(code: Code, *, parallel: bool) -> Callable[..., None]:
                 force_y += y - left_y
                 force_z += z - left_z
                 left_x, left_y, left_z = x, y, z
-            # What was there has been read when b was one less.
+            # What was stored there was read for the entry before.
             carried[0][carried_row * width + b - 1] = last_x
             carried[1][carried_row * width + b - 1] = last_y
             carried[2][carried_row * width + b - 1] = last_z
@@ -375,7 +376,7 @@ def _advance(code: Code, *, parallel: bool) -> Callable[..., None]:
 
     @ti.func
     def join_strips(field: ti.template(), p, strip):
-        """Fill the halo of row p: beside the first column of a strip is the last one of the strip before."""
+        """Fill the halo of row p: before the first column of a strip comes the last one of the strip before."""
         width = strip + 2
         for c in ti.static(range(3)):
             last = field[c][p * width + strip]
@@ -388,7 +389,7 @@ def _advance(code: Code, *, parallel: bool) -> Callable[..., None]:
         u: ti.template(), moment: ti.template(), by_column: ti.template(), strip, rows, i, before, here, after,
         target, bending_stiffness, dx, dy,
     ):  # fmt: skip
-        """Put the moments of row i into row `target`, given where it and its neighbours are in u; 0 at edges."""
+        """Store the moments of row i, which are 0 at edges, in row `target`; u has it in row `here`."""
         width = strip + 2
         across, down = bending_stiffness / (dx * dx), bending_stiffness / (dy * dy)
         for b in range(1, strip + 1):
@@ -403,12 +404,12 @@ def _advance(code: Code, *, parallel: bool) -> Callable[..., None]:
 
     @ti.func
     def copy_row(rows, worker, border, n, behind):
-        """Where a worker keeps the row that is so many behind a border after n steps."""
+        """Where a worker's copy of the row `behind` rows from a border is stored after n steps."""
         return rows + border_rows * (4 * worker + 2 * border + ti.cast(n % 2, ti.i32)) + behind
 
     @ti.func
     def row_at(row, low, high, way, rows, worker, workers, n):
-        """Where a row of a band, or one of two beyond its ends, is in u after n steps; if it is none, anywhere."""
+        """Where u has a row of a band, or one of two beyond its ends, after n steps; any row if there is none."""
         i = ti.select(way > 0, low, high - 1) + row * way
         stored = ti.max(0, ti.min(i, rows - 1))
         if ti.static(parallel):
@@ -420,7 +421,7 @@ def _advance(code: Code, *, parallel: bool) -> Callable[..., None]:
 
     @ti.func
     def has_come(done: ti.template(), worker, border, n, patience):
-        """Wait until a worker has taken n steps at a border, but not for long; tells whether it has."""
+        """Wait until a worker has taken n steps at a border, but not for long; returns whether it has."""
         steps = ti.atomic_add(done[(2 * worker + border) * COUNTER_STRIDE], 0)
         looks = 0
         while steps < n and looks < patience:
@@ -430,7 +431,7 @@ def _advance(code: Code, *, parallel: bool) -> Callable[..., None]:
 
     @ti.func
     def publish(u: ti.template(), done: ti.template(), rows, strip, worker, border, i, inward, n):
-        """Let the neighbour at a border have row i after n steps, and with bending the next one inward."""
+        """Copy row i, and with bending also the next one inward, for the neighbour at a border, after n steps."""
         width = strip + 2
         for behind in ti.static(range(border_rows)):
             copy = copy_row(rows, worker, border, n, behind)
@@ -506,7 +507,7 @@ def _advance(code: Code, *, parallel: bool) -> Callable[..., None]:
                 goes = True
                 while goes and turn * depth < count:
                     steps = ti.min(depth, count - turn * depth)
-                    # Row -1 is the one before the band, which gives its forces and stays.
+                    # Row -1 is the one before the band: it is swept for its forces, but not stepped.
                     while goes and k < high - low + steps - 1:
                         while goes and step < ti.min(steps, k + 2):
                             row = k - step
@@ -520,14 +521,14 @@ def _advance(code: Code, *, parallel: bool) -> Callable[..., None]:
                                 if row == -1 and 0 <= neighbour < workers:
                                     goes = has_come(done, neighbour, BEGIN, first + n, patience)
                                     p = copy_row(rows, neighbour, BEGIN, first + n, 0)
-                                # Bending looks a row further ahead.
+                                # With bending, one row further ahead is needed.
                                 if goes and row >= high - low - border_rows and 0 <= far_neighbour < workers:
                                     goes = has_come(done, far_neighbour, END, first + n, patience)
                                 if row == high - low - 1 and 0 <= far_neighbour < workers:
                                     q = copy_row(rows, far_neighbour, END, first + n, 0)
                             if goes:
                                 if ti.static(bending):
-                                    # Of the row ahead; at the beginning also of the first one and the one before.
+                                    # Moments of the row ahead; at the start also of row 0 and of the one before it.
                                     for ahead in range(ti.select(row < 0, -1, row + 1), row + 2):
                                         at = first + n
                                         before = row_at(ahead - 1, low, high, way, rows, worker, workers, at)
@@ -556,7 +557,7 @@ def _advance(code: Code, *, parallel: bool) -> Callable[..., None]:
                                 if row >= 0:
                                     join_strips(u, i, strip)
                                 if ti.static(parallel):
-                                    # Once all that is published has been stepped.
+                                    # As soon as all rows to be copied have been stepped.
                                     if row == border_rows - 1:
                                         publish(u, done, rows, strip, worker, BEGIN, begin, way, first + n + 1)
                                     if row == high - low - 1:
@@ -577,7 +578,7 @@ def _advance(code: Code, *, parallel: bool) -> Callable[..., None]:
 
 
 def _read(code: Code, *, parallel: bool) -> Callable[..., None]:
-    """Make the kernel that reads a sheet out, and measures it, by one thread or several."""
+    """Make the kernel that reads and measures a sheet, with one thread or several."""
     real, vector, lanes = code.real, code.vector, code.lanes
     measure = measuring(code)
 
@@ -640,7 +641,7 @@ def _read(code: Code, *, parallel: bool) -> Callable[..., None]:
 
 
 def _copy(code: Code) -> Callable[..., None]:
-    """Make the kernel that renews the copies of the rows at the borders of bands."""
+    """Make the kernel that updates the copies of the rows at the borders of bands."""
     vector = code.vector
 
     @ti.kernel

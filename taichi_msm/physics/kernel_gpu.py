@@ -1,6 +1,7 @@
 """Kernel 1 on a GPU: every point is a thread that gathers the forces of its eight springs; every step is a loop.
 
-The layout is the plain one: one lane, an entry a column, around the sheet a halo. u_n and u_{n+1} take turns.
+The layout is the simplest: vectors of one lane, one entry per column, and a halo around the sheet. Two buffers hold u_n
+and u_{n+1} by turns.
 """
 
 # No `from __future__ import annotations` here: Taichi reads the annotations of a kernel.
@@ -31,7 +32,7 @@ from taichi_msm.physics.kernel import (
 )
 from taichi_msm.system.runtime import our_compilation, ti
 
-# A launch is a chain of this many kernels, one a step.
+# A launch is a chain of this many kernels, one for each step.
 STEPS_PER_LAUNCH = 8
 
 
@@ -43,12 +44,12 @@ class Kernels(NamedTuple):
 
 
 class Gather:
-    """The state of a sheet in the memory of a GPU, and its kernels; its arguments are those of `kernel_cpu.Sweep`."""
+    """The state of a sheet in the memory of a GPU, and its kernels; arguments as for `kernel_cpu.Sweep`."""
 
     def __init__(self, s: Structure, start: Start) -> None:
         self._s = s
         self._kernels = _kernels(s.code)
-        # Which of the two buffers holds u_n, each within a halo of a row above and below.
+        # Which of the two buffers holds u_n. Each has a halo of one row above and below.
         self._now = 0
         buffer = np.pad(np.arange(s.rows, dtype=np.int32), 1, constant_values=-1)
         self._arrays = SheetArrays(s, np.concatenate([buffer, buffer]), start)
@@ -69,11 +70,11 @@ class Gather:
         self.advance(0, numbers, table)
 
     def set_decay(self, decay: NDArray[Any]) -> None:
-        """Let standing slots act elsewhere, or otherwise; shape (slots, rows, cols)."""
+        """Replace the decays of the standing slots, shape (slots, rows, cols)."""
         self._arrays.set_decay(decay)
 
     def read(self, spacing: tuple[float, float], out: ReadArguments) -> None:
-        """Copy what is asked for, and measure every row."""
+        """Copy displacements or differences, and measure every row."""
         s, arrays = self._s, self._arrays
         with our_compilation():
             self._kernels.read(
@@ -86,7 +87,7 @@ def _kernels(code: Code) -> Kernels:
     """Make the kernels of one code; each is compiled when it is first launched."""
     real, vector, columns = code.real, code.vector, code.load_columns
     structural_springs, shear_springs, bending = code.structural, code.shear, code.bending
-    # With a map there is no stiffness where there is no spring.
+    # With a map, the stiffness is 0 where there is no spring.
     mapped, open_edges = code.mapped, code.open_edges and not code.mapped
     by_area = open_edges and code.by_area
     along, to_other_row = spring_forces(code)
@@ -101,7 +102,7 @@ def _kernels(code: Code) -> Kernels:
         u: ti.template(), by_column: ti.template(), stiffness: ti.template(), width, p, q, between, b, row_exists,
         dx, up, k_down, k_shear, t_down, t_shear,
     ):  # fmt: skip
-        """Force on entry b of row p by the row q, which is up above: summed as a sweep does."""
+        """Force of row q, which is `up` above, on entry b of row p; summed in the order of a sweep."""
         force_x, force_y, force_z = vector(0), vector(0), vector(0)
         for right in ti.static((-1, 0, 1)):
             if ti.static(structural_springs if right == 0 else shear_springs):
@@ -126,7 +127,7 @@ def _kernels(code: Code) -> Kernels:
         u: ti.template(), by_column: ti.template(), stiffness: ti.template(), width, p, i, kind, b,
         dx, k_across, t_across,
     ):  # fmt: skip
-        """Force on entry b of row p by its right neighbour."""
+        """Force of its right neighbour on entry b of row p."""
         exists, k = vector(1), k_across * vector(1)
         if ti.static(open_edges):
             exists = by_column[HAS_RIGHT * width + b]
@@ -143,7 +144,7 @@ def _kernels(code: Code) -> Kernels:
         decay: ti.template(), loads: ti.template(), now, rows, width, i, b, n,
         keep, dx, dy, k_across, k_down, k_shear, t_across, t_down, t_shear, top,
     ):  # fmt: skip
-        """Step point (i, b - 1): now is the buffer of u_n, n the row of the table."""
+        """Step point (i, b - 1), where `now` is the buffer of u_n, and n the row of the table of loads."""
         p = now * (rows + 2) + i + 1
         kind = ti.select(i == rows - 1, 2, ti.select(i == 0, 0, 1))
         below, above = ti.cast(i < rows - 1, real), ti.cast(i > 0, real)
@@ -174,7 +175,7 @@ def _kernels(code: Code) -> Kernels:
         u: ti.template(), moment: ti.template(), by_column: ti.template(), now, rows, width, i, b,
         bending_stiffness, dx, dy,
     ):  # fmt: skip
-        """Take the moment of entry b of row i, 0 at edges, into row i + 1 of moments."""
+        """Store the moment of entry b of row i, which is 0 at edges, in row i + 1 of the moments."""
         across, down = bending_stiffness / (dx * dx), bending_stiffness / (dy * dy)
         p = now * (rows + 2) + i + 1
         inside = by_column[HAS_LEFT * width + b] * by_column[HAS_RIGHT * width + b]

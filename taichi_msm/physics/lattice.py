@@ -1,4 +1,4 @@
-"""The sheet at rest: where its points are, which of them are fixed, which springs join them."""
+"""The sheet at rest: where its points are, which of them are fixed, which springs connect them."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ Window = tuple[slice, slice]
 
 
 class Spring(NamedTuple):
-    """One of the springs that leave a point.
+    """A spring from a point to one of its neighbours.
 
     Attributes:
         down: rows from the point to its neighbour, i counted down.
@@ -33,14 +33,14 @@ class Spring(NamedTuple):
     stiffness: float
 
     def ends(self, points: tuple[int, int]) -> tuple[Window, Window]:
-        """Select the points of a sheet (rows, cols) that have this spring, and the neighbours to which it leads."""
+        """Select the points of a sheet (rows, cols) that have this spring, and the neighbours it connects them to."""
         i, i_q = _ends(self.down, points[0])
         j, j_q = _ends(self.right, points[1])
         return (i, j), (i_q, j_q)
 
 
 def _ends(ahead: int, count: int) -> tuple[slice, slice]:
-    """Select, of so many in a row, those with a neighbour so far ahead, and these neighbours."""
+    """Select, of `count` in a line, those with a neighbour `ahead` places further on, and these neighbours."""
     return slice(max(0, -ahead), count - max(0, ahead)), slice(max(0, ahead), count - max(0, -ahead))
 
 
@@ -60,7 +60,7 @@ def axes(sheet: Sheet) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
 
 
 def rest_positions(sheet: Sheet) -> NDArray[np.float64]:
-    """Place the points: X_ij = (x_j, y_i, 0).
+    """Give the rest positions of the points, X_ij = (x_j, y_i, 0).
 
     Returns:
         Rest positions [m], shape (rows, cols, 3).
@@ -89,7 +89,7 @@ def fixed_points(sheet: Sheet) -> NDArray[np.bool_]:
 
 
 def springs(scene: Scene) -> tuple[Spring, ...]:
-    """List the springs of a scene with `springs` and no map that lead from a point to its up to 8 neighbours.
+    """List the springs from a point to its neighbours, up to 8, in a scene with `springs` and without a map.
 
     Families of stiffness 0 are left out.
     """

@@ -1,17 +1,18 @@
-"""The probes in time: how hard each presses, where, and whether the virtual springs exist, step by step.
+"""The probes in time: how hard and where each presses, and whether the virtual springs act, step by step.
 
-What enters step n is the average with the hat function of half-width h about t_n,
+Step n takes the load averaged with the hat function of half-width h about t_n,
 
-    percent_n = integral of percent(t) (1 - |t - t_n| / h) dt / h,    at n = 0 twice that over [0, h],
+    percent_n = integral of percent(t) (1 - |t - t_n| / h) dt / h,    at n = 0 twice that over [0, h].
 
-which is what moves a free point as far as the load itself does, so that every load, a jump anywhere included, keeps
-the method of order 2. Where no key lies within the hat it is the value at t_n. The activity of the virtual springs is
-averaged alike.
+It moves a free point exactly as far as the load itself does, so the method keeps its order 2 for every load, wherever
+it jumps. If no key lies within the hat, the average is the value at t_n. The activity of the virtual springs is
+averaged in the same way.
 """
 
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -21,14 +22,14 @@ from numpy.typing import NDArray
 from taichi_msm.physics.lattice import axes
 from taichi_msm.physics.material import area_shares, material
 from taichi_msm.physics.probe_force import control_points, probe_force
-from taichi_msm.physics.timestep import step, steps_per_frame
-from taichi_msm.scene import Probe, Scene
+from taichi_msm.scene import Probe, Scene, Sheet
+from taichi_msm.timegrid import TimeGrid
 
-# A key that is nearer than this to an end of the hat, as a fraction of its half-width, is outside: what it would add
-# is less than rounding.
+# A key closer than this to an end of the hat, as a fraction of its half-width, counts as outside: it would contribute
+# less than rounding does.
 EDGE = 1e-9
 
-# Before all times [s].
+# A time before all others [s].
 LONG_AGO = -1e300
 
 Array = NDArray[np.float64]
@@ -38,8 +39,8 @@ class ProbeSegment(NamedTuple):
     """A control point between two jumps.
 
     Attributes:
-        times: keys [s], shape (n,).
-        points: control point at those keys, x and y at rest [m], shape (n, 2); held outside.
+        times: of the keys [s], shape (n,).
+        points: control point at those times, x and y at rest [m], shape (n, 2); constant before and after them.
     """
 
     times: Array
@@ -48,17 +49,17 @@ class ProbeSegment(NamedTuple):
 
 @dataclass(frozen=True)
 class ProbeSlot:
-    """A place at which a probe acts; one whose control point jumps acts at several by turns.
+    """A place where a probe acts; a probe whose control point jumps has several slots and uses them by turns.
 
-    A hat that a jump falls into needs the place before and the one after it. So the segments of the control point are
-    dealt out to two slots, the first, third, ... and the second, fourth, ...; to more where several jumps fall into one
-    hat.
+    If a jump falls within the hat, the probe acts in that step at the places before and after the jump. So the segments
+    of the control point are dealt out to two slots: the first, third, ... to one, the second, fourth, ... to the other.
+    If several jumps can fall within one hat, there are as many slots as it takes.
 
     Attributes:
         probe: index of the probe in the scene.
-        segments: of the control point, all of them.
-        turn: number of the first of its own segments.
-        turns: how many slots the probe has.
+        segments: all segments of the control point, also those of the other slots.
+        turn: index of the slot's first segment.
+        turns: number of slots that the probe has; every `turns`-th segment from `turn` on is the slot's.
     """
 
     probe: int
@@ -72,13 +73,8 @@ class ProbeSlot:
         return len(self.segments) > 1 or len(self.segments[0].times) > 1
 
     @property
-    def rest(self) -> Array:
-        """The first control point, x and y at rest [m]; of one that stands the only one."""
-        return self.segments[0].points[0]
-
-    @property
     def jumps(self) -> Array:
-        """When the control point jumps [s]: at the first key of every segment but the first."""
+        """Times at which the control point jumps [s]: the first key of every segment but the first."""
         return np.array([segment.times[0] for segment in self.segments[1:]])
 
 
@@ -86,51 +82,56 @@ class Schedule(NamedTuple):
     """The loads at consecutive steps.
 
     Attributes:
-        strength: force at the control point before its decay [N], shape (steps, slots, 3).
+        slots: where the probes act; the columns of the arrays.
+        strength: force at the control point before the decay [N], shape (steps, slots, 3).
         point: control point, x and y at rest [m], shape (steps, slots, 2).
-        active: share of the virtual springs' stiffness, 0 to 1; shape (steps,).
+        active: share of their stiffness with which the virtual springs act, 0 to 1; shape (steps,).
     """
 
+    slots: tuple[ProbeSlot, ...]
     strength: Array
     point: Array
     active: Array
 
 
-def probe_slots(scene: Scene) -> tuple[ProbeSlot, ...]:
-    """List the slots of all probes."""
+def probe_slots(probes: Sequence[Probe], sheet: Sheet, h: float) -> tuple[ProbeSlot, ...]:
+    """List the slots of all probes.
+
+    Args:
+        probes: of the scene, in its order.
+        sheet: on which they act.
+        h: half-width of the hat, which is the step [s]; 0 if loads are not averaged: every probe then has one slot.
+    """
     found = []
-    for index, probe in enumerate(scene.probes):
-        times, points = control_points(probe, scene.sheet)
+    for index, probe in enumerate(probes):
+        times, points = control_points(probe, sheet)
         jumps = np.flatnonzero((times[1:] == times[:-1]) & (points[1:] != points[:-1]).any(axis=1)) + 1
         parts = zip(np.split(times, jumps), np.split(points, jumps), strict=True)
         segments = tuple(ProbeSegment(*part) for part in parts)
-        # As many as there are in the hat that has the most jumps.
+        # One more than the largest number of jumps in any hat.
         jumped = times[jumps]
-        within = np.searchsorted(jumped, jumped + 2 * step(scene) * (1 - EDGE), "left") - np.arange(len(jumped))
+        within = np.searchsorted(jumped, jumped + 2 * h * (1 - EDGE), "left") - np.arange(len(jumped))
         turns = 1 + int(within.max(initial=0))
         found += [ProbeSlot(index, segments, turn, turns) for turn in range(turns)]
     return tuple(found)
 
 
-def decay(slot: ProbeSlot, scene: Scene) -> Array:
-    """Evaluate the decay of a standing slot.
+def decay(probe: Probe, sheet: Sheet) -> Array:
+    """Evaluate the decay of a probe around its control point, which stands; of one that moves, around its first place.
 
     Returns:
         Share of the force that each point feels, shape (rows, cols).
     """
-    acts = probe_force(scene.probes[slot.probe], scene.sheet)
-    x, y = axes(scene.sheet)
-    shares = acts.decay(np.hypot(x - slot.rest[0], y - slot.rest[1]))
-    return shares * area_shares(scene.sheet) if acts.by_area else shares
+    acts, (at_x, at_y) = probe_force(probe, sheet), control_points(probe, sheet)[1][0]
+    x, y = axes(sheet)
+    shares = acts.decay(np.hypot(x - at_x, y - at_y))
+    return shares * area_shares(sheet) if acts.by_area else shares
 
 
-def schedule(scene: Scene, first: int, count: int) -> Schedule:
-    """Average the loads over the steps first, ..., first + count - 1.
-
-    The time of step n is n / (frames per second x steps per frame), never a sum of steps.
-    """
-    t = np.arange(first, first + count) / (scene.time.frames_per_second * steps_per_frame(scene))
-    h, parts = step(scene), probe_slots(scene)
+def schedule(scene: Scene, grid: TimeGrid, first: int, count: int) -> Schedule:
+    """Average the loads over the steps first, ..., first + count - 1 of a grid."""
+    t, h = np.arange(first, first + count) / grid.steps_per_second, grid.step
+    parts = probe_slots(scene.probes, scene.sheet, h)
     strength, point = np.zeros((count, len(parts), 3)), np.zeros((count, len(parts), 2))
     for index, probe in enumerate(scene.probes):
         own = [n for n, part in enumerate(parts) if part.probe == index]
@@ -146,42 +147,40 @@ def schedule(scene: Scene, first: int, count: int) -> Schedule:
             for number in np.unique(place):
                 chosen = place == number
                 point[chosen, n] = _held(segments[number], t[chosen])
-    return Schedule(strength, point, _activity(scene).averages(t, h))
+    return Schedule(parts, strength, point, _activity(scene).averages(t, h))
 
 
 def loads_at(scene: Scene, t: Array) -> Schedule:
-    """Evaluate the loads at times on which no key falls, and not their averages [s], shape (times,)."""
-    parts = probe_slots(scene)
+    """Evaluate the loads themselves, not their averages, at times that are no keys [s], shape (times,)."""
+    parts = probe_slots(scene.probes, scene.sheet, 0.0)
     strength, point = np.zeros((len(t), len(parts), 3)), np.zeros((len(t), len(parts), 2))
-    for n, part in enumerate(parts):
-        probe = scene.probes[part.probe]
-        line = _load(probe)
+    for n, (part, probe) in enumerate(zip(parts, scene.probes, strict=True)):
+        strength[:, n] = np.multiply.outer(_load(probe).values(t) / 100, probe_force(probe, scene.sheet).force)
         number = part.jumps.searchsorted(t, "right")
-        acts = number % part.turns == part.turn
-        strength[:, n] = np.multiply.outer(line.values(t) * acts / 100, probe_force(probe, scene.sheet).force)
         for segment in np.unique(number):
             point[number == segment, n] = _held(part.segments[segment], t[number == segment])
-    return Schedule(strength, point, _activity(scene).values(t))
+    return Schedule(parts, strength, point, _activity(scene).values(t))
 
 
 def key_times(scene: Scene) -> Array:
-    """List the times of all keys after 0 and before the end [s], where the loads are not smooth."""
+    """List the times of all keys between 0 and the end [s]: only there the loads are not smooth."""
     times = {float(time) for keys in _key_lists(scene) for time in keys}
     return np.array(sorted(time for time in times if 0 < time < scene.time.duration))
 
 
 class Envelope:
-    """How hard the loads push at most from one time to another.
+    """Bounds of the loads from one time to another.
 
     Args:
         scene: a checked scene.
+        h: the step [s].
     """
 
-    def __init__(self, scene: Scene) -> None:
-        self._h = step(scene)
+    def __init__(self, scene: Scene, h: float) -> None:
+        self._h = h
         self._lines = [_load(probe) for probe in scene.probes]
         self._forces = [math.hypot(*probe_force(probe, scene.sheet).force) / 100 for probe in scene.probes]
-        self._probes = [slot.probe for slot in probe_slots(scene)]
+        self._probes = [slot.probe for slot in probe_slots(scene.probes, scene.sheet, h)]
         self._activity = _activity(scene)
         self._begins = self._activity.times[self._activity.before < self._activity.after]
 
@@ -189,10 +188,10 @@ class Envelope:
         """Bound what the loads do in the steps from one time to another, both included.
 
         Returns:
-            The largest force at each slot's control point [N], shape (slots,); whether the virtual springs act at any
-            time; and how often they begin to.
+            The largest force at the control point of each slot [N], shape (slots,); whether the virtual springs act at
+            any time; and how many times they begin to act.
         """
-        # A step sees what is within its hat.
+        # A step depends on everything within its hat.
         begin, end = begin - self._h, end + self._h
         most = [force * line.largest(begin, end) for force, line in zip(self._forces, self._lines, strict=True)]
         begun = self._begins.searchsorted(end, "right") - self._begins.searchsorted(begin, "left")
@@ -200,37 +199,37 @@ class Envelope:
 
 
 class _Line:
-    """A function of time, linear between its keys, where it may jump; 0 before the first, constant after the last.
+    """A piecewise linear function of time that may jump at its keys; 0 before the first, constant after the last.
 
     Args:
-        times: keys [s], in order; two at one time are a jump.
+        times: of the keys [s], in order; two keys at one time are a jump.
         values: at these keys.
     """
 
     def __init__(self, times: Array, values: Array) -> None:
         keys = np.unique(times)
-        # Its limits at every key.
+        # The limits from the left and from the right at every key.
         before, after = values[times.searchsorted(keys, "left")], values[times.searchsorted(keys, "right") - 1]
         before[0] = 0.0
-        # A key that changes nothing is dropped, so that it changes no rounding either.
+        # Keys that change nothing are dropped, so that they do not change the rounding either.
         last, following = np.append(0.0, after[:-1]), np.append(before[1:], after[-1])
         told = (last != before) | (before != after) | (after != following)
         told[0] = True
         self.times, self.before, self.after = keys[told], before[told], after[told]
 
     def values(self, t: Array) -> Array:
-        """Evaluate it; at a key its right limit."""
+        """Evaluate the function; at a key, its limit from the right."""
         return self._values(t, self.times.searchsorted(t, "right"))
 
     def averages(self, t: Array, h: float, begin: float = -math.inf, end: float = math.inf) -> Array:
-        """Average it with the hat of half-width h about times from 0 on; outside begin to end it counts as 0.
+        """Average the function with the hat of half-width h about times t >= 0; it counts as 0 outside [begin, end].
 
-        The average is the value itself where the hat holds no key, nor begin or end.
+        If neither a key nor begin nor end lies within the hat, the average is the value itself.
         """
         edges = [edge for edge in (begin, end) if math.isfinite(edge)]
         found = self.values(t) * ((begin <= t) & (t < end))
         bounds = np.union1d(self.times, edges)
-        # At t = 0 the hat is half a hat, whose average even of a line is not the value in its middle.
+        # At t = 0 there is only half a hat, so that even the average of a line is not its value at t.
         uneven = (t <= 0) | (
             bounds.searchsorted(t + h * (1 - EDGE), "left") > bounds.searchsorted(t - h * (1 - EDGE), "right")
         )
@@ -245,7 +244,7 @@ class _Line:
         return float(np.abs(np.concatenate([self.values(ends), self.before[first:last], self.after[first:last]])).max())
 
     def _values(self, t: Array, after: NDArray[np.intp]) -> Array:
-        """Evaluate it between the keys after[n] - 1 and after[n]."""
+        """Evaluate the function between the keys after[n] - 1 and after[n]."""
         low, high = np.maximum(after - 1, 0), np.minimum(after, len(self.times) - 1)
         span = self.times[high] - self.times[low]
         share = np.divide(t - self.times[low], span, out=np.zeros_like(t), where=span > 0)
@@ -253,7 +252,7 @@ class _Line:
         return np.where(after == 0, 0.0, self.after[low] + share * slope)
 
     def _average(self, t: float, h: float, begin: float, end: float) -> float:
-        """Integrate piece by piece: on each both the hat and the function are linear, and Simpson's rule is exact."""
+        """Integrate piece by piece: on each piece hat and function are linear, so that Simpson's rule is exact."""
         low, high = max(t - h, 0.0 if t <= 0 else -math.inf, begin), min(t + h, end)
         inner = self.times[(self.times > low) & (self.times < high)]
         cuts = np.unique(np.concatenate([[low, high], inner, [t] if low < t < high else []]))
@@ -269,10 +268,10 @@ class _Line:
 
 
 def _by_turns(line: _Line, jumps: Array, turns: int, t: Array, h: float) -> tuple[Array, NDArray[np.intp]]:
-    """Share the load out among the slots of a probe whose control point jumps.
+    """Share the load of a probe whose control point jumps out among its slots.
 
     Returns:
-        Percent of every slot, and the segment of the control point that it is at, each of shape (steps, slots).
+        For every slot, its percent and the index of its segment at each step, both of shape (steps, slots).
     """
     bounds = np.concatenate([[-math.inf], jumps, [math.inf]])
     first = jumps.searchsorted(t - h * (1 - EDGE), "right")
@@ -289,7 +288,7 @@ def _by_turns(line: _Line, jumps: Array, turns: int, t: Array, h: float) -> tupl
 
 
 def _held(segment: ProbeSegment, t: Array) -> Array:
-    """Tell where a control point is, held outside its keys; shape (times, 2)."""
+    """Interpolate a control point, constant before and after its keys; shape (times, 2)."""
     return np.stack([np.interp(t, segment.times, segment.points[:, axis]) for axis in range(2)], axis=-1)
 
 
@@ -299,13 +298,13 @@ def _load(probe: Probe) -> _Line:
 
 
 def _activity(scene: Scene) -> _Line:
-    """Tell when the virtual springs exist: 1 while the percent of any probe is not 0, or always; else 0."""
+    """Tell when the virtual springs act: 1 always or while the percent of any probe is not 0, else 0."""
     if material(scene).always:
         return _Line(np.array([LONG_AGO]), np.array([1.0]))
     times = np.unique([time for probe in scene.probes for time, _ in probe.load])
     if not times.size:
         return _Line(np.zeros(1), np.zeros(1))
-    # Between two keys, and after the last one.
+    # A time between each two keys, and one after the last.
     middles = np.append((times[:-1] + times[1:]) / 2, times[-1] + 1)
     active = np.zeros(len(times))
     for probe in scene.probes:
@@ -318,6 +317,6 @@ def _activity(scene: Scene) -> _Line:
 
 
 def _key_lists(scene: Scene) -> list[Array]:
-    """List the times of every list of keys [s]."""
+    """Collect the times of every list of keys [s]: of loads and of control points."""
     loads = [np.array([time for time, _ in probe.load]) for probe in scene.probes]
     return [*loads, *(control_points(probe, scene.sheet)[0] for probe in scene.probes)]

@@ -1,17 +1,17 @@
-"""What a sheet is made of: the numbers of the model for points and springs, whichever way a scene gives them.
+"""What a sheet is made of: masses, springs and damping of the model, whichever way a scene describes them.
 
-With `springs` a scene gives them itself. With `tissue` they follow from it cell by cell, each cell dx x dy adding to
-the springs along its edges and diagonals and to the points at its corners (f: the factor of the map there)
+With `springs`, the scene has these numbers. With `tissue`, they are derived from it cell by cell: each cell, dx by dy,
+adds to the springs along its edges and diagonals and to the points at its corners (f: the factor of the map there)
 
     along x     f E t (9/8 dy/dx - 3/8 dx/dy) / 2        along y: the same with x and y exchanged
     diagonals   f 3/16 E t (dx^2 + dy^2) / (dx dy)
     corners     mass rho t dx dy / 4,   K = foundation dx dy / 4,   C = damping mass
 
-so that the lattice is the isotropic sheet of plane stress with Poisson's ratio 1/3, which springs impose: docs/model.md
-derives it. Points and springs at an edge belong to fewer cells, and have less.
+so that the lattice is an isotropic sheet in plane stress. Springs impose its Poisson's ratio of 1/3; docs/model.md has
+the derivation. Points and springs at an edge belong to fewer cells, and so get less.
 
-A tension S pulls each spring at rest with tau L: tau = k1 e, where k1 is its stiffness for f = 1 and e = S / (3/2 E t).
-Then its force, but for what cancels at rest, is
+Under a tension S each spring of length L pulls at rest with tau L. Here tau = k1 e, where k1 is its stiffness for f = 1
+and e = S / (3/2 E t). Its force, less that at rest, which cancels, is
 
     (k - tau) (1 - L / |o + q|) (o + q) + tau q          o: the spring at rest, q: difference of its ends' displacements
 """
@@ -33,10 +33,10 @@ from taichi_msm.physics.lattice import fixed_points, spacing
 from taichi_msm.picture import PictureError
 from taichi_msm.scene import MAX_POINTS, Scene, Sheet, StiffnessMap
 
-# Of a lattice of springs between nearest and diagonal neighbours.
+# Poisson's ratio of a lattice of springs between nearest and diagonal neighbours.
 POISSON = 1 / 3
 
-# Cells longer than so many times their width would need springs that push.
+# Cells longer than this many times their width would need springs of negative stiffness.
 LONGEST_CELL = math.sqrt(3)
 
 Array = NDArray[np.float64]
@@ -44,18 +44,18 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class Material:
-    """The numbers of a sheet; where there is a map, for a factor of 1.
+    """The numbers of a sheet; with a map, those for a factor of 1.
 
     Attributes:
         mass: of a point [kg].
         drag: C / m [1/s].
         across, down, shear: stiffness k of springs along a row, along a column and along diagonals [N/m].
-        tension: share e of its stiffness times its length with which a spring pulls at rest.
-        virtual: stiffness K of the virtual springs [N/m]; 0 where they never act.
-        always: whether the virtual springs always act, and not only under a load.
+        tension: e; a spring pulls at rest with this share of its stiffness times its length.
+        virtual: stiffness K of the virtual springs [N/m]; 0 if they never act.
+        always: whether the virtual springs always act; else only under a load.
         bending: D dx dy [N m3].
-        by_area: whether points and springs at an edge have less, as with tissue; else as much as all others.
-        map: the factor of the stiffness from place to place.
+        by_area: whether points and springs at an edge get less than others, as in tissue.
+        map: factors of the stiffness from place to place.
     """
 
     mass: float
@@ -72,12 +72,12 @@ class Material:
 
     @property
     def stiffness(self) -> tuple[float, float, float]:
-        """Stiffness besides the tension, k - tau, of springs along rows, along columns and of diagonals [N/m]."""
+        """Stiffness less tension, k - tau, of springs along rows, along columns and of diagonals [N/m]."""
         return self._times(1 - self.tension)
 
     @property
     def tensions(self) -> tuple[float, float, float]:
-        """Tension by length, tau, of springs along rows, along columns and of diagonals [N/m]."""
+        """Tension per length, tau, of springs along rows, along columns and of diagonals [N/m]."""
         return self._times(self.tension)
 
     def _times(self, factor: float) -> tuple[float, float, float]:
@@ -146,7 +146,7 @@ def _of_tissue(scene: Scene) -> Material:
 
 
 def factors(scene: Scene) -> Array:
-    """Give the factor of the stiffness at the centre of every cell, shape (rows - 1, cols - 1); 1 without a map.
+    """Give the factor of the stiffness at the centre of every cell, shape (rows - 1, cols - 1); ones without a map.
 
     Raises:
         SceneError: when the map cannot be read.
@@ -160,7 +160,7 @@ def factors(scene: Scene) -> Array:
 
 @contextmanager
 def _naming_the_map(scene: Scene) -> Iterator[None]:
-    """Name the key of the map in an error of its file."""
+    """Add the key of the map to an error about its file."""
     try:
         yield
     except PictureError as error:
@@ -168,7 +168,7 @@ def _naming_the_map(scene: Scene) -> Iterator[None]:
 
 
 def stiffness(scene: Scene) -> Stiffness:
-    """Add up the stiffness of every spring, cell by cell.
+    """Assemble the stiffness of every spring from its cells.
 
     Raises:
         SceneError: when the map cannot be read.
@@ -178,7 +178,7 @@ def stiffness(scene: Scene) -> Stiffness:
     across = made.across / 2 * (above_and_below[:-1] + above_and_below[1:])
     down = made.down / 2 * (beside[:, :-1] + beside[:, 1:])
     if not made.by_area:
-        # A spring at an edge is like any other: it has the mean of its cells, of which there is one.
+        # A spring at an edge is as stiff as any other: with the factor of its only cell, not with half of it.
         across[[0, -1]] *= 2
         down[:, [0, -1]] *= 2
     return Stiffness(across, down, made.shear * factor)
@@ -192,17 +192,17 @@ def area_shares(sheet: Sheet) -> Array:
 
 
 def highest_frequency(scene: Scene) -> float:
-    """Bound the highest angular frequency of the sheet [rad/s], however it lies, if no spring is below half its length.
+    """Bound the highest angular frequency of the sheet [rad/s] in any shape without springs below half their length.
 
-    The energy is a sum over cells. In each, springs have at most the energy of k / 2 |q|^2, so that no mode of a cell
-    with a quarter of the points' mass at its corners has more than
+    The energy is a sum over cells. The springs of a cell have at most the energy k / 2 |q|^2, so that no mode of a cell
+    with a quarter of the points' mass at its corners has a higher frequency than
 
         w^2 = (4 max(across + down, across + 2 shear, down + 2 shear) + K) / m
 
-    and nor has the sheet. Where factors differ, cells share the mass of a point as they share its stiffness: then
-    the largest mean of the factors around a point stands before the maximum. Bending adds the square of the largest
-    Laplacian, (4 / dx^2 + 4 / dy^2)^2 D dx dy / m; at free edges, too, where a point has half the mass and is, with the
-    moments mirrored in the edge, one of a sheet without edges.
+    and hence no mode of the sheet. If factors differ, each cell takes the share of a point's mass that it has of the
+    point's stiffness; the maximum is then multiplied by the largest mean of the factors around a point. Bending adds
+    the square of the largest Laplacian, (4 / dx^2 + 4 / dy^2)^2 D dx dy / m. This holds at free edges too: mirror the
+    moments in the edge, and a point there, which has half the mass, becomes one of a sheet without edges.
     """
     made, (dx, dy) = material(scene), spacing(scene.sheet)
     pairs = (made.across + made.down, made.across + 2 * made.shear, made.down + 2 * made.shear)
@@ -212,19 +212,19 @@ def highest_frequency(scene: Scene) -> float:
 
 
 def cell_ratio(sheet: Sheet) -> float:
-    """Tell how many times as long as wide the cells are."""
+    """Give the ratio of the longer to the shorter side of a cell."""
     dx, dy = spacing(sheet)
     return max(dx, dy) / min(dx, dy)
 
 
-def has_fixed_border(scene: Scene) -> bool:
+def has_fixed_border(sheet: Sheet) -> bool:
     """Tell whether every point at an edge is fixed."""
-    fixed = fixed_points(scene.sheet)
+    fixed = fixed_points(sheet)
     return bool(fixed[[0, -1]].all() and fixed[:, [0, -1]].all())
 
 
 def _largest_factor(scene: Scene) -> float:
-    """Find the largest mean of the factors of the cells around a point; without shares of area the largest factor."""
+    """Find the largest mean of the factors of the cells around a point; with springs, the largest factor."""
     if scene.stiffness_map is None:
         return 1.0
     rows, cols = scene.sheet.points
@@ -234,7 +234,7 @@ def _largest_factor(scene: Scene) -> float:
 
 
 def problems(scene: Scene) -> Iterator[Problem]:
-    """Say what is missing or too much, of springs and of tissue, and which tissue there cannot be."""
+    """Find missing and superfluous keys of springs and of tissue, and tissue that is impossible."""
     kinds = list(_kind_problems(scene))
     yield from kinds
     if not kinds:
@@ -257,14 +257,14 @@ def _kind_problems(scene: Scene) -> Iterator[Problem]:
             yield Problem(("sheet", "tolerance"), said)
         return
     if scene.springs is not None:
-        yield Problem(("springs",), "tissue says already how stiff the sheet is; remove springs or tissue")
+        yield Problem(("springs",), "tissue already gives the stiffness of the sheet; remove springs or tissue")
     if sheet.mass is not None:
         yield Problem(("sheet", "mass"), "tissue has the mass of density x thickness x area; remove mass")
     if scene.damping:
         yield Problem(("damping",), f"{scene.damping:g} N s/m is per point; with tissue set tissue.damping, in 1/s")
     for index, probe in enumerate(scene.probes):
         if probe.force is not None:
-            said = "is per point, and more points would dent tissue otherwise; set total, the whole tool's, in newtons"
+            said = "is per point, so that more points would be pressed deeper; set total, of the whole tool, in newtons"
             yield Problem(("probes", index, "force"), said)
 
 
@@ -293,11 +293,14 @@ def _tissue_problems(scene: Scene, *, has_map: bool) -> Iterator[Problem]:
             f"{LONGEST_CELL:.3g} times; {remedy}",
         )
     if tissue.pretension > 0:
-        if not has_fixed_border(scene):
+        if not has_fixed_border(sheet):
             said = f"{tissue.pretension:g} N/m needs every side fixed; set sheet.fixed: border, or pretension: 0"
             yield Problem(("tissue", "pretension"), said)
         softest = float(factors(scene).min()) if has_map else 1.0
         most = 1.5 * tissue.young * tissue.thickness * softest
         if tissue.pretension >= most:
-            said = f"{tissue.pretension:g} N/m leaves springs no length; take less than {most:.3g} N/m, or more young"
-            yield Problem(("tissue", "pretension"), said)
+            yield Problem(
+                ("tissue", "pretension"),
+                f"{tissue.pretension:g} N/m needs springs without length; take less than {most:.3g} N/m, or a larger "
+                "young",
+            )

@@ -1,14 +1,14 @@
 """The force of a probe on the points around its control point.
 
-A probe with `force` gives a point at the distance d from its control point (eq. 5)
+A probe with `force` exerts on a point at the distance d from its control point (eq. 5)
 
     F = force exp(-falloff max(d - radius, 0) - offset)
 
-and one with `total`, whatever the points, the share of the sheet's area that belongs to the point times
+and one with `total`, for any number of points, the area that belongs to the point times
 
     F = total w(d) / W,    w = exp(-falloff max(d - radius, 0)),    W = pi R^2 + 2 pi (R / falloff + 1 / falloff^2)
 
-where W is the integral of w over an endless sheet, and R the radius of the tool's flat end.
+where W is the integral of w over an infinite sheet, and R the radius of the tool's flat end.
 """
 
 from __future__ import annotations
@@ -29,10 +29,10 @@ SAME_TIME = 1e-12
 
 Array = NDArray[np.float64]
 
-# Forces are summed up for so many points at a time.
+# Forces are summed for this many points at a time.
 BLOCK = 1 << 20
 
-# Less of a tool's total than this share on the sheet, or as much more, is remarkable.
+# A note is made if the force on the sheet is below this share of a tool's total, or above its inverse.
 LEAST_REACHING = 0.8
 
 
@@ -44,7 +44,7 @@ class ProbeForce(NamedTuple):
         falloff: [1/m].
         shift: offset - falloff radius, so that the exponent is that of the flat end up to its rim.
         offset: exponent on the flat end.
-        by_area: whether a point gets its share of a cell's area.
+        by_area: whether the force on a point is multiplied by its share of a cell's area.
     """
 
     force: tuple[float, float, float]
@@ -59,12 +59,12 @@ class ProbeForce(NamedTuple):
         return math.hypot(*self.force) * math.exp(-self.offset)
 
     def decay(self, distance: Array) -> Array:
-        """Tell which share of the force acts at a distance from the control point [m]."""
+        """Give the share of the force that acts at a distance from the control point [m]."""
         return np.exp(-np.maximum(self.falloff * distance + self.shift, self.offset))
 
 
 def probe_force(probe: Probe, sheet: Sheet) -> ProbeForce:
-    """Find how a probe acts on a sheet."""
+    """Compute how a probe acts on a sheet."""
     by_area = probe.total is not None
     offset = 0.0 if by_area else probe.offset
     shift = offset - probe.falloff * probe.radius
@@ -99,18 +99,18 @@ def control_point(probe: Probe, sheet: Sheet, time: float) -> Array:
 
 
 def spread(probe: Probe) -> float:
-    """Integrate the decay of a probe with `total` over an endless sheet: W [m2]."""
+    """Integrate the decay of a probe with `total` over an infinite sheet: W [m2]."""
     reach = 1 / probe.falloff
-    # Products and no powers, which raise where a product is infinite.
+    # Products instead of powers: these raise OverflowError where a product is infinite.
     return math.pi * (probe.radius * probe.radius + 2 * (probe.radius * reach + reach * reach))
 
 
 class Sums(NamedTuple):
-    """What a probe does to all points of a sheet at 100 %, at the first place of its control point.
+    """The forces of a probe on all points of a sheet at 100 %, at the first place of its control point.
 
     Attributes:
-        total: of the forces [N].
-        pressure: the largest force on a point by the area that belongs to it [Pa].
+        total: sum of the forces [N].
+        pressure: largest force on a point per area that belongs to it [Pa].
     """
 
     total: float
@@ -118,14 +118,20 @@ class Sums(NamedTuple):
 
 
 def sums(probe: Probe, sheet: Sheet, finer: int = 1) -> Sums:
-    """Sum up a probe on the points of a sheet, or on those of one with cells so many times as short."""
+    """Sum the forces of a probe on the points of a sheet.
+
+    Args:
+        probe: whose forces.
+        sheet: on which.
+        finer: sum over the points of a sheet whose cells are this many times shorter.
+    """
     acts, (at_x, at_y) = probe_force(probe, sheet), control_points(probe, sheet)[1][0]
     (rows, cols), (height, width) = ((count - 1) * finer for count in sheet.points), sheet.size
     x, y = (np.arange(cols + 1) / cols - 0.5) * width, (0.5 - np.arange(rows + 1) / rows) * height
     along, down = np.ones(cols + 1), np.ones(rows + 1)
     along[[0, -1]], down[[0, -1]] = 0.5, 0.5
     total, largest = 0.0, 0.0
-    # So many rows at a time that memory does not count.
+    # A block of rows at a time, which takes little memory.
     block = max(1, BLOCK // (cols + 1))
     for first in range(0, rows + 1, block):
         part = slice(first, first + block)
@@ -137,12 +143,12 @@ def sums(probe: Probe, sheet: Sheet, finer: int = 1) -> Sums:
 
 
 class ProbeRecord(TypedDict):
-    """What a probe does at 100 %, at the first place of its control point.
+    """The forces of a probe at 100 %, at the first place of its control point.
 
     Attributes:
-        total_force: on all points together [N].
+        total_force: sum over all points [N].
         flat_end_force: the part of a `total` that acts under the tool's flat end, on a wide sheet [N].
-        largest_pressure: force on a point by the area that belongs to it [Pa].
+        largest_pressure: largest force on a point per area that belongs to it [Pa].
     """
 
     total_force: float
@@ -151,7 +157,7 @@ class ProbeRecord(TypedDict):
 
 
 def probe_records(scene: Scene) -> list[ProbeRecord]:
-    """Add up what every probe of a scene does."""
+    """Sum the forces of every probe of a scene."""
     found = []
     for probe in scene.probes:
         flat, (total, pressure) = 0.0, sums(probe, scene.sheet)
@@ -162,13 +168,13 @@ def probe_records(scene: Scene) -> list[ProbeRecord]:
 
 
 def in_words(record: ProbeRecord) -> str:
-    """Say what a probe does."""
+    """Describe the forces of a probe in a line."""
     flat = f", {record['flat_end_force']:.3g} N of it under the flat end" if record["flat_end_force"] > 0 else ""
     return f"{record['total_force']:.3g} N in all{flat}, at most {record['largest_pressure'] / 1000:.3g} kPa"
 
 
 def notes(scene: Scene, records: Sequence[ProbeRecord]) -> Iterator[str]:
-    """Tell of probes whose forces do not add up to their total on this sheet.
+    """Note the probes whose forces do not add up to their total on this sheet.
 
     Args:
         scene: a checked scene.
@@ -178,6 +184,6 @@ def notes(scene: Scene, records: Sequence[ProbeRecord]) -> Iterator[str]:
         asked = math.hypot(*probe.total) if probe.total is not None else 0.0
         if asked > 0 and not LEAST_REACHING < record["total_force"] / asked < 1 / LEAST_REACHING:
             yield (
-                f"probes.{index}: {record['total_force']:.3g} N of its {asked:.3g} N reach the sheet; is it beside it, "
-                "wider than the sheet, or narrower than a cell?"
+                f"probes.{index}: {record['total_force']:.3g} N of its {asked:.3g} N reach the sheet; is the tool "
+                "beside the sheet, wider than the sheet, or narrower than a cell?"
             )

@@ -1,4 +1,4 @@
-"""Where a run is: what is known of its last frame, and the state from which another process can go on."""
+"""How far a run has come: facts about its last frame, and the state from which another process can continue."""
 
 from __future__ import annotations
 
@@ -10,16 +10,16 @@ from taichi_msm.physics.state import State
 
 @dataclass(frozen=True)
 class RunProgress:
-    """What is known of a run at a frame, besides where the points are.
+    """What is known about a run at a frame, apart from the positions.
 
     Attributes:
-        frame: its number.
-        max_displacement: largest displacement of any frame so far [m].
-        shortest_spring: smallest length of a spring over its rest length at any frame so far.
-        longest_spring: the largest.
-        energy: of motion and springs, without the virtual ones, at this frame [J].
+        frame: number of the frame.
+        max_displacement: largest displacement at any frame so far [m].
+        shortest_spring: smallest ratio of a spring's length to its rest length at any frame so far.
+        longest_spring: largest such ratio.
+        energy: kinetic energy and that of springs and bending, without the virtual springs, at this frame [J].
         reach: root of the sum of all squared displacements at this frame [m].
-        peak: largest energy of any frame so far [J].
+        peak: largest energy at any frame so far [J].
     """
 
     frame: int = 0
@@ -32,11 +32,11 @@ class RunProgress:
 
 
 class Saved(NamedTuple):
-    """Where a run was.
+    """A point of a run from which it can continue.
 
     Attributes:
-        state: at some step.
-        progress: of the last frame up to it.
+        state: at a step, which may lie between two frames.
+        progress: at the last frame up to that step.
     """
 
     state: State

@@ -1,4 +1,4 @@
-"""Kernel 1 from outside: the forces on every point and its Verlet update, all the steps of a frame in few launches.
+"""The interface to kernel 1, which computes the force on every point and its Verlet step, a frame in few launches.
 
 State of point P: its displacement u_n = x_n - X and the last difference d_n = u_n - u_{n-1}, from which the Verlet
 step (eq. 6 to 9) reads
@@ -9,19 +9,20 @@ step (eq. 6 to 9) reads
     backward:  keep = 1 - g h                          gain = h^2 / m
     step 0:    d_0 = 0                                 gain = h^2 / m / 2
 
-which is the position form without its cancellation: in f32 it keeps the digits of a small motion on a large sheet.
+This is the position form rearranged so that nothing cancels: in f32 it keeps the digits of a small motion on a large
+sheet.
 """
 
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from taichi_msm.errors import ArgumentError, DeviceError
-from taichi_msm.physics import workload
 from taichi_msm.physics.kernel import (
     ACROSS,
     AREA,
@@ -47,52 +48,54 @@ from taichi_msm.physics.kernel import (
 from taichi_msm.physics.kernel_cpu import Sweep
 from taichi_msm.physics.kernel_gpu import STEPS_PER_LAUNCH, Gather
 from taichi_msm.physics.lattice import axes, fixed_points, spacing
-from taichi_msm.physics.loads import decay, probe_slots, schedule
+from taichi_msm.physics.loads import ProbeSlot, decay, probe_slots, schedule
 from taichi_msm.physics.material import area_shares, has_fixed_border, material, stiffness
 from taichi_msm.physics.probe_force import probe_force
 from taichi_msm.physics.state import Reading, State
-from taichi_msm.physics.timestep import step, steps_per_frame
 from taichi_msm.physics.verlet import coefficients
 from taichi_msm.progress import Pause
 from taichi_msm.scene import Scene
 from taichi_msm.system.resources import available_threads
 from taichi_msm.system.runtime import Device, lanes
+from taichi_msm.timegrid import TimeGrid
 
-# Below this many points a worker costs more in waiting for the others than it saves.
+# With fewer points per worker, one worker more costs more time in waiting than it saves in work.
 POINTS_PER_WORKER = 450
 
-# What a band may take of a core's cache, and the most steps of one sweep.
+# How much of a core's cache a band may fill [bytes], and the largest number of steps in one sweep.
 CACHE = 3 << 17
 MOST_DEPTH = 8
 
-# Numbers that a sweep keeps for a point: displacement, difference, forces for the row ahead.
+# Numbers that a sweep keeps per point: displacement, difference and the force carried to the next row, as vectors.
 NUMBERS_PER_POINT = 9
 
-# A launch is to end soon enough for Ctrl-C: so many steps of points, some 0.1 s of one core.
+# A launch takes no more steps than this, so that Ctrl-C is noticed soon: steps times points, about 0.1 s of one core;
+# and steps.
 POINT_STEPS_PER_LAUNCH = 40_000_000
 MAX_STEPS_PER_LAUNCH = 8192
 
-# Loads are tabulated for so many steps at a time: for one of a few frames' steps NumPy takes as long.
+# Loads are tabulated for this many steps at a time; NumPy takes hardly less time for the steps of a few frames.
 STEPS_PER_TABLE = 4096
 
 
-def structure(scene: Scene, device: Device, cores: int | None = None) -> Structure:
-    """Find out what the scene needs: absent terms are left out of the kernel.
+def structure(scene: Scene, grid: TimeGrid, device: Device, cores: int | None = None) -> Structure:
+    """Choose how a sheet is laid out and shared out, and what is compiled for it: only the terms that the scene has.
 
     Args:
         scene: a checked scene.
+        grid: its steps.
         device: what `runtime.start` returned.
-        cores: how many cores are free for it; None: all.
+        cores: number of cores that stepping may use; None: all.
 
     Raises:
         DeviceError: when the device cannot do what the scene needs.
     """
     rows, cols = scene.sheet.points
-    fixed, made, slots = fixed_points(scene.sheet), material(scene), probe_slots(scene)
-    precision, open_edges = workload.precision(scene, device.arch), not has_fixed_border(scene)
+    fixed, made, slots = fixed_points(scene.sheet), material(scene), _slots(scene, grid)
+    precision, open_edges = grid.precision, not has_fixed_border(scene.sheet)
     fixed_rows = bool(fixed[0].all()), bool(fixed[-1].all())
     if device.arch == "cpu":
-        # Workers wait by spinning: more of them than cores would only keep each other from their work.
+        # Workers wait by spinning, so more workers than cores would only hold each other up.
         cores = min(device.threads, available_threads() if cores is None else cores)
         workers = max(1, min(cores, rows * cols // POINTS_PER_WORKER, (rows - sum(fixed_rows)) // 2))
     else:
@@ -110,7 +113,7 @@ def structure(scene: Scene, device: Device, cores: int | None = None) -> Structu
         virtual=made.virtual > 0,
         damped=made.drag > 0,
         slots_move=tuple(slot.moves for slot in slots),
-        slots_by_area=_slots_by_area(scene),
+        slots_by_area=_slots_by_area(scene, slots),
     )
     if device.arch == "vulkan" and precision == "f64" and any(code.slots_move):
         raise DeviceError(
@@ -124,7 +127,12 @@ def structure(scene: Scene, device: Device, cores: int | None = None) -> Structu
 
 
 def _depth(rows: int, row_bytes: int) -> int:
-    """Choose the steps of a sweep: one where the band stays in the cache anyway, else as many as its rows leave."""
+    """Choose the number of steps in a sweep: 1 if the whole band fits into the cache, else what the cache has room for.
+
+    Args:
+        rows: of a band.
+        row_bytes: memory of a row.
+    """
     if rows * row_bytes <= CACHE:
         return 1
     return max(1, min(MOST_DEPTH, CACHE // row_bytes - 2))
@@ -135,66 +143,77 @@ class Dynamics:
 
     Args:
         scene: a checked scene.
+        grid: its steps.
         device: what `runtime.start` returned.
-        layout: another structure than the scene's own; for tests.
-        cores: how many cores are free for it; None: all.
+        layout: a structure in the place of the scene's own; for tests.
+        cores: number of cores that stepping may use; None: all.
 
     Attributes:
+        scene: what is stepped.
+        grid: its steps.
         structure: what the kernels are compiled for.
         steps_done: number of steps taken.
         launches: number of launches of the kernel.
     """
 
-    def __init__(self, scene: Scene, device: Device, layout: Structure | None = None, cores: int | None = None) -> None:
-        self.scene = scene
+    def __init__(
+        self,
+        scene: Scene,
+        grid: TimeGrid,
+        device: Device,
+        layout: Structure | None = None,
+        cores: int | None = None,
+    ) -> None:
         self._device = device
         self._cores = cores
         self._layout = layout
         self.launches = 0
         self._sheet: Sweep | Gather | None = None
-        self.restart(scene)
+        self.restart(scene, grid)
 
-    def restart(self, scene: Scene, state: State | None = None) -> None:
-        """Begin again, with the same scene or another; nothing is compiled where only numbers differ.
+    def restart(self, scene: Scene, grid: TimeGrid, state: State | None = None) -> None:
+        """Begin again with the same scene or another; nothing is compiled if only numbers differ.
 
         Args:
             scene: a checked scene.
-            state: where to begin, as `state` gave it with the same points and step; None: at rest.
+            grid: its steps.
+            state: what `state` returned for the same points and steps, to continue from; None: at rest.
         """
-        self.scene = scene
-        self.structure = self._layout or structure(scene, self._device, self._cores)
+        self.scene, self.grid = scene, grid
+        self.structure = self._layout or structure(scene, grid, self._device, self._cores)
         self._begin(state)
 
     def steer(self, scene: Scene) -> None:
-        """Go on from here with other loads.
+        """Continue with other loads and the same steps.
 
         Args:
-            scene: the scene with other probes, of which each moves, jumps or stands as it did.
+            scene: the scene with other probes, each of which moves, jumps or stands as its predecessor did.
 
         Raises:
-            ArgumentError: when it needs another kernel.
+            ArgumentError: when the new probes need another kernel.
         """
-        moves = tuple(slot.moves for slot in probe_slots(scene))
+        slots = _slots(scene, self.grid)
+        moves = tuple(slot.moves for slot in slots)
         if moves != self.structure.code.slots_move:
+            before = _in_words(self.structure.code.slots_move)
             raise ArgumentError(
-                "probes: the scene's move, jump or stand otherwise (control points that move: "
-                f"{_in_words(self.structure.code.slots_move)}; now {_in_words(moves)}); "
-                "restart with a scene that has these"
+                f"probes: which control points move or jump cannot change (before: {before}; now: {_in_words(moves)}); "
+                "restart with the new scene"
             )
-        if _slots_by_area(scene) != self.structure.code.slots_by_area:
-            raise ArgumentError("probes: one that had force has total now, or the reverse; restart with such a scene")
-        if _standing(scene) != _standing(self.scene):
-            self._moving.set_decay(_standing_decays(scene))
+        if _slots_by_area(scene, slots) != self.structure.code.slots_by_area:
+            raise ArgumentError("probes: one has total instead of force, or the reverse; restart with the new scene")
+        if _standing(scene, slots) != _standing(self.scene, _slots(self.scene, self.grid)):
+            self._moving.set_decay(_standing_decays(scene, slots))
         self.scene = scene
-        # Who steers does so again in a frame.
-        self._first_tabled, self._loads = self.steps_done, self._table(self.steps_done, steps_per_frame(scene))
+        # A caller that steers will steer again in a frame, so no more loads than those of a frame are tabulated.
+        self._first_tabled, self._loads = self.steps_done, self._table(self.steps_done, self.grid.steps_per_frame)
 
     def advance(self, steps: int, pause: Pause = lambda: None) -> None:
         """Take a number of steps.
 
         Args:
             steps: how many.
-            pause: called after every launch; what it raises stops the sheet there, and it can go on.
+            pause: called after every launch. An exception from it stops the sheet there; another call continues.
         """
         points = self.structure.rows * self.structure.cols
         most = max(1, min(MAX_STEPS_PER_LAUNCH, POINT_STEPS_PER_LAUNCH // points))
@@ -222,7 +241,7 @@ class Dynamics:
         return self.read().displacement
 
     def state(self) -> State:
-        """Read all that the next steps depend on."""
+        """Read everything that the next steps depend on."""
         return State(self.steps_done, self._copy(differences=False)[0], self._copy(differences=True)[0])
 
     def read(self) -> Reading:
@@ -236,13 +255,13 @@ class Dynamics:
         squares = np.array([dx**2, dy**2, dx**2 + dy**2])
         stiffness = np.ones(3) if made.map else np.array(made.stiffness)
         springs = (stiffness * sums[STRETCHED : STRETCHED + 3] + made.tensions * sums[TENSE : TENSE + 3]) @ squares
-        motion = made.mass * sums[MOTION] / step(self.scene) ** 2
+        motion = made.mass * sums[MOTION] / self.grid.step**2
         return Reading(
             self.steps_done, displacement, shortest, longest, float(springs + motion + made.bending * sums[BENT]) / 2
         )
 
     def _copy(self, *, differences: bool) -> tuple[NDArray[Any], NDArray[Any]]:
-        """Copy displacements or differences, and what is measured of every row."""
+        """Copy the displacements or the differences, and the measures of every row."""
         s = self.structure
         out, measures = np.empty((s.rows, s.cols, 3), self._real), np.empty((s.rows, MEASURES), self._real)
         self._moving.read(spacing(self.scene.sheet), ReadArguments(differences, out, measures))
@@ -258,20 +277,19 @@ class Dynamics:
         return self._sheet
 
     def _begin(self, state: State | None) -> None:
-        """Put the sheet at rest, or where it was."""
+        """Prepare the sheet at rest or in a given state."""
         self._real = np.dtype(np.float32 if self.structure.code.precision == "f32" else np.float64)
         self.steps_done = 0 if state is None else state.steps
         self._material = material(self.scene)
+        self._verlet = coefficients(self._material, self.grid.step, self.scene.time.damping_difference)
         self._arguments = self._numbers()
         self._first_tabled, self._loads = self.steps_done, self._table(self.steps_done, STEPS_PER_TABLE)
         self._place(state)
 
     def _numbers(self) -> tuple[float, ...]:
-        """Give the numbers of the scene in the order of the kernel's arguments."""
-        scene = self.scene
-        dx, dy = spacing(scene.sheet)
-        made, keep = self._material, coefficients(scene).keep
-        return keep, dx, dy, *made.stiffness, *made.tensions, made.bending, scene.sheet.size[0] / 2
+        """List the scene's numbers in the order of the kernel's arguments."""
+        made, sheet = self._material, self.scene.sheet
+        return self._verlet.keep, *spacing(sheet), *made.stiffness, *made.tensions, made.bending, sheet.size[0] / 2
 
     def _next_loads(self, count: int) -> NDArray[Any]:
         """Give the table of the loads of the next steps, shape (count, columns)."""
@@ -284,26 +302,24 @@ class Dynamics:
 
     def _table(self, first: int, count: int) -> NDArray[Any]:
         """Tabulate the loads of steps first, ..., first + count - 1, shape (count, columns)."""
-        scene, verlet = self.scene, coefficients(self.scene)
-        loads = schedule(scene, first, count)
-        parts = probe_slots(scene)
+        scene, loads = self.scene, schedule(self.scene, self.grid, first, count)
         table = np.empty((count, self.structure.code.load_columns))
-        table[:, 0] = verlet.gain
+        table[:, 0] = self._verlet.gain
         if first == 0:
-            table[0, 0] = verlet.first_gain
+            table[0, 0] = self._verlet.first_gain
         table[:, 1] = self._material.virtual * loads.active
-        slot = table[:, SLOT_COLUMN:].reshape(count, len(parts), SLOT_COLUMNS)
+        slot = table[:, SLOT_COLUMN:].reshape(count, len(loads.slots), SLOT_COLUMNS)
         slot[..., :3] = loads.strength
         slot[..., 3:5] = loads.point
-        for n, part in enumerate(parts):
+        for n, part in enumerate(loads.slots):
             acts = probe_force(scene.probes[part.probe], scene.sheet)
             slot[:, n, 5:] = acts.falloff, acts.shift, acts.offset
-        # What is too large for f32 is infinite, and found when the sheet is read.
+        # Loads too large for f32 become infinite; the next reading of the sheet shows it.
         with np.errstate(over="ignore"):
             return table.astype(self._real)
 
     def _place(self, state: State | None) -> None:
-        """Put the sheet where it begins."""
+        """Fill the arrays of the sheet."""
         s, scene = self.structure, self.scene
         moves, column = ~fixed_points(scene.sheet), np.arange(s.cols)
         # Rows are of three kinds: the first, any in between, the last.
@@ -315,20 +331,25 @@ class Dynamics:
         by_column[ACROSS] = axes(scene.sheet)[0]
         by_column[HAS_LEFT] = column > 0
         by_column[HAS_RIGHT] = column < s.cols - 1
-        self._sheet = None  # Its memory is free before there is another.
+        self._sheet = None  # Frees its memory before another sheet takes some.
         kind = Sweep if s.workers else Gather
         begun = None if state is None else (state.displacement, state.difference)
-        self._sheet = kind(s, Start(by_column, _standing_decays(scene), _mapped_stiffness(scene), begun))
+        decays = _standing_decays(scene, _slots(scene, self.grid))
+        self._sheet = kind(s, Start(by_column, decays, _mapped_stiffness(scene), begun))
 
 
-def _slots_by_area(scene: Scene) -> tuple[bool, ...]:
-    """Tell for every slot whether points at an edge move and get less of its force than others."""
-    open_edges = not has_fixed_border(scene)
-    return tuple(open_edges and scene.probes[slot.probe].total is not None for slot in probe_slots(scene))
+def _slots(scene: Scene, grid: TimeGrid) -> tuple[ProbeSlot, ...]:
+    return probe_slots(scene.probes, scene.sheet, grid.step)
+
+
+def _slots_by_area(scene: Scene, slots: Sequence[ProbeSlot]) -> tuple[bool, ...]:
+    """Tell for every slot whether there are points at a free edge, and these get less of its force than others."""
+    open_edges = not has_fixed_border(scene.sheet)
+    return tuple(open_edges and scene.probes[slot.probe].total is not None for slot in slots)
 
 
 def _mapped_stiffness(scene: Scene) -> tuple[NDArray[Any], NDArray[Any], NDArray[Any]] | None:
-    """Give the stiffness of every spring besides its tension, as `Start` has it."""
+    """Give the stiffness k - tau of every spring in the form of `Start`; None without a map."""
     made = material(scene)
     if made.map is None:
         return None
@@ -341,15 +362,15 @@ def _mapped_stiffness(scene: Scene) -> tuple[NDArray[Any], NDArray[Any], NDArray
     )
 
 
-def _standing(scene: Scene) -> list[tuple[object, ...]]:
-    """List all on which the decays of the slots that stand depend."""
-    probes = [scene.probes[slot.probe] for slot in probe_slots(scene) if not slot.moves]
+def _standing(scene: Scene, slots: Sequence[ProbeSlot]) -> list[tuple[object, ...]]:
+    """List everything that the decays of the standing slots depend on."""
+    probes = [scene.probes[slot.probe] for slot in slots if not slot.moves]
     return [(probe.at, probe_force(probe, scene.sheet)[1:]) for probe in probes]
 
 
-def _standing_decays(scene: Scene) -> NDArray[np.float64]:
-    """Give the decays of all slots that stand, shape (slots, rows, cols)."""
-    return np.array([decay(slot, scene) for slot in probe_slots(scene) if not slot.moves])
+def _standing_decays(scene: Scene, slots: Sequence[ProbeSlot]) -> NDArray[np.float64]:
+    """Evaluate the decays of all standing slots, shape (slots, rows, cols)."""
+    return np.array([decay(scene.probes[slot.probe], scene.sheet) for slot in slots if not slot.moves])
 
 
 def _in_words(moves: tuple[bool, ...]) -> str:

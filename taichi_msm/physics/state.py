@@ -1,4 +1,4 @@
-"""The state of a sheet, and what is read of it."""
+"""The state of a sheet, and what is read from it."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 
 class State(NamedTuple):
-    """All that the next steps depend on.
+    """Everything that the next steps depend on.
 
     Attributes:
         steps: number of steps taken, n.
@@ -22,13 +22,13 @@ class State(NamedTuple):
 
 
 class Reading(NamedTuple):
-    """What is seen of a sheet at a step.
+    """What is read from a sheet at a step.
 
     Attributes:
         steps: number of steps taken, n.
         displacement: u_n = x - X [m], shape (rows, cols, 3).
-        shortest_spring, longest_spring: the least and the largest length of a spring over the one at rest.
-        energy: of the motion, of springs but the virtual ones and of bending [J].
+        shortest_spring, longest_spring: smallest and largest ratio of a spring's length to its rest length.
+        energy: kinetic energy and that of springs and bending, without the virtual springs [J].
     """
 
     steps: int

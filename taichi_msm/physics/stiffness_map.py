@@ -1,7 +1,7 @@
-"""The map of a sheet: how many times as stiff it is from place to place.
+"""The map of a sheet: factors of its stiffness from place to place.
 
-A map's file is read when a scene is checked, and not again, so that a run is of one map even where its file is changed
-or removed meanwhile.
+A map's file is read when a scene is checked, and then kept, so that a whole run has one map even if the file is changed
+or removed in the meantime.
 """
 
 from __future__ import annotations
@@ -18,22 +18,22 @@ from taichi_msm.scene import StiffnessMap
 
 Array = NDArray[np.float64]
 
-# What was read of so many files is kept.
+# The number of files whose content is kept.
 MOST_KEPT = 16
 
-# By the name of the file: when it was changed, and its grey, 0 to 255, shape (height, width).
+# By file name: the time of its last change, and its grey, 0 to 255, shape (height, width).
 _kept: dict[str, tuple[int, NDArray[np.uint8]]] = {}
 
 
 def read(stiffness_map: StiffnessMap) -> None:
-    """Read the file of a map, unless it is what was read last.
+    """Read the file of a map, unless it has been read and not changed since.
 
     Raises:
-        PictureError: when it cannot be used.
+        PictureError: when the file cannot be used.
     """
     image = stiffness_map.image
     changed = 0
-    # What is wrong with the file, reading it says.
+    # If something is wrong with the file, reading it will say so.
     with suppress(OSError, ValueError):
         changed = Path(image).stat().st_mtime_ns
     if image in _kept and _kept[image][0] == changed:
@@ -47,7 +47,7 @@ def read(stiffness_map: StiffnessMap) -> None:
 
 
 def factors(stiffness_map: StiffnessMap, rows: int, cols: int) -> Array:
-    """Give the factors at the centres of so many cells, shape (rows, cols).
+    """Give the factors at the centres of the cells, shape (rows, cols).
 
     Raises:
         PictureError: when the file cannot be used.
@@ -59,7 +59,7 @@ def factors(stiffness_map: StiffnessMap, rows: int, cols: int) -> Array:
 
 @lru_cache(maxsize=8)
 def _sampled(stiffness_map: StiffnessMap, rows: int, cols: int) -> Array:
-    """Sample at the centres of cells: bilinear between the texels' centres, held beyond them."""
+    """Interpolate at the centres of the cells: bilinearly between the centres of texels, constant beyond them."""
     grey = _kept[stiffness_map.image][1].astype(float)
     height, width = grey.shape
     row = np.clip((np.arange(rows) + 0.5) / rows * height - 0.5, 0, height - 1)
@@ -77,13 +77,13 @@ def _sampled(stiffness_map: StiffnessMap, rows: int, cols: int) -> Array:
 
 @lru_cache(maxsize=8)
 def largest(stiffness_map: StiffnessMap, rows: int, cols: int) -> float:
-    """Find the largest factor of so many cells."""
+    """Find the largest factor of rows x cols cells."""
     return float(factors(stiffness_map, rows, cols).max())
 
 
 @lru_cache(maxsize=8)
 def largest_mean(stiffness_map: StiffnessMap, rows: int, cols: int) -> float:
-    """Find the largest mean of the factors of the cells around a point, of so many cells."""
+    """Find the largest mean of the factors of the cells around a point, for rows x cols cells."""
     found = factors(stiffness_map, rows, cols)
     around, cells = np.pad(found, 1), np.pad(np.ones_like(found), 1)
 

@@ -1,14 +1,21 @@
-"""The step limit and the choice of a step."""
+"""The stability limit, and the choice of a step and a precision: the time grid of a scene."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Iterator
+from dataclasses import replace
 from typing import Any
 
 from taichi_msm.errors import Problem
+from taichi_msm.physics.lattice import spacing
 from taichi_msm.physics.material import highest_frequency, material
+from taichi_msm.physics.workload import is_small_in_f64
 from taichi_msm.scene import WHOLE, Scene
+from taichi_msm.timegrid import TimeGrid
+
+# Lengths [m] whose squares, and a few of their products, f32 holds.
+SMALLEST_SINGLE, LARGEST_SINGLE = 1e-15, 1e17
 
 
 def stable_step(scene: Scene) -> float:
@@ -22,11 +29,28 @@ def stable_step(scene: Scene) -> float:
     return 4 / limit if limit > 0 else math.inf
 
 
-def steps_per_frame(scene: Scene) -> int:
+def time_grid(scene: Scene, arch: str = "cpu") -> TimeGrid:
+    """Decide the steps and the precision of a scene.
+
+    A tolerance may ask for more steps, which `error_control.choose_step` finds.
+
+    Args:
+        scene: a scene, with the step "auto" or one that divides a frame.
+        arch: cpu, cuda or vulkan.
+    """
+    time = scene.time
+    grid = TimeGrid(time.frames_per_second, time.frames, _steps_per_frame(scene), "f64")
+    if time.precision != "auto":
+        return replace(grid, precision=time.precision)
+    # A tolerance asks for f64. On a GPU it is slow or missing.
+    in_f64 = arch == "cpu" and (time.tolerance is not None or is_small_in_f64(scene, grid))
+    return grid if in_f64 else replace(grid, precision="f32")
+
+
+def _steps_per_frame(scene: Scene) -> int:
     """Count the steps of one frame.
 
-    auto: the fewest whose step is at most half the stability limit; a tolerance may ask for more, which
-    `error_control.choose_step` finds. A given step is what the scene says.
+    auto: the fewest whose step is at most half the stability limit. A given step is rounded to a fraction of a frame.
     """
     frame = 1 / scene.time.frames_per_second
     if scene.time.step == "auto":
@@ -40,18 +64,25 @@ def with_time(scene: Scene, **changes: Any) -> Scene:
     return scene.model_copy(update={"time": scene.time.model_copy(update=changes)})
 
 
-def with_steps(scene: Scene, count: int) -> Scene:
-    """Give a frame of the scene so many steps."""
-    return with_time(scene, step=1 / scene.time.frames_per_second / count, tolerance=None)
+def with_grid(scene: Scene, grid: TimeGrid) -> Scene:
+    """Write into a scene what was decided for it, so that `time_grid` gives the same grid for it on any arch.
 
-
-def step(scene: Scene) -> float:
-    """Give the step h [s]: a whole fraction of a frame."""
-    return 1 / (scene.time.frames_per_second * steps_per_frame(scene))
+    The precision is written, and a step in the place of a tolerance; a step that follows from the scene stays "auto".
+    """
+    if scene.time.tolerance is None:
+        return with_time(scene, precision=grid.precision)
+    step = 1 / grid.frames_per_second / grid.steps_per_frame
+    return with_time(scene, precision=grid.precision, step=step, tolerance=None)
 
 
 def problems(scene: Scene) -> Iterator[Problem]:
-    """Say why a given step cannot be taken."""
+    """Find a given step that cannot be taken, and what f32 cannot hold."""
+    yield from _step_problems(scene)
+    yield from _range_problems(scene)
+
+
+def _step_problems(scene: Scene) -> Iterator[Problem]:
+    """Find a given step that is unstable or does not divide a frame."""
     given = scene.time.step
     if given == "auto":
         return
@@ -67,4 +98,26 @@ def problems(scene: Scene) -> Iterator[Problem]:
         yield Problem(
             ("time", "step"),
             f"{given:g} s does not divide a frame of {frame:.9g} s; try {frame / math.ceil(frame / given):.9g}",
+        )
+
+
+def _range_problems(scene: Scene) -> Iterator[Problem]:
+    """Find what would vanish or overflow in f32 when it is squared or multiplied."""
+    grid = time_grid(scene)
+    if grid.precision == "f64":
+        return
+    cells = spacing(scene.sheet)
+    if min(cells) < SMALLEST_SINGLE or max(scene.sheet.size) > LARGEST_SINGLE:
+        yield Problem(
+            ("sheet", "size"),
+            f"cells of {min(cells):g} m in a sheet of {max(scene.sheet.size):g} m leave the range of f32, "
+            f"{SMALLEST_SINGLE:g} to {LARGEST_SINGLE:g} m; take time.precision: f64",
+        )
+    mass = material(scene).mass
+    gain = grid.step**2 / mass
+    if not SMALLEST_SINGLE**2 < gain < LARGEST_SINGLE**2:
+        yield Problem(
+            ("time", "precision"),
+            f"f32 cannot hold the {gain:g} m by which a step of {grid.step:g} s moves a mass of "
+            f"{mass:g} kg for every newton; take f64",
         )

@@ -1,44 +1,52 @@
-"""What one should know before trusting the result of a run."""
+"""What to know before trusting the result of a run."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Iterator
+from dataclasses import replace
 
 from taichi_msm.physics import probe_force
 from taichi_msm.physics.error_control import Estimate
 from taichi_msm.physics.material import material
 from taichi_msm.physics.run_progress import RunProgress
-from taichi_msm.physics.timestep import step, steps_per_frame, with_steps
 from taichi_msm.scene import MAX_POINTS, Scene
+from taichi_msm.timegrid import TimeGrid
 
-# Down to this share of its rest length no spring shakes the limit of stability (see `timestep.highest_frequency`).
+# The stability limit holds while no spring is compressed below this share of its rest length (see
+# `material.highest_frequency`).
 SHORTEST = 0.5
 
-# Beyond so many times its rest length a spring is stretched more than any tissue.
+# No tissue can be stretched to more than this many times its rest length.
 LONGEST = 2.0
 
-# An error above this share of the largest displacement is told with what would help.
+# If an error is above this share of the largest displacement, a remedy is named.
 WRONG = 0.01
 
 
 def notes(
-    scene: Scene, progress: RunProgress, estimate: Estimate | None, reason: str = "", mesh_error: float | None = None
+    scene: Scene,
+    grid: TimeGrid,
+    progress: RunProgress,
+    estimate: Estimate | None,
+    reason: str = "",
+    mesh_error: float | None = None,
 ) -> Iterator[str]:
-    """Say what is remarkable about a run, one line each.
+    """Say what is remarkable about a run, each in a line.
 
     Args:
-        scene: with the step that was taken.
+        scene: what was run.
+        grid: the steps that were taken.
         progress: of the last frame.
-        estimate: of the error, if there is one.
-        reason: why there is none.
-        mesh_error: of the number of points, if it was estimated; infinite: not known.
+        estimate: of the error; None: there is none.
+        reason: why there is no estimate.
+        mesh_error: error that the number of points makes; None: not estimated, infinite: not known.
     """
     if estimate is not None:
         yield error(estimate, mesh_error)
         if WRONG < estimate.error < math.inf:
             wrong = float(f"{100 * estimate.error:.2g}")
-            yield f"the run is about {wrong:g} % wrong; {_remedy(scene, estimate)}"
+            yield f"the run is about {wrong:g} % wrong; {_remedy(scene, grid, estimate)}"
     elif reason:
         points = "" if mesh_error is None else f"; of the points {mesh_error:.2g}"
         yield f"error not estimated: {reason}{points}"
@@ -51,27 +59,26 @@ def notes(
         yield "nothing moved: does a probe press where and when it should?"
     if progress.longest_spring > LONGEST:
         yield (
-            f"a spring was stretched to {progress.longest_spring:.2g} times its length, which no tissue bears: press "
-            "less, or with a wider tool"
+            f"a spring was stretched to {progress.longest_spring:.2g} times its rest length, which no tissue "
+            "withstands: press less, or with a wider tool"
         )
     if progress.shortest_spring < SHORTEST:
         yield (
             f"a spring was pressed to {progress.shortest_spring:.2g} of its rest length: below {SHORTEST} the sheet "
             "folds over itself and small errors grow; press less"
         )
-    h = step(scene)
-    quick = material(scene).drag * h
+    quick = material(scene).drag * grid.step
     if quick > 2 and scene.time.damping_difference == "central":
         yield (
             f"the damping stops a point within 1/{quick:.3g} of a step: velocities change their sign at every step; "
-            f"take a time.step of at most {2 * h / quick:.2g} s"
+            f"take a time.step of at most {2 * grid.step / quick:.2g} s"
         )
 
 
 def error(estimate: Estimate, mesh_error: float | None = None) -> str:
     """Say how wrong a run is."""
     if estimate.error == math.inf:
-        return "error not known: a pilot run diverged, or a step is longer than the damping"
+        return "error not known: a pilot run diverged, or steps do not resolve the damping"
     parts = f"step {estimate.in_f64:.1g}" + (f", rounding {estimate.rounding:.1g}" if estimate.rounding else "")
     if mesh_error is None:
         return f"error {estimate.error:.1g} of the largest displacement ({parts})"
@@ -79,8 +86,8 @@ def error(estimate: Estimate, mesh_error: float | None = None) -> str:
     return f"error, as a share of the largest displacement: {parts}, points {points}"
 
 
-def _remedy(scene: Scene, estimate: Estimate) -> str:
-    """Say what would make it less wrong."""
+def _remedy(scene: Scene, grid: TimeGrid, estimate: Estimate) -> str:
+    """Say what would reduce the error."""
     said = []
     if estimate.rounding > WRONG / 2:
         said.append("time.precision: f64")
@@ -88,6 +95,7 @@ def _remedy(scene: Scene, estimate: Estimate) -> str:
             support = "springs.virtual" if scene.tissue is None else "tissue.pretension or bending"
             said.append(f"more {support}, where the sheet buckles")
     if estimate.in_f64 > WRONG / 2:
-        needed = steps_per_frame(scene) * (estimate.in_f64 / (WRONG / 2)) ** (1 / estimate.order)
-        said.insert(0, f"time.step: {step(with_steps(scene, math.ceil(needed))):.9g}")
+        needed = grid.steps_per_frame * (estimate.in_f64 / (WRONG / 2)) ** (1 / estimate.order)
+        finer = replace(grid, steps_per_frame=math.ceil(needed))
+        said.insert(0, f"time.step: {finer.step:.9g}")
     return f"try {', or '.join(said)}"

@@ -8,11 +8,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from taichi_msm.physics.lattice import fixed_points, rest_positions, spacing
-from taichi_msm.physics.loads import Schedule, probe_slots, schedule
+from taichi_msm.physics.loads import Schedule, schedule
 from taichi_msm.physics.material import area_shares
-from taichi_msm.physics.timestep import step, steps_per_frame
+from taichi_msm.physics.timestep import time_grid
 from taichi_msm.reference.sheet import Springs, sheet
 from taichi_msm.scene import Scene
+from taichi_msm.timegrid import TimeGrid
 
 Array = NDArray[np.float64]
 
@@ -143,7 +144,7 @@ def surgical_force(scene: Scene, loads: Schedule, n: int) -> Array:
     """
     rest = rest_positions(scene.sheet)
     force = np.zeros_like(rest)
-    for index, slot in enumerate(probe_slots(scene)):
+    for index, slot in enumerate(loads.slots):
         probe = scene.probes[slot.probe]
         distance = np.linalg.norm(rest[..., :2] - loads.point[n, index], axis=-1)
         decay = np.exp(-probe.falloff * np.maximum(distance - probe.radius, 0))
@@ -176,12 +177,12 @@ def force(scene: Scene, displacement: Array, loads: Schedule, n: int) -> Array:
     )
 
 
-def displacements(scene: Scene) -> Iterator[Array]:
+def displacements(scene: Scene, grid: TimeGrid) -> Iterator[Array]:
     """Step the scene by Stoermer-Verlet (eq. 6 to 9) and yield u_0, u_1, ... [m], each of shape (rows, cols, 3)."""
-    h, made = step(scene), sheet(scene)
+    h, made = grid.step, sheet(scene)
     m, g = made.mass[..., None], (made.drag / made.mass)[..., None]
     moves = ~fixed_points(scene.sheet)[..., None]
-    loads = schedule(scene, 0, scene.time.frames * steps_per_frame(scene))
+    loads = schedule(scene, grid, 0, grid.steps)
 
     previous = np.zeros((*scene.sheet.points, 3))
     yield previous
@@ -203,6 +204,6 @@ def simulate(scene: Scene) -> Array:
     Returns:
         Positions of every frame [m], shape (F + 1, rows, cols, 3).
     """
-    every = steps_per_frame(scene)
-    frames = [u for n, u in enumerate(displacements(scene)) if n % every == 0]
+    grid = time_grid(scene)
+    frames = [u for n, u in enumerate(displacements(scene, grid)) if n % grid.steps_per_frame == 0]
     return rest_positions(scene.sheet) + np.array(frames)

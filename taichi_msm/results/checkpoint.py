@@ -1,7 +1,7 @@
-"""What an unfinished run leaves for another process to go on with: its manifest, its frames and its last state.
+"""The files from which another process can continue an unfinished run: its manifest, its frames and its last state.
 
-Every part has a checksum, which is looked at before the part is used: the manifest a SHA-256 of its own, the positions
-one for every frame, the arrays of the state the CRC-32 of their archive.
+Every part has a checksum, which is verified before the part is used: a SHA-256 for the manifest, one for the positions
+of every frame, and the CRC-32 of the archive for the arrays of the state.
 """
 
 from __future__ import annotations
@@ -22,43 +22,42 @@ from numpy.typing import NDArray
 from taichi_msm.errors import DamagedError
 from taichi_msm.physics.run_progress import RunProgress, Saved
 from taichi_msm.physics.state import State
-from taichi_msm.physics.timestep import steps_per_frame
-from taichi_msm.physics.workload import precision
+from taichi_msm.physics.timestep import time_grid
 from taichi_msm.results.folder import Folder, write_all
 from taichi_msm.results.npz import read_array, write_array
 from taichi_msm.results.publication import CHECKPOINT, CHECKPOINT_TREE, DRAFT, MANIFEST, POSITIONS, STATE
 from taichi_msm.results.sealed import seal
 from taichi_msm.scene import Scene
 
-# Saving the state may take this share of the time.
+# The share of the time that saving states may take.
 SHARE = 0.02
 
 DIGEST_BYTES = 32
 
 
 class Checkpoint:
-    """A folder from which a run can go on, whenever its process is killed.
+    """A folder from which a run can continue, no matter when its process is killed.
 
     Args:
-        staging: the folder that it is in.
-        scene: what is run; where it has no output, positions are not kept.
+        staging: the folder that contains it.
+        scene: what is run; if it has no output, positions are not kept.
 
     Attributes:
-        frames: number of frames that were added.
+        frames: number of frames added so far.
         precision: type of the positions.
     """
 
     def __init__(self, staging: Folder, scene: Scene) -> None:
         self.frames = 0
         self._staging = staging
-        self._scene = scene
+        self._grid = time_grid(scene)
         self._shape = (*scene.sheet.points, 3)
-        self.precision = np.dtype(np.float32 if precision(scene) == "f32" else np.float64)
+        self.precision = np.dtype(np.float32 if self._grid.precision == "f32" else np.float64)
         self._frame_bytes = math.prod(self._shape) * self.precision.itemsize
         self._record_bytes = (DIGEST_BYTES + self._frame_bytes) if scene.output else 0
         self._due = 0.0
         self._open = ExitStack()
-        # What ties the parts of a checkpoint to its manifest.
+        # The digest of the manifest, to which all parts of a checkpoint are tied.
         self._key = b""
         self._folder: Folder | None = None
         self._positions: BinaryIO | None = None
@@ -69,20 +68,24 @@ class Checkpoint:
         return time.perf_counter() >= self._due
 
     def begin(self, manifest: Mapping[str, Any]) -> None:
-        """Begin without a frame, in the place of any other run; the manifest is what a process must know, in JSON."""
+        """Begin without frames, replacing the checkpoint of any other run.
+
+        Args:
+            manifest: what another process must know to continue the run, in JSON.
+        """
         with self._staging.folder(CHECKPOINT, create=True) as folder:
-            # First of all, so that a part of a checkpoint is none.
+            # Removed first: without a manifest, what is left of a checkpoint does not count as one.
             folder.remove(MANIFEST)
             folder.clear(CHECKPOINT_TREE)
         folder = self._enter()
-        # Without a buffer, so that what was written stays when the process is killed.
+        # Unbuffered, so that what was written is not lost when the process is killed.
         self._positions = self._open.enter_context(folder.create(POSITIONS, buffering=0))
         sealed = seal(manifest)
         self._key = _digest(sealed)
         folder.write(MANIFEST, sealed, DRAFT)
 
     def go_on(self) -> Saved | None:
-        """Go on from what was saved last; None: from the beginning.
+        """Continue an earlier run; returns the state that it saved last, or None to continue from rest.
 
         Raises:
             DamagedError: when the files do not belong together.
@@ -119,7 +122,7 @@ class Checkpoint:
             Positions [m], shape (rows, cols, 3).
 
         Raises:
-            DamagedError: when they are not as they were written.
+            DamagedError: when the positions are not as they were written.
         """
         assert self._positions is not None, "begin or go_on comes first"
         record = np.empty(self._record_bytes, np.uint8)
@@ -129,21 +132,21 @@ class Checkpoint:
             rest = rest[count:]
         data = record[DIGEST_BYTES:]
         found = data.view(self.precision).reshape(self._shape)
-        # Anybody may have written it.
+        # Not trusted: anybody may have written it.
         if rest or record[:DIGEST_BYTES].tobytes() != self._digest(frame, data.data) or not np.isfinite(found).all():
             raise self._damaged(POSITIONS)
         return found
 
     def positions(self, frames: int) -> Iterator[memoryview]:
-        """Read the bytes of the positions of the first frames, one after another; raises what `position` does."""
+        """Read the bytes of the positions of the first frames, frame by frame; raises what `position` does."""
         for frame in range(frames):
             yield self.position(frame).data.cast("B")
 
     def save(self, saved: Saved) -> str:
-        """Keep where the run is, in the place of what was saved before; its frames have been added.
+        """Save a state of the run, replacing the one saved before; the frames up to it must have been added.
 
         Returns:
-            The path of the file that has it, the arrays of `State` and the numbers of `RunProgress` by name.
+            The path of the file, which has the arrays of `State` and the numbers of `RunProgress` by name.
         """
         start = time.perf_counter()
         folder = self._entered
@@ -161,10 +164,10 @@ class Checkpoint:
         return str(folder.path / STATE)
 
     def load(self) -> Saved | None:
-        """Read what was saved last; None: nothing was.
+        """Read the state that was saved last; None: none was.
 
         Raises:
-            DamagedError: when it cannot be that of a run of the scene.
+            DamagedError: when it cannot be a state of a run of the scene.
         """
         like = self._arrays(Saved(State(0, np.empty(0), np.empty(0)), RunProgress()))
         sheet = self.precision, self._shape
@@ -174,15 +177,15 @@ class Checkpoint:
                 found = {name: read_array(archive, name, *kind) for name, kind in kinds.items()}
         except FileNotFoundError:
             return None
-        # A forged archive makes zipfile raise nearly anything.
+        # A forged archive can make zipfile raise almost anything.
         except Exception:
             raise self._damaged(STATE) from None
         progress = RunProgress(**{field.name: found[field.name].item() for field in fields(RunProgress)})
         saved = Saved(State(int(found["steps"]), found["displacement"], found["difference"]), progress)
-        every = steps_per_frame(self._scene)
-        # Anybody may have written it.
+        every = self._grid.steps_per_frame
+        # Not trusted: anybody may have written it.
         if not (
-            progress.frame <= self._scene.time.frames
+            progress.frame <= self._grid.frames
             and progress.frame * every <= saved.state.steps <= (progress.frame + 1) * every
             and all(np.isfinite(array).all() for array in found.values())
             and all(value >= 0 for value in asdict(progress).values())
@@ -206,12 +209,12 @@ class Checkpoint:
         return self._folder
 
     def _arrays(self, saved: Saved) -> dict[str, NDArray[Any]]:
-        """Give the arrays of a state and the numbers of a progress by their names, and the manifest's digest."""
+        """Give the arrays of a state, the numbers of its progress and the digest of the manifest, all by name."""
         named = {**saved.state._asdict(), **asdict(saved.progress), "manifest": np.frombuffer(self._key, np.uint8)}
         return {name: np.asarray(value) for name, value in named.items()}
 
     def _digest(self, frame: int, data: memoryview) -> bytes:
-        """Tell the positions of a frame from any others, and from those of another frame or run."""
+        """Compute a digest of the positions that also depends on the frame and the run."""
         return _digest(self._key, frame.to_bytes(8, "little"), data)
 
     def _damaged(self, name: str) -> DamagedError:

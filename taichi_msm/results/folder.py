@@ -1,8 +1,8 @@
 """A folder whose files are opened relative to it, so that no link and no name leads out of it.
 
-Where the system can, every operation names a single entry of a directory that is held open, and follows no symbolic
-link (`openat` with O_NOFOLLOW): nobody who exchanges a directory for a link meanwhile gets the operation elsewhere.
-Windows has no such calls; there each entry is looked at before it is opened.
+If the system supports it, every operation names a single entry of an open directory and follows no symbolic link
+(`openat` with O_NOFOLLOW). So nobody can redirect an operation by replacing a directory with a link in the meantime.
+Windows has no such calls; there each entry is checked before it is opened.
 """
 
 from __future__ import annotations
@@ -25,16 +25,16 @@ else:
     import fcntl
 
 HAS_DESCRIPTORS = os.open in os.supports_dir_fd and hasattr(os, "O_NOFOLLOW")
-# Whether another process can inherit an open file, and a lock with it.
+# Whether child processes can inherit an open file together with its lock.
 INHERITS = os.name == "posix"
 
 FILE, FOLDER = "a file", "a folder"
 
 _NO_LINK = getattr(os, "O_NOFOLLOW", 0) | getattr(os, "O_CLOEXEC", 0) | getattr(os, "O_BINARY", 0)
-# Opening a pipe must not wait for its other end; what was opened is looked at again.
+# Opening a pipe must not wait for its other end; what was opened is checked again.
 _NO_WAIT = getattr(os, "O_NONBLOCK", 0)
 
-# What a folder of ours may hold: patterns of names, with None for a file and another tree for a folder.
+# The entries that a folder of ours may contain: patterns of names, each with None for a file or a tree for a folder.
 Tree = Mapping[str, Union["Tree", None]]
 
 
@@ -42,12 +42,12 @@ Tree = Mapping[str, Union["Tree", None]]
 class Folder:
     """An open directory. Usable in a with statement, which closes it.
 
-    Every name is that of a single entry. Methods raise OSError as the system does, and ForeignError where an entry is
-    a symbolic link or not of the kind that is wanted.
+    Every name is that of a single entry. Methods raise the OSError of the system, and ForeignError if an entry is a
+    symbolic link or not of the expected kind.
 
     Attributes:
-        path: where it was when it was opened, for messages.
-        descriptor: the open directory; None on a system that cannot work relative to one.
+        path: of the directory when it was opened, for messages.
+        descriptor: of the open directory; None if the system does not support operations relative to one.
     """
 
     path: Path
@@ -55,23 +55,23 @@ class Folder:
 
     @classmethod
     def at(cls, path: Path, *, create: bool = False) -> Folder:
-        """Open the directory that a user named, through any links; with its parents it is made where it is missing."""
+        """Open the directory that a user named, following links; `create`: make it and its parents if missing."""
         if create and not path.exists():
             path.mkdir(parents=True, exist_ok=True)
         if HAS_DESCRIPTORS:
             return cls(path, os.open(path, os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC))
-        os.scandir(path).close()  # fails as opening it would
+        os.scandir(path).close()  # raises what opening it would
         return cls(path, None)
 
     def kind(self, name: str) -> str | None:
-        """Say what an entry is, without following it: FILE, FOLDER, another noun phrase, or None for nothing."""
+        """Give the kind of an entry, not of what it links to: FILE, FOLDER or other words; None if missing."""
         try:
             return _kind(os.stat(self._entry(name), dir_fd=self.descriptor, follow_symlinks=False).st_mode)
         except FileNotFoundError:
             return None
 
     def identity(self, name: str) -> list[int] | None:
-        """Tell a file from any other that may come under its name: number, size, time of change; None for nothing."""
+        """Identify a file by inode, size and time of change, so that its replacement shows; None if it is missing."""
         try:
             status = os.stat(self._entry(name), dir_fd=self.descriptor, follow_symlinks=False)
         except FileNotFoundError:
@@ -79,7 +79,7 @@ class Folder:
         return [status.st_ino, status.st_size, status.st_mtime_ns]
 
     def is_writable(self, name: str) -> bool:
-        """Tell whether an entry may be written to."""
+        """Tell whether this process may write to an entry."""
         return os.access(self._entry(name), os.W_OK, dir_fd=self.descriptor)
 
     def entries(self) -> Iterator[tuple[str, str]]:
@@ -91,7 +91,7 @@ class Folder:
                 yield name, kind
 
     def folder(self, name: str, *, create: bool = False) -> Folder:
-        """Open a folder in this one; `create`: it may be missing, and is made."""
+        """Open a folder in this one; `create`: make it if it is missing."""
         if create:
             with suppress(FileExistsError):
                 os.mkdir(self._entry(name), dir_fd=self.descriptor)
@@ -105,8 +105,8 @@ class Folder:
 
         Args:
             name: of the file.
-            write: it is to be changed in place, so it must have no other name.
-            create: it may be missing, and is made.
+            write: open it for changes in place; it must then have no other name (hard link).
+            create: make it if it is missing.
         """
         self._require(name, FILE)
         flags = (os.O_RDWR if write else os.O_RDONLY) | (os.O_CREAT if create else 0)
@@ -118,11 +118,11 @@ class Folder:
         return file
 
     def create(self, name: str, buffering: int = -1) -> BinaryIO:
-        """Make a file that is not there yet, and open it for writing and reading; `buffering` as for Python's open."""
+        """Make a new file, and open it for writing and reading; `buffering` as for Python's open."""
         return self._open(name, os.O_RDWR | os.O_CREAT | os.O_EXCL, buffering)
 
     def lock(self, name: str) -> BinaryIO:
-        """Lock a file, which is made where it is missing, until it is closed here and in all processes that inherit it.
+        """Lock a file, made if missing, until it is closed here and in all processes that have inherited it.
 
         Raises:
             BlockingIOError: when another process holds the lock.
@@ -138,13 +138,13 @@ class Folder:
         return file
 
     def replace(self, name: str, folder: Folder, new: str) -> None:
-        """Move a file to another folder or name, in the place of a file that is there."""
+        """Move a file to another folder or name, replacing a file there."""
         self._require(name, FILE)
         folder._require(new, FILE)
         os.replace(self._entry(name), folder._entry(new), src_dir_fd=self.descriptor, dst_dir_fd=folder.descriptor)
 
     def write(self, name: str, data: bytes, draft: str = "draft") -> None:
-        """Write a file whole or not at all, by way of a draft."""
+        """Write a file as a whole or not at all: write a draft, then rename it."""
         self.remove(draft)
         try:
             with self.create(draft) as file:
@@ -155,7 +155,7 @@ class Folder:
             raise
 
     def remove(self, name: str) -> None:
-        """Remove a file, if it is there."""
+        """Remove a file, if it exists."""
         if self.kind(name) is not None:
             self._require(name, FILE)
             os.unlink(self._entry(name), dir_fd=self.descriptor)
@@ -165,10 +165,10 @@ class Folder:
         os.rmdir(self._entry(name), dir_fd=self.descriptor)
 
     def require_only(self, tree: Tree) -> None:
-        """Make sure that all that is here, and in the folders below, is what may be here.
+        """Make sure that this folder and those below contain only what a tree allows.
 
         Raises:
-            ForeignError: names the first entry that may not.
+            ForeignError: names the first other entry.
         """
         for name, kind in self.entries():
             allowed = _allowed(tree, name)
@@ -181,7 +181,7 @@ class Folder:
                     inner.require_only(allowed[0])
 
     def clear(self, tree: Tree, keep: Collection[str] = ()) -> None:
-        """Remove all that is here but for some entries, if it is what `require_only` lets be here."""
+        """Remove all entries except those in `keep`; raises what `require_only` does, and then removes nothing."""
         self.require_only(tree)
         for name, kind in self.entries():
             if name in keep:
@@ -210,7 +210,7 @@ class Folder:
         return os.fdopen(descriptor, mode, buffering)  # type: ignore[return-value]
 
     def _require(self, name: str, wanted: str) -> None:
-        """Make sure that an entry, if it is there, is of a kind."""
+        """Make sure that an entry, if it exists, is of a kind."""
         kind = self.kind(name)
         if kind not in (None, wanted):
             raise ForeignError.at(self.path / name, str(kind))
@@ -222,14 +222,14 @@ class Folder:
 
 
 def write_all(file: BinaryIO, data: bytes | memoryview) -> None:
-    """Write to a file without a buffer, which may take some bytes at a time."""
+    """Write all data to an unbuffered file, which may take only some of the bytes at a time."""
     rest = memoryview(data)
     while rest:
         rest = rest[file.write(rest) :]
 
 
 def _allowed(tree: Tree, name: str) -> list[Tree | None]:
-    """List what a tree says of a name."""
+    """List what a tree allows for a name: a file (None) or a folder with its tree."""
     return [below for pattern, below in tree.items() if re.fullmatch(pattern, name)]
 
 
@@ -246,7 +246,7 @@ def _take(descriptor: int) -> None:
 
     Raises:
         BlockingIOError: when another process holds the lock.
-        OSError: when its file system has none.
+        OSError: when the file system has no locks.
     """
     if sys.platform == "win32":
         try:

@@ -1,4 +1,4 @@
-"""Arrays in .npz files: written piece by piece, and read without trusting what the file says of itself."""
+"""Arrays in .npz files: written piece by piece, and read without trusting the file's own headers."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ import numpy as np
 from numpy.lib import format as npy
 from numpy.typing import DTypeLike, NDArray
 
-# Zip files bear dates; this one, the earliest there is, makes equal arrays equal files.
+# Zip files contain dates. A fixed one, the earliest possible, makes files of equal arrays equal.
 EPOCH = (1980, 1, 1, 0, 0, 0)
 
 Shape = tuple[int, ...]
@@ -29,9 +29,9 @@ def write_array(
     Args:
         archive: open for writing.
         name: of the array.
-        dtype: of its numbers.
+        dtype: of the numbers.
         shape: of the array.
-        parts: its bytes in C order, in any number of pieces.
+        parts: the bytes of the array in C order, in any number of pieces.
     """
     with archive.open(zipfile.ZipInfo(f"{name}.npy", EPOCH), "w", force_zip64=True) as entry:
         entry.write(_header(dtype, shape))
@@ -45,12 +45,12 @@ def read_array(archive: zipfile.ZipFile, name: str, dtype: DTypeLike, shape: Sha
     Args:
         archive: open for reading.
         name: of the array.
-        dtype: what its numbers must be.
-        shape: what it must be.
+        dtype: that the numbers must have.
+        shape: that the array must have.
 
     Raises:
-        ValueError: when it is another, before any memory is taken for it.
-        Exception: whatever `zipfile` raises for an archive that is damaged.
+        ValueError: when dtype or shape differ; raised before memory is allocated for the array.
+        Exception: whatever `zipfile` raises for a damaged archive.
     """
     header, info = _header(dtype, shape), _entry(archive, name, dtype, shape)
     # Checks the CRC-32.
@@ -68,25 +68,25 @@ def read_rows(archive: zipfile.ZipFile, name: str, dtype: DTypeLike, row: Shape)
 
 
 def map_array(path: Path, name: str, dtype: DTypeLike, shape: Shape) -> NDArray[Any]:
-    """Map an array that `write_array` wrote, which may be larger than memory, once its checksum was found right.
+    """Map an array that `write_array` wrote, which may be larger than memory, after its checksum was verified.
 
     Args:
         path: of the archive.
         name: of the array.
-        dtype: what its numbers must be.
-        shape: what it must be, of at least one number.
+        dtype: that the numbers must have.
+        shape: that the array must have; not empty.
 
     Returns:
-        The array, read-only, which the system reads when it is looked at.
+        The array, read-only; the system reads it when it is accessed.
 
     Raises:
-        ValueError: when it is another, or damaged.
-        Exception: whatever `zipfile` raises for an archive that is damaged.
+        ValueError: when dtype or shape differ, or the array is damaged.
+        Exception: whatever `zipfile` raises for a damaged archive.
     """
     header = _header(dtype, shape)
     with path.open("rb") as file, zipfile.ZipFile(file) as archive:
         info = _entry(archive, name, dtype, shape)
-        # Before the data there are the entry's own header, its name and further fields, whose lengths are at its end.
+        # The data follow the entry's header, its name and its extra field; the header ends with the lengths of both.
         file.seek(info.header_offset + 26)
         file.seek(sum(struct.unpack("<HH", file.read(4))), 1)
         if file.read(len(header)) != header:
@@ -98,10 +98,10 @@ def map_array(path: Path, name: str, dtype: DTypeLike, shape: Shape) -> NDArray[
 
 
 def _entry(archive: zipfile.ZipFile, name: str, dtype: DTypeLike, shape: Shape) -> zipfile.ZipInfo:
-    """Find an array that is stored as it is and has the size that it must have; raises ValueError for any other."""
+    """Find an array that is stored uncompressed and has the expected size; raises ValueError if it does not."""
     info = archive.getinfo(f"{name}.npy")
     size = len(_header(dtype, shape)) + math.prod(shape) * np.dtype(dtype).itemsize
-    # What is compressed may be of any size, whatever the archive says.
+    # Compressed data might expand to any size, whatever the archive says.
     if info.compress_type != zipfile.ZIP_STORED or (info.file_size, info.compress_size) != (size, size):
         raise ValueError(name)
     return info

@@ -1,4 +1,4 @@
-"""What is in run.json."""
+"""The content of run.json."""
 
 from __future__ import annotations
 
@@ -10,14 +10,14 @@ from taichi_msm.physics.probe_force import ProbeRecord
 
 
 class ErrorRecord(TypedDict):
-    """The error of a run, as fractions of the largest displacement; None: not known, as a pilot diverged.
+    """The error of a run, as fractions of the largest displacement; None: not known, because a pilot diverged.
 
     Attributes:
-        error: the largest of any point and frame.
-        rounding: the part that f32 makes.
+        error: largest error of any point at any frame.
+        rounding: the part of it that comes from f32.
         in_f64: the error of the same step in f64.
         order: of the method.
-        mesh_error: made by the number of points; only with tissue.
+        mesh_error: the error that the number of points makes; only with tissue.
     """
 
     error: float | None
@@ -28,29 +28,29 @@ class ErrorRecord(TypedDict):
 
 
 class RunRecord(TypedDict, total=False):
-    """What was run, on what, how far it came and how wrong it is.
+    """What was run, on which machine, how far it came, and its error.
 
     Attributes:
-        status: how it ended.
-        error: where and why it diverged; only then.
-        dump: the file with the last good state; only then.
+        status: how the run ended.
+        error: where and why the run diverged; only if it did.
+        dump: path of the file with the last good state; only if the run diverged. None: there is no such file.
         scene: as it was loaded.
-        working_directory: from which the scene's image is found.
-        overrides: what made the scene beside its file.
+        working_directory: directory from which the path of the scene's image starts.
+        overrides: of the scene file.
         points: rows and columns of mass points.
-        step, stable_step: the step, and the largest stable one [s]; None: every one is.
-        steps_per_frame, steps: steps of a frame, and of the run so far.
-        precision: that was stepped in.
+        step, stable_step: the step, and the largest stable one [s]; None: every step is stable.
+        steps_per_frame, steps: number of steps in a frame, and in the run so far.
+        precision: of the steps.
         max_displacement: largest displacement [m].
-        shortest_spring, longest_spring: least and largest length of a spring over its rest length.
-        probes: what each does at 100 %.
-        notes: what one should know before trusting the result.
+        shortest_spring, longest_spring: smallest and largest ratio of a spring's length to its rest length.
+        probes: forces of each probe at 100 %.
+        notes: what to know before trusting the result.
         error_estimate: None: there is none, for the reason in `error_estimate_reason`.
-        resumed: how many frames an earlier run had simulated.
-        timings: seconds of every stage.
-        arch, device, threads, lanes, workers: what it ran on.
-        versions: what the results depend on.
-        frames, outputs: what was written.
+        resumed: number of frames that an earlier run had simulated.
+        timings: time of every stage [s].
+        arch, device, threads, lanes, workers: the machine, and how it was used.
+        versions: of all that the results depend on.
+        frames, outputs: number of frames, and names of the files written.
     """
 
     status: Literal["complete", "diverged", "interrupted"]

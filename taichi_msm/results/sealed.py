@@ -1,4 +1,4 @@
-"""JSON that carries its own checksum, so that damage to any of its bits is found."""
+"""JSON with a checksum, so that damage to any bit is detected."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from typing import Any
 
 
 def seal(content: Any) -> bytes:
-    """Write a value as JSON, with its SHA-256."""
+    """Write a value as JSON together with its SHA-256."""
     return json.dumps({"sha256": _digest(content), "content": content}).encode()
 
 
@@ -16,12 +16,12 @@ def unseal(data: bytes) -> Any:
     """Read what `seal` wrote.
 
     Raises:
-        ValueError: when a single bit is not as it was written.
+        ValueError: when any bit is not as it was written.
     """
     try:
         found = json.loads(data)
         content = found["content"]
-        # The same bytes again: what JSON lets vary, such as white space, does not vary here.
+        # Writing it again must give the same bytes, so that even white space, which means nothing in JSON, counts.
         if data == json.dumps(found).encode() and found["sha256"] == _digest(content):
             return content
     except (ValueError, KeyError, TypeError, RecursionError):

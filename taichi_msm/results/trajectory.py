@@ -1,4 +1,4 @@
-"""Write the positions of every frame to an .npz file, which may be larger than memory."""
+"""Write the positions of all frames to an .npz file, which may be larger than memory."""
 
 from __future__ import annotations
 
@@ -23,9 +23,9 @@ def write_trajectory(
     """Write time [s], shape (frames,), and position [m], shape (frames, rows, cols, 3), uncompressed.
 
     Args:
-        file: where to.
-        positions: the bytes of every frame's positions.
-        frames: how many frames.
+        file: open for writing.
+        positions: the bytes of the positions of each frame, in order.
+        frames: number of frames.
         points: rows, cols.
         precision: type of the positions.
         rate: frames per second.

@@ -1,4 +1,4 @@
-"""What a scene will need, before anything is computed."""
+"""The steps, memory and disk space that a scene needs, estimated before anything is computed."""
 
 from __future__ import annotations
 
@@ -12,47 +12,49 @@ from pathlib import Path
 
 from taichi_msm.errors import Path as Key
 from taichi_msm.errors import Problem, SceneError
-from taichi_msm.physics import timestep
-from taichi_msm.physics.workload import affords_pilot, precision
+from taichi_msm.physics.timestep import time_grid
+from taichi_msm.physics.workload import affords_pilot
 from taichi_msm.render import texture
 from taichi_msm.scene import Scene
 from taichi_msm.system.resources import available_memory
+from taichi_msm.timegrid import TimeGrid
 
 MAX_STEPS = 10**12
 
-# Bytes of the parts of a drawing.
-POINT_BYTES = 36  # a mass point, as it is seen, and its normal
-SAMPLE_BYTES = 32  # what is kept of a sample at most
-BAND_ROWS = 16  # rows of samples that a thread keeps at a time
-PIXEL_BYTES = 3 * 12  # colours of one pixel, from sums to bytes
-PICTURE_PIXEL_BYTES = 20  # of the file, while it is decoded and converted; its texture takes less
+# Memory for drawing [bytes].
+POINT_BYTES = 36  # per mass point: its projection and its normal
+SAMPLE_BYTES = 32  # per sample, at most
+BAND_ROWS = 16  # rows of samples that a thread holds at a time
+PIXEL_BYTES = 3 * 12  # per pixel of the frame: its colours, from sums to bytes
+PICTURE_PIXEL_BYTES = 20  # per pixel of the picture's file, while it is decoded and converted; its texture takes less
 
-# Bytes of a pixel in a file; masks are compressed.
+# Size of a pixel in a file [bytes]; masks are compressed.
 PIXEL_FILE_BYTES = {"png": 2, "gif": 1, "coordinates": 8, "depth": 4, "flow": 8, "occlusion": 0.05, "instrument": 0.05}
 
 # Bytes of a pixel while its labels are found and written; and of a tracked point in a frame, held until the end.
 LABEL_PIXEL_BYTES = 60
 TRACK_BYTES = 9
 
-# Numbers for each mass point: displacement and difference; and the copies made at the start and for output.
+# Numbers per mass point: displacement and difference; with a map, the stiffness of three springs and what it is made
+# from; and the copies made at the start and for output.
 STATE_NUMBERS = 6
-MAP_NUMBERS = 6  # the stiffness of three springs, and what it is made from
+MAP_NUMBERS = 6
 OUTPUT_NUMBERS = 15
 
 
 @dataclass(frozen=True)
 class Budget:
-    """What a scene will need.
+    """What a scene needs.
 
     Attributes:
-        points: mass points.
-        steps: time steps in all.
-        frames: frames in all, the one at rest included.
+        points: number of mass points.
+        steps: number of time steps in all.
+        frames: number of frames in all, including that at rest.
         simulation_bytes: memory for the state of the sheet and its output.
-        drawing_bytes: memory for a frame and the texture; 0 where nothing is drawn.
-        picture_bytes: size of the files with pictures and labels, about.
+        drawing_bytes: memory for a frame and the texture; 0 if nothing is drawn.
+        picture_bytes: approximate size of the files with pictures and labels.
         trajectory_bytes: size of the trajectory.
-        working_bytes: disk space that is taken besides until the run ends.
+        working_bytes: additional disk space that is used until the run ends.
     """
 
     points: int
@@ -66,7 +68,7 @@ class Budget:
 
     @property
     def memory_bytes(self) -> int:
-        """Memory in use at one time. Trajectories do not count: they are streamed to disk."""
+        """Memory in use at one time. Trajectories do not count, because they are streamed to disk."""
         return self.simulation_bytes + self.drawing_bytes
 
     @property
@@ -75,48 +77,49 @@ class Budget:
         return self.picture_bytes + self.trajectory_bytes
 
 
-def estimate(scene: Scene) -> Budget:
-    """Estimate what the scene will need."""
+def estimate(scene: Scene, grid: TimeGrid) -> Budget:
+    """Estimate what a scene needs with the steps of a grid."""
     rows, cols = scene.sheet.points
-    points = rows * cols
-    frames, pixels = scene.time.frames + 1, math.prod(scene.render.size)
-    positions = frames * points * 3 * _number_bytes(scene)
+    points, number_bytes = rows * cols, 4 if grid.precision == "f32" else 8
+    frames, pixels = grid.frames + 1, math.prod(scene.render.size)
+    positions = frames * points * 3 * number_bytes
     tracks = frames * scene.render.tracks**2 * TRACK_BYTES if "tracks" in scene.output else 0
     numbers = STATE_NUMBERS + OUTPUT_NUMBERS + len(scene.probes) + (MAP_NUMBERS if scene.stiffness_map else 0)
-    # A pilot is up to two more sheets, in f64; with tissue there are two smaller ones.
-    pilot = scene.time.tolerance is not None or affords_pilot(scene, 2)
-    sheets = _number_bytes(scene) + (8 * (2 + (scene.tissue is not None) * 5 / 16) if pilot else 0)
+    # Pilots are up to two more sheets in f64; with tissue also two smaller ones.
+    pilot = scene.time.tolerance is not None or affords_pilot(scene, grid, 2)
+    sheets = number_bytes + (8 * (2 + (scene.tissue is not None) * 5 / 16) if pilot else 0)
     return Budget(
         points=points,
-        steps=scene.time.frames * timestep.steps_per_frame(scene),
+        steps=grid.steps,
         frames=frames,
         simulation_bytes=round(points * sheets * numbers),
         drawing_bytes=(drawing_bytes(scene) if scene.renders else 0) + tracks,
         picture_bytes=round(frames * sum(pixels * PIXEL_FILE_BYTES.get(kind, 0) for kind in set(scene.output)))
         + tracks,
         trajectory_bytes=positions if "trajectory" in scene.output else 0,
-        # Two of the states with which a run can go on, and all its positions.
-        working_bytes=2 * points * STATE_NUMBERS * _number_bytes(scene) + (positions if scene.output else 0),
+        # Two saved states from which the run could continue, and all positions so far.
+        working_bytes=2 * points * STATE_NUMBERS * number_bytes + (positions if scene.output else 0),
     )
 
 
 def problems(scene: Scene) -> Iterator[Problem]:
-    """Say what makes the scene too large, with the numbers and the key to change."""
-    yield from _step_problems(scene)
-    yield from _memory_problems(scene)
+    """Find what makes a scene too large, with the numbers and the key to change."""
+    grid = time_grid(scene)
+    yield from _step_problems(scene, grid)
+    yield from _memory_problems(scene, estimate(scene, grid))
 
 
 def require_disk(scene: Scene, directory: Path) -> None:
-    """Make sure that there is room for the results.
+    """Make sure that the disk has room for the results.
 
     Args:
         scene: a checked scene.
-        directory: where they are to go; it may not be there yet.
+        directory: of the results; it need not exist yet.
 
     Raises:
-        SceneError: when there is not, with the numbers and the key to change.
+        SceneError: when there is too little room; has the numbers and the key to change.
     """
-    budget, free = estimate(scene), _free_disk(directory)
+    budget, free = estimate(scene, time_grid(scene)), _free_disk(directory)
     needed = budget.disk_bytes + budget.working_bytes
     if needed <= free:
         return
@@ -129,21 +132,17 @@ def require_disk(scene: Scene, directory: Path) -> None:
     size, key, name = max(parts)
     said = (
         f"{budget.frames} frames need {_in_words(needed)} on disk, {_in_words(size)} of it for {name}, but "
-        f"{_in_words(free)} is free for {directory}; take less, fewer time.frames_per_second, less output or "
+        f"{_in_words(free)} is free for {directory}; reduce it, time.frames_per_second or output, or choose "
         "another --out"
     )
     raise SceneError([f"{key}: {said}"])
 
 
-def _number_bytes(scene: Scene) -> int:
-    return 4 if precision(scene) == "f32" else 8
-
-
 def drawing_bytes(scene: Scene) -> int:
-    """Estimate the memory for drawing a frame [bytes], whether the scene's output asks for it or not."""
+    """Estimate the memory for drawing a frame [bytes], even if the scene's output has no pictures."""
     rows, cols = scene.sheet.points
     width, height = scene.render.size
-    # The whole picture is decoded, whatever the region.
+    # The whole picture is decoded, even if only a region of it is used.
     picture = math.prod(texture.image_size(scene) or (0,))
     factor = scene.render.supersample
     band_rows = min(height * factor, BAND_ROWS * (os.cpu_count() or 1))
@@ -152,11 +151,10 @@ def drawing_bytes(scene: Scene) -> int:
     return rows * cols * POINT_BYTES + samples + width * height * pixel + picture * PICTURE_PIXEL_BYTES
 
 
-def _step_problems(scene: Scene) -> Iterator[Problem]:
-    steps = scene.time.frames * timestep.steps_per_frame(scene)
-    if steps <= MAX_STEPS:
+def _step_problems(scene: Scene, grid: TimeGrid) -> Iterator[Problem]:
+    if grid.steps <= MAX_STEPS:
         return
-    count = f"{scene.time.duration:g} s in steps of {timestep.step(scene):.6g} s is {steps:.3g} steps"
+    count = f"{scene.time.duration:g} s in steps of {grid.step:.6g} s is {grid.steps:.3g} steps"
     limit = f"more than the {MAX_STEPS:.0e} that can be taken"
     if scene.time.step == "auto":
         remedy = "take a shorter time, softer springs or more mass"
@@ -165,8 +163,8 @@ def _step_problems(scene: Scene) -> Iterator[Problem]:
         yield Problem(("time", "step"), f"{count}, {limit}; take a longer step or a shorter time")
 
 
-def _memory_problems(scene: Scene) -> Iterator[Problem]:
-    budget, available = estimate(scene), available_memory()
+def _memory_problems(scene: Scene, budget: Budget) -> Iterator[Problem]:
+    available = available_memory()
     if budget.memory_bytes <= available:
         return
     rows, cols = scene.sheet.points
@@ -179,12 +177,12 @@ def _memory_problems(scene: Scene) -> Iterator[Problem]:
     yield Problem(
         key,
         f"the scene needs {_in_words(budget.memory_bytes)} of memory, {_in_words(size)} of it for {name}, "
-        f"but {_in_words(available)} is free; take less",
+        f"but {_in_words(available)} is free; reduce it",
     )
 
 
 def _free_disk(directory: Path) -> int:
-    """Tell how much may be written to a directory [bytes]; sys.maxsize where the system does not tell."""
+    """Give the free disk space for a directory [bytes]; sys.maxsize if the system does not report it."""
     for path in (directory, *directory.absolute().parents):
         try:
             return shutil.disk_usage(path).free

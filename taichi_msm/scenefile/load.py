@@ -1,4 +1,4 @@
-"""Scene file and overrides -> Scene, with the place in every error; and the schema for editors."""
+"""Scene file and overrides -> Scene, with file, line and column in every error; and the schema for editors."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ IMAGE: Key = ("image",)
 MAPS: tuple[Key, ...] = (("tissue", "map", "image"), ("springs", "map", "image"))
 PICTURES = (IMAGE, *MAPS)
 
-# Nobody reads further, and a broken file of the greatest size has tens of thousands.
+# The largest number of lines in an error: nobody reads more, and a broken file may have tens of thousands of problems.
 MAX_LINES = 100
 
 
@@ -54,19 +54,19 @@ def load_scene(
     """Read a scene and check all that can be checked before computing.
 
     Args:
-        path: the scene file; the image that it names is relative to its folder, and in it or below. An override may
-            name one elsewhere, relative to the same folder.
-        overrides: what to put in place of the file's values: "KEY=VALUE" with a dotted key (items of a list
-            by number, probes.0.load) and the value in YAML, which errors call --set; or a mapping from dotted keys
-            to values, which they call override.
+        path: of the scene file. The image that it names is relative to its folder, and must be in it or below. An
+            override may name an image elsewhere, also relative to this folder.
+        overrides: values that replace those of the file: texts "KEY=VALUE" with a dotted key (items of a list by
+            number: probes.0.load) and a value in YAML, which errors call --set; or a mapping from dotted keys to
+            values, which errors call override.
         image: another picture for the sheet, relative to the current directory.
 
     Returns:
-        The scene, its image relative to the current directory.
+        The scene; its image is relative to the current directory.
 
     Raises:
         ArgumentError: when the overrides are neither a sequence of texts nor a mapping from texts.
-        SceneError: all problems of the scene, one line each, in the order in which they stand.
+        SceneError: with all problems of the scene, one line each, in the order of their places in the file.
     """
     if isinstance(overrides, str) or not (
         isinstance(overrides, (Sequence, Mapping)) and all(isinstance(one, str) for one in overrides)
@@ -88,14 +88,14 @@ def load_scene(
 def schema() -> dict[str, Any]:
     """Describe the scene for editors, as JSON Schema (draft 2020-12).
 
-    It holds what can be said of one key by itself; rules that join several keys, such as the step limit, are
+    It has the rules for single keys; those for several keys together, such as the stability limit of the step, are
     checked when a scene is loaded.
     """
     return {"$schema": "https://json-schema.org/draft/2020-12/schema"} | Scene.model_json_schema()
 
 
 class _Override(NamedTuple):
-    """One value in place of the file's; `problems` says why it cannot be read, if so."""
+    """A value that replaces one of the file; `problems` says why it cannot be read."""
 
     name: str
     path: Key
@@ -137,7 +137,7 @@ def _parse_value(key: str, value: Any) -> _Override:
 
 
 def _parse_key(key: str) -> Key:
-    """Split a dotted key; into nothing, if it is none."""
+    """Split a dotted key; returns an empty key if it is not valid."""
     parts = key.split(".")
     if len(parts) > MAX_DEPTH or not all(part and part.isprintable() for part in parts):
         return ()
@@ -145,12 +145,12 @@ def _parse_key(key: str) -> Key:
 
 
 class _Place(NamedTuple):
-    """Where a key was given; places sort as they are read, the file and then the overrides.
+    """Where a key was given; places are sorted in the order of reading: the file, then the overrides.
 
     Attributes:
-        source: 0 for the file, then 1, 2, ... for each override.
+        source: 0 for the file; 1, 2, ... for the overrides.
         mark: line and column in the file.
-        name: the place as the user knows it, such as press.yaml:7:3.
+        name: of the place in messages, such as press.yaml:7:3.
     """
 
     source: int
@@ -159,15 +159,15 @@ class _Place(NamedTuple):
 
 
 class Draft:
-    """A file as given so far.
+    """The content of a file while overrides are applied to it.
 
     Args:
-        name: the file's.
-        document: what it says.
+        name: of the file.
+        document: its content.
 
     Attributes:
-        data: what it says, with its overrides.
-        found: what is wrong with it, and where.
+        data: its content, with the overrides applied so far.
+        found: the problems found so far, each with its place.
     """
 
     def __init__(self, name: str, document: Document) -> None:
@@ -179,7 +179,7 @@ class Draft:
         self.found = [(self._in_file(mark), Problem(key, message)) for mark, key, message in document.faults]
 
     def override(self, override: _Override) -> None:
-        """Put one value in place."""
+        """Apply an override."""
         self._overrides += 1
         place = _Place(self._overrides, Mark(1, 1), override.name)
         if override.problems:
@@ -188,7 +188,7 @@ class Draft:
             self.found.append((place, problem))
 
     def find_pictures(self, folder: Path, keys: Sequence[Key]) -> None:
-        """Make the paths of pictures, relative to a folder so far, relative to the current directory."""
+        """Change the paths of pictures, given relative to a folder, to paths from the current directory."""
         for key in keys:
             self._find_picture(key, folder)
 
@@ -200,7 +200,7 @@ class Draft:
         if not (isinstance(image, str) and 0 < len(image) <= MAX_PATH):
             return
         holder[key[-1]] = str(folder / image)
-        # A scene may come from anybody, and is to see no more than what came with it.
+        # A scene may come from anybody, so it may only read files that came with it.
         given = any(key[:n] in self._overridden for n in range(1, len(key) + 1))
         if not given and not _is_below(folder / image, folder):
             remedy = ", or name it with --image" if key == IMAGE else ""
@@ -209,7 +209,7 @@ class Draft:
             del holder[key[-1]]
 
     def report(self, problems: Iterable[Problem]) -> None:
-        """Note problems, each at its place, leaving out what was said of the same key before."""
+        """Add problems with their places, except those of keys that already have a problem."""
         keys = {problem.path for _, problem in self.found}
         for problem in problems:
             if problem.path not in keys:
@@ -217,7 +217,7 @@ class Draft:
                 self.found.append((self._place(problem.path), problem))
 
     def lines(self) -> list[str]:
-        """Write the problems down in the order of their places."""
+        """Format the problems in the order of their places."""
         found = sorted(self.found, key=lambda item: item[0][:2])
         lines = [_line(place.name, problem) for place, problem in found[:MAX_LINES]]
         return lines if len(lines) == len(found) else [*lines, "and more"]
@@ -226,14 +226,14 @@ class Draft:
         return _Place(0, mark, f"{self._name}:{mark.line}:{mark.column}")
 
     def _place(self, path: Key) -> _Place:
-        """Find where a key was given, or else the nearest section or list around it."""
+        """Find where a key was given, or else the innermost section or list around it that was."""
         around = [path[:n] for n in range(len(path), -1, -1)]
         overridden = (self._overridden[key] for key in around if key in self._overridden)
         given = (self._in_file(self._marks[key]) for key in around if key in self._marks)
         return next(chain(overridden, given))
 
     def _put(self, path: Key, value: Any, place: _Place) -> Problem | None:
-        """Set one key, making the sections above it that are not there yet."""
+        """Set a key, creating the sections above it that do not exist yet."""
         holder: Any = self.data
         here: Key = ()
         for n, part in enumerate(path):
@@ -258,19 +258,19 @@ class Draft:
 
 
 def _is_below(path: Path, folder: Path) -> bool:
-    """Tell whether a path is in a folder or below it, wherever symbolic links lead."""
+    """Tell whether a path is in a folder or below it, with symbolic links resolved."""
     try:
         return path.resolve().is_relative_to(folder.resolve())
     except (OSError, RuntimeError, ValueError):
-        # A loop of links, or no path at all: reading it says so.
+        # A loop of links, or not a valid path: reading it will say so.
         return True
 
 
 def read_file(name: str, kind: Kind) -> Document:
-    """Read a file, whatever it says, as long as it is a mapping.
+    """Read a file that contains a mapping, without checking its keys.
 
     Raises:
-        SceneError: when it is none, or cannot be read.
+        SceneError: when it contains no mapping, or cannot be read.
     """
     text = _read_text(name, kind)
     try:
@@ -289,7 +289,7 @@ def _read_text(name: str, kind: Kind) -> str:
     try:
         mode = path.stat().st_mode
         if not stat.S_ISREG(mode):
-            # Opening a pipe would wait for its other end.
+            # Opening a pipe would block until its other end is opened.
             found = "a directory" if stat.S_ISDIR(mode) else "not a regular file"
             raise _error(name, f"{found}; name a {kind.name} file")
         with path.open("rb") as file:
@@ -313,5 +313,5 @@ def _error(place: str, message: str) -> SceneError:
 
 
 def _line(place: str, problem: Problem) -> str:
-    """Write one problem as one line."""
+    """Format a problem as one line."""
     return f"{place}: {Problem(tuple(cut(str(part)) for part in problem.path), problem.message)}"

@@ -1,4 +1,4 @@
-"""Plain data -> Scene, or everything that is wrong with it, each problem at its key."""
+"""Plain data -> Scene, or everything that is wrong with it: a list of problems, each with its key."""
 
 from __future__ import annotations
 
@@ -9,23 +9,22 @@ from pydantic import ValidationError
 
 from taichi_msm import faults
 from taichi_msm.errors import ArgumentError, Problem, SceneError
-from taichi_msm.physics import material, timestep, workload
+from taichi_msm.physics import material, timestep
 from taichi_msm.render import camera, texture
 from taichi_msm.scene import Scene, Section
 from taichi_msm.scenefile import budget
 
 Model = TypeVar("Model", bound=Section)
 
-# What one section cannot know: these see the whole scene, once `material` finds it to be one.
+# Checks of keys in several sections. They require a scene in which `material.problems` finds nothing.
 CHECKS: tuple[Callable[[Scene], Iterable[Problem]], ...] = (
     timestep.problems,
-    workload.problems,
     camera.problems,
     texture.problems,
     budget.problems,
 )
 
-# Faultless sections to stand for faulty ones, chosen so that no check finds anything in them.
+# Valid sections that replace faulty ones; no check finds anything in them.
 _STAND_INS: dict[str, Any] = {
     "image": None,
     "sheet": {"points": [2, 2], "size": [1, 1]},
@@ -37,16 +36,16 @@ _STAND_INS: dict[str, Any] = {
 
 
 def validate(data: dict[str, Any]) -> tuple[Scene | None, list[Problem]]:
-    """Check a scene, its keys first and then what joins them.
+    """Check a scene: first each key by itself, then several keys together.
 
-    Where some sections are wrong, the checks that join several keys still run on the others, so that all
-    problems come at once.
+    If some sections are faulty, the checks of several keys still run on the others, so that all problems are reported
+    at once.
 
     Returns:
-        The scene, None if there is any problem; and the problems.
+        The scene, or None if there is any problem; and the problems.
     """
     problems: list[Problem] = []
-    # Pydantic asks for the picture once the sections are faultless, and CHECKS run once it has that too.
+    # Pydantic checks the scene as a whole once its sections are valid, and CHECKS run once that finds nothing either.
     for _ in range(3):
         scene, found = parse(Scene, data)
         problems += found
@@ -58,28 +57,28 @@ def validate(data: dict[str, Any]) -> tuple[Scene | None, list[Problem]]:
 
 
 def joint_problems(scene: Scene, *, picture: bool = True) -> list[Problem]:
-    """Find what is wrong with keys that are right each by itself.
+    """Find what is wrong with several keys together.
 
     Args:
-        scene: whose sections are right.
-        picture: whether its picture is looked at.
+        scene: whose keys are valid each by itself.
+        picture: whether to check its picture too.
     """
     checks = [check for check in CHECKS if picture or check is not texture.problems]
     found = list(material.problems(scene))
     if found:
-        # Steps and memory follow from what the sheet is made of.
+        # Steps and memory depend on what the sheet is made of, so they cannot be checked.
         checks = [check for check in checks if check in (camera.problems, texture.problems)]
     return found + [problem for check in checks for problem in check(scene)]
 
 
 def checked(scene: Scene | Mapping[str, Any]) -> Scene:
-    """Give a scene of which all but its picture is checked.
+    """Check a scene, except for its picture, and return it.
 
     Args:
-        scene: one that may have been made in Python, or its keys.
+        scene: a scene, which may have been made in Python, or a mapping of its keys.
 
     Raises:
-        SceneError: with all that is wrong with it.
+        SceneError: with everything that is wrong with it.
     """
     if isinstance(scene, Scene):
         problems = joint_problems(scene, picture=False)
@@ -94,7 +93,7 @@ def checked(scene: Scene | Mapping[str, Any]) -> Scene:
 
 
 def _spare(data: dict[str, Any], problems: list[Problem]) -> dict[str, Any]:
-    """Replace the faulty sections; without the picture, nothing may ask to draw it."""
+    """Replace the faulty sections; without a picture, output that draws it is removed too."""
     faulty = {problem.path[0] for problem in problems}
     if "image" in faulty:
         faulty.add("output")
@@ -110,7 +109,7 @@ def parse(model: type[Model], data: dict[str, Any]) -> tuple[Model | None, list[
     """Check each section of a file by itself.
 
     Returns:
-        What the file says, None if there is any problem; and the problems.
+        The model made of the file, or None if there is any problem; and the problems.
     """
     try:
         return model.model_validate(data), []

@@ -1,9 +1,8 @@
-"""YAML text -> plain data and where each key stands; a safe and small part of YAML 1.2.
+"""YAML text -> plain data with the place of each key; a safe, small subset of YAML 1.2.
 
-The data is built straight from the parser's events: what a scene has no use for (anchors, aliases, tags,
-several documents, deep nesting) is met as an event and refused there, so that no text can make the reader
-recurse, expand or load anything. Scalars follow the core schema of YAML 1.2: 1e4 is a number, 010 is ten,
-`yes` is text.
+The data is built directly from the parser's events. What a scene does not need (anchors, aliases, tags, several
+documents, deep nesting) is refused as soon as its event arrives, so that no text can make the reader recurse, expand
+aliases or load anything. Scalars follow the core schema of YAML 1.2: 1e4 is a number, 010 is ten, `yes` is text.
 """
 
 from __future__ import annotations
@@ -19,17 +18,17 @@ from taichi_msm.errors import Path
 MAX_DEPTH = 20
 MAX_NODES = 100_000
 
-# Nobody reads further, and a broken file of the greatest size has tens of thousands.
+# The largest number of faults to collect; a broken file may have tens of thousands.
 MAX_FAULTS = 1000
 
-# Longer plain scalars are text, whatever they look like: no number of a scene needs more, and Python refuses
-# to read integers of several thousand digits.
+# Longer plain scalars are text even if they look like numbers: no number of a scene is so long, and Python refuses to
+# read integers of several thousand digits.
 MAX_NUMBER_LENGTH = 100
 
-# The C parser is twenty times faster; a PyYAML that was built without it gives the same data.
+# The C parser is twenty times faster; without it, PyYAML's own parser gives the same data.
 _LOADER: Any = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
 
-# What YAML excludes, and the line breaks that it knows and editors do not, which would put line numbers off.
+# Characters that YAML excludes, and line breaks of YAML that editors do not count, which would make line numbers wrong.
 _NOT_ALLOWED = re.compile("[^\t\n\r\x20-\x7e\xa0-\u2027\u202a-\ud7ff\ue000-\ufffd\U00010000-\U0010ffff]")
 
 _SURROGATE = re.compile("[\ud800-\udfff]")
@@ -49,14 +48,14 @@ _WORDS: dict[str, bool | None] = {
 
 
 class Mark(NamedTuple):
-    """A place in the text, counted from 1."""
+    """A place in the text; lines and columns are counted from 1."""
 
     line: int
     column: int
 
 
 class Fault(NamedTuple):
-    """What is wrong with one node of the text that can be read all the same."""
+    """A fault of one node that does not keep the rest of the text from being read."""
 
     mark: Mark
     path: Path
@@ -64,12 +63,12 @@ class Fault(NamedTuple):
 
 
 class Document(NamedTuple):
-    """What a text says.
+    """The content of a text.
 
     Attributes:
-        data: None, bool, int, float, str, and lists and dicts of them; None for an empty text.
-        marks: where each key, and each item of a list, stands.
-        faults: what is wrong but did not stop the reading, the first of it.
+        data: None, bool, int, float, str, and lists and dicts of these; None for an empty text.
+        marks: places of all keys and of all items of lists.
+        faults: the first MAX_FAULTS faults that did not stop the reading.
     """
 
     data: Any
@@ -78,7 +77,7 @@ class Document(NamedTuple):
 
 
 class UnreadableError(Exception):
-    """The text is not YAML, or more of it than a scene can be."""
+    """The text is not YAML, or too long or too deeply nested for a scene."""
 
     def __init__(self, mark: Mark, message: str) -> None:
         super().__init__(message)
@@ -100,7 +99,7 @@ def read(text: str) -> Document:
     except yaml.MarkedYAMLError as error:
         raise _syntax_error(text, error) from None
     except (yaml.YAMLError, ValueError) as error:
-        # PyYAML's own parser passes some bad escapes of a quoted text on to chr().
+        # PyYAML's own parser passes some invalid escapes of a quoted text on to chr().
         raise UnreadableError(Mark(1, 1), f"not valid YAML: {error}") from None
 
 
@@ -123,7 +122,7 @@ def _mark(mark: Any) -> Mark:
 
 
 def _resolve(text: str) -> Any:
-    """Give a plain scalar its value."""
+    """Convert a plain scalar to its value."""
     if text in _WORDS:
         return _WORDS[text]
     if text[0] in "+-.0123456789" and len(text) <= MAX_NUMBER_LENGTH:
@@ -134,7 +133,7 @@ def _resolve(text: str) -> Any:
 
 
 class _Reader:
-    """Builds the data of a stream of events."""
+    """Builds data from a stream of events."""
 
     def __init__(self, events: Iterator[Any]) -> None:
         self.marks: dict[Path, Mark] = {(): Mark(1, 1)}
@@ -165,7 +164,7 @@ class _Reader:
         return self._mapping(path)
 
     def _admit(self, event: Any, path: Path) -> None:
-        """Refuse what a scene has no use for."""
+        """Refuse what a scene does not need."""
         self._nodes += 1
         if self._nodes > MAX_NODES:
             raise UnreadableError(_mark(event.start_mark), f"more than {MAX_NODES} values; write fewer")

@@ -1,4 +1,4 @@
-"""A whole study: stepping, SciPy beside it, drawing, points, terms; what is done stays when it is interrupted."""
+"""A whole study: stepping, SciPy for comparison, drawing, points, terms; when interrupted it keeps what is done."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ from taichi_msm.system.runtime import Device
 
 TOLERANCE = 1e-3
 
-# Trajectories of the whole scene in memory at one time: the reference, and those that it is made of or compared with.
+# Number of trajectories in memory at one time: the reference, and those that it is made of or compared with.
 TRAJECTORIES = 6
 
 
@@ -37,10 +37,10 @@ class Effort:
 
     Attributes:
         quick: whether to vary the settings of drawing one at a time.
-        longest_run: of stepping through the whole scene once [s].
-        peer: of SciPy, for each of its tolerances [s].
+        longest_run: longest time of stepping through the whole scene once [s].
+        peer: longest time of SciPy for each of its tolerances [s].
         peer_rtols: these tolerances.
-        sample: of one measurement of a step [s].
+        sample: time of one measurement of a step [s].
     """
 
     quick: bool
@@ -64,17 +64,17 @@ def study(
     threads: int | None = None,
     progress: Progress = lambda stage, done, total: None,
 ) -> Study:
-    """Measure what every setting of a scene costs on this machine, and how wrong it is.
+    """Measure the cost and the error of the settings of a scene on this machine.
 
     Args:
         scene: what `load_scene` returned.
-        name: what to call it.
-        tolerance: the error that is allowed, as a fraction of the largest displacement; None: the scene's, or 1e-3.
-        quick: whether to measure fewer settings for a shorter time: about a minute for a small sheet.
+        name: of the scene, for the report.
+        tolerance: largest allowed error, as a fraction of the largest displacement; None: the scene's, or else 1e-3.
+        quick: whether to measure fewer settings in less time: about a minute for a small sheet.
         arch: cpu or cuda.
         threads: number of CPU threads; None takes every core.
-        progress: called with the stage, the work done and all of it; where it raises KeyboardInterrupt, what is done
-            is returned.
+        progress: called with the stage, the work done and all of it. If it raises KeyboardInterrupt, the study returns
+            what is done.
 
     Raises:
         SceneError: when the picture cannot be decoded, or the trajectories do not fit in memory.
@@ -91,7 +91,7 @@ def study(
         machine=machine(device),
     )
     effort = QUICK if quick else FULL
-    # The step is what is studied.
+    # The study itself varies the step.
     scene = with_time(scene, tolerance=None)
     try:
         with closing(SteppingStudy(scene, device, effort.longest_run, partial(progress, "stepping"))) as stepping:
@@ -115,7 +115,7 @@ def study(
 
 
 def machine(device: Device) -> dict[str, Any]:
-    """Describe where the study ran."""
+    """Describe the machine that the study ran on."""
     return {
         "cpu": resources.processor(),
         "cores": os.cpu_count(),
@@ -140,7 +140,7 @@ def _require_memory(scene: Scene) -> None:
 
 
 def _measure_peer(scene: Scene, stepping: SteppingStudy, effort: Effort, found: Study, progress: Progress) -> None:
-    """Solve by DOP853 at several tolerances, each as often as its time allows."""
+    """Solve by DOP853 at several tolerances, each as many times as time allows, up to 5."""
     assert stepping.reference is not None
     rtols = effort.peer_rtols
     for index, rtol in enumerate(rtols):
@@ -183,7 +183,7 @@ def _measure_pictures(
 
 
 def _measure_points(scene: Scene, device: Device, effort: Effort, found: Study, progress: Progress) -> None:
-    """Change the number of points of tissue; with springs other points make another sheet."""
+    """Vary the number of points of tissue; with springs, other points would make another sheet."""
     if scene.tissue is None:
         return
     points = PointStudy(scene, device, effort.longest_run, partial(progress, "points"))

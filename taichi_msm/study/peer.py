@@ -1,4 +1,4 @@
-"""The same equations by SciPy's DOP853, as a careful person would solve them without this program."""
+"""The same equations solved by SciPy's DOP853, as a careful person would do without this program."""
 
 from __future__ import annotations
 
@@ -15,18 +15,18 @@ from taichi_msm.physics.loads import Schedule, key_times, loads_at
 from taichi_msm.reference.sheet import sheet
 from taichi_msm.scene import Scene
 
-# Loads are read this far inside a piece between two keys, as a fraction of it: at its ends they may jump.
+# Loads are evaluated this far inside an interval between two keys, as a fraction of it: at its ends they may jump.
 INSIDE = 1e-9
 
 Array = NDArray[np.float64]
 
 
 class TooSlowError(Exception):
-    """The time allowed is over."""
+    """The time limit is exceeded, or the solver fails."""
 
 
 def solve(scene: Scene, rtol: float, atol: float, deadline: float, tick: Callable[[], None]) -> tuple[Array, int]:
-    """Integrate piece by piece between the keys of the loads.
+    """Integrate from key to key of the loads, between which they are smooth.
 
     Args:
         scene: a checked scene.
@@ -39,7 +39,7 @@ def solve(scene: Scene, rtol: float, atol: float, deadline: float, tick: Callabl
         Displacements at every frame but the first [m], shape (F, rows, cols, 3); and the number of evaluations.
 
     Raises:
-        TooSlowError: at the deadline.
+        TooSlowError: at the deadline, or when SciPy fails.
         ImportError: when SciPy is not installed.
     """
     from scipy.integrate import solve_ivp
@@ -58,7 +58,8 @@ def solve(scene: Scene, rtol: float, atol: float, deadline: float, tick: Callabl
                 raise TooSlowError
             tick()
             share = (t - start) / (end - start)
-            loads = Schedule(*(each[:1] + share * (each[1:] - each[:1]) for each in ends))
+            between = (each[:1] + share * (each[1:] - each[:1]) for each in ends[1:])
+            loads = Schedule(ends.slots, *between)
             u, v = y.reshape(2, *shape)
             force = reference.force(scene, u, loads, 0) - made.drag[..., None] * v
             return np.concatenate([v.ravel(), (force / made.mass[..., None] * moves).ravel()])
@@ -74,10 +75,10 @@ def solve(scene: Scene, rtol: float, atol: float, deadline: float, tick: Callabl
 
 
 def _pieces(scene: Scene) -> Iterator[tuple[float, float, Array]]:
-    """Cut the time at the keys: start, end, and the times of the frames after start, up to and with end."""
+    """Split the time at the keys: start, end, and the times t of frames with start < t <= end."""
     frames = np.arange(1, scene.time.frames + 1) / scene.time.frames_per_second
     bounds = [0.0, *key_times(scene), float(frames[-1])]
     for start, end in pairwise(bounds):
-        # A key that is on a frame but for rounding is on it.
+        # A key that differs from the time of a frame only by rounding is at that frame.
         near = frames[(frames > start * (1 + INSIDE)) & (frames <= end * (1 + INSIDE))]
         yield start, end, np.minimum(near, end)

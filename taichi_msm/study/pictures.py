@@ -1,4 +1,4 @@
-"""Work and precision of the drawing: every refinement and supersampling, on the most deformed frame."""
+"""Work and precision of drawing: every refinement and supersampling, for the most deformed frame."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from taichi_msm.system import resources
 REFINES = (0, 1, 2, 5, 10, 20)
 SUPERSAMPLES = (1, 2, 3, 4)
 
-# What the truth is drawn with, if there is memory for it; it must be finer than all that it judges.
+# Settings of the reference picture, if there is memory for it; they must be finer than all that are compared with it.
 FINEST = {"refine": 40, "supersample": 8}
 
 ROUNDS = 5
@@ -75,7 +75,7 @@ class PictureStudy:
         ]
 
     def run(self) -> None:
-        """Draw the truth, then every setting, all of them in turn."""
+        """Draw the reference picture, then every setting, taking turns."""
         memory = resources.available_memory() // 2
         if not self._draw_truth(memory):
             return
@@ -100,13 +100,13 @@ class PictureStudy:
                 trial.samples.append(time.perf_counter() - start)
 
     def points(self) -> list[Drawn]:
-        """Give what is known so far."""
+        """Give the results so far."""
         return [self._point(trial) for trial in self._trials if trial.samples]
 
     def _draw_truth(self, memory: int) -> bool:
         scene = _with_render(self._scene, **FINEST)
         if budget.drawing_bytes(scene) > memory:
-            self.notes.append("drawing was not measured: there is no memory for a picture fine enough to judge by")
+            self.notes.append("drawing was not measured: there is no memory for a picture fine enough to compare with")
             return False
         self._truth = Drawing(scene, self._texture).draw(self._position)
         return True
@@ -129,5 +129,5 @@ def psnr(picture: Picture, truth: Picture) -> float | None:
 
 
 def _with_render(scene: Scene, **changes: int) -> Scene:
-    # The truth is drawn beyond what a scene may ask for, so this is not checked.
+    # Not checked, because the settings of the reference picture exceed the limits of a scene.
     return scene.model_copy(update={"render": BaseModel.model_copy(scene.render, update=changes)})

@@ -1,4 +1,4 @@
-"""A study as a picture: work against precision of stepping, drawing and points, and what every term costs."""
+"""A study as a picture: work against precision of stepping, drawing and points, and the cost of every term."""
 
 from __future__ import annotations
 
@@ -24,11 +24,11 @@ from numpy.typing import NDArray
 from taichi_msm.study.result import Drawn, Peer, Points, Stepping, Study, Timing
 from taichi_msm.study.table import duration, number, shown, unit, where
 
-# The colours of Okabe and Ito, which everybody can tell apart.
+# The colours of Okabe and Ito, which the colour-blind can tell apart too.
 BLUE, VERMILION, GREEN, ORANGE, PURPLE, SKY = "#0072B2", "#D55E00", "#009E73", "#E69F00", "#CC79A7", "#56B4E9"
 INK, GREY, SILVER, PALE = "#222222", "#767676", "#A0A0A0", "#E6E6E6"
 
-# Colour tells the damping difference; dashes and shape tell the precision.
+# Colour shows the damping difference, dashes and markers the precision.
 COLOURS = {"central": BLUE, "backward": VERMILION}
 LINES: dict[str, dict[str, Any]] = {
     "f32": {"linestyle": "-", "marker": "o", "markersize": 4.5},
@@ -91,14 +91,14 @@ Point = Stepping | Peer | Points
 
 
 def plot(study: Study, path: Path) -> None:
-    """Draw what a study has measured, and leave out what it has not.
+    """Draw the parts that a study has measured.
 
     Args:
         study: with at least one of the `panels`.
         path: of the PNG.
     """
     with style.context(STYLE, after_reset=True), warnings.catch_warnings():
-        # A scene may be named in a script that the font lacks.
+        # The name of a scene may contain characters that the font lacks.
         warnings.filterwarnings("ignore", "Glyph .* missing")
         _figure(study).savefig(path, format="png")
 
@@ -116,7 +116,7 @@ def panels(study: Study) -> Iterator[tuple[str, Panel]]:
 
 
 def _drawable(value: float | None) -> bool:
-    """Tell whether a value has a place on a logarithmic axis."""
+    """Tell whether a value can be shown on a logarithmic axis."""
     return value is not None and 0 < value < math.inf
 
 
@@ -143,7 +143,7 @@ def _figure(study: Study) -> Figure:
     axes = figure.subplot_mosaic(layout, width_ratios=columns, height_ratios=rows)
     for name, panel in shown.items():
         panel(axes[name], study)
-    # Now that every panel is there, it is known how large each is.
+    # Labels depend on the sizes of the panels, which are known only now.
     layout_engine.execute(figure)
     figure.set_layout_engine("none")
     if "drawing" in axes:
@@ -154,7 +154,7 @@ def _figure(study: Study) -> Figure:
 
 
 def _write_header(figure: Figure, study: Study) -> None:
-    """Say above the panels what was studied, where, and what came out."""
+    """Write above the panels what was studied, on which machine, and with what result."""
     versions = study.machine["versions"]
     machine = f"{where(study)}; taichi-msm {versions['taichi-msm']}, Taichi {versions['taichi']}"
     title = f"{shown(study.scene)}: speed against error"
@@ -224,7 +224,7 @@ def _plot_stepping(axes: Axes, study: Study) -> None:
 
 
 def _plot_method(axes: Axes, study: Study, method: str) -> Line2D:
-    """Draw one method; returns what stands for it in the legend."""
+    """Draw one method; returns its entry in the legend."""
     points = [point for point in study.stepping if point.method == method]
     line = {**LINES[points[0].precision], "color": COLOURS[points[0].damping_difference]}
     diverged = [point.seconds.median for point in points if point.error is None]
@@ -236,7 +236,7 @@ def _plot_method(axes: Axes, study: Study, method: str) -> Line2D:
 
 
 def _plot_series(axes: Axes, points: Sequence[Point], line: dict[str, Any], label: str) -> Line2D:
-    """Draw a line through points; those not known are hollow, those of rounding half."""
+    """Draw a line through points; markers are hollow for upper bounds, and half filled where rounding dominates."""
     errors = [point.error or 0.0 for point in points]
     _plot_spread(axes, errors, [point.seconds for point in points], line["color"], 1)
     axes.plot(errors, [point.seconds.median for point in points], **line, zorder=3)
@@ -251,7 +251,7 @@ def _mostly_rounding(point: Point) -> bool:
 
 
 def _marks(study: Study) -> Iterator[Line2D]:
-    """Explain the marks that are in the picture."""
+    """Give legend entries for the kinds of markers in the picture."""
     every: list[Point] = [*study.stepping, *study.peers]
     points = [point for point in every if _drawable(point.error)]
     dot: dict[str, Any] = {"linestyle": "none", "marker": "o", "markersize": 4.5, "color": GREY}
@@ -268,8 +268,8 @@ def _marks(study: Study) -> Iterator[Line2D]:
 def _guides(
     points: Sequence[Stepping], orders: dict[str, float | None]
 ) -> Iterator[tuple[int, list[tuple[float, float]]]]:
-    """Lay lines of error ~ step^order beside the points of that order: above them for 1, below them for 2."""
-    # Where rounding spoils the order in f32, it is that of the same difference in f64.
+    """Give lines of error ~ step^order beside the points of that order: above them for order 1, below for order 2."""
+    # The order in f64 also stands for that in f32, which rounding may hide.
     found = {method.split()[1]: round(order) for method, order in orders.items() if order is not None}
     for order in (1, 2):
         own = [
@@ -306,16 +306,16 @@ def _plot_drawing(axes: Axes, study: Study) -> None:
 
 
 def _by_supersample(study: Study) -> list[list[Drawn]]:
-    """Sort what can be drawn into one line for each supersampling."""
+    """Group the drawings into one line for each supersampling."""
     drawings = [drawn for drawn in study.drawing if _drawable(drawn.psnr)]
     supersamples = sorted({drawn.supersample for drawn in drawings})
     return [[drawn for drawn in drawings if drawn.supersample == supersample] for supersample in supersamples]
 
 
 def _label_refinements(axes: Axes, study: Study) -> None:
-    """Write the refinement beside each point where nothing else is, the recommended one's first."""
+    """Label each point with its refinement, where there is room; the recommended one first."""
     lines, best = _by_supersample(study), study.best_drawing
-    # Places are in points of print.
+    # Lengths are in typographic points.
     paths = [axes.transData.transform([_place(drawn) for drawn in line]) * 72 / DPI for line in lines]
     taken = [Bbox.from_bounds(x - 2, y - 2, 4, 4) for path in paths for x, y in _dots(path)]
     points = zip(chain(*lines), chain(*paths), strict=True)
@@ -338,7 +338,7 @@ def _place(drawn: Drawn) -> tuple[float, float]:
 
 
 def _dots(path: NDArray[np.float64]) -> Iterator[NDArray[np.float64]]:
-    """Dot a line every two points of print or so."""
+    """Give positions along a line, about every two typographic points."""
     yield path[0]
     for start, end in pairwise(path):
         yield from np.linspace(start, end, 2 + int(np.linalg.norm(end - start) / 2))
@@ -367,11 +367,11 @@ def _plot_points(axes: Axes, study: Study) -> None:
 
 
 def _label_points(axes: Axes, study: Study) -> None:
-    """Write their number beside the points where nothing else is, that of the scene bold."""
+    """Label each sheet with its number of points, where there is room; the scene's own in bold."""
     points = [one for one in study.points if _drawable(one.error)]
     places = [(one.error or 0.0, one.seconds.median) for one in points]
     estimates = [(one.estimate or error, height) for one, (error, height) in zip(points, places, strict=True)]
-    # Places are in points of print.
+    # Lengths are in typographic points.
     spreads = [(error, time) for (error, _), one in zip(places, points, strict=True) for time in _extremes([one])]
     path, ends, spread = (axes.transData.transform(each) * 72 / DPI for each in (places, estimates, spreads))
     strokes = [*zip(path, ends, strict=True), *zip(spread[::2], spread[1::2], strict=True)]
@@ -425,7 +425,7 @@ def _extremes(points: Iterable[Point | Drawn]) -> Iterator[float]:
 
 
 def _span(set_limits: Callable[[float, float], object], values: Iterable[float], least: float) -> None:
-    """Make a logarithmic axis span values, with some room, and no less than some decades."""
+    """Make a logarithmic axis span the values with a margin, and at least `least` decades."""
     exponents = [math.log10(value) for value in values if value > 0]
     low, high = min(exponents), max(exponents)
     room = max(0.07 * (high - low), (least - (high - low)) / 2)
@@ -433,7 +433,7 @@ def _span(set_limits: Callable[[float, float], object], values: Iterable[float],
 
 
 def _tick_plainly(axis: Axis) -> None:
-    """Write 0.05 rather than 5 x 10^-2."""
+    """Label an axis with 0.05 rather than 5 x 10^-2."""
     low, high = axis.get_view_interval()
     axis.set_major_locator(LogLocator(subs=(1, 2, 5) if high / low < 300 else (1,)))
     axis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
@@ -441,5 +441,5 @@ def _tick_plainly(axis: Axis) -> None:
 
 
 def _duration(seconds: float) -> str:
-    """Write a time with its unit, as one prints it."""
+    """Write a time with its unit in typeset form."""
     return duration(seconds).replace("us", "µs")

@@ -1,4 +1,4 @@
-"""Work and precision of the number of points: tissue with a quarter, half and twice as many cells a side."""
+"""Work and precision of the number of points: tissue with a quarter, half and twice the cells a side."""
 
 from __future__ import annotations
 
@@ -17,21 +17,22 @@ from taichi_msm.physics.divergence import farthest_displacement
 from taichi_msm.physics.error_control import longest
 from taichi_msm.physics.mesh_error import FEWEST, CubicSampling, MeshPilot, coarser, with_points
 from taichi_msm.physics.solver import Dynamics
-from taichi_msm.physics.timestep import steps_per_frame, with_steps, with_time
+from taichi_msm.physics.timestep import time_grid, with_time
 from taichi_msm.progress import Count
 from taichi_msm.scene import MAX_POINTS, Scene
 from taichi_msm.scenefile import budget
 from taichi_msm.study.result import Points, Timing
 from taichi_msm.system.runtime import Device
+from taichi_msm.timegrid import TimeGrid
 
-# How many times as many cells a side as the scene has.
+# Cells a side, relative to those of the scene.
 COARSER = (1 / 4, 1 / 2)
 FINER = 2
 
-# Every number of points is timed so often, all of them in turn.
+# How many times every sheet is timed; all sheets take turns.
 ROUNDS = 5
 
-# An error is known when it is so many times what the reference's own may be at most.
+# An error counts as known if it is at least this many times the bound of the reference's own error.
 MARGIN = 5
 
 Field = NDArray[Any]
@@ -40,9 +41,10 @@ Lattice = tuple[int, int]
 
 @dataclass
 class _Trial:
-    """One number of points, and what is known of it so far."""
+    """A sheet with some number of points, and what is known about it so far."""
 
     scene: Scene
+    grid: TimeGrid
     dynamics: Dynamics
     estimate: float = math.inf
     error: float = math.inf
@@ -56,20 +58,20 @@ class _Trial:
 
 
 class PointStudy:
-    """Measures how exact a sheet of tissue is with more or fewer points, and how fast, in f64.
+    """Measures the error and the speed of a sheet of tissue with more or fewer points, in f64.
 
-    Errors are those of runs with the same steps, which are alike in what the step makes wrong; times are those of runs
-    with the automatic step, which is longer where there are fewer points.
+    Errors are measured with the same steps for all sheets, so that the errors of the step cancel. Times are measured
+    with the automatic step of each sheet, which is longer for fewer points.
 
-    The reference is a sheet with more points than all that are listed, if it can be afforded; else it is the finest of
-    them, of which only a bound of the error is known then.
+    The reference is a sheet with more points than all those listed, if there is time for it. Otherwise it is the finest
+    of those listed, whose own error is then known only as a bound.
 
     Args:
         scene: a checked scene with tissue.
         device: what `runtime.start` returned.
-        longest_run: a run is to take no longer than about this [s]; the reference, which is run but once, as long as
-            all the runs by which another is timed.
-        progress: called with the work done and all of it; may raise KeyboardInterrupt, which leaves what is done.
+        longest_run: approximate time that a run may take [s]. The reference is run only once, and may take as long as
+            all the runs together by which another sheet is timed.
+        progress: called with the work done and all of it; may raise KeyboardInterrupt: what is done is kept.
 
     Attributes:
         notes: what was left out.
@@ -85,7 +87,7 @@ class PointStudy:
         self._done = 0
 
     def run(self) -> None:
-        """Make the estimates, then the errors, then the times."""
+        """Compute the estimates, then the errors, then measure the times."""
         with ExitStack() as opened:
             seconds = 0.0
             for points in lattices(self._scene):
@@ -108,67 +110,68 @@ class PointStudy:
                     trial.samples.append(self._step_through(trial))
 
     def points(self) -> list[Points]:
-        """Give what is known so far, the fewest points first."""
+        """Give the results so far, the fewest points first."""
         return [self._point(trial) for trial in self._trials if trial.samples]
 
     def _try(self, points: Lattice, opened: ExitStack) -> float:
-        """Run so many points with their own step and the pilot that `run` has beside it; gives the seconds it takes."""
+        """Run a sheet with its own step beside the pilot that `run` would have; returns the time of stepping [s]."""
         scene = with_points(self._scene, points)
-        trial = _Trial(scene, Dynamics(scene, self._device))
+        grid = time_grid(scene)
+        trial = _Trial(scene, grid, Dynamics(scene, grid, self._device))
         opened.callback(trial.dynamics.close)
         coarse = coarser(scene)
         assert coarse is not None
         self._trials.append(trial)
         self._tick()
         trial.dynamics.compile()
-        with closing(MeshPilot(scene, coarse, self._device)) as pilot:
+        with closing(MeshPilot(scene, grid, coarse, self._device)) as pilot:
             pilot.compile()
             first = self._step_through(trial, pilot)
             trial.estimate = pilot.error
-        # What disturbs one run does not disturb the other.
+        # The faster of two runs: what disturbs one may not disturb the other.
         return min(first, self._step_through(trial))
 
     def _finer(self, scene: Scene, seconds: float, longest_run: float) -> Scene | None:
-        """Give a scene more points; None where they cannot be afforded.
+        """Give a scene more points; None if a run would take too long or too much memory.
 
         Args:
-            scene: what is to be finer.
-            seconds: that stepping through it took.
-            longest_run: that it may take then.
+            scene: what is to be refined.
+            seconds: time that stepping through it took [s].
+            longest_run: time that stepping through the finer one may take [s].
         """
         points = _scaled(scene, FINER)
         if max(points) > MAX_POINTS:
             return None
         finer = with_points(scene, points)
-        work = [math.prod(one.sheet.points) * steps_per_frame(one) for one in (scene, finer)]
+        work = [math.prod(one.sheet.points) * time_grid(one).steps_per_frame for one in (scene, finer)]
         return None if seconds * work[1] / work[0] > longest_run or any(budget.problems(finer)) else finer
 
     def _measure_errors(self, finer: Scene | None) -> None:
-        """Step through the scene with all numbers of points side by side, and compare them frame by frame.
+        """Step through the scene with all sheets side by side, and compare them frame by frame.
 
         Args:
-            finer: the scene with more points yet, for the reference; None: they cannot be afforded.
+            finer: the scene with even more points, for the reference; None: there is no time for it.
         """
         finest = self._trials[-1].scene if finer is None else finer
-        steps = steps_per_frame(finest)
+        grid = time_grid(finest)
         with ExitStack() as opened:
             sheets = [trial.dynamics for trial in self._trials]
             if finer is not None:
-                sheets.append(opened.enter_context(closing(Dynamics(finer, self._device))))
+                sheets.append(opened.enter_context(closing(Dynamics(finer, grid, self._device))))
                 sheets[-1].compile()
             for sheet in sheets:
-                sheet.restart(with_steps(sheet.scene, steps))
+                sheet.restart(sheet.scene, grid)
             errors, own_error, largest = [0.0] * len(sheets), 0.0, 0.0
-            for _ in range(finest.time.frames):
+            for _ in range(grid.frames):
                 for sheet in sheets:
                     self._tick()
-                    sheet.advance(steps)
+                    sheet.advance(grid.steps_per_frame)
                 fields = [sheet.displacement() for sheet in sheets]
                 with np.errstate(all="ignore"):
                     exact, bound = _reference(fields)
                     apart = [longest(_sampled(one, exact) - exact) for one in fields[:-1]]
-                    # Between the points of the finest nothing is known of it; but of order 1 or more, it is as near
-                    # to what is exact as to what is twice as coarse.
+                    # Between the points of the finest sheet, its error is not known. But if its order is 1 or more, it
+                    # is at most its distance from a sheet that is twice as coarse.
                     apart.append(longest(_sampled(fields[-2], fields[-1]) - fields[-1]))
                 errors = [max(pair) for pair in zip(errors, apart, strict=True)]
                 own_error, largest = max(own_error, bound), max(largest, longest(exact))
@@ -183,14 +186,13 @@ class PointStudy:
             trial.error = error / largest if largest > 0 else 0.0
 
     def _step_through(self, trial: _Trial, pilot: MeshPilot | None = None) -> float:
-        """Step through the scene with its own step; returns the seconds of stepping alone."""
-        steps = steps_per_frame(trial.scene)
-        trial.dynamics.restart(trial.scene)
+        """Step through the scene with the sheet's own step; returns the time of stepping alone [s]."""
+        trial.dynamics.restart(trial.scene, trial.grid)
         seconds = 0.0
-        for _ in range(trial.scene.time.frames):
+        for _ in range(trial.grid.frames):
             self._tick()
             start = time.perf_counter()
-            trial.dynamics.advance(steps)
+            trial.dynamics.advance(trial.grid.steps_per_frame)
             seconds += time.perf_counter() - start
             displacement = trial.dynamics.displacement()
             if pilot is not None:
@@ -199,7 +201,7 @@ class PointStudy:
         return seconds
 
     def _tick(self) -> None:
-        # The estimate, another run and the rounds of each; and the errors of all.
+        # For each sheet the estimate, another run and the rounds; for all of them together the errors.
         self._progress(self._done, 1 + (2 + ROUNDS) * len(self._trials))
 
     def _point(self, trial: _Trial) -> Points:
@@ -207,7 +209,7 @@ class PointStudy:
         return Points(
             rows=rows,
             cols=cols,
-            steps_per_frame=steps_per_frame(trial.scene),
+            steps_per_frame=trial.grid.steps_per_frame,
             error=trial.error if trial.error < math.inf else None,
             known=trial.known,
             estimate=trial.estimate if trial.estimate < math.inf else None,
@@ -216,29 +218,30 @@ class PointStudy:
 
 
 def lattices(scene: Scene) -> Iterator[Lattice]:
-    """List the numbers of points to compare that the scene allows, its own the last."""
+    """List the numbers of points to compare, as far as the scene allows them; its own come last."""
     for points in (*(_scaled(scene, share) for share in COARSER), scene.sheet.points):
         if min(points) >= FEWEST and not any(material.problems(with_points(scene, points))):
             yield points
 
 
 def _scaled(scene: Scene, factor: float) -> Lattice:
-    """Give the sheet so many times as many cells a side."""
+    """Give the rows and columns of points for `factor` times the cells a side."""
     rows, cols = (round((count - 1) * factor) + 1 for count in scene.sheet.points)
     return rows, cols
 
 
 def _reference(fields: list[Field]) -> tuple[Field, float]:
-    """Extrapolate the two finest by Richardson, where the error is of second order in the length of cells.
+    """Extrapolate the two finest fields by Richardson, for an error of order 2 in the length of cells.
 
-    u* = u + (u - u_r) / (r^2 - 1), where u_r is of r times longer cells. What is added is found at their points, and
-    sampled at those of u. It is wrong by its distance from the same of the next two, or of u from u_r, at most about.
+    u* = u + (u - u_r) / (r^2 - 1), where u_r has cells r times as long. The correction is computed at the points of u_r
+    and interpolated at those of u. The error of u* is at most about its distance from the extrapolation of the next two
+    fields, or of u from u_r if there are only two.
 
     Args:
-        fields: displacements, the fewest points first, two or more; each of shape (rows, cols, 3).
+        fields: two or more fields of displacements [m], the fewest points first, each of shape (rows, cols, 3).
 
     Returns:
-        u* at the points of the finest, and how wrong it is at most about [m].
+        u* at the points of the finest field [m], and an approximate bound of its error [m].
     """
     exact = fields[-1] + _sampled(_correction(fields[-1], fields[-2]), fields[-1])
     if len(fields) > 2:
@@ -249,13 +252,13 @@ def _reference(fields: list[Field]) -> tuple[Field, float]:
 
 
 def _correction(fine: Field, coarse: Field) -> Field:
-    """Give what Richardson's extrapolation adds to the fine field, at the points of the coarse one."""
+    """Compute the correction of Richardson's extrapolation at the points of the coarse field."""
     ratio = min((of - 1) / (to - 1) for of, to in zip(fine.shape[:2], coarse.shape[:2], strict=True))
     correction: Field = (_sampled(fine, coarse) - coarse) / (ratio**2 - 1)
     return correction
 
 
 def _sampled(values: Field, like: Field) -> Field:
-    """Sample a field at the points of another one."""
+    """Interpolate a field at the points of another one."""
     (rows, cols), (to_rows, to_cols) = values.shape[:2], like.shape[:2]
     return CubicSampling((rows, cols), (to_rows, to_cols)).at(values)

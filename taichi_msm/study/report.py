@@ -1,4 +1,4 @@
-"""The files of a study: everything as JSON, a flat table, tables to paste, a picture."""
+"""The files of a study: everything as JSON, one flat table, tables in Markdown, a picture."""
 
 from __future__ import annotations
 
@@ -61,7 +61,7 @@ Row = dict[str, Any]
 
 
 def require_writable(directory: Path) -> None:
-    """Find out before a long measurement whether its report can be written.
+    """Check before a long measurement that its report can be written.
 
     Raises:
         FilesError: when it cannot.
@@ -76,16 +76,16 @@ def require_writable(directory: Path) -> None:
 
 
 def write_report(study: Study, directory: Path) -> list[str]:
-    """Write the report of a study in the place of an earlier one.
+    """Write the report of a study, replacing an earlier one.
 
-    Every file is whole or not there, and the record is the last to come.
+    Every file is written as a whole or not at all; study.json is the last.
 
     Args:
-        study: complete or not; gets a note where the picture cannot be drawn.
-        directory: made where it does not exist. Its other files stay.
+        study: complete or not; a note is added to it if the picture cannot be drawn.
+        directory: created if it does not exist. Its other files stay.
 
     Returns:
-        The names of what was written, study.json the last.
+        The names of the files written, study.json last.
 
     Raises:
         FilesError: when the directory cannot be written.
@@ -108,7 +108,7 @@ def write_report(study: Study, directory: Path) -> list[str]:
 
 
 def as_record(study: Study) -> Row:
-    """Give everything as what JSON holds; a number that is not finite is null."""
+    """Give the whole study as data for JSON; numbers that are not finite become null."""
     methods = [{"method": one.method, **asdict(one)} for one in study.stepping]
     return _finite({**asdict(study), "stepping": methods, "recommendation": study.recommendation()})
 
@@ -122,7 +122,7 @@ def _finite(value: Any) -> Any:
 
 
 def _draw(study: Study, path: Path) -> bool:
-    """Draw the picture if there is something to draw, and something to draw it with."""
+    """Draw the picture, if there is something to draw and Matplotlib is installed; returns whether it was drawn."""
     try:
         from taichi_msm.study.plot import panels, plot
     except ImportError:
@@ -134,19 +134,19 @@ def _draw(study: Study, path: Path) -> bool:
     try:
         plot(study, path)
     except Exception as error:
-        # Minutes of measurement are not to be lost for the sake of their picture.
+        # Minutes of measurement must not be lost because their picture fails.
         study.notes.append(f"study.png could not be drawn: {type(error).__name__}: {error}")
         return False
     return True
 
 
 def _write(path: Path, text: str) -> None:
-    # A file name that is not UTF-8 has surrogates, whose backslash form is their JSON form.
+    # A file name that is not UTF-8 contains surrogates; written with backslashes they are valid in JSON too.
     path.write_text(text, encoding="utf-8", errors="backslashreplace", newline="")
 
 
 def _flat(study: Study) -> str:
-    """Write one line for each measurement, under the columns of all parts."""
+    """Write all measurements as CSV, one line each, with the columns of all parts."""
     text = io.StringIO()
     table = csv.DictWriter(text, COLUMNS, lineterminator="\n")
     table.writeheader()
@@ -166,7 +166,7 @@ def _rows(study: Study) -> Iterator[Row]:
 
 
 def _page(study: Study) -> str:
-    """Write the tables to paste."""
+    """Write the page in Markdown."""
     versions = study.machine["versions"]
     state = "" if study.status == "complete" else f" ({study.status})"
     blocks = [
@@ -227,9 +227,9 @@ def _stepping(study: Study) -> Iterator[str]:
 
 
 def _bounds(points: Sequence[Stepping | Peer | Points]) -> Iterator[str]:
-    """Explain the errors that are upper bounds, if there are any."""
+    """Explain errors that are upper bounds, if there are any."""
     if any(wrong(one).startswith("<") for one in points):
-        yield "An error with < is at most about that; the reference is not exact enough to tell it."
+        yield "An error with < is an approximate upper bound; the reference is not exact enough to know the error."
 
 
 def _drawing(study: Study) -> Iterator[str]:
@@ -260,11 +260,11 @@ def _points(study: Study) -> Iterator[str]:
         return
     yield "## Points"
     yield (
-        "An error is what the number of points makes, at the points and between them, where the displacement is taken "
-        "from cubics: the largest of any place at any frame, as a fraction of the largest displacement. The reference "
-        "is the extrapolation, of order 2, of the two finest sheets; all are stepped in f64 with the same step. "
-        "The estimate is that of `run`, which has a sheet with half as many points a side beside it. "
-        "Times are with the automatic step of each."
+        "The error is that made by the number of points, at the points and between them, where the displacement is "
+        "interpolated by cubics: the largest anywhere at any frame, as a fraction of the largest displacement. The "
+        "reference is the extrapolation, of order 2, of the two finest sheets. All are stepped in f64 with the same "
+        "step. The estimate is that of `run`, by a sheet beside it with half the cells a side. "
+        "Times are those of each sheet's automatic step."
     )
     own = tuple(study.settings["sheet"]["points"])
     rows = [

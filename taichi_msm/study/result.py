@@ -1,4 +1,4 @@
-"""What a study finds out: plain data, and the setting it recommends."""
+"""The results of a study: plain data, and the settings it recommends."""
 
 from __future__ import annotations
 
@@ -7,17 +7,17 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
-# A picture is refined enough when no finer one of the same supersampling is closer to the truth by more than this [dB].
+# A picture is refined enough if no other one of the same supersampling has a PSNR higher by more than this [dB].
 REFINED_ENOUGH = 0.1
 
 
 @dataclass(frozen=True)
 class Timing:
-    """Seconds of repeated, equal work.
+    """Times of repeated, equal work.
 
     Attributes:
-        median, fastest, slowest: [s].
-        runs: how often it was done.
+        median, fastest, slowest: of the times [s].
+        runs: number of repetitions.
     """
 
     median: float
@@ -27,17 +27,17 @@ class Timing:
 
     @classmethod
     def of(cls, samples: Sequence[float]) -> Timing:
-        """Sum up samples [s], at least one."""
+        """Summarise samples [s], at least one."""
         return cls(statistics.median(samples), min(samples), max(samples), len(samples))
 
 
 @dataclass(frozen=True)
 class Reference:
-    """What the errors of the stepping are measured against: central differences in f64, extrapolated.
+    """The solution that errors of the stepping refer to: central differences in f64, extrapolated.
 
     Attributes:
         steps_per_frame: of its finest run.
-        error: its own, estimated by halving the step, as a fraction of the largest displacement.
+        error: its own error, estimated by halving the step, as a fraction of the largest displacement.
         largest: the largest displacement of any point at any frame [m].
     """
 
@@ -53,12 +53,12 @@ class Stepping:
     Attributes:
         precision: f32 or f64.
         damping_difference: central or backward.
-        steps_per_frame: n ...
-        step: ... and the step that it makes [s].
+        steps_per_frame: number of steps in a frame.
+        step: the step h that follows from it [s].
         error: largest error of any point at any frame, as a fraction of the largest displacement; None: it diverged.
-        rounding: the part of it that f32 makes; None for f64.
-        known: whether the reference is exact enough for this error; if not, the error is at most about this.
-        seconds: of stepping through the whole scene, compiled and warm.
+        rounding: the part of the error that comes from f32; None for f64.
+        known: whether the reference is exact enough to know this error; if not, it is an approximate upper bound.
+        seconds: time of stepping through the whole scene, compiled and warm.
     """
 
     precision: str
@@ -81,11 +81,11 @@ class Peer:
     """SciPy's DOP853 on the same equations.
 
     Attributes:
-        rtol: its relative tolerance; the absolute one is rtol x the largest displacement / 10.
-        error: as above.
-        known: as above.
-        evaluations: of the forces.
-        seconds: of the whole scene.
+        rtol: relative tolerance; the absolute one is rtol x the largest displacement / 10.
+        error: as for `Stepping`.
+        known: as for `Stepping`.
+        evaluations: number of evaluations of the forces.
+        seconds: time of the whole scene.
     """
 
     rtol: float
@@ -100,10 +100,10 @@ class Drawn:
     """One way to draw the most deformed frame.
 
     Attributes:
-        refine, supersample: the setting.
-        psnr: against a picture of high refinement and supersampling [dB]; None: equal.
-        largest_error: of any colour of any pixel [0 to 255].
-        seconds: of one frame.
+        refine, supersample: the settings.
+        psnr: against a picture of high refinement and supersampling [dB]; None: they are equal.
+        largest_error: of any colour of any pixel, 0 to 255.
+        seconds: time of one frame.
     """
 
     refine: int
@@ -118,13 +118,13 @@ class Points:
     """A sheet of tissue with more or fewer points, in f64.
 
     Attributes:
-        rows, cols: of points.
-        steps_per_frame: that the automatic step makes with so many points.
+        rows, cols: numbers of points.
+        steps_per_frame: of the automatic step with these points.
         error: that the number of points makes: the largest of any point at any frame, as a fraction of the largest
             displacement; None: it diverged.
-        known: as above.
-        estimate: of this error by the pilot that `run` has beside it; None: it is not known.
-        seconds: of stepping through the whole scene, compiled and warm.
+        known: as for `Stepping`.
+        estimate: of this error, by the pilot that `run` has beside it; None: not known.
+        seconds: time of stepping through the whole scene, compiled and warm.
     """
 
     rows: int
@@ -137,17 +137,17 @@ class Points:
 
     @property
     def name(self) -> str:
-        """Name it, such as 31 x 31."""
+        """Give its name, such as 31 x 31."""
         return f"{self.rows} x {self.cols}"
 
 
 @dataclass(frozen=True)
 class Term:
-    """What a step costs without one term of the model.
+    """The cost of a step without one term of the model.
 
     Attributes:
-        without: the key whose term is left out; empty: nothing is.
-        seconds: of one step.
+        without: key of the term that is left out; empty: none is.
+        seconds: time of one step.
     """
 
     without: str
@@ -160,17 +160,17 @@ class Study:
 
     Attributes:
         scene: its name.
-        settings: the scene as resolved.
+        settings: the scene with its defaults filled in.
         status: complete or interrupted.
-        tolerance: the error that is allowed, as a fraction of the largest displacement.
+        tolerance: largest allowed error, as a fraction of the largest displacement.
         machine: cpu, cores, arch, threads, bits of a vector and versions.
-        reference: None where the study was interrupted before.
-        stepping: in the order of methods and, within one, of falling steps.
-        orders: of every method, by regression over the points above the rounding floor; None: too few of them.
+        reference: None if the study was interrupted before there was one.
+        stepping: ordered by method and, within a method, by falling step.
+        orders: of every method, by regression over the points where the step makes the error; None: too few of them.
         peers: DOP853 at several tolerances.
-        drawing: in the order of supersample and refine; empty where the scene has no picture.
-        points: with tissue, from few to many; empty where the scene has springs.
-        terms: the first of them leaves nothing out.
+        drawing: ordered by supersample and refine; empty if the scene has no picture.
+        points: with tissue, from few to many; empty if the scene has springs.
+        terms: the first leaves nothing out.
         notes: what a reader must know, such as parts left out and why.
     """
 
@@ -190,9 +190,9 @@ class Study:
 
     @property
     def best_stepping(self) -> Stepping | None:
-        """Find the fastest stepping within the tolerance; None where there is none.
+        """Find the fastest stepping within the tolerance; None if there is none.
 
-        Of one method it is the largest step, whatever the noise of the clock says.
+        Of every method only its largest step counts, so that noise of the clock cannot prefer a smaller one.
         """
         good = [one for one in self.stepping if one.error is not None and one.error <= self.tolerance]
         largest = {one.method: one for one in sorted(good, key=lambda one: one.step)}
@@ -200,7 +200,7 @@ class Study:
 
     @property
     def best_drawing(self) -> Drawn | None:
-        """Find the fastest refinement that is refined enough, at the scene's own supersampling."""
+        """Find the fastest sufficient refinement at the scene's own supersampling."""
         own = self.settings["render"]["supersample"]
         same = [one for one in self.drawing if one.supersample == own]
         best = max((_decibels(one) for one in same), default=0.0)
@@ -208,14 +208,14 @@ class Study:
         return min(good, key=lambda one: one.seconds.median, default=None)
 
     def recommendation(self) -> list[str]:
-        """Write the lines to put in the scene."""
+        """Write the recommended settings as lines of a scene file."""
         lines = []
         if (step := self.best_stepping) is not None:
             lines.append("time:")
             if self.settings["time"]["tolerance"] is not None:
                 lines.append("  tolerance: null")
             lines += [
-                # All digits: rounded up, the largest stable step would be above the limit.
+                # With all digits: rounded up, the largest stable step would exceed the limit.
                 f"  step: {step.step!r}",
                 f"  damping_difference: {step.damping_difference}",
                 f"  precision: {step.precision}",

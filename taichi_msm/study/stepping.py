@@ -1,4 +1,4 @@
-"""Work and precision of the stepping: every precision and damping difference, from the largest stable step down."""
+"""Work and precision of stepping: every precision and damping difference, from the largest stable step downwards."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import math
 import time
 from collections.abc import Iterator
 from contextlib import ExitStack
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -15,22 +15,23 @@ from numpy.typing import NDArray
 from taichi_msm.physics.divergence import farthest_displacement
 from taichi_msm.physics.error_control import longest
 from taichi_msm.physics.solver import Dynamics
-from taichi_msm.physics.timestep import stable_step, step, with_steps, with_time
+from taichi_msm.physics.timestep import stable_step, time_grid, with_time
 from taichi_msm.progress import Count
 from taichi_msm.scene import Scene
 from taichi_msm.study.result import Reference, Stepping, Timing
 from taichi_msm.system.runtime import Device
+from taichi_msm.timegrid import Precision
 
-PRECISIONS = ("f64", "f32")
+PRECISIONS: tuple[Precision, ...] = ("f64", "f32")
 DIFFERENCES = ("central", "backward")
 
-# Every setting is timed so often, all of them in turn.
+# How many times every setting is timed; all settings take turns.
 ROUNDS = 5
 
-# An error is known when the reference is so many times more exact.
+# An error counts as known if it is at least this many times that of the reference.
 MARGIN = 20
 
-# The steps of a series below the largest stable one, whatever they cost.
+# How many times the largest stable step is halved at least, whatever it costs.
 LEAST_HALVINGS = 2
 
 Frames = NDArray[Any]
@@ -38,9 +39,9 @@ Frames = NDArray[Any]
 
 @dataclass
 class _Trial:
-    """One setting, and what is known of it so far."""
+    """One setting, and what is known about it so far."""
 
-    precision: str
+    precision: Precision
     difference: str
     steps: int
     error: float = math.inf
@@ -54,16 +55,17 @@ class SteppingStudy:
     Args:
         scene: a checked scene.
         device: what `runtime.start` returned.
-        longest_run: a run is to take no longer than about this [s].
-        progress: called with the runs done and the runs in all; may raise KeyboardInterrupt, which leaves what is done.
+        longest_run: approximate time that a run may take [s].
+        progress: called with the runs done and the runs in all; may raise KeyboardInterrupt: what is done is kept.
 
     Attributes:
         frames: displacements of the reference at every frame but the first [m], shape (F, rows, cols, 3).
-        reference: what is known of it.
+        reference: the facts about it.
     """
 
     def __init__(self, scene: Scene, device: Device, longest_run: float, progress: Count) -> None:
         self.scene = scene
+        self._grid = time_grid(scene, device.arch)
         self.frames: Frames | None = None
         self.reference: Reference | None = None
         self._longest_run = longest_run
@@ -72,14 +74,14 @@ class SteppingStudy:
         self._done = 0
         self._to_do = 1
         with ExitStack() as opened:
-            self._dynamics: dict[str, Dynamics] = {}
+            self._dynamics: dict[Precision, Dynamics] = {}
             for precision in PRECISIONS:
-                dynamics = self._dynamics[precision] = Dynamics(with_time(scene, precision=precision), device)
+                dynamics = self._dynamics[precision] = Dynamics(scene, replace(self._grid, precision=precision), device)
                 opened.callback(dynamics.close)
             self._open = opened.pop_all()
 
     def run(self) -> None:
-        """Make the reference, then the errors, then the times."""
+        """Compute the reference, then the errors, then measure the times."""
         for dynamics in self._dynamics.values():
             self._progress(0, self._to_do)
             dynamics.compile()
@@ -95,12 +97,12 @@ class SteppingStudy:
                 self._run(trial.precision, trial.difference, trial.steps, trial.samples)
 
     def points(self) -> list[Stepping]:
-        """Give what is known so far, in the order of methods and of falling steps."""
+        """Give the results so far, ordered by method and by falling step."""
         ordered = sorted(self._trials, key=lambda one: (one.precision, one.difference != "central", one.steps))
         return [self._point(trial) for trial in ordered if trial.samples]
 
     def relative(self, frames: Frames) -> float:
-        """Give the largest error of frames against the reference, as a fraction of the largest displacement."""
+        """Give the largest error of frames relative to the reference, as a fraction of the largest displacement."""
         assert self.frames is not None
         assert self.reference is not None
         return longest(frames - self.frames) / self.reference.largest if self.reference.largest > 0 else 0.0
@@ -115,7 +117,7 @@ class SteppingStudy:
         self._open.close()
 
     def _series(self, difference: str) -> Iterator[int]:
-        """Count the steps a frame, from the largest stable step down by halvings to what may be afforded."""
+        """Give the steps per frame of a series: of the largest stable step, doubled until a run would take too long."""
         limit = stable_step(with_time(self.scene, damping_difference=difference))
         steps = max(1, math.ceil(1 / self.scene.time.frames_per_second / limit * (1 - 1e-12)))
         samples: list[float] = []
@@ -129,7 +131,7 @@ class SteppingStudy:
     def _make_reference(self, finest: int) -> None:
         """Extrapolate central differences from steps well below the finest that is measured.
 
-        u* = u_{h/2} + (u_{h/2} - u_h) / 3; its error is at most about its distance from the same at twice the step.
+        u* = u_{h/2} + (u_{h/2} - u_h) / 3. Its error is at most about its distance from the same with 2 h for h.
         """
         coarse, middle, fine = (self._run("f64", "central", finest * 2**halving, []) for halving in range(3))
         before = middle + (middle - coarse) / 3
@@ -139,7 +141,7 @@ class SteppingStudy:
         self.reference = Reference(4 * finest, error, largest)
 
     def _measure_errors(self, difference: str, counts: list[int]) -> None:
-        """Run every step once, in f32 until rounding dominates and in f64 until the reference is not exact enough."""
+        """Run every step once: in f32 until rounding dominates, in f64 until the reference is not exact enough."""
         assert self.reference is not None
         going = set(PRECISIONS)
         for steps in counts:
@@ -161,11 +163,12 @@ class SteppingStudy:
                 if trial.error < math.inf and (dominated or not self.known(trial.error)):
                     going.discard(precision)
 
-    def _run(self, precision: str, difference: str, steps: int, samples: list[float]) -> Frames:
-        """Step through the scene; appends the seconds of stepping alone to the samples."""
+    def _run(self, precision: Precision, difference: str, steps: int, samples: list[float]) -> Frames:
+        """Step through the scene, and append the time of stepping alone [s] to the samples."""
         dynamics = self._dynamics[precision]
-        dynamics.restart(with_steps(with_time(self.scene, precision=precision, damping_difference=difference), steps))
-        frames = np.empty((self.scene.time.frames, *self.scene.sheet.points, 3), precision.replace("f", "float"))
+        grid = replace(self._grid, precision=precision, steps_per_frame=steps)
+        dynamics.restart(with_time(self.scene, damping_difference=difference), grid)
+        frames = np.empty((grid.frames, *self.scene.sheet.points, 3), precision.replace("f", "float"))
         seconds = 0.0
         for frame in frames:
             self._progress(self._done, self._to_do)
@@ -178,13 +181,12 @@ class SteppingStudy:
         return frames
 
     def _point(self, trial: _Trial) -> Stepping:
-        made = with_steps(self.scene, trial.steps)
         finite = trial.error < math.inf
         return Stepping(
             precision=trial.precision,
             damping_difference=trial.difference,
             steps_per_frame=trial.steps,
-            step=step(made),
+            step=replace(self._grid, steps_per_frame=trial.steps).step,
             error=trial.error if finite else None,
             rounding=trial.rounding if finite else None,
             known=finite and self.known(trial.error),
@@ -193,7 +195,7 @@ class SteppingStudy:
 
 
 def observed_orders(points: list[Stepping]) -> dict[str, float | None]:
-    """Fit the order of every method over the points where the step, and not rounding, makes the error."""
+    """Fit the order of every method over the points where the error comes from the step, not from rounding."""
     orders: dict[str, float | None] = {}
     for method in dict.fromkeys(point.method for point in points):
         fit = [

@@ -1,4 +1,4 @@
-"""A study in the terminal, and the words that its report and its picture use too."""
+"""A study in the terminal, and the wording that its report and its picture share."""
 
 from __future__ import annotations
 
@@ -22,12 +22,12 @@ Point = TypeVar("Point", Stepping, Peer)
 
 
 def number(value: float) -> str:
-    """Write what was measured in three significant digits."""
+    """Write a measured value with three significant digits."""
     return f"{value:.0f}" if 999.5 <= abs(value) < 1e6 else f"{value:#.3g}".rstrip(".")
 
 
 def unit(seconds: float) -> tuple[float, str]:
-    """Choose the unit in which a time reads well: how many of it a second has, and its name."""
+    """Choose a readable unit for a time; returns how many of it make a second, and its name."""
     return next(((scale, name) for scale, name in UNITS if seconds * scale >= 0.9995), UNITS[-1])
 
 
@@ -38,25 +38,25 @@ def duration(seconds: float) -> str:
 
 
 def timing(seconds: Timing) -> str:
-    """Write a median and, in the same unit, its spread."""
+    """Write a median and, in the same unit, the range."""
     scale, _ = unit(seconds.median)
     spread = f"{number(seconds.fastest * scale)} to {number(seconds.slowest * scale)}" if seconds.runs > 1 else "once"
     return f"{duration(seconds.median)} ({spread})"
 
 
 def wrong(point: Stepping | Peer | Points) -> str:
-    """Write an error; where the reference cannot tell it, what it is below."""
+    """Write an error; if it is not known exactly, its bound."""
     size = _size(point)
     return f"{'' if point.known else '< '}{number(size)}" if size < math.inf else "diverged"
 
 
 def estimated(points: Points) -> str:
-    """Write what `run` estimates of an error."""
+    """Write the error that `run` estimates."""
     return "not known" if points.estimate is None else number(points.estimate)
 
 
 def shown(text: str) -> str:
-    """Write a file name that is not UTF-8 so that it can be shown."""
+    """Make a file name printable even if it is not UTF-8."""
     return text.encode("utf-8", "backslashreplace").decode("utf-8")
 
 
@@ -68,7 +68,7 @@ def where(study: Study) -> str:
 
 
 def shortfall(study: Study) -> str | None:
-    """Say why no step is recommended, and what to do; None where one is."""
+    """Say why no step is recommended, and what to do about it; None if one is."""
     if study.best_stepping is not None:
         return None
     if not study.stepping:
@@ -80,16 +80,16 @@ def shortfall(study: Study) -> str | None:
     else:
         said += f"; the closest is {closest.method} at {duration(closest.step)}, with an error of {wrong(closest)}."
     return (
-        f"{said} Set time.tolerance, with which a run looks for a finer step itself, and time.precision: f64; "
-        "or allow more by --tolerance."
+        f"{said} Set time.tolerance, with which a run searches for a finer step itself, and time.precision: f64; "
+        "or allow a larger error with --tolerance."
     )
 
 
 def print_summary(study: Study, console: Console) -> None:
-    """Print what matters of a study, the lines to put in the scene the last."""
+    """Print the most important results of a study, and last the lines to put in the scene."""
 
     def say(text: str) -> None:
-        # Neither markup nor line breaks, so that what is copied is what was meant.
+        # Without markup and line breaks, so that lines can be copied.
         console.print(Text(text), soft_wrap=True, highlight=False)
 
     say(f"{shown(study.scene)} on {where(study)}")
@@ -165,12 +165,12 @@ def _points_table(study: Study) -> Table:
 
 
 def decibels(drawn: Drawn) -> str:
-    """Write how close a picture is to the truth."""
+    """Write the PSNR of a picture."""
     return "equal" if drawn.psnr is None else f"{drawn.psnr:.1f} dB"
 
 
 def _drawings(study: Study) -> Iterator[Drawn]:
-    """Choose for every supersampling the refinement that would be recommended if the scene had it."""
+    """Choose for every supersampling the refinement that would be recommended if the scene had that supersampling."""
     for supersample in sorted({drawn.supersample for drawn in study.drawing}):
         render = {**study.settings["render"], "supersample": supersample}
         best = replace(study, settings={**study.settings, "render": render}).best_drawing
@@ -179,7 +179,7 @@ def _drawings(study: Study) -> Iterator[Drawn]:
 
 
 def _best(points: Sequence[Point], tolerance: float) -> Point | None:
-    """Find the fastest within the tolerance, or else the most exact."""
+    """Find the fastest point within the tolerance, or else the most exact one."""
     good = [point for point in points if _size(point) <= tolerance]
     if good:
         return min(good, key=lambda point: point.seconds.median)
@@ -210,7 +210,7 @@ def _add(table: Table, recommended: bool, *cells: str) -> None:
 
 
 def markdown(head: Sequence[str], rows: Sequence[Sequence[str]], left: Sequence[int] = ()) -> str:
-    """Write a Markdown table, numbers to the right; `left` names the columns of words."""
+    """Write a Markdown table; columns are aligned right, but those in `left`, of words, left."""
     widths = [max(len(row[column]) for row in [head, *rows]) for column in range(len(head))]
     rule = ["-" * width if column in left else "-" * (width - 1) + ":" for column, width in enumerate(widths)]
 

@@ -1,4 +1,4 @@
-"""What each term of the model costs: the step with one term after another left out."""
+"""The cost of each term of the model: the time of a step without it."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from collections.abc import Iterator
 from contextlib import ExitStack
 
 from taichi_msm.physics.solver import Dynamics
-from taichi_msm.physics.timestep import steps_per_frame, with_steps
+from taichi_msm.physics.timestep import time_grid
 from taichi_msm.progress import Count
 from taichi_msm.scene import Scene
 from taichi_msm.study.result import Term, Timing
@@ -17,50 +17,52 @@ ROUNDS = 9
 
 
 class TermStudy:
-    """Measures the step of a scene without one term after another.
+    """Measures the time of a step with each term left out in turn.
 
     Args:
         scene: a checked scene.
         device: what `runtime.start` returned.
-        sample: about how long one measurement takes [s].
+        sample: approximate time of one measurement [s].
         progress: called with the measurements done and all of them; may raise KeyboardInterrupt.
     """
 
     def __init__(self, scene: Scene, device: Device, sample: float, progress: Count) -> None:
         self._device = device
+        # All variants have the steps of the whole scene: without a spring the automatic step would be another.
+        self._grid = time_grid(scene, device.arch)
         self._variants = dict(variants(scene))
         self._samples: dict[str, list[float]] = {name: [] for name in self._variants}
         self._sample = sample
         self._progress = progress
 
     def run(self) -> None:
-        """Compile every variant, then step them in turn."""
+        """Compile every variant, and then let them step in turn."""
         with ExitStack() as opened:
             sheets: dict[str, Dynamics] = {}
             for name, scene in self._variants.items():
                 self._progress(0, len(self._variants))
-                sheets[name] = Dynamics(scene, self._device)
+                sheets[name] = Dynamics(scene, self._grid, self._device)
                 opened.callback(sheets[name].close)
                 sheets[name].compile()
             frames = self._frames(sheets[""])
             for round_ in range(ROUNDS):
                 for number, (name, scene) in enumerate(self._variants.items()):
                     self._progress(round_ * len(sheets) + number, ROUNDS * len(sheets))
-                    # From rest, so that all variants step through the same stretch of the scene.
-                    sheets[name].restart(scene)
+                    # From rest, so that all variants step through the same part of the scene.
+                    sheets[name].restart(scene, self._grid)
                     self._samples[name].append(_step_seconds(sheets[name], frames))
 
     def points(self) -> list[Term]:
-        """Give what is known so far, the whole scene first."""
+        """Give the results so far, the whole scene first."""
         return [Term(name, Timing.of(samples)) for name, samples in self._samples.items() if samples]
 
     def _frames(self, whole: Dynamics) -> int:
         """Count the frames that a measurement takes."""
-        seconds = _step_seconds(whole, 1) * steps_per_frame(whole.scene)
-        return max(1, min(whole.scene.time.frames, round(self._sample / seconds)))
+        seconds = _step_seconds(whole, 1) * self._grid.steps_per_frame
+        return max(1, min(self._grid.frames, round(self._sample / seconds)))
 
 
-# The terms of a sheet that can be left out, and what stands for them then.
+# The terms of a sheet that can be left out, and the values that leave them out.
 SPRING_TERMS: dict[str, float | None] = {"structural": 0.0, "shear": 0.0, "virtual": 0.0, "map": None}
 TISSUE_TERMS: dict[str, float | None] = {
     "foundation": 0.0,
@@ -72,9 +74,7 @@ TISSUE_TERMS: dict[str, float | None] = {
 
 
 def variants(scene: Scene) -> Iterator[tuple[str, Scene]]:
-    """Leave out one term after another, at the same step; the first variant is the whole scene."""
-    # Fixed, as without a spring the largest stable step is another.
-    scene = with_steps(scene, steps_per_frame(scene))
+    """Give the scene without each of its terms in turn, by the term's key; the first variant is the whole scene."""
     yield "", scene
     section, terms = ("springs", SPRING_TERMS) if scene.tissue is None else ("tissue", TISSUE_TERMS)
     sheet = getattr(scene, section)
@@ -89,8 +89,8 @@ def variants(scene: Scene) -> Iterator[tuple[str, Scene]]:
 
 
 def _step_seconds(dynamics: Dynamics, frames: int) -> float:
-    """Give the time of one step [s]."""
-    steps = frames * steps_per_frame(dynamics.scene)
+    """Measure the time of one step [s]."""
+    steps = frames * dynamics.grid.steps_per_frame
     start = time.perf_counter()
     dynamics.advance(steps)
     return (time.perf_counter() - start) / steps

@@ -1,1 +1,1 @@
-"""The machine: Taichi, signals, streams."""
+"""The machine: Taichi, cores and memory, signals, streams."""

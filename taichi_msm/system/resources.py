@@ -1,4 +1,4 @@
-"""What the machine has for this process: its cores, its memory, its processor's name."""
+"""The resources that this process may use: cores and memory; and the processor's name."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ CONTROL_GROUPS = Path("/sys/fs/cgroup")
 
 
 def available_threads() -> int:
-    """Count the cores this process may use: its affinity, and the quota of its control group."""
+    """Count the cores that this process may use, by its affinity and the quota of its control group."""
     cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
     with contextlib.suppress(OSError, ValueError):
         quota, period = (CONTROL_GROUPS / "cpu.max").read_text().split()
@@ -30,9 +30,9 @@ def processor() -> str:
 
 
 def available_memory() -> int:
-    """Tell how much memory a run may take [bytes]: what is free and what the control group still allows.
+    """Give the memory that a run may take [bytes]: what is free and what the control group still allows.
 
-    Without /proc it is all the memory there is, and sys.maxsize where the system does not tell.
+    Without /proc it is all physical memory; sys.maxsize if the system does not report that.
     """
     try:
         free = _free_memory(Path("/proc/meminfo"))
@@ -42,13 +42,13 @@ def available_memory() -> int:
 
 
 def _free_memory(meminfo: Path) -> int:
-    """Read Linux's estimate of what can be taken without swapping [bytes]."""
+    """Read Linux's estimate of the memory available without swapping [bytes]."""
     fields = dict(line.split(":", 1) for line in meminfo.read_text().splitlines())
     return int(fields["MemAvailable"].split()[0]) * 1024
 
 
 def _control_group_rest(membership: Path, root: Path) -> int:
-    """Find what the control groups (version 2) of this process still allow [bytes]; sys.maxsize: no limit."""
+    """Find the memory that this process's control groups (version 2) still allow [bytes]; sys.maxsize: no limit."""
     lines = membership.read_text().splitlines()
     own = next((line[len("0::/") :] for line in lines if line.startswith("0::/")), "")
     group = root / own
@@ -62,7 +62,7 @@ def _group_rest(group: Path) -> int:
         cached = dict(line.split() for line in (group / "memory.stat").read_text().splitlines())
     except OSError:
         return sys.maxsize
-    # Cached files count as used, but make room when memory is asked for.
+    # Cached files count as used, but are dropped when memory is needed.
     return sys.maxsize if limit == "max" else max(0, int(limit) - used + int(cached.get("inactive_file", 0)))
 
 

@@ -1,4 +1,4 @@
-"""The only place that imports and starts Taichi."""
+"""The only module that imports and starts Taichi."""
 
 from __future__ import annotations
 
@@ -37,16 +37,16 @@ __all__ = [
 ]
 
 if not os.environ.get("HOME"):
-    # Without one Taichi aborts the process.
+    # Without HOME, Taichi aborts the process.
     os.environ.pop("HOME", None)
     _folder = os.path.expanduser("~")  # noqa: PTH111  # Path.home raises where there is none
     os.environ["HOME"] = _folder if _folder != "~" else tempfile.gettempdir()
 
-# No banner on stdout, which may be JSON, and no call home.
+# No banner on stdout, which may be JSON, and no check for a newer version over the network.
 os.environ.setdefault("ENABLE_TAICHI_HEADER_PRINT", "0")
 os.environ.setdefault("TI_SKIP_VERSION_CHECK", "ON")
 
-# In a notebook Taichi says on import that it is in one. This is for the import alone; ti.init has a level of its own.
+# In a notebook, Taichi reports on import that it is in one. This level is for the import only; ti.init sets its own.
 os.environ.setdefault("TI_LOG_LEVEL", "error")
 
 import numpy as np
@@ -61,23 +61,22 @@ _features: dict[str, bool] = _core._multiarray_umath.__cpu_features__
 
 ARCHS = ("cpu", "cuda", "vulkan")
 
-# More threads than any machine has cores; Taichi starts them all.
+# More than the cores of any machine; Taichi would start all of these threads.
 MOST_THREADS = 1024
 
-# A lock on Taichi's cache that is older than this was left by a process that was killed [s].
+# A lock on Taichi's cache older than this was left behind by a process that was killed [s].
 STALE_LOCK = 60.0
 
-
-# The widest vectors of a processor, by what NumPy calls them.
+# Width of a processor's vectors [bits], by NumPy's names of its features.
 VECTOR_BITS = {"AVX512F": 512, "AVX2": 256}
 
-# What the kernels of a run may take in the cache: files, and bytes.
+# What the kernels of a run may need in the cache: files and bytes.
 CACHE_FILES, CACHE_BYTES = 64, 1 << 24
 
-# Taichi takes 1 GiB of addresses at once, and its libraries as much again.
+# Taichi reserves 1 GiB of address space at once, and its libraries need nearly as much again [bytes].
 ADDRESS_SPACE = 1900 << 20
 
-# How Taichi names a GPU in its log.
+# Lines in which Taichi names a GPU in its log.
 GPU_NAME = re.compile(r'Vulkan Device "(.+)" supports|CUDA device \[id=\d+\]: (.+)')
 
 # Taichi gives a CPU thread at least this many iterations of a parallel loop: make_cpu_multithreaded_range_for.cpp.
@@ -86,12 +85,12 @@ ITERATIONS_PER_THREAD = 512
 
 @dataclass(frozen=True)
 class Device:
-    """Where kernels run.
+    """The device that kernels run on.
 
     Attributes:
         arch: cpu, cuda or vulkan.
         threads: number of CPU threads.
-        name: of the processor or the GPU; "" where the system does not tell.
+        name: of the processor or the GPU; empty if the system does not tell it.
     """
 
     arch: str
@@ -100,19 +99,19 @@ class Device:
 
 
 class Memory:
-    """Arrays of Taichi's. When this is dropped they are used again, as Taichi frees none on a CPU."""
+    """Taichi's arrays. When a `Memory` is dropped its arrays are reused, because Taichi frees none on a CPU."""
 
     def __init__(self) -> None:
         self._taken: list[tuple[tuple[str, int], Any]] = []
         weakref.finalize(self, _give_back, self._taken)
 
     def array(self, precision: str, lanes: int, length: int) -> Any:
-        """Take a one-dimensional array, or a longer one, of whatever was in it.
+        """Allocate a one-dimensional array, or reuse one; its content is arbitrary.
 
         Args:
             precision: f32 or f64.
-            lanes: numbers of a vector; 0: plain numbers.
-            length: of the array, at least.
+            lanes: numbers in a vector; 0: an array of plain numbers.
+            length: smallest length of the array; a reused one may be longer.
         """
         kind = precision, lanes
         fitting = [array for array in _free[kind] if array.shape[0] >= length]
@@ -140,7 +139,7 @@ _home = (0, 0)
 
 
 def lanes(precision: str) -> int:
-    """Tell how many numbers a vector register of the processor holds; one on a GPU, where every point is a thread.
+    """Give the numbers that a vector register of the processor holds; 1 on a GPU, where every point is a thread.
 
     Args:
         precision: f32 or f64.
@@ -151,26 +150,26 @@ def lanes(precision: str) -> int:
 
 
 def vector_bits() -> int:
-    """Tell how wide the processor's vectors are."""
+    """Give the width of the processor's vectors [bits]."""
     return next((bits for feature, bits in VECTOR_BITS.items() if _features.get(feature)), 128)
 
 
 def started() -> Device:
-    """Give the device that runs."""
+    """Give the device that `start` started."""
     assert _device is not None, "runtime.start comes first"
     return _device
 
 
 def start(arch: str = "cpu", threads: int | None = None) -> Device:
-    """Start Taichi, once in a process.
+    """Start Taichi, or return the device if it was started in the same way before.
 
     Args:
         arch: cpu, cuda or vulkan.
         threads: number of CPU threads; None takes every core.
 
     Raises:
-        ArgumentError: when there is no such number of threads.
-        DeviceError: when the arch is not supported or not there, or Taichi already runs otherwise.
+        ArgumentError: when the number of threads is not valid.
+        DeviceError: when the arch is not supported or not available, or Taichi already runs on another device.
         MsmError: as for `require_here`.
     """
     global _device, _home
@@ -193,10 +192,10 @@ def start(arch: str = "cpu", threads: int | None = None) -> Device:
 
 
 def require_here() -> None:
-    """Make sure that Taichi works where it is called.
+    """Make sure that Taichi can be used in this process and thread.
 
     Raises:
-        MsmError: in a process that was forked from the one that started it, or in another of its threads.
+        MsmError: in a process forked from the one that started Taichi, or in another thread than the one that did.
     """
     process, thread = _home
     if process != os.getpid():
@@ -209,7 +208,7 @@ def require_here() -> None:
 
 
 def open_window(title: str, size: tuple[int, int]) -> Any:
-    """Open Taichi's window, which needs no GPU; pixels are written to its `img`, one number each, rows from the top.
+    """Open Taichi's window, which needs no GPU. Its `img` takes the pixels, one number each, rows from the top.
 
     Args:
         title: of the window.
@@ -231,14 +230,15 @@ def open_window(title: str, size: tuple[int, int]) -> Any:
 
 @contextlib.contextmanager
 def our_compilation(*, optimised: bool = True) -> Iterator[None]:
-    """Launch kernels of this package, which are compiled otherwise than a user's own in the same process.
+    """Set the compiler's options for kernels of this package, not for a user's own kernels in the same process.
 
-    Every operation rounds as IEEE 754 says, so that the bits of a result do not depend on threads, lanes or the
-    compiler's mood; on a CPU vectors stay vectors (docs/decisions/0010); and Taichi's optimisation of control flow,
-    which takes half of the time of compiling for what LLVM does again, is left out.
+    Every operation is rounded by IEEE 754, so that the bits of a result do not depend on threads, lanes or compiler
+    optimisation. On a CPU vectors stay vectors (docs/decisions/0010). Taichi's optimisation of control flow is left
+    out: it takes half the compile time, and LLVM does the same again.
 
     Args:
-        optimised: False leaves all to LLVM that Taichi would optimise before it. A kernel is launched always alike.
+        optimised: False leaves Taichi's other optimisations to LLVM too. It must be the same at every launch of a
+            kernel.
     """
     config, found = ti.lang.impl.current_cfg(), {}
     wanted = {
@@ -252,8 +252,8 @@ def our_compilation(*, optimised: bool = True) -> Iterator[None]:
         setattr(config, name, value)
     position = ASTTransformerContext.get_pos_info
     if "TAICHI_MSM_TRACEBACK" not in os.environ:
-        # For every node of a kernel Taichi prepares the source line that an error in it would show: a third of a warm
-        # compilation. Only who changes a kernel misses it.
+        # For every node of a kernel, Taichi prepares the source line that an error would show, which takes a third of
+        # the time of a warm compilation. It is useful only to those who change a kernel.
         ASTTransformerContext.get_pos_info = lambda self, node: ""
     try:
         yield
@@ -264,7 +264,7 @@ def our_compilation(*, optimised: bool = True) -> Iterator[None]:
 
 
 def _cache() -> dict[str, Any]:
-    """Give Taichi's options for keeping compiled kernels for the next process."""
+    """Give Taichi's options for the cache of compiled kernels, which later processes use."""
     folder = Path(os.environ.get("TI_OFFLINE_CACHE_FILE_PATH") or ti.lang.impl.default_cfg().offline_cache_file_path)
     try:
         folder.mkdir(parents=True, exist_ok=True)
@@ -272,10 +272,10 @@ def _cache() -> dict[str, Any]:
             pass
         _require_room(folder)
     except OSError:
-        # Taichi crashes at the end of a process whose folder it cannot write, even where it is not to.
+        # When a process ends, Taichi crashes if it cannot write to the folder, even if the cache is off.
         os.environ.pop("TI_OFFLINE_CACHE_FILE_PATH", None)
         return {"offline_cache": False, "offline_cache_file_path": tempfile.gettempdir()}
-    # Held for milliseconds, but a process that was killed leaves it, and no other uses the cache until it is gone.
+    # The lock is held for milliseconds. A killed process leaves it behind, which blocks the cache for all others.
     lock = folder / "ticache.lock"
     with contextlib.suppress(OSError):
         if time.time() - lock.stat().st_mtime > STALE_LOCK:
@@ -284,16 +284,16 @@ def _cache() -> dict[str, Any]:
 
 
 def _require_room(folder: Path) -> None:
-    """Raise OSError where the files of a run's kernels may not fit."""
+    """Raise OSError if the files of a run's kernels may not fit into a folder."""
     if hasattr(os, "statvfs"):
         free = os.statvfs(folder)
-        # Some file systems have as many files as one wants, and say that it is none.
+        # Some file systems without a limit of files report a limit of 0.
         if (free.f_files > 0 and free.f_favail < CACHE_FILES) or free.f_bavail * free.f_frsize < CACHE_BYTES:
             raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
 
 
 def _require_address_space() -> None:
-    """Raise DeviceError where Taichi would not get the memory that it takes at once."""
+    """Raise DeviceError if Taichi could not get the address space that it reserves at once."""
     try:
         import resource
     except ImportError:  # Windows
@@ -307,16 +307,16 @@ def _require_address_space() -> None:
 
 
 def _threads() -> list[int]:
-    """List the threads of this process by their numbers, which mostly grow; empty where the system does not tell."""
+    """List the ids of this process's threads, mostly in the order of their start; empty if the system has no list."""
     with contextlib.suppress(OSError):
         return sorted(int(task.name) for task in Path("/proc/self/task").iterdir())
     return []
 
 
 def _pin(pool: list[int]) -> None:
-    """Give every thread of Taichi's pool a core of its own, if it has one for each that this process may use.
+    """Pin every thread of Taichi's pool to a core of its own, if there are as many threads as usable cores.
 
-    Left to the system two of them may share a core for some 10 ms, the one spinning until the other has done its part.
+    Otherwise the system may let two threads share a core for about 10 ms, while one spins and waits for the other.
     """
     if hasattr(os, "sched_setaffinity") and len(pool) == len(os.sched_getaffinity(0)):
         for thread, core in zip(pool, sorted(os.sched_getaffinity(0)), strict=True):
@@ -331,8 +331,8 @@ def _initialise(device: Device) -> str:
     before = _threads()
     on_cpu = device.arch == "cpu"
     try:
-        # Taichi prints the arch and, where a driver is missing, its search for it, which our error says in a line. What
-        # it tells of a GPU that is there is the only way to its name.
+        # Taichi prints the arch and, if a driver is missing, its search for it, which our error says in a line. Only
+        # its log has the name of a GPU.
         with tempfile.NamedTemporaryFile("r", errors="replace") as told:
             with contextlib.redirect_stdout(io.StringIO()), silenced(*(() if on_cpu else (2,)), into=told.name):
                 ti.init(
@@ -340,7 +340,7 @@ def _initialise(device: Device) -> str:
                     cpu_max_num_threads=device.threads,
                     enable_fallback=False,
                     **cache,
-                    # No warning of loops over the samples of a pixel.
+                    # No warning about unrolled loops over the samples of a pixel.
                     unrolling_limit=0,
                     log_level=ti.ERROR if on_cpu else ti.TRACE,
                 )
@@ -349,7 +349,7 @@ def _initialise(device: Device) -> str:
     except Exception as error:
         said = f"Taichi says: {' '.join(str(error).split())}" if on_cpu else "take --arch cpu"
         raise DeviceError(f"--arch {device.arch}: not available on this machine; {said}") from error
-    # The pool is the last that Taichi starts.
+    # The threads of the pool are the last that Taichi starts.
     _pin([thread for thread in _threads() if thread not in before][-device.threads :])
     if on_cpu:
         return resources.processor()

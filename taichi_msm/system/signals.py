@@ -1,7 +1,7 @@
-"""Ctrl-C and SIGTERM as a request, granted where the work can stop.
+"""Ctrl-C and SIGTERM as a request to stop, granted only where the work can stop.
 
-Python raises KeyboardInterrupt between any two bytecodes: inside an import, a destructor or a callback of a library it
-gets lost or turns into another error.
+By default Python raises KeyboardInterrupt between any two bytecodes; raised in an import, a destructor or a callback of
+a library, it is lost or turned into another error.
 """
 
 from __future__ import annotations
@@ -13,15 +13,15 @@ from types import FrameType
 
 SIGNALS = (signal.SIGINT, signal.SIGTERM)
 
-# Where stderr is, also while libraries are kept from writing there.
+# A descriptor of stderr that works even while libraries are kept from writing there.
 _outlet = 2
 
 
 class Interruption:
-    """Remembers that the program was asked to stop; asked twice, it ends the process at once.
+    """Remembers a request to stop; a second request ends the process at once.
 
     Attributes:
-        code: the exit code of a program that stops, 128 and the number of the signal.
+        code: exit code of a program that was stopped: 128 plus the number of the signal.
     """
 
     def __init__(self) -> None:
@@ -29,12 +29,12 @@ class Interruption:
         self._requested = False
 
     def listen(self) -> None:
-        """Take the signals as a request from now on."""
+        """Treat the signals as requests from now on."""
         for number in SIGNALS:
             signal.signal(number, self._request)
 
     def grant(self) -> None:
-        """Stop here if it was asked for.
+        """Stop here if a stop was requested.
 
         Raises:
             KeyboardInterrupt: when a signal came since `listen`.
@@ -50,7 +50,7 @@ class Interruption:
 
 
 def leave_at_once() -> None:
-    """End the process at a signal, as long as there is nothing to keep."""
+    """From now on let a signal end the process at once; for use while there are no results to keep."""
     global _outlet
     _outlet = os.dup(2)
     for number in SIGNALS:

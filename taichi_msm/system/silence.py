@@ -1,4 +1,4 @@
-"""Keep libraries from writing to the terminal what an error says that is raised, or what nobody asked for."""
+"""Keep libraries from writing to the terminal what an exception says anyway, or what nobody needs."""
 
 from __future__ import annotations
 
@@ -10,11 +10,11 @@ from pathlib import Path
 
 @contextmanager
 def silenced(*descriptors: int, into: str = os.devnull) -> Iterator[None]:
-    """Send what is written to some file descriptors nowhere, in a with block.
+    """Discard what is written to some file descriptors within a with block.
 
     Args:
-        descriptors: 1 for stdout, 2 for stderr; one that is closed stays so.
-        into: a file that takes it instead.
+        descriptors: 1 for stdout, 2 for stderr; a closed one stays closed.
+        into: path of a file that takes the output instead.
     """
     with Path(into).open("wb") as nowhere:
         kept = {descriptor: copy for descriptor in descriptors if (copy := _copy(descriptor)) is not None}

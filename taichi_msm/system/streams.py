@@ -1,4 +1,4 @@
-"""The process's standard streams, which may be closed, full, or read by nobody."""
+"""The standard streams of the process, which may be closed, full, or without a reader."""
 
 from __future__ import annotations
 
@@ -15,19 +15,19 @@ from taichi_msm.errors import printable
 
 
 def open_missing() -> None:
-    """Open streams that the process was started without, so that no file of ours takes their place."""
+    """Open standard streams that the process was started without, so that no other file gets their descriptors."""
     for descriptor in (0, 1, 2):
         try:
             os.fstat(descriptor)
         except OSError:
-            os.open(os.devnull, os.O_RDWR)  # takes the lowest number that is free
+            os.open(os.devnull, os.O_RDWR)  # gets the lowest free descriptor
     for name, descriptor in (("stdout", 1), ("stderr", 2)):
         if getattr(sys, name) is None:
             setattr(sys, name, io.TextIOWrapper(io.FileIO(descriptor, "w", closefd=False), "utf-8"))
 
 
 def tell(lines: Iterable[str]) -> None:
-    """Write lines on stderr, whatever characters the user's names hold; where nobody can read them, nowhere."""
+    """Write lines to stderr, whatever characters they contain; discard them if nobody can read them."""
     try:
         for line in lines:
             click.echo(printable(line), err=True)
@@ -36,7 +36,7 @@ def tell(lines: Iterable[str]) -> None:
 
 
 def mute(stream: TextIO) -> None:
-    """Let what is still to be written to a stream go nowhere; the interpreter would try again when it ends."""
+    """Discard what is still buffered in a stream; otherwise the interpreter would try to write it when it ends."""
     with suppress(OSError, ValueError):
         nowhere = os.open(os.devnull, os.O_WRONLY)
         os.dup2(nowhere, stream.fileno())

@@ -14,8 +14,7 @@ from taichi_msm.physics.error_control import choose_step
 from taichi_msm.physics.lattice import rest_positions
 from taichi_msm.physics.mesh_error import choose_points
 from taichi_msm.physics.probe_force import control_point, probe_force
-from taichi_msm.physics.timestep import steps_per_frame, with_time
-from taichi_msm.physics.workload import with_precision
+from taichi_msm.physics.timestep import time_grid, with_grid, with_time
 from taichi_msm.render.instrument import rod
 from taichi_msm.render.texture import load_texture
 from taichi_msm.results.gif import Picture
@@ -73,7 +72,8 @@ def with_live_frames(scene: Scene) -> tuple[Scene, int]:
     """
     parts = max(1, int(MOST_FRAMES / scene.time.frames_per_second * (1 + 1e-9)))
     if scene.time.step != "auto":
-        while steps_per_frame(scene) % parts:
+        steps = time_grid(scene).steps_per_frame
+        while steps % parts:
             parts -= 1
     return with_time(scene, frames_per_second=scene.time.frames_per_second * parts), parts
 
@@ -122,10 +122,10 @@ class Session:
         if scene.sheet.tolerance is not None:
             scene, _ = choose_points(scene, device, checked, lambda done, total: progress("pilot"))
         scene, self.parts = with_live_frames(scene)
+        grid = time_grid(scene, device.arch)
         if scene.time.tolerance is not None:
-            scene, _ = choose_step(scene, device, lambda done, total: progress("pilot"))
-        else:
-            scene = with_precision(scene, device.arch)
+            grid, _ = choose_step(scene, grid, device, lambda done, total: progress("pilot"))
+        scene = with_grid(scene, grid)
         rate = scene.time.frames_per_second
         self._captures = captures
         self._recording = Recording(captures, scene, given.time.frames_per_second, self.parts)
