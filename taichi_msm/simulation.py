@@ -474,7 +474,7 @@ class Simulation:
         from taichi_msm.render.rasterizer import Drawing, structure
 
         positions, rods = self._placed(positions, time)
-        view = self._view(camera)
+        view = None if camera is None else self._view(camera)
         if (picture, labels) not in self._drawings:
             code = structure(self.scene, picture=picture, labels=labels)
             self._drawings[picture, labels] = Drawing(self.scene, self._require_texture(picture=picture), code)

@@ -89,7 +89,7 @@ class Seen(NamedTuple):
         depth: along the direction of view [m]; infinite where nothing is.
         u, v: the material point, fractions of the sheet's width and height from its upper left; NaN where none is.
         wire: share of the mesh lines in the colour.
-        footprint: the larger of a sample's width and height on the texture [texels].
+        footprint: the larger of a sample's width and height on the texture [texels by style.SHARP].
     """
 
     depth: Array
@@ -147,7 +147,9 @@ def triangles(surface: Array) -> Iterator[Array]:
 
 
 def footprint(triangle: Array, x: Array, y: Array, texels: tuple[int, int]) -> Array:
-    """Give the larger of a sample's width and height on the texture, by differences over a thousandth of a sample.
+    """Give the larger of a sample's width and height on the texture, in texels by style.SHARP.
+
+    By differences over a thousandth of a sample.
 
     Args:
         triangle: corners (X, Y, w, depth, u, v), shape (3, 6).
@@ -163,7 +165,7 @@ def footprint(triangle: Array, x: Array, y: Array, texels: tuple[int, int]) -> A
 
     right = place(x + step, y) - place(x - step, y)
     down = place(x, y + step) - place(x, y - step)
-    return np.asarray(np.maximum(np.hypot(*right), np.hypot(*down)) / (2 * step))
+    return np.asarray(np.maximum(np.hypot(*right), np.hypot(*down)) / (2 * step * style.SHARP))
 
 
 def draw(scene: Scene, position: Array, texture: NDArray[np.uint8], rods: Sequence[Rod] = ()) -> NDArray[np.uint8]:

@@ -99,7 +99,7 @@ def minified(texture: NDArray[np.uint8], u: Array, v: Array, footprint: Array) -
         texture: colours, shape (height, width, 3).
         u: 0 at the left edge to 1 at the right one, any shape.
         v: 0 at the top edge to 1 at the bottom one, the same shape.
-        footprint: the larger of a sample's width and height on the texture [texels], the same shape.
+        footprint: the larger of a sample's width and height on the texture [texels by style.SHARP], the same shape.
 
     Returns:
         Colours, shape (*u.shape, 3); and how the grey rises from texel to texel of the texture to the right and down,
@@ -185,9 +185,9 @@ def illuminate(camera: View, factor: int, depth: Array, normal: Array) -> tuple[
 
 
 def highlight(normal: Array, to_light: Array, to_eye: Array) -> Array:
-    """Give Blinn's highlight, 0 to 1."""
-    cosine = (normal * unit(to_light + to_eye)).sum(axis=-1)
-    return np.asarray(np.clip(cosine, 0, 1) ** 2**style.SHARPNESS)
+    """Give Phong's highlight, 0 to 1."""
+    mirrored = 2 * (normal * to_light).sum(axis=-1, keepdims=True) * normal - to_light
+    return np.asarray(np.clip((mirrored * to_eye).sum(axis=-1), 0, 1) ** 2**style.SHARPNESS)
 
 
 def tissue(

@@ -12,6 +12,7 @@ from functools import cache
 from typing import Any, NamedTuple
 
 from taichi_msm.render import style
+from taichi_msm.render.numbers import AXES
 from taichi_msm.render.patch import Plane, edge, on_triangle, small_quad, turn
 from taichi_msm.render.samples import DEPTH, INFINITY, TEXEL_X, TEXEL_Y, Code
 from taichi_msm.system.runtime import ti
@@ -61,7 +62,7 @@ class Band(NamedTuple):
         top, bottom: first row of samples, and the row after the last.
         width, height: of the picture [samples].
         near: what is not farther than this is not drawn.
-        axes: the camera's, of which the last is the direction to the headlight.
+        numbers: as `view_numbers` makes them.
     """
 
     samples: Any
@@ -72,7 +73,7 @@ class Band(NamedTuple):
     width: Any
     height: Any
     near: Any
-    axes: Any
+    numbers: Any
 
 
 class Cell(NamedTuple):
@@ -145,27 +146,33 @@ def covering(code: Code) -> Callable[..., Any]:
         return normal[0], normal[1], normal[2]
 
     @ti.func
-    def light(surface: ti.template(), cell: ti.template(), axes: ti.template(), across, along):
+    def light(surface: ti.template(), cell: ti.template(), numbers: ti.template(), across, along):
         """Share of the headlight that comes back: the cosine between the normal and the direction to the light."""
         n_x, n_y, n_z = normal_at(surface, cell, across, along)
         length = ti.sqrt(n_x * n_x + n_y * n_y + n_z * n_z)
-        cosine = absolute(n_x * axes[2, 0] + n_y * axes[2, 1] + n_z * axes[2, 2]) / ti.max(length, 1e-30)
+        toward = AXES + 6
+        cosine = absolute(n_x * numbers[toward] + n_y * numbers[toward + 1] + n_z * numbers[toward + 2])
+        cosine = cosine / ti.max(length, 1e-30)
         # The normal of a point that is infinitely far, or nowhere, is none.
         return ti.max(ti.min(cosine, 1.0), 0.0)
 
     @ti.func
     def footprint(x, y, s, t, texels_x, texels_y, plane: ti.template()):
-        """Square of the larger of a sample's width and height on the texture, in texels.
+        """Square of the larger of a sample's width and height on the texture, in texels by style.SHARP.
 
         With x = X / w the derivatives of (x, y) by (s, t) are (R_1, D_1; R_2, D_2) / w, where R_1 = R_x - x R_w and so
         on; those of (s, t) by (x, y) are the inverse.
         """
-        r_1 = (plane.r_x - x * plane.r_w) * texels_y
-        d_1 = (plane.d_x - x * plane.d_w) * texels_x
-        r_2 = (plane.r_y - y * plane.r_w) * texels_y
-        d_2 = (plane.d_y - y * plane.d_w) * texels_x
-        w = (plane.p_w + plane.r_w * s + plane.d_w * t) * (texels_x * texels_y) / (r_1 * d_2 - r_2 * d_1)
-        return ti.min(ti.max(r_1 * r_1 + d_1 * d_1, r_2 * r_2 + d_2 * d_2) * (w * w), LARGEST_FOOTPRINT)
+        r_1 = plane.r_x - x * plane.r_w
+        d_1 = plane.d_x - x * plane.d_w
+        r_2 = plane.r_y - y * plane.r_w
+        d_2 = plane.d_y - y * plane.d_w
+        # As in `on_triangle`, so that it is computed once.
+        share = 1.0 / (r_1 * d_2 - r_2 * d_1)
+        scale = (plane.p_w + plane.r_w * s + plane.d_w * t) * share
+        across_1, across_2, down_1, down_2 = d_1 * texels_x, d_2 * texels_x, r_1 * texels_y, r_2 * texels_y
+        largest = ti.max(across_1 * across_1 + down_1 * down_1, across_2 * across_2 + down_2 * down_2)
+        return ti.min(largest * (scale * scale) * (1.0 / (style.SHARP * style.SHARP)), LARGEST_FOOTPRINT)
 
     @ti.func
     def wire_share(across, down, right_across, right_down, below_across, below_down):
@@ -246,7 +253,7 @@ def covering(code: Code) -> Callable[..., Any]:
             keep(at + code.layout["across"], visible, (cell.j + across) / cell.cells_across, band.samples)
             keep(at + code.layout["down"], visible, (cell.i + along) / cell.cells_down, band.samples)
         if ti.static(code.headlit):
-            keep(at + code.layout["light"], visible, light(surface, cell, band.axes, across, along), band.samples)
+            keep(at + code.layout["light"], visible, light(surface, cell, band.numbers, across, along), band.samples)
         if ti.static(code.tissue):
             n_x, n_y, n_z = normal_at(surface, cell, across, along)
             keep(at + code.layout["normal_x"], visible, n_x, band.samples)

@@ -7,16 +7,11 @@ as its length, which is a quadratic equation; beyond A and the other end, sphere
 
 # No `from __future__ import annotations` here: Taichi reads the annotations of a kernel.
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from functools import cache
 from typing import Any
 
-import numpy as np
-from numpy.typing import NDArray
-
-from taichi_msm.render.camera import View
-from taichi_msm.render.instrument import Rod
-from taichi_msm.render.lighting import (
+from taichi_msm.render.numbers import (
     AXIS,
     BOTTOM,
     CENTRE_X,
@@ -27,39 +22,13 @@ from taichi_msm.render.lighting import (
     RADIUS,
     RIGHT,
     ROD_NUMBERS,
+    RODS,
     SPREAD,
+    TIP,
     TOP,
 )
 from taichi_msm.render.samples import DEPTH, INFINITY, Code
 from taichi_msm.system.runtime import ti
-
-Array = NDArray[np.float64]
-
-
-def rod_numbers(placed: Sequence[Rod], view: View, factor: int) -> Array:
-    """Put together what the kernel knows of the rods, shape (rods or 1, ROD_NUMBERS).
-
-    Args:
-        placed: the rods.
-        view: the camera.
-        factor: samples of a pixel along each axis.
-    """
-    numbers = np.zeros((max(1, len(placed)), ROD_NUMBERS))
-    for row, rod in zip(numbers, placed, strict=False):
-        ends = np.stack([rod.tip, rod.tip + rod.axis * rod.length])
-        row[:AXIS] = view.axes @ (rod.tip - view.eye)
-        row[AXIS:LENGTH] = view.axes @ rod.axis
-        row[[LENGTH, RADIUS]] = rod.length, rod.radius
-        # The picture of a box around each end holds that of the end.
-        corner = np.array(np.meshgrid(*[(-rod.radius, rod.radius)] * 3)).reshape(3, -1).T @ view.axes
-        boxes = (ends[:, None] + corner).reshape(-1, 3)
-        x, y, w = view.matrix[:3, :3] @ boxes.T + view.matrix[:3, 3:]
-        if (w > view.near).all():
-            bounds = np.array([(x / w).min(), (y / w).min(), (x / w).max(), (y / w).max()])
-        else:
-            bounds = np.array([0, 0, *2 * view.centre])
-        row[LEFT:] = np.clip(bounds, 0, np.tile(2 * view.centre, 2)) * factor
-    return numbers
 
 
 @ti.func
@@ -69,28 +38,29 @@ def dot(a_x, a_y, a_z, b_x, b_y, b_z):
 
 
 @ti.func
-def meet(x, y, n, rods: ti.template(), light: ti.template()):
+def meet(x, y, n, numbers: ti.template()):
     """Find where lines of sight meet rod n first.
 
     Args:
         x: column of the samples.
         y: their row.
         n: number of the rod.
-        rods: as `rod_numbers` makes them.
-        light: as `light_numbers` makes them; only what the camera is.
+        numbers: as `view_numbers` makes them.
 
     Returns:
         The depth, INFINITY where they miss the rod, and the normal times the radius.
     """
-    u_x, u_y, u_z = rods[n, AXIS], rods[n, AXIS + 1], rods[n, AXIS + 2]
-    length, radius = rods[n, LENGTH], rods[n, RADIUS]
+    rod = RODS + n * ROD_NUMBERS
+    tip, axis = rod + TIP, rod + AXIS
+    u_x, u_y, u_z = numbers[axis], numbers[axis + 1], numbers[axis + 2]
+    length, radius = numbers[rod + LENGTH], numbers[rod + RADIUS]
     # The line of sight P = O + D t from where it is as deep as the tip, which is at 0.
-    start = rods[n, 2] * (-1.0)
-    across = (x - light[CENTRE_X]) * light[SPREAD]
-    up = (light[CENTRE_Y] - y) * light[SPREAD]
-    d_x, d_y, d_z = across * light[PINHOLE], up * light[PINHOLE], -1.0
-    w = start * light[PINHOLE] + (1.0 - light[PINHOLE])
-    o_x, o_y, o_z = across * w - rods[n, 0], up * w - rods[n, 1], 0.0
+    start = numbers[tip + 2] * (-1.0)
+    across = (x - numbers[CENTRE_X]) * numbers[SPREAD]
+    up = (numbers[CENTRE_Y] - y) * numbers[SPREAD]
+    d_x, d_y, d_z = across * numbers[PINHOLE], up * numbers[PINHOLE], -1.0
+    w = start * numbers[PINHOLE] + (1.0 - numbers[PINHOLE])
+    o_x, o_y, o_z = across * w - numbers[tip], up * w - numbers[tip + 1], 0.0
     # The side of the rod: a t^2 + 2 b t + c = 0.
     d_d = dot(d_x, d_y, d_z, d_x, d_y, d_z)
     d_u = dot(d_x, d_y, d_z, u_x, u_y, u_z)
@@ -133,11 +103,11 @@ def instruments(code: Code) -> Callable[..., Any]:
     lines = [lane // code.tile_width + 0.5 for lane in range(code.lanes)]
 
     @ti.func
-    def cover_tile(at, x, y, n, rods: ti.template(), light: ti.template(), band: ti.template()):
+    def cover_tile(at, x, y, n, band: ti.template()):
         """Cover a tile of samples with rod n."""
-        depth, n_x, n_y, n_z = meet(x, y, n, rods, light)
+        depth, n_x, n_y, n_z = meet(x, y, n, band.numbers)
         samples = ti.static(band.samples)
-        in_front = depth * light[PINHOLE] + (1.0 - light[PINHOLE]) > band.near
+        in_front = depth * band.numbers[PINHOLE] + (1.0 - band.numbers[PINHOLE]) > band.near
         visible = in_front & (depth < samples[at + DEPTH])
         samples[at + DEPTH] = ti.select(visible, depth, samples[at + DEPTH])
         mask = at + ti.static(code.layout["instrument"])
@@ -148,27 +118,27 @@ def instruments(code: Code) -> Callable[..., Any]:
                 samples[plane] = ti.select(visible, value, samples[plane])
 
     @ti.func
-    def cover(count, rods: ti.template(), light: ti.template(), band: ti.template()):
+    def cover(count, band: ti.template()):
         """Cover a band with the instruments.
 
         Args:
             count: how many there are.
-            rods: as `rod_numbers` makes them.
-            light: as `light_numbers` makes them.
             band: the band.
         """
+        numbers = ti.static(band.numbers)
         for n in range(count):
-            if rods[n, TOP] < band.bottom and rods[n, BOTTOM] > band.top:
-                first_row = ti.cast(ti.max(ti.floor(rods[n, TOP]), band.top), ti.i32)
-                end_row = ti.cast(ti.min(ti.ceil(rods[n, BOTTOM]), band.bottom), ti.i32)
+            rod = RODS + n * ROD_NUMBERS
+            if numbers[rod + TOP] < band.bottom and numbers[rod + BOTTOM] > band.top:
+                first_row = ti.cast(ti.max(ti.floor(numbers[rod + TOP]), band.top), ti.i32)
+                end_row = ti.cast(ti.min(ti.ceil(numbers[rod + BOTTOM]), band.bottom), ti.i32)
                 first_line = (first_row - band.top) // code.tile_height
                 end_line = (end_row - band.top + (code.tile_height - 1)) // code.tile_height
-                first_tile = ti.cast(ti.floor(rods[n, LEFT]), ti.i32) // code.tile_width
-                end_tile = (ti.cast(ti.ceil(rods[n, RIGHT]), ti.i32) + (code.tile_width - 1)) // code.tile_width
+                first_tile = ti.cast(ti.floor(numbers[rod + LEFT]), ti.i32) // code.tile_width
+                end_tile = (ti.cast(ti.ceil(numbers[rod + RIGHT]), ti.i32) + (code.tile_width - 1)) // code.tile_width
                 for line in range(first_line, end_line):
                     for tile in range(first_tile, end_tile):
                         x = floats(columns) + ti.cast(tile * code.tile_width, ti.f32)
                         y = floats(lines) + ti.cast(band.top + line * code.tile_height, ti.f32)
-                        cover_tile(band.first + (line * band.across + tile) * code.planes, x, y, n, rods, light, band)
+                        cover_tile(band.first + (line * band.across + tile) * code.planes, x, y, n, band)
 
     return cover

@@ -18,14 +18,17 @@ from numpy.typing import NDArray
 from taichi_msm.render.camera import View, view
 from taichi_msm.render.coverage import NORMAL, POINT_NUMBERS, SEEN, Band, Surface, covering
 from taichi_msm.render.instrument import Rod
-from taichi_msm.render.instrument_coverage import instruments, rod_numbers
+from taichi_msm.render.instrument_coverage import instruments
 from taichi_msm.render.labels import Labels
-from taichi_msm.render.lighting import light_numbers
+from taichi_msm.render.numbers import AXES, MATRIX, NEAR, PARTS, view_numbers
 from taichi_msm.render.pyramid import pyramid
 from taichi_msm.render.samples import DEPTH, INFINITY, Code
 from taichi_msm.render.shading import Out, Texture, resolving
 from taichi_msm.scene import Scene
 from taichi_msm.system.runtime import ITERATIONS_PER_THREAD, Memory, lanes, our_compilation, started, ti
+
+# The sizes that the kernel is told in one array, and how many bands are taken.
+COLS, WIDTH, HEIGHT, TEXTURE_WIDTH, TEXTURE_HEIGHT, ROD_COUNT, TAKEN = range(7)
 
 
 class Drawn(NamedTuple):
@@ -53,6 +56,8 @@ def structure(scene: Scene, *, picture: bool = True, labels: bool = False) -> Co
         refined=render.refine > 0,
         supersample=render.supersample if picture else 1,
         shading=render.shading,
+        relief=render.shading == "tissue" and picture and render.light.relief != 0,
+        vignette=render.shading == "tissue" and picture and render.light.vignette != 0,
         wireframe=render.wireframe,
         instruments=scene.has_instruments,
         picture=picture,
@@ -83,7 +88,7 @@ class Drawing:
         # Of every row of mass points its highest and its lowest place in the picture.
         self._reach = memory.array("f32", 0, rows * 2)
         self._samples = memory.array("f32", self.code.lanes, self._workers * self.code.band_vectors(width))
-        self._background = np.array(scene.render.background, np.float32)
+        self._known: tuple[View, NDArray[np.float32]] | None = None
         self._texture_size = texture.shape[1], texture.shape[0]
         texels, self._levels = pyramid(texture, minified=self.code.tissue)
         self._texels: Any = texels
@@ -110,45 +115,50 @@ class Drawing:
     def look(self, position: NDArray[Any], camera: View | None = None, rods: Sequence[Rod] = ()) -> Drawn:
         """Draw whatever the code has; as for `draw`."""
         camera, code = camera or self._view, self.code
-        (rows, cols), (width, height), factor = self.scene.sheet.points, self.scene.render.size, code.supersample
-        scale = np.array([[factor], [factor], [1], [1]])
+        (rows, cols), (width, height) = self.scene.sheet.points, self.scene.render.size
         # Whole tiles are given out, of which the last may be wider than the picture.
         stride = code.tiles_across(width) * code.tile_width if code.in_words else width
         picture = np.empty((height, stride, 3) if code.picture else (1, 4, 3), np.uint8)
-        pixels = (height, width) if code.labels else (1, 1)
-        coordinates, depth = np.empty((*pixels, 2), np.float32), np.empty(pixels, np.float32)
-        instrument = np.zeros(pixels, np.uint8)
-        light = light_numbers(camera, self.scene.render.light, factor, self.scene.sheet.size, self._texture_size)
+        pixels = width * height if code.labels else 1
+        labels = np.zeros(4 * pixels, np.float32)
+        sizes = np.array([cols, width, height, *self._texture_size, len(rods), 0], np.int32)
         with our_compilation(optimised=False):
             self._draw(
                 np.ascontiguousarray(position, np.float32),
                 self._texels,
                 self._levels,
-                np.ascontiguousarray(camera.matrix * scale, np.float32),
-                np.ascontiguousarray(camera.axes, np.float32),
-                self._background,
-                light.astype(np.float32),
-                rod_numbers(rods, camera, factor).astype(np.float32),
-                len(rods),
-                camera.near,
-                self.scene.render.refine + 1,
+                self._numbers(camera, rods),
                 rows,
-                cols,
-                width,
-                height,
-                *self._texture_size,
                 self._workers,
-                np.zeros(1, np.int32),
+                sizes,
                 self._point,
                 self._reach,
                 self._samples,
                 picture.ravel().view(np.int32) if code.in_words else picture.ravel(),
-                coordinates.ravel(),
-                depth.ravel(),
-                instrument.ravel(),
+                labels,
             )
         seen = np.ascontiguousarray(picture[:, :width]) if code.picture else None
-        return Drawn(seen, Labels(coordinates, depth, instrument) if code.labels else None)
+        if not code.labels:
+            return Drawn(seen, None)
+        coordinates, depth, instrument = np.split(labels, [2 * pixels, 3 * pixels])
+        return Drawn(
+            seen,
+            Labels(
+                coordinates.reshape(height, width, 2),
+                depth.reshape(height, width),
+                instrument.reshape(height, width).astype(np.uint8),
+            ),
+        )
+
+    def _numbers(self, camera: View, rods: Sequence[Rod]) -> NDArray[np.float32]:
+        """Give the numbers of a view; without instruments they are put together only for another camera."""
+        if rods or self._known is None or self._known[0] is not camera:
+            render, size = self.scene.render, self.scene.sheet.size
+            numbers = view_numbers(camera, render, self.code.supersample, size, self._texture_size, rods)
+            if rods:
+                return numbers.astype(np.float32)
+            self._known = camera, numbers.astype(np.float32)
+        return self._known[1]
 
 
 @cache
@@ -158,14 +168,13 @@ def _kernel(code: Code) -> Callable[..., None]:
     cover, cover_rods, resolve = covering(code), instruments(code), resolving(code)
 
     @ti.func
-    def project(
-        position: ti.template(), matrix: ti.template(), axes: ti.template(), point: ti.template(), i, j, rows, cols
-    ):
+    def project(position: ti.template(), numbers: ti.template(), point: ti.template(), i, j, rows, cols):
         """Note where mass point (i, j) is seen, and its normal; of tissue in the camera's frame."""
         here = (i * cols + j) * POINT_NUMBERS
         x, y, z = position[i, j, 0], position[i, j, 1], position[i, j, 2]
         for n in ti.static(range(4)):
-            point[here + n] = matrix[n, 0] * x + matrix[n, 1] * y + matrix[n, 2] * z + matrix[n, 3]
+            row = MATRIX + 4 * n
+            point[here + n] = numbers[row] * x + numbers[row + 1] * y + numbers[row + 2] * z + numbers[row + 3]
         point[here + SEEN] = point[here] / point[here + 2]
         point[here + SEEN + 1] = point[here + 1] / point[here + 2]
         if ti.static(code.headlit or code.tissue):
@@ -184,7 +193,8 @@ def _kernel(code: Code) -> Callable[..., None]:
             n_x, n_y, n_z = n_x / length, n_y / length, n_z / length
             if ti.static(code.tissue):
                 for n in ti.static(range(3)):
-                    point[here + NORMAL + n] = axes[n, 0] * n_x + axes[n, 1] * n_y + axes[n, 2] * n_z
+                    axis = AXES + 3 * n
+                    point[here + NORMAL + n] = numbers[axis] * n_x + numbers[axis + 1] * n_y + numbers[axis + 2] * n_z
             else:
                 point[here + NORMAL] = n_x
                 point[here + NORMAL + 1] = n_y
@@ -210,38 +220,25 @@ def _kernel(code: Code) -> Callable[..., None]:
         position: ti.types.ndarray(dtype=ti.f32, ndim=3),
         texels: ti.types.ndarray(dtype=ti.f32, ndim=1),
         levels: ti.types.ndarray(dtype=ti.i32, ndim=2),
-        matrix: ti.types.ndarray(dtype=ti.f32, ndim=2),
-        axes: ti.types.ndarray(dtype=ti.f32, ndim=2),
-        background: ti.types.ndarray(dtype=ti.f32, ndim=1),
-        light: ti.types.ndarray(dtype=ti.f32, ndim=1),
-        rods: ti.types.ndarray(dtype=ti.f32, ndim=2),
-        rod_count: ti.i32,
-        near: ti.f32,
-        parts: ti.f32,
+        numbers: ti.types.ndarray(dtype=ti.f32, ndim=1),
         rows: ti.i32,
-        cols: ti.i32,
-        width: ti.i32,
-        height: ti.i32,
-        texture_width: ti.i32,
-        texture_height: ti.i32,
         workers: ti.i32,
-        taken: ti.types.ndarray(dtype=ti.i32, ndim=1),
+        sizes: ti.types.ndarray(dtype=ti.i32, ndim=1),
         point: ti.types.ndarray(dtype=ti.f32, ndim=1),
         reach: ti.types.ndarray(dtype=ti.f32, ndim=1),
         samples: ti.types.ndarray(dtype=floats, ndim=1),
         colours: ti.types.ndarray(dtype=ti.i32 if code.in_words else ti.u8, ndim=1),
-        coordinates: ti.types.ndarray(dtype=ti.f32, ndim=1),
-        depth: ti.types.ndarray(dtype=ti.f32, ndim=1),
-        instrument: ti.types.ndarray(dtype=ti.u8, ndim=1),
+        labels: ti.types.ndarray(dtype=ti.f32, ndim=1),
     ):
         for index in range(rows * ITERATIONS_PER_THREAD):
             if index % ITERATIONS_PER_THREAD == 0:
                 i = index // ITERATIONS_PER_THREAD
                 low, high = INFINITY, -INFINITY
+                cols = sizes[COLS]
                 for j in range(cols):
-                    project(position, matrix, axes, point, i, j, rows, cols)
+                    project(position, numbers, point, i, j, rows, cols)
                     here = (i * cols + j) * POINT_NUMBERS
-                    if point[here + 2] > near:
+                    if point[here + 2] > numbers[NEAR]:
                         low = ti.min(low, point[here + SEEN + 1])
                         high = ti.max(high, point[here + SEEN + 1])
                     else:
@@ -251,28 +248,30 @@ def _kernel(code: Code) -> Callable[..., None]:
 
         for index in range(workers * ITERATIONS_PER_THREAD):
             if index % ITERATIONS_PER_THREAD == 0:
+                width, height = sizes[WIDTH], sizes[HEIGHT]
+                texture_width, texture_height = sizes[TEXTURE_WIDTH], sizes[TEXTURE_HEIGHT]
+                cols, rod_count, parts, near = sizes[COLS], sizes[ROD_COUNT], numbers[PARTS], numbers[NEAR]
                 across = (width * factor + code.tile_width - 1) // code.tile_width
                 first = index // ITERATIONS_PER_THREAD * across * (code.band_lines * code.planes)
                 surface = ti.static(Surface(point, rows, cols, parts, texture_width, texture_height))
-                texture = ti.static(
-                    Texture(texels, levels, texture_width, texture_height, background, light, rods, rod_count)
-                )
-                out = ti.static(Out(colours, coordinates, depth, instrument))
+                texture = ti.static(Texture(texels, levels, texture_width, texture_height, numbers, rod_count))
+                pixels = width * height
+                out = ti.static(Out(colours, labels, pixels))
                 samples_width, samples_height = width * factor, height * factor
                 # A worker that another program holds up leaves the bands to the others.
                 taking = True
                 while taking:
-                    row = ti.atomic_add(taken[0], 1) * code.band_rows
+                    row = ti.atomic_add(sizes[TAKEN], 1) * code.band_rows
                     taking = row < height
                     if taking:
                         end_row = ti.min(row + code.band_rows, height)
                         top, bottom = row * factor, end_row * factor
                         band = ti.static(
-                            Band(samples, first, across, top, bottom, samples_width, samples_height, near, axes)
+                            Band(samples, first, across, top, bottom, samples_width, samples_height, near, numbers)
                         )
                         draw_band(surface, band, reach)
                         if ti.static(code.instruments):
-                            cover_rods(rod_count, rods, light, band)
+                            cover_rods(rod_count, band)
                         resolve(samples, first, row, end_row, across, width, texture, out)
 
     return draw

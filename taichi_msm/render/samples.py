@@ -35,6 +35,8 @@ class Code:
         refined: whether vertices are inserted between mass points.
         supersample: samples of a pixel along each axis.
         shading: none, headlight or tissue.
+        relief: whether tissue is shaded with a relief.
+        vignette: whether with a vignette.
         wireframe: whether the mass-point mesh is drawn.
         instruments: whether there are any.
         picture: whether colours are given out.
@@ -45,6 +47,8 @@ class Code:
     refined: bool
     supersample: int
     shading: str
+    relief: bool
+    vignette: bool
     wireframe: bool
     instruments: bool
     picture: bool

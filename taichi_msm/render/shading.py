@@ -8,7 +8,8 @@ from functools import cache
 from typing import Any, NamedTuple
 
 from taichi_msm.render import style
-from taichi_msm.render.lighting import ACROSS, SLOPE_X, SLOPE_Y, UP, Ray, lighting
+from taichi_msm.render.lighting import lighting
+from taichi_msm.render.numbers import ACROSS, BACKGROUND, SLOPE_X, SLOPE_Y, UP
 from taichi_msm.render.samples import DEPTH, INFINITY, TEXEL_X, TEXEL_Y, Code
 from taichi_msm.system.runtime import ti
 
@@ -23,19 +24,15 @@ class Texture(NamedTuple):
         texels: as in a `Pyramid`.
         levels: likewise.
         width, height: of the first level.
-        background: red, green and blue of samples that show nothing.
-        light: as `light_numbers` makes them.
-        rods: as `rod_numbers` makes them.
-        rod_count: how many there are.
+        numbers: as `view_numbers` makes them.
+        rod_count: how many instruments there are.
     """
 
     texels: Any
     levels: Any
     width: Any
     height: Any
-    background: Any
-    light: Any
-    rods: Any
+    numbers: Any
     rod_count: Any
 
 
@@ -44,15 +41,13 @@ class Out(NamedTuple):
 
     Attributes:
         colours: of the pixels, as words or bytes.
-        coordinates: of the material points, two for each pixel.
-        depth: of every pixel.
-        instrument: 255 where one is seen, for each pixel.
+        labels: coordinates of all pixels, two each; then their depths; then 255 or 0 for an instrument.
+        pixels: how many there are.
     """
 
     colours: Any
-    coordinates: Any
-    depth: Any
-    instrument: Any
+    labels: Any
+    pixels: Any
 
 
 @cache
@@ -63,7 +58,7 @@ def shading(code: Code) -> Callable[..., Any]:
         code: what it is compiled for.
     """
     lanes, floats, integers = code.lanes, code.floats, code.integers
-    rays, shaded, tissue, metal = lighting(code)
+    tissue, metal = lighting(code)
     columns = [lane % code.tile_width + 0.5 for lane in range(lanes)]
     lines = [lane // code.tile_width + 0.5 for lane in range(lanes)]
 
@@ -91,7 +86,7 @@ def shading(code: Code) -> Callable[..., Any]:
         """Filter a level bilinearly at (x, y) of its texels.
 
         Returns:
-            Red, green and blue; and where tissue is shaded how its grey rises from texel to texel.
+            Red, green and blue; and where there is a relief how its grey rises from texel to texel.
         """
         # Beyond the middle of its outermost texels the texture does not change.
         texel_x = ti.max(ti.min(x, width - 1.0), 0.0)
@@ -107,7 +102,7 @@ def shading(code: Code) -> Callable[..., Any]:
         red_ll, green_ll, blue_ll = channels(texture.texels, under + left)
         red_lr, green_lr, blue_lr = channels(texture.texels, under + right)
         rise_x, rise_y = u, v
-        if ti.static(code.tissue):
+        if ti.static(code.relief):
             grey_ul = red_ul + green_ul + blue_ul
             grey_ur = red_ur + green_ur + blue_ur
             grey_ll = red_ll + green_ll + blue_ll
@@ -182,31 +177,26 @@ def shading(code: Code) -> Callable[..., Any]:
         if ti.static(code.headlit):
             light = samples[at + ti.static(code.layout["light"])]
             red, green, blue = red * light, green * light, blue * light
-        light = ti.static(texture.light)
+        numbers = ti.static(texture.numbers)
         x = floats(columns) + ti.cast(left, ti.f32)
         y = floats(lines) + ti.cast(top, ti.f32)
         if ti.static(code.tissue):
             n_x = samples[at + ti.static(code.layout["normal_x"])]
             n_y = samples[at + ti.static(code.layout["normal_y"])]
             n_z = samples[at + ti.static(code.layout["normal_z"])]
-            length = 1.0 / ti.max(ti.sqrt(n_x * n_x + n_y * n_y + n_z * n_z), 1e-30)
-            n_x, n_y, n_z = n_x * length, n_y * length, n_z * length
-            # Where the picture rises the normal leans back.
-            a_x, a_y, a_z = light[ACROSS], light[ACROSS + 1], light[ACROSS + 2]
-            b_x, b_y, b_z = light[UP], light[UP + 1], light[UP + 2]
-            slope_x, slope_y = rise_x * light[SLOPE_X], rise_y * light[SLOPE_Y]
-            along = slope_x * (a_x * n_x + a_y * n_y + a_z * n_z) + slope_y * (b_x * n_x + b_y * n_y + b_z * n_z)
-            r_x = n_x * (along + 1.0) - slope_x * a_x - slope_y * b_x
-            r_y = n_y * (along + 1.0) - slope_x * a_y - slope_y * b_y
-            r_z = n_z * (along + 1.0) - slope_x * a_z - slope_y * b_z
-            n_x, n_y, n_z, l_x, l_y, l_z, v_x, v_y, v_z, nearness = rays(
-                x, y, samples[at + DEPTH], r_x, r_y, r_z, light
-            )
-            ray = ti.static(Ray(n_x, n_y, n_z, l_x, l_y, l_z, v_x, v_y, v_z, nearness))
-            share, gloss = tissue(x, y, ray, light)
-            if ti.static(code.instruments):
-                left_over = shaded(x, y, samples[at + DEPTH], texture.rod_count, texture.rods, light)
-                share, gloss = share * left_over, gloss * left_over
+            if ti.static(code.relief):
+                length = 1.0 / ti.max(ti.sqrt(n_x * n_x + n_y * n_y + n_z * n_z), 1e-30)
+                n_x, n_y, n_z = n_x * length, n_y * length, n_z * length
+                # Where the picture rises the normal leans back.
+                a_x, a_y, a_z = numbers[ACROSS], numbers[ACROSS + 1], numbers[ACROSS + 2]
+                b_x, b_y, b_z = numbers[UP], numbers[UP + 1], numbers[UP + 2]
+                slope_x, slope_y = rise_x * numbers[SLOPE_X], rise_y * numbers[SLOPE_Y]
+                along = slope_x * (a_x * n_x + a_y * n_y + a_z * n_z) + slope_y * (b_x * n_x + b_y * n_y + b_z * n_z)
+                n_x = n_x * (along + 1.0) - slope_x * a_x - slope_y * b_x
+                n_y = n_y * (along + 1.0) - slope_x * a_y - slope_y * b_y
+                n_z = n_z * (along + 1.0) - slope_x * a_z - slope_y * b_z
+            depth = samples[at + DEPTH]
+            share, gloss = tissue(x, y, depth, n_x, n_y, n_z, texture.rod_count, numbers)
             red = ti.min(red * share + gloss, 255.0)
             green = ti.min(green * share + gloss, 255.0)
             blue = ti.min(blue * share + gloss, 255.0)
@@ -221,18 +211,14 @@ def shading(code: Code) -> Callable[..., Any]:
                 m_x = samples[at + ti.static(code.layout["normal_x"])]
                 m_y = samples[at + ti.static(code.layout["normal_y"])]
                 m_z = samples[at + ti.static(code.layout["normal_z"])]
-                m_x, m_y, m_z, l_x, l_y, l_z, v_x, v_y, v_z, nearness = rays(
-                    x, y, samples[at + DEPTH], m_x, m_y, m_z, light
-                )
-                ray = ti.static(Ray(m_x, m_y, m_z, l_x, l_y, l_z, v_x, v_y, v_z, nearness))
-                metal_red, metal_green, metal_blue = metal(ray)
+                metal_red, metal_green, metal_blue = metal(x, y, samples[at + DEPTH], m_x, m_y, m_z, numbers)
                 red = ti.select(is_metal, metal_red, red)
                 green = ti.select(is_metal, metal_green, green)
                 blue = ti.select(is_metal, metal_blue, blue)
         return (
-            ti.select(seen, red, floats(texture.background[0])),
-            ti.select(seen, green, floats(texture.background[1])),
-            ti.select(seen, blue, floats(texture.background[2])),
+            ti.select(seen, red, floats(numbers[BACKGROUND + 0])),
+            ti.select(seen, green, floats(numbers[BACKGROUND + 1])),
+            ti.select(seen, blue, floats(numbers[BACKGROUND + 2])),
         )
 
     return shade
@@ -296,12 +282,12 @@ def resolving(code: Code) -> Callable[..., Any]:
                 if row + line < end_row and left + n < width:
                     pixel = (row + line) * width + left + n
                     lane = ti.static(line * tile_width + n)
-                    out.coordinates[2 * pixel] = across[lane]
-                    out.coordinates[2 * pixel + 1] = down[lane]
-                    out.depth[pixel] = depth[lane]
+                    out.labels[2 * pixel] = across[lane]
+                    out.labels[2 * pixel + 1] = down[lane]
+                    out.labels[2 * out.pixels + pixel] = depth[lane]
                     if ti.static(code.instruments):
                         mark = samples[at + ti.static(code.layout["instrument"])][lane]
-                        out.instrument[pixel] = ti.cast(mark * 255.0, ti.u8)
+                        out.labels[3 * out.pixels + pixel] = mark * 255.0
 
     @ti.func
     def resolve(

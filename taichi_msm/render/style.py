@@ -5,12 +5,15 @@ WIRE_COLOUR = (235, 245, 255)
 WIRE_WIDTH = 1.0
 WIRE_OPACITY = 0.75
 
+# Up to so many texels wide, a sample of tissue shows the texture as it is.
+SHARP = 1.1
+
 # Where the light is, to the right of the eye and above it, by the distance to what is looked at.
 LIGHT_RIGHT, LIGHT_UP = -0.3, 0.0
 
-# How far around the surface light wraps, and how narrow highlights are: (N H)^(2^SHARPNESS).
+# How far around the surface light wraps, and how narrow highlights are: (M V)^(2^SHARPNESS).
 WRAP = 0.3
-SHARPNESS = 5
+SHARPNESS = 3
 
 # Share of the light that an instrument keeps from the tissue that it touches.
 SHADE = 0.7

@@ -14,9 +14,8 @@ from numpy.typing import NDArray
 
 from taichi_msm.render.camera import View
 from taichi_msm.render.instrument import Rod
-from taichi_msm.render.instrument_coverage import rod_numbers
 from taichi_msm.render.labels import Sight
-from taichi_msm.render.lighting import light_numbers
+from taichi_msm.render.numbers import view_numbers
 from taichi_msm.render.tracking_kernel import CELL_NUMBERS, POINT_NUMBERS, count, fill, project, search
 from taichi_msm.scene import Scene
 from taichi_msm.system.runtime import our_compilation
@@ -50,12 +49,13 @@ def find(
         moved: whether points are those at the centres of all pixels, one row after another, and `pixels` is to
             tell how far they are from these.
     """
-    (rows, cols), (width, height), parts = scene.sheet.points, scene.render.size, scene.render.refine + 1
+    (rows, cols), (width, height) = scene.sheet.points, scene.render.size
+    numbers = view_numbers(view, scene.render, 1, scene.sheet.size, (1, 1), rods)
     cells = (rows - 1) * (cols - 1)
     point, cell = np.empty(rows * cols * POINT_NUMBERS), np.empty(cells * CELL_NUMBERS)
     bin_size = max(SMALLEST_BIN, round((width * height / cells) ** 0.5))
     with our_compilation(optimised=False):
-        project(np.ascontiguousarray(position, np.float64), view.matrix, view.near, rows, cols, point, cell)
+        project(np.ascontiguousarray(position, np.float64), numbers, rows, cols, point, cell)
         while True:
             across, down = -(-width // bin_size), -(-height // bin_size)
             ends = np.zeros(across * down + 1, np.int32)
@@ -75,8 +75,6 @@ def find(
             cell,
             rows,
             cols,
-            float(parts),
-            view.near,
             width,
             height,
             bin_size,
@@ -84,8 +82,7 @@ def find(
             starts.astype(np.int32),
             entries,
             TOUCHING * max(scene.sheet.size),
-            light_numbers(view, scene.render.light, 1, scene.sheet.size, (1, 1)),
-            rod_numbers(rods, view, 1),
+            numbers,
             len(rods),
             pixels.ravel(),
             hidden,

@@ -5,7 +5,7 @@
 import math
 
 from taichi_msm.render.instrument_coverage import meet
-from taichi_msm.render.lighting import PINHOLE
+from taichi_msm.render.numbers import MATRIX, NEAR, PARTS, PINHOLE
 from taichi_msm.render.patch import Plane, edge, on_triangle, small_quad, turn
 from taichi_msm.system.runtime import ti
 
@@ -23,8 +23,7 @@ vec4 = ti.types.vector(4, ti.f64)
 @ti.kernel
 def project(
     position: ti.types.ndarray(dtype=ti.f64, ndim=3),
-    matrix: ti.types.ndarray(dtype=ti.f64, ndim=2),
-    near: ti.f64,
+    numbers: ti.types.ndarray(dtype=ti.f64, ndim=1),
     rows: ti.i32,
     cols: ti.i32,
     point: ti.types.ndarray(dtype=ti.f64, ndim=1),
@@ -34,14 +33,16 @@ def project(
     for index in range(rows * cols):
         i, j, here = index // cols, index % cols, index * POINT_NUMBERS
         for n in ti.static(range(4)):
-            value = matrix[n, 3]
+            row = MATRIX + 4 * n
+            value = numbers[row + 3]
             for axis in ti.static(range(3)):
-                value += matrix[n, axis] * position[i, j, axis]
+                value += numbers[row + axis] * position[i, j, axis]
             point[here + n] = value
         point[here + SEEN] = point[here] / point[here + 2]
         point[here + SEEN + 1] = point[here + 1] / point[here + 2]
 
     for index in range((rows - 1) * (cols - 1)):
+        near = numbers[NEAR]
         a = (index // (cols - 1) * cols + index % (cols - 1)) * POINT_NUMBERS
         b, c = a + POINT_NUMBERS, a + cols * POINT_NUMBERS
         d = c + POINT_NUMBERS
@@ -231,8 +232,6 @@ def search(
     cell: ti.types.ndarray(dtype=ti.f64, ndim=1),
     rows: ti.i32,
     cols: ti.i32,
-    parts: ti.f64,
-    near: ti.f64,
     width: ti.i32,
     height: ti.i32,
     bin_size: ti.i32,
@@ -240,14 +239,14 @@ def search(
     starts: ti.types.ndarray(dtype=ti.i32, ndim=1),
     entries: ti.types.ndarray(dtype=ti.i32, ndim=1),
     touching: ti.f64,
-    light: ti.types.ndarray(dtype=ti.f64, ndim=1),
-    rods: ti.types.ndarray(dtype=ti.f64, ndim=2),
+    numbers: ti.types.ndarray(dtype=ti.f64, ndim=1),
     rod_count: ti.i32,
     pixels: ti.types.ndarray(dtype=ti.f32, ndim=1),
     hidden: ti.types.ndarray(dtype=ti.u8, ndim=1),
 ):
     """Find points, of which `row` fill a row of pixels; 0: they are no pixels."""
     for k in range(count):
+        near, parts = numbers[NEAR], numbers[PARTS]
         u, v = coordinates[2 * k], coordinates[2 * k + 1]
         x, y, out_of_sight = ti.cast(NOWHERE, ti.f64), ti.cast(NOWHERE, ti.f64), False
         if abs(u) < 2.0:  # no NaN
@@ -276,8 +275,8 @@ def search(
                                 x, y, depth, entries[n], own, own_triangle, cols, parts, near, point, cell
                             )
                     for n in range(rod_count):
-                        met, _, _, _ = meet(x, y, n, rods, light)
-                        if met < depth and met * light[PINHOLE] + (1.0 - light[PINHOLE]) > near:
+                        met, _, _, _ = meet(x, y, n, numbers)
+                        if met < depth and met * numbers[PINHOLE] + (1.0 - numbers[PINHOLE]) > near:
                             out_of_sight = True
         if row > 0:
             x -= ti.cast(k % row, ti.f64) + 0.5
