@@ -81,9 +81,7 @@ def flow_between(before: Labels, sight: Sight) -> Flow:
         sight: how far what its pixels show has moved, and what is hidden.
     """
     shape = before.depth.shape
-    nowhere = np.isnan(sight.pixels[:, :1])
-    flow = np.where(nowhere, np.float32(NO_FLOW), sight.pixels).reshape(*shape, 2)
-    return Flow(flow, sight.hidden.reshape(shape).view(np.uint8) * np.uint8(255))
+    return Flow(sight.pixels.reshape(*shape, 2), sight.hidden.reshape(shape).view(np.uint8) * np.uint8(255))
 
 
 # What the Middlebury format has where there is no flow.

@@ -16,7 +16,7 @@ from taichi_msm.render.camera import View
 from taichi_msm.render.instrument import Rod
 from taichi_msm.render.labels import Sight
 from taichi_msm.render.numbers import view_numbers
-from taichi_msm.render.tracking_kernel import CELL_NUMBERS, POINT_NUMBERS, count, fill, project, search
+from taichi_msm.render.tracking_kernel import CELL_NUMBERS, POINT_NUMBERS, count, fill, judge, project, search
 from taichi_msm.scene import Scene
 from taichi_msm.system.runtime import our_compilation
 
@@ -47,13 +47,14 @@ def find(
         view: the camera.
         rods: the instruments.
         moved: whether points are those at the centres of all pixels, one row after another, and `pixels` is to
-            tell how far they are from these.
+            tell how far they are from these; NO_FLOW where they are nowhere.
     """
     (rows, cols), (width, height) = scene.sheet.points, scene.render.size
     numbers = view_numbers(view, scene.render, 1, scene.sheet.size, (1, 1), rods)
     cells = (rows - 1) * (cols - 1)
     point, cell = np.empty(rows * cols * POINT_NUMBERS), np.empty(cells * CELL_NUMBERS)
-    bin_size = max(SMALLEST_BIN, round((width * height / cells) ** 0.5))
+    # Half as wide as a cell, most bins have cells around one mass point only.
+    bin_size = max(SMALLEST_BIN, round((width * height / cells) ** 0.5 / 2))
     with our_compilation(optimised=False):
         project(np.ascontiguousarray(position, np.float64), numbers, rows, cols, point, cell)
         while True:
@@ -66,6 +67,8 @@ def find(
             bin_size *= 2
         entries = np.empty(max(1, starts[-1]), np.int32)
         fill(cell, cells, bin_size, across, down, starts[:-1].astype(np.int32), entries)
+        first, simple = starts.astype(np.int32), np.empty(across * down, np.uint8)
+        judge(cell, cols, across * down, first, entries, simple)
         pixels, hidden = np.empty((len(coordinates), 2), np.float32), np.empty(len(coordinates), np.uint8)
         search(
             np.ascontiguousarray(coordinates, np.float32).ravel(),
@@ -79,8 +82,9 @@ def find(
             height,
             bin_size,
             across,
-            starts.astype(np.int32),
+            first,
             entries,
+            simple,
             TOUCHING * max(scene.sheet.size),
             numbers,
             len(rods),

@@ -5,14 +5,16 @@
 import math
 
 from taichi_msm.render.instrument_coverage import meet
-from taichi_msm.render.numbers import MATRIX, NEAR, PARTS, PINHOLE
+from taichi_msm.render.labels import NO_FLOW
+from taichi_msm.render.numbers import BOTTOM, LEFT, MATRIX, NEAR, PARTS, PINHOLE, RIGHT, ROD_NUMBERS, RODS, TOP
 from taichi_msm.render.patch import Plane, edge, on_triangle, small_quad, turn
+from taichi_msm.render.samples import INFINITY
 from taichi_msm.system.runtime import ti
 
 # Numbers of a mass point: (X, Y, w, depth), its place in the picture; and of a cell: its bounds there, its least depth,
 # and 1 or -1 where it is drawn as a whole and its front or its back is seen, else 0.
 SEEN, POINT_NUMBERS = 4, 6
-LEFT, TOP, RIGHT, BOTTOM, NEAREST, SIDE, CELL_NUMBERS = range(7)
+MIN_X, MIN_Y, MAX_X, MAX_Y, NEAREST, SIDE, CELL_NUMBERS = range(7)
 
 # Where a point is seen that is not.
 NOWHERE = math.nan
@@ -55,25 +57,25 @@ def project(
         least, most = ti.min(abd, bdc, dca, cab), ti.max(abd, bdc, dca, cab)
         cell[here + SIDE] = ti.select(least > 0, 1.0, ti.select(most < 0, -1.0, 0.0))
         if point[a + 2] > near and point[b + 2] > near and point[c + 2] > near and point[d + 2] > near:
-            cell[here + LEFT], cell[here + RIGHT] = ti.min(a_x, b_x, c_x, d_x), ti.max(a_x, b_x, c_x, d_x)
-            cell[here + TOP], cell[here + BOTTOM] = ti.min(a_y, b_y, c_y, d_y), ti.max(a_y, b_y, c_y, d_y)
+            cell[here + MIN_X], cell[here + MAX_X] = ti.min(a_x, b_x, c_x, d_x), ti.max(a_x, b_x, c_x, d_x)
+            cell[here + MIN_Y], cell[here + MAX_Y] = ti.min(a_y, b_y, c_y, d_y), ti.max(a_y, b_y, c_y, d_y)
         elif point[a + 2] <= near and point[b + 2] <= near and point[c + 2] <= near and point[d + 2] <= near:
-            cell[here + LEFT], cell[here + RIGHT] = 1.0, -1.0
-            cell[here + TOP], cell[here + BOTTOM] = 1.0, -1.0
+            cell[here + MIN_X], cell[here + MAX_X] = 1.0, -1.0
+            cell[here + MIN_Y], cell[here + MAX_Y] = 1.0, -1.0
         else:
             cell[here + SIDE] = 0.0
-            cell[here + LEFT], cell[here + RIGHT] = -1e9, 1e9
-            cell[here + TOP], cell[here + BOTTOM] = -1e9, 1e9
+            cell[here + MIN_X], cell[here + MAX_X] = -1e9, 1e9
+            cell[here + MIN_Y], cell[here + MAX_Y] = -1e9, 1e9
 
 
 @ti.func
 def _bins(here, bin_size, across, down, cell: ti.template()):
     """Give the bins that a cell reaches: first and end of their columns, first and end of their rows."""
     size = ti.cast(bin_size, ti.f64)
-    left = ti.cast(ti.floor(ti.math.clamp(cell[here + LEFT] / size, 0.0, 1e6)), ti.i32)
-    right = ti.cast(ti.floor(ti.math.clamp(cell[here + RIGHT] / size, -1.0, 1e6)), ti.i32) + 1
-    top = ti.cast(ti.floor(ti.math.clamp(cell[here + TOP] / size, 0.0, 1e6)), ti.i32)
-    bottom = ti.cast(ti.floor(ti.math.clamp(cell[here + BOTTOM] / size, -1.0, 1e6)), ti.i32) + 1
+    left = ti.cast(ti.floor(ti.math.clamp(cell[here + MIN_X] / size, 0.0, 1e6)), ti.i32)
+    right = ti.cast(ti.floor(ti.math.clamp(cell[here + MAX_X] / size, -1.0, 1e6)), ti.i32) + 1
+    top = ti.cast(ti.floor(ti.math.clamp(cell[here + MIN_Y] / size, 0.0, 1e6)), ti.i32)
+    bottom = ti.cast(ti.floor(ti.math.clamp(cell[here + MAX_Y] / size, -1.0, 1e6)), ti.i32) + 1
     return left, ti.min(right, across), top, ti.min(bottom, down)
 
 
@@ -113,6 +115,39 @@ def fill(
             for column in range(left, right):
                 entries[ends[row * across + column]] = index
                 ends[row * across + column] += 1
+
+
+@ti.kernel
+def judge(
+    cell: ti.types.ndarray(dtype=ti.f64, ndim=1),
+    cols: ti.i32,
+    bins: ti.i32,
+    starts: ti.types.ndarray(dtype=ti.i32, ndim=1),
+    entries: ti.types.ndarray(dtype=ti.i32, ndim=1),
+    simple: ti.types.ndarray(dtype=ti.u8, ndim=1),
+):
+    """Tell of every bin whether no place in it shows two of its cells.
+
+    That is so where they are among four cells around a mass point that are all drawn as a whole, from the same side:
+    each is convex, so it lies between the two sides that leave the point, and the angles between these are parts of 360
+    degrees.
+    """
+    for square in range(bins):
+        first_i, last_i, first_j, last_j = 1 << 30, -1, 1 << 30, -1
+        for n in range(starts[square], starts[square + 1]):
+            i, j = entries[n] // (cols - 1), entries[n] % (cols - 1)
+            first_i, last_i = ti.min(first_i, i), ti.max(last_i, i)
+            first_j, last_j = ti.min(first_j, j), ti.max(last_j, j)
+        around_a_point = last_i - first_i <= 1 and last_j - first_j <= 1
+        if around_a_point:
+            sides, count = 0.0, 0.0
+            # All four, also those that do not reach the bin.
+            for i in range(first_i, last_i + 1):
+                for j in range(first_j, last_j + 1):
+                    sides += cell[(i * (cols - 1) + j) * CELL_NUMBERS + SIDE]
+                    count += 1.0
+            around_a_point = abs(sides) == count
+        simple[square] = ti.cast(around_a_point, ti.u8)
 
 
 @ti.func
@@ -188,10 +223,10 @@ def _hides(x, y, depth, index, own, own_triangle, cols, parts, near, point: ti.t
     possible = cell[here + NEAREST] < depth and not (index == own and side != 0.0)
     if (
         possible
-        and x >= cell[here + LEFT]
-        and x <= cell[here + RIGHT]
-        and y >= cell[here + TOP]
-        and y <= cell[here + BOTTOM]
+        and x >= cell[here + MIN_X]
+        and x <= cell[here + MAX_X]
+        and y >= cell[here + MIN_Y]
+        and y <= cell[here + MAX_Y]
     ):
         a, b, c, d = _corners(index, cols, point)
         if side != 0.0:
@@ -238,13 +273,14 @@ def search(
     across: ti.i32,
     starts: ti.types.ndarray(dtype=ti.i32, ndim=1),
     entries: ti.types.ndarray(dtype=ti.i32, ndim=1),
+    simple: ti.types.ndarray(dtype=ti.u8, ndim=1),
     touching: ti.f64,
     numbers: ti.types.ndarray(dtype=ti.f64, ndim=1),
     rod_count: ti.i32,
     pixels: ti.types.ndarray(dtype=ti.f32, ndim=1),
     hidden: ti.types.ndarray(dtype=ti.u8, ndim=1),
 ):
-    """Find points, of which `row` fill a row of pixels; 0: they are no pixels."""
+    """Find points; where `row` of them fill a row of pixels, tell how far they are from the centres of these."""
     for k in range(count):
         near, parts = numbers[NEAR], numbers[PARTS]
         u, v = coordinates[2 * k], coordinates[2 * k + 1]
@@ -269,18 +305,23 @@ def search(
                     out_of_sight = False
                     depth = p[3] - touching
                     square = ti.cast(y, ti.i32) // bin_size * across + ti.cast(x, ti.i32) // bin_size
-                    for n in range(starts[square], starts[square + 1]):
-                        if not out_of_sight:
-                            out_of_sight = _hides(
-                                x, y, depth, entries[n], own, own_triangle, cols, parts, near, point, cell
-                            )
+                    if simple[square] == 0:
+                        for n in range(starts[square], starts[square + 1]):
+                            if not out_of_sight:
+                                out_of_sight = _hides(
+                                    x, y, depth, entries[n], own, own_triangle, cols, parts, near, point, cell
+                                )
                     for n in range(rod_count):
-                        met, _, _, _ = meet(x, y, n, numbers)
-                        if met < depth and met * numbers[PINHOLE] + (1.0 - numbers[PINHOLE]) > near:
-                            out_of_sight = True
+                        rod = RODS + n * ROD_NUMBERS
+                        across_it = x >= numbers[rod + LEFT] and x <= numbers[rod + RIGHT]
+                        if across_it and y >= numbers[rod + TOP] and y <= numbers[rod + BOTTOM]:
+                            met, _, _, _ = meet(x, y, n, numbers)
+                            if met < depth and met * numbers[PINHOLE] + (1.0 - numbers[PINHOLE]) > near:
+                                out_of_sight = True
         if row > 0:
-            x -= ti.cast(k % row, ti.f64) + 0.5
-            y -= ti.cast(k // row, ti.f64) + 0.5
+            seen = x > -INFINITY  # no NaN
+            x = ti.select(seen, x - ti.cast(k % row, ti.f64) - 0.5, NO_FLOW)
+            y = ti.select(seen, y - ti.cast(k // row, ti.f64) - 0.5, NO_FLOW)
         pixels[2 * k] = ti.cast(x, ti.f32)
         pixels[2 * k + 1] = ti.cast(y, ti.f32)
         hidden[k] = ti.cast(out_of_sight, ti.u8)
