@@ -8,7 +8,7 @@ from importlib import metadata
 from pathlib import Path
 from typing import Any
 
-from benchmarks import bounds, native, terms, whole_run
+from benchmarks import bounds, looks, native, terms, whole_run
 from benchmarks.drawing.measure import WANTED
 from benchmarks.parts import NARROW, PIXELS, READY, REFINE
 from benchmarks.process import ROOT
@@ -77,6 +77,8 @@ def tables(results: Results) -> dict[str, str]:
         "flat_table": ("drawing", lambda: drawing_table(results["drawing"]["flat"])),
         "whole_run_table": ("whole_run", lambda: whole_run_table(results["whole_run"])),
         "terms_table": ("terms", lambda: terms_table(results["terms"])),
+        "looks_table": ("looks", lambda: looks_table(results["looks"]["pictures"])),
+        "rates_table": ("looks", lambda: rates_table(results["looks"]["rates"])),
         "size_table": ("size", lambda: size_table(results["size"])),
         "threads_table": ("threads", lambda: threads_table(results["threads"])),
         "machine_table": ("bounds", lambda: machine_table(results["bounds"])),
@@ -238,6 +240,25 @@ def terms_table(measured: dict[str, dict[str, list[float]]]) -> str:
         for name in names
     ]
     return table(["a step", *medians], rows)
+
+
+def looks_table(measured: dict[str, dict[str, list[float]]]) -> str:
+    """Show the time of a picture of every kind, and how many times that of one with the headlight it is."""
+    medians = {size: {name: Timing.of(times).median for name, times in own.items()} for size, own in measured.items()}
+    names = next(iter(medians.values()))
+    rows = [
+        [name, *(f"{duration(own[name])} ({own[name] / own[looks.HEADLIGHT]:.2f})" for own in medians.values())]
+        for name in names
+    ]
+    return table(["a picture", *(f"{size} × {size}" for size in medians)], rows)
+
+
+def rates_table(measured: dict[str, list[float]]) -> str:
+    """Show how many frames a second runs write."""
+    return table(
+        ["512 × 512 pixels", "frames a second"],
+        [[name, f"{Timing.of(rates).median:.0f}"] for name, rates in measured.items()],
+    )
 
 
 def size_table(measured: dict[str, list[Entry]]) -> str:

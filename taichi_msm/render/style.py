@@ -5,8 +5,8 @@ WIRE_COLOUR = (235, 245, 255)
 WIRE_WIDTH = 1.0
 WIRE_OPACITY = 0.75
 
-# Up to so many texels wide, a sample of tissue shows the texture as it is.
-SHARP = 1.1
+# Up to so many texels wide, a sample of tissue shows the texture as it is: the filter is two texels wide.
+SHARP = 1.5
 
 # Where the light is, to the right of the eye and above it, by the distance to what is looked at.
 LIGHT_RIGHT, LIGHT_UP = -0.3, 0.0

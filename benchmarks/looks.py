@@ -1,0 +1,112 @@
+"""What a picture costs with every shading, with an instrument, and with labels; all in turn in one process.
+
+And how many frames a second a run writes with labels, from the first step to the last file.
+"""
+
+from __future__ import annotations
+
+import json
+import tempfile
+import time
+from collections.abc import Callable
+from typing import Any
+
+from benchmarks.drawing.problem import Problem
+from benchmarks.process import call
+from benchmarks.race import Progress
+from benchmarks.whole_run import SCENE, command
+from taichi_msm.render.camera import view
+from taichi_msm.render.instrument import rods
+from taichi_msm.render.rasterizer import Drawing, structure
+from taichi_msm.render.tracking import find
+from taichi_msm.scene import PIXEL_LABELS, Scene
+from taichi_msm.system import runtime
+from taichi_msm.system.resources import available_threads
+
+PIXELS = (512, 1024)
+REFINE = 10
+
+# What others are compared with.
+HEADLIGHT = "headlight"
+
+# Pictures of every kind in a round.
+PICTURES = 8
+
+INSTRUMENT = {"radius": 0.012, "shaft": [0.5, -0.6, 0.9], "length": 0.3}
+
+# What is written of a run, and the scene's keys for it; its own steps are of no interest here.
+OUTPUTS = {
+    "frames": ("png",),
+    "labels": (*PIXEL_LABELS, "tracks"),
+    "frames and labels": ("png", *PIXEL_LABELS, "tracks"),
+}
+SETTINGS = ("sheet.points=[31,31]", "time.duration=6")
+
+Samples = dict[str, list[float]]
+
+
+def variants(problem: Problem) -> dict[str, Callable[[], Any]]:
+    """Make what is timed, each a call."""
+    position, camera = problem.position, view(problem.scene)
+
+    def scene(shading: str, **changes: Any) -> Scene:
+        render = problem.scene.render.model_copy(update={"shading": shading, **changes})
+        return problem.scene.model_copy(update={"render": render})
+
+    def picture(made: Scene, *, picture: bool = True, labels: bool = False) -> Callable[[], Any]:
+        drawing = Drawing(made, problem.texture, structure(made, picture=picture, labels=labels))
+        return lambda: drawing.look(position, None, rods(made, position, 0.2))
+
+    held = problem.scene.probes[0].model_copy(update={"instrument": INSTRUMENT})
+    plain, tissue = scene(HEADLIGHT), scene("tissue")
+    seen = picture(plain, picture=False, labels=True)().labels.coordinates.reshape(-1, 2)
+    return {
+        HEADLIGHT: picture(plain),
+        "none": picture(scene("none")),
+        "tissue": picture(tissue),
+        "tissue, relief": picture(scene("tissue", light={"relief": -0.2})),
+        "tissue, instrument": picture(tissue.model_copy(update={"probes": [held]})),
+        "headlight and labels": picture(plain, labels=True),
+        "labels alone": picture(plain, picture=False, labels=True),
+        "flow and occlusion": lambda: find(plain, seen, problem.rest, camera, moved=True),
+    }
+
+
+def cost(pixels: int, rounds: int) -> Samples:
+    """Time every variant [s], in turn."""
+    runtime.start("cpu", available_threads())
+    timed = variants(Problem(pixels, REFINE, lit=True))
+    samples: Samples = {name: [] for name in timed}
+    for _ in range(1 + rounds):
+        for name, draw in timed.items():
+            start = time.perf_counter()
+            for _ in range(PICTURES):
+                draw()
+            samples[name].append((time.perf_counter() - start) / PICTURES)
+    # In the first round kernels are compiled.
+    return {name: times[1:] for name, times in samples.items()}
+
+
+def rates(rounds: int) -> Samples:
+    """Tell how many frames a second runs write, after compilation."""
+    found: Samples = {name: [] for name in OUTPUTS}
+    settings = [word for setting in SETTINGS for word in ("--set", setting)]
+    with tempfile.TemporaryDirectory() as folder:
+        for _ in range(rounds):
+            for name, output in OUTPUTS.items():
+                words = [*settings, "--set", f"output=[{','.join(output)}]", "--no-estimate"]
+                _, text = command("run", SCENE, "--json", "--out", f"{folder}/out", *words, cache=f"{folder}/cache")
+                record = json.loads(text)
+                times = record["timings"]
+                found[name].append(record["frames"] / (times["total"] - times["startup"] - times["compile"]))
+    return found
+
+
+def measure(rounds: int, progress: Progress) -> dict[str, Any]:
+    """Time pictures of every size, and runs."""
+    pictures = {}
+    for pixels in PIXELS:
+        progress(f"{pixels} px")
+        pictures[str(pixels)] = call("benchmarks.looks:cost", pixels=pixels, rounds=8 * rounds)
+    progress("runs")
+    return {"pictures": pictures, "rates": rates(rounds)}
