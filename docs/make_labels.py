@@ -126,9 +126,10 @@ def main() -> None:
     page(panels).save(PICTURE, quality=92)
     said = (
         f"The panels show it: frame {FRAME} of `{SCENE}.yaml` and the next, drawn without light at {SIZE} × {SIZE}\n"
-        f"pixels of {SAMPLES} × {SAMPLES} samples, differ by {before:.2f} grey levels on average where the next one shows\n"
-        f"the same; fetched from where flow leads, by {after:.2f}, which is what filtering leaves. In lit frames more\n"
-        "is left, as highlights do not move with the tissue. (`docs/make_labels.py` makes the picture and these lines.)\n"
+        f"pixels of {SAMPLES} × {SAMPLES} samples, differ by {before:.2f} grey levels on average where the next one\n"
+        f"shows the same; fetched from where flow leads, by {after:.2f}, which is what filtering leaves. In lit\n"
+        "frames more is left, as highlights do not move with the tissue. (`docs/make_labels.py` makes the picture\n"
+        "and these lines.)\n"
     )
     begin, rest = README.read_text(encoding="utf-8").split(START)
     README.write_text(begin + START + said + END + rest.split(END)[1], encoding="utf-8")

@@ -526,3 +526,12 @@ def test_numbers_have_three_digits() -> None:
 def test_a_spread_is_in_the_unit_of_its_median() -> None:
     assert timing(Timing(0.0011, 0.0009, 0.012, 5)) == "1.10 ms (0.900 to 12.0)"
     assert timing(Timing(0.0011, 0.0011, 0.0011, 1)) == "1.10 ms (once)"
+
+
+def test_of_steppings_that_are_as_fast_the_least_wrong_is_recommended() -> None:
+    quick = replace(realistic().stepping[0], error=9e-4, seconds=spread(0.030), damping_difference="backward")
+    exact = replace(quick, error=1e-6, seconds=spread(0.0325), damping_difference="central")
+    found = replace(realistic(), stepping=[quick, exact])
+    assert found.best_stepping == exact
+    slower = replace(exact, seconds=spread(0.0335))
+    assert replace(found, stepping=[quick, slower]).best_stepping == quick, "more than a tenth is not the clock's"

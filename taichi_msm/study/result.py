@@ -10,6 +10,9 @@ from typing import Any
 # A picture is refined enough if no other one of the same supersampling has a PSNR higher by more than this [dB].
 REFINED_ENOUGH = 0.1
 
+# A stepping that takes up to this many times the time of the fastest one is as fast: so much the clock is off.
+AS_FAST = 1.1
+
 
 @dataclass(frozen=True)
 class Timing:
@@ -190,13 +193,15 @@ class Study:
 
     @property
     def best_stepping(self) -> Stepping | None:
-        """Find the fastest stepping within the tolerance; None if there is none.
+        """Find the fastest stepping within the tolerance, or one that is as fast and less wrong; None if there is none.
 
         Of every method only its largest step counts, so that noise of the clock cannot prefer a smaller one.
         """
         good = [one for one in self.stepping if one.error is not None and one.error <= self.tolerance]
         largest = {one.method: one for one in sorted(good, key=lambda one: one.step)}
-        return min(largest.values(), key=lambda one: one.seconds.median, default=None)
+        fastest = min((one.seconds.median for one in largest.values()), default=0.0)
+        alike = [one for one in largest.values() if one.seconds.median <= AS_FAST * fastest]
+        return min(alike, key=lambda one: one.error or 0.0, default=None)
 
     @property
     def best_drawing(self) -> Drawn | None:
