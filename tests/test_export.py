@@ -14,6 +14,7 @@ from taichi_msm import cli, console
 from taichi_msm.errors import FilesError, ForeignError
 from taichi_msm.export.convert import convert
 from taichi_msm.export.formats import FORMATS
+from taichi_msm.export.staging import staging
 from tests.conftest import Program
 from tests.outputs import files
 
@@ -120,11 +121,56 @@ def test_a_new_export_takes_the_place_of_the_earlier_one(results: Path) -> None:
     names = exported(results, out)
     whole = files(out)
     (out / ".partial-x1").mkdir()
-    for stale in ("0099.obj", "0001.obj", ".partial-x1/0000.obj"):
-        (out / stale).write_text("of an earlier export")
-    assert exported(results, out) == names == sorted(whole)
+    stale = ["0099.obj", "0001.obj"]
+    for name in (*stale, ".partial-x1/0000.obj"):
+        (out / name).write_text("of an earlier export")
+    (out / "export.json").write_text(json.dumps({"files": stale + names}))
+    assert exported(results, out) == names == sorted(set(whole) - {"export.json"})
     assert files(out) == whole
     assert not (out / ".partial-x1").exists()
+
+
+def test_a_file_that_is_named_like_ours_is_not_touched(results: Path) -> None:
+    out = results / "here"
+    out.mkdir()
+    for name in ("picture.png", "0000.obj"):
+        (out / name).write_text("mine")
+        with pytest.raises(ForeignError, match=rf"^{out}/{name}: a file that no run has put there"):
+            exported(results, out)
+        assert files(out) == {name: b"mine"}
+        (out / name).unlink()
+
+
+def test_two_exports_do_not_write_into_one_folder(results: Path) -> None:
+    out = results / "here"
+    exported(results, out)
+    before = files(out)
+    with (
+        staging(out, {r".*": None}) as staged,
+        pytest.raises(FilesError, match="another export is writing there; choose another --out"),
+    ):
+        exported(results, out)
+    assert not staged.exists()
+    assert set(files(out)) == {"export.json"}, "the first one had no files"
+    assert before
+
+
+def test_an_export_that_is_killed_is_known_to_the_next_one(results: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    out = results / "here"
+    names = exported(results, out)
+    whole = files(out)
+
+    def killed(self: Path, target: Path) -> None:
+        raise SystemExit
+
+    # While it moves its files into place.
+    with monkeypatch.context() as patch:
+        patch.setattr(Path, "rename", killed)
+        with pytest.raises(SystemExit):
+            exported(results, out)
+    assert set(files(out)) == {"export.json"}
+    assert exported(results, out) == names
+    assert files(out) == whole
 
 
 def test_an_export_that_fails_leaves_the_earlier_one(results: Path) -> None:
