@@ -1,4 +1,4 @@
-"""Replace the files that an export has put into a folder by new ones: those of one export, and each of them whole."""
+"""Replace the files of an earlier export by new ones, so that the folder has the whole files of a single export."""
 
 from __future__ import annotations
 
@@ -15,14 +15,14 @@ PREFIX = ".partial-"
 
 @contextmanager
 def staging(directory: Path, files: Tree) -> Iterator[Path]:
-    """Make a folder to write the new files in; where the block ends well, they take the place of the earlier ones.
+    """Make a folder to write the new files in; if the block ends without an error, they replace the earlier ones.
 
     Args:
-        directory: where they go; made where it does not exist, and removed again where nothing comes of it.
-        files: all that may be there, by patterns of its names.
+        directory: where they go; made if it does not exist, and then removed again if the block fails.
+        files: all that may be there, as patterns of names.
 
     Raises:
-        ForeignError: when anything else is there; nothing of it is touched.
+        ForeignError: when anything else is there; nothing is touched then.
         FilesError: when the directory cannot be written.
     """
     ours = {**files, rf"\{PREFIX}.*": files}
@@ -38,5 +38,5 @@ def staging(directory: Path, files: Tree) -> Iterator[Path]:
                     entry.rename(directory / entry.name)
     finally:
         if created:
-            with suppress(OSError):  # there is something in it, or never was a directory
+            with suppress(OSError):  # it is not empty, or it was never made
                 directory.rmdir()
