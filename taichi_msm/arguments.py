@@ -1,4 +1,4 @@
-"""Checks of what a caller gives to the library."""
+"""Checks of the arguments that a caller gives to the library."""
 
 from __future__ import annotations
 
@@ -13,12 +13,12 @@ if TYPE_CHECKING:
 
 
 def as_array(values: Any, name: str) -> NDArray[Any]:
-    """Make an array of an argument.
+    """Turn an argument into an array.
 
     Raises:
-        ArgumentError: when that is impossible, as where rows differ in length.
+        ArgumentError: when that is impossible, such as for rows of different lengths.
     """
-    # Not at the top: checking a scene starts without NumPy.
+    # Imported here, so that a scene can be checked without importing NumPy.
     import numpy as np
 
     try:
@@ -38,10 +38,10 @@ def require_frame_count(frames: int) -> None:
 
 
 def require_path(directory: str | Path) -> None:
-    """Make sure that something may be the path of a directory.
+    """Make sure that an argument can be the path of a directory.
 
     Raises:
-        ArgumentError: when it may not.
+        ArgumentError: when it cannot.
     """
     if not isinstance(directory, (str, Path)) or "\0" in str(directory):
         raise ArgumentError(f"directory: {directory!r}; take a path")

@@ -1,4 +1,4 @@
-"""The command line: arguments, exit codes, printing. Nothing else prints or exits."""
+"""The command line: arguments, exit codes, printing. No other module prints or exits."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ if TYPE_CHECKING:
     from taichi_msm.console import Progress
 
 DONE, BUG, WRONG_INPUT, DIVERGED, FILES = 0, 1, 2, 3, 4
-# What may be typed beside --resume.
+# The options that may be given together with --resume.
 RESUMABLE = ("resume", "threads", "quiet", "as_json")
 
 # What results can be converted to.
@@ -37,7 +37,7 @@ FORMATS = ("kitti", "tapvid", "vtk", "gltf", "obj")
 EXIT_CODES = {"complete": DONE, "diverged": DIVERGED}
 
 scene_argument = click.argument("scene", metavar="SCENE")
-image_option = click.option("--image", metavar="FILE", help="Another picture on the scene's sheet.")
+image_option = click.option("--image", metavar="FILE", help="The picture on the sheet, instead of the scene's.")
 set_option = click.option(
     "--set",
     "overrides",
@@ -70,10 +70,10 @@ def program() -> None:
 @click.option(
     "--estimate-error/--no-estimate",
     default=None,
-    help="Estimate the error whatever it costs, or never.  [default: where it takes less than a third of the run]",
+    help="Always or never estimate the error.  [default: if that takes less than a third of the run]",
 )
-@click.option("--resume", metavar="DIR", help="Continue the unfinished run into DIR, instead of running SCENE.")
-@click.option("--quiet", is_flag=True, help="No progress and no summary.")
+@click.option("--resume", metavar="DIR", help="Continue the unfinished run in DIR, instead of running SCENE.")
+@click.option("--quiet", is_flag=True, help="Print no progress and no summary.")
 @json_option
 @click.pass_context
 def run(
@@ -209,7 +209,7 @@ def schema() -> int:
     metavar="ERROR",
     help="Largest error, as a fraction of the largest displacement.  [default: the scene's, or 1e-3]",
 )
-@click.option("--quick", is_flag=True, help="A minute instead of several: fewer and shorter measurements.")
+@click.option("--quick", is_flag=True, help="Take a minute instead of several: fewer and shorter measurements.")
 @json_option
 def study(
     scene: str,
@@ -255,7 +255,7 @@ def study(
         report("interrupted", ["interrupted; nothing was written"], as_json)
         return interruption.code
     if found.status == "interrupted" and (directory / RECORD).exists():
-        # An earlier study is not to be lost for a part of another.
+        # An earlier study is not replaced by part of a new one.
         directory = without_link(directory / "interrupted", "--out")
     outputs = write_report(found, directory)
     if as_json:
@@ -299,11 +299,11 @@ def view(
     if (record is None) != (seconds is None):
         raise click.UsageError("--record FILE.gif and --seconds N go together")
     if record is None and script is not None:
-        raise click.UsageError("--script is for --record; in the window it is your hand that presses")
+        raise click.UsageError("--script needs --record; in the window you press with the mouse")
     if seconds is not None and math.isnan(seconds):
         raise click.BadParameter("nan is not a number of seconds", param_hint="--seconds")
     if record is not None and Path(record).suffix.lower() != ".gif":
-        raise click.BadParameter(f"{record} has no name of a GIF; let it end in .gif", param_hint="--record")
+        raise click.BadParameter(f"{record} is not the name of a GIF; let it end in .gif", param_hint="--record")
     loaded = load_scene(scene, overrides, image)
     directory = result_directory(out, f"{Path(scene).stem}-live")
 
@@ -360,10 +360,10 @@ def view(
     "obj: for other programs with surfaces.",
 )
 @click.option("--out", metavar="DIR2", help="Directory for the files.  [default: DIR/export-FORMAT]")
-@click.option("--quiet", is_flag=True, help="No progress and no summary.")
+@click.option("--quiet", is_flag=True, help="Print no progress and no summary.")
 @json_option
 def export(directory: str, name: str, out: str | None, quiet: bool, as_json: bool) -> int:
-    """Convert the results of a run, in DIR, to files of other programs."""
+    """Convert the results of a run, in DIR, to the formats of other programs."""
     run = result_directory(directory, option="DIR")
     folder = without_link(run / f"export-{name}", "--out") if out is None else result_directory(out)
 
@@ -388,12 +388,12 @@ def export(directory: str, name: str, out: str | None, quiet: bool, as_json: boo
 
 
 def unfinished(context: click.Context, directory: str) -> Path:
-    """Make sure that there is a run to resume in a directory, and that no other scene or settings were typed."""
+    """Make sure that a directory has a run to resume, and that no scene and no settings were given with it."""
     for option in context.command.params:
         typed = context.get_parameter_source(str(option.name)) is click.core.ParameterSource.COMMANDLINE
         if typed and option.name not in RESUMABLE:
             name = option.opts[0] if isinstance(option, click.Option) else "SCENE"
-            raise click.UsageError(f"--resume goes on with a run as it was begun; leave out {name}")
+            raise click.UsageError(f"--resume continues a run with its own settings; leave out {name}")
     if not going_on(result_directory(directory, option="--resume")):
         raise click.BadParameter(f"there is no unfinished run in {directory}", param_hint="--resume")
     return Path(directory)
@@ -411,34 +411,34 @@ def result_directory(out: str | None, default: str = "", option: str = "--out") 
 
 
 def without_link(folder: Path, option: str) -> Path:
-    """Make sure that a folder that nobody named, as it may have come with the scene, does not lead elsewhere."""
+    """Make sure that a folder which the user did not name is no symbolic link: it may have come with the scene."""
     if folder.is_symlink():
-        raise FilesError(f"{folder}: a symbolic link; name the folder that it leads to by {option}")
+        raise FilesError(f"{folder}: a symbolic link; name the folder it leads to with {option}")
     return folder
 
 
 def going_on(directory: Path) -> str:
-    """Say how to go on with the unfinished run into a directory; nothing where there is none."""
+    """Say how to continue the unfinished run in a directory; empty if there is none."""
     from taichi_msm.results.publication import is_unfinished
 
     if not is_unfinished(directory):
         return ""
-    return f"; go on with: taichi-msm run --resume {shlex.quote(str(directory))}"
+    return f"; continue with: taichi-msm run --resume {shlex.quote(str(directory))}"
 
 
 @contextmanager
 def resumable(directory: Path) -> Iterator[None]:
-    """Say in errors how to go on with a run that has begun."""
+    """Add to errors how to continue a run that has begun."""
     try:
         yield
     except FilesError as error:
-        # What cannot be written now may be written later; what is damaged, or locked, is not helped by trying again.
+        # What cannot be written now may be written later; trying again does not help if a file is damaged or locked.
         raise FilesError(f"{error}{going_on(directory) if isinstance(error.__cause__, OSError) else ''}") from None
 
 
 @contextmanager
 def naming(scene: str) -> Iterator[None]:
-    """Name the scene in errors that are found after it was loaded."""
+    """Add the name of the scene to errors that are found after it was loaded."""
     try:
         yield
     except SceneError as error:
@@ -446,11 +446,11 @@ def naming(scene: str) -> Iterator[None]:
 
 
 def interruptible(bar: Progress, interruption: Interruption) -> Callable[[str, int, int], None]:
-    """Show the progress of some work, which an interruption then stops where it reports."""
+    """Show the progress of some work, and stop it after an interruption when it next reports its progress."""
 
     def progress(stage: str, done: int, total: int) -> None:
         bar.update(stage, done, total)
-        # Before the first stage the process may end at once; and what is being put in place is put in place.
+        # Before the first stage, the process may end at once. While results are put in place, nothing interrupts that.
         interruption.listen()
         if stage != "write":
             interruption.grant()
@@ -486,7 +486,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
             report("error", lines, "--json" in words)
         return code
     except OSError as error:
-        # Nobody reads stdout any more, or its disk is full.
+        # The reader of stdout is gone, or its disk is full.
         mute(sys.stdout)
         if not isinstance(error, BrokenPipeError):
             tell([f"taichi-msm: cannot read or write: {error.strerror or error}"])
@@ -494,7 +494,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 def _run(words: list[str]) -> tuple[int, Sequence[str]]:
-    """Run a command; gives the exit code and what is to be said of a failure."""
+    """Run a command; returns the exit code, and the message of a failure."""
     try:
         Path.cwd()
     except OSError:
@@ -502,7 +502,7 @@ def _run(words: list[str]) -> tuple[int, Sequence[str]]:
     try:
         return int(program.main(words, prog_name="taichi-msm", standalone_mode=False) or DONE), ()
     except SystemExit:
-        # How click ends where nobody reads stdout any more.
+        # This is how click ends when the reader of stdout is gone.
         raise BrokenPipeError from None
     except SceneError as error:
         return WRONG_INPUT, error.lines

@@ -1,4 +1,4 @@
-"""What a person sees of a run: progress while it works, a summary at its end."""
+"""What a person sees of a run: its progress, and a summary at the end."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ STAGES = {
     "start": "starting Taichi",
     "pilot": "pilot runs",
     "compile": "compiling the kernels",
-    "check": "checking the frames done",
+    "check": "checking the finished frames",
     "frames": "simulating and drawing",
     "diagnosis": "finding out why it diverged",
     "stepping": "measuring the stepping",
@@ -34,12 +34,12 @@ STAGES = {
 }
 
 
-# Without a terminal a line is written so often [s].
+# Time between two lines when stderr is not a terminal [s].
 LINE_EVERY = 60.0
 
 
 class Progress:
-    """Progress on stderr: a bar on a terminal, else a line a minute; or silence."""
+    """Progress on stderr: a bar on a terminal, else a line a minute; or nothing."""
 
     def __init__(self, quiet: bool) -> None:
         self._quiet = quiet
@@ -78,7 +78,7 @@ def _bar() -> Bar:
 
 
 def summary(record: Mapping[str, Any], directory: Path) -> str:
-    """Say in a few lines what a run did, how wrong it may be, and how long it took."""
+    """Say in a few lines what a run did, how large its error is, and how long it took."""
     times, (rows, cols) = record["timings"], record["points"]
     stages = ", ".join(f"{stage} {seconds:.2f}" for stage, seconds in times.items() if stage != "total")
     lines = [

@@ -1,4 +1,4 @@
-"""What can go wrong, as the user is told it. Only the command line prints these or turns them into exit codes."""
+"""The errors that the user is told of. Only the command line prints them or turns them into exit codes."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ class Problem:
 
     Attributes:
         path: the key at fault, e.g. ("probes", 0, "load").
-        message: the value, what is wrong with it and the remedy, without the key.
+        message: the value, what is wrong with it, and the remedy; without the key.
     """
 
     path: Path
@@ -36,33 +36,33 @@ class MsmError(Exception):
 
 
 class SceneError(MsmError):
-    """A scene that cannot be run; `lines` holds one line for each fault, whatever characters the user's names hold."""
+    """A scene cannot be run; `lines` holds one printable line for each fault, whatever characters the names have."""
 
     def __init__(self, lines: Sequence[str]) -> None:
-        # A value that is wrong in two ways may be told of twice.
+        # Two checks may report the same fault of a value.
         self.lines = tuple(dict.fromkeys(printable(line) for line in lines))
         super().__init__("\n".join(self.lines))
 
 
 class DeviceError(MsmError):
-    """The arch or thread count asked for cannot be had."""
+    """The requested arch or number of threads is not available."""
 
 
 class NotInstalledError(MsmError):
-    """A package that is needed only for what was asked for is not installed; the message says how to install it."""
+    """An optional package that the request needs is not installed; the message says how to install it."""
 
 
 class ArgumentError(MsmError, ValueError):
-    """An argument of a call is wrong; the message names it, its value and what it may be."""
+    """An argument of a call is wrong; the message names it, its value, and which values are allowed."""
 
 
 class DivergedError(MsmError):
-    """The simulation left every bound; the message names the time, the point and the remedy.
+    """The simulation diverged; the message names the time, the point and the remedy.
 
     Attributes:
-        step: number of steps that were taken.
-        time: simulated time then [s].
-        point: row and column of the point that is farthest from rest.
+        step: number of steps taken so far.
+        time: simulated time so far [s].
+        point: row and column of the point that is farthest from its rest position.
     """
 
     def __init__(self, message: str, step: int, time: float, point: tuple[int, int]) -> None:
@@ -80,33 +80,33 @@ class FilesError(MsmError):
 
 
 class ForeignError(FilesError):
-    """Something that no run has put there is in the way; nothing of it was touched."""
+    """Something that no run has put there is in the way; it was not touched."""
 
     @classmethod
     def at(cls, path: object, found: str) -> ForeignError:
-        """Say what was found where."""
+        """Make the error for what was found at a path."""
         return cls(f"{path}: {found} that no run has put there; move it away or choose another folder")
 
 
 class DamagedError(FilesError):
-    """What an unfinished run left cannot be used."""
+    """The files of an unfinished run cannot be used."""
 
 
 def printable(text: str) -> str:
-    """Write what would break a line, steer a terminal or be no character as its escape."""
+    """Escape line breaks, control characters for terminals, and what is not a character."""
     return "".join(c if c.isprintable() else c.encode("unicode_escape").decode() for c in text)
 
 
 @contextmanager
 def writing(place: object, option: str = "--out") -> Iterator[None]:
-    """Turn any error of the system into one line with its remedy.
+    """Turn any error of the operating system into one line with its remedy.
 
     Args:
-        place: what cannot be written then.
-        option: where another is chosen.
+        place: the path that the message says cannot be written.
+        option: the option that the message says chooses another path.
 
     Raises:
-        FilesError: in the place of an OSError.
+        FilesError: instead of an OSError.
     """
     try:
         yield

@@ -1,4 +1,4 @@
-"""Pydantic's errors of plain data, in terms of the document: each problem at its key, with what may stand there."""
+"""Translate pydantic's errors into the user's terms: each problem at its key, with the values that it may have."""
 
 from __future__ import annotations
 
@@ -14,22 +14,22 @@ from pydantic import BaseModel, ValidationError
 
 from taichi_msm.errors import Path, Problem
 
-# Beyond these sizes squares and quotients of two numbers leave floating point.
+# Beyond these limits, squares and quotients of two numbers overflow or underflow.
 LARGEST = 1e30
 SMALLEST = 1e-30
 
-# The type of the errors that validators raise: their message is for the user as it is, and their context may name the
+# The type of the errors that validators raise. Their message goes to the user as it is, and their context may name the
 # `key` (or item) below the validated value that is at fault.
 REFUSED = "refused"
 
 MAX_SHOWN = 60
 
-# Nobody reads further, and a broken file of the greatest size has tens of thousands.
+# The most faults that are reported; a broken file of the largest size can have tens of thousands.
 MAX_FAULTS = 1000
 
 
 def flow(value: Any) -> str:
-    """Show a value as it could stand in the file, cut to a line's measure."""
+    """Show a value as it could be written in the file, cut to a length that fits a line."""
     return cut(json.dumps(value, ensure_ascii=False, default=repr))
 
 
@@ -43,7 +43,7 @@ def problems(error: ValidationError, section: type[BaseModel], data: Any) -> lis
 
     Args:
         error: what pydantic found.
-        section: the model that the data was to be.
+        section: the model that the data should match.
         data: mappings and sequences.
     """
     faults = [_fault(one, section) for one in error.errors(include_url=False, include_input=False)[:MAX_FAULTS]]
@@ -60,8 +60,8 @@ class _Fault(NamedTuple):
         context: the numbers and names in the message.
         section: the section that the key belongs to.
         expects: what the key may hold.
-        choice: the nearest key above that may hold values of several kinds, if there is one.
-        branch: the one of these kinds that was tried.
+        choice: the key, or the nearest one above it, that may hold values of several kinds; None: there is none.
+        branch: the kind that was tried.
     """
 
     path: Path
@@ -75,7 +75,7 @@ class _Fault(NamedTuple):
 
 
 class _Key(NamedTuple):
-    """What `_fault` needs of a key: the section below it or its own, what it expects, if of several kinds."""
+    """What `_fault` needs to know of a key: its section or the one below it, what it expects, whether kinds differ."""
 
     section: type[BaseModel]
     expects: str
@@ -83,7 +83,7 @@ class _Key(NamedTuple):
 
 
 def _fault(error: Any, section: type[BaseModel]) -> _Fault:
-    """Follow an error's location through the models, past pydantic's names for the kinds of a value."""
+    """Follow an error's location through the models, skipping pydantic's names for the kinds of a value."""
     path: Path = ()
     expects, choice, branch = "", None, ""
     parts = iter(error["loc"])
@@ -118,9 +118,9 @@ def _sections(annotation: Any) -> Iterator[type[BaseModel]]:
 
 
 def _choose_kinds(faults: Sequence[_Fault]) -> Iterator[_Fault]:
-    """Of a key that may hold several kinds of value, report only the kind that was meant.
+    """For a key that may hold several kinds of value, report only the faults of the kind that was meant.
 
-    That is the one that got furthest into the value; if two got equally far, all of the value is at fault.
+    That is the kind whose check got furthest into the value; if two got equally far, the whole value is at fault.
     """
     reached: dict[Path | None, dict[str, int]] = defaultdict(dict)
     for fault in faults:
@@ -137,7 +137,7 @@ def _choose_kinds(faults: Sequence[_Fault]) -> Iterator[_Fault]:
 
 
 def _drop_short(faults: Iterable[_Fault]) -> Iterator[_Fault]:
-    """Report a list that lacks items as one fault, and not at all where an item of it is at fault."""
+    """Report a list that lacks items as one fault, or not at all if one of its items is at fault."""
     merged = [
         fault._replace(path=fault.path[:-1], kind="too_short")
         if fault.kind == "missing" and isinstance(fault.path[-1], int)

@@ -1,4 +1,4 @@
-"""Frames to look at in a notebook."""
+"""Show frames in a notebook."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from PIL import Image
 
 from taichi_msm.errors import ArgumentError
 
-# Small enough for a notebook to hold some hundred frames; differences from the picture are not seen.
+# The quality of JPEGs: some hundred frames fit into a notebook, and no difference from the picture is visible.
 QUALITY = 92
 
 _PAGE = Template("""\
@@ -51,7 +51,7 @@ _names = count()
 
 
 class Player:
-    """Frames with a button and a slider, shown where a notebook shows values.
+    """Frames with a button and a slider, which a notebook shows as the value of a cell.
 
     Args:
         frames: pictures of one size, shape (height, width, 3) each, at least one.
@@ -76,12 +76,12 @@ class Player:
 
 
 def source(picture: NDArray[np.uint8]) -> str:
-    """Write a picture as a URL that holds it."""
+    """Write a picture as a data URL."""
     file = io.BytesIO()
     Image.fromarray(picture).save(file, "JPEG", quality=QUALITY)
     return f"data:image/jpeg;base64,{b64encode(file.getvalue()).decode()}"
 
 
 def captioned(picture: NDArray[np.uint8], caption: str) -> str:
-    """Write HTML of a picture with a line below it."""
+    """Write the HTML of a picture with a caption below it."""
     return f'<figure><img alt="" src="{source(picture)}"><figcaption>{escape(caption)}</figcaption></figure>'

@@ -1,4 +1,4 @@
-"""Reading a picture's file, whatever is in it: its size, its pixels."""
+"""Read the size or the pixels of a picture's file, whatever is in it."""
 
 from __future__ import annotations
 
@@ -17,14 +17,14 @@ if TYPE_CHECKING:
 
 FORMATS = ("PNG", "JPEG", "WEBP", "BMP", "TIFF")
 
-# The pixels, by Pillow's names, whose colours are certain; 32-bit and floating-point greys have any range.
+# The kinds of pixels, by Pillow's names, whose colours are defined; 32-bit and floating-point greys can have any range.
 _MODES_16_BIT = ("I;16", "I;16L", "I;16B", "I;16N")
 _MODES = ("1", "L", "LA", "P", "PA", "RGB", "RGBA", "RGBa", "RGBX", "CMYK", "YCbCr", *_MODES_16_BIT)
 
 # The longest side of a picture. Pillow needs memory and time for every row, and a picture of one column has many.
 MAX_SIDE = 65535
 
-# Every scan of a JPEG goes over all pixels. Encoders make some ten; a few seconds' work may be more.
+# Every scan of a JPEG goes over all pixels. Encoders make about ten; more are allowed up to a few seconds of decoding.
 USUAL_SCANS = 16
 SCANNED_PIXELS = 2 * 10**8
 
@@ -37,9 +37,9 @@ class PictureError(Exception):
 
 
 def read_rgb(path: str, background: tuple[int, int, int]) -> Image.Image:
-    """Read a picture, upright, in 8-bit RGB; a transparent one lies on the background.
+    """Read a picture, upright, in 8-bit RGB; a transparent one is laid over the background.
 
-    Of several pictures in one file the first is taken.
+    If a file has several pictures, the first is taken.
 
     Raises:
         PictureError: when the file cannot be used.
@@ -55,8 +55,8 @@ def picture_size(path: str) -> tuple[int, int]:
     from PIL import Image
 
     with _open(path) as image:
-        # Pillow's size of a TIFF is that of the upright picture already. The base class's getexif() keeps to
-        # the header, where that of PNG would decode the picture to look behind it.
+        # For a TIFF, Pillow already gives the size of the upright picture. The base class's getexif() reads only the
+        # header; that of PNG would decode the picture to look behind it.
         if image.format != "TIFF" and Image.Image.getexif(image).get(_ORIENTATION) in _LYING:
             return image.height, image.width
         return image.size
@@ -67,25 +67,25 @@ def _open(path: str) -> Iterator[Image.Image]:
     """Open a picture for a block that decodes it.
 
     Raises:
-        PictureError: whatever Pillow raises, here or in the block; broken pictures raise many types.
+        PictureError: instead of any error of Pillow, here or in the block; broken pictures raise many types.
     """
     from PIL import Image, UnidentifiedImageError
 
     _require_file(path)
-    # What libtiff and Pillow's log say of a broken picture the error says that is raised.
+    # The output of libtiff and of Pillow's log is silenced: the error that is raised says the same.
     with silenced(2), warnings.catch_warnings():
         warnings.simplefilter("ignore")
         warnings.simplefilter("error", Image.DecompressionBombWarning)
         try:
             with Image.open(path, formats=FORMATS) as image:
                 if max(image.size) > MAX_SIDE:
-                    said = f"has {image.width} x {image.height} pixels; a side may have {MAX_SIDE}, cut it"
+                    said = f"has {image.width} x {image.height} pixels; a side may have at most {MAX_SIDE}, cut it"
                     raise PictureError(f"{path} {said}")
                 if image.format in ("JPEG", "MPO"):
                     scans = _scans(path)
                     most = max(USUAL_SCANS, SCANNED_PIXELS // (image.width * image.height))
                     if scans > most:
-                        raise PictureError(f"{path} has {scans} scans, of which {most} are allowed; save it anew")
+                        raise PictureError(f"{path} has {scans} scans, and {most} are allowed; save it again")
                 if image.mode not in _MODES:
                     raise PictureError(f"{path} has pixels of kind {image.mode}; save it as 8-bit RGB")
                 yield image
@@ -97,11 +97,11 @@ def _open(path: str) -> Iterator[Image.Image]:
             limit = (Image.MAX_IMAGE_PIXELS or 0) // 10**6
             raise PictureError(f"{path} has more than {limit} million pixels; scale it down") from None
         except Exception as error:
-            raise PictureError(f"{path} cannot be decoded ({error}); save it anew") from None
+            raise PictureError(f"{path} cannot be decoded ({error}); save it again") from None
 
 
 def _scans(path: str) -> int:
-    """Count the scans of a JPEG, as far as it is one."""
+    """Count the scans of a JPEG, which may be broken."""
     with Path(path).open("rb") as file, mmap(file.fileno(), 0, access=ACCESS_READ) as data:
         return _count_scans(data)
 
@@ -119,7 +119,7 @@ def _count_scans(data: mmap) -> int:
 
 
 def _require_file(path: str) -> None:
-    """Refuse what is not a regular file, without opening it: opening a pipe would wait for its other end."""
+    """Refuse anything but a regular file, without opening it: opening a pipe would wait for its other end."""
     try:
         mode = Path(path).stat().st_mode
     except ValueError:
@@ -146,7 +146,7 @@ def _to_rgb(image: Image.Image, background: tuple[int, int, int]) -> Image.Image
 
 
 def _to_8_bit(image: Image.Image) -> Image.Image:
-    """Scale 16-bit grey to 8 bits, 65535 to 255, to the nearest; Pillow's own conversion clips at 255."""
+    """Scale 16-bit grey to 8 bits, 65535 to 255, rounding to the nearest; Pillow's own conversion clips at 255."""
     import numpy as np
     from PIL import Image
 

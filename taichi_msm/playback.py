@@ -1,4 +1,4 @@
-"""A run that has ended, to be drawn and labelled again: any frame, any camera, and flow between any two frames."""
+"""Draw and label a run that has ended: any of its frames, from any camera, and the flow between any two frames."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ class Playback:
     """The frames of a run, by number. Usable in a with statement, which frees its memory.
 
     Args:
-        directory: where its results are, the trajectory among them.
+        directory: where its results are; the trajectory must be among them.
         arch: as for `Simulation`.
         threads: as for `Simulation`.
 
@@ -29,7 +29,7 @@ class Playback:
         FilesError: when there is no trajectory of a run, or it is damaged.
 
     Attributes:
-        scene: as it was run, with the points, the step and the precision that were chosen.
+        scene: the scene as it was run, with the points, the step and the precision that were chosen.
         time: of every frame [s], shape (frames,).
         positions: of the points in every frame [m], shape (frames, rows, cols, 3); not to be written to.
     """
@@ -52,7 +52,7 @@ class Playback:
         return self._simulation.labels(camera, *self._at(frame))
 
     def flow(self, first: int, second: int, camera: CameraLike = None) -> Flow:
-        """Give how what one frame shows moves until another, before or after it, and what of it is hidden there."""
+        """Give the flow from one frame to another, before or after it, and which of its material is hidden there."""
         return self._simulation.flow(self.labels(first, camera), camera, *self._at(second))
 
     def close(self) -> None:

@@ -1,4 +1,4 @@
-"""How work tells how far it is; what these functions raise stops it there."""
+"""Functions by which work reports its progress; what they raise stops the work there."""
 
 from __future__ import annotations
 
@@ -7,8 +7,8 @@ from collections.abc import Callable
 # Called some times a second.
 Pause = Callable[[], None]
 
-# Called with what is done and what is to be done in all.
+# Called with how much is done and how much there is in all.
 Count = Callable[[int, int], None]
 
-# Called with the stage of the work besides, first.
+# Called with the stage of the work, then the same two.
 Progress = Callable[[str, int, int], None]

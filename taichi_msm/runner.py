@@ -1,4 +1,4 @@
-"""The loop over the frames of a scene, and nothing but the loop."""
+"""The loop over the frames of a scene: it simulates, draws and writes them."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ from taichi_msm.timegrid import TimeGrid
 
 
 class Stopwatch:
-    """Adds up the seconds of every stage.
+    """Adds up the time of every stage.
 
     Args:
         started: `time.perf_counter()` when the first stage began; None: now.
@@ -56,13 +56,13 @@ class Stopwatch:
         self._started = self._last = time.perf_counter() if started is None else started
 
     def lap(self, stage: str) -> None:
-        """Count the time since the last lap for a stage."""
+        """Add the time since the last lap to a stage."""
         now = time.perf_counter()
         self.seconds[stage] = self.seconds.get(stage, 0.0) + now - self._last
         self._last = now
 
     def total(self) -> float:
-        """Tell the time since the beginning [s]."""
+        """Give the time since the beginning [s]."""
         return time.perf_counter() - self._started
 
 
@@ -77,9 +77,9 @@ def run(
     started: float | None = None,
     progress: Progress = lambda stage, done, total: None,
 ) -> RunRecord:
-    """Simulate a scene and write its results: whole or not at all.
+    """Simulate a scene and write its results, whole or not at all.
 
-    An unfinished run of the same scene into the same directory is gone on with: the results have the same bits.
+    An unfinished run of the same scene in the same directory is continued: the results have the same bits.
 
     Args:
         scene: what `load_scene` returned, or the same as a mapping.
@@ -87,21 +87,21 @@ def run(
         arch: cpu, cuda or vulkan.
         threads: number of CPU threads; None takes every core.
         overrides: the overrides that made the scene, for the record.
-        estimate_error: whether to estimate the error of the run, by a pilot beside it; None: where it takes less than
-            a third of the run. A tolerance in the scene does in any case.
+        estimate_error: whether to estimate the error of the run, by a pilot beside it; None: if the pilot takes less
+            than a third of the run. For a tolerance in the scene it is estimated in any case.
         started: `time.perf_counter()` when the program began; None: now.
-        progress: called with the stage, the frames done and the frames in all, often; what it raises stops the run
-            there, KeyboardInterrupt keeping the frames done.
+        progress: called often, with the stage, the frames done and the frames in all; what it raises stops the run
+            there. After a KeyboardInterrupt the finished frames are kept.
 
     Returns:
-        What is in run.json; its "status" is "complete", "diverged" (then "error" says where and why) or "interrupted".
-        After the last two, and where the process was killed, `resume` goes on.
+        The content of run.json; its "status" is "complete", "diverged" (then "error" says where and why) or
+        "interrupted". After the last two, and after the process was killed, `resume` continues the run.
 
     Raises:
         ArgumentError: when an argument is not what it must be.
         SceneError: when the scene cannot be run, its picture cannot be decoded, no step meets its tolerance, or the
             disk has no room for the results.
-        DeviceError: when the arch is not there.
+        DeviceError: when the arch is not available.
         FilesError: when the results cannot be written.
         KeyboardInterrupt: when interrupted before the first frame; nothing is written then.
     """
@@ -144,7 +144,7 @@ def run(
 
 
 def _is_begun(manifest: Manifest, directory: Path) -> bool:
-    """Tell whether the unfinished run into a directory, if there is one, gives the bits of this one."""
+    """Tell whether a directory has an unfinished run whose results have the same bits as those of this one."""
     try:
         return manifest.gives_the_bits_of(read_manifest(directory))
     except (FilesError, SceneError):
@@ -158,7 +158,7 @@ def resume(
     started: float | None = None,
     progress: Progress = lambda stage, done, total: None,
 ) -> RunRecord:
-    """Go on with a run that was interrupted, killed, short of disk space or diverged; the result has the same bits.
+    """Continue a run that was interrupted or killed, ran out of disk space, or diverged; to the same bits.
 
     Args:
         directory: where the results of the run go.
@@ -167,13 +167,13 @@ def resume(
         progress: as for `run`.
 
     Returns:
-        What `run` does.
+        The same as `run`.
 
     Raises:
         SceneError: when the scene's picture or map cannot be decoded.
-        DeviceError: when the arch is not there.
+        DeviceError: when the arch is not available.
         FilesError: when there is nothing to resume, or what there is cannot be used; and as for `run`.
-        KeyboardInterrupt: when interrupted before there is a frame more; all is as it was then.
+        KeyboardInterrupt: when interrupted before another frame is finished; nothing has changed then.
     """
     watch = Stopwatch(started)
     require_path(directory)
@@ -197,7 +197,7 @@ def _carry_out(
     *,
     resumes: bool,
 ) -> RunRecord:
-    """Simulate and draw, from the beginning or what the unfinished run in the directory lacks."""
+    """Simulate and draw all frames, or those that the unfinished run in the directory lacks."""
     scene, grid = manifest.scene, time_grid(manifest.scene, device.arch)
     frames = grid.frames + 1
     ending: dict[str, Any] = {"status": "complete"}
@@ -226,7 +226,7 @@ def _carry_out(
         rest = rest_positions(scene.sheet)
         for frame in range(resumed if scene.output else 0):
             progress("check", frame, resumed)
-            writer.position(frame)  # finds damage before anything is made of it
+            writer.position(frame)  # finds damage before the positions are used
         watch.lap("startup")
         try:
             simulation.compile(partial(progress, "compile", 0, frames))
@@ -256,12 +256,12 @@ def _carry_out(
                     watch.lap("pilot")
             writer.finish(partial(progress, "frames", frames, frames))
         except KeyboardInterrupt:
-            # Who interrupts elsewhere than in `progress` may do so before the last frame is stored.
+            # An interruption outside `progress` may come before the last frame is stored.
             if simulation.steps > 0 and simulation.frame < writer.stored:
-                # What went wrong within this frame is found when it is resumed.
+                # If the simulation diverges within this frame, the resumed run will find it.
                 with suppress(DivergedError):
                     writer.save(simulation.save())
-            # Frames that were there before are no new results; in a hurry, new ones may be given up.
+            # Without a new frame there are no new results; to end soon, new frames may be given up too.
             if writer.frames > resumed:
                 writer.finish(hurry=True)
             if writer.frames <= resumed:
@@ -316,12 +316,12 @@ def _mesh_pilot(manifest: Manifest, grid: TimeGrid, device: Device, cores: int, 
 
 
 class Known(NamedTuple):
-    """What is known of the error of a run.
+    """What is known about the error of a run.
 
     Attributes:
-        estimate: of the step and of rounding; None: not estimated.
-        reason: why not.
-        mesh_error: made by the number of points; None: not estimated, infinite: not known.
+        estimate: the error due to the step and to rounding; None: not estimated.
+        reason: why it was not estimated.
+        mesh_error: the error due to the number of points; None: not estimated; infinite: not known.
     """
 
     estimate: Estimate | None
@@ -353,7 +353,7 @@ def _facts(manifest: Manifest, grid: TimeGrid, progress: RunProgress, known: Kno
 
 
 def free_cores(scene: Scene, grid: TimeGrid) -> int:
-    """Count the cores that are free for stepping: the encoder needs one of them, unless it mostly waits for frames."""
+    """Count the cores that are free for stepping: all but one for the encoder, unless that mostly waits for frames."""
     width, height = scene.render.size
     rows, cols = scene.sheet.points
     encoding = width * height * ENCODING if scene.draws else 0
@@ -362,7 +362,7 @@ def free_cores(scene: Scene, grid: TimeGrid) -> int:
 
 
 def error_record(estimate: Estimate, mesh_error: float | None = None) -> dict[str, Any]:
-    """Write an estimate down for run.json, where null stands for a pilot run that diverged."""
+    """Write an estimate for run.json, where null stands for a pilot run that diverged."""
     found = {key: asdict(estimate)[key] for key in ("error", "rounding", "in_f64", "order")}
     if mesh_error is not None:
         found["mesh_error"] = mesh_error

@@ -29,7 +29,7 @@ MAX_REFINE = 64
 MAX_TRACKS = 256
 MAX_RELIEF = 10
 
-# Systems have a limit near this for the path of a file.
+# Operating systems limit the length of a path to about this.
 MAX_PATH = 4096
 
 # The offset of a probe in the paper (eq. 5).
@@ -38,7 +38,7 @@ DEFAULT_OFFSET = 10.0
 # Times that differ by less than this fraction of a frame are one instant: 0.1 s x 30 /s is 3 frames.
 WHOLE = 1e-6
 
-# Below, rounding in f64 is no longer small beside the error; above, an error is no error of something.
+# Below the first, rounding in f64 is no longer small beside the error; above the second, the result means nothing.
 SMALLEST_TOLERANCE = 1e-10
 LARGEST_TOLERANCE = 0.5
 
@@ -55,14 +55,14 @@ Share = Annotated[Number, Field(ge=0, le=1)]
 Output = Literal["png", "gif", "trajectory", "coordinates", "depth", "flow", "occlusion", "instrument", "tracks"]
 Side = Literal["top", "bottom", "left", "right"]
 Vector = tuple[Number, Number, Number]
-# A tool may come from beyond the edge, but pixels are no fractions.
+# A tool may come from beyond the edge; larger numbers are taken for pixels given by mistake, and refused.
 Fraction = Annotated[Number, Field(ge=-1, le=2)]
 
 OUTPUTS: tuple[str, ...] = get_args(Output)
 
-# The outputs that tell something of every pixel.
+# The outputs with a value for every pixel.
 PIXEL_LABELS = ("coordinates", "depth", "flow", "occlusion", "instrument")
-# Of these, the ones of what happens until the next frame.
+# Those of them that describe what happens until the next frame.
 UNTIL_NEXT = ("flow", "occlusion")
 NEED_CAMERA = ("coordinates", "depth", "flow", "tracks")
 
@@ -79,7 +79,7 @@ else:
 
 
 class _Checked(ModelMetaclass):
-    """Makes sections; pydantic itself makes those inside others without it, and collects their faults."""
+    """Makes the sections that a caller asks for; pydantic makes those inside them, and collects their faults."""
 
     def __call__(cls: type[BaseModel], /, *values: Any, **keys: Any) -> Any:  # type: ignore[misc]  # noqa: N805
         if values:
@@ -101,13 +101,13 @@ class Section(BaseModel, metaclass=_Checked):
 
     def model_copy(self, *, update: Mapping[str, Any] | None = None, deep: bool = False) -> Self:
         """Copy the section, with other values for some keys."""
-        del deep  # Nothing in it can be changed.
+        del deep  # The values are immutable, so a shallow copy is as good.
         if not (update is None or (isinstance(update, Mapping) and all(isinstance(name, str) for name in update))):
             raise ArgumentError(f"update: {update!r}; take a mapping from keys to values")
         return type(self)(**{**{name: getattr(self, name) for name in type(self).model_fields}, **(update or {})})
 
     def __setattr__(self, name: str, value: object) -> None:
-        raise SceneError([f"{name}: a scene is not changed; take model_copy(update={{{name!r}: ...}})"])
+        raise SceneError([f"{name}: a scene cannot be changed; use model_copy(update={{{name!r}: ...}})"])
 
 
 class Sheet(Section):
@@ -129,7 +129,7 @@ class Sheet(Section):
     )
     tolerance: Tolerance | None = key(
         None,
-        means="with tissue: largest error that the number of points may make, as a fraction of the largest "
+        means="with tissue: largest allowed error due to the number of points, as a fraction of the largest "
         "displacement; pilot runs find how many more points are needed",
         expects=f"a number, {SMALLEST_TOLERANCE:g} to {LARGEST_TOLERANCE:g}",
     )
@@ -171,14 +171,14 @@ class Springs(Section):
 
 
 class Tissue(Section):
-    """Tissue in physical units: a sheet of plane stress with Poisson's ratio 1/3, alike at any number of points."""
+    """Tissue in physical units: a sheet of plane stress with Poisson's ratio 1/3, the same at any number of points."""
 
     young: Positive = key(means="Young's modulus E [Pa]", expects="a number above 0, in Pa")
     thickness: Positive = key(means="thickness t of the sheet [m]", expects="a number above 0, in metres")
     density: Positive = key(means="density [kg/m3]", expects="a number above 0, in kg/m3")
     foundation: NotNegative = key(
         0.0,
-        means="of the tissue underneath: force per area and displacement [N/m3]; the virtual springs",
+        means="stiffness of the tissue underneath, as virtual springs: force per area and displacement [N/m3]",
         expects="a number, 0 or more, in N/m3",
     )
     foundation_active: Literal["loaded", "always"] = key(
@@ -203,7 +203,7 @@ class Tissue(Section):
 
 
 class Instrument(Section):
-    """The rod that is drawn as a probe: metal, with a rounded tip that touches the sheet at the control point."""
+    """The rod that is drawn for a probe: metal, with a rounded tip that touches the sheet at the control point."""
 
     radius: Positive = key(means="radius of the rod [m]", expects="a number above 0, in metres")
     shaft: Vector = key(means="direction from the tip along the rod", expects="three numbers, not all 0: [x, y, z]")
@@ -235,7 +235,7 @@ class Probe(Section):
     )
     force: Vector | None = key(
         None,
-        means="instead of total, with springs: force at 100 % on one point [N], at the control point times e^-offset",
+        means="with springs, instead of total: force on one point at 100 %, before decay and offset [N]",
         expects="three numbers: [x, y, z] in newtons",
     )
     load: Annotated[tuple[tuple[Number, Number], ...], Field(min_length=1)] = key(
@@ -250,11 +250,13 @@ class Probe(Section):
         expects="a number, 0 or more, in 1/m",
     )
     radius: NotNegative = key(
-        0.0, means="of the tool's flat end, where the force does not decay [m]", expects="a number, 0 or more, in m"
+        0.0,
+        means="radius of the tool's flat end, where the force does not decay [m]",
+        expects="a number, 0 or more, in m",
     )
     offset: Annotated[Number, Field(ge=-50, le=1000)] = key(
         DEFAULT_OFFSET,
-        means="exponent subtracted at the control point itself; with force only",
+        means="with force only: subtracted in the exponent of the decay, so also at the control point",
         expects="a number, -50 to 1000",
     )
     instrument: Instrument | None = key(
@@ -268,12 +270,10 @@ class Probe(Section):
             return force  # A fault of its own.
         total = info.data["total"]
         if force is None and total is None:
-            said = (
-                "missing; expected total, the whole tool's, or with springs force, on one point: [x, y, z] in newtons"
-            )
+            said = "missing; expected total (whole tool) or, with springs, force (one point): [x, y, z] in newtons"
             raise PydanticCustomError(REFUSED, said)
         if force is not None and total is not None:
-            raise PydanticCustomError(REFUSED, "stands beside total; remove one of them")
+            raise PydanticCustomError(REFUSED, "is given together with total; remove one of them")
         return force
 
     @field_validator("falloff", "offset", mode="after")
@@ -281,10 +281,10 @@ class Probe(Section):
     def _fit_total(cls, value: float, info: ValidationInfo) -> float:
         if info.data.get("total") is not None:
             if info.field_name == "falloff" and value < SMALLEST:
-                said = f"{value:g} would spread total over an endless sheet; take a number above 0, in 1/m"
+                said = f"{value:g} would spread total over an infinite area; take a number above 0, in 1/m"
                 raise PydanticCustomError(REFUSED, said)
             if info.field_name == "offset" and value != DEFAULT_OFFSET:
-                said = "belongs to force, and total is the whole of it; remove offset"
+                said = "goes with force, not with total; remove offset"
                 raise PydanticCustomError(REFUSED, said)
         return value
 
@@ -325,19 +325,19 @@ class Time(Section):
     )
     tolerance: Tolerance | None = key(
         None,
-        means="largest error of any frame, as a fraction of the largest displacement, that step: auto may make; "
-        "pilot runs find the step",
+        means="with step: auto, largest allowed error of any frame due to the step, as a fraction of the largest "
+        "displacement; pilot runs find the step",
         expects=f"a number, {SMALLEST_TOLERANCE:g} to {LARGEST_TOLERANCE:g}",
     )
     damping_difference: Literal["central", "backward"] = key(
         "central",
-        means="difference that stands for the velocity in the damping: central is of order 2, backward "
+        means="finite difference for the velocity in the damping: central is of order 2, backward "
         "(the paper's eq. 3) of order 1",
         expects="central or backward",
     )
     precision: Literal["auto", "f32", "f64"] = key(
         "auto",
-        means="floating-point precision; auto: f64 while stepping is a small part of the run, else f32",
+        means="floating-point precision; auto: f64 if stepping is a small part of the run, else f32",
         expects="auto, f32 or f64",
     )
 
@@ -400,7 +400,7 @@ class Light(Section):
     gloss: Share = key(0.4, means="brightness of the wet highlight, as a fraction of white", expects="a number, 0 to 1")
     relief: Annotated[Number, Field(ge=-MAX_RELIEF, le=MAX_RELIEF)] = key(
         0.0,
-        means="height of what is bright in the picture over what is dark, in percent of the sheet's larger side",
+        means="height of white in the picture above black, in percent of the sheet's larger side",
         expects=f"a number, -{MAX_RELIEF} to {MAX_RELIEF}",
     )
     vignette: Share = key(0.0, means="how much darker the picture's corners are", expects="a number, 0 to 1")
@@ -428,7 +428,7 @@ class Render(Section):
         "endoscope",
         expects="none, headlight or tissue",
     )
-    light: Light = key(Light(), means="with shading: tissue", expects="a mapping")
+    light: Light = key(Light(), means="the light, with shading: tissue", expects="a mapping")
     wireframe: StrictBool = key(False, means="draw the mass-point mesh over the surface", expects="true or false")
     supersample: Annotated[Whole, Field(ge=1, le=4)] = key(
         1, means="samples per pixel along each axis", expects="a whole number, 1 to 4"
@@ -490,17 +490,17 @@ class Scene(Section):
 
     @property
     def renders(self) -> bool:
-        """Whether any output is of what the camera sees."""
+        """Whether any output depends on what the camera sees."""
         return self.draws or self.labels_pixels or "tracks" in self.output
 
     @property
     def output_camera(self) -> bool:
-        """Whether an output is of use only with the camera's numbers."""
+        """Whether any output can be used only with the camera's matrices."""
         return any(kind in NEED_CAMERA for kind in self.output)
 
     @property
     def has_instruments(self) -> bool:
-        """Whether any probe is drawn."""
+        """Whether any probe has an instrument, which is drawn."""
         return any(probe.instrument is not None for probe in self.probes)
 
     @property

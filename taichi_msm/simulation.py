@@ -1,4 +1,4 @@
-"""A scene in motion: the two kernels behind a handful of methods."""
+"""A scene in motion: a class whose methods run the two kernels."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ if TYPE_CHECKING:
     from taichi_msm.notebook import Player
     from taichi_msm.render.rasterizer import Drawing, Drawn
 
-# A camera as a scene has it; None: the scene's own. A `View` is one that was set up already.
+# A camera in one of the forms that a scene may have; or a `View`, which was set up already; None: the scene's own.
 CameraLike = str | Mapping[str, Any] | Camera | View | None
 
 
@@ -45,19 +45,19 @@ class Simulation:
     """A sheet that moves by frames and can be drawn. Usable in a with statement, which frees its memory.
 
     Args:
-        scene: what `load_scene` returned, or the same as a mapping; where it has a tolerance, pilot runs choose the
-            points or the step first.
+        scene: what `load_scene` returned, or the same as a mapping; if it has a tolerance, pilot runs first choose the
+            points or the step.
         arch: cpu, cuda or vulkan.
         threads: number of CPU threads; None takes every core.
         texture: the picture on the sheet, shape (height, width, 3); None: the scene's own, read when it is drawn.
-        cores: how many cores are free for stepping; None: all. Its threads wait for each other by spinning, and one
-            that has no core holds all of them up.
+        cores: how many cores are free for stepping; None: all. The threads spin while they wait for each other, so a
+            thread without a core delays all of them.
 
     Raises:
-        MsmError: here and in all methods, in another thread than that of the first simulation, or in a process that
-            was forked after it.
+        MsmError: here and in all methods, in any thread but that of the first simulation, or in a process that was
+            forked after it.
         ArgumentError: here and in all methods, when an argument is not what it must be.
-        DeviceError: when the arch is not there, or Taichi already runs on another one in this process.
+        DeviceError: when the arch is not available, or Taichi already runs on another one in this process.
         SceneError: when the scene cannot be run, or no step meets its tolerance.
 
     Attributes:
@@ -82,7 +82,7 @@ class Simulation:
         self._position = self._place(self._dynamics.displacement())
         self._texture = texture
         self._own_texture = texture is None
-        # By whether they give a picture, and labels.
+        # The keys tell whether a drawing gives a picture, and whether it gives labels.
         self._drawings: dict[tuple[bool, bool], Drawing] = {}
 
     def _resolved(self, scene: Scene) -> tuple[Scene, TimeGrid]:
@@ -111,12 +111,12 @@ class Simulation:
 
     @property
     def lanes(self) -> int:
-        """Numbers of a vector that the steps are taken in; 1 on a GPU."""
+        """Lanes of the vectors that the steps are computed in; 1 on a GPU."""
         return self._dynamics.structure.code.lanes
 
     @property
     def workers(self) -> int:
-        """Threads that share the steps, unless other programs need the cores; 0 on a GPU."""
+        """Number of threads that share the steps while the cores are free; 0 on a GPU."""
         return self._dynamics.structure.workers
 
     @property
@@ -125,17 +125,17 @@ class Simulation:
         return self._watch.progress
 
     def advance(self, frames: int = 1, pause: Pause = lambda: None) -> None:
-        """Simulate a number of frames; the scene's loads go on as its keys say.
+        """Simulate a number of frames, with the loads of the scene's keys.
 
         Args:
             frames: how many, 0 or more.
             pause: called some times a second, between steps; what it raises stops the simulation there, and the next
-                call goes on.
+                call goes on from there.
 
         Raises:
             MsmError: when the simulation is closed.
-            DivergedError: when a point is no longer finite or has left every bound. `positions` and `draw` then give
-                the last frame that was good.
+            DivergedError: when the simulation diverges: a position is no longer finite, or exceeds every bound.
+                `positions` and `draw` then give the last good frame.
         """
         require_frame_count(frames)
         self._require_open()
@@ -145,16 +145,16 @@ class Simulation:
             self._position = self._read()
 
     def steer(self, probes: Sequence[Probe | Mapping[str, Any]]) -> None:
-        """Let other loads act from here on.
+        """Replace the loads from here on.
 
         Args:
-            probes: the scene's with other numbers, each of whose control points moves, jumps or stands as it did: a
-                tool that is to move later has keys from the start, if only one.
+            probes: the scene's probes with other numbers. Each control point must move, jump or stand as before; for a
+                tool that is to move later, give `at` as keys from the start, be it a single one.
 
         Raises:
             MsmError: when the simulation is closed.
-            ArgumentError: when the kernel was not compiled for them.
-            SceneError: when one of them is no probe.
+            ArgumentError: when the kernel was not compiled for such probes.
+            SceneError: when one of them is not a probe.
         """
         self._require_open()
         if not isinstance(probes, Sequence):
@@ -165,7 +165,7 @@ class Simulation:
         self.scene = scene
 
     def restart(self, scene: Scene | Mapping[str, Any] | None = None) -> None:
-        """Begin again at rest. With the same terms of the model and the same precision nothing is compiled.
+        """Begin again at rest. Nothing is compiled if the terms of the model and the precision stay the same.
 
         Args:
             scene: another one; None: the same.
@@ -187,7 +187,7 @@ class Simulation:
         self._position = self._place(self._dynamics.displacement())
 
     def save(self) -> Saved:
-        """Give all that is needed to go on from here in another simulation.
+        """Save all that another simulation needs to go on from here.
 
         Raises:
             MsmError: when the simulation is closed.
@@ -199,7 +199,7 @@ class Simulation:
         return Saved(self._dynamics.state(), self.progress)
 
     def go_on(self, saved: Saved) -> None:
-        """Be where a simulation of the same scene was, maybe between two frames; what follows has the same bits.
+        """Go on from where a simulation of the same scene was saved, which may be between two frames; to the same bits.
 
         Raises:
             MsmError: when the simulation is closed.
@@ -207,7 +207,7 @@ class Simulation:
         """
         self._require_open()
         if not isinstance(saved, Saved):
-            raise ArgumentError(f"{type(saved).__name__} is nothing that `save` gave")
+            raise ArgumentError(f"{type(saved).__name__} is not what `save` returns")
         state, per_frame = saved.state, self._grid.steps_per_frame
         since = state.steps - saved.progress.frame * per_frame
         alike = (state.displacement.shape, state.displacement.dtype) == (self._position.shape, self._position.dtype)
@@ -230,7 +230,7 @@ class Simulation:
         return self._position
 
     def velocities(self) -> NDArray[Any]:
-        """Give how fast the points move: the mean over the last step, so half a step before `time`.
+        """Give the velocities of the points: the mean over the last step, so those half a step before `time`.
 
         Returns:
             Velocities [m/s], shape (rows, cols, 3), in the scene's precision; 0 at the start.
@@ -251,7 +251,7 @@ class Simulation:
 
         Returns:
             Fractions of the sheet's width from its left and of its height from its top, as in a probe's `at`;
-            None where no surface is.
+            None if no surface is there.
 
         Raises:
             ArgumentError: when the pixel is not two numbers.
@@ -264,10 +264,10 @@ class Simulation:
         return pick(self._position, self.scene.render.refine, self._view(camera), (x, y))
 
     def diagnose(self, start: Saved | None = None, pause: Pause = lambda: None) -> Diagnosis:
-        """Find out why `advance` said that the simulation diverged; it cannot advance afterwards, but by `go_on`.
+        """Find out why the simulation diverged in `advance`. Afterwards it can advance only after `go_on`.
 
         Args:
-            start: what `save` gave before; None: the simulation is repeated from rest.
+            start: what `save` returned before; the simulation is repeated from there. None: from rest.
             pause: called some times a second; what it raises stops the search.
 
         Raises:
@@ -284,16 +284,16 @@ class Simulation:
         """Draw the sheet as it is now, and the probes' instruments.
 
         Args:
-            camera: another than the scene's: "top", "oblique", a `Camera` or its keys.
+            camera: "top", "oblique", a `Camera` or its keys; None: the scene's.
             positions: other positions of the points [m], such as those of an earlier frame, shape (rows, cols, 3).
-            time: of these positions [s], where control points move; None: now.
+            time: time of these positions [s], for control points that move; None: now.
 
         Returns:
             Colours, shape (height, width, 3).
 
         Raises:
             ArgumentError: when the positions are of another shape.
-            SceneError: when the scene's picture cannot be read, or the camera is none.
+            SceneError: when the scene's picture cannot be read, or the camera is not valid.
         """
         picture = self._look(camera, positions, time, picture=True, labels=False).picture
         assert picture is not None
@@ -311,7 +311,7 @@ class Simulation:
 
         Raises:
             ArgumentError: as for `draw`.
-            SceneError: when the camera is none.
+            SceneError: when the camera is not valid.
         """
         labels = self._look(camera, positions, time, picture=False, labels=True).labels
         assert labels is not None
@@ -324,17 +324,17 @@ class Simulation:
         positions: NDArray[Any] | None = None,
         time: float | None = None,
     ) -> Flow:
-        """Give how what an earlier or later frame shows has moved in the picture until now, and what of it is hidden.
+        """Give the optical flow from an earlier or later frame to this one, and which of its material is now hidden.
 
         Args:
-            before: what `labels` gave of the other frame, with the same size of the picture.
+            before: what `labels` returned for the other frame, with the same size of the picture.
             camera: as for `draw`.
             positions: as for `draw`.
             time: as for `draw`.
 
         Raises:
             ArgumentError: as for `draw`, and when `before` is of another size.
-            SceneError: when the camera is none.
+            SceneError: when the camera is not valid.
         """
         width, height = self.scene.render.size
         if not isinstance(before, Labels) or before.coordinates.shape != (height, width, 2):
@@ -349,7 +349,7 @@ class Simulation:
         positions: NDArray[Any] | None = None,
         time: float | None = None,
     ) -> Sight:
-        """Find where material points are seen, and whether anything hides them; the way back from `pick`.
+        """Find where material points are seen, and whether anything hides them; the inverse of `pick`.
 
         Args:
             coordinates: fractions of the sheet's width from its left and of its height from its top, 0 to 1, shape
@@ -359,8 +359,8 @@ class Simulation:
             time: as for `draw`.
 
         Raises:
-            ArgumentError: as for `draw`, and when the coordinates are none.
-            SceneError: when the camera is none.
+            ArgumentError: as for `draw`, and when the coordinates are not numbers of that shape from 0 to 1.
+            SceneError: when the camera is not valid.
         """
         found = as_array(coordinates, "coordinates")
         numbers = found.dtype.kind in "fiu" and found.ndim == 2 and found.shape[1] == 2
@@ -371,15 +371,15 @@ class Simulation:
         return self._find(found, camera, positions, time)
 
     def observe(self, before: Labels | None, positions: NDArray[Any], time: float) -> Observed:
-        """Give all that the scene's output asks for of one frame.
+        """Give everything that the scene's output asks for of one frame.
 
         Args:
-            before: what the frame before showed; None: there was none.
+            before: the labels of the frame before; None: there was none.
             positions: of the points [m], shape (rows, cols, 3).
             time: of the frame [s].
         """
         scene = self.scene
-        # With several samples a pixel none of them is at its centre.
+        # Labels need one sample, at the pixel's centre; with several samples per pixel, none is there.
         together = scene.render.supersample == 1
         picture = labels = flow = tracks = None
         if scene.draws:
@@ -393,7 +393,7 @@ class Simulation:
         return Observed(picture, labels, flow, tracks)
 
     def play(self, frames: int, camera: CameraLike = None) -> Player:
-        """Simulate and draw a number of frames, the present one before them, and give them to look at in a notebook.
+        """Draw the present frame, simulate and draw more of them, and show them in a notebook.
 
         Args:
             frames: how many, 0 or more.
@@ -423,7 +423,7 @@ class Simulation:
         return captioned(self.draw(), caption)
 
     def compile(self, pause: Pause = lambda: None) -> None:
-        """Compile now what would be compiled by the first frame.
+        """Compile the kernels now that would otherwise be compiled at the first frame.
 
         Args:
             pause: called between kernels; what it raises stops here.
@@ -454,7 +454,7 @@ class Simulation:
         self.close()
 
     def _require_open(self) -> None:
-        # The kernels would write to memory that is freed.
+        # The kernels would write to memory that was freed.
         if self._closed:
             raise MsmError("this simulation is closed; make another")
         runtime.require_here()
@@ -464,7 +464,7 @@ class Simulation:
             return camera
         if camera is None:
             return view(self.scene)
-        # As a whole, so that an error names the key as a scene has it.
+        # The scene is checked as a whole, so that an error names the key as a scene has it.
         render = {**dict(self.scene.render), "camera": camera}
         return view(self.scene.model_copy(update={"render": render}))
 
@@ -509,7 +509,7 @@ class Simulation:
         return positions, rods(self.scene, positions, self.time if time is None else time)
 
     def _require_texture(self, *, picture: bool) -> NDArray[np.uint8]:
-        """Give the picture on the sheet; one of a single texel where it is not seen."""
+        """Give the picture on the sheet; a single texel if it is not seen."""
         if not picture:
             return np.zeros((1, 1, 3), np.uint8)
         if self._texture is None:
@@ -517,7 +517,7 @@ class Simulation:
         return self._texture
 
     def _read(self) -> NDArray[Any]:
-        """Read where the points are, if the simulation has not gone wrong since the last frame."""
+        """Read where the points are, after checking that the simulation has not diverged since the last frame."""
         reading = self._dynamics.read()
         self._require_good(reading, self._watch.follow(reading))
         return self._place(reading.displacement)
@@ -532,7 +532,7 @@ class Simulation:
     def _place(self, displacement: NDArray[Any]) -> NDArray[Any]:
         """Turn displacements into positions."""
         position, (x, y) = displacement, axes(self.scene.sheet)
-        # Summed in float64 and rounded once, without a copy of the sheet.
+        # The sum is computed in float64 and rounded once, without a float64 copy of the sheet.
         np.add(position[..., 0], x, out=position[..., 0], casting="same_kind")
         np.add(position[..., 1], y, out=position[..., 1], casting="same_kind")
         position.flags.writeable = False

@@ -279,7 +279,7 @@ def test_a_signal_keeps_the_frames_so_far(number: signal.Signals, code: int, sto
     assert record["status"] == "interrupted"
     frames = record["frames"]
     assert 3 < frames < 20000
-    then = "go on with: taichi-msm run --resume long"
+    then = "continue with: taichi-msm run --resume long"
     assert error == f"small.yaml: interrupted; frames in long: {frames}; {then}\n"
     assert len(list((small / "long" / "frames").iterdir())) == frames
     assert np.load(small / "long" / "trajectory.npz")["position"].shape == (frames, 9, 11, 3)
@@ -422,11 +422,11 @@ def call(capsys: pytest.CaptureFixture[str], *arguments: str) -> tuple[int, str,
         ),
         (
             ["run", "small.yaml", "--resume", "there"],
-            "taichi-msm: --resume goes on with a run as it was begun; leave out SCENE (see taichi-msm --help)\n",
+            "taichi-msm: --resume continues a run with its own settings; leave out SCENE (see taichi-msm --help)\n",
         ),
         (
             ["run", "--resume", "there", "--set", "damping=1"],
-            "taichi-msm: --resume goes on with a run as it was begun; leave out --set (see taichi-msm --help)\n",
+            "taichi-msm: --resume continues a run with its own settings; leave out --set (see taichi-msm --help)\n",
         ),
         (["run"], "taichi-msm: Missing argument 'SCENE'. (see taichi-msm --help)\n"),
         (["jump"], "taichi-msm: No such command 'jump'. (see taichi-msm --help)\n"),

@@ -202,7 +202,7 @@ def test_a_link_leads_nowhere(results: Path, program: Program) -> None:
     (results.parent / "elsewhere").mkdir()
     (results / "export-obj").symlink_to(results.parent / "elsewhere")
     done = program("export", str(results), "--format", "obj")
-    said = "a symbolic link; name the folder that it leads to by --out"
+    said = "a symbolic link; name the folder it leads to with --out"
     assert (done.returncode, done.stderr) == (4, f"{results / 'export-obj'}: {said}\n")
     assert files(results.parent / "elsewhere") == {}
 

@@ -143,7 +143,7 @@ def test_one_frame_has_no_flow(labelled: Path) -> None:
     (labelled / "run.json").write_text(json.dumps(record | {"frames": 1}))
     with pytest.raises(FilesError) as caught:
         convert(labelled, "kitti", labelled / "out")
-    said = "has one frame, and flow is from one to the next; run the scene to its end"
+    said = "has only one frame, and flow needs two; run the scene to its end"
     assert str(caught.value) == f"{labelled}: {said}"
 
 

@@ -74,7 +74,7 @@ def test_positions_of_another_shape_are_refused(shape: tuple[int, ...], simulati
     ids=["grey", "float", "alpha", "empty", "long"],
 )
 def test_what_is_no_picture_is_refused(texture: Any, device: Device) -> None:
-    with pytest.raises(ArgumentError, match="is no picture; take uint8 of shape"):
+    with pytest.raises(ArgumentError, match="is not a picture; take uint8 of shape"):
         Simulation(scene(), threads=device.threads, texture=texture)
 
 
@@ -274,7 +274,7 @@ def test_what_was_saved_elsewhere_is_not_gone_on_with(simulation: Simulation, de
             elsewhere.advance(1)
             with pytest.raises(ArgumentError, match="take what was saved with this scene's points, precision and step"):
                 simulation.go_on(elsewhere.save())
-    with pytest.raises(ArgumentError, match="int is nothing that `save` gave"):
+    with pytest.raises(ArgumentError, match="int is not what `save` returns"):
         simulation.go_on(3)  # type: ignore[arg-type]
     np.testing.assert_array_equal(simulation.positions(), before)
     simulation.advance()
@@ -310,7 +310,7 @@ def test_sections_take_keys_by_name_and_stay_as_they_are(simulation: Simulation)
     with pytest.raises(ArgumentError, match="Sheet takes its keys by name: points, size, mass, fixed"):
         Sheet((3, 3), (1, 1), 1)  # type: ignore[call-arg]
     with pytest.raises(
-        SceneError, match=r"damping: a scene is not changed; take model_copy\(update={'damping': ...}\)"
+        SceneError, match=r"damping: a scene cannot be changed; use model_copy\(update={'damping': ...}\)"
     ):
         made.damping = 3
     for update in (3, {3: 3}):

@@ -229,7 +229,7 @@ def test_the_default_folder_is_not_reached_by_a_link(treasure: Path, monkeypatch
     Path("output").mkdir()
     assert result_directory(None, "press") == Path("output/press")
     Path("output/press").symlink_to(treasure)
-    with pytest.raises(FilesError, match=r"^output/press: a symbolic link; name the folder that it leads to by --out"):
+    with pytest.raises(FilesError, match=r"^output/press: a symbolic link; name the folder it leads to with --out"):
         result_directory(None, "press")
     shutil.rmtree("output")
     Path("output").symlink_to(treasure)

@@ -207,7 +207,7 @@ def test_a_staged_file_that_is_taken_away_is_missed(directory: Path) -> None:
     with Publication(directory, NEW) as publication:
         write(publication.staged.path, NEW, "new")
         (publication.staged.path / "frames" / "0001.png").unlink()
-        with pytest.raises(FilesError, match=r"new/frames/0001\.png was taken away while the run worked; run it again"):
+        with pytest.raises(FilesError, match=r"new/frames/0001\.png was removed during the run; run it again"):
             publication.publish(NEW)
     assert contents(directory) == expected(OLD, "old")
     assert_tidy(directory)

@@ -40,7 +40,7 @@ probes:
 """
 
 ROOT_KEYS = "image, region, sheet, tissue, springs, damping, probes, time, render, output"
-NO_FORCE = "missing; expected total, the whole tool's, or with springs force, on one point: [x, y, z] in newtons"
+NO_FORCE = "missing; expected total (whole tool) or, with springs, force (one point): [x, y, z] in newtons"
 POINTS = "expected two whole numbers, 2 to 4096: [rows, cols]"
 A_PROBE_KEY = "expected keys [[t, percent], ...], t in seconds"
 AN_AT = "expected [across, down], fractions from -1 to 2, or keys [[t, across, down], ...]"

@@ -402,9 +402,9 @@ def test_a_session_too_long_for_a_file_says_so_before(begin: Begin, monkeypatch:
         session.handle(Drag(50 + n % 20, 50))
         session.advance()
         told.append(session.notice)
-    assert told[200] == "soon this session will be too long for a scene: write it now (w), then reset it (r)"
+    assert told[200] == "this session will soon be too long for a scene: save it now (w), then reset it (r)"
     assert sum(notice != "" for notice in told) <= 160, "once"
-    with pytest.raises(FilesError, match=r"^this session is too long for the file of a scene; reset it, and do less$"):
+    with pytest.raises(FilesError, match=r"^this session is too long for a scene file; reset it, and do less$"):
         session.handle(Key("w"))
     assert list(Path("captures").iterdir()) == [Path("captures/speckle.png")]
     session.handle(Key("r"))
@@ -500,12 +500,12 @@ def test_a_given_step_stays(small: Path) -> None:
 @pytest.mark.parametrize(
     ("overrides", "play", "expected"),
     [
-        ({"probes": []}, False, "probes: none; the tool takes its force from the first one, add it"),
-        ({"image": None, "output": []}, False, "image: none; a session shows one, name it here or with --image"),
+        ({"probes": []}, False, "probes: empty; the tool takes its force from the first probe, add one"),
+        ({"image": None, "output": []}, False, "image: missing; a session needs one, name it here or with --image"),
         (
             {"probes": [{"force": [0, 0, -1]}] * 16},
             True,
-            "probes: 16 leave no place for the tool; remove one, or leave out --play",
+            "probes: 16 leave no room for the tool; remove one, or leave out --play",
         ),
     ],
 )

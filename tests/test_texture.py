@@ -275,7 +275,7 @@ def test_truncated_pictures(name: str) -> None:
     Path(name).write_bytes(whole[: len(whole) // 2])
     line = refusal(name)
     assert line.startswith(f"image: {name} ")
-    assert line.endswith(("; save it anew", "; convert it"))
+    assert line.endswith(("; save it again", "; convert it"))
 
 
 def test_a_name_is_one_line_that_steers_no_terminal() -> None:
@@ -319,7 +319,7 @@ def test_a_jpeg_of_too_many_scans(tmp_path: Path, monkeypatch: pytest.MonkeyPatc
         Path("a.jpg").write_bytes(whole[:-2] + copies * last + b"\xff\xd9" + b"\xff\xda" * 4000)
         found = [str(problem) for problem in problems(made)]
         assert found == (
-            [f"image: a.jpg has {copies + 10} scans, of which 1333 are allowed; save it anew"] if refused else []
+            [f"image: a.jpg has {copies + 10} scans, and 1333 are allowed; save it again"] if refused else []
         )
     with pytest.raises(SceneError, match="has 1410 scans"):
         load_texture(made)
@@ -336,7 +336,7 @@ def test_a_picture_of_too_many_rows(tmp_path: Path, monkeypatch: pytest.MonkeyPa
     monkeypatch.chdir(tmp_path)
     for size in ((1, 65536), (65536, 1)):
         Image.new("L", size).save("a.png")
-        expected = f"image: a.png has {size[0]} x {size[1]} pixels; a side may have 65535, cut it"
+        expected = f"image: a.png has {size[0]} x {size[1]} pixels; a side may have at most 65535, cut it"
         assert [str(problem) for problem in problems(scene(image="a.png"))] == [expected]
     Image.new("L", (1, 65535)).save("a.png")
     assert load_texture(scene(image="a.png")).shape == (65535, 1, 3)

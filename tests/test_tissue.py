@@ -218,7 +218,7 @@ SIZE = (
     "take another sheet.size"
 )
 WRONG = "5 is not allowed; expected three numbers: [x, y, z] in newtons"
-FLAT = "0 would spread total over an endless sheet; take a number above 0, in 1/m"
+FLAT = "0 would spread total over an infinite area; take a number above 0, in 1/m"
 
 
 @pytest.mark.parametrize(
@@ -228,8 +228,8 @@ FLAT = "0 would spread total over an endless sheet; take a number above 0, in 1/
         ("sheet.mass=1", f"sheet.mass: {NO_MASS}"),
         ("damping=0.1", f"damping: {DRAG}"),
         ("probes.0={force: [0, 0, 1]}", f"probes.0.force: {PER_POINT}"),
-        ("probes.0.force=[0, 0, 1]", "probes.0.force: stands beside total; remove one of them"),
-        ("probes.0.offset=3", "probes.0.offset: belongs to force, and total is the whole of it; remove offset"),
+        ("probes.0.force=[0, 0, 1]", "probes.0.force: is given together with total; remove one of them"),
+        ("probes.0.offset=3", "probes.0.offset: goes with force, not with total; remove offset"),
         ("probes.0.falloff=0", f"probes.0.falloff: {FLAT}"),
         ("sheet.points=[13, 40]", f"sheet.points: {LONG}"),
         ("sheet.points=[40, 13]", f"sheet.points: {WIDE}"),

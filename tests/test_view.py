@@ -63,11 +63,11 @@ def test_a_script_is_done_and_filmed(small: Path, program: Program) -> None:
         (["--seconds", "2"], "taichi-msm: --record FILE.gif and --seconds N go together (see taichi-msm --help)"),
         (
             ["--script", "a.yaml"],
-            "taichi-msm: --script is for --record; in the window it is your hand that presses (see taichi-msm --help)",
+            "taichi-msm: --script needs --record; in the window you press with the mouse (see taichi-msm --help)",
         ),
         (
             ["--record", "a.png", "--seconds", "1"],
-            "taichi-msm: Invalid value for --record: a.png has no name of a GIF; let it end in .gif "
+            "taichi-msm: Invalid value for --record: a.png is not the name of a GIF; let it end in .gif "
             "(see taichi-msm --help)",
         ),
         (
@@ -81,7 +81,7 @@ def test_a_script_is_done_and_filmed(small: Path, program: Program) -> None:
         (["--record", "a.gif", "--seconds", "1", "--script", "no.yaml"], "no.yaml: no such file or directory"),
         (
             ["--record", "a.gif", "--seconds", "1", "--set", "probes=[]"],
-            "small.yaml: probes: none; the tool takes its force from the first one, add it",
+            "small.yaml: probes: empty; the tool takes its force from the first probe, add one",
         ),
     ],
 )
@@ -344,7 +344,7 @@ def shown(clock: Clock, stepping: float, drawing: float, seconds: float) -> tupl
         # Pictures are slow: several frames for each, and time goes as it should.
         (0.002, 0.07, 500, "13 pictures/s"),
         # Stepping is slow: no picture waits for more than it must, and time goes slower.
-        (0.05, 0.01, 190, "9 pictures/s  ·  too slow: time goes at 0.36 of real time"),
+        (0.05, 0.01, 190, "9 pictures/s  ·  too slow: 0.36 x real time"),
     ],
     ids=["fast", "slow pictures", "slow steps"],
 )

@@ -1,4 +1,4 @@
-"""From the folder of a run to a folder of another program's files."""
+"""Convert the folder of a run to a folder with another program's files."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ class Exported(NamedTuple):
 
     Attributes:
         files: names in the folder, with slashes.
-        notes: what one should know of them.
+        notes: what the user should know about them.
     """
 
     files: list[str]
@@ -25,13 +25,13 @@ class Exported(NamedTuple):
 
 
 def convert(run: Path, name: str, directory: Path, progress: Count = lambda done, total: None) -> Exported:
-    """Convert the results of a run, and put the files in the place of an earlier export.
+    """Convert the results of a run; the files replace those of an earlier export.
 
     Args:
         run: the folder of the run's results.
         name: of the format, one of `FORMATS`.
-        directory: where the files go; made where it does not exist.
-        progress: called with the frames done and the frames in all; what it raises stops here and changes nothing.
+        directory: where the files go; made if it does not exist.
+        progress: called with the frames done and the frames in all; what it raises stops the work, and no file changes.
 
     Raises:
         FilesError: when a file that is needed is missing or damaged, or the directory cannot be written.
@@ -44,7 +44,7 @@ def convert(run: Path, name: str, directory: Path, progress: Count = lambda done
             notes = wanted.write(finished, staged, progress)
             files = sorted(path.relative_to(staged).as_posix() for path in staged.rglob("*") if path.is_file())
     except SceneError as error:
-        # What a scene would have to name is here what it had.
+        # The fault names what the scene is to change; here the picture itself must be put back.
         fault = error.lines[0].partition(";")[0]
         said = f"{run}: {fault}; put back the picture that it was run with, or run the scene again"
         raise FilesError(said) from None

@@ -1,4 +1,4 @@
-"""The formats by name: the files of each, and the function that writes them."""
+"""The export formats by name: the files of each, and the function that writes them."""
 
 from __future__ import annotations
 
@@ -13,12 +13,12 @@ from taichi_msm.results.folder import Tree
 
 
 class Format(NamedTuple):
-    """A format.
+    """An export format.
 
     Attributes:
-        files: what is in its folder, by patterns of names.
-        write: writes the files of a run into an empty folder, telling how far it is, and returns what one should know
-            of them.
+        files: the files in its folder, as patterns of names.
+        write: writes the files of a run into an empty folder, reports its progress, and returns what the user should
+            know about the files.
     """
 
     files: Tree

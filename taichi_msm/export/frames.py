@@ -1,4 +1,4 @@
-"""Reading the frames of a run, and other pictures of their size."""
+"""Read the frames of a run, and other pictures of the same size."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ BLACK = (0, 0, 0)
 
 
 def frame_path(run: FinishedRun, number: int) -> Path:
-    """Find the picture of a frame; raises FilesError where it is not among the results."""
+    """Find the picture of a frame; raises FilesError if it is not among the results."""
     return run.result(f"{FRAMES}/{series_file(FRAMES, number)}", "png")
 
 

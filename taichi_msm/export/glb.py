@@ -1,6 +1,6 @@
-"""The container of glTF, .glb: JSON, and one chunk of binary data that it leads into.
+"""The container format of glTF, .glb: JSON, and one chunk of binary data that the JSON refers to.
 
-Written here: a header of 12 bytes and two chunks are less than the three packages that pygltflib would bring along.
+It is written here because a header of 12 bytes and two chunks cost less than pygltflib and the packages it depends on.
 
 Source: the glTF 2.0 specification of Khronos, sections 3.6 (accessors) and 4.4 (GLB).
 """
@@ -20,7 +20,7 @@ JSON, BINARY = b"JSON", b"BIN\0"
 
 COMPONENTS = {"f": 5126, "u": 5125}  # float32, uint32
 KINDS = {1: "SCALAR", 2: "VEC2", 3: "VEC3"}
-# What a buffer is for: its vertices, their indices.
+# What a buffer holds: vertices, or indices of vertices.
 VERTICES, INDICES = 34962, 34963
 
 # Every part begins at a multiple of this many bytes.
@@ -42,7 +42,7 @@ class Binary:
         self._length = 0
 
     def view(self, data: bytes | memoryview, target: int | None = None) -> int:
-        """Add bytes, and give the number of their view; `target`: what they are for."""
+        """Add bytes, and return the number of their view; `target` tells what they are for."""
         place = {"buffer": 0, "byteOffset": self._length, "byteLength": len(data)}
         self.views.append(place if target is None else {**place, "target": target})
         self._parts += [data, _padding(len(data), b"\0")]
@@ -50,12 +50,12 @@ class Binary:
         return len(self.views) - 1
 
     def accessor(self, values: NDArray[Any], target: int | None = None, *, bounds: bool = False) -> int:
-        """Add numbers, and give the number of their accessor.
+        """Add numbers, and return the number of their accessor.
 
         Args:
             values: float32 or uint32, one number or a vector in each row.
             target: what they are for.
-            bounds: whether the accessor tells the least and the largest of every component.
+            bounds: whether the accessor has the minimum and the maximum of every component.
         """
         rows = np.ascontiguousarray(values).reshape(len(values), -1)
         accessor = {
@@ -70,7 +70,7 @@ class Binary:
         return len(self.accessors) - 1
 
     def container(self, document: dict[str, Any]) -> Iterator[bytes | memoryview]:
-        """Give the parts of the file of a document, which leads into this."""
+        """Give the parts of a file with these data and the document that refers to them."""
         own = {"accessors": self.accessors, "bufferViews": self.views, "buffers": [{"byteLength": self._length}]}
         text = json.dumps({**document, **own}, separators=(",", ":"), allow_nan=False).encode()
         text += _padding(len(text), b" ")

@@ -1,11 +1,13 @@
 """The surface in motion as glTF 2.0, in one file with its picture.
 
-The mesh is that of the first frame. Every other frame is a morph target, which says how far each vertex and its normal
-are from there; an animation gives the target of a frame the weight 1 at its time and 0 at those of the frames beside
-it, linear between. Metres, y up and texture coordinates from the picture's upper left are those of this program.
+The mesh is that of the first frame. Every other frame is a morph target, which holds the differences of each vertex and
+its normal from the mesh. An animation gives the target of a frame the weight 1 at its time and 0 at the times of the
+frames beside it, linear between. Both glTF and this program use metres, y up, and texture coordinates from the upper
+left.
 
-Browsers hold the targets in a texture of as many layers, of which WebGL 2 has 256. A run of more frames, or of so many
-points that the file were too large, is told by key frames, and the largest error that this makes is said.
+Browsers store the targets in a texture with a layer for each, and WebGL 2 guarantees 256 layers. A run with more
+frames, or with so many points that the file would be too large, is reduced to key frames, and the largest error of this
+is reported.
 
 Source: the glTF 2.0 specification of Khronos, sections 3.7.2.2 (morph targets) and 3.11 (animations).
 """
@@ -30,13 +32,13 @@ from taichi_msm.results.folder import Tree
 FILE = "surface.glb"
 FILES: Tree = {r"surface\.glb": None}
 
-# Morph targets: MAX_ARRAY_TEXTURE_LAYERS, which every WebGL 2 has, and what is left to load of them.
+# Limits of morph targets: by number, MAX_ARRAY_TEXTURE_LAYERS of every WebGL 2; by bytes, what still loads well.
 MOST_TARGETS = 256
 MOST_BYTES = 1 << 28
-# Of a vertex in a target: the differences of its position and of its normal.
+# Bytes per vertex in a target: the differences of its position and of its normal.
 VERTEX_BYTES = 2 * 3 * 4
 
-# OpenGL's numbers for how a picture is filtered, and that it ends at its edge.
+# OpenGL's constants for filtering a picture, and for clamping it at its edge.
 LINEAR, MIPMAPS, CLAMPED = 9729, 9987, 33071
 
 
@@ -45,7 +47,7 @@ def write_gltf(run: FinishedRun, folder: Path, progress: Count) -> list[str]:
 
     Raises:
         FilesError: when the run has no trajectory, or it is damaged.
-        SceneError: when the picture is gone.
+        SceneError: when the picture is missing.
     """
     positions, picture, binary = run.positions(), picture_png(run), Binary()
     most = max(1, min(MOST_TARGETS, MOST_BYTES // (VERTEX_BYTES * positions[0, ..., 0].size)))
@@ -104,7 +106,7 @@ def _target(first: NDArray[np.floating], position: NDArray[np.floating], binary:
 
 
 def _animation(times: NDArray[np.float32], binary: Binary) -> dict[str, Any]:
-    """Make the weights of all targets at all key frames: at its own frame each has 1, the first frame has none."""
+    """Make the weights of all targets at all key frames: each is 1 at its own frame; the first frame has no target."""
     weights = np.eye(len(times), dtype=np.float32)[:, 1:].reshape(-1)
     sampler = {
         "input": binary.accessor(times, bounds=True),
@@ -119,14 +121,14 @@ def _animation(times: NDArray[np.float32], binary: Binary) -> dict[str, Any]:
 
 
 def _material(has_picture: bool) -> dict[str, Any]:
-    """Make a rough material, so that a light shows the relief."""
+    """Make a rough material, so that light shows the shape of the surface."""
     colour = {"baseColorTexture": {"index": 0}} if has_picture else {}
     rough = {"metallicFactor": 0.0, "roughnessFactor": 1.0}
     return {"name": "sheet", "doubleSided": True, "pbrMetallicRoughness": {**colour, **rough}}
 
 
 def _texture(picture: bytes, binary: Binary) -> dict[str, Any]:
-    """Make the picture a texture of the document."""
+    """Add the picture to the document as a texture."""
     return {
         "textures": [{"source": 0, "sampler": 0}],
         "images": [{"name": "picture", "mimeType": "image/png", "bufferView": binary.view(picture)}],

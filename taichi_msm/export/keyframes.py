@@ -1,4 +1,4 @@
-"""Frames that stand for a motion: between two of them every point goes in a straight line at a constant speed."""
+"""Key frames, which represent a motion: between two of them every point moves in a straight line at constant speed."""
 
 from __future__ import annotations
 
@@ -24,17 +24,17 @@ class KeyFrames(NamedTuple):
 
 
 def key_frames(position: NDArray[np.floating], most: int, progress: Count = lambda done, total: None) -> KeyFrames:
-    """Choose the frames that stand for a motion: all of them, where they are not too many.
+    """Choose the key frames of a motion: all frames, unless they are too many.
 
-    Else, beginning with the first and the last, the frame that is farthest from its place becomes a key frame, again
-    and again. So keys are close together where the motion is sudden.
+    If they are, the first and the last frame are key frames to begin with. Then the frame that the key frames represent
+    worst becomes a key frame too, again and again. So key frames are close together where the motion is sudden.
 
     Args:
         position: positions [m] at equal distances in time, shape (frames, rows, cols, 3).
-        most: number of key frames, at most; 2 or more.
-        progress: called with the key frames that were chosen, and their number in the end.
+        most: the largest number of key frames; 2 or more.
+        progress: called with the number of key frames chosen so far, and `most`.
 
-    Source: Douglas and Peucker 1973, with all points in the place of one and a number in the place of a tolerance.
+    Source: Douglas and Peucker 1973, for all points together and with a given number instead of a tolerance.
     """
     count = len(position)
     if count <= most:
@@ -51,11 +51,11 @@ def key_frames(position: NDArray[np.floating], most: int, progress: Count = lamb
 
 
 class _Span(NamedTuple):
-    """The frames from one key frame to the next; the worst sorts first.
+    """The frames from one key frame to the next; the span with the largest error sorts first.
 
     Attributes:
-        error: minus the largest distance of a point from its place in any of them [m].
-        frame: that has it.
+        error: minus the largest distance between a point in any of the frames and where the key frames place it [m].
+        frame: the frame with this error.
         first, last: the key frames.
     """
 

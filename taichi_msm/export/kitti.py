@@ -1,4 +1,4 @@
-"""Optical flow as KITTI 2015 has it.
+"""Optical flow in the format of KITTI 2015.
 
 Every pair of frames f and f + 1 is a scene of KITTI: `image_2/NNNNNN_10.png` and `_11.png`, and its flow in
 `flow_occ/NNNNNN_10.png`, valid wherever the sheet is, and `flow_noc/NNNNNN_10.png`, valid only where what is seen in f
@@ -41,11 +41,11 @@ def write_kitti(run: FinishedRun, folder: Path, progress: Count) -> list[str]:
     """Write the flow of a run, and its frames and occlusion if it has them.
 
     Raises:
-        FilesError: when the run has no flow, or a file is missing or damaged.
+        FilesError: when the run has no flow, or when a file is missing or damaged.
     """
     size, pairs = run.scene.render.size, run.frames - 1
     if pairs == 0:
-        raise FilesError(f"{run.directory}: has one frame, and flow is from one to the next; run the scene to its end")
+        raise FilesError(f"{run.directory}: has only one frame, and flow needs two; run the scene to its end")
     has = {output: run.has(output) for output in (OCCLUSION, FRAMES)}
     wanted = [ALL, *([SEEN] if has[OCCLUSION] else []), *([PICTURES] if has[FRAMES] else [])]
     for name in wanted:
@@ -73,13 +73,13 @@ def encode(flow: NDArray[np.float32], seen: NDArray[np.bool_] | None = None) -> 
     """Turn flow into the colours of KITTI.
 
     Args:
-        flow: to the right and down [px], shape (height, width, 2); anything that does not fit is not valid.
-        seen: where else it is not valid, shape (height, width); None: nowhere.
+        flow: to the right and down [px], shape (height, width, 2); values that do not fit are not valid.
+        seen: where flow can be valid at all, shape (height, width); None: everywhere.
 
     Returns:
         Red, green and blue, shape (height, width, 3).
     """
-    # In double precision, so that nothing but this rounds.
+    # In double precision, so that the only rounding is to the nearest whole number.
     scaled = np.rint(flow.astype(np.float64) * SCALE + ZERO)
     valid = ((scaled >= 0) & (scaled <= LARGEST)).all(axis=-1)
     if seen is not None:
@@ -91,7 +91,7 @@ def encode(flow: NDArray[np.float32], seen: NDArray[np.bool_] | None = None) -> 
 
 
 def _copy(run: FinishedRun, number: int, path: Path) -> None:
-    """Copy a frame, once it was found to be a whole picture of the right size."""
+    """Copy a frame, after checking that it is a whole picture of the right size."""
     source = frame_path(run, number)
     read_picture(source, run.scene.render.size)
     shutil.copyfile(source, path)

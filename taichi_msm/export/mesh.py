@@ -1,4 +1,4 @@
-"""What programs for surfaces need of a run: its picture, normals, and the names of its frames."""
+"""What all formats for surfaces share: the picture of a run, its normals, and the names of its frames."""
 
 from __future__ import annotations
 
@@ -12,18 +12,18 @@ from taichi_msm.reference.shading import normals
 from taichi_msm.render.texture import load_texture
 from taichi_msm.results.finished_run import FinishedRun
 
-# The mass points themselves, cut as the picture cuts them: what is drawn between them is bilinear, so that more
-# vertices would tell no more of the motion.
+# The vertices are the mass points, and cells are cut as in the picture. The surface between mass points is bilinear, so
+# more vertices would add nothing about the motion.
 REFINE = 0
 
 PICTURE = "picture.png"
 
 
 def picture_png(run: FinishedRun) -> bytes | None:
-    """Encode the picture on the sheet, cut to the scene's region; None where the scene names none.
+    """Encode the picture on the sheet, cut to the scene's region; None if the scene names none.
 
     Raises:
-        SceneError: when it is gone, or cannot be used any more.
+        SceneError: when it is missing, or can no longer be used.
     """
     if run.scene.image is None:
         return None
@@ -33,7 +33,7 @@ def picture_png(run: FinishedRun) -> bytes | None:
 
 
 def unit_normals(position: NDArray[np.floating]) -> NDArray[np.float64]:
-    """Give unit normals of the points, as pictures are lit; along z where a fold leaves none.
+    """Give unit normals of the points, the same as for the light in pictures; along z where a fold leaves none.
 
     Args:
         position: positions [m], shape (rows, cols, 3).

@@ -1,7 +1,7 @@
-"""The surface as Wavefront OBJ: one file for every frame, all with one material and the picture.
+"""The surface as Wavefront OBJ: one file for every frame; all share one material and the picture.
 
-Texture coordinates are counted from the picture's lower left. Every vertex of a face has its position, texture
-coordinate and normal under one number.
+Texture coordinates are counted from the picture's lower left. The position, the texture coordinate and the normal of a
+vertex have the same index.
 
 Source: Wavefront's Advanced Visualizer manual, appendix B1 (OBJ) and its specification of materials (MTL).
 """
@@ -23,7 +23,7 @@ from taichi_msm.results.folder import Tree
 MATERIAL = "surface.mtl"
 FILES: Tree = dict.fromkeys((r"[0-9]{4,}\.obj", r"surface\.mtl", r"picture\.png"))
 
-# As many digits as tell a number of single precision from any other.
+# As many digits as distinguish any two numbers of single precision.
 EXACT = "%.9g"
 
 
@@ -32,7 +32,7 @@ def write_obj(run: FinishedRun, folder: Path, progress: Count) -> list[str]:
 
     Raises:
         FilesError: when the run has no trajectory, or it is damaged.
-        SceneError: when the picture is gone.
+        SceneError: when the picture is missing.
     """
     positions, picture = run.positions(), picture_png(run)
     if picture is not None:

@@ -1,7 +1,7 @@
-"""PNGs of 16 bits a channel.
+"""PNGs with 16 bits per channel.
 
-Written here, in a page: Pillow has no such pictures in colour, pypng has had no release since 2022, and OpenCV would be
-60 MB to install for one call.
+The format is written here, in one page: Pillow has no such pictures in colour, pypng has had no release since 2022, and
+OpenCV would be 60 MB to install for one call.
 """
 
 from __future__ import annotations

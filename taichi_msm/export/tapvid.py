@@ -1,13 +1,13 @@
-"""Tracks of points as TAP-Vid has them.
+"""Tracks of points in the format of TAP-Vid.
 
-One pickle as that of TAP-Vid-DAVIS: a dictionary from the video's name to
+One pickle like that of TAP-Vid-DAVIS: a dictionary from the video's name to a dictionary of
 
     video      frames, uint8, shape (frames, height, width, 3)
     points     where each point is, float32, shape (tracks, frames, 2): x / width and y / height, 0 at the left and the
                upper edge of the picture, so that the centre of the first pixel is at (0.5 / width, 0.5 / height)
     occluded   whether it is hidden or outside the picture, bool, shape (tracks, frames)
 
-Its readers multiply `points` by width and height, and have pixels with the origin at the picture's corner.
+Its readers multiply `points` by width and height to get pixels, with the origin at the picture's upper left corner.
 
 Source: google-deepmind/tapnet, tapnet/tapvid/README.md, evaluation_datasets.py (create_davis_dataset) and visualize.py.
 """
@@ -34,12 +34,12 @@ from taichi_msm.system.resources import available_memory
 FILE = "tapvid.pkl"
 FILES: Tree = {r"tapvid\.pkl": None}
 
-# Every Python from 3.4 on reads this one.
+# The pickle protocol that every Python from 3.4 on reads.
 PROTOCOL = 4
 
 
 class _Pickler(pickle.Pickler):
-    """Pickles arrays so that every NumPy reads them: those of NumPy 2 name a module that 1.26.0 and before lack."""
+    """Pickles arrays so that every NumPy reads them: NumPy 2 would name a module that 1.26.0 and earlier lack."""
 
     def reducer_override(self, value: Any) -> Any:
         if isinstance(value, np.ndarray):
@@ -55,7 +55,7 @@ def write_tapvid(run: FinishedRun, folder: Path, progress: Count) -> list[str]:
     """
     width, height = run.scene.render.size
     points, occluded = read_tracks(run)
-    # All of it is in memory at once, wherever it is read; while it is written, twice.
+    # Readers hold the whole video in memory; writing it takes twice that.
     need, free = 2 * 3 * run.frames * height * width, available_memory()
     if need > free:
         raise FilesError(
@@ -78,7 +78,7 @@ def read_tracks(run: FinishedRun) -> tuple[NDArray[np.float32], NDArray[np.bool_
 
     Returns:
         Where each point is [px], shape (tracks, frames, 2), and whether it is hidden, shape (tracks, frames). A point
-        that is nowhere in the picture's plane, as it is behind the eye, is hidden and at (0, 0).
+        behind the eye has no place in the picture's plane; it is hidden and at (0, 0).
 
     Raises:
         FilesError: when there are none, or they are damaged.

@@ -1,15 +1,15 @@
-"""The surface for ParaView: an unstructured grid for every frame (.vtu), and a collection of them by time (.pvd).
+"""The surface for ParaView: an unstructured grid for every frame (.vtu), and a list of them with their times (.pvd).
 
-Points are the mass points, row after row from the top left; the triangles between them are those that the picture
-shows. At the points there are
+Points are the mass points, row after row from the top left; the triangles between them are cut as in the picture. Each
+point has
 
     displacement     from rest [m]
-    speed            [m/s], from the frames beside it: the displacement of two frames over their time
-    energy_density   elastic energy of the springs by area at rest [J/m2]; that of bending and of the virtual springs
-                     is not in it
+    speed            [m/s], from the frames before and after it: the difference of their displacements over their time
+    energy_density   elastic energy of the springs per area at rest [J/m2], without that of bending and of the virtual
+                     springs
     texture          texture coordinates, from the picture's lower left; the picture is beside the files
 
-Source: VTK's own writer; the collection as ParaView's guide has it.
+Source: VTK's own writer; for the .pvd file, ParaView's guide.
 """
 
 from __future__ import annotations
@@ -44,7 +44,7 @@ def write_vtk(run: FinishedRun, folder: Path, progress: Count) -> list[str]:
 
     Raises:
         FilesError: when the run has no trajectory, or it is damaged.
-        SceneError: when the picture or the map is gone.
+        SceneError: when the picture or the map is missing.
         NotInstalledError: when VTK is not installed.
     """
     try:
@@ -70,7 +70,7 @@ def write_vtk(run: FinishedRun, folder: Path, progress: Count) -> list[str]:
 
 
 def speed(positions: Array, time: Array, frame: int) -> Array:
-    """Tell how fast the points are, by the difference of the frames on either side; 0 in the first, which is at rest.
+    """Give the speed of the points, by the difference of the frames on either side; 0 in the first, which is at rest.
 
     Args:
         positions: of every frame [m], shape (frames, rows, cols, 3).
@@ -94,14 +94,14 @@ def _name(frame: int) -> str:
 
 
 def _write_grid(path: Path, position: Array, values: dict[str, Array]) -> None:
-    """Write a surface with what is known at its points."""
+    """Write a surface with the data of its points."""
     from vtkmodules.util.numpy_support import numpy_to_vtk, numpy_to_vtkIdTypeArray
     from vtkmodules.vtkCommonCore import vtkDataArray, vtkPoints
     from vtkmodules.vtkCommonDataModel import VTK_TRIANGLE, vtkCellArray, vtkUnstructuredGrid
     from vtkmodules.vtkIOXML import vtkXMLUnstructuredGridWriter
 
     def named(name: str, data: Array) -> Any:
-        # In the precision of the run.
+        # The data have the precision of the run.
         array = numpy_to_vtk(np.ascontiguousarray(data, position.dtype), deep=True)
         array.SetName(name)
         if name in UNITS:
@@ -122,7 +122,7 @@ def _write_grid(path: Path, position: Array, values: dict[str, Array]) -> None:
         grid.GetPointData().AddArray(named(name, data))
     grid.GetPointData().SetActiveVectors(DISPLACEMENT)
     grid.GetPointData().SetTCoords(named("texture", shown.texture_coordinates * (1, -1) + (0, 1)))
-    # As text, so that it is Python that finds a disk to be full: VTK would say so itself.
+    # VTK makes a text that Python writes, so that a full disk is Python's error; VTK would print one of its own.
     writer = vtkXMLUnstructuredGridWriter()
     writer.WriteToOutputStringOn()
     writer.SetInputData(grid)
@@ -131,7 +131,7 @@ def _write_grid(path: Path, position: Array, values: dict[str, Array]) -> None:
 
 
 def _write_collection(path: Path, time: Array) -> None:
-    """Write which file is of which time."""
+    """Write the list of the files with their times."""
     root = ElementTree.Element("VTKFile", type="Collection", version="0.1")
     collection = ElementTree.SubElement(root, "Collection")
     for frame, seconds in enumerate(time.tolist()):

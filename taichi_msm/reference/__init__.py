@@ -1,6 +1,6 @@
-"""The model and the picture once more in plain float64 NumPy, slow and obvious: what the kernels are tested against.
+"""The model and the picture a second time, in plain float64 NumPy, slow and simple: the kernels are tested against it.
 
-Not to be confused with an independent check: it is itself tested against closed forms and SciPy's integrators.
+This is no independent check of the model; it is itself tested against closed forms and SciPy's integrators.
 """
 
 from taichi_msm.reference.drawing import draw, refine

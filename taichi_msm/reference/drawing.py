@@ -1,4 +1,4 @@
-"""The picture once more: triangle by triangle, pixel by pixel."""
+"""The reference for the picture, drawn triangle by triangle and pixel by pixel."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ def refine(values: Array, n: int) -> Array:
 
     Args:
         values: values at the mass points, shape (rows, cols, k).
-        n: number of new ones between two.
+        n: number of values inserted between two.
 
     Returns:
         Values at the vertices, shape ((rows - 1)(n + 1) + 1, (cols - 1)(n + 1) + 1, k).
@@ -37,9 +37,9 @@ def refine(values: Array, n: int) -> Array:
 
 
 def weights(triangle: Array, x: Array, y: Array) -> Array:
-    """Give the share of each corner in the point of a triangle that is seen at a pixel; perspective-correct.
+    """Give the barycentric weights of the point of a triangle that is seen at a pixel, corrected for perspective.
 
-    With p the pixel and (X, Y, w) the corners, the point sum b_i (X, Y, w)_i is at p where
+    With p the pixel and (X, Y, w) the corners, the point sum b_i (X, Y, w)_i is seen at p if
     sum b_i ((X, Y)_i - p w_i) = 0, so b_i is the cross product of the other two such differences.
 
     Args:
@@ -48,7 +48,7 @@ def weights(triangle: Array, x: Array, y: Array) -> Array:
         y: pixel, down [px], the same shape.
 
     Returns:
-        Weights of sum 1, shape (3, *x.shape); all are 0 or more inside, NaN where the triangle is seen edge-on.
+        Weights with sum 1, shape (3, *x.shape); inside all are 0 or more; NaN where the triangle is seen edge-on.
     """
     dx = [corner[0] - x * corner[2] for corner in triangle]
     dy = [corner[1] - y * corner[2] for corner in triangle]
@@ -83,13 +83,13 @@ def wire_share(scene: Scene, triangle: Array, x: Array, y: Array) -> Array:
 
 
 class Seen(NamedTuple):
-    """What the samples of a picture show; each of shape (height, width), of samples.
+    """What the samples of a picture show; each array has the shape (height, width), counted in samples.
 
     Attributes:
         depth: along the direction of view [m]; infinite where nothing is.
         u, v: the material point, fractions of the sheet's width and height from its upper left; NaN where none is.
         wire: share of the mesh lines in the colour.
-        footprint: the larger of a sample's width and height on the texture [texels by style.SHARP].
+        footprint: the larger of a sample's width and height on the texture, in units of style.SHARP texels.
     """
 
     depth: Array
@@ -100,12 +100,12 @@ class Seen(NamedTuple):
 
 
 def look(scene: Scene, position: Array, factor: int = 1, texels: tuple[int, int] = (1, 1)) -> Seen:
-    """Find what every sample shows: refine, project, and of every sample keep the nearest triangle.
+    """Find what every sample shows: refine, project, and keep the nearest triangle at every sample.
 
     Args:
         scene: the scene.
         position: positions of the mass points [m], shape (rows, cols, 3).
-        factor: samples of a pixel along each axis.
+        factor: samples per pixel along each axis.
         texels: width and height of the texture.
     """
     rows, cols = scene.sheet.points
@@ -139,7 +139,7 @@ def look(scene: Scene, position: Array, factor: int = 1, texels: tuple[int, int]
 
 
 def triangles(surface: Array) -> Iterator[Array]:
-    """List the triangles of refined vertices, shape (rows, cols, k), each with shape (3, k)."""
+    """List the triangles of refined vertices, shape (rows, cols, k); each triangle has the shape (3, k)."""
     for r, c in np.ndindex(surface.shape[0] - 1, surface.shape[1] - 1):
         corners = surface[r, c], surface[r + 1, c], surface[r + 1, c + 1], surface[r, c + 1]
         yield np.array(corners[:3])
@@ -147,9 +147,9 @@ def triangles(surface: Array) -> Iterator[Array]:
 
 
 def footprint(triangle: Array, x: Array, y: Array, texels: tuple[int, int]) -> Array:
-    """Give the larger of a sample's width and height on the texture, in texels by style.SHARP.
+    """Give the larger of a sample's width and height on the texture, in units of style.SHARP texels.
 
-    By differences over a thousandth of a sample.
+    It is found by finite differences over a thousandth of a sample.
 
     Args:
         triangle: corners (X, Y, w, depth, u, v), shape (3, 6).

@@ -1,4 +1,4 @@
-"""The model once more: forces and steps."""
+"""The reference for the model: its forces and its steps."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ Array = NDArray[np.float64]
 
 
 def elastic_force(scene: Scene, displacement: Array) -> Array:
-    """Sum k (L - L0) (Q - P) / L over the neighbours Q of every point P (eq. 2), but for what cancels at rest.
+    """Sum k (L - L0) (Q - P) / L over the neighbours Q of every point P (eq. 2), without the part that cancels at rest.
 
     Args:
         scene: the scene.
@@ -41,7 +41,7 @@ def elastic_force(scene: Scene, displacement: Array) -> Array:
 
 
 def _ends_apart(springs: Springs, displacement: Array) -> tuple[Array, Array]:
-    """Give the vectors from one end of springs to the other, and their lengths [m]."""
+    """Give the vectors from one end of each spring to the other, and their lengths [m]."""
     between = displacement[springs.there] - displacement[springs.here] + springs.offset
     return between, np.linalg.norm(between, axis=-1)
 
@@ -80,7 +80,7 @@ def shortest_spring(scene: Scene, displacement: Array) -> float:
         displacement: x - X [m], shape (rows, cols, 3).
 
     Returns:
-        The smallest length of a spring over the one at rest; 1 where there are none.
+        The smallest ratio of a spring's length to that at rest; 1 if there are no springs.
     """
     return min(1.0, *(float(strain.min(initial=1.0)) for strain in _strains(scene, displacement)))
 
@@ -96,15 +96,15 @@ def _strains(scene: Scene, displacement: Array) -> Iterator[Array]:
 
 
 def energy(scene: Scene, displacement: Array) -> float:
-    """Add up what springs and bending hold more than at rest [J], without the virtual springs."""
+    """Give the elastic energy of springs and bending above that at rest [J], without the virtual springs."""
     held = sum(float(held.sum()) for _, held in _held(scene, displacement))
     return held + sheet(scene).bending / 2 * float((_laplacian(scene, displacement) ** 2).sum())
 
 
 def energy_density(scene: Scene, displacement: Array) -> Array:
-    """Tell what springs hold more than at rest by area, without bending and the virtual springs.
+    """Give the elastic energy of springs above that at rest, per area, without bending and the virtual springs.
 
-    Each end of a spring gets half of what it holds, and a point has the share of the sheet's area at rest that
+    Each end of a spring gets half of its energy, and a point has the share of the sheet's area at rest that
     `area_shares` gives it, so that the sum of density times area is the energy of all springs.
 
     Args:
@@ -112,7 +112,7 @@ def energy_density(scene: Scene, displacement: Array) -> Array:
         displacement: x - X [m], shape (rows, cols, 3).
 
     Returns:
-        Energy by area at rest [J/m2], shape (rows, cols).
+        Energy per area at rest [J/m2], shape (rows, cols).
     """
     at_points, (dx, dy) = np.zeros(displacement.shape[:2]), spacing(scene.sheet)
     for springs, held in _held(scene, displacement):
@@ -122,17 +122,17 @@ def energy_density(scene: Scene, displacement: Array) -> Array:
 
 
 def _held(scene: Scene, displacement: Array) -> Iterator[tuple[Springs, Array]]:
-    """Give what every spring holds more than at rest [J], with the springs."""
+    """Give the energy of every spring above that at rest [J], with the springs."""
     for springs in sheet(scene).springs:
         between, length = _ends_apart(springs, displacement)
         rest = springs.length - springs.unstretched
-        # What is linear in the displacements cancels in the sum over a sheet that is in balance at rest.
+        # The part that is linear in the displacements cancels in the sum, as the sheet is in equilibrium at rest.
         linear = (between - springs.offset) @ springs.offset * rest / springs.length
         yield springs, springs.stiffness * ((length - springs.unstretched) ** 2 / 2 - rest**2 / 2 - linear)
 
 
 def surgical_force(scene: Scene, loads: Schedule, n: int) -> Array:
-    """Sum the forces of the probes: (percent / 100) force exp(-falloff d - offset) (eq. 5), or their share of a total.
+    """Sum the forces of the probes: (percent / 100) force exp(-falloff d - offset) (eq. 5), or shares of their totals.
 
     Args:
         scene: the scene.
@@ -158,7 +158,7 @@ def surgical_force(scene: Scene, loads: Schedule, n: int) -> Array:
 
 
 def force(scene: Scene, displacement: Array, loads: Schedule, n: int) -> Array:
-    """Add up all forces but the damping at one step (eq. 1).
+    """Add up all forces except the damping at one step (eq. 1).
 
     Args:
         scene: the scene.

@@ -1,4 +1,4 @@
-"""What is known of every pixel once more: every point against every triangle."""
+"""The reference for labels: every point is tested against every triangle."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from taichi_msm.scene import Scene
 
 Array = NDArray[np.float64]
 
-# Nearer than this fraction of the sheet's larger side is the surface at the point itself.
+# Whatever is in front of a point by less than this fraction of the sheet's larger side counts as the point's own place.
 TOUCHING = 1e-9
 
 
@@ -48,13 +48,13 @@ def find(scene: Scene, coordinates: Array, position: Array) -> tuple[Array, NDAr
         position: positions of the mass points [m], shape (rows, cols, 3).
 
     Returns:
-        Pixels, shape (n, 2), NaN behind the eye; and what is hidden, shape (n,).
+        Pixels, shape (n, 2), NaN behind the eye; and whether each point is hidden, shape (n,).
     """
     camera, (width, height) = view(scene), scene.render.size
     points = np.concatenate([position, np.ones((*position.shape[:2], 1))], axis=-1) @ camera.matrix.T
     surface = refine(points, scene.render.refine)
     rows, cols = surface.shape[:2]
-    # The vertices up and to the left of a point, and its place in their small quad.
+    # The vertex to the upper left of each point, and the point's place in the small quad of that vertex.
     across, down = coordinates[:, 0] * (cols - 1), coordinates[:, 1] * (rows - 1)
     j, i = (np.clip(p.astype(int), 0, count - 2) for p, count in ((across, cols), (down, rows)))
     s, t = (across - j)[:, None], (down - i)[:, None]

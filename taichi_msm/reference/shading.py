@@ -1,4 +1,4 @@
-"""The colours of the picture once more: the texture, and the light on tissue and on metal."""
+"""The reference for the colours of the picture: the texture, and the light on tissue and on metal."""
 
 from __future__ import annotations
 
@@ -85,7 +85,7 @@ def sample(texture: NDArray[np.uint8], u: Array, v: Array) -> Array:
 
 
 def mean_of_fours(texture: NDArray[np.uint8]) -> NDArray[np.uint8]:
-    """Halve a texture: each texel the mean of 2 x 2, rounded; beyond an edge are the texels at it."""
+    """Halve a texture: each texel is the rounded mean of 2 x 2; beyond an edge, the texels at the edge are repeated."""
     rows, cols = (np.minimum(np.arange(size + size % 2), size - 1) for size in texture.shape[:2])
     even = texture[rows][:, cols].astype(float)
     mean = (even[::2, ::2] + even[1::2, ::2] + even[::2, 1::2] + even[1::2, 1::2]) / 4
@@ -93,17 +93,18 @@ def mean_of_fours(texture: NDArray[np.uint8]) -> NDArray[np.uint8]:
 
 
 def minified(texture: NDArray[np.uint8], u: Array, v: Array, footprint: Array) -> tuple[Array, Array]:
-    """Filter a texture over samples that may each show many of its texels.
+    """Filter a texture for samples each of which may show many of its texels.
 
     Args:
         texture: colours, shape (height, width, 3).
         u: 0 at the left edge to 1 at the right one, any shape.
         v: 0 at the top edge to 1 at the bottom one, the same shape.
-        footprint: the larger of a sample's width and height on the texture [texels by style.SHARP], the same shape.
+        footprint: the larger of a sample's width and height on the texture, in units of style.SHARP texels; the same
+            shape.
 
     Returns:
-        Colours, shape (*u.shape, 3); and how the grey rises from texel to texel of the texture to the right and down,
-        shape (*u.shape, 2).
+        Colours, shape (*u.shape, 3); and the slope of the grey from texel to texel to the right and down, shape
+        (*u.shape, 2).
     """
     levels = [texture]
     while levels[-1].shape[:2] != (1, 1):
@@ -111,7 +112,7 @@ def minified(texture: NDArray[np.uint8], u: Array, v: Array, footprint: Array) -
     lower = np.floor(np.log2(np.maximum(footprint, 1))).astype(int)
     share = np.clip(footprint / 2.0**lower - 1, 0, 1)[..., None]
     height, width, _ = texture.shape
-    # Of every level, at the places of all samples; a halved texel begins where its first half does.
+    # Every level is filtered at the places of all samples; a texel of a halved level begins where its first half does.
     colours, rises = [], []
     for n, level in enumerate(levels):
         across, down = u * width / 2**n / level.shape[1], v * height / 2**n / level.shape[0]
@@ -140,16 +141,18 @@ def rise(texture: NDArray[np.uint8], u: Array, v: Array) -> Array:
 
 
 def unit(vector: Array) -> Array:
-    """Give vectors length 1, shape (..., 3)."""
+    """Scale vectors to length 1, shape (..., 3)."""
     return np.asarray(vector / np.maximum(np.linalg.norm(vector, axis=-1, keepdims=True), 1e-30))
 
 
 def points(camera: View, factor: int, depth: Array) -> Array:
-    """Find what the samples of a picture show, in space [m], shape (height, width, 3); where nothing is, anything.
+    """Find the points in space that the samples of a picture show [m], shape (height, width, 3).
+
+    Where nothing is seen, the values have no meaning.
 
     Args:
         camera: the camera.
-        factor: samples of a pixel along each axis.
+        factor: samples per pixel along each axis.
         depth: along the direction of view [m], shape (height, width).
     """
     right, up, toward = camera.axes
@@ -162,17 +165,17 @@ def points(camera: View, factor: int, depth: Array) -> Array:
 
 
 def illuminate(camera: View, factor: int, depth: Array, normal: Array) -> tuple[Array, Array, Array, Array]:
-    """Find what lights the samples of a picture, in space.
+    """Find the vectors in space that decide how the samples of a picture are lit.
 
     Args:
         camera: the camera.
-        factor: samples of a pixel along each axis.
+        factor: samples per pixel along each axis.
         depth: along the direction of view [m], shape (height, width).
         normal: of any length, to either side, shape (height, width, 3).
 
     Returns:
-        Unit vectors: the normal on the camera's side, to the light, to the eye; and the distance from the light to what
-        is in the middle of the picture over that to the sample.
+        Unit vectors: the normal on the camera's side, the direction to the light, the direction to the eye; and the
+        distance from the light to the point in the middle of the picture over that to the sample.
     """
     right, up, toward = camera.axes
     point = points(camera, factor, depth)
@@ -185,7 +188,7 @@ def illuminate(camera: View, factor: int, depth: Array, normal: Array) -> tuple[
 
 
 def highlight(normal: Array, to_light: Array, to_eye: Array) -> Array:
-    """Give Phong's highlight, 0 to 1."""
+    """Give the highlight of Phong's model, 0 to 1."""
     mirrored = 2 * (normal * to_light).sum(axis=-1, keepdims=True) * normal - to_light
     return np.asarray(np.clip((mirrored * to_eye).sum(axis=-1), 0, 1) ** 2**style.SHARPNESS)
 
@@ -207,7 +210,7 @@ def tissue(
         texture: the picture on the sheet, shape (height, width, 3).
         normal: of the sheet, of any length, shape (height, width, 3).
         depth: along the direction of view [m], shape (height, width).
-        place: u, v and footprint of the samples, as for `minified`.
+        place: u, v and footprint of the samples, the arguments of `minified`.
         rods: the instruments.
 
     Returns:
@@ -215,7 +218,7 @@ def tissue(
     """
     light, factor = scene.render.light, scene.render.supersample
     colour, rises = minified(texture, *place)
-    # Where the picture rises the normal leans back, along the sheet.
+    # Where the relief rises, the normal tilts back, along the sheet.
     upward = light.relief / 100 * max(scene.sheet.size) / 255
     sizes = texture.shape[1] / scene.sheet.size[1], texture.shape[0] / scene.sheet.size[0]
     normal = unit(normal)
@@ -239,7 +242,7 @@ def tissue(
 
 
 def metal(camera: View, factor: int, depth: Array, normal: Array) -> Array:
-    """Shade metal, which mirrors a room that is bright above and dark below; colours, shape (height, width, 3)."""
+    """Shade metal, which reflects a room that is bright above and dark below; colours, shape (height, width, 3)."""
     facing, to_light, to_eye, _ = illuminate(camera, factor, depth, normal)
     cosine = np.maximum((facing * to_light).sum(axis=-1), 0)
     mirrored = 2 * (facing * to_eye).sum(axis=-1, keepdims=True) * facing - to_eye
@@ -250,13 +253,13 @@ def metal(camera: View, factor: int, depth: Array, normal: Array) -> Array:
 
 
 def meet(rods: Sequence[Rod], camera: View, size: tuple[int, int], factor: int) -> tuple[Array, Array]:
-    """Find the instruments that samples show, by halving: the distance to a rod is convex along a line of sight.
+    """Find the instruments that samples show, by search: the distance to a rod is convex along a line of sight.
 
     Args:
         rods: the instruments.
         camera: the camera.
         size: width and height of the picture [px].
-        factor: samples of a pixel along each axis.
+        factor: samples per pixel along each axis.
 
     Returns:
         Depths [m], infinite where there is none, shape (height, width); and normals of any length, shape (height,
@@ -283,14 +286,14 @@ def meet(rods: Sequence[Rod], camera: View, size: tuple[int, int], factor: int) 
         reach = rod.radius * 1.01
         low, high = np.full_like(x, ends.min() - reach), np.full_like(x, ends.max() + reach)
         first = np.copy(low)
-        for _ in range(200):  # nearest to the rod: the interval shrinks to two thirds
+        for _ in range(200):  # ternary search for the place nearest to the rod: the interval shrinks to two thirds
             a, b = low + (high - low) / 3, high - (high - low) / 3
             left = np.linalg.norm(outward(a), axis=-1) < np.linalg.norm(outward(b), axis=-1)
             low, high = np.where(left, low, a), np.where(left, b, high)
         middle = (low + high) / 2
         met = np.linalg.norm(outward(middle), axis=-1) <= rod.radius
         low, high = first, middle
-        for _ in range(60):  # where it is entered
+        for _ in range(60):  # bisection for where the line of sight enters the rod
             half = (low + high) / 2
             inside = np.linalg.norm(outward(half), axis=-1) <= rod.radius
             low, high = np.where(inside, low, half), np.where(inside, half, high)

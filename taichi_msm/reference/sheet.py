@@ -1,4 +1,4 @@
-"""The model once more: what the sheet is made of, put together cell by cell."""
+"""The reference for the sheet: what it is made of, put together cell by cell."""
 
 from __future__ import annotations
 
@@ -17,14 +17,14 @@ Window = tuple[slice, slice]
 
 
 class Springs(NamedTuple):
-    """All springs that lead down and right by so many points.
+    """All springs with the same number of points down and to the right between their ends.
 
     Attributes:
         here, there: select the points at their ends; `there` is down or to the right of `here`.
         offset: vector from here to there at rest [m], x right, y up, z.
         length: at rest [m].
         stiffness: k of each [N/m], shape as selected by `here`.
-        unstretched: length at which each does not pull [m]; that at rest, unless the sheet is under tension.
+        unstretched: length at which each has no force [m]; equal to `length`, unless the sheet is under tension.
     """
 
     here: Window
@@ -101,17 +101,17 @@ def _of_tissue(scene: Scene, tissue: Tissue) -> Sheet:
 
 
 def _rows_of(cells: Array) -> Array:
-    """Add what cells give to the edges above and below them; one row more."""
+    """Add the contributions of cells to the edges above and below them; the result has one row more."""
     return np.pad(cells, ((0, 1), (0, 0))) + np.pad(cells, ((1, 0), (0, 0)))
 
 
 def _columns_of(cells: Array) -> Array:
-    """Add what cells give to the edges at their left and right; one column more."""
+    """Add the contributions of cells to the edges at their left and right; the result has one column more."""
     return np.pad(cells, ((0, 0), (0, 1))) + np.pad(cells, ((0, 0), (1, 0)))
 
 
 def _springs(scene: Scene, ahead: tuple[int, int], stiffness: Array, pull: Array) -> Springs:
-    """Make the springs that lead down and right by so many points; `pull` is their force at rest by their length."""
+    """Make the springs that lead this many points down and right; `pull` is their force at rest over their length."""
     (down, right), (dx, dy) = ahead, spacing(scene.sheet)
     rows, cols = scene.sheet.points
     here = slice(0, rows - down), slice(max(0, -right), cols - max(0, right))

@@ -1,1 +1,1 @@
-"""Kernel 2 and what belongs to it: the camera, the texture, the picture."""
+"""Kernel 2 and its surroundings: the camera, the texture, light, instruments, pictures, labels."""

@@ -19,30 +19,30 @@ OBLIQUE_DIRECTION = np.array([0.0, -0.64, 0.77])
 OBLIQUE_FOV = 32.0
 OBLIQUE_MARGIN = 1.04
 
-# Nothing nearer to the eye's plane than this fraction of the sheet's diagonal is drawn.
+# The near plane: only what is farther from the eye than this fraction of the sheet's diagonal is drawn.
 NEAR = 1e-6
 
 
 class View(NamedTuple):
-    """How points become pixels.
+    """A camera that was set up: the map from points to pixels.
 
     A point's place in the camera's frame is (right, up, -depth) [m] from the eye. It is seen at
 
         x = centre_x + right / w scale,    y = centre_y - up / w scale    [px]
 
-    with w = depth for a pinhole, and w = 1 for the orthographic camera, whose eye is anywhere on its plane.
+    with w = depth for a pinhole camera, and w = 1 for the orthographic one, whose eye may be anywhere on its plane.
 
     Attributes:
-        matrix: takes (x, y, z, 1) [m] to (X, Y, w, depth), shape (4, 4): the point is at X / w, Y / w [px], x right
+        matrix: maps (x, y, z, 1) [m] to (X, Y, w, depth), shape (4, 4): the point is at X / w, Y / w [px], x right
             and y down from the picture's top-left corner; of two points the one of smaller depth [m] is nearer.
-        near: nothing with a w of this or less is drawn [m].
+        near: only what has a larger w than this is drawn [m].
         axes: unit vectors to the right, up and toward the camera, as rows, shape (3, 3); the last is also the direction
             of the headlight.
-        eye: where depth and the camera's frame begin [m], shape (3,).
-        scale: pixels of a metre at w = 1.
+        eye: origin of depth and of the camera's frame [m], shape (3,).
+        scale: pixels per metre at w = 1.
         centre: the middle of the picture [px], shape (2,).
-        distance: from the eye to what is looked at [m].
-        pinhole: whether it is one.
+        distance: from the eye to the point that it looks at [m].
+        pinhole: whether it is a pinhole camera.
     """
 
     matrix: Array
@@ -61,7 +61,7 @@ class View(NamedTuple):
 
 
 def calibration(camera: View) -> dict[str, list[list[float]]]:
-    """Write a camera down as other programs take it.
+    """Describe a camera by the matrices that other programs use.
 
     Returns:
         projection: 3 x 4, with pixel = (P [x y z 1])_12 / (P [x y z 1])_3 from the picture's upper left corner. For a
@@ -109,7 +109,7 @@ def problems(scene: Scene) -> Iterator[Problem]:
 
 
 def pinhole(scene: Scene) -> Camera:
-    """Give the scene's camera as a pinhole; for the orthographic one from straight above, the sheet as large."""
+    """Give the scene's camera as a pinhole camera; the orthographic one becomes one above the sheet, at equal scale."""
     camera = scene.render.camera
     if isinstance(camera, Camera):
         return camera
@@ -120,10 +120,10 @@ def pinhole(scene: Scene) -> Camera:
 
 
 def turned(camera: Camera, right: float, up: float) -> Camera:
-    """Carry a camera around its target.
+    """Orbit a camera around its target.
 
     Args:
-        camera: where it was.
+        camera: the camera before.
         right: angle about the sheet's normal [rad].
         up: angle about the camera's own horizontal axis, over the sheet [rad].
     """
@@ -142,15 +142,15 @@ def _rotation(axis: Array, angle: float) -> Array:
 
 
 def _top_scale(scene: Scene) -> float:
-    """Give the pixels of a metre that fit the rest rectangle into the picture."""
+    """Give the pixels per metre at which the rest rectangle fits into the picture."""
     (height, width), (columns, lines) = scene.sheet.size, scene.render.size
     return min(columns / width, lines / height)
 
 
 def _top(scene: Scene) -> View:
-    """Look straight down, the rest rectangle fitted into the picture at one scale and centred.
+    """Look straight down; the rest rectangle is centred in the picture and fits it, at one scale for both axes.
 
-    Depth begins at the larger side of the sheet above it.
+    The eye, where depth is 0, is as far above the sheet as the sheet's larger side is long.
     """
     (columns, lines), scale, distance = scene.render.size, _top_scale(scene), max(scene.sheet.size)
     rows = [[scale, 0, 0, columns / 2], [0, -scale, 0, lines / 2], [0, 0, 0, 1], [0, 0, -1, distance]]

@@ -1,8 +1,8 @@
 """What every sample of the picture shows: the nearest point of the surface, and where on the sheet it is.
 
-No vertex is stored. A sample inside the outline of a cell solves the two equations of patch.py, which tells the small
-quad, its side of the diagonal the triangle, and the triangle's own two linear equations the place on it. A cell that is
-folded or reaches behind the camera is drawn triangle by triangle instead.
+Vertices are not stored. For a sample inside the outline of a cell, the two equations of patch.py give the small quad;
+the side of the quad's diagonal that the sample is on gives the triangle; and the two linear equations of the triangle
+give the place on it. A cell that is folded or reaches behind the camera is drawn triangle by triangle instead.
 """
 
 # No `from __future__ import annotations` here: Taichi reads the annotations of a kernel.
@@ -17,18 +17,18 @@ from taichi_msm.render.patch import Plane, edge, on_triangle, small_quad, turn
 from taichi_msm.render.samples import DEPTH, INFINITY, TEXEL_X, TEXEL_Y, Code
 from taichi_msm.system.runtime import ti
 
-# A triangle that is drawn by itself may be overstepped, so that no gap is left beside it: by so much of its side, and
-# of the picture's, for which f32 has places.
+# A triangle that is drawn by itself is enlarged a little, so that no gap is left beside it: by this fraction of its
+# side, and by this fraction of the picture's, which is what f32 resolves.
 OVERSTEP = 1e-5
 OVERSTEP_OF_PICTURE = 2e-6
 
-# Beyond so many samples f32 has no places for the outline of a cell that is drawn as a whole.
+# A cell is drawn as a whole only if its outline stays within this distance, at which f32 still resolves it [samples].
 FARTHEST = float(1 << 16)
 
-# What is kept of a mass point: (X, Y, w, depth), its place in the picture [samples], its unit normal.
+# The numbers of a mass point: (X, Y, w, depth), its place in the picture [samples], its unit normal.
 SEEN, NORMAL, POINT_NUMBERS = 4, 6, 9
 
-# So many texels squared are all of any texture.
+# A footprint of this size covers any texture [texels squared].
 LARGEST_FOOTPRINT = 1e12
 
 vec4 = ti.types.vector(4, ti.f32)
@@ -38,7 +38,7 @@ class Surface(NamedTuple):
     """What is drawn.
 
     Attributes:
-        point: of every mass point the POINT_NUMBERS.
+        point: the POINT_NUMBERS of every mass point.
         rows, cols: mass points.
         parts: small quads along a side of a cell.
         texture_width, texture_height: of the texture [texels].
@@ -56,12 +56,12 @@ class Band(NamedTuple):
     """A band of the picture, and the view.
 
     Attributes:
-        samples: what is kept of the tiles of all workers.
+        samples: the planes of the tiles of all workers.
         first: entry of `samples` where the band begins.
-        across: tiles of a row of them.
+        across: tiles in a row.
         top, bottom: first row of samples, and the row after the last.
         width, height: of the picture [samples].
-        near: what is not farther than this is not drawn.
+        near: only what is farther than this is drawn.
         numbers: as `view_numbers` makes them.
     """
 
@@ -85,7 +85,7 @@ class Cell(NamedTuple):
         side: 1 where its front is seen, else -1.
         corner: entry of its upper left mass point.
         texel_x, texel_y: whole texels to that point.
-        rest_x, rest_y: what is left of a texel there.
+        rest_x, rest_y: the fraction of a texel that remains.
         step_x, step_y: texels of the cell.
         i, j: its row and column.
         cells_down, cells_across: cells of the sheet.
@@ -127,7 +127,7 @@ def covering(code: Code) -> Callable[..., Any]:
 
     @ti.func
     def largest_edge(p_x, p_y, q_x, q_y, x, y, side):
-        """The largest `edge` times side of a tile whose upper left sample is at (x, y), rounded alike."""
+        """The largest `edge` times side in a tile whose upper left sample is at (x, y), rounded as `edge` rounds."""
         right, down = (q_x - p_x) * side, (q_y - p_y) * side
         x += ti.select(down > 0.0, 0.0, code.tile_width - 1.0)
         y += ti.select(right > 0.0, code.tile_height - 1.0, 0.0)
@@ -135,7 +135,7 @@ def covering(code: Code) -> Callable[..., Any]:
 
     @ti.func
     def normal_at(surface: ti.template(), cell: ti.template(), across, along):
-        """Interpolate the normals of the mass points; of no length in particular."""
+        """Interpolate the normals of the mass points; the result is not normalised."""
         normal = [floats(0) for _ in ti.static(range(3))]
         corner = cell.corner + NORMAL
         below = corner + surface.cols * POINT_NUMBERS
@@ -147,27 +147,27 @@ def covering(code: Code) -> Callable[..., Any]:
 
     @ti.func
     def light(surface: ti.template(), cell: ti.template(), numbers: ti.template(), across, along):
-        """Share of the headlight that comes back: the cosine between the normal and the direction to the light."""
+        """Share of the headlight that is reflected: the cosine between the normal and the direction to the light."""
         n_x, n_y, n_z = normal_at(surface, cell, across, along)
         length = ti.sqrt(n_x * n_x + n_y * n_y + n_z * n_z)
         toward = AXES + 6
         cosine = absolute(n_x * numbers[toward] + n_y * numbers[toward + 1] + n_z * numbers[toward + 2])
         cosine = cosine / ti.max(length, 1e-30)
-        # The normal of a point that is infinitely far, or nowhere, is none.
+        # Where a point is infinite or NaN, so is its normal.
         return ti.max(ti.min(cosine, 1.0), 0.0)
 
     @ti.func
     def footprint(x, y, s, t, texels_x, texels_y, plane: ti.template()):
-        """Square of the larger of a sample's width and height on the texture, in texels by style.SHARP.
+        """Square of the larger of a sample's width and height on the texture, in units of style.SHARP texels.
 
-        With x = X / w the derivatives of (x, y) by (s, t) are (R_1, D_1; R_2, D_2) / w, where R_1 = R_x - x R_w and so
-        on; those of (s, t) by (x, y) are the inverse.
+        With x = X / w the derivatives of (x, y) with respect to (s, t) are (R_1, D_1; R_2, D_2) / w, where
+        R_1 = R_x - x R_w and so on; those of (s, t) with respect to (x, y) are the inverse.
         """
         r_1 = plane.r_x - x * plane.r_w
         d_1 = plane.d_x - x * plane.d_w
         r_2 = plane.r_y - y * plane.r_w
         d_2 = plane.d_y - y * plane.d_w
-        # As in `on_triangle`, so that it is computed once.
+        # Written as in `on_triangle`, so that the compiler computes it once.
         share = 1.0 / (r_1 * d_2 - r_2 * d_1)
         scale = (plane.p_w + plane.r_w * s + plane.d_w * t) * share
         across_1, across_2, down_1, down_2 = d_1 * texels_x, d_2 * texels_x, r_1 * texels_y, r_2 * texels_y
@@ -176,7 +176,10 @@ def covering(code: Code) -> Callable[..., Any]:
 
     @ti.func
     def wire_share(across, down, right_across, right_down, below_across, below_down):
-        """Share of the mesh lines in a sample's colour, from places on the mesh; see `reference/drawing.py`."""
+        """Share of the mesh lines in a sample's colour, from its place on the mesh and those of its neighbours.
+
+        See `reference/drawing.py`.
+        """
         to_right, to_below = right_across - across, below_across - across
         slope = ti.sqrt(to_right * to_right + to_below * to_below)
         distance = absolute(across - ti.round(across)) / ti.max(slope, 1e-12)
@@ -301,7 +304,7 @@ def covering(code: Code) -> Callable[..., Any]:
             before and convex and ti.max(-left_end, right_end) < FARTHEST and ti.max(-upper_end, lower_end) < FARTHEST
         )
         side = ti.select(abd > 0, 1.0, -1.0)
-        # Where the texture is, in texels, exact to a fraction of one on any sheet.
+        # The cell's place on the texture in texels; in f64, so that it is exact to a fraction of one on any sheet.
         texel_x = ti.cast(j, ti.f64) * surface.texture_width / (surface.cols - 1) - 0.5
         texel_y = ti.cast(i, ti.f64) * surface.texture_height / (surface.rows - 1) - 0.5
         whole_x, whole_y = ti.floor(texel_x), ti.floor(texel_y)
@@ -322,7 +325,7 @@ def covering(code: Code) -> Callable[..., Any]:
 
         pieces = ti.select(whole, 1, 2 * count * count)
         for piece in range(pieces):
-            # Of a triangle that is drawn by itself: its quad, and whether it is below the diagonal.
+            # For a triangle that is drawn by itself: its quad, and whether it is below the diagonal.
             quad = piece // 2
             quad_s = ti.cast(quad % count, ti.f32)
             quad_t = ti.cast(quad // count, ti.f32)
@@ -375,7 +378,7 @@ def covering(code: Code) -> Callable[..., Any]:
                         inside = floats(1) > 0.0
                         column, line = floats(quad_s), floats(quad_t)
                         if not whole:
-                            # Beyond its bounds rounding decides, and how far tiles reach there depends on their shape.
+                            # Outside its bounds rounding would decide, in samples that depend on the tiles' shape.
                             inside = (
                                 (x > ti.cast(first_column, ti.f32))
                                 & (x < ti.cast(end_column, ti.f32))

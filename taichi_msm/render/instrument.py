@@ -15,7 +15,7 @@ Array = NDArray[np.float64]
 
 
 class Rod(NamedTuple):
-    """An instrument at one time.
+    """The shape and place of an instrument at one time.
 
     Attributes:
         tip: middle of its rounded tip [m], shape (3,).
@@ -36,7 +36,7 @@ def rods(scene: Scene, position: NDArray[np.floating], time: float) -> list[Rod]
     Args:
         scene: a checked scene.
         position: positions of the mass points [m], shape (rows, cols, 3).
-        time: at which the control points are taken [s].
+        time: the time at which the control points are taken [s].
     """
     return [
         rod(probe.instrument, scene, position, control_point(probe, scene.sheet, time))
@@ -52,7 +52,7 @@ def rod(instrument: Instrument, scene: Scene, position: NDArray[np.floating], re
         instrument: the instrument.
         scene: whose sheet it touches.
         position: positions of the mass points [m], shape (rows, cols, 3).
-        rest: where the point that it touches is at rest, x and y [m], shape (2,).
+        rest: rest position of the point that it touches, x and y [m], shape (2,).
     """
     shaft = np.array(instrument.shaft) / max(map(abs, instrument.shaft))
     axis = shaft / np.linalg.norm(shaft)

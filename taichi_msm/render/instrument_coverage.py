@@ -1,8 +1,9 @@
 """The samples that show an instrument.
 
-A rod is all that is within its radius of the line from the middle A of its tip to the other end, A + U length. The line
-of sight through a sample is P = O + D t with t the depth; at the rod's side the part of P - A across U has the radius
-as its length, which is a quadratic equation; beyond A and the other end, spheres about them are met instead.
+A rod is all that lies within its radius of the line segment from the middle A of its tip to A + U length, its other
+end. The line of sight through a sample is P = O + D t, where t is the depth. On the side of the rod the component of
+P - A perpendicular to U has the radius as its length, which is a quadratic equation for t. Where its solution lies
+beyond an end of the segment, the line of sight is intersected with the sphere around that end instead.
 """
 
 # No `from __future__ import annotations` here: Taichi reads the annotations of a kernel.
@@ -33,7 +34,7 @@ from taichi_msm.system.runtime import ti
 
 @ti.func
 def dot(a_x, a_y, a_z, b_x, b_y, b_z):
-    """Multiply two vectors."""
+    """Give the scalar product of two vectors."""
     return a_x * b_x + a_y * b_y + a_z * b_z
 
 
@@ -54,7 +55,7 @@ def meet(x, y, n, numbers: ti.template()):
     tip, axis = rod + TIP, rod + AXIS
     u_x, u_y, u_z = numbers[axis], numbers[axis + 1], numbers[axis + 2]
     length, radius = numbers[rod + LENGTH], numbers[rod + RADIUS]
-    # The line of sight P = O + D t from where it is as deep as the tip, which is at 0.
+    # The line of sight P = O + D t; here t is counted from the depth of the tip, and the tip is at 0.
     start = numbers[tip + 2] * (-1.0)
     across = (x - numbers[CENTRE_X]) * numbers[SPREAD]
     up = (numbers[CENTRE_Y] - y) * numbers[SPREAD]
@@ -73,7 +74,7 @@ def meet(x, y, n, numbers: ti.template()):
     inner = b * b - a * c
     t_side = (ti.sqrt(ti.max(inner, 0.0)) + b) * (-1.0) / a
     along = o_u + t_side * d_u
-    # The sphere about the end where the side is left.
+    # The sphere around the end beyond which the solution lies.
     end = ti.select(along < length * 0.5, 0.0, length)
     b_end = o_d - end * d_u
     c_end = o_o - 2.0 * end * o_u + end * end - radius * radius

@@ -1,4 +1,4 @@
-"""What is known of every pixel: values, without Taichi."""
+"""Labels, which tell what each pixel shows: the types of their values, without Taichi."""
 
 from __future__ import annotations
 
@@ -14,8 +14,8 @@ class Labels(NamedTuple):
     Attributes:
         coordinates: of the material point, fractions of the sheet's width from its left and of its height from its top,
             shape (height, width, 2); NaN where no sheet is seen.
-        depth: along the direction of view, from the eye [m], shape (height, width); 0 where nothing is seen. The
-            orthographic camera's eye is as far above the sheet at rest as the sheet's larger side is long.
+        depth: distance from the eye along the direction of view [m], shape (height, width); 0 where nothing is seen.
+            The orthographic camera's eye is as far above the sheet at rest as the sheet's larger side is long.
         instrument: 255 where an instrument is seen, else 0, shape (height, width).
     """
 
@@ -25,13 +25,13 @@ class Labels(NamedTuple):
 
 
 class Flow(NamedTuple):
-    """How the material that one frame shows moves in the picture until another.
+    """How the material that one frame shows moves in the picture from this frame to another.
 
     Attributes:
-        flow: to the right and down [px], shape (height, width, 2); NO_FLOW where no sheet is seen, and where it goes
-            behind the eye.
-        occlusion: 255 where the sheet is seen in the one frame, but in the other something is in front of it or it is
-            outside the picture; else 0; shape (height, width).
+        flow: to the right and down [px], shape (height, width, 2); NO_FLOW where no sheet is seen, and where the
+            material goes behind the eye.
+        occlusion: 255 where the sheet is seen in the first frame, but in the other something is in front of it or it
+            is outside the picture; else 0; shape (height, width).
     """
 
     flow: NDArray[np.float32]
@@ -51,12 +51,12 @@ class Sight(NamedTuple):
 
 
 class Observed(NamedTuple):
-    """What is written of one frame, as far as it is asked for.
+    """The outputs of one frame; None for those that were not asked for.
 
     Attributes:
         picture: colours, shape (height, width, 3).
         labels: what each pixel shows.
-        flow: of what the frame before showed, until this one.
+        flow: from the frame before to this one.
         tracks: where the tracked points are.
     """
 
@@ -67,22 +67,22 @@ class Observed(NamedTuple):
 
 
 def track_grid(count: int) -> NDArray[np.float32]:
-    """Give the coordinates of points in the middle of equal fields of the sheet, shape (count^2, 2), row after row."""
+    """Give the coordinates of the centres of count^2 equal fields of the sheet, row by row, shape (count^2, 2)."""
     middle = (np.arange(count) + 0.5) / count
     down, across = np.meshgrid(middle, middle, indexing="ij")
     return np.stack([across, down], axis=-1).reshape(-1, 2).astype(np.float32)
 
 
 def flow_between(before: Labels, sight: Sight) -> Flow:
-    """Put flow together.
+    """Put the flow from one frame to another together.
 
     Args:
-        before: what the earlier frame shows.
-        sight: how far what its pixels show has moved, and what is hidden.
+        before: what the first frame shows.
+        sight: for each of its pixels, how far what it shows has moved and whether it is hidden.
     """
     shape = before.depth.shape
     return Flow(sight.pixels.reshape(*shape, 2), sight.hidden.reshape(shape).view(np.uint8) * np.uint8(255))
 
 
-# What the Middlebury format has where there is no flow.
+# The value for "no flow" in the Middlebury format.
 NO_FLOW = 1e10

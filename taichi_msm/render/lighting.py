@@ -1,15 +1,16 @@
-"""Light on wet tissue and on metal, as an endoscope gives it: from beside the camera, weaker with distance.
+"""The light of an endoscope on wet tissue and on metal: it comes from beside the camera and weakens with distance.
 
-All is in the camera's frame, the eye at 0: x right, y up, z toward the camera. With P the point that a sample shows, N
-its unit normal on the camera's side, L from P to the light and V from P to the eye, both of length 1, and M where light
-from L is mirrored to, 2 (N L) N - L:
+All vectors are in the camera's frame: the eye at 0, x right, y up, z toward the camera. P is the point that a sample
+shows, N its unit normal on the camera's side, L the unit vector from P to the light, V that from P to the eye, and
+M = 2 (N L) N - L the direction into which light from L is reflected:
 
     light    = ambient + (1 - ambient) (N L + wrap) / (1 + wrap) d0 / d / the same at the middle of the picture
     colour   = texture light + 255 gloss (M V)^shininess d0 / d
 
-d is the distance to the light and d0 that from the middle; a flat sheet that faces the camera keeps its colours there.
-Light wraps around the surface as it does in tissue, through which it is scattered; so no side of a dent is black. An
-instrument keeps light from tissue near it: at r times its radius from its axis, the share style.SHADE / r^2.
+d is the distance from P to the light, and d0 that from the point in the middle of the picture; there, a flat sheet that
+faces the camera keeps its colours. Light wraps around the surface, as scattering in tissue makes it do, so no side of a
+dent is black. An instrument shades tissue near it: at r times its radius from its axis it takes away the share
+style.SHADE / r^2 of the light.
 """
 
 # No `from __future__ import annotations` here: Taichi reads the annotations of a kernel.
@@ -50,24 +51,24 @@ def lighting(code: Code) -> tuple[Callable[..., Any], ...]:
         code: what it is compiled for.
 
     Returns:
-        `tissue`, which gives what colours are multiplied by and what is added to them; `metal`, which gives red, green
-        and blue.
+        `tissue`, which gives the factor of colours and what is then added to them; `metal`, which gives red, green and
+        blue.
     """
     floats = code.floats
 
     @ti.func
     def illuminate(x, y, depth, n_x, n_y, n_z, numbers: ti.template()):
-        """Find how samples are lit, given depths and normals of any length to either side.
+        """Find how samples are lit; normals may have any length and point to either side.
 
         Returns:
-            N L; M V; d0 / d; and how far up V is mirrored.
+            N L; M V; d0 / d; and the upward component of the direction into which V is reflected.
         """
         w = depth * numbers[PINHOLE] + (1.0 - numbers[PINHOLE])
         right = (x - numbers[CENTRE_X]) * numbers[SPREAD] * w
         up = (numbers[CENTRE_Y] - y) * numbers[SPREAD] * w
         l_x, l_y = numbers[LIGHT_X] - right, numbers[LIGHT_Y] - up
         v_x, v_y, v_z = right * (numbers[PINHOLE] * (-1.0)), up * (numbers[PINHOLE] * (-1.0)), w
-        # Of vectors that are not of length 1 yet.
+        # Scalar products of vectors that are not normalised yet.
         n_l = n_x * l_x + n_y * l_y + n_z * depth
         n_v = n_x * v_x + n_y * v_y + n_z * v_z
         l_v = l_x * v_x + l_y * v_y + depth * v_z
@@ -97,7 +98,7 @@ def lighting(code: Code) -> tuple[Callable[..., Any], ...]:
 
     @ti.func
     def shaded(x, y, depth, rod_count, numbers: ti.template()):
-        """Share of the light that instruments leave to samples at (x, y)."""
+        """Share of the light that reaches samples at (x, y) past the instruments."""
         w = depth * numbers[PINHOLE] + (1.0 - numbers[PINHOLE])
         right = (x - numbers[CENTRE_X]) * numbers[SPREAD] * w
         up = (numbers[CENTRE_Y] - y) * numbers[SPREAD] * w
@@ -126,17 +127,17 @@ def lighting(code: Code) -> tuple[Callable[..., Any], ...]:
             left = shaded(x, y, depth, rod_count, numbers)
             share, gloss = share * left, gloss * left
         if ti.static(code.vignette):
-            # From the middle of the picture, by half its diagonal.
+            # The distance from the middle of the picture is in units of half its diagonal.
             off_x, off_y = x - numbers[CENTRE_X], y - numbers[CENTRE_Y]
             diagonal = numbers[CENTRE_X] * numbers[CENTRE_X] + numbers[CENTRE_Y] * numbers[CENTRE_Y]
             rim = 1.0 - numbers[VIGNETTE] * (off_x * off_x + off_y * off_y) / diagonal
             share, gloss = share * rim, gloss * rim
-        # The normal of a point that is infinitely far, or nowhere, is none.
+        # Where a point is infinite or NaN, so is its normal.
         return ti.max(ti.min(share, 8.0), 0.0), ti.max(ti.min(gloss, 8.0 * 255.0), 0.0)
 
     @ti.func
     def metal(x, y, depth, n_x, n_y, n_z, numbers: ti.template()):
-        """Light metal, which mirrors a room that is bright above and dark below."""
+        """Light metal, which reflects a room that is bright above and dark below."""
         cosine, mirror, _, upward = illuminate(x, y, depth, n_x, n_y, n_z, numbers)
         bright = ti.max(upward, 0.0)
         share = style.METAL_AMBIENT + style.METAL_DIFFUSE * ti.max(cosine, 0.0) + style.METAL_MIRROR * bright * bright

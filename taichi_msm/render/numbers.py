@@ -1,4 +1,4 @@
-"""What the kernels are told of a view, its light and its instruments, in one row, as every argument costs time."""
+"""The numbers of a view, its light and its instruments, in one array, as every argument of a kernel costs time."""
 
 from __future__ import annotations
 
@@ -15,21 +15,23 @@ from taichi_msm.scene import Render
 
 Array = NDArray[np.float64]
 
-# Where they are. The camera: its matrix, row after row; its axes; what is not farther than NEAR is not drawn. Then
-# small quads along a side of a cell, and the background's colour.
+# Indices into the array. The camera: its matrix, row after row; its axes; only what is farther than NEAR is drawn. Then
+# the number of small quads along a side of a cell, and the background's colour.
 MATRIX, AXES, NEAR, PARTS, BACKGROUND = 0, 16, 25, 26, 27
 
-# The middle of the picture [samples]; metres of a sample at w = 1; 1 for a pinhole, else 0.
+# The middle of the picture [samples]; metres per sample at w = 1; 1 for a pinhole camera, else 0.
 CENTRE_X, CENTRE_Y, SPREAD, PINHOLE = range(30, 34)
 
-# The light's place [m]; its distance from what is in the middle [m]; what makes it 1 there; the scene's numbers.
+# The light's place [m]; its distance from the point in the middle of the picture [m]; the factor that makes the light 1
+# there; the scene's numbers.
 LIGHT_X, LIGHT_Y, FARNESS, UNIT, AMBIENT, GLOSS, VIGNETTE = range(34, 41)
 
-# The sheet's axes to the right and up, in the camera's frame; the slope that a step of one grey from texel to texel is.
+# The sheet's axes to the right and up, in the camera's frame; the slope of the relief for a step of one grey from texel
+# to texel.
 ACROSS, UP, SLOPE_X, SLOPE_Y = 41, 44, 47, 48
 
-# Then the instruments. Of each: the middle of its tip and its axis in the camera's frame; length, radius; and its
-# bounds in the picture [samples].
+# Then the instruments, each with the middle of its tip and its axis in the camera's frame; its length and radius; and
+# its bounds in the picture [samples].
 RODS, ROD_NUMBERS = 49, 12
 TIP, AXIS, LENGTH, RADIUS, LEFT, TOP, RIGHT, BOTTOM = 0, 3, 6, 7, 8, 9, 10, 11
 
@@ -42,7 +44,7 @@ def view_numbers(
     Args:
         view: the camera.
         render: how the scene is drawn.
-        factor: samples of a pixel along each axis.
+        factor: samples per pixel along each axis.
         sheet: its height and width [m].
         texture: its width and height [texels].
         rods: the instruments.
@@ -72,7 +74,7 @@ def _rod_numbers(rod: Rod, view: View, factor: int) -> Array:
     numbers[TIP:AXIS] = view.axes @ (rod.tip - view.eye)
     numbers[AXIS:LENGTH] = view.axes @ rod.axis
     numbers[[LENGTH, RADIUS]] = rod.length, rod.radius
-    # The picture of a box around each end holds that of the end.
+    # The bounds of a box around each end also hold for the end itself.
     ends = np.stack([rod.tip, rod.tip + rod.axis * rod.length])
     corner = np.array(np.meshgrid(*[(-rod.radius, rod.radius)] * 3)).reshape(3, -1).T @ view.axes
     boxes = (ends[:, None] + corner).reshape(-1, 3)

@@ -1,8 +1,8 @@
 """A cell of the surface as the camera sees it, for one sample or a vector of them, in any precision.
 
-A point of the surface is carried as (X, Y, w, depth), what the camera's matrix makes of it. That map is linear, so
-refining the projected mass points is refining the surface, and the perspective needs no special case: within a cell,
-the surface between four mass points, with s to the right and t down,
+A point of the surface is represented by (X, Y, w, depth), the product of the camera's matrix and the point. That map is
+linear, so refining the projected mass points is the same as refining the surface, and perspective is no special case.
+In a cell, with s to the right and t down, the surface between the four mass points is
 
     P(s, t) = A + B s + C t + D s t,    seen at sample (x, y) where    X - x w = 0,  Y - y w = 0.
 """
@@ -15,7 +15,7 @@ from taichi_msm.system.runtime import ti
 
 
 class Plane(NamedTuple):
-    """The triangle P + R s + D t of a small quad that a sample is on, each of them (X, Y, w)."""
+    """The triangle P + R s + D t of a small quad that a sample is on; P, R and D are (X, Y, w) each."""
 
     p_x: Any
     p_y: Any
@@ -43,13 +43,13 @@ def on_triangle(x, y, plane: ti.template()):
 
 @ti.func
 def edge(p_x, p_y, q_x, q_y, x, y):
-    """Twice the area of p, q and (x, y), of one sign on each side; the same bits for both cells of an edge."""
+    """Twice the signed area of p, q and (x, y): the sign tells the side; both cells of an edge get the same bits."""
     return (q_x - p_x) * (y - p_y) - (q_y - p_y) * (x - p_x)
 
 
 @ti.func
 def turn(p_x, p_y, q_x, q_y, r_x, r_y):
-    """Twice the area of p, q and r: above 0 where the way from p over q to r turns to the right in the picture."""
+    """Twice the signed area of p, q and r: above 0 if the path from p over q to r turns right in the picture."""
     return (q_x - p_x) * (r_y - q_y) - (q_y - p_y) * (r_x - q_x)
 
 
@@ -78,7 +78,7 @@ def small_quad(
     b_2 = b[1] - y * b[2]
     c_2 = c[1] - y * c[2]
     d_2 = d[1] - y * d[2]
-    # Without t the two equations are bd s^2 + (ad + bc) s + ac = 0; without s they have the same discriminant.
+    # Eliminating t gives bd s^2 + (ad + bc) s + ac = 0; eliminating s gives an equation with the same discriminant.
     ad = a_1 * d_2 - d_1 * a_2
     bc = b_1 * c_2 - c_1 * b_2
     ac = a_1 * c_2 - c_1 * a_2

@@ -1,4 +1,4 @@
-"""Which material point is seen at a pixel: the way back from the picture to the sheet."""
+"""Which material point is seen at a pixel: the inverse of projection."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 
 from taichi_msm.render.camera import View
 
-# So many cells are looked into at a time.
+# How many cells are examined at a time.
 CELLS = 1024
 
 Array = NDArray[np.float64]
@@ -17,10 +17,10 @@ Seen = tuple[float, Place]
 
 
 def pick(position: NDArray[np.floating], refine: int, view: View, pixel: Pixel) -> Place | None:
-    """Find the material point that is drawn at the centre of a pixel: of the surface's triangles there the nearest.
+    """Find the material point that is drawn at the centre of a pixel, on the nearest of the triangles there.
 
-    With (X, Y, w, depth) what the camera makes of a point, a = X - x w and b = Y - y w are linear in the point and
-    both 0 where it is seen at (x, y). So nothing has to be divided by w, which is no positive number behind the camera.
+    The camera maps a point to (X, Y, w, depth). Then a = X - x w and b = Y - y w are linear in the point, and both are
+    0 if it is seen at (x, y). This needs no division by w, which is 0 or negative behind the camera.
 
     Args:
         position: positions of the mass points [m], shape (rows, cols, 3).
@@ -29,7 +29,7 @@ def pick(position: NDArray[np.floating], refine: int, view: View, pixel: Pixel) 
         pixel: x to the right and y down from the picture's top-left pixel, which is (0, 0).
 
     Returns:
-        Fractions of the sheet's width from its left and of its height from its top; None where no surface is.
+        Fractions of the sheet's width from its left and of its height from its top; None if no surface is there.
     """
     rows, cols = position.shape[:2]
     matrix = _seen_from(view, pixel)
@@ -49,7 +49,7 @@ def on_rest_plane(view: View, pixel: Pixel) -> NDArray[np.floating] | None:
     """Find where the line of sight through the centre of a pixel meets the plane of the sheet at rest.
 
     Returns:
-        x and y [m]; None where it does not meet it in front of the camera.
+        x and y [m]; None if they do not meet in front of the camera.
     """
     matrix = _seen_from(view, pixel)
     planar = matrix[:2, :2]
@@ -61,7 +61,7 @@ def on_rest_plane(view: View, pixel: Pixel) -> NDArray[np.floating] | None:
 
 
 def _seen_from(view: View, pixel: Pixel) -> Array:
-    """Give the matrix that makes (a, b, w, depth) of a point, shape (4, 4)."""
+    """Give the matrix that maps a point to (a, b, w, depth), shape (4, 4)."""
     matrix = view.matrix.copy()
     for row in (0, 1):
         matrix[row] -= (pixel[row] + 0.5) * matrix[2]
@@ -69,11 +69,11 @@ def _seen_from(view: View, pixel: Pixel) -> Array:
 
 
 def _may_show(position: NDArray[np.floating], matrix: Array) -> NDArray[np.bool_]:
-    """Mark the cells in which a and b can both be 0, given the matrix that makes (a, b, w, depth) of a point."""
+    """Mark the cells in which a and b can both be 0, given the matrix that maps a point to (a, b, w, depth)."""
     rows, cols = position.shape[:2]
     marked = np.ones((rows - 1, cols - 1), dtype=bool)
     for row in matrix[:2]:
-        # One number of every point at a time: all of a large sheet at once are no longer in the cache.
+        # One number per point at a time: for a large sheet, all of them together do not fit into the cache.
         value = position @ row[:3] + row[3]
         for side in (value <= 0, value >= 0):
             pairs = side[:-1] | side[1:]
@@ -88,7 +88,7 @@ def _around_zero(corners: Array) -> NDArray[np.bool_]:
 
 
 def _in_cells(corners: Array, i: NDArray[np.intp], j: NDArray[np.intp], refine: int, near: float) -> list[Seen]:
-    """List the depth and the place, in cells from the top left, of all that is seen in some cells at the pixel."""
+    """List what is seen of some cells at the pixel: each time the depth, and the place in cells from the top left."""
     parts = refine + 1
     share = np.arange(parts + 1) / parts
     s, t = share[:, None], share[:, None, None]
@@ -98,7 +98,7 @@ def _in_cells(corners: Array, i: NDArray[np.intp], j: NDArray[np.intp], refine: 
     cell, line, column = np.nonzero(_around_zero(quads))
     quad = quads[cell, line, column]
     found = []
-    for third in (1, 2):  # the corner besides the ends of the diagonal: upper right, lower left
+    for third in (1, 2):  # the third corner, beside the two ends of the diagonal: upper right, lower left
         triangle = quad[:, [0, third, 3]]
         p, q, r = np.moveaxis(triangle[..., :2], 1, 0)
         share = np.stack([_cross(q, r), _cross(r, p), _cross(p, q)], axis=-1)

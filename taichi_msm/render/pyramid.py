@@ -1,4 +1,4 @@
-"""The texture at half, a quarter, ... of its size, so that a sample that shows many texels shows their mean."""
+"""The texture at 1/2, 1/4, ... of its size (mipmaps), so that a sample that shows many texels shows their mean."""
 
 from __future__ import annotations
 
@@ -9,11 +9,11 @@ from numpy.typing import NDArray
 
 
 class Pyramid(NamedTuple):
-    """Levels of a texture, the first its own size, the last one texel.
+    """Levels of a texture: the first has the texture's size, the last has one texel.
 
     Attributes:
         texels: of all levels, as `packed` makes them, one row after another.
-        levels: of every level where it begins in `texels`, its width and its height, shape (levels, 3).
+        levels: for every level, where it begins in `texels`, its width and its height, shape (levels, 3).
     """
 
     texels: NDArray[np.float32]
@@ -21,7 +21,7 @@ class Pyramid(NamedTuple):
 
 
 def packed(colours: NDArray[np.uint8]) -> NDArray[np.float32]:
-    """Make one number of each colour, red + 256 green + 65536 blue, for which f32 has places."""
+    """Pack each colour into one number, red + 256 green + 65536 blue, which f32 holds exactly."""
     return colours.astype(np.float32) @ np.array([1, 1 << 8, 1 << 16], np.float32)
 
 
@@ -30,7 +30,7 @@ def pyramid(texture: NDArray[np.uint8], *, minified: bool) -> Pyramid:
 
     Args:
         texture: colours, shape (height, width, 3).
-        minified: False makes the first alone.
+        minified: whether all levels are made; False makes the first alone.
     """
     level, texels, levels, first = texture, [], [], 0
     while True:
@@ -44,7 +44,7 @@ def pyramid(texture: NDArray[np.uint8], *, minified: bool) -> Pyramid:
 
 
 def halved(colours: NDArray[np.uint8]) -> NDArray[np.uint8]:
-    """Give means of 2 x 2 texels; the last row and column of an odd number count twice."""
+    """Average blocks of 2 x 2 texels; where their number is odd, the last row or column counts twice."""
     height, width, _ = colours.shape
     even = np.pad(colours, ((0, height % 2), (0, width % 2), (0, 0)), "edge").astype(np.uint16)
     sums = even[::2, ::2] + even[1::2, ::2] + even[::2, 1::2] + even[1::2, 1::2]

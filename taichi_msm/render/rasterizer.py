@@ -1,9 +1,9 @@
 """Kernel 2: bilinear refinement, projection, rasterisation of textured triangles, shading.
 
-The picture is cut into bands of rows. A worker takes the next band, finds what each of its samples shows: the sheet
-(coverage.py) or an instrument before it (instrument.py). From that it gives out the colours of pixels, their labels, or
-both (shading.py). As in kernel 1, vectors stay vectors down to the machine code
-(docs/decisions/0010); casts, and floor and abs of vectors, are written so that they can.
+The picture is cut into bands of rows. A worker takes the next band and finds what each of its samples shows: the sheet
+(coverage.py) or an instrument in front of it (instrument_coverage.py). From that it writes the colours of pixels, their
+labels, or both (shading.py). As in kernel 1, vectors stay vectors down to the machine code (docs/decisions/0010), and
+casts, floor and abs of vectors are written to allow this.
 """
 
 # No `from __future__ import annotations` here: Taichi reads the annotations of a kernel.
@@ -27,7 +27,7 @@ from taichi_msm.render.shading import Out, Texture, resolving
 from taichi_msm.scene import Scene
 from taichi_msm.system.runtime import ITERATIONS_PER_THREAD, Memory, lanes, our_compilation, started, ti
 
-# The sizes that the kernel is told in one array, and how many bands are taken.
+# Indices into the kernel's array of sizes; the last entry counts the bands that workers have taken.
 COLS, WIDTH, HEIGHT, TEXTURE_WIDTH, TEXTURE_HEIGHT, ROD_COUNT, TAKEN = range(7)
 
 
@@ -36,7 +36,7 @@ class Drawn(NamedTuple):
 
     Attributes:
         picture: colours, shape (height, width, 3); None where only labels are drawn.
-        labels: what each pixel sees; None where only the picture is drawn.
+        labels: what each pixel shows; None where only the picture is drawn.
     """
 
     picture: NDArray[np.uint8] | None
@@ -44,12 +44,12 @@ class Drawn(NamedTuple):
 
 
 def structure(scene: Scene, *, picture: bool = True, labels: bool = False) -> Code:
-    """Find out what drawing a scene needs.
+    """Decide what the kernel must be compiled for to draw a scene.
 
     Args:
         scene: the scene.
         picture: whether colours are wanted.
-        labels: whether labels are; with both, a pixel has one sample.
+        labels: whether labels are wanted; for both together, the scene must have one sample per pixel.
     """
     render = scene.render
     return Code(
@@ -67,12 +67,12 @@ def structure(scene: Scene, *, picture: bool = True, labels: bool = False) -> Co
 
 
 class Drawing:
-    """Draws one scene's sheet; `runtime.start` comes first.
+    """Draws one scene's sheet; call `runtime.start` first.
 
     Args:
         scene: a checked scene.
         texture: the picture on the sheet, shape (height, width, 3).
-        code: another than that of the scene's picture.
+        code: what the kernel is compiled for; None: what the scene's picture needs.
     """
 
     def __init__(self, scene: Scene, texture: NDArray[np.uint8], code: Code | None = None) -> None:
@@ -85,7 +85,7 @@ class Drawing:
         self._workers = min(bands, started().threads) if started().arch == "cpu" else bands
         self._memory = memory = Memory()
         self._point = memory.array("f32", 0, rows * cols * POINT_NUMBERS)
-        # Of every row of mass points its highest and its lowest place in the picture.
+        # For every row of mass points, its highest and its lowest place in the picture.
         self._reach = memory.array("f32", 0, rows * 2)
         self._samples = memory.array("f32", self.code.lanes, self._workers * self.code.band_vectors(width))
         self._known: tuple[View, NDArray[np.float32]] | None = None
@@ -93,7 +93,7 @@ class Drawing:
         texels, self._levels = pyramid(texture, minified=self.code.tissue)
         self._texels: Any = texels
         if started().arch != "cpu":
-            # Kept there, or it would travel there and back with every picture.
+            # The texture stays on the device; a NumPy array would be copied there and back with every picture.
             self._texels = ti.ndarray(ti.f32, texels.size)
             self._texels.from_numpy(texels)
 
@@ -113,10 +113,10 @@ class Drawing:
         return picture
 
     def look(self, position: NDArray[Any], camera: View | None = None, rods: Sequence[Rod] = ()) -> Drawn:
-        """Draw whatever the code has; as for `draw`."""
+        """Draw the picture, the labels or both, as the code says; arguments as for `draw`."""
         camera, code = camera or self._view, self.code
         (rows, cols), (width, height) = self.scene.sheet.points, self.scene.render.size
-        # Whole tiles are given out, of which the last may be wider than the picture.
+        # Whole tiles are written, and the last of a row may reach beyond the picture.
         stride = code.tiles_across(width) * code.tile_width if code.in_words else width
         picture = np.empty((height, stride, 3) if code.picture else (1, 4, 3), np.uint8)
         pixels = width * height if code.labels else 1
@@ -151,7 +151,7 @@ class Drawing:
         )
 
     def _numbers(self, camera: View, rods: Sequence[Rod]) -> NDArray[np.float32]:
-        """Give the numbers of a view; without instruments they are put together only for another camera."""
+        """Give the numbers of a view; without instruments they are computed again only when the camera changes."""
         if rods or self._known is None or self._known[0] is not camera:
             render, size = self.scene.render, self.scene.sheet.size
             numbers = view_numbers(camera, render, self.code.supersample, size, self._texture_size, rods)
@@ -169,7 +169,7 @@ def _kernel(code: Code) -> Callable[..., None]:
 
     @ti.func
     def project(position: ti.template(), numbers: ti.template(), point: ti.template(), i, j, rows, cols):
-        """Note where mass point (i, j) is seen, and its normal; of tissue in the camera's frame."""
+        """Store where mass point (i, j) is seen, and its normal; for tissue, in the camera's frame."""
         here = (i * cols + j) * POINT_NUMBERS
         x, y, z = position[i, j, 0], position[i, j, 1], position[i, j, 2]
         for n in ti.static(range(4)):
@@ -258,7 +258,7 @@ def _kernel(code: Code) -> Callable[..., None]:
                 pixels = width * height
                 out = ti.static(Out(colours, labels, pixels))
                 samples_width, samples_height = width * factor, height * factor
-                # A worker that another program holds up leaves the bands to the others.
+                # Bands are taken one by one: if another program delays a worker, the others take its bands.
                 taking = True
                 while taking:
                     row = ti.atomic_add(sizes[TAKEN], 1) * code.band_rows

@@ -1,8 +1,8 @@
-"""What is kept of every sample of the picture between covering and shading, and how it lies in memory.
+"""What is stored of every sample of the picture between covering and shading, and its layout in memory.
 
-Samples are pixels, or where pixels are supersampled their parts. A tile of them is one vector: 4 x 4 samples for the 16
-lanes of AVX-512, 4 x 2 for 8 lanes, 4 x 1 for 4; on a GPU a single one. Bands of rows of tiles are the unit of parallel
-work; a worker keeps one band at a time, `planes` vectors a tile.
+Samples are pixels, or parts of pixels where these are supersampled. A tile of samples is one vector: 4 x 4 samples for
+the 16 lanes of AVX-512, 4 x 2 for 8 lanes, 4 x 1 for 4, a single one on a GPU. Bands of rows of tiles are the unit of
+parallel work; a worker stores one band at a time, with `planes` vectors per tile.
 """
 
 from __future__ import annotations
@@ -13,14 +13,14 @@ from typing import Any
 
 from taichi_msm.system.runtime import ti
 
-# Rows of samples of a band on a CPU, about.
+# Approximate number of rows of samples in a band on a CPU.
 BAND_ROWS = 16
 
-# Samples of a row of a tile, where there are as many lanes.
+# Samples in a row of a tile, if there are that many lanes.
 TILE_WIDTH = 4
 
-# Planes of every tile: the depth of what is seen, and its place in the texture [texels]. Other planes follow where the
-# code has them (`Code.layout`).
+# The first planes of every tile: the depth of what is seen, and its place in the texture [texels]. Other planes follow
+# as the code needs them (`Code.layout`).
 DEPTH, TEXEL_X, TEXEL_Y = 0, 1, 2
 
 # Farther than anything that is drawn.
@@ -29,19 +29,19 @@ INFINITY = 3e38
 
 @dataclass(frozen=True)
 class Code:
-    """What kernel 2 is compiled for; all else is an argument.
+    """What kernel 2 is compiled for; all else it takes as arguments.
 
     Attributes:
         refined: whether vertices are inserted between mass points.
-        supersample: samples of a pixel along each axis.
+        supersample: samples per pixel along each axis.
         shading: none, headlight or tissue.
         relief: whether tissue is shaded with a relief.
-        vignette: whether with a vignette.
+        vignette: whether tissue is shaded with a vignette.
         wireframe: whether the mass-point mesh is drawn.
         instruments: whether there are any.
-        picture: whether colours are given out.
-        labels: whether what each pixel sees is given out; of one sample a pixel.
-        lanes: samples of a tile.
+        picture: whether colours are written.
+        labels: whether labels are written; needs one sample per pixel.
+        lanes: samples in a tile.
     """
 
     refined: bool
@@ -57,12 +57,12 @@ class Code:
 
     @property
     def tile_width(self) -> int:
-        """Columns of samples of a tile."""
+        """Columns of samples in a tile."""
         return min(self.lanes, TILE_WIDTH)
 
     @property
     def tile_height(self) -> int:
-        """Rows of samples of a tile."""
+        """Rows of samples in a tile."""
         return self.lanes // self.tile_width
 
     @property
@@ -87,7 +87,7 @@ class Code:
 
     @cached_property
     def layout(self) -> dict[str, int]:
-        """Name the planes that follow the first, and say which vector of a tile each is."""
+        """Map the names of the planes after the first three to the vector of a tile that each is."""
         wanted = {
             "light": self.headlit,  # share of the headlight that comes back
             "wire": self.wires,  # share of the mesh's lines in the colour
@@ -101,26 +101,26 @@ class Code:
 
     @property
     def planes(self) -> int:
-        """Vectors that are kept of a tile."""
+        """Vectors stored per tile."""
         return TEXEL_Y + 1 + len(self.layout)
 
     @property
     def band_rows(self) -> int:
-        """Rows of pixels of a band: all of the samples of a row of tiles; one on a GPU."""
+        """Rows of pixels in a band, a whole number of rows of tiles; one on a GPU."""
         return 1 if self.lanes == 1 else max(1, BAND_ROWS // self.supersample)
 
     @property
     def band_lines(self) -> int:
-        """Rows of tiles of a band."""
+        """Rows of tiles in a band."""
         return -(-self.band_rows * self.supersample // self.tile_height)
 
     @property
     def in_words(self) -> bool:
-        """Whether pixels are given out by fours, as three words, and not as bytes."""
+        """Whether pixels are written in groups of four, as three words, and not as bytes."""
         return self.supersample == 1 and self.tile_width == TILE_WIDTH
 
     def tiles_across(self, width: int) -> int:
-        """Count the tiles of a row of them.
+        """Count the tiles in a row.
 
         Args:
             width: of the picture [px].
@@ -128,7 +128,7 @@ class Code:
         return -(-width * self.supersample // self.tile_width)
 
     def band_vectors(self, width: int) -> int:
-        """Count the vectors that a worker keeps.
+        """Count the vectors that a worker stores.
 
         Args:
             width: of the picture [px].
@@ -137,10 +137,10 @@ class Code:
 
     @cached_property
     def floats(self) -> Any:
-        """Taichi's type of a number for every lane."""
+        """Taichi's type of one floating-point number per lane."""
         return ti.types.vector(self.lanes, ti.f32)
 
     @cached_property
     def integers(self) -> Any:
-        """Taichi's type of a whole number for every lane."""
+        """Taichi's type of one whole number per lane."""
         return ti.types.vector(self.lanes, ti.i32)

@@ -1,4 +1,4 @@
-"""The colours of samples, from what they show, and what is given out of pixels: their colours and their labels."""
+"""The colours of samples, from what they show; then the output for pixels: their colours and their labels."""
 
 # No `from __future__ import annotations` here: Taichi reads the annotations of a kernel.
 
@@ -18,7 +18,7 @@ NOTHING = math.nan
 
 
 class Texture(NamedTuple):
-    """The picture on the sheet, and what it is shaded with.
+    """The picture on the sheet, and the light and the instruments that it is shaded with.
 
     Attributes:
         texels: as in a `Pyramid`.
@@ -37,7 +37,7 @@ class Texture(NamedTuple):
 
 
 class Out(NamedTuple):
-    """What is given out.
+    """What the kernel writes.
 
     Attributes:
         colours: of the pixels, as words or bytes.
@@ -68,7 +68,7 @@ def shading(code: Code) -> Callable[..., Any]:
 
     @ti.func
     def channels(texels: ti.template(), index):
-        """Gather texels, and take them apart."""
+        """Gather texels, and unpack their red, green and blue."""
         texel = floats([texels[index[lane]] for lane in ti.static(range(lanes))])
         blue = ti.floor(texel * (1.0 / 65536.0))
         rest = texel - blue * 65536.0
@@ -86,7 +86,7 @@ def shading(code: Code) -> Callable[..., Any]:
         """Filter a level bilinearly at (x, y) of its texels.
 
         Returns:
-            Red, green and blue; and where there is a relief how its grey rises from texel to texel.
+            Red, green and blue; and, if there is a relief, the slope of the grey from texel to texel.
         """
         # Beyond the middle of its outermost texels the texture does not change.
         texel_x = ti.max(ti.min(x, width - 1.0), 0.0)
@@ -129,7 +129,8 @@ def shading(code: Code) -> Callable[..., Any]:
             footprint = ti.select(seen, samples[at + ti.static(code.layout["footprint"])], 0.0)
             most = footprint.max()
             if most > 1.0:
-                # Of every sample the level whose texels are not larger than it, and the next one, which are mixed.
+                # For every sample, the coarsest level whose texels are not larger than the sample is mixed with the
+                # next coarser one.
                 last = texture.levels.shape[0] - 1
                 level, bound = 0, 1.0
                 while level <= last and most >= bound:
@@ -163,10 +164,10 @@ def shading(code: Code) -> Callable[..., Any]:
 
     @ti.func
     def shade(samples: ti.template(), at, left, top, texture: ti.template()):
-        """Shade a tile: the texture, lit, the mesh drawn over it, and instruments.
+        """Shade a tile: light the texture, draw the mesh over it, then the instruments.
 
         Args:
-            samples: what is kept of the tiles.
+            samples: the planes of the tiles.
             at: entry where the tile begins.
             left: its first column of samples.
             top: its first row.
@@ -187,7 +188,7 @@ def shading(code: Code) -> Callable[..., Any]:
             if ti.static(code.relief):
                 length = 1.0 / ti.max(ti.sqrt(n_x * n_x + n_y * n_y + n_z * n_z), 1e-30)
                 n_x, n_y, n_z = n_x * length, n_y * length, n_z * length
-                # Where the picture rises the normal leans back.
+                # Where the relief rises, the normal tilts back.
                 a_x, a_y, a_z = numbers[ACROSS], numbers[ACROSS + 1], numbers[ACROSS + 2]
                 b_x, b_y, b_z = numbers[UP], numbers[UP + 1], numbers[UP + 2]
                 slope_x, slope_y = rise_x * numbers[SLOPE_X], rise_y * numbers[SLOPE_Y]
@@ -226,7 +227,7 @@ def shading(code: Code) -> Callable[..., Any]:
 
 @cache
 def resolving(code: Code) -> Callable[..., Any]:
-    """Make Taichi's function that shades the samples of a band and gives out its pixels.
+    """Make Taichi's function that shades the samples of a band and writes its pixels.
 
     Args:
         code: what it is compiled for.
@@ -237,7 +238,7 @@ def resolving(code: Code) -> Callable[..., Any]:
 
     @ti.func
     def give_tile(red, green, blue, row, end_row, tile, across, colours: ti.template()):
-        """Give out the colours of a tile whose samples are pixels."""
+        """Write the colours of a tile whose samples are pixels."""
         colour = ti.floor(red + 0.5) + ti.floor(green + 0.5) * 256.0 + ti.floor(blue + 0.5) * 65536.0
         for line in ti.static(range(tile_height)):
             if row + line < end_row:
@@ -254,7 +255,7 @@ def resolving(code: Code) -> Callable[..., Any]:
 
     @ti.func
     def give_means(samples: ti.template(), first, row, end_row, across, width, colours: ti.template()):
-        """Give out the colours of pixels, each the mean of its samples."""
+        """Write the colours of pixels, each the mean of its samples."""
         for y in range(row, end_row):
             for x in range(width):
                 for n in ti.static(range(3)):
@@ -268,7 +269,7 @@ def resolving(code: Code) -> Callable[..., Any]:
 
     @ti.func
     def give_labels(samples: ti.template(), at, left, row, end_row, width, out: ti.template()):
-        """Give out what the pixels of a tile see."""
+        """Write the labels of the pixels of a tile."""
         depth = samples[at + DEPTH]
         across, down = samples[at + ti.static(code.layout["across"])], samples[at + ti.static(code.layout["down"])]
         sheet = depth < INFINITY
@@ -293,14 +294,14 @@ def resolving(code: Code) -> Callable[..., Any]:
     def resolve(
         samples: ti.template(), first, row, end_row, across, width, texture: ti.template(), out: ti.template()
     ):  # fmt: skip
-        """Shade the samples of a band and give out its pixels.
+        """Shade the samples of a band and write its pixels.
 
         Args:
-            samples: what is kept of the tiles.
+            samples: the planes of the tiles.
             first: entry where the band begins.
             row: first row of pixels of the band.
             end_row: the row after its last.
-            across: tiles of a row of them.
+            across: tiles in a row.
             width: of the picture [px].
             texture: the texture and the light.
             out: the colours and the labels.

@@ -1,4 +1,4 @@
-"""The refined surface as arrays, for other programs to draw: vertices, triangles and where the picture is on them."""
+"""The refined surface as arrays that other programs can draw: vertices, triangles and texture coordinates."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ class Surface(NamedTuple):
 
 
 def surface(position: NDArray[np.floating], refine: int) -> Surface:
-    """Refine the sheet bilinearly (section 2 of the paper), and cut every small quad from top left to bottom right.
+    """Refine the sheet bilinearly (section 2 of the paper); every small quad is cut from top left to bottom right.
 
     Args:
         position: positions of the mass points [m], shape (rows, cols, 3).
@@ -50,13 +50,13 @@ def surface(position: NDArray[np.floating], refine: int) -> Surface:
 def touched(
     position: NDArray[np.floating], refine: int, sheet: Sheet, rest: NDArray[np.float64]
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Find where the point of the refined surface is that is at `rest` when the sheet is at rest.
+    """Find the point of the refined surface whose rest position is `rest`.
 
     Args:
         position: positions of the mass points [m], shape (rows, cols, 3).
         refine: vertices inserted between two neighbours.
         sheet: the sheet.
-        rest: x and y of the point [m], shape (2,); one beside the sheet moves with the nearest of its edge.
+        rest: x and y of the point [m], shape (2,); a point outside the sheet moves with the nearest point of its edge.
 
     Returns:
         The point [m], and the unit normal of its cell there, upward at rest; both of shape (3,).
@@ -71,14 +71,14 @@ def touched(
     normal = np.cross(b + d * t, -(c + d * s))
     s0, t0 = min(int(s * parts), parts - 1) / parts, min(int(t * parts), parts - 1) / parts
     s1, t1 = s - s0, t - t0
-    # On the small quad D s t becomes linear on either side of its diagonal.
+    # In the small quad, D s t is replaced by a function that is linear on either side of the diagonal.
     point = a + b * s + c * t + d * (s0 * t0 + s1 * t0 + s0 * t1 + min(s1, t1) / parts)
     beside = np.array([rest[0] - (across - 0.5) * width, rest[1] - (0.5 - down) * height, 0.0])
     return point + beside, normal / max(float(np.linalg.norm(normal)), 1e-300)
 
 
 def _between(values: NDArray[np.floating], refine: int, axis: int) -> NDArray[np.floating]:
-    """Insert values between neighbours along an axis; those that were there keep their bits."""
+    """Insert values between neighbours along an axis; the given values keep their bits."""
     parts = refine + 1
     along = np.moveaxis(values, axis, 0)
     share = np.arange(parts, dtype=values.dtype).reshape(-1, *(1,) * (along.ndim - 1)) / parts

@@ -18,13 +18,13 @@ if TYPE_CHECKING:
 def load_texture(scene: Scene) -> NDArray[np.uint8]:
     """Read the scene's picture: upright, in 8-bit RGB, cut to the scene's region.
 
-    Of several pictures in one file the first is taken; transparent ones lie on the scene's background.
+    If a file has several pictures, the first is taken; a transparent one is laid over the scene's background.
 
     Returns:
         Colours, 0 to 255, shape (height, width, 3), top row first.
 
     Raises:
-        SceneError: when the scene names no picture, or one that cannot be used.
+        SceneError: when the scene names no picture, or the picture cannot be used.
     """
     import numpy as np
 
@@ -42,7 +42,7 @@ def load_texture(scene: Scene) -> NDArray[np.uint8]:
 
 
 def require_texture(texture: Any) -> NDArray[np.uint8]:
-    """Make sure that an array can be the picture on the sheet.
+    """Check that an array can be the picture on the sheet.
 
     Raises:
         ArgumentError: when it cannot.
@@ -53,14 +53,14 @@ def require_texture(texture: Any) -> NDArray[np.uint8]:
     is_picture = found.dtype == np.uint8 and found.ndim == 3 and found.shape[2] == 3
     if not (is_picture and min(found.shape) > 0 and max(found.shape) <= MAX_SIDE):
         raise ArgumentError(
-            f"texture: {found.dtype} of shape {found.shape} is no picture; take uint8 of shape (height, width, 3), "
+            f"texture: {found.dtype} of shape {found.shape} is not a picture; take uint8 of shape (height, width, 3), "
             f"up to {MAX_SIDE} a side, such as numpy.asarray(image.convert('RGB'))"
         )
     return found
 
 
 def image_size(scene: Scene) -> tuple[int, int] | None:
-    """Tell the whole picture's width and height [px] without decoding it; None if there is no usable picture."""
+    """Give the whole picture's width and height [px] without decoding it; None if there is no usable picture."""
     try:
         return None if scene.image is None else picture_size(scene.image)
     except PictureError:
@@ -68,7 +68,7 @@ def image_size(scene: Scene) -> tuple[int, int] | None:
 
 
 def problems(scene: Scene) -> Iterator[Problem]:
-    """Say why the scene's picture or the region of it cannot be used, from the file's header alone."""
+    """Find, from the file's header alone, why the scene's picture or the region of it cannot be used."""
     size = None
     if scene.image is not None:
         try:

@@ -1,8 +1,8 @@
-"""Where material points are seen, and whether anything is in front of them: exactly, not by a picture of depths.
+"""Where material points are seen, and whether anything is in front of them: found exactly, without a depth map.
 
-A point is taken to where it is on the drawn surface, and projected. It is hidden if another part of the surface, or an
-instrument, is nearer on the same line of sight. Which cells may be there is told by bins: squares of the picture, each
-with a list of the cells whose outlines reach it.
+A point is placed on the drawn surface, and projected. It is hidden if another part of the surface, or an instrument, is
+nearer on the same line of sight. Bins tell which cells may be there: squares of the picture, each with a list of the
+cells whose outlines reach it.
 """
 
 from __future__ import annotations
@@ -20,10 +20,10 @@ from taichi_msm.render.tracking_kernel import CELL_NUMBERS, POINT_NUMBERS, count
 from taichi_msm.scene import Scene
 from taichi_msm.system.runtime import our_compilation
 
-# What is in front of a point by less than this fraction of the sheet's larger side is the surface at the point itself.
+# Whatever is in front of a point by less than this fraction of the sheet's larger side counts as the point's own place.
 TOUCHING = 1e-9
 
-# A bin is at least so many pixels wide. There are at most so many entries of cells in bins for each cell and bin.
+# The smallest width of a bin [px]. The largest number of entries in all lists, per cell and bin.
 SMALLEST_BIN = 4
 MOST_ENTRIES = 64
 
@@ -40,20 +40,20 @@ def find(
     """Find material points.
 
     Args:
-        scene: a checked scene; `runtime.start` comes first.
+        scene: a checked scene; call `runtime.start` first.
         coordinates: fractions of the sheet's width from its left and of its height from its top, shape (n, 2). NaN
-            is no point, which is nowhere and not hidden.
+            stands for no point, which is seen nowhere and not hidden.
         position: positions of the mass points [m], shape (rows, cols, 3).
         view: the camera.
         rods: the instruments.
-        moved: whether points are those at the centres of all pixels, one row after another, and `pixels` is to
-            tell how far they are from these; NO_FLOW where they are nowhere.
+        moved: whether the points are those that were at the centres of all pixels, one row after another, and `pixels`
+            is to tell how far they have moved from there; NO_FLOW where they are seen nowhere.
     """
     (rows, cols), (width, height) = scene.sheet.points, scene.render.size
     numbers = view_numbers(view, scene.render, 1, scene.sheet.size, (1, 1), rods)
     cells = (rows - 1) * (cols - 1)
     point, cell = np.empty(rows * cols * POINT_NUMBERS), np.empty(cells * CELL_NUMBERS)
-    # Half as wide as a cell, most bins have cells around one mass point only.
+    # If a bin is half as wide as a cell, the cells of most bins are around one mass point only.
     bin_size = max(SMALLEST_BIN, round((width * height / cells) ** 0.5 / 2))
     with our_compilation(optimised=False):
         project(np.ascontiguousarray(position, np.float64), numbers, rows, cols, point, cell)

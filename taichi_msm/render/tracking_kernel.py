@@ -11,12 +11,13 @@ from taichi_msm.render.patch import Plane, edge, on_triangle, small_quad, turn
 from taichi_msm.render.samples import INFINITY
 from taichi_msm.system.runtime import ti
 
-# Numbers of a mass point: (X, Y, w, depth), its place in the picture; and of a cell: its bounds there, its least depth,
-# and 1 or -1 where it is drawn as a whole and its front or its back is seen, else 0.
+# The numbers of a mass point: (X, Y, w, depth), its place in the picture. The numbers of a cell: its bounds in the
+# picture; its least depth; and its side, 0 for a cell drawn triangle by triangle, else 1 or -1 as its front or its back
+# is seen.
 SEEN, POINT_NUMBERS = 4, 6
 MIN_X, MIN_Y, MAX_X, MAX_Y, NEAREST, SIDE, CELL_NUMBERS = range(7)
 
-# Where a point is seen that is not.
+# The pixel of a point that is seen nowhere.
 NOWHERE = math.nan
 
 vec4 = ti.types.vector(4, ti.f64)
@@ -70,7 +71,7 @@ def project(
 
 @ti.func
 def _bins(here, bin_size, across, down, cell: ti.template()):
-    """Give the bins that a cell reaches: first and end of their columns, first and end of their rows."""
+    """Give the bins that a cell reaches: their first and end column, their first and end row."""
     size = ti.cast(bin_size, ti.f64)
     left = ti.cast(ti.floor(ti.math.clamp(cell[here + MIN_X] / size, 0.0, 1e6)), ti.i32)
     right = ti.cast(ti.floor(ti.math.clamp(cell[here + MAX_X] / size, -1.0, 1e6)), ti.i32) + 1
@@ -88,7 +89,7 @@ def count(
     down: ti.i32,
     ends: ti.types.ndarray(dtype=ti.i32, ndim=1),
 ):
-    """Count the cells of every bin, one entry after its own."""
+    """Count the cells of every bin; the count of bin n is in entry n + 1."""
     ti.loop_config(serialize=True)
     for index in range(cells):
         left, right, top, bottom = _bins(index * CELL_NUMBERS, bin_size, across, down, cell)
@@ -107,7 +108,7 @@ def fill(
     ends: ti.types.ndarray(dtype=ti.i32, ndim=1),
     entries: ti.types.ndarray(dtype=ti.i32, ndim=1),
 ):
-    """List the cells of every bin; `ends`, where each list begins, becomes where it ends."""
+    """List the cells of every bin; `ends` holds where each list begins, and afterwards where it ends."""
     ti.loop_config(serialize=True)
     for index in range(cells):
         left, right, top, bottom = _bins(index * CELL_NUMBERS, bin_size, across, down, cell)
@@ -126,11 +127,11 @@ def judge(
     entries: ti.types.ndarray(dtype=ti.i32, ndim=1),
     simple: ti.types.ndarray(dtype=ti.u8, ndim=1),
 ):
-    """Tell of every bin whether no place in it shows two of its cells.
+    """Mark the bins in which no two cells can be seen at the same place.
 
-    That is so where they are among four cells around a mass point that are all drawn as a whole, from the same side:
-    each is convex, so it lies between the two sides that leave the point, and the angles between these are parts of 360
-    degrees.
+    This is so if the cells of a bin are among the four around one mass point, and these four are all drawn as a whole
+    and seen from the same side: each is convex, so it lies within the angle between its two edges at the point, and
+    the four angles add up to 360 degrees without overlapping.
     """
     for square in range(bins):
         first_i, last_i, first_j, last_j = 1 << 30, -1, 1 << 30, -1
@@ -141,7 +142,7 @@ def judge(
         around_a_point = last_i - first_i <= 1 and last_j - first_j <= 1
         if around_a_point:
             sides, count = 0.0, 0.0
-            # All four, also those that do not reach the bin.
+            # All four count, even those that do not reach the bin.
             for i in range(first_i, last_i + 1):
                 for j in range(first_j, last_j + 1):
                     sides += cell[(i * (cols - 1) + j) * CELL_NUMBERS + SIDE]
@@ -164,7 +165,7 @@ def _corners(index, cols, point: ti.template()):
 
 @ti.func
 def _triangle(x, y, s0, t0, lower, part, near, a, b, c, d):
-    """Find the depth at which the plane of a small triangle is seen at (x, y), and whether that is on the triangle.
+    """Find the depth at which (x, y) shows the plane of a small triangle, and whether that point is on the triangle.
 
     Args:
         x: place in the picture, to the right [px].
@@ -172,8 +173,8 @@ def _triangle(x, y, s0, t0, lower, part, near, a, b, c, d):
         s0: upper left corner of its small quad, to the right in the cell.
         t0: likewise, down.
         lower: whether it is the one below the diagonal.
-        part: side of a small quad, by that of the cell.
-        near: what is not farther than this is not seen.
+        part: side of a small quad, as a fraction of the cell's.
+        near: only what is farther than this is seen.
         a: coefficient A of the cell.
         b: likewise B.
         c: likewise C.
@@ -192,7 +193,7 @@ def _triangle(x, y, s0, t0, lower, part, near, a, b, c, d):
 
 @ti.func
 def _is_below(x, y, s0, t0, part, side, a, b, c, d):
-    """Tell whether (x, y) is below the diagonal of a small quad that faces one way."""
+    """Tell whether (x, y) is below the diagonal of a small quad of a cell that is drawn as a whole."""
     p = a + b * s0 + (c + d * s0) * t0
     s1, t1 = s0 + part, t0 + part
     f = a + b * s1 + (c + d * s1) * t1
@@ -201,7 +202,7 @@ def _is_below(x, y, s0, t0, part, side, a, b, c, d):
 
 @ti.func
 def _hides(x, y, depth, index, own, own_triangle, cols, parts, near, point: ti.template(), cell: ti.template()):
-    """Tell whether a cell is seen at (x, y) before `depth`.
+    """Tell whether a cell is seen at (x, y) at a smaller depth than `depth`.
 
     Args:
         x: place in the picture, to the right [px].
@@ -209,17 +210,17 @@ def _hides(x, y, depth, index, own, own_triangle, cols, parts, near, point: ti.t
         depth: of the point [m].
         index: of the cell.
         own: the cell that the point is on.
-        own_triangle: the small triangle of it.
-        cols: of mass points.
+        own_triangle: the small triangle of that cell that the point is on.
+        cols: columns of mass points.
         parts: small quads along a side of a cell.
-        near: what is not farther than this is not seen.
+        near: only what is farther than this is seen.
         point: as `project` makes it.
         cell: likewise.
     """
     here, part = index * CELL_NUMBERS, 1.0 / parts
     side = cell[here + SIDE]
     hides = False
-    # A cell that is drawn as a whole has every place of the picture once.
+    # A cell that is drawn as a whole shows at most one of its points at a place of the picture.
     possible = cell[here + NEAREST] < depth and not (index == own and side != 0.0)
     if (
         possible
@@ -280,12 +281,12 @@ def search(
     pixels: ti.types.ndarray(dtype=ti.f32, ndim=1),
     hidden: ti.types.ndarray(dtype=ti.u8, ndim=1),
 ):
-    """Find points; where `row` of them fill a row of pixels, tell how far they are from the centres of these."""
+    """Find points; if `row` is not 0, they belong to pixels, `row` in a row, and `pixels` gets their distances."""
     for k in range(count):
         near, parts = numbers[NEAR], numbers[PARTS]
         u, v = coordinates[2 * k], coordinates[2 * k + 1]
         x, y, out_of_sight = ti.cast(NOWHERE, ti.f64), ti.cast(NOWHERE, ti.f64), False
-        if abs(u) < 2.0:  # no NaN
+        if abs(u) < 2.0:  # False for NaN
             s = ti.math.clamp(ti.cast(u, ti.f64), 0.0, 1.0) * (cols - 1)
             t = ti.math.clamp(ti.cast(v, ti.f64), 0.0, 1.0) * (rows - 1)
             j, i = ti.min(ti.cast(s, ti.i32), cols - 2), ti.min(ti.cast(t, ti.i32), rows - 2)
@@ -296,7 +297,7 @@ def search(
             s1, t1 = s - s0, t - t0
             own_triangle = 2 * ti.cast(line * parts + column, ti.i32) + ti.cast(t1 > s1, ti.i32)
             a, b, c, d = _corners(own, cols, point)
-            # On the small quad D s t becomes linear on either side of its diagonal.
+            # In the small quad, D s t is replaced by a function that is linear on either side of the diagonal.
             p = a + b * s + c * t + d * (s0 * t0 + s1 * t0 + s0 * t1 + ti.min(s1, t1) * part)
             out_of_sight = True
             if p[2] > near:
@@ -319,7 +320,7 @@ def search(
                             if met < depth and met * numbers[PINHOLE] + (1.0 - numbers[PINHOLE]) > near:
                                 out_of_sight = True
         if row > 0:
-            seen = x > -INFINITY  # no NaN
+            seen = x > -INFINITY  # False for NaN
             x = ti.select(seen, x - ti.cast(k % row, ti.f64) - 0.5, NO_FLOW)
             y = ti.select(seen, y - ti.cast(k // row, ti.f64) - 0.5, NO_FLOW)
         pixels[2 * k] = ti.cast(x, ti.f32)

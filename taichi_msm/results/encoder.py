@@ -1,8 +1,7 @@
-"""Encode pictures as PNG and GIF in a process of their own, beside the simulation.
+"""Encode pictures as PNG and GIF in a separate process, in parallel with the simulation.
 
-Pillow lets other threads run while it encodes, but Taichi does not while a kernel runs: it keeps Python's
-GIL. Measured with launches of 25 ms and PNGs of 512 x 512 pixels, which take 18 ms: threads lengthen a frame
-by 22 ms, a process by 1 ms.
+Pillow releases Python's GIL while it encodes, but Taichi holds it while a kernel runs. Measured with launches of 25 ms
+and PNGs of 512 x 512 pixels, which take 18 ms: encoding in threads lengthens a frame by 22 ms, in a process by 1 ms.
 """
 
 from __future__ import annotations
@@ -34,15 +33,15 @@ from taichi_msm.results.publication import ANIMATION, FRAMES, series_file
 # Level 1 takes a fifth of the time of the default (18 against 93 ms) for 10 % more bytes.
 COMPRESS_LEVEL = 1
 
-# Pictures that wait in memory, at most: so many, or so many bytes of them.
+# The most pictures that wait in memory: by number, and by bytes.
 WAITING = 4
 WAITING_BYTES = 256 << 20
 
-# While nothing can be handed over, who waits is asked so often whether to go on waiting [s].
+# While a caller waits for the encoder, this is how long until its `pause` is called again [s].
 PATIENCE = 0.1
 
-# Our path, so that the child finds this package where we did. It must not run the caller's main module, as
-# multiprocessing would: a script that calls us need not be guarded against its own import.
+# The child gets our path, so that it finds this package where we did. It must not run the caller's main module, as
+# multiprocessing would: a script that calls us then needs no guard against its own import.
 _CHILD = "import sys; sys.path[:] = {path!r}; from taichi_msm.results.encoder import main; main()"
 
 
@@ -72,7 +71,7 @@ class Report:
     """What was encoded.
 
     Attributes:
-        frames: number of pictures that came whole.
+        frames: number of pictures that were encoded completely.
         seconds: processor time spent encoding [s].
     """
 
@@ -88,7 +87,7 @@ class Encoder:
         inherit: file descriptors that the process holds open while it lives.
 
     Raises:
-        OSError: here or in the methods, when a file cannot be written or the process ends; `finish` always tells.
+        OSError: here or in the methods, when a file cannot be written or the process ends; at the latest in `finish`.
     """
 
     def __init__(self, job: Job, inherit: tuple[int, ...] = ()) -> None:
@@ -98,9 +97,9 @@ class Encoder:
                 bufsize=0,
                 stdin=subprocess.PIPE,
                 stdout=subprocess.PIPE,
-                # The folder has the same descriptor there.
+                # The folder keeps its descriptor in the child.
                 pass_fds=(*inherit, *([] if job.folder.descriptor is None else [job.folder.descriptor])),
-                # Ctrl-C is for us alone: the pictures so far are still to be finished, as they are after a SIGTERM.
+                # Ctrl-C must reach only us: the child still finishes the pictures so far, as it does after a SIGTERM.
                 start_new_session=True,
                 creationflags=getattr(subprocess, "CREATE_NEW_PROCESS_GROUP", 0),
             )
@@ -119,13 +118,13 @@ class Encoder:
 
         Args:
             picture: colours, shape (height, width, 3).
-            pause: called some times a second while it waits; what it raises gives the picture up.
+            pause: called some times a second while it waits; if it raises, the picture is given up.
         """
         rest = np.ascontiguousarray(picture).reshape(-1).data
         try:
             while rest:
                 count = self._pictures.write(rest)
-                # The process may be stopped, for all that we know.
+                # The process may have been stopped, so the waiting must be interruptible.
                 if count is None and not select.select([], [self._pictures], [], PATIENCE)[1]:
                     pause()
                 rest = rest[count or 0 :]
@@ -161,7 +160,7 @@ class Encoder:
         return self._report
 
     def _read_answer(self, pause: Pause) -> bytes:
-        """Wait for the next part of the answer; nothing is left after an empty one."""
+        """Wait for the next part of the answer; an empty part is the last."""
         if os.name != "nt":  # where pipes cannot be waited for
             while not select.select([self._answer], [], [], PATIENCE)[0]:
                 pause()
@@ -178,7 +177,7 @@ class Encoder:
 
 @contextmanager
 def _hurry_held_back() -> Iterator[None]:
-    """Start a process that gets its SIGINT when it is ready for it."""
+    """Block SIGINT while a process is started, so that it stays blocked there until the process is ready for it."""
     if not hasattr(signal, "pthread_sigmask"):
         yield
         return
@@ -190,10 +189,11 @@ def _hurry_held_back() -> Iterator[None]:
 
 
 def main() -> None:
-    """Be the process: read a job and its pictures from stdin, report on stdout."""
+    """Run as the child process: read a job and its pictures from stdin, report on stdout."""
     answer: Report | Exception
     hurry = Event()
-    # Who ends all processes of a service ends this one too; our pictures end when who asked for them does.
+    # A SIGTERM to all processes of a service reaches this one too; it is ignored, as our pictures end when the parent
+    # process closes the stream.
     signal.signal(signal.SIGTERM, signal.SIG_IGN)
     signal.signal(signal.SIGINT, lambda number, frame: hurry.set())
     if hasattr(signal, "pthread_sigmask"):
@@ -205,7 +205,7 @@ def main() -> None:
     except Exception as error:
         # Not every exception can be pickled.
         answer = RuntimeError(f"in the encoder: {type(error).__name__}: {error}")
-    with suppress(BrokenPipeError):  # when who asked was killed
+    with suppress(BrokenPipeError):  # when the parent process was killed
         os.write(sys.stdout.fileno(), pickle.dumps(answer))
 
 
@@ -215,7 +215,7 @@ def encode(job: Job, source: BinaryIO, hurry: Event) -> Report:
     Args:
         job: what to encode.
         source: the bytes of the pictures, one after another.
-        hurry: once it is set, pictures that are not being encoded yet are given up.
+        hurry: once this is set, pictures that are not being encoded yet are given up.
 
     Raises:
         OSError: when a file cannot be written.
@@ -229,7 +229,7 @@ def encode(job: Job, source: BinaryIO, hurry: Event) -> Report:
     film = _Film(job)
 
     def shoot(picture: Picture, still: Future[float] | None) -> float:
-        """Complete a frame; the film never has one whose still is missing."""
+        """Complete a frame: first its still, then its place in the film, which so has no frame without a still."""
         spent = still.result() if still else 0.0
         return spent + (_seconds(film.add, picture) if job.gif else 0.0)
 
@@ -261,13 +261,13 @@ def encode(job: Job, source: BinaryIO, hurry: Event) -> Report:
 
 
 def _leave_orphaned(parent: int) -> None:
-    """End here if who asked was killed: its directory is to be free for another run."""
+    """End this process if its parent was killed, so that the directory is free for another run."""
     if os.getppid() != parent:
         os._exit(1)
 
 
 class _Film:
-    """The animation, begun when its first frame has shown which colours it needs."""
+    """The animation; it is begun at its first frame, which shows the colours that it needs."""
 
     def __init__(self, job: Job) -> None:
         self._job = job
@@ -285,7 +285,7 @@ class _Film:
 
 
 def _pictures(source: BinaryIO, size: tuple[int, int]) -> Iterator[Picture]:
-    """Read pictures until the stream ends; a last one that is not whole is that of an interrupted run."""
+    """Read pictures until the stream ends; an incomplete last one, of an interrupted run, is dropped."""
     width, height = size
     while True:
         data = source.read(3 * width * height)
@@ -300,7 +300,7 @@ def _write_png(picture: Picture, folder: Folder, number: int) -> None:
 
 
 def _seconds(work: Callable[..., None], *args: object) -> float:
-    """Do some work and tell its processor time [s], which does not grow where the simulation takes the cores."""
+    """Do some work and return its processor time [s], which does not grow while the simulation occupies the cores."""
     start = time.thread_time()
     work(*args)
     return time.thread_time() - start

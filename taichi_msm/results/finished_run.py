@@ -1,4 +1,4 @@
-"""The results of a run that has ended, read again for what is made of them afterwards."""
+"""Read the results of a run that has ended, for later use."""
 
 from __future__ import annotations
 
@@ -29,9 +29,9 @@ class FinishedRun:
 
     Attributes:
         directory: where its results are.
-        record: what is in run.json.
-        scene: as it was run: with the points, the step and the precision that were chosen, no tolerance, and pictures
-            as they are found from the current directory.
+        record: the content of run.json.
+        scene: the scene as it was run: with the points, the step and the precision that were chosen, without a
+            tolerance, and with paths of pictures that are relative to the current directory.
         frames: how many were simulated.
     """
 
@@ -46,20 +46,20 @@ class FinishedRun:
         return np.arange(self.frames) / self.scene.time.frames_per_second
 
     def positions(self) -> NDArray[np.floating]:
-        """Map the trajectory, after it was read once to find damage.
+        """Map the trajectory into memory, after reading it once to find damage.
 
         Returns:
             Positions [m], shape (frames, rows, cols, 3), read-only.
 
         Raises:
-            FilesError: when there is none, or it is damaged or of another run.
+            FilesError: when there is none, or it is damaged or belongs to another run.
         """
         path = self.result(TRAJECTORY, "trajectory")
         dtype = np.dtype(np.float32 if self.scene.time.precision == "f32" else np.float64)
         rest = rest_positions(self.scene.sheet)
         with reading(path):
             found = map_array(path, "position", dtype, (self.frames, *rest.shape))
-        # Every run begins at rest, and anybody may have written the file.
+        # Every run begins at rest; this is checked, as anybody may have written the file.
         if not np.array_equal(found[0], rest.astype(dtype)) or not all(np.isfinite(frame).all() for frame in found):
             raise damaged(path)
         return found
@@ -73,7 +73,7 @@ class FinishedRun:
 
         Args:
             name: of the file, with its folder.
-            key: what a scene's `output` must hold for it.
+            key: the entry of a scene's `output` that makes a run write it.
 
         Raises:
             FilesError: when it is not there.
@@ -89,13 +89,13 @@ class FinishedRun:
 
 
 def read_run(directory: str | Path) -> FinishedRun:
-    """Read the record of a run; its other results are read when they are asked for.
+    """Read the record of a run; its other results are read only when they are asked for.
 
     Args:
         directory: where the results are.
 
     Raises:
-        ArgumentError: when that cannot be a path.
+        ArgumentError: when the directory cannot be a path.
         FilesError: when there is no record of a run, or one that no run has written.
     """
     require_path(directory)
@@ -113,32 +113,32 @@ def read_run(directory: str | Path) -> FinishedRun:
 
 @contextmanager
 def reading(path: Path) -> Iterator[None]:
-    """Turn whatever is raised while a result is read into one line with its remedy.
+    """Turn any error that is raised while a result is read into one line with its remedy.
 
     Raises:
-        FilesError: in the place of any error; damaged archives and records raise nearly anything.
+        FilesError: instead of any other error; damaged archives and records raise nearly anything.
     """
     try:
         yield
     except FilesError:
         raise
     except Exception as error:
-        # What the file says of itself may lead to a place that is none.
+        # The numbers in a damaged file may lead to an impossible position.
         if isinstance(error, OSError) and error.errno != errno.EINVAL:
             raise FilesError(f"{path}: {(error.strerror or str(error)).lower()}") from None
         raise damaged(path) from None
 
 
 def damaged(path: Path) -> FilesError:
-    """Make the error of a result that is not as a run has written it."""
+    """Make the error for a result that is not what the run has written."""
     return FilesError(f"{path}: damaged, or not of this run; run the scene again")
 
 
 def _as_run(record: Mapping[str, Any]) -> Scene:
-    """Make the scene of a record with what was chosen for it.
+    """Make the scene of a record, with the points, the step and the precision that were chosen for it.
 
     Raises:
-        Exception: when it is none that can be run, or the record lacks something.
+        Exception: when the scene cannot be run, or the record lacks something.
     """
     given, folder = Scene(**record["scene"]), Path(record["working_directory"])
     sheet = {"points": record["points"], "tolerance": None}
@@ -153,7 +153,7 @@ def _as_run(record: Mapping[str, Any]) -> Scene:
     if scene.stiffness_map is not None:
         scene = scene.with_map_image(str(folder / scene.stiffness_map.image))
     found = [problem for check in (material.problems, camera.problems) for problem in check(scene)]
-    # A picture that is gone, or is another now, is told of by whoever needs it.
+    # A picture that is missing, or has changed, is reported by the code that needs it.
     if any(problem.path[-1:] != ("image",) for problem in found):
         raise SceneError([str(problem) for problem in found])
     return scene

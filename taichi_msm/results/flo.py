@@ -1,4 +1,4 @@
-"""Optical flow as Middlebury's .flo has it: a magic number, width, height, then two floats a pixel; little-endian."""
+"""Optical flow in Middlebury's .flo format: a magic number, width, height, two floats per pixel; little-endian."""
 
 from __future__ import annotations
 
@@ -33,12 +33,12 @@ def read_flo(path: Path, size: tuple[int, int]) -> NDArray[np.float32]:
         Flow to the right and down [px], shape (height, width, 2).
 
     Raises:
-        FilesError: when it cannot be read, or is none of that size.
+        FilesError: when it cannot be read, or is not a flow of that size.
     """
     width, height = size
     header, length = _header(width, height), 8 * width * height
     with reading(path), path.open("rb") as file:
-        # Another size in the file takes no more memory.
+        # Only the expected size is read, so that a wrong one in the file takes no more memory.
         found, data, rest = file.read(len(header)), file.read(length), file.read(1)
     if found != header or len(data) != length or rest:
         raise damaged(path)

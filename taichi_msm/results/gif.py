@@ -1,8 +1,8 @@
-"""Write an animated GIF as its frames come: one palette for all, and time right to 10 ms at every frame rate.
+"""Write an animated GIF as its frames come, with one palette for all, and exact to 10 ms at every frame rate.
 
-Pillow's own writer keeps every frame in memory until the last one is known; here two wait. Given RGB
-pictures, it makes a palette for each, which takes 24 times longer. Measured with 512 x 512 pixels of shaded
-tissue: 4 ms and 89 kB a frame. Floyd-Steinberg dithering would take 7 ms and 115 kB, and flicker.
+Pillow's own writer keeps all frames in memory until the last one is known; here at most two wait. Given RGB pictures,
+Pillow also makes a palette for each, which takes 24 times longer. Measured with 512 x 512 pixels of shaded tissue: 4 ms
+and 89 kB a frame. Floyd-Steinberg dithering would take 7 ms and 115 kB, and flicker.
 """
 
 from __future__ import annotations
@@ -19,26 +19,26 @@ from PIL import Image
 
 Picture = NDArray[np.uint8]
 
-# A delay in hundredths of a second is a whole number of 16 bits, and browsers play 0 and 1 as 10.
+# The limits of a delay [1/100 s]: it is a whole number of 16 bits, and browsers play 0 and 1 as 10.
 SHORTEST = 2
 LONGEST = 0xFFFF
 
-# Of 256 indices the last is no colour: it lets the frame before show through.
+# The last of the 256 indices is not a colour but transparent: it lets the frame before show through.
 COLOURS = 255
 TRANSPARENT = COLOURS
 
-# The palette is chosen from so many pixels of the first frame along each axis, at these levels of light: the sheet is
-# drawn as it rests, and later turns its parts toward the headlight and away from it. Most of it stays as it is.
+# The palette is chosen from this many pixels of the first frame along each axis, at these levels of light: the first
+# frame shows the sheet at rest, whose parts later turn toward the headlight and away from it. Most parts do not turn.
 SAMPLES = 64
 LIGHT = (1.0, 1.0, 1.0, 1.0, 1.15, 1.3, 0.8, 0.6, 0.35, 0.15)
 
-# Pillow's lookup gives each cell of 4 x 4 x 4 colours the entry nearest to the cell's darkest corner. Looking
-# up entries that are half a cell darker makes it the nearest to the cell's middle: the error falls by 0.8 dB.
+# Pillow's lookup gives each cell of 4 x 4 x 4 colours the palette entry nearest to the cell's darkest corner. Looking
+# up entries that were made half a cell darker gives the entry nearest to the cell's middle: the error falls by 0.8 dB.
 HALF_CELL = 2
 
 
 def shades(picture: Picture) -> Picture:
-    """Foresee the colours of an animation from its first frame.
+    """Predict the colours of an animation from its first frame.
 
     Args:
         picture: colours, shape (height, width, 3).
@@ -56,7 +56,7 @@ class Palette:
 
     Args:
         samples: colours like those of the frames to come, shape (height, width, 3).
-        background: a colour that survives exactly, whatever the samples are.
+        background: a colour that is kept exactly, whatever the samples are.
     """
 
     def __init__(self, samples: Picture, background: tuple[int, int, int]) -> None:
@@ -95,8 +95,8 @@ class _Shown(NamedTuple):
 class GifWriter:
     """An animation that loops for ever; frame f lasts from f / rate to (f + 1) / rate, in whole 1/100 s.
 
-    A frame that would be shown for less than 2/100 s is left out, unless it is the last, for which the one
-    before makes room. A frame equal to the one before is left out too, and that one lasts longer.
+    A frame that would be shown for less than 2/100 s is left out, except the last one, for which the one before is
+    shortened. A frame equal to the one before is left out too, and the one before lasts longer.
 
     Args:
         file: open for writing; it is closed in the end.
@@ -110,7 +110,7 @@ class GifWriter:
         self._palette = palette
         self._frames = 0
         self._latest: Picture | None = None
-        # Two at most: the second may turn out to be the last and too short, and then the first makes room.
+        # At most two: the second may turn out to be the last and too short, and then the first is shortened.
         self._waiting: deque[_Shown] = deque()
         self._screen: Picture | None = None
         self._file = file
@@ -158,7 +158,7 @@ class GifWriter:
         return round(100 * frame / self._rate)
 
     def _write_last(self, indices: Picture) -> None:
-        """Write the frames that wait, the last of them in the animation's last state."""
+        """Write the frames that wait; the last one shows the last state of the animation."""
         first, last = self._waiting[0], self._waiting.pop()
         end = self._hundredths(self._frames)
         start = min(last.start, end - SHORTEST)
@@ -171,7 +171,7 @@ class GifWriter:
         self._write_first(until=max(end, start + 1))
 
     def _write_first(self, until: int) -> None:
-        """Write the frame that waits longest; a delay too long for one frame is shared by repetitions."""
+        """Write the frame that has waited longest; a delay too long for one frame is divided among repetitions."""
         start, indices = self._waiting.popleft()
         repetitions = math.ceil((until - start) / LONGEST)
         for n in range(repetitions):
@@ -184,7 +184,7 @@ class GifWriter:
         if self._screen is not None:
             changed = indices != self._screen
             rows, cols = np.flatnonzero(changed.any(axis=1)), np.flatnonzero(changed.any(axis=0))
-            # Where nothing changes, one pixel that stays as it is.
+            # If nothing changes, one pixel is written as it is.
             left, top, right, bottom = (cols[0], rows[0], cols[-1], rows[-1]) if rows.size else (0, 0, 0, 0)
             patch = np.where(changed, indices, np.uint8(TRANSPARENT))[top : bottom + 1, left : right + 1]
         self._screen = indices

@@ -1,4 +1,4 @@
-"""The labels of the frames of a run, as files."""
+"""Write the labels of the frames of a run to files."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ from taichi_msm.results.publication import (
 )
 from taichi_msm.scene import UNTIL_NEXT, Scene
 
-# Masks are few large areas, which the fastest compression makes small.
+# Masks consist of few large areas, for which the fastest compression is enough.
 COMPRESS_LEVEL = 1
 
 
@@ -37,8 +37,8 @@ class LabelWriter:
     """Writes the labels of a run, frame by frame.
 
     Args:
-        folder: where to.
-        scene: what is run; its `output` says which are wanted.
+        folder: where the files go.
+        scene: what is run; its `output` says which labels are wanted.
     """
 
     def __init__(self, folder: Folder, scene: Scene) -> None:
@@ -63,7 +63,7 @@ class LabelWriter:
             self._tracks.append(observed.tracks)
 
     def finish(self, frames: int) -> None:
-        """Remove what is of later frames than the first so many, and write what is of all together."""
+        """Keep the files of the first frames only, this many, and write those that belong to all frames together."""
         for name in self._series if frames else ():
             with self._folder.folder(name, create=True) as folder:
                 for number in range(series_length(name, frames), self._added):
@@ -81,7 +81,7 @@ def write_tracks(file: BinaryIO, coordinates: NDArray[np.float32], sights: list[
     """Write tracks.npz.
 
     Args:
-        file: where to.
+        file: open for writing.
         coordinates: of the points, shape (n, 2).
         sights: where they are in every frame.
     """

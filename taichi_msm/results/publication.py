@@ -1,12 +1,13 @@
-"""Replace the results in a directory: whole or not at all, and nothing that is not a run's.
+"""Replace the results in a directory, whole or not at all, and only what a run has written.
 
 New files are staged below the directory, so that every move is a rename within one file system. When all are there, a
-marker with their names says so. Then the record of the earlier results goes first, the other files are moved, and the
-new record comes last: where there is a record, the results are whole and belong together. A process killed before the
-marker leaves the directory as it was; after it, the next publication completes the moves first.
+marker with their names is written. Then the record of the earlier results is removed, the other files are moved, and
+the new record is moved last: where there is a record, the results are whole and belong together. If the process is
+killed before the marker is written, the directory stays as it was; if later, the next publication first completes the
+moves.
 
-The record lists what a run has written, and only that is ever replaced or removed. Anything else in its place is an
-error before anything is touched.
+The record lists what a run has written, and only that is ever replaced or removed. If anything else is in the way, that
+is an error before anything is touched.
 """
 
 from __future__ import annotations
@@ -36,16 +37,16 @@ FRAMES, COORDINATES, DEPTH, FLOW, OCCLUSION, INSTRUMENT = SERIES_NAMES = (
 ANIMATION, TRAJECTORY, TRACKS, CAMERA = FILE_NAMES = "animation.gif", "trajectory.npz", "tracks.npz", "camera.json"
 RECORD = "run.json"
 
-# Folders with a file for every frame, and the kind of it.
+# Folders with a file for every frame, and the extension of these files.
 SERIES = dict(zip(SERIES_NAMES, ("png", "npy", "tiff", "flo", "png", "png"), strict=True))
 
-# What makes a checkpoint one: a run's manifest. Besides there are the positions of its frames, and its last state.
+# A folder is a checkpoint if it has a run's manifest. Beside it are the positions of the frames and the last state.
 MANIFEST, POSITIONS, STATE = "manifest.json", "positions", "state.npz"
 
 STAGING, NEW, CHECKPOINT = ".partial", "new", "checkpoint"
 LOCK, MARKER, DRAFT = "lock", "complete", "draft"
 
-# All that a run ever puts below a directory until it publishes its results.
+# All files that a run may have below a directory before it publishes its results.
 CHECKPOINT_TREE: Tree = dict.fromkeys((MANIFEST, POSITIONS, re.escape(STATE), DRAFT))
 NEW_TREE: Tree = {
     **{folder: {rf"[0-9]{{4,}}\.{kind}": None} for folder, kind in SERIES.items()},
@@ -53,21 +54,21 @@ NEW_TREE: Tree = {
 }
 STAGING_TREE: Tree = {**dict.fromkeys((LOCK, MARKER, DRAFT)), NEW: NEW_TREE, CHECKPOINT: CHECKPOINT_TREE}
 
-# How often a directory is tried that other runs are leaving; after that it is itself gone.
+# How often the staging directory is tried again while ending runs remove it; then it counts as missing.
 ATTEMPTS = 100
 
-# A record of so many frames that no disk holds them is smaller [bytes].
+# Size limit of a record [bytes]; even with more frames than any disk holds, it is smaller.
 MAX_RECORD = 1 << 28
 
 
 def open_checkpoint(directory: Path) -> Folder:
-    """Open what an unfinished run into a directory needs to go on; raises OSError where there is none."""
+    """Open the checkpoint of the unfinished run in a directory; raises OSError if there is none."""
     with Folder.at(directory) as here, here.folder(STAGING) as staging:
         return staging.folder(CHECKPOINT)
 
 
 def is_unfinished(directory: Path) -> bool:
-    """Tell whether there is a run into a directory to go on with."""
+    """Tell whether a directory has an unfinished run that can be continued."""
     try:
         with open_checkpoint(directory) as checkpoint:
             return checkpoint.kind(MANIFEST) == FILE
@@ -81,7 +82,7 @@ def series_file(folder: str, number: int) -> str:
 
 
 def series_length(folder: str, frames: int) -> int:
-    """Count the files in a folder of results of so many frames."""
+    """Count the files in a folder of results with this many frames."""
     return max(0, frames - 1) if folder in UNTIL_NEXT else frames
 
 
@@ -105,8 +106,8 @@ class Publication:
     """New contents for a directory. Leaving the with statement without `publish` discards them.
 
     Args:
-        directory: where the results go; made where it does not exist.
-        names: what will be published, at most; it is an error if anything but earlier results is there.
+        directory: where the results go; made if it does not exist.
+        names: all that may be published; it is an error if anything but earlier results has one of these names.
 
     Raises:
         FilesError: on entering, when another process publishes there, or something is in the way that no run has put
@@ -114,7 +115,7 @@ class Publication:
         OSError: when the directory cannot be written.
 
     Attributes:
-        staging: where all that is not published yet lies; known when entered.
+        staging: the folder for all that is not published yet; known after entering.
         staged: the folder to write the new files in, under their final names; likewise.
         keep: whether the checkpoint of an unfinished run, this one or an earlier, stays when the with statement is
             left.
@@ -137,24 +138,24 @@ class Publication:
         return (self._lock.fileno(),) if self._lock and INHERITS else ()
 
     def publish(self, names: Collection[str]) -> None:
-        """Put the staged files in the place of earlier results.
+        """Replace earlier results by the staged files.
 
         Args:
-            names: of the files, all of which were staged, RECORD among them.
+            names: the names of the files, all staged, with RECORD among them.
 
         Raises:
-            FilesError: when one was taken away, or something has come in its place.
+            FilesError: when a staged file was removed, or something that no run has written is in its place.
         """
         with ExitStack() as opened:
             staged = _Files(self.staged, opened)
             for name in names:
                 if staged.kind(name) != FILE:
-                    raise FilesError(f"{self.staged.path / name} was taken away while the run worked; run it again")
+                    raise FilesError(f"{self.staged.path / name} was removed during the run; run it again")
         earlier = self._earlier()
         self._require_free(names, earlier)
         with ExitStack() as opened:
             here = _Files(self._here, opened)
-            # So that nobody can make up a marker by which the user's files would go.
+            # The marker names the exact files, so that a forged marker cannot make us remove the user's files.
             known = {name: here.identity(name) for name in sorted(earlier)}
         self.staging.write(MARKER, seal({"names": sorted(names), "earlier": known}), DRAFT)
         self._complete()
@@ -176,14 +177,14 @@ class Publication:
         return self
 
     def __exit__(self, *_: object) -> None:
-        # What cannot be tidied now is tidied by the next publication; an error on its way out matters more.
+        # What fails here is done by the next publication; an error that is being raised matters more.
         with suppress(OSError, FilesError):
             self._complete()
             self._clear()
         self._open.close()
 
     def _earlier(self) -> set[str]:
-        """List the results that are there of the run before, as its record tells."""
+        """List the results of the earlier run that are there, according to its record."""
         if self._here.kind(RECORD) is None:
             return set()
         try:
@@ -195,24 +196,24 @@ class Publication:
         return {name for name in _results(self._here) if _belongs(name, outputs, frames)}
 
     def _require_free(self, names: Collection[str], earlier: Collection[str]) -> None:
-        """Make sure that results can be put in place, and that nothing is there but earlier ones."""
+        """Make sure that results can be put in place, and that only earlier results are in their places."""
         with ExitStack() as opened:
             here = _Files(self._here, opened)
-            # Before the run rather than halfway through the moves.
+            # Checked here, so that it fails before the run, and not halfway through the moves.
             for folder in {name.partition("/")[0] for name in names if "/" in name}:
                 if here.has_folder(folder) and not self._here.is_writable(folder):
-                    raise PermissionError(errno.EACCES, f"{folder} is no directory that can be written")
+                    raise PermissionError(errno.EACCES, f"{folder} is not a writable directory")
             for name in names:
                 kind = here.kind(name)
                 if kind is not None and (kind != FILE or name not in earlier):
                     raise ForeignError.at(self._path / name, kind)
 
     def _complete(self) -> None:
-        """Move the staged files into place if the marker says that all are there; as often as it takes."""
+        """Move the staged files into place, if the marker says that all are there; after an interruption, go on."""
         try:
             with self.staging.open(MARKER) as file:
                 marker = unseal(file.read(MAX_RECORD))
-            # Anybody may have written it.
+            # The marker is not trusted, as anybody may have written it.
             names = [name for name in marker["names"] if is_result(name)]
             known = {name: identity for name, identity in marker["earlier"].items() if is_result(name)}
         except FileNotFoundError:
@@ -227,7 +228,7 @@ class Publication:
             here, staged = _Files(self._here, opened), _Files(new, opened)
             left = [name for name in names if staged.kind(name) is not None]
             if RECORD not in left:
-                return  # It comes last, so all is done.
+                return  # The record is moved last, so all is done.
             earlier = [name for name, identity in known.items() if here.identity(name) == identity]
             self._require_free(left, earlier)
             here.remove(RECORD)
@@ -243,20 +244,20 @@ class Publication:
             staged.replace(RECORD, here)
 
     def _clear(self) -> None:
-        """Empty the staging directory but for the lock and what is to be kept."""
+        """Empty the staging directory, except for the lock and what is to be kept."""
         if not self.keep and self.staging.kind(CHECKPOINT) is not None:
             with self.staging.folder(CHECKPOINT) as checkpoint:
-                # First of all, so that a part of a checkpoint is none.
+                # The manifest is removed first, so that a half-removed checkpoint does not count as one.
                 checkpoint.remove(MANIFEST)
         self.staging.clear(STAGING_TREE, keep=(LOCK, CHECKPOINT) if self.keep else (LOCK,))
 
     def _acquire(self, opened: ExitStack) -> None:
-        """Make the staging directory and lock it. The lock dies with the processes that hold it."""
+        """Make the staging directory and lock it. The lock is released when the processes that hold it have ended."""
         for _ in range(ATTEMPTS):
-            # A run that ends just now may remove what we open, or have removed it when we have its lock.
+            # A run that is ending may remove the directory before we open it, or before we have its lock.
             with suppress(FileNotFoundError), ExitStack() as tried:
                 self.staging = tried.enter_context(self._here.folder(STAGING, create=True))
-                # Before anything is put there.
+                # Checked before anything is written there.
                 self.staging.require_only(STAGING_TREE)
                 tried.callback(self._remove_staging)
                 lock = tried.enter_context(self.staging.lock(LOCK))
@@ -285,10 +286,10 @@ class Publication:
 
 
 class _Files:
-    """Files by names that may have a folder, which is opened once.
+    """Files by their names, which may begin with a folder; each folder is opened once.
 
     Args:
-        top: the folder of names without one.
+        top: the folder of names that begin with none.
         opened: closes what is opened.
     """
 
@@ -297,29 +298,29 @@ class _Files:
         self._folders = {"": top}
 
     def has_folder(self, name: str) -> bool:
-        """Tell whether a folder is there; raises ForeignError where something else is."""
+        """Tell whether a folder is there; raises ForeignError if something else has its name."""
         if name not in self._folders and self._top.kind(name) is not None:
             self._folders[name] = self._opened.enter_context(self._top.folder(name))
         return name in self._folders
 
     def kind(self, name: str) -> str | None:
-        """Say what is there."""
+        """Say what has this name."""
         folder, _, file = name.rpartition("/")
         return self._folders[folder].kind(file) if self.has_folder(folder) else None
 
     def identity(self, name: str) -> list[int] | None:
-        """Tell a file from any other that may come in its place."""
+        """Give what distinguishes a file from any other that may take its place."""
         folder, _, file = name.rpartition("/")
         return self._folders[folder].identity(file) if self.has_folder(folder) else None
 
     def remove(self, name: str) -> None:
-        """Remove a file, if it is there."""
+        """Remove a file, if there is one."""
         folder, _, file = name.rpartition("/")
         if self.has_folder(folder):
             self._folders[folder].remove(file)
 
     def replace(self, name: str, other: _Files) -> None:
-        """Move a file to the same place among others."""
+        """Move a file to the same name among other files."""
         folder, _, file = name.rpartition("/")
         if not other.has_folder(folder):
             other._top.folder(folder, create=True).close()
@@ -344,7 +345,7 @@ def is_result(name: object) -> bool:
 
 
 def _belongs(name: str, outputs: Collection[str], frames: int) -> bool:
-    """Tell whether a result is one of so many frames with some outputs."""
+    """Tell whether a result is one of a run with these outputs and this many frames."""
     frame = _frame(name)
     if frame is None:
         return name in outputs

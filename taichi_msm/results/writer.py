@@ -1,4 +1,4 @@
-"""The results of a run: frames, animation, trajectory and record, whole or not at all."""
+"""Write the results of a run: frames, animation, trajectory and record, whole or not at all."""
 
 from __future__ import annotations
 
@@ -34,16 +34,16 @@ from taichi_msm.scene import Scene
 
 
 class ResultWriter:
-    """Writes the frames of a run as they come, and puts all in place at the end.
+    """Writes the frames of a run as they come, and puts all files in place at the end.
 
-    Within the with statement the files grow out of sight. Left without `publish` they are removed; but once a run with
-    a manifest has a frame, its checkpoint takes the place of any earlier one, and stays until results are published as
+    Within the with statement the files grow in a hidden folder. Leaving it without `publish` removes them. But once a
+    run with a manifest has a frame, its checkpoint replaces any earlier one, and stays until results are published as
     complete.
 
     Args:
-        directory: where the results go; made where it does not exist. Files there that no run writes stay.
+        directory: where the results go; made if it does not exist. Files there that no run has written stay.
         scene: what is run; its `output` says which files are wanted.
-        manifest: what another process must know to go on with this run, in JSON.
+        manifest: what another process must know to continue this run, in JSON.
         resumes: whether this run is to go on from its checkpoint in the directory.
 
     Raises:
@@ -51,7 +51,7 @@ class ResultWriter:
             or something is in the way that no run has put there.
 
     Attributes:
-        saved: where the run is to go on; None: at rest.
+        saved: the state from which the run is to go on; None: from rest.
     """
 
     def __init__(
@@ -73,21 +73,21 @@ class ResultWriter:
 
     @property
     def frames(self) -> int:
-        """Number of frames that are in the results. After an interruption only `finish` knows."""
+        """Number of frames in the results. After an interruption it is known only after `finish`."""
         return self._frames
 
     @property
     def encode_seconds(self) -> float:
-        """Processor time spent encoding pictures, beside the simulation [s]; known after `finish`."""
+        """Processor time spent encoding pictures, in parallel with the simulation [s]; known after `finish`."""
         return self._encode_seconds
 
     @property
     def stored(self) -> int:
-        """Number of frames whose positions are there; those of a run that is resumed are from the start."""
+        """Number of frames whose positions are stored, including those from before the run was resumed."""
         return self._checkpoint.frames
 
     def position(self, frame: int) -> NDArray[Any]:
-        """Read the positions of a frame that is stored [m], shape (rows, cols, 3)."""
+        """Read the positions of a stored frame [m], shape (rows, cols, 3)."""
         with writing(self._directory):
             return self._checkpoint.position(frame)
 
@@ -96,11 +96,11 @@ class ResultWriter:
 
         Args:
             position: positions [m], shape (rows, cols, 3).
-            observed: what is seen of it, as far as it is wanted.
-            pause: called some times a second while the encoder takes no more; what it raises gives the picture up.
+            observed: the outputs of the frame that are wanted.
+            pause: called some times a second while the encoder takes no more; if it raises, the picture is given up.
         """
         with writing(self._directory):
-            # In this order, whatever is interrupted, there are at least as many positions as pictures.
+            # Positions come first: whenever the run is interrupted, there are at least as many of them as pictures.
             if self.stored == 0:
                 self._publication.keep = False
                 self._checkpoint.begin(self._plan or {})
@@ -114,16 +114,16 @@ class ResultWriter:
 
     @property
     def due(self) -> bool:
-        """Whether it is time to save where the run is."""
+        """Whether it is time to save the state of the run."""
         return self.stored > 0 and self._checkpoint.due
 
     def save(self, saved: Saved) -> str:
-        """Keep where the run is, in case it ends here; gives the file that has it."""
+        """Save the state of the run, in case it ends here; returns the file."""
         with writing(self._directory):
             return self._checkpoint.save(saved)
 
     def load(self) -> Saved | None:
-        """Give what was saved last; None: nothing was."""
+        """Give the state that was saved last; None: none was."""
         with writing(self._directory):
             return self._checkpoint.load()
 
@@ -156,28 +156,29 @@ class ResultWriter:
         self._finished = True
 
     def publish(self, record: Mapping[str, Any]) -> dict[str, Any]:
-        """Write run.json and put the results in the place of earlier ones.
+        """Write run.json, and replace earlier results by the new ones.
 
         Args:
-            record: what run.json holds, besides the number of "frames" and the names of "outputs", itself the last.
+            record: the content of run.json without "frames", their number, and "outputs", the names of all results,
+                with run.json as the last.
 
         Returns:
-            What it holds.
+            The whole content of run.json.
         """
         self.finish()
         with writing(self._directory):
-            # The next run into the directory knows our files by these.
+            # By these names the next run into the directory recognises our files.
             facts = {**record, "frames": self._frames, "outputs": self._outputs(self._frames)}
             text = json.dumps(facts, indent=2, ensure_ascii=False, allow_nan=False)
             with self._publication.staged.create(RECORD) as file:
-                # A file name that is not UTF-8 has surrogates, whose backslash form is their JSON form.
+                # A file name that is not UTF-8 has surrogates; escaped with a backslash they are valid JSON.
                 file.write((text + "\n").encode("utf-8", "backslashreplace"))
             self._publication.publish(self._names(self._frames))
             self._publication.keep &= record.get("status") != "complete"
         return facts
 
     def _outputs(self, frames: int) -> list[str]:
-        """List what results of so many frames consist of, the record last."""
+        """List the outputs of a run with this many frames, the record last."""
         kinds = {"png": FRAMES, "gif": ANIMATION, "trajectory": TRAJECTORY, "tracks": TRACKS}
         wanted = [kinds.get(kind, kind) for kind in self._scene.output] if frames else []
         if frames and self._scene.output_camera:
@@ -186,7 +187,7 @@ class ResultWriter:
         return [*(name for name in order if name in wanted), RECORD]
 
     def _names(self, frames: int) -> list[str]:
-        """List the files of results of so many frames."""
+        """List the files of a run with this many frames."""
         return result_names(self._outputs(frames), frames)
 
     def __enter__(self) -> ResultWriter:

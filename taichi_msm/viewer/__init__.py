@@ -1,1 +1,1 @@
-"""Live: a person presses the tissue. The session is one half, the window the other; they share events and pictures."""
+"""Live sessions, in which a person presses the tissue. The window gives the session events and gets pictures."""

@@ -1,4 +1,4 @@
-"""What a session keeps: pictures, films and scenes, each whole or not at all, and none in the place of another."""
+"""The files that a session saves: pictures, films and scenes, each whole or not at all; none replaces another."""
 
 from __future__ import annotations
 
@@ -24,19 +24,19 @@ from taichi_msm.viewer.film import Film
 # The C emitter is ten times faster; a PyYAML that was built without it writes the same text.
 _DUMPER: Any = getattr(yaml, "CSafeDumper", yaml.SafeDumper)
 
-# A scene has no more values besides the keys of its probes.
+# A scene has at most this many values besides the keys of its probes.
 VALUES_BESIDES = 1000
 
 
 class Captures:
-    """A folder of what a session keeps; made when there is something to keep.
+    """The folder where a session saves its files; made with the first file.
 
     Args:
-        folder: where.
-        name: what the session is of, for its scenes.
+        folder: the folder.
+        name: what the session is of; written into its scenes.
 
     Attributes:
-        kept: the files, in order.
+        kept: the saved files, in order.
     """
 
     def __init__(self, folder: Path, name: str) -> None:
@@ -55,7 +55,7 @@ class Captures:
             return self._place(draft, "picture", ".png")
 
     def keep_scene(self, scene: Scene) -> Path:
-        """Save a scene, and copies of its pictures beside it, as a scene file needs them near; returns its file."""
+        """Save a scene, and beside it copies of its pictures, where a scene file must have them; returns its file."""
         with _draft(self.folder) as draft:
             if scene.stiffness_map is not None:
                 scene = scene.with_map_image(self._copied(Path(scene.stiffness_map.image)).name)
@@ -65,9 +65,9 @@ class Captures:
             text = yaml.dump(
                 data, Dumper=_DUMPER, sort_keys=False, default_flow_style=None, width=120, allow_unicode=True
             )
-            text = f"# What was done in a live session of {printable(self._name)}; run repeats it.\n{text}"
+            text = f"# What was done in a live session of {printable(self._name)}; `run` repeats it.\n{text}"
             if len(text.encode()) > MAX_BYTES or values(scene) + VALUES_BESIDES > MAX_NODES:
-                raise FilesError("this session is too long for the file of a scene; reset it, and do less")
+                raise FilesError("this session is too long for a scene file; reset it, and do less")
             draft.write_text(text, "utf-8")
             return self._place(draft, "session", ".yaml")
 
@@ -76,12 +76,12 @@ class Captures:
         return Film(self.folder, size, rate, background)
 
     def keep_film(self, film: Film) -> Path:
-        """Save a film that has a picture, and end it; returns its file."""
+        """End a film that has a picture, and save it; returns its file."""
         with film, writing(self.folder):
             return self._place(film.encoded(), "film", ".gif")
 
     def _place(self, draft: Path, stem: str, suffix: str) -> Path:
-        """Give a file the next name that no other has."""
+        """Give a file the next free name."""
         number = 1
         while not _named(draft, path := self.folder / f"{stem}-{number}{suffix}"):
             number += 1
@@ -89,10 +89,10 @@ class Captures:
         return path
 
     def _copied(self, image: Path) -> Path:
-        """Have a copy of a picture in the folder, under its own name if that is free."""
+        """Make sure that the folder has a copy of a picture, under the picture's own name if that is free."""
         copy, number = self.folder / image.name, 1
         if not image.is_file():
-            raise FilesError(f"{image}: is gone; put the picture back, the scene needs a copy of it")
+            raise FilesError(f"{image}: missing; put the picture back, the scene needs a copy of it")
         while os.path.lexists(copy) and not (copy.exists() and filecmp.cmp(image, copy, shallow=False)):
             number += 1
             copy = self.folder / f"{image.stem}-{number}{image.suffix}"
@@ -105,8 +105,8 @@ class Captures:
 
 @contextmanager
 def _draft(folder: Path) -> Iterator[Path]:
-    """Give a name out of sight to write a file under; it is gone in the end."""
-    # No two processes ever have one name: a draft may be another name of what was kept by one that was killed.
+    """Give a hidden name to write a file under; the name is removed in the end."""
+    # The name is random, as a killed process may have left its draft, which can be a hard link to a file that it saved.
     draft = folder / f".draft-{secrets.token_hex(8)}"
     with writing(folder):
         folder.mkdir(parents=True, exist_ok=True)
@@ -117,19 +117,19 @@ def _draft(folder: Path) -> Iterator[Path]:
 
 
 def values(scene: Scene) -> int:
-    """Count the values that the keys of a scene's probes are in its file, which may have `MAX_NODES`."""
+    """Count the values that the keys of a scene's probes add to its file, which may have `MAX_NODES` in all."""
     return sum(4 * len(probe.at) + 3 * len(probe.load) for probe in scene.probes)
 
 
 def _named(draft: Path, path: Path) -> bool:
     """Give a file a name, unless another has it."""
     try:
-        # Unlike a rename, a link takes no other file's place.
+        # Unlike a rename, a link does not replace another file.
         os.link(draft, path)
     except FileExistsError:
         return False
     except OSError:
-        # A file system without links.
+        # The file system has no links.
         if path.exists():
             return False
         draft.replace(path)

@@ -1,4 +1,4 @@
-"""The pointer in a session: where it presses, and how far a drag moves the tool."""
+"""The pointer in a session: where it presses the tissue, and how far a drag moves the tool."""
 
 from __future__ import annotations
 
@@ -12,25 +12,25 @@ from taichi_msm.viewer.viewport import Viewport
 
 
 class Controller:
-    """Moves a tool by a pointer over a picture.
+    """Moves a tool with a pointer over a picture.
 
     Args:
-        tool: what is moved.
-        viewport: how the tissue is looked at.
-        scene: what is looked at.
+        tool: the tool.
+        viewport: how the tissue is shown.
+        scene: the scene that is shown.
     """
 
     def __init__(self, tool: Tool, viewport: Viewport, scene: Scene) -> None:
         self._tool = tool
         self._viewport = viewport
         self._refine, self._size = scene.render.refine, scene.sheet.size
-        # A place of the tool, and the point on the plane at rest that was under the pointer then.
+        # Where a drag begins: the place of the tool, and the point of the rest plane that was then under the pointer.
         self._held: tuple[Place, NDArray[np.floating] | None] | None = None
         self._pointer = (0.0, 0.0)
         self._hovering: tuple[float, float] | None = None
 
     def press(self, position: NDArray[np.floating], x: float, y: float, direction: int) -> bool:
-        """Press, 1, or pull, -1, what is seen at a pixel; tells whether there is anything."""
+        """Press (1) or pull (-1) what is seen at a pixel; returns whether there is anything."""
         place = pick(position, self._refine, self._viewport.view, (x, y))
         if place is None:
             return False
@@ -40,19 +40,19 @@ class Controller:
         return True
 
     def over(self, position: NDArray[np.floating]) -> Place | None:
-        """Find the place on the sheet that is under a pointer which presses nothing; None where there is none."""
+        """Find the place on the sheet under a pointer that presses nothing; None if there is none."""
         if self._tool.held or self._tool.percent != 0 or self._hovering is None:
             return None
         return pick(position, self._refine, self._viewport.view, self._hovering)
 
     def point(self, x: float, y: float) -> None:
-        """Follow a pointer that presses nothing."""
+        """Note where a pointer is that presses nothing."""
         self._hovering = x, y
 
     def drag(self, x: float, y: float) -> None:
-        """Move the control point as far over the sheet at rest as the pointer went.
+        """Move the control point as far over the sheet at rest as the pointer moved.
 
-        Where the sheet is now is no guide: it gives way under the tool, and the pointer would run after itself.
+        The deformed sheet cannot serve for this: it gives way to the tool, so each move would cause another.
         """
         if self._held is None:
             return
@@ -70,7 +70,7 @@ class Controller:
             self._tool.release()
 
     def hold_on(self) -> None:
-        """Keep the tool where it is under a camera that moved; a drag goes on from there."""
+        """Keep the tool where it is after the camera moved; a drag goes on from there."""
         if self._held is not None:
             self._held = self._tool.goal, on_rest_plane(self._viewport.view, self._pointer)
 

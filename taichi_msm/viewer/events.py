@@ -1,4 +1,4 @@
-"""What a person does, as the session is told it. Pixels count from the picture's top-left one, x right and y down."""
+"""What a person does, as events for the session. Pixels count from the picture's top-left one, x right and y down."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ class Point(NamedTuple):
 
 
 class Press(NamedTuple):
-    """The tool touches the tissue at a pixel; `pull` turns its force around."""
+    """The tool touches the tissue at a pixel; `pull` reverses its force."""
 
     x: float
     y: float
@@ -21,7 +21,7 @@ class Press(NamedTuple):
 
 
 class Drag(NamedTuple):
-    """The tool goes to another pixel."""
+    """The tool is dragged to another pixel."""
 
     x: float
     y: float
@@ -32,20 +32,20 @@ class Release(NamedTuple):
 
 
 class Turn(NamedTuple):
-    """The picture is turned, as if its nearest side were pushed by so many pixels."""
+    """The picture is turned as if its nearest side were pushed by this many pixels."""
 
     right: float
     down: float
 
 
 class Percent(NamedTuple):
-    """Press with another share of the full force."""
+    """The strength is set to another percentage of the full force."""
 
     percent: float
 
 
 class Harder(NamedTuple):
-    """Press harder, by so many percent of the full force; or less hard."""
+    """The strength grows by this many percent of the full force; below 0 it falls."""
 
     percent: float
 
@@ -58,13 +58,13 @@ class Key(NamedTuple):
 
 Event = Point | Press | Drag | Release | Turn | Percent | Harder | Key
 
-# What a notch of the wheel and the keys up and down change [percent].
+# How much a notch of the wheel, or the up or down key, changes the strength [percent of the full force].
 NOTCH = 5.0
 
 # What the pointer does.
 POINTER = {
     "left button": "press with the scene's force; dragged, the tool moves",
-    "shift + left button": "the opposite force: pull, where the scene's pushes",
+    "shift + left button": "the opposite force: pull, if the scene's force pushes",
     "wheel": f"press harder or less hard, by {NOTCH:g} % of the full force",
     "right button": "dragged, turn the picture",
 }
@@ -78,12 +78,12 @@ KEYS = {
     "o": "look from the side, from above",
     "m": "mesh on and off",
     "l": "light on and off",
-    "space": "pause, and go on",
-    ".": "one frame further, when paused",
-    "r": "reset: tissue at rest, and what was done forgotten",
+    "space": "pause and go on",
+    ".": "while paused: one frame further",
+    "r": "reset: put the tissue at rest, forget what was done",
     "p": "save the tissue as PNG",
-    "g": "start and stop a film, a GIF",
-    "w": "write what was done as a scene, which run repeats",
+    "g": "start and stop a film (GIF)",
+    "w": "save what was done as a scene, which run repeats",
     "i": "the figures on and off",
     "h": "the keys on and off",
     "q": "quit; so does Escape",

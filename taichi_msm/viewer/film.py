@@ -1,4 +1,4 @@
-"""A film of a session, encoded beside it, that is whole or not there."""
+"""A film of a session, encoded while the session runs; in the end it is whole or not there."""
 
 from __future__ import annotations
 
@@ -15,20 +15,20 @@ from taichi_msm.results.folder import FOLDER, INHERITS, Folder, Tree
 from taichi_msm.results.gif import Picture
 from taichi_msm.results.publication import ANIMATION
 
-# A film is encoded in a hidden folder, which is locked as long as the film lives.
+# A film is encoded in a hidden folder, which is locked until the film is closed.
 HIDDEN, LOCK = r"\.film-[0-9a-f]{16}", "lock"
 TREE: Tree = {LOCK: None, re.escape(ANIMATION): None}
 
 
 class Film:
-    """A GIF that is encoded in a process of its own, out of sight; gone when it is left, if nobody took it.
+    """A GIF that a process of its own encodes in a hidden folder; on leaving, it is removed unless it was moved away.
 
     Args:
-        folder: near which it is encoded; made where it does not exist.
+        folder: the folder in which the hidden one is made; made if it does not exist.
         size: width, height of the pictures [px].
         rate: pictures per second.
         background: a colour that is kept exactly.
-        option: where another folder is chosen.
+        option: what the error says to choose another folder by.
 
     Raises:
         FilesError: here and in `add` and `encoded`, when it cannot be written.
@@ -63,7 +63,7 @@ class Film:
         self.pictures += 1
 
     def encoded(self, pause: Pause = lambda: None) -> Path:
-        """Wait for the last picture; returns the file, which is to be moved to its place. There must be a picture."""
+        """Wait until the last picture is encoded; there must be one. Returns the file, which is to be moved away."""
         with writing(*self._place):
             self._encoder.finish(pause)
         return self._hidden.path / ANIMATION
@@ -78,12 +78,12 @@ class Film:
 
 
 def clear_abandoned(folder: Folder) -> None:
-    """Remove what films have left whose processes were killed."""
+    """Remove what films of killed processes have left."""
     if not INHERITS:
         return
     for name, kind in folder.entries():
         if kind == FOLDER and re.fullmatch(HIDDEN, name):
-            # Another's, or one that is being made, stays.
+            # A film of another user, or one still being made, stays.
             with suppress(OSError, FilesError), folder.folder(name) as hidden:
                 hidden.require_only(TREE)
                 if hidden.kind(LOCK) is not None:
@@ -92,7 +92,7 @@ def clear_abandoned(folder: Folder) -> None:
 
 
 def _remove(folder: Folder, name: str) -> None:
-    """Remove a film's hidden folder, as far as it can be."""
+    """Remove a film's hidden folder, as far as possible."""
     with suppress(OSError, FilesError), folder.folder(name) as hidden:
         hidden.clear(TREE)
         folder.remove_folder(name)

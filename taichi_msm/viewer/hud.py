@@ -12,14 +12,14 @@ from PIL import Image, ImageDraw, ImageFont
 
 from taichi_msm.results.gif import Picture
 
-# Heights of letters [px]: this share of the picture's, within limits.
+# Height of letters: this share of the picture's height, within limits [px].
 LETTER = 1 / 36
 SMALLEST, LARGEST = 11, 22
 
-# A letter is so wide, as a share of its height, in most texts at most.
+# Width of a letter as a share of its height; in most texts letters are narrower on average.
 LETTER_WIDTH = 0.56
 
-# Behind text the picture is so many times darker.
+# How many times darker the picture is behind text.
 DARKER = 3
 
 SHADE = (0, 0, 0)
@@ -36,8 +36,8 @@ def write(picture: Picture, above: Sequence[str], below: str = "", table: Mappin
     Args:
         picture: colours, shape (height, width, 3); changed.
         above: lines for its top left corner.
-        below: a text for its bottom left corner, in as many lines as it needs.
-        table: two columns, under the first lines.
+        below: a text for its bottom left corner, wrapped as needed.
+        table: two columns, below the lines at the top.
     """
     height, width = picture.shape[:2]
     size = _size(picture)
@@ -62,13 +62,13 @@ def mark(picture: Picture, tool: tuple[float, float], *, pulls: bool) -> None:
 
     Args:
         picture: colours, shape (height, width, 3); changed.
-        tool: the pixel that the tool is seen at.
+        tool: the pixel at which the tool is seen.
         pulls: whether it pulls.
     """
     radius = picture.shape[0] * RING
     reach = int(radius) + 4
     left, top = max(0, int(tool[0]) - reach), max(0, int(tool[1]) - reach)
-    # To copy the whole picture would take longer than all else here.
+    # Only this part is copied: copying the whole picture would take longer than all else here.
     part = picture[top : max(0, int(tool[1]) + reach), left : max(0, int(tool[0]) + reach)]
     if part.size == 0:
         return
@@ -80,7 +80,7 @@ def mark(picture: Picture, tool: tuple[float, float], *, pulls: bool) -> None:
 
 
 def _lay(picture: Picture, panel: NDArray[np.uint8], left: int, top: int) -> None:
-    """Lay a panel of white letters over a picture, as far as it has place."""
+    """Lay a panel of white letters over a picture; what does not fit is cut off."""
     left, top = max(0, left), max(0, top)
     part = picture[top : top + panel.shape[0], left : left + panel.shape[1]]
     part[:] = np.maximum(part // DARKER, panel[: part.shape[0], : part.shape[1], None])
@@ -94,7 +94,7 @@ def _lines(lines: tuple[str, ...], size: int) -> NDArray[np.uint8]:
 
 @lru_cache(maxsize=64)
 def _columns(rows: tuple[tuple[str, str], ...], size: int) -> NDArray[np.uint8]:
-    """Make the panel of two columns, shape (height, width); without a row it is empty."""
+    """Make the panel of two columns, shape (height, width); without rows it is empty."""
     if not rows:
         return np.zeros((0, 0), np.uint8)
     font, line, edge = ImageFont.load_default(size), round(1.4 * size), size // 2

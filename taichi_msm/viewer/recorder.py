@@ -1,4 +1,4 @@
-"""A session without a window: a script is done, and a film taken of it."""
+"""A session without a window: the events of a script happen, and the session is filmed."""
 
 from __future__ import annotations
 
@@ -22,18 +22,19 @@ def record(
     progress: Callable[[int, int], None] = lambda done, total: None,
     say: Callable[[str], None] = lambda notice: None,
 ) -> None:
-    """Let a session go on for some time and film it.
+    """Run a session for some time and film it.
 
     Args:
         session: the session.
-        path: the GIF; one that is there is replaced when the film is whole.
+        path: the GIF; an earlier one is replaced when the film is whole.
         seconds: how long.
-        events: each with the frame of the session before which it happens, in order; taken one after another.
-        progress: called with the frames done and the frames in all, often; what it raises stops here.
+        events: each with the frame of the session before which it happens, in order; read one at a time.
+        progress: called often, with the frames done and the frames in all; what it raises stops the session there.
         say: called with what the person should know.
 
     Raises:
-        FilesError: when the film cannot be written, or, when it is, what an event was to keep could not.
+        FilesError: when the film cannot be written; or, after it was written, when a file that an event was to save
+            could not be.
     """
     if path.is_dir():
         raise FilesError(f"{path}: a directory; choose another {OPTION}")

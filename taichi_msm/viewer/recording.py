@@ -16,7 +16,7 @@ class Recording:
         captures: where films are kept.
         scene: whose pictures are filmed.
         rate: frames per second of the film.
-        parts: frames of the session that make one of the film.
+        parts: frames of the session per frame of the film.
     """
 
     def __init__(self, captures: Captures, scene: Scene, rate: float, parts: int) -> None:
@@ -29,7 +29,7 @@ class Recording:
 
     @property
     def on(self) -> bool:
-        """Whether pictures are filmed."""
+        """Whether a film is on."""
         return self._film is not None
 
     def start(self, beat: int) -> None:
@@ -38,7 +38,7 @@ class Recording:
         self._from = beat
 
     def expose(self, picture: Picture, beat: int) -> str:
-        """Film a picture; where the pictures are too slow for the film one stays for several."""
+        """Film a picture; if pictures come too slowly for the film, each fills several of its frames."""
         film = self._film
         if film is None:
             return ""
@@ -52,7 +52,7 @@ class Recording:
         return ""
 
     def end(self) -> str:
-        """Keep the film that is on, if it has a picture."""
+        """End the film that is on, and save it if it has a picture."""
         film, self._film = self._film, None
         if film is None:
             return ""

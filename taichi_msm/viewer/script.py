@@ -1,4 +1,4 @@
-"""A script of events: what a person would do, from a YAML file."""
+"""A script of events: what a person would do, read from a YAML file."""
 
 from __future__ import annotations
 
@@ -23,20 +23,20 @@ Pair = tuple[Number, Number]
 Seconds = Annotated[NotNegative, Field(le=LONGEST)]
 SECONDS = f"a number from 0 to {LONGEST:g}, in seconds"
 
-# What every kind of entry needs beside its time.
+# The key that every kind of entry needs besides its time.
 NEEDS = {"press": "at", "pull": "at", "drag": "at", "release": "", "turn": "by", "percent": "to", "key": "name"}
 
-# Of these, a longer one is spread over the frames that it takes.
+# The kinds that may last; such an entry is spread over the frames of its duration.
 LASTING = ("drag", "turn")
 
-# A script ends when it ends.
+# A script may not quit: the session ends at its given time.
 PRESSABLE = tuple(name for name in KEYS if name != "q")
 
 _SCRIPT = Kind("script", "events")
 
 
 class Entry(Section):
-    """One thing that is done."""
+    """One entry of a script."""
 
     t: Seconds = key(means="when, or when it begins [s]", expects=SECONDS)
     do: Literal["press", "pull", "drag", "release", "turn", "percent", "key"] = key(
@@ -110,7 +110,7 @@ def load_script(path: str | Path, size: tuple[int, int]) -> Script:
         size: width, height of the picture that is shown [px].
 
     Raises:
-        SceneError: all that is wrong with it, one line each, in the order in which it stands.
+        SceneError: with all faults, one line each, in the order of the file.
     """
     draft = Draft(str(path), read_file(str(path), _SCRIPT))
     script, problems = parse(Script, draft.data)
@@ -122,7 +122,7 @@ def load_script(path: str | Path, size: tuple[int, int]) -> Script:
 
 
 def _outside(script: Script, size: tuple[int, int]) -> Iterator[Problem]:
-    """Find what is pressed outside of the picture."""
+    """Find the entries that point outside the picture."""
     width, height = script.size or size
     for n, entry in enumerate(script.events):
         if entry.do in ("press", "pull") and entry.at is not None:
@@ -133,10 +133,10 @@ def _outside(script: Script, size: tuple[int, int]) -> Iterator[Problem]:
 
 
 def timed(script: Script, rate: float, size: tuple[int, int]) -> Iterator[tuple[int, Event]]:
-    """Give the events, each with the frame before which it happens.
+    """Give the events of a script, each with the frame before which it happens.
 
     Args:
-        script: what is done.
+        script: the script.
         rate: frames per second.
         size: width, height of the picture that is shown [px].
     """

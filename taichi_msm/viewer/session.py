@@ -1,4 +1,4 @@
-"""A session: events in, the state of the tissue and its picture out. It knows no window and no clock."""
+"""A session: it takes events, and gives the state of the tissue and its picture. It has no window and no clock."""
 
 from __future__ import annotations
 
@@ -44,28 +44,28 @@ from taichi_msm.viewer.recording import Recording
 from taichi_msm.viewer.tool import Tool
 from taichi_msm.viewer.viewport import Viewport
 
-# A session has as many frames a second as a screen shows, as whole parts of the scene's.
+# A session has at most this many frames per second, what a screen shows; each is a whole part of a frame of the scene.
 MOST_FRAMES = 60.0
 
-# A displacement of less than this share of the sheet is none that is shown.
+# A displacement below this share of the sheet's larger side is shown as 0.
 AT_REST = 1e-6
 
-# Between figures.
+# What stands between two figures.
 SEPARATOR = "  ·  "
 
-# A notice is shown for so long [s].
+# How long a notice is shown [s].
 NOTICE = 3.0
 
-# What is recorded is looked at every so many frames; it is nearly too long at this share of what it may be.
+# The length of the recorded scene is checked once in this many frames; a warning comes at this share of the limit.
 CHECKED = 200
 NEARLY = 0.75
 
-# The time of stepping is averaged over about so many frames.
+# The time of stepping is averaged over about this many frames.
 AVERAGED = 20
 
 
 def with_live_frames(scene: Scene) -> tuple[Scene, int]:
-    """Cut the frames of a scene into as many as a screen shows; a given step stays.
+    """Divide the frames of a scene into shorter ones, for as many per second as a screen shows; a given step stays.
 
     Returns:
         The scene, and how many of its frames make one of the given scene's.
@@ -79,29 +79,29 @@ def with_live_frames(scene: Scene) -> tuple[Scene, int]:
 
 
 class Session:
-    """A person with a tool at the tissue of a scene. Usable in a with statement, which keeps a film that is on.
+    """A person presses the tissue of a scene with a tool. Usable in a with statement, which saves a film that is on.
 
     The tool has the force, the falloff and the offset of the scene's first probe.
 
     Args:
         scene: a checked scene with a picture.
-        captures: where is kept what the person wants to.
+        captures: the folder where the person's pictures, films and scenes are saved.
         arch: cpu or cuda.
         threads: number of CPU threads; None takes every core.
-        play: whether the scene's probes do what the scene says, besides.
-        progress: called with the viewport before each, often; what it raises stops here.
+        play: whether the scene's own probes act as well.
+        progress: called often, with the name of the stage; what it raises stops the work there.
 
     Raises:
-        SceneError: when the scene has no picture or no probe, or no place for one more.
-        DeviceError: when the arch is not there.
+        SceneError: when the scene has no picture, no probe, or no room for another probe.
+        DeviceError: when the arch is not available.
 
     Attributes:
-        scene: with the frames and the step of the session.
-        tool: the tool in the hand.
-        viewport: how the tissue is looked at.
-        parts: how many of its frames make one of the given scene's.
+        scene: the scene, with the frames and the step of the session.
+        tool: the tool in the person's hand.
+        viewport: how the tissue is shown.
+        parts: how many frames of the session make one of the given scene's.
         paused: whether time stands still.
-        fault: why the tissue moves no more; nothing if it does.
+        fault: why the tissue no longer moves; empty while it does.
         seconds_a_frame: how long the steps of a frame take [s].
     """
 
@@ -171,18 +171,18 @@ class Session:
         return float(np.linalg.norm(moved))
 
     def recorded(self) -> Scene:
-        """Give what was done as a scene; its run has the same bits."""
-        # What went wrong within a frame goes wrong again.
+        """Give what was done as a scene; a run of it has the same bits."""
+        # After a divergence, the frame in which it happened is part of the scene, whose run diverges as well.
         frames = max(1, self.frame + bool(self.fault))
         time = self.scene.time.model_copy(update={"duration": frames / self.rate, "tolerance": None})
         probes = (*self._others, self.tool.recorded(frames))
         return self.scene.model_copy(update={"probes": probes, "time": time, "render": self.viewport.render})
 
     def handle(self, event: Event) -> None:
-        """Do what an event asks for; what it does to the tissue is seen in the next frame.
+        """Do what an event asks for; its effect on the tissue is seen in the next frame.
 
         Raises:
-            FilesError: when something to be kept cannot be written.
+            FilesError: when a file cannot be saved.
         """
         match event:
             case Point(x, y):
@@ -225,10 +225,12 @@ class Session:
         self.seconds_a_frame += share * (spent - self.seconds_a_frame)
 
     def picture(self, pacing: str = "") -> Picture:
-        """Draw the tissue and what is written over it. A film that is on takes it without text, or ends if it cannot.
+        """Draw the tissue, and write the texts over it.
+
+        A film that is on takes the picture without texts; if it cannot, the film ends.
 
         Args:
-            pacing: what is to be said of the speed of the pictures.
+            pacing: a text about the speed of the pictures.
 
         Returns:
             Colours, shape (height, width, 3).
@@ -244,16 +246,16 @@ class Session:
         return picture
 
     def say(self, notice: str) -> None:
-        """Show a notice for some time."""
+        """Show a notice for a few seconds."""
         self._notice, self._notice_until = notice, self._beats + round(NOTICE * self.rate)
 
     @property
     def notice(self) -> str:
-        """What the person should know now."""
+        """The notice that is shown now."""
         return self._notice if self._beats < self._notice_until else self.fault
 
     def close(self) -> None:
-        """Keep the film that is on, and free the memory."""
+        """Save the film that is on, and free the memory."""
         self._simulation.close()
         self.viewport.close()
         self._tell(self._recording.end())
@@ -267,13 +269,13 @@ class Session:
         self.close()
 
     def _warn_of_length(self) -> None:
-        """Say once that soon there will be more than a scene file may hold."""
+        """Warn once before the session becomes too long for a scene file."""
         if self.frame % CHECKED == 0 and not self._warned and values(self.recorded()) > NEARLY * MAX_NODES:
             self._warned = True
-            self.say("soon this session will be too long for a scene: write it now (w), then reset it (r)")
+            self.say("this session will soon be too long for a scene: save it now (w), then reset it (r)")
 
     def _draw(self) -> Picture:
-        """Draw the tissue and the instruments, the tool's where it acts or would."""
+        """Draw the tissue and the instruments; the tool's is where the tool acts, or would if it were pressed."""
         positions, rate = self.positions(), self.rate
         placed = [
             rod(probe.instrument, self.scene, positions, control_point(probe, self.scene.sheet, self.frame / rate))
@@ -338,7 +340,7 @@ class Session:
 
     @property
     def _pulls(self) -> bool:
-        """Whether the tool pulls out of the sheet, where scenes may have a force that does."""
+        """Whether the force of the tool points away from the sheet; a scene's force may do so by itself."""
         return self.tool.percent * probe_force(self.scene.probes[-1], self.scene.sheet).force[2] > 0
 
     def _figure_lines(self, pacing: str) -> list[str]:
@@ -349,7 +351,7 @@ class Session:
         does = "pull" if self._pulls else "push"
         percent = f"{does} {abs(tool.percent):.0f} %" if tool.percent else f"tool {tool.strength:.0f} %"
         moved = self.displacement()
-        # Less is what f32 makes of places.
+        # Smaller displacements are rounding errors of positions in f32.
         moved = moved if moved > AT_REST * max(self.scene.sheet.size) else 0.0
         lines = [percent, length(moved)], [pacing, speed, *state]
         return [SEPARATOR.join(part for part in line if part) for line in lines]
@@ -358,17 +360,17 @@ class Session:
 def _require_usable(scene: Scene, *, play: bool) -> None:
     problems = []
     if scene.image is None:
-        problems.append("image: none; a session shows one, name it here or with --image")
+        problems.append("image: missing; a session needs one, name it here or with --image")
     if not scene.probes:
-        problems.append("probes: none; the tool takes its force from the first one, add it")
+        problems.append("probes: empty; the tool takes its force from the first probe, add one")
     if play and len(scene.probes) == MAX_PROBES:
-        problems.append(f"probes: {MAX_PROBES} leave no place for the tool; remove one, or leave out --play")
+        problems.append(f"probes: {MAX_PROBES} leave no room for the tool; remove one, or leave out --play")
     if problems:
         raise SceneError(problems)
 
 
 def _between(values: NDArray[np.floating], across: float, down: float) -> NDArray[np.float64]:
-    """Interpolate what points have, shape (rows, cols, 3), bilinearly at a place on the sheet."""
+    """Interpolate values of the mass points, shape (rows, cols, 3), bilinearly at a place on the sheet."""
     rows, cols = values.shape[:2]
     y, x = down * (rows - 1), across * (cols - 1)
     i, j = min(int(y), rows - 2), min(int(x), cols - 2)
@@ -379,7 +381,7 @@ def _between(values: NDArray[np.floating], across: float, down: float) -> NDArra
 
 
 def length(metres: float) -> str:
-    """Write a length in a unit in which it is legible."""
+    """Write a length in a readable unit."""
     if metres == 0 or 1e-6 <= metres < 1:
         return f"{1e3 * metres:.3g} mm"
     return f"{metres:.3g} m"

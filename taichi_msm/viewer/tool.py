@@ -1,4 +1,4 @@
-"""The tool in a person's hand, as the probe of a scene: every frame adds the keys that a run needs to repeat it."""
+"""The tool in a person's hand, as a probe of a scene: every frame adds the keys that a run needs to repeat it."""
 
 from __future__ import annotations
 
@@ -8,13 +8,13 @@ from typing import TypeVar
 
 from taichi_msm.scene import Instrument, Probe
 
-# A hand needs some time to press: from nothing to the full force [s]. It lets go at once.
+# How long a hand takes from no force to the full force [s]. It lets go at once.
 RISE = 0.2
 
-# Digits of a control point's fractions: a millionth of the sheet.
+# Decimal places of a control point's fractions: a millionth of the sheet.
 DIGITS = 6
 
-# The last keys of a list decide over the frame to come and the jump at its beginning.
+# This many of the last keys of a list decide what happens in the next frame, with the jump at its beginning.
 LATEST = 4
 
 Place = tuple[float, float]
@@ -24,16 +24,16 @@ Key = TypeVar("Key", bound=tuple[float, ...])
 class Tool:
     """Presses at one place at a time.
 
-    What is asked for takes effect from the next frame on, of which one sees at most one press or release; so the force
-    jumps at frames only, and is 0 in at least one frame before it acts elsewhere.
+    Presses, moves and releases take effect at the next frame, at most one press or release per frame. So the force
+    jumps only between frames, and it is 0 for at least one frame before the tool acts elsewhere.
 
     Args:
-        probe: whose force, falloff and offset it has.
+        probe: the probe whose force, falloff and offset it has.
         rate: frames per second.
 
     Attributes:
-        strength: percent of the full force that is pressed with.
-        percent: of the full force that acts now, below 0 when pulling.
+        strength: the percentage of the full force that a press goes up to.
+        percent: the percentage of the full force that acts now, below 0 when pulling.
         place: the control point now, as fractions of the sheet.
     """
 
@@ -49,33 +49,33 @@ class Tool:
         self.place: Place = (0.5, 0.5)
         self._goal = self.place
         self._pressing = 0
-        # Presses, with their place and 1 to push or -1 to pull, and releases.
+        # What is still to be done: presses, each with its place and 1 to push or -1 to pull, and releases.
         self._asked: deque[tuple[Place, int] | None] = deque()
-        # What the probe that was given last holds on to, if there was one.
+        # The percentage and the place of the last probe that was given, if there was one.
         self._given: tuple[float, Place] | None = None
         self._load: list[tuple[float, float]] = [(0.0, 0.0)]
         self._at: list[tuple[float, float, float]] = [(0.0, *self.place)]
 
     @property
     def instrument(self) -> Instrument | None:
-        """What it looks like."""
+        """The rod that is drawn as the tool, if there is one."""
         return self._probe.instrument
 
     @property
     def goal(self) -> Place:
-        """Where it will be when all that was asked for is done."""
+        """The place of the tool once all that was asked for is done."""
         press = next((asked for asked in reversed(self._asked) if asked is not None), None)
         return self._goal if press is None else press[0]
 
     @property
     def held(self) -> bool:
-        """Whether it presses or will, unless it is released."""
+        """Whether the tool presses, or will press, unless it is released."""
         return self._asked[-1] is not None if self._asked else self._pressing != 0
 
     def press(self, place: Place, direction: int) -> None:
-        """Press, 1, or pull, -1, at a place; what it does elsewhere it lets go."""
+        """Press (1) or pull (-1) at a place; the tool lets go of any other place."""
         if len(self._asked) > 1 and self._asked[-1] is None:
-            # A click that nobody has seen yet, as when time stands still, is none.
+            # A click that has not taken effect yet, as while the session is paused, is dropped.
             self._asked.pop()
             self._asked.pop()
         if self.held:
@@ -83,7 +83,7 @@ class Tool:
         self._asked.append((_rounded(place), direction))
 
     def move(self, place: Place) -> None:
-        """Move to another place, along a line within a frame."""
+        """Move to another place, in a straight line within a frame."""
         place = _rounded(place)
         if self._asked and self._asked[-1] is not None:
             self._asked[-1] = (place, self._asked[-1][1])
@@ -95,10 +95,10 @@ class Tool:
         self._asked.append(None)
 
     def follow(self, frame: int) -> Probe | None:
-        """Do what was asked for, from a frame to the next one.
+        """Do what was asked for, from one frame to the next.
 
         Returns:
-            The probe, with the keys that decide over this time; None where the last values of the one before do.
+            The probe, with the keys that matter for this time; None if the last values of the probe before still hold.
         """
         begin, end = frame / self._rate, (frame + 1) / self._rate
         if self._asked:
@@ -123,7 +123,7 @@ class Tool:
         return self._as_probe(self._load[-LATEST:], self._at[-LATEST:], end)
 
     def recorded(self, frame: int) -> Probe:
-        """Give the probe with all keys up to a frame."""
+        """Give the probe with all its keys up to a frame."""
         return self._as_probe(self._load, self._at, frame / self._rate)
 
     def _nearer(self, goal: float) -> float:
@@ -140,20 +140,20 @@ class Tool:
     def _as_probe(
         self, load: Sequence[tuple[float, float]], at: Sequence[tuple[float, float, float]], end: float
     ) -> Probe:
-        """Make a probe whose control point moves, also where it stands: the kernel is made for one that does."""
+        """Make a probe whose control point has at least two keys, as the kernel is compiled for one that moves."""
         if len(at) == 1:
             at = [*at, (max(end, 1 / self._rate), *at[0][1:])]
         return self._probe.model_copy(update={"load": tuple(load), "at": tuple(at)})
 
 
 def _extend(keys: list[Key], key: Key) -> None:
-    """Add a key; of more than two in a row that differ in time alone those in between go, which changes no bit."""
+    """Add a key; if it and the two before differ only in time, the middle one is dropped, which changes no bit."""
     if len(keys) > 1 and keys[-1][1:] == keys[-2][1:] == key[1:]:
         keys.pop()
     keys.append(key)
 
 
 def _rounded(place: Place) -> Place:
-    """Keep a place on the sheet, in as many digits as its file has."""
+    """Limit a place to the sheet, and round it to the digits that a scene file gets."""
     across, down = (round(min(1.0, max(0.0, fraction)), DIGITS) for fraction in place)
     return across, down

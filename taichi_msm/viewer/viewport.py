@@ -1,4 +1,4 @@
-"""How the tissue is looked at: the camera, the light and the mesh, which a person changes while it moves."""
+"""How the tissue is shown: the camera, the light and the mesh, which a person may change while it moves."""
 
 from __future__ import annotations
 
@@ -17,10 +17,10 @@ from taichi_msm.scene import Camera, Render, Scene
 
 
 class Viewport:
-    """Draws a sheet as is wanted now; `runtime.start` comes first.
+    """Draws a sheet in the way chosen now; call `runtime.start` first.
 
     Args:
-        scene: a checked scene; what it says of its picture is where one begins.
+        scene: a checked scene, whose `render` and camera come first.
         texture: the picture on the sheet, shape (height, width, 3).
 
     Attributes:
@@ -37,21 +37,21 @@ class Viewport:
 
     @property
     def compiled(self) -> bool:
-        """Whether the next picture needs no other kernel than those there are."""
+        """Whether the next picture can be drawn without compiling a kernel."""
         return (self.render.shading, self.render.wireframe) in self._drawings
 
     def look(self, camera: str | Camera) -> None:
-        """Take another camera."""
+        """Choose another camera."""
         self._change(camera=camera)
         self.view = view(self._seen())
 
     def turn(self, right: float, down: float) -> None:
-        """Turn the picture as if its nearest side were pushed by so many pixels; by its height, half around."""
+        """Turn the picture as if its nearest side were pushed by this many pixels; its height is half a turn."""
         angle = math.pi / self.render.size[1]
         self.look(turned(pinhole(self._seen()), -right * angle, down * angle))
 
     def light(self) -> None:
-        """Switch the light off, or on again: the scene's, if it has one."""
+        """Switch the light off or on; on is the scene's shading if it has one, else the headlight."""
         lit = self._scene.render.shading if self._scene.render.shading != "none" else "headlight"
         self._change(shading="none" if self.render.shading != "none" else lit)
 
@@ -60,7 +60,7 @@ class Viewport:
         self._change(wireframe=not self.render.wireframe)
 
     def draw(self, position: NDArray[Any], rods: Sequence[Rod] = ()) -> Picture:
-        """Draw the sheet; the kernel is compiled when it is first wanted.
+        """Draw the sheet; a kernel is compiled when it is first needed.
 
         Args:
             position: positions of the mass points [m], shape (rows, cols, 3).

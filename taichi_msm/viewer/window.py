@@ -1,4 +1,4 @@
-"""The window: the pointer and the keys become events, pictures become visible, and nothing else."""
+"""The window: it turns the pointer and the keys into events, and shows pictures, and does nothing else."""
 
 from __future__ import annotations
 
@@ -19,11 +19,11 @@ from taichi_msm.viewer.events import NOTCH, Drag, Event, Harder, Key, Point, Pre
 from taichi_msm.viewer.pacing import Pacing
 from taichi_msm.viewer.session import Session
 
-# What the keyboard calls keys that have no letter.
+# Our names for the window's names of keys.
 NAMES = {" ": "space", "Escape": "q"}
 NAMES |= dict.fromkeys(("Up", "=", "+", "KP_Add"), "up") | dict.fromkeys(("Down", "-", "KP_Subtract"), "down")
 
-# Held down they go on; of all other keys the keyboard's repetition is none.
+# These keys repeat while they are held down; for all others, the keyboard's repetition is ignored.
 REPEATED = ("up", "down")
 
 QUIT = Key("q")
@@ -42,7 +42,7 @@ class Window:
 
     def __init__(self, title: str, size: tuple[int, int]) -> None:
         self._gui = open_window(title, size)
-        # What is written here is shown: rows from the top, blue, green, red and nothing; on a Mac red comes first.
+        # The memory that the window shows: rows from the top; blue, green, red, an unused byte; on a Mac red is first.
         self._shown = self._gui.img.view(np.uint8).reshape(size[1], size[0], 4)
         self._shown[..., 3] = 255
         self._places = (0, 1, 2) if sys.platform == "darwin" else (2, 1, 0)
@@ -50,20 +50,20 @@ class Window:
 
     def show(self, picture: Picture) -> None:
         """Show a picture, shape (height, width, 3)."""
-        # Plane by plane it takes an eighth of the time of all at once.
+        # One colour at a time takes an eighth of the time of all at once.
         for channel, place in enumerate(self._places):
             self._shown[..., place] = picture[..., channel]
         self._gui.show()
 
     def say(self, text: str) -> None:
-        """Write over what is shown."""
+        """Write a text over the picture that is shown."""
         picture = self._shown[..., self._places]
         hud.announce(picture, text)
         self.show(picture)
 
     def events(self) -> Iterator[Event]:
-        """Give what was done since the last call, up to now."""
-        # A window learns of it when it is shown.
+        """Give the events since the last call."""
+        # A window collects its events when it is shown.
         self._gui.show()
         yield from self._hand.events(self._gui.get_events())
 
@@ -77,7 +77,7 @@ class Window:
 
 
 class Hand:
-    """Understands what a window tells of the pointer and the keyboard.
+    """Turns a window's reports of the pointer and the keyboard into events.
 
     Args:
         size: width, height of the picture [px].
@@ -89,10 +89,10 @@ class Hand:
         self._turning: tuple[float, float] | None = None
 
     def events(self, told: Iterable[Any]) -> Iterator[Event]:
-        """Turn what a window tells at a time, in events of `ti.GUI`, into ours."""
+        """Turn the reports of one moment, events of `ti.GUI`, into our events."""
         before = None
         for event in told:
-            # A key that is held down is released and pressed at the same time, again and again.
+            # For a key that is held down, a release and a press are reported at the same time, again and again.
             repeated = before is not None and before.type == ti.GUI.RELEASE and before.key == event.key
             before = event
             for understood in self._understood(event):
@@ -125,11 +125,11 @@ class Hand:
 
 
 def show(session: Session, window: Window, pause: Pause) -> None:
-    """Show a session until the person has enough of it.
+    """Show a session until the person quits.
 
     Args:
         session: the session.
-        window: where.
+        window: the window.
         pause: called before every picture; what it raises ends the session.
     """
     pacing = Pacing(session.rate, time.perf_counter)
@@ -143,7 +143,7 @@ def show(session: Session, window: Window, pause: Pause) -> None:
             try:
                 session.handle(event)
             except FilesError as error:
-                # What was done until now is not to be lost for a full disk.
+                # The session goes on, so that a full disk does not lose what was done so far.
                 session.say(str(error))
         for _ in pacing.due():
             session.advance()
