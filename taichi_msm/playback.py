@@ -69,6 +69,6 @@ class Playback:
 
     def _at(self, frame: int) -> tuple[NDArray[np.floating], float]:
         """Give the positions and the time of a frame."""
-        if type(frame) is not int or not 0 <= frame < len(self.time):
+        if isinstance(frame, bool) or not isinstance(frame, int | np.integer) or not 0 <= frame < len(self.time):
             raise ArgumentError(f"frame: {frame!r}; take a whole number, 0 to {len(self.time) - 1}")
         return self.positions[frame], float(self.time[frame])

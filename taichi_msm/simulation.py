@@ -337,10 +337,12 @@ class Simulation:
             SceneError: when the camera is not valid.
         """
         width, height = self.scene.render.size
-        if not isinstance(before, Labels) or before.coordinates.shape != (height, width, 2):
+        points = as_array(before.coordinates, "before") if isinstance(before, Labels) else np.empty(0)
+        on_sheet = points.dtype.kind == "f" and not ((points < 0) | (points > 1)).any()
+        if points.shape != (height, width, 2) or not on_sheet:
             raise ArgumentError(f"before: take what `labels` gave for a picture of {width} x {height} pixels")
-        points = before.coordinates.reshape(-1, 2)
-        return flow_between(before, self._find(points, camera, positions, time, moved=True))
+        sight = self._find(points.reshape(-1, 2), camera, positions, time, moved=True)
+        return flow_between(sight, (height, width))
 
     def locate(
         self,
@@ -504,7 +506,8 @@ class Simulation:
             found, expected = positions.shape, self._position.shape
             if found != expected or positions.dtype.kind not in "fiu":
                 raise ArgumentError(f"positions: {positions.dtype} of shape {found}; take numbers of shape {expected}")
-        if time is not None and not (isinstance(time, int | float) and math.isfinite(time)):
+        number = time is None or (isinstance(time, int | float | np.number) and not isinstance(time, bool))
+        if not number or (time is not None and not math.isfinite(time)):
             raise ArgumentError(f"time: {time!r}; take a number, in seconds, or None for now")
         return positions, rods(self.scene, positions, self.time if time is None else time)
 

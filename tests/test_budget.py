@@ -63,7 +63,7 @@ def test_drawing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(os, "cpu_count", lambda: 2)
     render = {"size": [50, 60], "refine": 2, "supersample": 3}
     need = estimate(scene(render=render, output=["gif"]))
-    assert need.drawing_bytes == 1200 * 36 + 2 * 16 * 150 * 32 + 50 * 60 * 36
+    assert need.drawing_bytes == 1200 * 36 + 2 * 16 * 150 * 48 + 50 * 60 * 36
     assert need.memory_bytes == need.simulation_bytes + need.drawing_bytes
 
     Image.new("RGB", (70, 80)).save(tmp_path / "a.png")
@@ -94,6 +94,13 @@ def test_disk(output: list[str], of_a_frame: int) -> None:
     assert estimate(scene(render={"size": [50, 60]}, output=output)).disk_bytes == 21 * of_a_frame
 
 
+def test_tracks() -> None:
+    # Of 10 x 10 points in 21 frames: two coordinates in f32, and whether it is hidden.
+    need = estimate(scene(render={"tracks": 10}, output=["tracks"]))
+    assert need.track_bytes == 21 * 100 * 9
+    assert need.disk_bytes == need.track_bytes
+
+
 def test_an_ordinary_scene_has_no_problems() -> None:
     assert faults(scene(output=["png", "gif", "trajectory"])) == []
 
@@ -108,11 +115,16 @@ def test_an_ordinary_scene_has_no_problems() -> None:
         ),
         (
             {"render": {"refine": 0, "size": [8192, 4096]}},
-            "render.size: the scene needs 1.13 GiB of memory, 1.13 GiB of it for frames of 8192 x 4096 "
+            "render.size: the scene needs 1.14 GiB of memory, 1.14 GiB of it for frames of 8192 x 4096 "
             "pixels and their texture, but 512 MiB is free; reduce it",
         ),
+        (
+            {"render": {"size": [9, 9], "tracks": 256}, "output": ["tracks"], "time": {"duration": 2000}},
+            "render.tracks: the scene needs 11 GiB of memory, 11 GiB of it for tracks of 256 x 256 points in "
+            "20001 frames, but 512 MiB is free; reduce it",
+        ),
     ],
-    ids=["points", "picture"],
+    ids=["points", "picture", "tracks"],
 )
 def test_what_takes_most_of_the_memory_is_named(
     monkeypatch: pytest.MonkeyPatch, keys: dict[str, Any], fault: str
@@ -120,7 +132,7 @@ def test_what_takes_most_of_the_memory_is_named(
     output = ["gif"] if "render" in keys else []
     monkeypatch.setattr(os, "cpu_count", lambda: 2)
     monkeypatch.setattr(budget, "available_memory", lambda: 2**29)
-    assert faults(scene(output=output, **keys)) == [fault]
+    assert faults(scene(**{"output": output, **keys})) == [fault]
 
 
 def test_memory_that_just_fits(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -100,7 +100,10 @@ def test_what_is_missing_is_named_with_the_remedy(results: Path) -> None:
     assert str(caught.value) == f"flow: {again} 'flow' in output"
     with pytest.raises(FilesError) as caught:
         run.result("frames/0003.png", "png")
-    assert str(caught.value) == f"{results / 'frames' / '0003.png'}: no such file; run the scene again"
+    assert (
+        str(caught.value)
+        == f"{results / 'frames' / '0003.png'}: no such file; run the scene again with 'png' in output"
+    )
     assert run.has("frames")
     assert not run.has("flow")
 

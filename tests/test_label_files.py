@@ -205,6 +205,8 @@ def test_a_run_is_played_back(small: Path, device: Device) -> None:
     [
         (lambda one: one.flow("labels"), "before: take what `labels` gave"),
         (lambda one: one.flow(one.labels()._replace(coordinates=np.zeros((3, 3, 2)))), "before: take what"),
+        (lambda one: one.flow(one.labels()._replace(coordinates="none")), "before: "),
+        (lambda one: one.flow(one.labels()._replace(coordinates=one.labels().coordinates * 7)), "before: take what"),
         (lambda one: one.locate([[0.5, 1.5]]), "coordinates: float64 of shape"),
         (lambda one: one.locate([0.5, 0.5]), "coordinates: float64 of shape"),
         (lambda one: one.locate([[np.nan, 0.5]]), "coordinates: float64 of shape"),

@@ -90,6 +90,7 @@ class Seen(NamedTuple):
         u, v: the material point, fractions of the sheet's width and height from its upper left; NaN where none is.
         wire: share of the mesh lines in the colour.
         footprint: the larger of a sample's width and height on the texture, in units of style.SHARP texels.
+        front: 1 where the front of the triangle is seen, else -1.
     """
 
     depth: Array
@@ -97,6 +98,7 @@ class Seen(NamedTuple):
     v: Array
     wire: Array
     footprint: Array
+    front: Array
 
 
 def look(scene: Scene, position: Array, factor: int = 1, texels: tuple[int, int] = (1, 1)) -> Seen:
@@ -116,7 +118,7 @@ def look(scene: Scene, position: Array, factor: int = 1, texels: tuple[int, int]
     u, v = np.meshgrid(np.arange(cols) / (cols - 1), np.arange(rows) / (rows - 1))
     surface = refine(np.concatenate([projected, u[..., None], v[..., None]], axis=-1), scene.render.refine)
 
-    seen = Seen(*(np.full((height, width), value) for value in (np.inf, np.nan, np.nan, 0.0, 0.0)))
+    seen = Seen(*(np.full((height, width), value) for value in (np.inf, np.nan, np.nan, 0.0, 0.0, 1.0)))
     for triangle in triangles(surface):
         if (triangle[:, 2] > camera.near).all():
             corner = triangle[:, :2] / triangle[:, 2:3] - 0.5
@@ -132,7 +134,9 @@ def look(scene: Scene, position: Array, factor: int = 1, texels: tuple[int, int]
         w, depth, u, v = np.tensordot(triangle[:, 2:].T, share, 1)
         here = (share >= -1e-12).all(axis=0) & (w > camera.near) & (depth < seen.depth[box])
         wire = wire_share(scene, triangle, x, y) if scene.render.wireframe else np.zeros_like(x)
-        found = Seen(depth, u, v, wire, footprint(triangle, x, y, texels))
+        # From the upper left the corners go down and around: counter-clockwise where the front is seen.
+        front = np.full_like(x, -np.sign(np.linalg.det(triangle[:, :3])))
+        found = Seen(depth, u, v, wire, footprint(triangle, x, y, texels), front)
         for kept, new in zip(seen, found, strict=True):
             kept[box][here] = new[here]
     return seen
@@ -184,7 +188,7 @@ def draw(scene: Scene, position: Array, texture: NDArray[np.uint8], rods: Sequen
     seen = look(scene, position, factor, (texture.shape[1], texture.shape[0]))
     sheet = np.isfinite(seen.depth)
     u, v = np.where(sheet, seen.u, 0), np.where(sheet, seen.v, 0)
-    normal = normals_at(normals(position), u, v)
+    normal = normals_at(normals(position), u, v) * seen.front[..., None]
     if scene.render.shading == "tissue":
         lit = tissue(scene, camera, texture, normal, seen.depth, (u, v, seen.footprint), rods)
     else:

@@ -171,20 +171,19 @@ def illuminate(camera: View, factor: int, depth: Array, normal: Array) -> tuple[
         camera: the camera.
         factor: samples per pixel along each axis.
         depth: along the direction of view [m], shape (height, width).
-        normal: of any length, to either side, shape (height, width, 3).
+        normal: of any length, shape (height, width, 3).
 
     Returns:
-        Unit vectors: the normal on the camera's side, the direction to the light, the direction to the eye; and the
+        Unit vectors: the normal, the direction to the light, the direction to the eye; and the
         distance from the light to the point in the middle of the picture over that to the sample.
     """
     right, up, toward = camera.axes
     point = points(camera, factor, depth)
     light = camera.eye + camera.distance * (style.LIGHT_RIGHT * right + style.LIGHT_UP * up)
     to_eye = unit(camera.eye - point) if camera.pinhole else np.broadcast_to(toward, point.shape)
-    normal = unit(normal) * np.where((normal * to_eye).sum(axis=-1, keepdims=True) < 0, -1, 1)
     middle = np.linalg.norm(light - (camera.eye - camera.distance * toward))
     nearness = np.minimum(middle / np.linalg.norm(light - point, axis=-1), 4)
-    return normal, unit(light - point), to_eye, nearness
+    return unit(normal), unit(light - point), to_eye, nearness
 
 
 def highlight(normal: Array, to_light: Array, to_eye: Array) -> Array:
@@ -243,7 +242,9 @@ def tissue(
 
 def metal(camera: View, factor: int, depth: Array, normal: Array) -> Array:
     """Shade metal, which reflects a room that is bright above and dark below; colours, shape (height, width, 3)."""
-    facing, to_light, to_eye, _ = illuminate(camera, factor, depth, normal)
+    far = camera.distance * np.hypot(1, np.hypot(style.LIGHT_RIGHT, style.LIGHT_UP))
+    below = np.maximum(np.where(np.isfinite(depth), depth, far), style.METAL_NEAREST * far)
+    facing, to_light, to_eye, _ = illuminate(camera, factor, below, normal)
     cosine = np.maximum((facing * to_light).sum(axis=-1), 0)
     mirrored = 2 * (facing * to_eye).sum(axis=-1, keepdims=True) * facing - to_eye
     bright = np.maximum(mirrored @ camera.axes[1], 0)

@@ -162,6 +162,9 @@ def covering(code: Code) -> Callable[..., Any]:
 
         With x = X / w the derivatives of (x, y) with respect to (s, t) are (R_1, D_1; R_2, D_2) / w, where
         R_1 = R_x - x R_w and so on; those of (s, t) with respect to (x, y) are the inverse.
+
+        Returns:
+            The square; and 1 where the front of the triangle is seen, else -1.
         """
         r_1 = plane.r_x - x * plane.r_w
         d_1 = plane.d_x - x * plane.d_w
@@ -172,7 +175,8 @@ def covering(code: Code) -> Callable[..., Any]:
         scale = (plane.p_w + plane.r_w * s + plane.d_w * t) * share
         across_1, across_2, down_1, down_2 = d_1 * texels_x, d_2 * texels_x, r_1 * texels_y, r_2 * texels_y
         largest = ti.max(across_1 * across_1 + down_1 * down_1, across_2 * across_2 + down_2 * down_2)
-        return ti.min(largest * (scale * scale) * (1.0 / (style.SHARP * style.SHARP)), LARGEST_FOOTPRINT)
+        square = largest * (scale * scale) * (1.0 / (style.SHARP * style.SHARP))
+        return ti.min(square, LARGEST_FOOTPRINT), ti.select(scale < 0.0, floats(-1.0), floats(1.0))
 
     @ti.func
     def wire_share(across, down, right_across, right_down, below_across, below_down):
@@ -258,11 +262,12 @@ def covering(code: Code) -> Callable[..., Any]:
         if ti.static(code.headlit):
             keep(at + code.layout["light"], visible, light(surface, cell, band.numbers, across, along), band.samples)
         if ti.static(code.tissue):
+            size, front = footprint(x, y, s, t, cell.step_x * part, cell.step_y * part, plane)
+            # On the side that is seen of the triangle: at a fold, the interpolated normal may lean the other way.
             n_x, n_y, n_z = normal_at(surface, cell, across, along)
-            keep(at + code.layout["normal_x"], visible, n_x, band.samples)
-            keep(at + code.layout["normal_y"], visible, n_y, band.samples)
-            keep(at + code.layout["normal_z"], visible, n_z, band.samples)
-            size = footprint(x, y, s, t, cell.step_x * part, cell.step_y * part, plane)
+            keep(at + code.layout["normal_x"], visible, n_x * front, band.samples)
+            keep(at + code.layout["normal_y"], visible, n_y * front, band.samples)
+            keep(at + code.layout["normal_z"], visible, n_z * front, band.samples)
             keep(at + code.layout["footprint"], visible, size, band.samples)
         if ti.static(code.wires):
             s_right, t_right = on_triangle(x + 1.0, y, plane)

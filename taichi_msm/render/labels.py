@@ -7,6 +7,9 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+# The value for "no flow" in the Middlebury format.
+NO_FLOW = 1e10
+
 
 class Labels(NamedTuple):
     """What each pixel of a frame shows at its centre.
@@ -15,7 +18,8 @@ class Labels(NamedTuple):
         coordinates: of the material point, fractions of the sheet's width from its left and of its height from its top,
             shape (height, width, 2); NaN where no sheet is seen.
         depth: distance from the eye along the direction of view [m], shape (height, width); 0 where nothing is seen.
-            The orthographic camera's eye is as far above the sheet at rest as the sheet's larger side is long.
+            The orthographic camera's eye is as far above the sheet at rest as the sheet's larger side is long; what
+            is above the eye has a depth below 0.
         instrument: 255 where an instrument is seen, else 0, shape (height, width).
     """
 
@@ -73,16 +77,11 @@ def track_grid(count: int) -> NDArray[np.float32]:
     return np.stack([across, down], axis=-1).reshape(-1, 2).astype(np.float32)
 
 
-def flow_between(before: Labels, sight: Sight) -> Flow:
-    """Put the flow from one frame to another together.
+def flow_between(sight: Sight, shape: tuple[int, int]) -> Flow:
+    """Put flow together.
 
     Args:
-        before: what the first frame shows.
-        sight: for each of its pixels, how far what it shows has moved and whether it is hidden.
+        sight: how far what the pixels of the earlier frame show has moved, and what is hidden.
+        shape: height and width of the picture [px].
     """
-    shape = before.depth.shape
     return Flow(sight.pixels.reshape(*shape, 2), sight.hidden.reshape(shape).view(np.uint8) * np.uint8(255))
-
-
-# The value for "no flow" in the Middlebury format.
-NO_FLOW = 1e10

@@ -58,7 +58,7 @@ def lighting(code: Code) -> tuple[Callable[..., Any], ...]:
 
     @ti.func
     def illuminate(x, y, depth, n_x, n_y, n_z, numbers: ti.template()):
-        """Find how samples are lit; normals may have any length and point to either side.
+        """Find how samples are lit; normals may have any length.
 
         Returns:
             N L; M V; d0 / d; and the upward component of the direction into which V is reflected.
@@ -82,7 +82,7 @@ def lighting(code: Code) -> tuple[Callable[..., Any], ...]:
         to_l, to_v = to_both * root_v, to_both * root_l
         cosine = n_l * ti.sqrt(to_n) * to_l
         return (
-            ti.select(n_v < 0.0, cosine * (-1.0), cosine),
+            cosine,
             (2.0 * n_l * n_v * to_n - l_v) * to_both,
             ti.min(numbers[FARNESS] * to_l, 4.0),
             (2.0 * n_v * n_y * to_n - v_y) * to_v,
@@ -138,7 +138,9 @@ def lighting(code: Code) -> tuple[Callable[..., Any], ...]:
     @ti.func
     def metal(x, y, depth, n_x, n_y, n_z, numbers: ti.template()):
         """Light metal, which reflects a room that is bright above and dark below."""
-        cosine, mirror, _, upward = illuminate(x, y, depth, n_x, n_y, n_z, numbers)
+        # What reaches to the light or beyond it is lit as if it ended before.
+        below = ti.max(depth, style.METAL_NEAREST * numbers[FARNESS])
+        cosine, mirror, _, upward = illuminate(x, y, below, n_x, n_y, n_z, numbers)
         bright = ti.max(upward, 0.0)
         share = style.METAL_AMBIENT + style.METAL_DIFFUSE * ti.max(cosine, 0.0) + style.METAL_MIRROR * bright * bright
         gloss = highlight(mirror) * (255.0 * style.METAL_GLOSS)

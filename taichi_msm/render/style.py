@@ -22,3 +22,6 @@ SHADE = 0.7
 # highlight, as a fraction of white.
 METAL = (176.0, 182.0, 190.0)
 METAL_AMBIENT, METAL_DIFFUSE, METAL_MIRROR, METAL_GLOSS = 0.2, 0.35, 0.6, 0.7
+
+# The least depth at which metal is lit, in units of the distance from the light to the middle of the picture.
+METAL_NEAREST = 0.2

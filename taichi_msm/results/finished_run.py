@@ -84,7 +84,7 @@ class FinishedRun:
                 f"{output}: not among the results of {self.directory}; run the scene again with '{key}' in output"
             )
         if not path.is_file():
-            raise FilesError(f"{path}: no such file; run the scene again")
+            raise FilesError(f"{path}: no such file; run the scene again with '{key}' in output")
         return path
 
 

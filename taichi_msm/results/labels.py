@@ -45,7 +45,8 @@ class LabelWriter:
         self._folder = folder
         self._scene = scene
         self._series = [name for name in _WRITERS if name in scene.output]
-        self._tracks: list[Sight] = []
+        wanted = "tracks" in scene.output
+        self._tracks = Tracks(scene.render.tracks, scene.time.frames + 1) if wanted else None
         self._added = 0
 
     def add(self, frame: int, observed: Observed) -> None:
@@ -59,8 +60,8 @@ class LabelWriter:
                     folder.create(series_file(name, number), buffering=0) as file,
                 ):
                     _WRITERS[name](file, observed)
-        if observed.tracks is not None:
-            self._tracks.append(observed.tracks)
+        if self._tracks is not None and observed.tracks is not None:
+            self._tracks.add(frame, observed.tracks)
 
     def finish(self, frames: int) -> None:
         """Keep the files of the first frames only, this many, and write those that belong to all frames together."""
@@ -72,24 +73,40 @@ class LabelWriter:
             found = {"size": list(self._scene.render.size), **calibration(view(self._scene))}
             with self._folder.create(CAMERA) as file:
                 file.write((json.dumps(found, indent=2) + "\n").encode())
-        if "tracks" in self._scene.output and frames:
+        if self._tracks is not None and frames:
             with self._folder.create(TRACKS) as file:
-                write_tracks(file, track_grid(self._scene.render.tracks), self._tracks[:frames])
+                self._tracks.write(file, frames)
 
 
-def write_tracks(file: BinaryIO, coordinates: NDArray[np.float32], sights: list[Sight]) -> None:
-    """Write tracks.npz.
+class Tracks:
+    """The tracks of a run, frame by frame; held until all are there, as a file has them point by point.
 
     Args:
-        file: open for writing.
-        coordinates: of the points, shape (n, 2).
-        sights: where they are in every frame.
+        count: points along each side of their grid.
+        frames: how many frames there may be.
     """
-    points = np.stack([sight.pixels for sight in sights], axis=1)
-    occluded = np.stack([sight.hidden for sight in sights], axis=1)
-    with zipfile.ZipFile(file, "w", zipfile.ZIP_STORED) as archive:
-        for name, array in (("coordinates", coordinates), ("points", points), ("occluded", occluded)):
-            write_array(archive, name, array.dtype, array.shape, [np.ascontiguousarray(array).tobytes()])
+
+    def __init__(self, count: int, frames: int) -> None:
+        self._coordinates = track_grid(count)
+        self._points = np.empty((count * count, frames, 2), np.float32)
+        self._occluded = np.empty((count * count, frames), np.bool_)
+
+    def add(self, frame: int, sight: Sight) -> None:
+        """Add where the points are in a frame."""
+        self._points[:, frame] = sight.pixels
+        self._occluded[:, frame] = sight.hidden
+
+    def write(self, file: BinaryIO, frames: int) -> None:
+        """Write the first so many frames as tracks.npz."""
+        arrays = {
+            "coordinates": self._coordinates,
+            "points": self._points[:, :frames],
+            "occluded": self._occluded[:, :frames],
+        }
+        with zipfile.ZipFile(file, "w", zipfile.ZIP_STORED) as archive:
+            for name, array in arrays.items():
+                # Point by point, so that there is no second copy of all.
+                write_array(archive, name, array.dtype, array.shape, (point.tobytes() for point in array))
 
 
 def _write_coordinates(file: BinaryIO, observed: Observed) -> None:

@@ -23,7 +23,7 @@ MAX_STEPS = 10**12
 
 # Memory for drawing [bytes].
 POINT_BYTES = 36  # per mass point: its projection and its normal
-SAMPLE_BYTES = 32  # per sample, at most
+SAMPLE_BYTES = 48  # per sample, at most
 BAND_ROWS = 16  # rows of samples that a thread holds at a time
 PIXEL_BYTES = 3 * 12  # per pixel of the frame: its colours, from sums to bytes
 PICTURE_PIXEL_BYTES = 20  # per pixel of the picture's file, while it is decoded and converted; its texture takes less
@@ -52,6 +52,7 @@ class Budget:
         frames: number of frames in all, including that at rest.
         simulation_bytes: memory for the state of the sheet and its output.
         drawing_bytes: memory for a frame and the texture; 0 if nothing is drawn.
+        track_bytes: memory for the tracks, which are held until the run ends, and size of their file.
         picture_bytes: approximate size of the files with pictures and labels.
         trajectory_bytes: size of the trajectory.
         working_bytes: additional disk space that is used until the run ends.
@@ -62,6 +63,7 @@ class Budget:
     frames: int
     simulation_bytes: int
     drawing_bytes: int
+    track_bytes: int
     picture_bytes: int
     trajectory_bytes: int
     working_bytes: int
@@ -69,12 +71,12 @@ class Budget:
     @property
     def memory_bytes(self) -> int:
         """Memory in use at one time. Trajectories do not count, because they are streamed to disk."""
-        return self.simulation_bytes + self.drawing_bytes
+        return self.simulation_bytes + self.drawing_bytes + self.track_bytes
 
     @property
     def disk_bytes(self) -> int:
         """Size of all files."""
-        return self.picture_bytes + self.trajectory_bytes
+        return self.picture_bytes + self.track_bytes + self.trajectory_bytes
 
 
 def estimate(scene: Scene, grid: TimeGrid) -> Budget:
@@ -93,9 +95,9 @@ def estimate(scene: Scene, grid: TimeGrid) -> Budget:
         steps=grid.steps,
         frames=frames,
         simulation_bytes=round(points * sheets * numbers),
-        drawing_bytes=(drawing_bytes(scene) if scene.renders else 0) + tracks,
-        picture_bytes=round(frames * sum(pixels * PIXEL_FILE_BYTES.get(kind, 0) for kind in set(scene.output)))
-        + tracks,
+        drawing_bytes=drawing_bytes(scene) if scene.renders else 0,
+        track_bytes=tracks,
+        picture_bytes=round(frames * sum(pixels * PIXEL_FILE_BYTES.get(kind, 0) for kind in set(scene.output))),
         trajectory_bytes=positions if "trajectory" in scene.output else 0,
         # Two saved states from which the run could continue, and all positions so far.
         working_bytes=2 * points * STATE_NUMBERS * number_bytes + (positions if scene.output else 0),
@@ -124,9 +126,10 @@ def require_disk(scene: Scene, directory: Path) -> None:
     if needed <= free:
         return
     rows, cols = scene.sheet.points
-    width, height = scene.render.size
+    (width, height), tracks = scene.render.size, scene.render.tracks
     parts = [
-        (needed - budget.picture_bytes, "sheet.points", f"positions of {rows} x {cols} points"),
+        (needed - budget.picture_bytes - budget.track_bytes, "sheet.points", f"positions of {rows} x {cols} points"),
+        (budget.track_bytes, "render.tracks", f"tracks of {tracks} x {tracks} points"),
         (budget.picture_bytes, "render.size", f"pictures of {width} x {height} pixels"),
     ]
     size, key, name = max(parts)
@@ -168,9 +171,10 @@ def _memory_problems(scene: Scene, budget: Budget) -> Iterator[Problem]:
     if budget.memory_bytes <= available:
         return
     rows, cols = scene.sheet.points
-    width, height = scene.render.size
+    (width, height), tracks = scene.render.size, scene.render.tracks
     parts: list[tuple[int, Key, str]] = [
         (budget.simulation_bytes, ("sheet", "points"), f"{rows} x {cols} points"),
+        (budget.track_bytes, ("render", "tracks"), f"tracks of {tracks} x {tracks} points in {budget.frames} frames"),
         (budget.drawing_bytes, ("render", "size"), f"frames of {width} x {height} pixels and their texture"),
     ]
     size, key, name = max(parts)
