@@ -18,7 +18,7 @@ from benchmarks.whole_run import SCENE, command
 from taichi_msm.render.camera import view
 from taichi_msm.render.instrument import rods
 from taichi_msm.render.rasterizer import Drawing, structure
-from taichi_msm.render.tracking import find
+from taichi_msm.render.tracking import find_flow
 from taichi_msm.scene import PIXEL_LABELS, Scene
 from taichi_msm.system import runtime
 from taichi_msm.system.resources import available_threads
@@ -59,7 +59,7 @@ def variants(problem: Problem) -> dict[str, Callable[[], Any]]:
 
     held = problem.scene.probes[0].model_copy(update={"instrument": INSTRUMENT})
     plain, tissue = scene(HEADLIGHT), scene("tissue")
-    seen = picture(plain, picture=False, labels=True)().labels.coordinates.reshape(-1, 2)
+    seen = picture(plain, picture=False, labels=True)().labels.coordinates
     return {
         HEADLIGHT: picture(plain),
         "none": picture(scene("none")),
@@ -68,7 +68,7 @@ def variants(problem: Problem) -> dict[str, Callable[[], Any]]:
         "tissue, instrument": picture(tissue.model_copy(update={"probes": [held]})),
         "headlight and labels": picture(plain, labels=True),
         "labels alone": picture(plain, picture=False, labels=True),
-        "flow and occlusion": lambda: find(plain, seen, problem.rest, camera, moved=True),
+        "flow and occlusion": lambda: find_flow(plain, seen, problem.rest, camera),
     }
 
 

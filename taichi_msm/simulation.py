@@ -24,7 +24,7 @@ from taichi_msm.physics.timestep import time_grid, with_grid
 from taichi_msm.progress import Pause
 from taichi_msm.render.camera import View, view
 from taichi_msm.render.instrument import Rod, rods
-from taichi_msm.render.labels import Flow, Labels, Observed, Sight, flow_between, track_grid
+from taichi_msm.render.labels import Flow, Labels, Observed, Sight, track_grid
 from taichi_msm.render.picking import pick
 from taichi_msm.render.surface import Surface, surface
 from taichi_msm.render.texture import load_texture, require_texture
@@ -341,8 +341,10 @@ class Simulation:
         on_sheet = points.dtype.kind == "f" and not ((points < 0) | (points > 1)).any()
         if points.shape != (height, width, 2) or not on_sheet:
             raise ArgumentError(f"before: take what `labels` gave for a picture of {width} x {height} pixels")
-        sight = self._find(points.reshape(-1, 2), camera, positions, time, moved=True)
-        return flow_between(sight, (height, width))
+        from taichi_msm.render.tracking import find_flow
+
+        positions, rods = self._placed(positions, time)
+        return find_flow(self.scene, points, positions, self._view(camera), rods)
 
     def locate(
         self,
@@ -370,7 +372,10 @@ class Simulation:
             raise ArgumentError(
                 f"coordinates: {found.dtype} of shape {found.shape}; take numbers from 0 to 1 of shape (n, 2)"
             )
-        return self._find(found, camera, positions, time)
+        from taichi_msm.render.tracking import find
+
+        positions, rods = self._placed(positions, time)
+        return find(self.scene, found, positions, self._view(camera), rods)
 
     def observe(self, before: Labels | None, positions: NDArray[Any], time: float) -> Observed:
         """Give everything that the scene's output asks for of one frame.
@@ -481,20 +486,6 @@ class Simulation:
             code = structure(self.scene, picture=picture, labels=labels)
             self._drawings[picture, labels] = Drawing(self.scene, self._require_texture(picture=picture), code)
         return self._drawings[picture, labels].look(positions, view, rods)
-
-    def _find(
-        self,
-        coordinates: NDArray[Any],
-        camera: CameraLike,
-        positions: NDArray[Any] | None,
-        time: float | None,
-        *,
-        moved: bool = False,
-    ) -> Sight:
-        from taichi_msm.render.tracking import find
-
-        positions, rods = self._placed(positions, time)
-        return find(self.scene, coordinates, positions, self._view(camera), rods, moved=moved)
 
     def _placed(self, positions: NDArray[Any] | None, time: float | None) -> tuple[NDArray[Any], list[Rod]]:
         """Check positions, and place the instruments on the sheet."""

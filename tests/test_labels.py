@@ -14,7 +14,7 @@ from taichi_msm.render.camera import view
 from taichi_msm.render.instrument import rods
 from taichi_msm.render.labels import Labels
 from taichi_msm.render.rasterizer import Drawing, structure
-from taichi_msm.render.tracking import find
+from taichi_msm.render.tracking import find, find_flow
 from taichi_msm.scene import Scene
 from taichi_msm.system.runtime import Device
 from tests.test_drawing import NEAR, dented, drawable, with_instruments
@@ -87,14 +87,14 @@ def test_what_is_seen_is_not_hidden_in_the_same_frame(device: Device) -> None:
     for shape in (dented, folded):
         made = with_instruments(drawable(camera="oblique"))
         position = shape(made)
-        seen = look(made, position).coordinates.reshape(-1, 2)
-        found = find(made, seen, position, view(made), rods(made, position, 0), moved=True)
-        sheet = ~np.isnan(seen[:, 0])
-        assert np.abs(found.pixels[sheet]).max() < 1e-3
-        assert (found.pixels[~sheet] == 1e10).all()
-        assert not found.hidden[~sheet].any()
+        seen = look(made, position).coordinates
+        found = find_flow(made, seen, position, view(made), rods(made, position, 0))
+        sheet = ~np.isnan(seen[..., 0])
+        assert np.abs(found.flow[sheet]).max() < 1e-3
+        assert (found.flow[~sheet] == 1e10).all()
+        assert not found.occlusion[~sheet].any()
         # A sample that an outline passes through within rounding.
-        assert found.hidden.sum() <= 2
+        assert (found.occlusion > 0).sum() <= 2
 
 
 def test_an_instrument_hides_what_is_behind_it(device: Device) -> None:
@@ -124,15 +124,15 @@ def test_a_flat_sheet_has_the_depth_of_its_camera(device: Device) -> None:
 def test_a_sheet_that_is_shifted_flows_by_its_shift(device: Device) -> None:
     made = drawable(camera="top")
     rest = rest_positions(made.sheet)
-    seen = look(made, rest).coordinates.reshape(-1, 2)
+    seen = look(made, rest).coordinates
     # 200 px a metre.
-    found = find(made, seen, rest + np.array([0.01, 0.02, -0.1]), view(made), moved=True)
-    np.testing.assert_allclose(found.pixels, np.tile([2.0, -4.0], (4800, 1)), atol=1e-3)
+    found = find_flow(made, seen, rest + np.array([0.01, 0.02, -0.1]), view(made))
+    np.testing.assert_allclose(found.flow, np.tile([2.0, -4.0], (60, 80, 1)), atol=1e-3)
     # The right two columns and the upper four rows leave the picture.
     gone = np.zeros((60, 80), bool)
     gone[:, 78:] = True
     gone[:4] = True
-    np.testing.assert_array_equal(found.hidden.reshape(60, 80), gone)
+    np.testing.assert_array_equal(found.occlusion, gone * 255)
 
 
 def test_points_behind_the_eye_are_nowhere(device: Device) -> None:

@@ -75,13 +75,3 @@ def track_grid(count: int) -> NDArray[np.float32]:
     middle = (np.arange(count) + 0.5) / count
     down, across = np.meshgrid(middle, middle, indexing="ij")
     return np.stack([across, down], axis=-1).reshape(-1, 2).astype(np.float32)
-
-
-def flow_between(sight: Sight, shape: tuple[int, int]) -> Flow:
-    """Put flow together.
-
-    Args:
-        sight: how far what the pixels of the earlier frame show has moved, and what is hidden.
-        shape: height and width of the picture [px].
-    """
-    return Flow(sight.pixels.reshape(*shape, 2), sight.hidden.reshape(shape).view(np.uint8) * np.uint8(255))

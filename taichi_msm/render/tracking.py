@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from taichi_msm.render.camera import View
 from taichi_msm.render.instrument import Rod
-from taichi_msm.render.labels import Sight
+from taichi_msm.render.labels import Flow, Sight
 from taichi_msm.render.numbers import view_numbers
 from taichi_msm.render.tracking_kernel import CELL_NUMBERS, POINT_NUMBERS, count, fill, judge, project, search
 from taichi_msm.scene import Scene
@@ -34,21 +34,51 @@ def find(
     position: NDArray[np.floating],
     view: View,
     rods: Sequence[Rod] = (),
-    *,
-    moved: bool = False,
 ) -> Sight:
     """Find material points.
 
     Args:
         scene: a checked scene; call `runtime.start` first.
-        coordinates: fractions of the sheet's width from its left and of its height from its top, shape (n, 2). NaN
-            stands for no point, which is seen nowhere and not hidden.
+        coordinates: fractions of the sheet's width from its left and of its height from its top, shape (n, 2).
         position: positions of the mass points [m], shape (rows, cols, 3).
         view: the camera.
         rods: the instruments.
-        moved: whether the points are those that were at the centres of all pixels, one row after another, and `pixels`
-            is to tell how far they have moved from there; NO_FLOW where they are seen nowhere.
     """
+    pixels, hidden = _search(scene, coordinates, position, view, rods, moved=False)
+    return Sight(pixels, hidden.view(np.bool_))
+
+
+def find_flow(
+    scene: Scene,
+    coordinates: NDArray[np.floating],
+    position: NDArray[np.floating],
+    view: View,
+    rods: Sequence[Rod] = (),
+) -> Flow:
+    """Find how far the points that the pixels of another frame show have moved in the picture.
+
+    Args:
+        scene: as for `find`.
+        coordinates: as in the labels of the other frame, shape (height, width, 2); NaN where no sheet is seen.
+        position: positions of the mass points now [m], shape (rows, cols, 3).
+        view: the camera.
+        rods: the instruments now.
+    """
+    shape = coordinates.shape[:2]
+    moved, hidden = _search(scene, coordinates.reshape(-1, 2), position, view, rods, moved=True)
+    return Flow(moved.reshape(*shape, 2), hidden.reshape(shape) * np.uint8(255))
+
+
+def _search(
+    scene: Scene,
+    coordinates: NDArray[np.floating],
+    position: NDArray[np.floating],
+    view: View,
+    rods: Sequence[Rod],
+    *,
+    moved: bool,
+) -> tuple[NDArray[np.float32], NDArray[np.uint8]]:
+    """Find material points, or how far they are from the centres of all pixels, row by row; and which are hidden."""
     (rows, cols), (width, height) = scene.sheet.points, scene.render.size
     numbers = view_numbers(view, scene.render, 1, scene.sheet.size, (1, 1), rods)
     cells = (rows - 1) * (cols - 1)
@@ -91,4 +121,4 @@ def find(
             pixels.ravel(),
             hidden,
         )
-    return Sight(pixels, hidden.view(np.bool_))
+    return pixels, hidden
