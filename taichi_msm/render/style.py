@@ -6,7 +6,7 @@ WIRE_WIDTH = 1.0
 WIRE_OPACITY = 0.75
 
 # A sample of tissue that is at most this many texels wide shows the texture at full size: the filter has two texels.
-SHARP = 1.5
+SHARP = 2.0
 
 # Where the light is, to the right of the eye and above it, as a fraction of the distance to what the camera looks at.
 LIGHT_RIGHT, LIGHT_UP = -0.3, 0.0
