@@ -141,13 +141,13 @@ def judge(
             first_j, last_j = ti.min(first_j, j), ti.max(last_j, j)
         around_a_point = last_i - first_i <= 1 and last_j - first_j <= 1
         if around_a_point:
-            sides, count = 0.0, 0.0
-            # All four count, even those that do not reach the bin.
+            sides, around = 0.0, 0.0
+            # All four matter, even those that do not reach the bin.
             for i in range(first_i, last_i + 1):
                 for j in range(first_j, last_j + 1):
                     sides += cell[(i * (cols - 1) + j) * CELL_NUMBERS + SIDE]
-                    count += 1.0
-            around_a_point = abs(sides) == count
+                    around += 1.0
+            around_a_point = abs(sides) == around
         simple[square] = ti.cast(around_a_point, ti.u8)
 
 
@@ -249,11 +249,11 @@ def _hides(x, y, depth, index, own, own_triangle, cols, parts, near, point: ti.t
                 seen, _ = _triangle(x, y, s0, t0, lower, part, near, a, b, c, d)
                 hides = seen < depth
         else:
-            count = ti.cast(parts, ti.i32)
-            for triangle in range(2 * count * count):
+            per_side = ti.cast(parts, ti.i32)
+            for triangle in range(2 * per_side * per_side):
                 if not hides and not (index == own and triangle == own_triangle):
                     quad = triangle // 2
-                    s0, t0 = ti.cast(quad % count, ti.f64) * part, ti.cast(quad // count, ti.f64) * part
+                    s0, t0 = ti.cast(quad % per_side, ti.f64) * part, ti.cast(quad // per_side, ti.f64) * part
                     seen, inside = _triangle(x, y, s0, t0, triangle % 2 == 1, part, near, a, b, c, d)
                     hides = inside and seen < depth
     return hides
@@ -281,7 +281,11 @@ def search(
     pixels: ti.types.ndarray(dtype=ti.f32, ndim=1),
     hidden: ti.types.ndarray(dtype=ti.u8, ndim=1),
 ):
-    """Find points; if `row` is not 0, they belong to pixels, `row` in a row, and `pixels` gets their distances."""
+    """Find where `count` material points are seen, and which are hidden.
+
+    If `row` is 0, `pixels` gets their places [px]. Otherwise they are what the pixels of another frame showed, `row` of
+    them in a row of the picture, and `pixels` gets how far each has moved from its pixel's centre [px].
+    """
     for k in range(count):
         near, parts = numbers[NEAR], numbers[PARTS]
         u, v = coordinates[2 * k], coordinates[2 * k + 1]
