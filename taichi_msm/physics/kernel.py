@@ -254,24 +254,21 @@ def _filling(code: Code) -> tuple[Callable[..., None], Callable[..., None]]:
 def spring_forces(code: Code) -> tuple[Callable[..., Any], Callable[..., Any]]:
     """Make the functions for the force of a spring along a row, and of a spring to the other row.
 
-    With q = u_Q - u_P and the rest vector o from P to Q, L^2 - L0^2 = q (q + 2 o). In the form
+    They give the force of P on its neighbour Q; that of Q on P is the opposite, to the bit. With q = u_P - u_Q and the
+    rest vector o from Q to P, L^2 - L0^2 = q (q + 2 o). In the form
 
-        k (L - L0) (Q - P) / L = k (L^2 - L0^2) / (L^2 + L0 L) (o + q)                         (eq. 2)
+        k (L - L0) (P - Q) / L = k (L^2 - L0^2) / (L^2 + L0 L) (o + q)                         (eq. 2)
 
-    the force keeps the digits of a small motion on a large sheet. Swapping P and Q changes its sign and no other bit.
-    Under tension tau q is added (see `material`).
+    the force keeps the digits of a small motion on a large sheet. Under tension tau q is added (see `material`).
     """
     open_edges, tense = code.open_edges and not code.mapped, code.tense
-    # Prevents a division by 0 at L = 0, where the force is then 0, as Q - P is. A literal in a kernel is always f32.
+    # Prevents a division by 0 at L = 0, where the force is then 0, as P - Q is. A literal in a kernel is always f32.
     tiny = 1e-36
 
     @ti.func
-    def pull(longer, square, length, stiffness):
-        return stiffness * longer / (square + length * ti.sqrt(square))
-
-    @ti.func
-    def along_vector(force, to_x, to_y, to_z, tension, x, y, z):
-        """Force along the deformed spring, and what the tension adds for the difference (x, y, z)."""
+    def pull(weighted, square, length, to_x, to_y, to_z, tension, x, y, z):
+        """Force along the deformed spring, given k (L^2 - L0^2) and L^2, and the tension's for the difference."""
+        force = weighted / (square + length * ti.sqrt(square))
         force_x, force_y, force_z = force * to_x, force * to_y, force * to_z
         if ti.static(tense):
             force_x += tension * x
@@ -280,28 +277,44 @@ def spring_forces(code: Code) -> tuple[Callable[..., Any], Callable[..., Any]]:
         return force_x, force_y, force_z
 
     @ti.func
-    def along(x, y, z, dx, stiffness, tension, exists):
-        """Force of the right neighbour, displaced by (x, y, z) from the point; exists: 0 if there is none."""
-        to_x = x + dx
+    def along(u: ti.template(), right, here_x, here_y, here_z, dx, stiffness, tension, exists):
+        """Force on the right neighbour, in entry `right` of u, of a point displaced by `here`; exists: 0 if none."""
+        x, y, z = here_x - u[0][right], here_y - u[1][right], here_z - u[2][right]
+        to_x = x - dx
         rest = y * y + z * z
-        force = pull(x * (to_x + dx) + rest, to_x * to_x + rest + tiny, dx, stiffness)
+        weighted = stiffness * (x * (to_x - dx) + rest)
         if ti.static(open_edges):
-            force *= exists
-        return along_vector(force, to_x, y, z, tension, x, y, z)
+            weighted *= exists
+        return pull(weighted, to_x * to_x + (rest + tiny), dx, to_x, y, z, tension, x, y, z)
 
     @ti.func
-    def to_other_row(x, y, z, right: ti.template(), dx, dy, length, stiffness, tension, exists):
-        """Force of the neighbour `right` columns on in the row dy above, displaced by (x, y, z) from the point."""
+    def to_other_row(
+        u: ti.template(),
+        entry,
+        right: ti.template(),
+        here_x,
+        here_y,
+        here_z,
+        dx,
+        dy,
+        length,
+        stiffness,
+        tension,
+        exists,
+    ):
+        """Force on the neighbour in an entry of u, which is `right` columns on in the row dy above."""
+        x, y, z = here_x - u[0][entry], here_y - u[1][entry], here_z - u[2][entry]
         to_x = x
-        to_y = y + dy
-        longer = x * x + (y * (to_y + dy) + z * z)
+        to_y = y - dy
+        rest = z * z
+        longer = x * x + (y * (to_y - dy) + rest)
         if ti.static(right != 0):
-            to_x = x + right * dx
-            longer = x * (to_x + right * dx) + (y * (to_y + dy) + z * z)
-        force = pull(longer, to_x * to_x + to_y * to_y + z * z + tiny, length, stiffness)
+            to_x = x - right * dx
+            longer = x * (to_x - right * dx) + (y * (to_y - dy) + rest)
+        weighted = stiffness * longer
         if ti.static(open_edges):
-            force *= exists
-        return along_vector(force, to_x, to_y, z, tension, x, y, z)
+            weighted *= exists
+        return pull(weighted, to_x * to_x + to_y * to_y + (rest + tiny), length, to_x, to_y, z, tension, x, y, z)
 
     return along, to_other_row
 

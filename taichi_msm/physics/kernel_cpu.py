@@ -67,8 +67,9 @@ BEGIN, END = 0, 1
 # How many times a worker checks for its neighbour before it gives up: about 0.2 ms.
 PATIENCE = 40_000
 
-# After a launch in which a worker gave up, a single worker steps for some time [s]; it grows each time this happens.
-SHORTEST_REST, LONGEST_REST = 0.002, 1.0
+# After a worker has given up, a single worker steps for some time [s]: four times as long as the last time, but half as
+# long for every so many seconds that all have stepped since then.
+SHORTEST_REST, LONGEST_REST, HALF_LIFE = 0.002, 1.0, 0.07
 
 # Numbers that record the place of a worker: pass, round and step of the round.
 PLACE = 3
@@ -100,6 +101,8 @@ class Sweep:
         self._kernels = _kernels(s.code)
         self._steps = 0
         self._rest, self._rests_until = SHORTEST_REST, 0.0
+        # Time that all workers have stepped since the last rest [s].
+        self._together = 0.0
         self._first_row, self._end_row = int(s.fixed_rows[0]), s.rows - int(s.fixed_rows[1])
         # Stored after the sheet's own rows: two copies for every border of every worker.
         self._borders = self._border_rows()
@@ -107,7 +110,7 @@ class Sweep:
         self._arrays = SheetArrays(s, stored, start)
         # Rows of `carried` per worker: one for each step of a pass, and then a page, which no prefetcher crosses.
         self._carried_rows = s.depth - (-PAGE // (s.width * s.code.lanes * BYTES[s.code.precision]))
-        # Forces carried to the next row, for every worker and step of a pass; their sign is that for the row before.
+        # Forces carried to the next row, for every worker and step of a pass.
         self._carried = [self._arrays.rows(s.workers * self._carried_rows) for _ in range(3)]
         self._moment = [self._arrays.rows(MOMENTS * s.workers if s.code.bending else 1) for _ in range(3)]
         # The number of steps taken at each border of each worker.
@@ -122,17 +125,22 @@ class Sweep:
                 D dx dy; y of the first row.
             table: of the loads, shape (count, columns).
         """
-        together = self._s.workers > 1 and time.perf_counter() >= self._rests_until
-        done = self._advance_together(count, numbers, table) if together else 0
-        if not together or done < count:
-            self._advance_alone(done, count, numbers, table)
+        done = 0
+        while done < count:
+            if self._s.workers == 1:
+                self._advance_alone(0, count, numbers, table)
+                done = count
+            elif time.perf_counter() < self._rests_until:
+                done = self._advance_while_resting(done, count, numbers, table)
+            else:
+                done = self._advance_together(done, count, numbers, table)
 
     def compile(self, numbers: tuple[float, ...], table: NDArray[Any]) -> None:
         """Compile everything that steps may need, without taking one."""
-        self._rests_until = 0.0
-        self.advance(0, numbers, table)
+        self._advance_alone(0, 0, numbers, table)
         if self._s.workers > 1:
-            self._advance_alone(0, 0, numbers, table)
+            self._launch_together(0, 0, numbers, table)
+            self._copy_borders()
 
     def set_decay(self, decay: NDArray[Any]) -> None:
         """Replace the decays of the standing slots, shape (slots, rows, cols)."""
@@ -152,33 +160,53 @@ class Sweep:
                 *arrays.u, *arrays.d, arrays.by_column, *arrays.stiffness, s.rows, s.cols, s.strip, *spacing, *out
             )  # fmt: skip
 
-    def _advance_alone(self, done: int, count: int, numbers: tuple[float, ...], table: NDArray[Any]) -> None:
-        """Take the remaining steps with a single worker."""
-        self._launch(self._kernels.advance_alone, 1, done, count - done, numbers, table, np.array([0, -1, 0]))
-        if self._s.workers > 1:
-            with our_compilation():
-                self._kernels.copy(*self._arrays.u, self._borders, self._s.rows, self._s.width)
-            self._done[:] = self._steps
+    def _advance_alone(self, done: int, end: int, numbers: tuple[float, ...], table: NDArray[Any]) -> None:
+        """Take the steps from `done` to `end` with a single worker."""
+        self._launch(self._kernels.advance_alone, 1, done, end - done, numbers, table, np.array([0, -1, 0]))
 
-    def _advance_together(self, count: int, numbers: tuple[float, ...], table: NDArray[Any]) -> int:
-        """Take steps with all workers; returns how many, fewer than `count` if a worker gave up."""
-        s = self._s
+    def _advance_while_resting(self, done: int, end: int, numbers: tuple[float, ...], table: NDArray[Any]) -> int:
+        """Take steps with a single worker until it is time for all of them; returns how many are done."""
+        # Pieces double, as nobody knows how long a step takes.
+        piece = self._s.depth
+        while done < end and time.perf_counter() < self._rests_until:
+            piece = min(2 * piece, end - done)
+            self._advance_alone(done, done + piece, numbers, table)
+            done += piece
+        self._copy_borders()
+        return done
+
+    def _advance_together(self, done: int, end: int, numbers: tuple[float, ...], table: NDArray[Any]) -> int:
+        """Take steps with all workers; returns how many are done, fewer than `end` if a worker gave up."""
+        start = time.perf_counter()
+        count = self._launch_together(done, end, numbers, table)
+        now = time.perf_counter()
+        self._together += now - start
+        if done + count < end:
+            rest = 4 * self._rest * 0.5 ** (self._together / HALF_LIFE)
+            self._rest = min(max(rest, SHORTEST_REST), LONGEST_REST)
+            self._together, self._rests_until = 0.0, now + self._rest
+        return done + count
+
+    def _launch_together(self, done: int, end: int, numbers: tuple[float, ...], table: NDArray[Any]) -> int:
+        """Launch all workers; returns how many steps they have taken, fewer than wanted if one gave up."""
+        s, count, first = self._s, end - done, self._steps
         places = np.tile(np.array([0, -1, 0]), s.workers)
-        first = self._steps
-        self._launch(self._kernels.advance_together, s.workers, 0, count, numbers, table, places)
+        self._launch(self._kernels.advance_together, s.workers, done, count, numbers, table, places)
         passes, rounds = places[::PLACE], places[1::PLACE]
-        if (passes * s.depth >= count).all():
-            self._rest = max(self._rest / 2, SHORTEST_REST)
-            return count
-        self._rests_until = time.perf_counter() + self._rest
-        self._rest = min(4 * self._rest, LONGEST_REST)
-        # All continue to the end of the pass that the foremost of them is in.
-        count = min(count, int((passes + (rounds >= 0)).max()) * s.depth)
-        while not (passes * s.depth >= count).all():
-            self._steps = first
-            self._launch(self._kernels.advance_together, s.workers, 0, count, numbers, table, places)
-        self._steps = first + count
+        if not (passes * s.depth >= count).all():
+            # All continue to the end of the pass that the foremost of them is in.
+            count = min(count, int((passes + (rounds >= 0)).max()) * s.depth)
+            while not (passes * s.depth >= count).all():
+                self._steps = first
+                self._launch(self._kernels.advance_together, s.workers, done, count, numbers, table, places)
+            self._steps = first + count
         return count
+
+    def _copy_borders(self) -> None:
+        """Bring the copies of the rows at the borders of bands up to date, after steps of a single worker."""
+        with our_compilation():
+            self._kernels.copy(*self._arrays.u, self._borders, self._s.rows, self._s.width)
+        self._done[:] = self._steps
 
     def _launch(
         self,
@@ -270,12 +298,9 @@ def _advance(code: Code, *, parallel: bool) -> Callable[..., None]:
         share = ti.cast(1, real)
         if ti.static(by_area):
             share = ti.select(kind == 1, ti.cast(1, real), ti.cast(0.5, real))
-        # Displacements in this row: at this entry and the next. In the other row: before, beside and after this entry.
-        here_x, here_y, here_z = u[0][p * width + 0], u[1][p * width + 0], u[2][p * width + 0]
-        next_x, next_y, next_z = u[0][p * width + 1], u[1][p * width + 1], u[2][p * width + 1]
-        before_x, before_y, before_z = u[0][q * width + 0], u[1][q * width + 0], u[2][q * width + 0]
-        beside_x, beside_y, beside_z = u[0][q * width + 1], u[1][q * width + 1], u[2][q * width + 1]
-        # Force of the left neighbour, with the opposite sign.
+        # Where u has this row and the other one, and where the forces between them are carried; all from entry 0 on.
+        row, other, carry = p * width, q * width, carried_row * width
+        # Force of the left neighbour.
         left_x, left_y, left_z = vector(0), vector(0), vector(0)
         # Forces carried to the other row: for the entry before this one, this one and the next one.
         last_x, last_y, last_z = vector(0), vector(0), vector(0)
@@ -284,23 +309,21 @@ def _advance(code: Code, *, parallel: bool) -> Callable[..., None]:
         has_left, has_right = vector(1), vector(1)
         if ti.static(open_edges):
             has_right = by_column[HAS_RIGHT * width + 0]
+        here_x, here_y, here_z = u[0][row], u[1][row], u[2][row]
         if ti.static(structural_springs):
             k = of_springs(stiffness, 0, own, k_across * share)
-            x, y, z = along(next_x - here_x, next_y - here_y, next_z - here_z, dx, k, t_across, has_right)
-            left_x, left_y, left_z = x, y, z
+            left_x, left_y, left_z = along(u, row + 1, here_x, here_y, here_z, dx, k, t_across, has_right)
         if ti.static(shear_springs):
             k = of_springs(stiffness, 2, between, k_shear)
-            x, y, z = to_other_row(
-                beside_x - here_x, beside_y - here_y, beside_z - here_z,
-                1, dx, up, diagonal, k, t_shear, has_right * exists,
-            )  # fmt: skip
-            coming_x, coming_y, coming_z = x, y, z
+            coming_x, coming_y, coming_z = to_other_row(
+                u, other + 1, 1, here_x, here_y, here_z, dx, up, diagonal, k, t_shear, has_right * exists
+            )
         # Read once, because the compiler must assume that stores to the arrays change the table.
         now = [loads[n, c] for c in ti.static(range(columns))]
         for b in range(1, strip + 1):
-            here_x, here_y, here_z = next_x, next_y, next_z
-            next_x, next_y, next_z = u[0][p * width + b + 1], u[1][p * width + b + 1], u[2][p * width + b + 1]
-            after_x, after_y, after_z = u[0][q * width + b + 1], u[1][q * width + b + 1], u[2][q * width + b + 1]
+            # The neighbours are read again for every entry: to keep them would take more registers than there are.
+            here_x, here_y, here_z = u[0][row + b], u[1][row + b], u[2][row + b]
+            # On the neighbours in the other row.
             force_x, force_y, force_z = vector(0), vector(0), vector(0)
             last_x, last_y, last_z = this_x, this_y, this_z
             this_x, this_y, this_z = coming_x, coming_y, coming_z
@@ -309,18 +332,15 @@ def _advance(code: Code, *, parallel: bool) -> Callable[..., None]:
             if ti.static(shear_springs):
                 k = of_springs(stiffness, 2, between + b - 1, k_shear)
                 x, y, z = to_other_row(
-                    before_x - here_x, before_y - here_y, before_z - here_z,
-                    -1, dx, up, diagonal, k, t_shear, has_left * exists,
-                )  # fmt: skip
+                    u, other + b - 1, -1, here_x, here_y, here_z, dx, up, diagonal, k, t_shear, has_left * exists
+                )
                 force_x, force_y, force_z = x, y, z
                 last_x += x
                 last_y += y
                 last_z += z
             if ti.static(structural_springs):
                 k = of_column(stiffness, by_column, width, between, b, k_down)
-                x, y, z = to_other_row(
-                    beside_x - here_x, beside_y - here_y, beside_z - here_z, 0, dx, up, ti.abs(up), k, t_down, exists
-                )
+                x, y, z = to_other_row(u, other + b, 0, here_x, here_y, here_z, dx, up, ti.abs(up), k, t_down, exists)
                 force_x += x
                 force_y += y
                 force_z += z
@@ -330,49 +350,46 @@ def _advance(code: Code, *, parallel: bool) -> Callable[..., None]:
             if ti.static(shear_springs):
                 k = of_springs(stiffness, 2, between + b, k_shear)
                 x, y, z = to_other_row(
-                    after_x - here_x, after_y - here_y, after_z - here_z,
-                    1, dx, up, diagonal, k, t_shear, has_right * exists,
-                )  # fmt: skip
+                    u, other + b + 1, 1, here_x, here_y, here_z, dx, up, diagonal, k, t_shear, has_right * exists
+                )
                 force_x += x
                 force_y += y
                 force_z += z
                 coming_x, coming_y, coming_z = x, y, z
-            force_x = force_x - carried[0][carried_row * width + b]
-            force_y = force_y - carried[1][carried_row * width + b]
-            force_z = force_z - carried[2][carried_row * width + b]
+            force_x = carried[0][carry + b] - force_x
+            force_y = carried[1][carry + b] - force_y
+            force_z = carried[2][carry + b] - force_z
             if ti.static(structural_springs):
                 k = of_springs(stiffness, 0, own + b, k_across * share)
-                x, y, z = along(next_x - here_x, next_y - here_y, next_z - here_z, dx, k, t_across, has_right)
-                force_x += x - left_x
-                force_y += y - left_y
-                force_z += z - left_z
+                x, y, z = along(u, row + b + 1, here_x, here_y, here_z, dx, k, t_across, has_right)
+                force_x += left_x - x
+                force_y += left_y - y
+                force_z += left_z - z
                 left_x, left_y, left_z = x, y, z
             # What was stored there was read for the entry before.
-            carried[0][carried_row * width + b - 1] = last_x
-            carried[1][carried_row * width + b - 1] = last_y
-            carried[2][carried_row * width + b - 1] = last_z
+            carried[0][carry + b - 1] = last_x
+            carried[1][carry + b - 1] = last_y
+            carried[2][carry + b - 1] = last_z
             if moving:
                 move(
                     u, d, by_column, decay, moment, rows, width, p, i, b, kind,
                     moment_before, moment_here, moment_after, here_x, here_y, here_z,
                     force_x, force_y, force_z, keep, dx, dy, top, now,
                 )  # fmt: skip
-            before_x, before_y, before_z = beside_x, beside_y, beside_z
-            beside_x, beside_y, beside_z = after_x, after_y, after_z
         if ti.static(shear_springs):
             if ti.static(open_edges):
                 has_left = by_column[HAS_LEFT * width + strip + 1]
             k = of_springs(stiffness, 2, between + strip, k_shear)
+            end = row + strip + 1
             x, y, z = to_other_row(
-                before_x - next_x, before_y - next_y, before_z - next_z,
-                -1, dx, up, diagonal, k, t_shear, has_left * exists,
-            )  # fmt: skip
+                u, other + strip, -1, u[0][end], u[1][end], u[2][end], dx, up, diagonal, k, t_shear, has_left * exists
+            )
             this_x += x
             this_y += y
             this_z += z
-        carried[0][carried_row * width + strip] = this_x
-        carried[1][carried_row * width + strip] = this_y
-        carried[2][carried_row * width + strip] = this_z
+        carried[0][carry + strip] = this_x
+        carried[1][carry + strip] = this_y
+        carried[2][carry + strip] = this_z
 
     @ti.func
     def join_strips(field: ti.template(), p, strip):
@@ -504,7 +521,11 @@ def _advance(code: Code, *, parallel: bool) -> Callable[..., None]:
                 turn = ti.cast(places[PLACE * worker], ti.i32)
                 k = ti.cast(places[PLACE * worker + 1], ti.i32)
                 step = ti.cast(places[PLACE * worker + 2], ti.i32)
-                goes = True
+                # A vector that is read by a variable index stays on the stack, for which the compiler aligns the stack,
+                # and so all vectors for which there is no register: a step takes up to 7 % less.
+                aligned = vector(0)
+                aligned[workers % lanes] = 1
+                goes = aligned[count % lanes] >= 0
                 while goes and turn * depth < count:
                     steps = ti.min(depth, count - turn * depth)
                     # Row -1 is the one before the band: it is swept for its forces, but not stepped.

@@ -94,15 +94,12 @@ def _kernels(code: Code) -> Kernels:
     move, measure, laplacian = point_step(code), measuring(code), five_point()
 
     @ti.func
-    def apart(u: ti.template(), here, other):
-        return u[0][other] - u[0][here], u[1][other] - u[1][here], u[2][other] - u[2][here]
-
-    @ti.func
     def by_row(
         u: ti.template(), by_column: ti.template(), stiffness: ti.template(), width, p, q, between, b, row_exists,
         dx, up, k_down, k_shear, t_down, t_shear,
     ):  # fmt: skip
-        """Force of row q, which is `up` above, on entry b of row p; summed in the order of a sweep."""
+        """Force of entry b of row p on row q, which is `up` above; summed in the order of a sweep."""
+        here_x, here_y, here_z = u[0][p * width + b], u[1][p * width + b], u[2][p * width + b]
         force_x, force_y, force_z = vector(0), vector(0), vector(0)
         for right in ti.static((-1, 0, 1)):
             if ti.static(structural_springs if right == 0 else shear_springs):
@@ -115,8 +112,10 @@ def _kernels(code: Code) -> Kernels:
                     k *= by_column[(AREA + 1) * width + b]
                 if ti.static(mapped):
                     k = stiffness[ti.static(2 if right else 1)][between * width + b + ti.static(min(right, 0))]
-                x, y, z = apart(u, p * width + b, q * width + b + right)
-                x, y, z = to_other_row(x, y, z, right, dx, up, length, k, tension, exists * row_exists)
+                x, y, z = to_other_row(
+                    u, q * width + b + right, right, here_x, here_y, here_z, dx, up, length, k, tension,
+                    exists * row_exists,
+                )  # fmt: skip
                 force_x += x
                 force_y += y
                 force_z += z
@@ -127,7 +126,7 @@ def _kernels(code: Code) -> Kernels:
         u: ti.template(), by_column: ti.template(), stiffness: ti.template(), width, p, i, kind, b,
         dx, k_across, t_across,
     ):  # fmt: skip
-        """Force of its right neighbour on entry b of row p."""
+        """Force of entry b of row p on its right neighbour."""
         exists, k = vector(1), k_across * vector(1)
         if ti.static(open_edges):
             exists = by_column[HAS_RIGHT * width + b]
@@ -135,8 +134,8 @@ def _kernels(code: Code) -> Kernels:
             k *= ti.select(kind == 1, ti.cast(1, real), ti.cast(0.5, real))
         if ti.static(mapped):
             k = stiffness[0][i * width + b]
-        x, y, z = apart(u, p * width + b, p * width + b + 1)
-        return along(x, y, z, dx, k, t_across, exists)
+        here = p * width + b
+        return along(u, here + 1, u[0][here], u[1][here], u[2][here], dx, k, t_across, exists)
 
     @ti.func
     def step(
@@ -148,21 +147,19 @@ def _kernels(code: Code) -> Kernels:
         p = now * (rows + 2) + i + 1
         kind = ti.select(i == rows - 1, 2, ti.select(i == 0, 0, 1))
         below, above = ti.cast(i < rows - 1, real), ti.cast(i > 0, real)
-        force_x, force_y, force_z = by_row(
+        below_x, below_y, below_z = by_row(
             u, by_column, stiffness, width, p, p + 1, i + 1, b, below, dx, -dy, k_down, k_shear, t_down, t_shear
         )
-        x, y, z = by_row(
+        above_x, above_y, above_z = by_row(
             u, by_column, stiffness, width, p, p - 1, i, b, above, dx, dy, k_down, k_shear, t_down, t_shear
         )
-        force_x += x
-        force_y += y
-        force_z += z
+        force_x, force_y, force_z = 0 - (below_x + above_x), 0 - (below_y + above_y), 0 - (below_z + above_z)
         if ti.static(structural_springs):
             right_x, right_y, right_z = by_right(u, by_column, stiffness, width, p, i, kind, b, dx, k_across, t_across)
             left_x, left_y, left_z = by_right(u, by_column, stiffness, width, p, i, kind, b - 1, dx, k_across, t_across)
-            force_x += right_x - left_x
-            force_y += right_y - left_y
-            force_z += right_z - left_z
+            force_x += left_x - right_x
+            force_y += left_y - right_y
+            force_z += left_z - right_z
         row = [loads[n, c] for c in ti.static(range(columns))]
         move(
             u, d, by_column, decay, moment, rows, width, (1 - now) * (rows + 2) + i + 1, i, b, kind, i, i + 1, i + 2,

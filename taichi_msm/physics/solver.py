@@ -62,9 +62,9 @@ from taichi_msm.timegrid import TimeGrid
 # With fewer points per worker, one worker more costs more time in waiting than it saves in work.
 POINTS_PER_WORKER = 450
 
-# How much of a core's cache a band may fill [bytes], and the largest number of steps in one sweep.
+# A band that fills more of a core's cache than this [bytes] is taken so many steps further in one sweep.
 CACHE = 3 << 17
-MOST_DEPTH = 8
+DEPTH = 8
 
 # Numbers that a sweep keeps per point: displacement, difference and the force carried to the next row, as vectors.
 NUMBERS_PER_POINT = 9
@@ -120,22 +120,9 @@ def structure(scene: Scene, grid: TimeGrid, device: Device, cores: int | None = 
             "--arch vulkan: has no exp in f64, which control points that move need; take time.precision: f32 without a "
             "tolerance or an estimate of the error, or --arch cpu"
         )
-    depth = 1
-    if workers and not code.bending:
-        depth = _depth(rows // workers, cols * NUMBERS_PER_POINT * BYTES[precision])
+    fits = workers == 0 or rows // workers * cols * NUMBERS_PER_POINT * BYTES[precision] <= CACHE
+    depth = 1 if fits or code.bending else DEPTH
     return Structure(rows, cols, workers, depth, fixed_rows, code)
-
-
-def _depth(rows: int, row_bytes: int) -> int:
-    """Choose the number of steps in a sweep: 1 if the whole band fits into the cache, else what the cache has room for.
-
-    Args:
-        rows: of a band.
-        row_bytes: memory of a row.
-    """
-    if rows * row_bytes <= CACHE:
-        return 1
-    return max(1, min(MOST_DEPTH, CACHE // row_bytes - 2))
 
 
 class Dynamics:
