@@ -69,7 +69,7 @@ PATIENCE = 40_000
 
 # After a worker has given up, a single worker steps for some time [s]: four times as long as the last time, but half as
 # long for every so many seconds that all have stepped since then.
-SHORTEST_REST, LONGEST_REST, HALF_LIFE = 0.002, 1.0, 0.07
+SHORTEST_REST, LONGEST_REST, HALF_LIFE = 0.002, 0.2, 0.02
 
 # Numbers that record the place of a worker: pass, round and step of the round.
 PLACE = 3
