@@ -13,7 +13,7 @@ from typing import Any, NamedTuple
 
 from taichi_msm.render import style
 from taichi_msm.render.numbers import AXES
-from taichi_msm.render.patch import Plane, edge, on_triangle, small_quad, turn
+from taichi_msm.render.patch import Plane, edge, on_triangle, seen_side, small_quad
 from taichi_msm.render.samples import DEPTH, INFINITY, TEXEL_X, TEXEL_Y, Code
 from taichi_msm.system.runtime import ti
 
@@ -82,7 +82,7 @@ class Cell(NamedTuple):
     Attributes:
         a, b, c, d: coefficients, each (X, Y, w, depth).
         whole: whether it is drawn as a whole, and not triangle by triangle.
-        side: 1 where its front is seen, else -1.
+        side: 1 where its front is seen, -1 where its back is, 0 if it is folded.
         corner: entry of its upper left mass point.
         texel_x, texel_y: whole texels to that point.
         rest_x, rest_y: the fraction of a texel that remains.
@@ -298,17 +298,15 @@ def covering(code: Code) -> Callable[..., Any]:
         c = down - a
         d = far - right - c
         before = a[2] > near and right[2] > near and down[2] > near and far[2] > near
-        abd = turn(a_x, a_y, b_x, b_y, d_x, d_y)
-        bdc = turn(b_x, b_y, d_x, d_y, c_x, c_y)
-        dca = turn(d_x, d_y, c_x, c_y, a_x, a_y)
-        cab = turn(c_x, c_y, a_x, a_y, b_x, b_y)
-        convex = ti.min(abd, bdc, dca, cab) > 0 or ti.max(abd, bdc, dca, cab) < 0
+        side = seen_side(a_x, a_y, b_x, b_y, c_x, c_y, d_x, d_y)
         left_end, right_end = ti.min(a_x, b_x, c_x, d_x), ti.max(a_x, b_x, c_x, d_x)
         upper_end, lower_end = ti.min(a_y, b_y, c_y, d_y), ti.max(a_y, b_y, c_y, d_y)
         whole = (
-            before and convex and ti.max(-left_end, right_end) < FARTHEST and ti.max(-upper_end, lower_end) < FARTHEST
+            before
+            and side != 0
+            and ti.max(-left_end, right_end) < FARTHEST
+            and ti.max(-upper_end, lower_end) < FARTHEST
         )
-        side = ti.select(abd > 0, 1.0, -1.0)
         # The cell's place on the texture in texels; in f64, so that it is exact to a fraction of one on any sheet.
         texel_x = ti.cast(j, ti.f64) * surface.texture_width / (surface.cols - 1) - 0.5
         texel_y = ti.cast(i, ti.f64) * surface.texture_height / (surface.rows - 1) - 0.5

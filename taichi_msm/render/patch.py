@@ -54,6 +54,15 @@ def turn(p_x, p_y, q_x, q_y, r_x, r_y):
 
 
 @ti.func
+def seen_side(a_x, a_y, b_x, b_y, c_x, c_y, d_x, d_y):
+    """1 where the front of the cell with corners a, b and, below them, c, d is seen, -1 its back; 0 if it is folded."""
+    abd, bdc = turn(a_x, a_y, b_x, b_y, d_x, d_y), turn(b_x, b_y, d_x, d_y, c_x, c_y)
+    dca, cab = turn(d_x, d_y, c_x, c_y, a_x, a_y), turn(c_x, c_y, a_x, a_y, b_x, b_y)
+    least, most = ti.min(abd, bdc, dca, cab), ti.max(abd, bdc, dca, cab)
+    return ti.select(least > 0, 1.0, ti.select(most < 0, -1.0, 0.0))
+
+
+@ti.func
 def small_quad(
     x, y, inside, parts, side, a: ti.template(), b: ti.template(), c: ti.template(), d: ti.template()
 ):  # fmt: skip

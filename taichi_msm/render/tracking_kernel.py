@@ -7,7 +7,7 @@ import math
 from taichi_msm.render.instrument_coverage import meet
 from taichi_msm.render.labels import NO_FLOW
 from taichi_msm.render.numbers import BOTTOM, LEFT, MATRIX, NEAR, PARTS, PINHOLE, RIGHT, ROD_NUMBERS, RODS, TOP
-from taichi_msm.render.patch import Plane, edge, on_triangle, small_quad, turn
+from taichi_msm.render.patch import Plane, edge, on_triangle, seen_side, small_quad
 from taichi_msm.render.samples import INFINITY
 from taichi_msm.system.runtime import ti
 
@@ -51,12 +51,9 @@ def project(
         d = c + POINT_NUMBERS
         a_x, a_y, b_x, b_y = point[a + SEEN], point[a + SEEN + 1], point[b + SEEN], point[b + SEEN + 1]
         c_x, c_y, d_x, d_y = point[c + SEEN], point[c + SEEN + 1], point[d + SEEN], point[d + SEEN + 1]
-        abd, bdc = turn(a_x, a_y, b_x, b_y, d_x, d_y), turn(b_x, b_y, d_x, d_y, c_x, c_y)
-        dca, cab = turn(d_x, d_y, c_x, c_y, a_x, a_y), turn(c_x, c_y, a_x, a_y, b_x, b_y)
         here = index * CELL_NUMBERS
         cell[here + NEAREST] = ti.min(point[a + 3], point[b + 3], point[c + 3], point[d + 3])
-        least, most = ti.min(abd, bdc, dca, cab), ti.max(abd, bdc, dca, cab)
-        cell[here + SIDE] = ti.select(least > 0, 1.0, ti.select(most < 0, -1.0, 0.0))
+        cell[here + SIDE] = seen_side(a_x, a_y, b_x, b_y, c_x, c_y, d_x, d_y)
         if point[a + 2] > near and point[b + 2] > near and point[c + 2] > near and point[d + 2] > near:
             cell[here + MIN_X], cell[here + MAX_X] = ti.min(a_x, b_x, c_x, d_x), ti.max(a_x, b_x, c_x, d_x)
             cell[here + MIN_Y], cell[here + MAX_Y] = ti.min(a_y, b_y, c_y, d_y), ti.max(a_y, b_y, c_y, d_y)
