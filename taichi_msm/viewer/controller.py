@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 
 from taichi_msm.render.picking import on_rest_plane, pick
 from taichi_msm.scene import Scene
-from taichi_msm.viewer.tool import Place, Tool
+from taichi_msm.viewer.held_tool import HeldTool, Place
 from taichi_msm.viewer.viewport import Viewport
 
 
@@ -20,7 +20,7 @@ class Controller:
         scene: the scene that is shown.
     """
 
-    def __init__(self, tool: Tool, viewport: Viewport, scene: Scene) -> None:
+    def __init__(self, tool: HeldTool, viewport: Viewport, scene: Scene) -> None:
         self._tool = tool
         self._viewport = viewport
         self._refine, self._size = scene.render.refine, scene.sheet.size

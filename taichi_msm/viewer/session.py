@@ -40,8 +40,8 @@ from taichi_msm.viewer.events import (
     Release,
     Turn,
 )
+from taichi_msm.viewer.held_tool import HeldTool
 from taichi_msm.viewer.recording import Recording
-from taichi_msm.viewer.tool import Tool
 from taichi_msm.viewer.viewport import Viewport
 
 # A session has at most this many frames per second, what a screen shows; each is a whole part of a frame of the scene.
@@ -130,7 +130,7 @@ class Session:
         self._captures = captures
         self._recording = Recording(captures, scene, given.time.frames_per_second, self.parts)
         self._others = scene.probes if play else ()
-        self.tool = Tool(scene.probes[0], rate)
+        self.tool = HeldTool(scene.probes[0], rate)
         self.scene = scene.model_copy(update={"probes": (*self._others, self.tool.recorded(0))})
         self._rest = rest_positions(scene.sheet)
         self.viewport = Viewport(scene, texture)
@@ -315,7 +315,7 @@ class Session:
                 self._once = self.paused
             case "r":
                 self._once = False
-                self._simulation.go_on(self._beginning)
+                self._simulation.restore(self._beginning)
                 self._controller.forget()
                 self._warned = False
                 self.fault = ""

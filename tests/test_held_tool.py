@@ -8,14 +8,14 @@ import pytest
 from taichi_msm.physics.loads import Schedule, schedule
 from taichi_msm.physics.timestep import time_grid
 from taichi_msm.scene import Probe, Scene
-from taichi_msm.viewer.tool import RISE, Tool
+from taichi_msm.viewer.held_tool import RISE, HeldTool
 from tests.scenes import scene
 
 RATE = 50.0
 
 
-def tool() -> Tool:
-    return Tool(scene().probes[0], RATE)
+def tool() -> HeldTool:
+    return HeldTool(scene().probes[0], RATE)
 
 
 def with_probe(probe: Probe, frames: int) -> Scene:
@@ -30,7 +30,7 @@ def loads(probe: Probe, frame: int) -> Schedule:
     return schedule(made, grid, frame * grid.steps_per_frame, grid.steps_per_frame)
 
 
-def percents(hand: Tool, first: int, count: int) -> list[float]:
+def percents(hand: HeldTool, first: int, count: int) -> list[float]:
     found = []
     for frame in range(first, first + count):
         hand.follow(frame)

@@ -21,7 +21,7 @@ Place = tuple[float, float]
 Key = TypeVar("Key", bound=tuple[float, ...])
 
 
-class Tool:
+class HeldTool:
     """Presses at one place at a time.
 
     Presses, moves and releases take effect at the next frame, at most one press or release per frame. So the force
