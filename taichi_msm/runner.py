@@ -213,7 +213,7 @@ def _carry_out(
     cores = free_cores(scene, grid)
     # In this order, so that the encoder starts up while kernels are compiled.
     with (
-        ResultWriter(directory, scene, manifest.as_json(), resumes=resumes) as writer,
+        ResultWriter(directory, scene, grid, manifest.as_json(), resumes=resumes) as writer,
         Simulation(scene, device.arch, device.threads, texture, cores) as simulation,
         ExitStack() as opened,
     ):
@@ -234,7 +234,7 @@ def _carry_out(
                 one.compile()
             watch.lap("compile")
             if writer.saved:
-                simulation.go_on(writer.saved)
+                simulation.restore(writer.saved)
             for frame in range(1, writer.frames if pilots else 0):
                 for one in pilots:
                     one.follow(writer.position(frame) - rest, partial(progress, "pilot", frame, frames))

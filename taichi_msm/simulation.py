@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from taichi_msm.arguments import as_array, require_frame_count
 from taichi_msm.errors import ArgumentError, DivergedError, MsmError
+from taichi_msm.physics import divergence
 from taichi_msm.physics.diagnosis import Diagnosis, diagnose
 from taichi_msm.physics.divergence import Watch, farthest
 from taichi_msm.physics.error_control import choose_step
@@ -187,7 +188,7 @@ class Simulation:
         self._position = self._place(self._dynamics.displacement())
 
     def save(self) -> Saved:
-        """Save all that another simulation needs to go on from here.
+        """Save all that another simulation needs to continue from here.
 
         Raises:
             MsmError: when the simulation is closed.
@@ -198,8 +199,8 @@ class Simulation:
         self._require_good(reading, self._watch.judge(reading))
         return Saved(self._dynamics.state(), self.progress)
 
-    def go_on(self, saved: Saved) -> None:
-        """Go on from where a simulation of the same scene was saved, which may be between two frames; to the same bits.
+    def restore(self, saved: Saved) -> None:
+        """Continue from where a simulation of the same scene was saved, also between two frames; to the same bits.
 
         Raises:
             MsmError: when the simulation is closed.
@@ -264,7 +265,7 @@ class Simulation:
         return pick(self._position, self.scene.render.refine, self._view(camera), (x, y))
 
     def diagnose(self, start: Saved | None = None, pause: Pause = lambda: None) -> Diagnosis:
-        """Find out why the simulation diverged in `advance`. Afterwards it can advance only after `go_on`.
+        """Find out why the simulation diverged in `advance`. Afterwards it can advance only after `restore`.
 
         Args:
             start: what `save` returned before; the simulation is repeated from there. None: from rest.
@@ -521,7 +522,7 @@ class Simulation:
             self._diverged = True
             steps, time = reading.steps, self._grid.time(reading.steps)
             point = farthest(reading.displacement)[:2]
-            raise DivergedError(f"diverged before {time:g} s, step {steps}: {wrong}", steps, time, point)
+            raise DivergedError(divergence.message(time, steps, wrong, exact=False), steps, time, point)
 
     def _place(self, displacement: NDArray[Any]) -> NDArray[Any]:
         """Turn displacements into positions."""

@@ -7,8 +7,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from taichi_msm.physics.timestep import with_time
+from taichi_msm.physics.timestep import time_grid, with_time
 from taichi_msm.scene import Scene
+from taichi_msm.timegrid import TimeGrid
 
 SHEET = {"points": [9, 11], "size": [0.3, 0.4], "mass": 1e-3}
 SPRINGS = {"structural": 20, "shear": 10, "virtual": 0.5}
@@ -146,3 +147,8 @@ def speckle(height: int, width: int, seed: int = 0) -> NDArray[np.uint8]:
 def with_steps(made: Scene, count: int) -> Scene:
     """The scene with so many steps in a frame."""
     return with_time(made, step=1 / made.time.frames_per_second / count, tolerance=None)
+
+
+def with_grid(made: Scene) -> tuple[Scene, TimeGrid]:
+    """The scene and its steps."""
+    return made, time_grid(made)

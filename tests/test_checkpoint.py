@@ -21,7 +21,7 @@ from taichi_msm.results.manifest import Manifest, read_manifest
 from taichi_msm.results.publication import MANIFEST, POSITIONS, STATE
 from taichi_msm.results.sealed import seal, unseal
 from taichi_msm.scene import Scene
-from tests.scenes import scene
+from tests.scenes import scene, with_grid
 
 FRAMES = 3
 EVERY = 17  # steps a frame
@@ -29,6 +29,11 @@ EVERY = 17  # steps a frame
 
 def small_scene() -> Scene:
     return scene(sheet={"points": [2, 3], "size": [0.3, 0.4], "mass": 1e-3}, output=["trajectory"])
+
+
+def checkpoint_in(staging: Folder) -> Checkpoint:
+    made, grid = with_grid(small_scene())
+    return Checkpoint(staging, grid, made.sheet.points, keeps_positions=True)
 
 
 def position(frame: int) -> Any:
@@ -53,7 +58,7 @@ def out(tmp_path: Path) -> Path:
     """A directory with a checkpoint."""
     (tmp_path / ".partial").mkdir()
     with Folder.at(tmp_path / ".partial") as staging:
-        checkpoint = Checkpoint(staging, small_scene())
+        checkpoint = checkpoint_in(staging)
         checkpoint.begin(manifest().as_json())
         for frame in range(FRAMES):
             checkpoint.add(position(frame))
@@ -65,9 +70,9 @@ def out(tmp_path: Path) -> Path:
 def read(out: Path) -> list[Any]:
     """All that is used of a checkpoint when a run goes on."""
     with Folder.at(out / ".partial") as staging:
-        checkpoint = Checkpoint(staging, small_scene())
+        checkpoint = checkpoint_in(staging)
         try:
-            saved = checkpoint.go_on()
+            saved = checkpoint.reopen()
             assert saved is not None
             positions = [checkpoint.position(frame).tolist() for frame in range(checkpoint.frames)]
         finally:
@@ -184,7 +189,7 @@ def test_a_compressed_array_takes_no_memory(out: Path) -> None:
 def test_parts_of_another_run_are_refused(name: str, out: Path, tmp_path: Path) -> None:
     """Of the same sheet, and whole."""
     with Folder.at(tmp_path / ".partial") as staging:
-        other = Checkpoint(staging, small_scene())
+        other = checkpoint_in(staging)
         part = (out / ".partial" / "checkpoint" / name).read_bytes()
         other.begin({**manifest().as_json(), "folder": "/elsewhere"})
         for frame in range(FRAMES):
@@ -199,8 +204,8 @@ def test_parts_of_another_run_are_refused(name: str, out: Path, tmp_path: Path) 
 def test_positions_that_are_no_numbers_are_refused(out: Path) -> None:
     """With a checksum that is right."""
     with Folder.at(out / ".partial") as staging:
-        checkpoint = Checkpoint(staging, small_scene())
-        checkpoint.go_on()
+        checkpoint = checkpoint_in(staging)
+        checkpoint.reopen()
         checkpoint.frames = 1
         checkpoint.add(np.full((2, 3, 3), math.nan))
         checkpoint.close()

@@ -60,10 +60,10 @@ def test_faults_are_found_within_a_frame(name: str, device: Device) -> None:
     part, change, frames = FAULTS[name]
     with Simulation(made, threads=device.threads) as simulation:
         for frame in frames:
-            simulation.go_on(rest(made))
+            simulation.restore(rest(made))
             simulation.advance(frame)
             good = simulation.positions()
-            simulation.go_on(with_fault(simulation.save(), part, change, np.random.default_rng(frame)))
+            simulation.restore(with_fault(simulation.save(), part, change, np.random.default_rng(frame)))
             with pytest.raises(DivergedError, match=r"diverged before [.\d]+ s, step \d+: .*point \(\d+, \d+\) is"):
                 simulation.advance()
             assert simulation.frame == frame, "the frame that went wrong does not count"
@@ -151,7 +151,7 @@ def test_springs_that_begin_to_pull_from_afar_give_energy(device: Device) -> Non
     away = np.full((2, 2, 3), [0, 0, 0.02])
     held = 50 / 2 * 0.02**2 * 4
     with Simulation(made, threads=device.threads) as simulation:
-        simulation.go_on(Saved(State(0, away, np.zeros_like(away)), RunProgress(reach=0.04)))
+        simulation.restore(Saved(State(0, away, np.zeros_like(away)), RunProgress(reach=0.04)))
         simulation.advance()
         assert simulation.progress.energy > 10 * held
 
@@ -184,7 +184,7 @@ def test_a_force_that_is_too_strong_is_named(device: Device) -> None:
     assert found.good.state.steps == bad - 1
     assert np.isfinite(found.good.state.displacement).all()
     with Simulation(made, threads=device.threads) as simulation:
-        simulation.go_on(found.good)
+        simulation.restore(found.good)
         with pytest.raises(DivergedError):
             simulation.advance()
 
@@ -204,7 +204,7 @@ def test_a_step_that_is_too_long_is_named(device: Device) -> None:
 def test_a_machine_that_makes_errors_is_told_of(device: Device) -> None:
     def flip(simulation: Simulation) -> None:
         simulation.advance(3)
-        simulation.go_on(with_fault(simulation.save(), "displacement", np.nan, np.random.default_rng(1)))
+        simulation.restore(with_fault(simulation.save(), "displacement", np.nan, np.random.default_rng(1)))
 
     made = pressed()
     found = diagnosed(made, device, flip)
@@ -214,7 +214,7 @@ def test_a_machine_that_makes_errors_is_told_of(device: Device) -> None:
     assert found.good
     assert found.good.progress.frame == 1, "where it was saved"
     with Simulation(made, threads=device.threads) as simulation:
-        simulation.go_on(found.good)
+        simulation.restore(found.good)
         simulation.advance(made.time.frames - simulation.frame)
         resumed = simulation.positions()
     with Simulation(made, threads=device.threads) as simulation:

@@ -273,9 +273,9 @@ def test_what_was_saved_elsewhere_is_not_gone_on_with(simulation: Simulation, de
         with Simulation(other, threads=device.threads) as elsewhere:
             elsewhere.advance(1)
             with pytest.raises(ArgumentError, match="take what was saved with this scene's points, precision and step"):
-                simulation.go_on(elsewhere.save())
+                simulation.restore(elsewhere.save())
     with pytest.raises(ArgumentError, match="int is not what `save` returns"):
-        simulation.go_on(3)  # type: ignore[arg-type]
+        simulation.restore(3)  # type: ignore[arg-type]
     np.testing.assert_array_equal(simulation.positions(), before)
     simulation.advance()
 

@@ -8,6 +8,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from taichi_msm.physics import divergence
 from taichi_msm.physics.divergence import Watch, farthest
 from taichi_msm.physics.lattice import axes
 from taichi_msm.physics.probe_force import control_points, probe_force
@@ -56,7 +57,7 @@ def diagnose(dynamics: Dynamics, start: Saved | None, pause: Pause) -> Diagnosis
         low = dynamics.state()
     if not wrong:
         said = "but not when it was repeated, so the machine has made an error; continue with --resume"
-        return Diagnosis(f"diverged before {grid.time(bad):.6g} s, step {bad}, {said}", start)
+        return Diagnosis(divergence.message(grid.time(bad), bad, said, exact=False), start)
     high = dynamics.steps_done
     while high - low.steps > 1:
         dynamics.restart(scene, grid, low)
@@ -70,8 +71,8 @@ def diagnose(dynamics: Dynamics, start: Saved | None, pause: Pause) -> Diagnosis
     reading = dynamics.read()
     wrong = watch.judge(reading)
     cause = _cause(dynamics, high, farthest(reading.displacement)[:2], pause)
-    message = f"diverged at {grid.time(high):.6g} s, step {high}: {wrong}; {cause}"
-    return Diagnosis(message, Saved(low, watch.progress))
+    found = divergence.message(grid.time(high), high, f"{wrong}; {cause}", exact=True)
+    return Diagnosis(found, Saved(low, watch.progress))
 
 
 def _cause(dynamics: Dynamics, bad: int, point: tuple[int, int], pause: Pause) -> str:

@@ -148,6 +148,18 @@ class Watch:
         return self._swing * root * root + ROUNDING * progress.peak + self._least
 
 
+def message(time: float, step: int, wrong: str, *, exact: bool) -> str:
+    """Say where a run diverged.
+
+    Args:
+        time: of the step at which it was found [s].
+        step: its number.
+        wrong: what `Watch` says of it.
+        exact: whether the step before was still sound.
+    """
+    return f"diverged {'at' if exact else 'before'} {time:.6g} s, step {step}: {wrong}"
+
+
 class Farthest(NamedTuple):
     """The point that is farthest from its rest position, or not finite.
 

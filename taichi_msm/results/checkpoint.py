@@ -22,12 +22,11 @@ from numpy.typing import NDArray
 from taichi_msm.errors import DamagedError
 from taichi_msm.physics.run_progress import RunProgress, Saved
 from taichi_msm.physics.state import State
-from taichi_msm.physics.timestep import time_grid
 from taichi_msm.results.folder import Folder, write_all
 from taichi_msm.results.npz import read_array, write_array
 from taichi_msm.results.publication import CHECKPOINT, CHECKPOINT_TREE, DRAFT, MANIFEST, POSITIONS, STATE
 from taichi_msm.results.sealed import seal
-from taichi_msm.scene import Scene
+from taichi_msm.timegrid import TimeGrid
 
 # The share of the time that saving states may take.
 SHARE = 0.02
@@ -40,21 +39,23 @@ class Checkpoint:
 
     Args:
         staging: the folder that contains it.
-        scene: what is run; if it has no output, positions are not kept.
+        grid: the steps of the run.
+        points: rows and columns of the sheet.
+        keeps_positions: whether the positions of the frames are kept.
 
     Attributes:
         frames: number of frames added so far.
         precision: type of the positions.
     """
 
-    def __init__(self, staging: Folder, scene: Scene) -> None:
+    def __init__(self, staging: Folder, grid: TimeGrid, points: tuple[int, int], *, keeps_positions: bool) -> None:
         self.frames = 0
         self._staging = staging
-        self._grid = time_grid(scene)
-        self._shape = (*scene.sheet.points, 3)
-        self.precision = np.dtype(np.float32 if self._grid.precision == "f32" else np.float64)
+        self._grid = grid
+        self._shape = (*points, 3)
+        self.precision = np.dtype(np.float32 if grid.precision == "f32" else np.float64)
         self._frame_bytes = math.prod(self._shape) * self.precision.itemsize
-        self._record_bytes = (DIGEST_BYTES + self._frame_bytes) if scene.output else 0
+        self._record_bytes = (DIGEST_BYTES + self._frame_bytes) if keeps_positions else 0
         self._due = 0.0
         self._open = ExitStack()
         # The digest of the manifest, to which all parts of a checkpoint are tied.
@@ -84,7 +85,7 @@ class Checkpoint:
         self._key = _digest(sealed)
         folder.write(MANIFEST, sealed, DRAFT)
 
-    def go_on(self) -> Saved | None:
+    def reopen(self) -> Saved | None:
         """Continue an earlier run; returns the state that it saved last, or None to continue from rest.
 
         Raises:
@@ -108,7 +109,7 @@ class Checkpoint:
     def add(self, position: NDArray[Any]) -> None:
         """Add the positions of the next frame [m], shape (rows, cols, 3)."""
         if self._record_bytes:
-            assert self._positions is not None, "begin or go_on comes first"
+            assert self._positions is not None, "begin or reopen comes first"
             data = np.ascontiguousarray(position, self.precision).data.cast("B")
             self._positions.seek(self.frames * self._record_bytes)
             write_all(self._positions, self._digest(self.frames, data))
@@ -124,7 +125,7 @@ class Checkpoint:
         Raises:
             DamagedError: when the positions are not as they were written.
         """
-        assert self._positions is not None, "begin or go_on comes first"
+        assert self._positions is not None, "begin or reopen comes first"
         record = np.empty(self._record_bytes, np.uint8)
         self._positions.seek(frame * self._record_bytes)
         rest = record.data
@@ -167,7 +168,7 @@ class Checkpoint:
         """Read the state that was saved last; None: none was.
 
         Raises:
-            DamagedError: when it cannot be a state of a run of the scene.
+            DamagedError: when it cannot be a state of this run.
         """
         like = self._arrays(Saved(State(0, np.empty(0), np.empty(0)), RunProgress()))
         sheet = self.precision, self._shape
@@ -200,7 +201,7 @@ class Checkpoint:
 
     @property
     def _entered(self) -> Folder:
-        assert self._folder is not None, "begin or go_on comes first"
+        assert self._folder is not None, "begin or reopen comes first"
         return self._folder
 
     def _enter(self) -> Folder:

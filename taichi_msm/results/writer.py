@@ -31,6 +31,7 @@ from taichi_msm.results.publication import (
 )
 from taichi_msm.results.trajectory import write_trajectory
 from taichi_msm.scene import Scene
+from taichi_msm.timegrid import TimeGrid
 
 
 class ResultWriter:
@@ -43,24 +44,32 @@ class ResultWriter:
     Args:
         directory: where the results go; made if it does not exist. Files there that no run has written stay.
         scene: what is run; its `output` says which files are wanted.
+        grid: its steps.
         manifest: what another process must know to continue this run, in JSON.
-        resumes: whether this run is to go on from its checkpoint in the directory.
+        resumes: whether this run continues from its checkpoint in the directory.
 
     Raises:
         FilesError: on entering and in every method, when the directory cannot be written, another run writes there,
             or something is in the way that no run has put there.
 
     Attributes:
-        saved: the state from which the run is to go on; None: from rest.
+        saved: the state from which the run continues; None: from rest.
     """
 
     def __init__(
-        self, directory: Path, scene: Scene, manifest: Mapping[str, Any] | None = None, *, resumes: bool = False
+        self,
+        directory: Path,
+        scene: Scene,
+        grid: TimeGrid,
+        manifest: Mapping[str, Any] | None = None,
+        *,
+        resumes: bool = False,
     ) -> None:
         self.saved: Saved | None = None
         self._directory = directory
         self._scene = scene
-        self._plan = manifest
+        self._grid = grid
+        self._manifest = manifest
         self._resumes = resumes
         self._publication = Publication(directory, self._names(scene.time.frames + 1))
         self._checkpoint: Checkpoint
@@ -103,10 +112,10 @@ class ResultWriter:
             # Positions come first: whenever the run is interrupted, there are at least as many of them as pictures.
             if self.stored == 0:
                 self._publication.keep = False
-                self._checkpoint.begin(self._plan or {})
+                self._checkpoint.begin(self._manifest or {})
             if self._frames == self.stored:
                 self._checkpoint.add(position)
-                self._publication.keep = self._plan is not None
+                self._publication.keep = self._manifest is not None
             self._labels.add(self._frames, observed)
             if self._encoder and observed.picture is not None:
                 self._encoder.add(observed.picture, pause)
@@ -194,7 +203,9 @@ class ResultWriter:
         scene = self._scene
         with writing(self._directory), ExitStack() as opened:
             opened.enter_context(self._publication)
-            self._checkpoint = Checkpoint(self._publication.staging, scene)
+            self._checkpoint = Checkpoint(
+                self._publication.staging, self._grid, scene.sheet.points, keeps_positions=bool(scene.output)
+            )
             self._labels = LabelWriter(self._publication.staged, scene)
             if scene.draws:
                 job = Job(
@@ -209,7 +220,7 @@ class ResultWriter:
                 opened.callback(self._encoder.abort)
             opened.callback(self._checkpoint.close)
             if self._resumes:
-                self.saved = self._checkpoint.go_on()
+                self.saved = self._checkpoint.reopen()
             self._frames = 0 if scene.renders else self.stored
             self._open = opened.pop_all()
         return self
