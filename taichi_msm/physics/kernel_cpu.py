@@ -100,7 +100,7 @@ class Sweep:
         self._s = s
         self._kernels = _kernels(s.code)
         self._steps = 0
-        self._rest, self._rests_until = SHORTEST_REST, 0.0
+        self._rest = self._rests_until = 0.0
         # Time that all workers have stepped since the last rest [s].
         self._together = 0.0
         self._first_row, self._end_row = int(s.fixed_rows[0]), s.rows - int(s.fixed_rows[1])
@@ -125,12 +125,12 @@ class Sweep:
                 D dx dy; y of the first row.
             table: of the loads, shape (count, columns).
         """
+        if self._s.workers == 1:
+            self._advance_alone(0, count, numbers, table)
+            return
         done = 0
         while done < count:
-            if self._s.workers == 1:
-                self._advance_alone(0, count, numbers, table)
-                done = count
-            elif time.perf_counter() < self._rests_until:
+            if time.perf_counter() < self._rests_until:
                 done = self._advance_while_resting(done, count, numbers, table)
             else:
                 done = self._advance_together(done, count, numbers, table)
