@@ -1,4 +1,4 @@
-"""Functions by which work reports its progress; what they raise stops the work there."""
+"""Functions by which work reports its progress; an exception from one stops the work at that point."""
 
 from __future__ import annotations
 

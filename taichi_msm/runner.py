@@ -257,7 +257,7 @@ def _carry_out(
             writer.finish(partial(progress, "frames", frames, frames))
         except KeyboardInterrupt:
             # An interruption outside `progress` may come before the last frame is stored.
-            if simulation.steps > 0 and simulation.frame < writer.stored:
+            if simulation.steps > 0 and simulation.frame < writer.stored and not simulation.torn:
                 # If the simulation diverges within this frame, the resumed run will find it.
                 with suppress(DivergedError):
                     writer.save(simulation.save())
@@ -298,9 +298,9 @@ def _pilot(
     if manifest.asks_estimate is False:
         return None, "not asked for"
     if manifest.asks_estimate is None and device.arch != "cpu":
-        return None, "on a GPU only --estimate-error asks for it"
+        return None, "a GPU does it only with --estimate-error"
     if manifest.asks_estimate is None and not affords_pilot(scene, grid, error_control.refinement(scene, grid)):
-        return None, "it would take more than a third of the run; --estimate-error asks for it"
+        return None, "it would take more than a third of the run; --estimate-error does it all the same"
     if resumed and not scene.output:
         return None, "the frames before the interruption were not kept"
     try:

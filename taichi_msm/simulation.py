@@ -111,6 +111,11 @@ class Simulation:
         return self._dynamics.steps_done
 
     @property
+    def torn(self) -> bool:
+        """Whether it was interrupted while steps were taken, so that only `restore` or `restart` make it whole."""
+        return self._dynamics.torn
+
+    @property
     def lanes(self) -> int:
         """Lanes of the vectors that the steps are computed in; 1 on a GPU."""
         return self._dynamics.structure.code.lanes

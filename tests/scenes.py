@@ -149,6 +149,6 @@ def with_steps(made: Scene, count: int) -> Scene:
     return with_time(made, step=1 / made.time.frames_per_second / count, tolerance=None)
 
 
-def with_grid(made: Scene) -> tuple[Scene, TimeGrid]:
+def scene_and_grid(made: Scene) -> tuple[Scene, TimeGrid]:
     """The scene and its steps."""
     return made, time_grid(made)

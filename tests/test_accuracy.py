@@ -261,7 +261,7 @@ def test_instruments_that_can_hardly_be_meant_are_noted(instrument: dict[str, An
 def test_a_scene_that_is_all_right_has_no_notes() -> None:
     assert not list(notes(scene(), time_grid(scene()), RunProgress(1, 1.0, 0.51), None))
     assert next(notes(scene(), time_grid(scene()), RunProgress(1, 0.0, 0.49), Estimate(40, 1e-3, 1e-4, 1e-3, 2))) == (
-        "error 0.001 of the largest displacement (step 0.001, rounding 0.0001)"
+        "error 0.001 of the largest displacement: 0.001 due to the time step, 0.0001 to rounding"
     )
     assert len(list(notes(scene(), time_grid(scene()), RunProgress(1, 0.0, 0.49), None))) == 2
 
@@ -301,9 +301,9 @@ def test_the_error_in_f64_is_that_of_the_step(device: Device) -> None:
     assert single.in_f64 == pytest.approx(double.error, rel=1e-9)
     assert double.in_f64 == double.error
     (said,) = notes(made, time_grid(made), MOVED, single)
-    assert f"(step {double.error:.1g}, rounding {single.rounding:.1g})" in said
+    assert f"{double.error:.1g} due to the time step, {single.rounding:.1g} to rounding" in said
     (said,) = notes(made, time_grid(made), MOVED, double)
-    assert said.endswith(f"(step {single.in_f64:.1g})")
+    assert said.endswith(f": {single.in_f64:.1g} due to the time step")
 
 
 @pytest.mark.parametrize("ends", [(0.0044889, 0.0121111), pytest.param((0.0067778, 0.0164444), marks=pytest.mark.slow)])

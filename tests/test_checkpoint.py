@@ -21,7 +21,7 @@ from taichi_msm.results.manifest import Manifest, read_manifest
 from taichi_msm.results.publication import MANIFEST, POSITIONS, STATE
 from taichi_msm.results.sealed import seal, unseal
 from taichi_msm.scene import Scene
-from tests.scenes import scene, with_grid
+from tests.scenes import scene, scene_and_grid
 
 FRAMES = 3
 EVERY = 17  # steps a frame
@@ -32,7 +32,7 @@ def small_scene() -> Scene:
 
 
 def checkpoint_in(staging: Folder) -> Checkpoint:
-    made, grid = with_grid(small_scene())
+    made, grid = scene_and_grid(small_scene())
     return Checkpoint(staging, grid, made.sheet.points, keeps_positions=True)
 
 

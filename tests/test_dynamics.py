@@ -13,6 +13,7 @@ import pytest
 from numpy.typing import NDArray
 
 from taichi_msm import reference
+from taichi_msm.errors import MsmError
 from taichi_msm.physics import kernel_cpu, kernel_gpu
 from taichi_msm.physics.kernel import Structure
 from taichi_msm.physics.lattice import rest_positions
@@ -494,11 +495,11 @@ def test_rests_grow_while_workers_give_up_and_are_forgotten_when_they_do_not(
         nonlocal now
         now, taken[0] = now + 0.001 * (end - done), taken[0] + end - done
 
-    def together(done: int, end: int, *_: object) -> int:
+    def together(done: int, end: int, *_: object) -> tuple[int, bool]:
         nonlocal now
         steps = end - done if patient else 1
         now, taken[1] = now + 0.001 * steps, taken[1] + steps
-        return steps
+        return steps, not patient
 
     monkeypatch.setattr(sweep, "_advance_alone", alone)
     monkeypatch.setattr(sweep, "_launch_together", together)
@@ -510,8 +511,47 @@ def test_rests_grow_while_workers_give_up_and_are_forgotten_when_they_do_not(
     patient = True
     sweep.advance(1_000_000, (), np.empty(0))
     patient, taken = False, [0, 0]
-    sweep.advance(4, (), np.empty(0))
-    assert taken == [2, 2]
+    sweep.advance(5, (), np.empty(0))
+    # One step in each launch of all; the rest of 2 ms takes pieces of one and two steps.
+    assert taken == [3, 2]
+
+
+def test_giving_up_in_the_last_pass_of_a_launch_counts(device: Device, monkeypatch: pytest.MonkeyPatch) -> None:
+    made = scene(sheet={**SHEET, "points": [101, 101]}, time={"precision": "f32"})
+    monkeypatch.setattr(kernel_cpu, "PATIENCE", 0)
+    dynamics = dynamics_of(made, device, replace(structure_of(made, device), workers=2, depth=8))
+    sweep = dynamics._moving
+    assert isinstance(sweep, kernel_cpu.Sweep)
+    for _ in range(200):
+        dynamics.advance(8)
+    assert sweep._rests_until > 0
+
+
+def test_a_sheet_that_was_interrupted_while_stepping_is_not_used(
+    device: Device, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Python may raise KeyboardInterrupt after a launch, before its steps are counted."""
+    made = scene()
+    dynamics = dynamics_of(made, device)
+    dynamics.advance(10)
+    saved, advance = dynamics.state(), dynamics._moving.advance
+
+    def interrupted(*arguments: Any) -> None:
+        advance(*arguments)
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(dynamics._moving, "advance", interrupted)
+    with pytest.raises(KeyboardInterrupt):
+        dynamics.advance(5)
+    monkeypatch.undo()
+    for use in (dynamics.state, dynamics.read, lambda: dynamics.advance(1)):
+        with pytest.raises(MsmError, match="restore what was saved before"):
+            use()
+    dynamics.restart(made, dynamics.grid, saved)
+    dynamics.advance(5)
+    fresh = dynamics_of(made, device)
+    fresh.advance(15)
+    assert dynamics.displacement().tobytes() == fresh.displacement().tobytes()
 
 
 def test_a_second_sheet_of_the_same_terms_compiles_nothing(device: Device, monkeypatch: pytest.MonkeyPatch) -> None:

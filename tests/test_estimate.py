@@ -107,7 +107,7 @@ def test_a_run_that_is_wrong_says_what_helps() -> None:
     tried = time_grid(with_time(scene(), step=found))
     assert tried.steps_per_frame == math.ceil(time_grid(scene()).steps_per_frame * 8**0.5)
     (first, rounding) = said(0.03, 0.03, 1e-4)
-    assert first == "error 0.03 of the largest displacement (step 0.0001, rounding 0.03)"
+    assert first == "error 0.03 of the largest displacement: 0.0001 due to the time step, 0.03 to rounding"
     assert rounding == (
         "the run is about 3 % wrong; try time.precision: f64, or more springs.virtual, where the sheet buckles"
     )

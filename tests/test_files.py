@@ -24,7 +24,7 @@ from taichi_msm.results.folder import Folder
 from taichi_msm.results.writer import ResultWriter
 from taichi_msm.scene import Scene
 from tests.outputs import files
-from tests.scenes import scene, speckle, with_grid
+from tests.scenes import scene, scene_and_grid, speckle
 
 ROWS, COLS = 3, 4
 WIDTH, HEIGHT = 40, 24
@@ -36,10 +36,10 @@ import sys
 from pathlib import Path
 from taichi_msm.render.labels import Observed
 from taichi_msm.results.writer import ResultWriter
-from tests.scenes import with_grid
+from tests.scenes import scene_and_grid
 from tests.test_files import picture, position, small_scene
 
-with ResultWriter(Path(sys.argv[1]), *with_grid(small_scene())) as writer:
+with ResultWriter(Path(sys.argv[1]), *scene_and_grid(small_scene())) as writer:
     for frame in itertools.count():
         writer.add(position(frame), Observed(picture(frame)))
         if frame == 10:
@@ -66,7 +66,7 @@ def picture(frame: int) -> NDArray[np.uint8]:
 
 
 def write(directory: Path, frames: int, scene: Scene) -> list[str]:
-    with ResultWriter(directory, *with_grid(scene)) as writer:
+    with ResultWriter(directory, *scene_and_grid(scene)) as writer:
         for frame in range(frames):
             writer.add(position(frame), Observed(picture(frame) if scene.draws else None))
         names: list[str] = writer.publish({})["outputs"]
@@ -145,7 +145,7 @@ def test_the_animation_is_like_its_frames(tmp_path: Path, light: float) -> None:
     later[:8] = (first[:8] * light).astype(np.uint8)
     background = (1, 99, 255)
     first[:, 0] = later[:, 0] = background
-    with ResultWriter(tmp_path, *with_grid(small_scene("gif", background=background, size=[16, 16]))) as writer:
+    with ResultWriter(tmp_path, *scene_and_grid(small_scene("gif", background=background, size=[16, 16]))) as writer:
         writer.add(position(0), Observed(first))
         writer.add(position(1), Observed(later))
         writer.publish({})
@@ -161,7 +161,7 @@ def test_leaving_without_publishing_leaves_what_was_there(tmp_path: Path) -> Non
     write(tmp_path / "out", 3, small_scene())
     before = files(tmp_path / "out")
     for directory in (tmp_path / "out", tmp_path / "fresh"):
-        with ResultWriter(directory, *with_grid(small_scene())) as writer:
+        with ResultWriter(directory, *scene_and_grid(small_scene())) as writer:
             writer.add(position(9), Observed(picture(9)))
     assert files(tmp_path / "out") == before
     assert not (tmp_path / "fresh").exists()
@@ -180,7 +180,7 @@ def test_an_interrupted_hand_over_leaves_whole_frames(
         raise KeyboardInterrupt
 
     add = Encoder.add
-    with ResultWriter(tmp_path / "interrupted", *with_grid(small_scene())) as writer:
+    with ResultWriter(tmp_path / "interrupted", *scene_and_grid(small_scene())) as writer:
         writer.add(position(0), Observed(picture(0)))
         with monkeypatch.context() as patch:
             patch.setattr(Encoder, "add", interrupted)
@@ -197,7 +197,7 @@ def test_an_interrupted_hand_over_leaves_whole_frames(
 def test_in_a_hurry_frames_are_given_up_and_those_left_are_whole(tmp_path: Path) -> None:
     made = small_scene(size=[1500, 1000])
     large = [speckle(1000, 1500, frame) for frame in range(7)]
-    with ResultWriter(tmp_path, *with_grid(made)) as writer:
+    with ResultWriter(tmp_path, *scene_and_grid(made)) as writer:
         for frame, shown in enumerate(large):
             writer.add(position(frame), Observed(shown))
         writer.finish(hurry=True)
@@ -216,7 +216,7 @@ def test_in_a_hurry_frames_are_given_up_and_those_left_are_whole(tmp_path: Path)
 
 @pytest.mark.skipif(sys.platform == "win32", reason="no sessions")
 def test_ctrl_c_does_not_reach_the_encoder(tmp_path: Path) -> None:
-    with ResultWriter(tmp_path, *with_grid(small_scene())) as writer:
+    with ResultWriter(tmp_path, *scene_and_grid(small_scene())) as writer:
         assert writer._encoder
         assert os.getsid(writer._encoder._process.pid) != os.getsid(0)
 
@@ -228,7 +228,7 @@ def test_who_waits_for_a_stopped_encoder_can_stop_waiting(tmp_path: Path) -> Non
     def stop() -> None:
         raise KeyboardInterrupt
 
-    with ResultWriter(tmp_path, *with_grid(small_scene())) as writer:
+    with ResultWriter(tmp_path, *scene_and_grid(small_scene())) as writer:
         assert writer._encoder
         os.kill(writer._encoder._process.pid, signal.SIGSTOP)
         for frame in range(3):
@@ -241,7 +241,7 @@ def test_who_waits_for_a_stopped_encoder_can_stop_waiting(tmp_path: Path) -> Non
 
 
 def test_the_time_spent_encoding_is_told(tmp_path: Path) -> None:
-    with ResultWriter(tmp_path, *with_grid(small_scene())) as writer:
+    with ResultWriter(tmp_path, *scene_and_grid(small_scene())) as writer:
         writer.add(position(0), Observed(picture(0)))
         writer.finish()
         assert 0 < writer.encode_seconds < 60
@@ -306,7 +306,7 @@ def test_positions_that_cannot_be_written(tmp_path: Path, points: int, limit: in
     soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
 
     def run() -> None:
-        with ResultWriter(tmp_path, *with_grid(scene(sheet=sheet, output=["trajectory"]))) as writer:
+        with ResultWriter(tmp_path, *scene_and_grid(scene(sheet=sheet, output=["trajectory"]))) as writer:
             resource.setrlimit(resource.RLIMIT_FSIZE, (limit, hard))
             writer.add(np.zeros((points, points, 3)), Observed())
             writer.publish({})
@@ -323,7 +323,7 @@ def refused(directory: Path, meanwhile: Callable[[ResultWriter], None] = lambda 
     """The error of a run of many frames in whose course something happens."""
 
     def run() -> None:
-        with ResultWriter(directory, *with_grid(small_scene())) as writer:
+        with ResultWriter(directory, *scene_and_grid(small_scene())) as writer:
             meanwhile(writer)
             for frame in range(1000):
                 writer.add(position(frame), Observed(picture(frame)))
@@ -374,7 +374,7 @@ def test_a_directory_that_vanishes(tmp_path: Path) -> None:
 
 
 def test_the_record_is_strict_json(tmp_path: Path) -> None:
-    with ResultWriter(tmp_path, *with_grid(scene())) as writer:
+    with ResultWriter(tmp_path, *scene_and_grid(scene())) as writer:
         with pytest.raises(ValueError, match="not JSON compliant"):
             writer.publish({"step": float("nan")})
         writer.publish({"image": "Schleimhaut-Ä.png", "odd": "\udcff.png"})

@@ -18,7 +18,7 @@ from taichi_msm.results.manifest import read_manifest
 from taichi_msm.results.publication import MANIFEST, is_unfinished
 from taichi_msm.results.writer import ResultWriter
 from taichi_msm.scene import Scene
-from tests.scenes import scene, speckle, with_grid
+from tests.scenes import scene, scene_and_grid, speckle
 
 pytestmark = pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="needs links and pipes")
 
@@ -46,7 +46,7 @@ def small_scene() -> Scene:
 def write(directory: Path, *, resumes: bool = False) -> None:
     """Run into a directory, without simulating."""
     made = small_scene()
-    with ResultWriter(directory, *with_grid(made), {}, resumes=resumes) as writer:
+    with ResultWriter(directory, *scene_and_grid(made), {}, resumes=resumes) as writer:
         for frame in range(made.time.frames + 1):
             writer.add(np.zeros((3, 4, 3)), Observed(speckle(6, 8, frame)))
         writer.publish({"status": "complete"})
@@ -209,7 +209,7 @@ def test_a_folder_exchanged_for_a_link_meanwhile(treasure: Path) -> None:
     """What is open stays where it is: nothing that follows goes elsewhere."""
     out, aside = treasure.parent / "out", treasure.parent / "aside"
     precious, made = snapshot(treasure), small_scene()
-    with ResultWriter(out, *with_grid(made), {}) as writer:
+    with ResultWriter(out, *scene_and_grid(made), {}) as writer:
         writer.add(np.zeros((3, 4, 3)), Observed(speckle(6, 8, 0)))
         shutil.move(out / ".partial", aside)
         (out / ".partial").symlink_to(treasure)

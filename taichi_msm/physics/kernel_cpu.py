@@ -14,8 +14,8 @@ n + 1 to n + 2, and so on.
 
 Bands. Every worker has a band of rows. Neighbouring workers sweep away from their common border or toward it, so that
 they arrive there at the same time. Each needs the other's row at the border as it was before the step: after every step
-both copy their row, into two copies by turns, and wait for the other's copy. The order in which forces are added does
-not depend on the direction of a sweep, so the bits of a result do not depend on the number of workers.
+each copies its row, into one of two buffers by turns, and waits for the other's copy. The order in which forces are
+added does not depend on the direction of a sweep, so the bits of a result do not depend on the number of workers.
 
 Bending. A moment is the Laplacian of the displacements, and the force on a row is the Laplacian of the moments. So
 before a row is stepped, the moments of the row ahead are computed, which depend on one row more. A pass is then one
@@ -67,8 +67,8 @@ BEGIN, END = 0, 1
 # How many times a worker checks for its neighbour before it gives up: about 0.2 ms.
 PATIENCE = 40_000
 
-# After a worker has given up, a single worker steps for some time [s]: four times as long as the last time, but half as
-# long for every so many seconds that all have stepped since then.
+# After a worker has given up, a single worker steps for some time [s]: four times the last such rest, halved for every
+# HALF_LIFE that all workers have stepped since then.
 SHORTEST_REST, LONGEST_REST, HALF_LIFE = 0.002, 0.2, 0.02
 
 # Numbers that record the place of a worker: pass, round and step of the round.
@@ -101,7 +101,7 @@ class Sweep:
         self._kernels = _kernels(s.code)
         self._steps = 0
         self._rest = self._rests_until = 0.0
-        # Time that all workers have stepped since the last rest [s].
+        # Time that all workers have stepped undisturbed since the last rest [s].
         self._together = 0.0
         self._first_row, self._end_row = int(s.fixed_rows[0]), s.rows - int(s.fixed_rows[1])
         # Stored after the sheet's own rows: two copies for every border of every worker.
@@ -169,38 +169,42 @@ class Sweep:
         # Pieces double, as nobody knows how long a step takes.
         piece = self._s.depth
         while done < end and time.perf_counter() < self._rests_until:
-            piece = min(2 * piece, end - done)
-            self._advance_alone(done, done + piece, numbers, table)
-            done += piece
+            until = min(done + piece, end)
+            self._advance_alone(done, until, numbers, table)
+            done, piece = until, 2 * piece
         self._copy_borders()
         return done
 
     def _advance_together(self, done: int, end: int, numbers: tuple[float, ...], table: NDArray[Any]) -> int:
-        """Take steps with all workers; returns how many are done, fewer than `end` if a worker gave up."""
+        """Take steps with all workers; returns how many are done, which may be fewer than `end` if a worker gave up."""
         start = time.perf_counter()
-        count = self._launch_together(done, end, numbers, table)
+        count, gave_up = self._launch_together(done, end, numbers, table)
         now = time.perf_counter()
-        self._together += now - start
-        if done + count < end:
+        if gave_up:
             rest = 4 * self._rest * 0.5 ** (self._together / HALF_LIFE)
             self._rest = min(max(rest, SHORTEST_REST), LONGEST_REST)
             self._together, self._rests_until = 0.0, now + self._rest
+        else:
+            self._together += now - start
         return done + count
 
-    def _launch_together(self, done: int, end: int, numbers: tuple[float, ...], table: NDArray[Any]) -> int:
-        """Launch all workers; returns how many steps they have taken, fewer than wanted if one gave up."""
+    def _launch_together(
+        self, done: int, end: int, numbers: tuple[float, ...], table: NDArray[Any]
+    ) -> tuple[int, bool]:
+        """Launch all workers; returns how many steps they have taken, and whether one gave up."""
         s, count, first = self._s, end - done, self._steps
         places = np.tile(np.array([0, -1, 0]), s.workers)
         self._launch(self._kernels.advance_together, s.workers, done, count, numbers, table, places)
         passes, rounds = places[::PLACE], places[1::PLACE]
-        if not (passes * s.depth >= count).all():
+        gave_up = not (passes * s.depth >= count).all()
+        if gave_up:
             # All continue to the end of the pass that the foremost of them is in.
             count = min(count, int((passes + (rounds >= 0)).max()) * s.depth)
             while not (passes * s.depth >= count).all():
                 self._steps = first
                 self._launch(self._kernels.advance_together, s.workers, done, count, numbers, table, places)
             self._steps = first + count
-        return count
+        return count, gave_up
 
     def _copy_borders(self) -> None:
         """Bring the copies of the rows at the borders of bands up to date, after steps of a single worker."""

@@ -22,7 +22,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from taichi_msm.errors import ArgumentError, DeviceError
+from taichi_msm.errors import ArgumentError, DeviceError, MsmError
 from taichi_msm.physics.kernel import (
     ACROSS,
     AREA,
@@ -62,7 +62,7 @@ from taichi_msm.timegrid import TimeGrid
 # With fewer points per worker, one worker more costs more time in waiting than it saves in work.
 POINTS_PER_WORKER = 450
 
-# A band that fills more of a core's cache than this [bytes] is taken so many steps further in one sweep.
+# Where a band fills more of a core's cache than this [bytes], a sweep takes so many steps.
 CACHE = 3 << 17
 DEPTH = 8
 
@@ -140,7 +140,9 @@ class Dynamics:
         grid: its steps.
         structure: what the kernels are compiled for.
         steps_done: number of steps taken.
-        launches: number of launches of the kernel.
+        launches: number of times that steps were taken without a pause.
+        torn: whether an exception, such as KeyboardInterrupt, came while steps were taken, so that it is not known how
+            many were; then only `restart` helps.
     """
 
     def __init__(
@@ -201,16 +203,24 @@ class Dynamics:
         Args:
             steps: how many.
             pause: called after every launch. An exception from it stops the sheet there; another call continues.
+
+        Raises:
+            MsmError: when the sheet is torn; so do `state` and `read`.
         """
         points = self.structure.rows * self.structure.cols
-        most = max(1, min(MAX_STEPS_PER_LAUNCH, POINT_STEPS_PER_LAUNCH // points))
+        most, depth = max(1, min(MAX_STEPS_PER_LAUNCH, POINT_STEPS_PER_LAUNCH // points)), self.structure.depth
+        # Whole passes, also where one takes somewhat longer than a launch should.
+        most = most // depth * depth or min(depth, 4 * most)
         if self.structure.workers == 0:
             most = STEPS_PER_LAUNCH
+        self._require_whole()
         end = self.steps_done + steps
         while self.steps_done < end:
             count = min(most, end - self.steps_done)
+            self.torn = True
             self._moving.advance(count, self._arguments, self._next_loads(count))
             self.steps_done += count
+            self.torn = False
             self.launches += 1
             pause()
 
@@ -229,10 +239,12 @@ class Dynamics:
 
     def state(self) -> State:
         """Read everything that the next steps depend on."""
+        self._require_whole()
         return State(self.steps_done, self._copy(differences=False)[0], self._copy(differences=True)[0])
 
     def read(self) -> Reading:
         """Read the displacements and measure the sheet, in the scene's precision."""
+        self._require_whole()
         displacement, measures = self._copy(differences=False)
         shortest, longest = (
             math.sqrt(max(0.0, 1.0 + float(one))) for one in (measures[:, LEAST].min(), measures[:, MOST].max())
@@ -254,6 +266,10 @@ class Dynamics:
         self._moving.read(spacing(self.scene.sheet), ReadArguments(differences, out, measures))
         return out, measures
 
+    def _require_whole(self) -> None:
+        if self.torn:
+            raise MsmError("interrupted while steps were taken; restore what was saved before, or restart the scene")
+
     def close(self) -> None:
         """Free the memory."""
         self._sheet = None
@@ -266,12 +282,13 @@ class Dynamics:
     def _begin(self, state: State | None) -> None:
         """Prepare the sheet at rest or in a given state."""
         self._real = np.dtype(np.float32 if self.structure.code.precision == "f32" else np.float64)
-        self.steps_done = 0 if state is None else state.steps
+        self.steps_done, self.torn = 0 if state is None else state.steps, True
         self._material = material(self.scene)
         self._verlet = coefficients(self._material, self.grid.step, self.scene.time.damping_difference)
         self._arguments = self._numbers()
         self._first_tabled, self._loads = self.steps_done, self._table(self.steps_done, STEPS_PER_TABLE)
         self._place(state)
+        self.torn = False
 
     def _numbers(self) -> tuple[float, ...]:
         """List the scene's numbers in the order of the kernel's arguments."""

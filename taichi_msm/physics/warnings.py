@@ -51,8 +51,8 @@ def notes(
             wrong = float(f"{100 * estimate.error:.2g}")
             yield f"the run is about {wrong:g} % wrong; {_remedy(scene, grid, estimate)}"
     elif reason:
-        points = "" if mesh_error is None else f"; of the points {mesh_error:.2g}"
-        yield f"error not estimated: {reason}{points}"
+        points = "" if mesh_error is None else f"; that due to the number of points is {mesh_error:.2g}"
+        yield f"error{' due to the time step' * bool(points)} not estimated: {reason}{points}"
     yield from probe_force.notes(scene, probe_force.probe_records(scene))
     yield from _instrument_notes(scene)
     if mesh_error is not None and WRONG < mesh_error < math.inf:
@@ -100,11 +100,15 @@ def error(estimate: Estimate, mesh_error: float | None = None) -> str:
     """Say how wrong a run is."""
     if estimate.error == math.inf:
         return "error not known: a pilot run diverged, or steps do not resolve the damping"
-    parts = f"step {estimate.in_f64:.1g}" + (f", rounding {estimate.rounding:.1g}" if estimate.rounding else "")
+    parts = [f"{estimate.in_f64:.1g} due to the time step"]
+    if estimate.rounding:
+        parts.append(f"{estimate.rounding:.1g} to rounding")
     if mesh_error is None:
-        return f"error {estimate.error:.1g} of the largest displacement ({parts})"
-    points = f"{mesh_error:.2g}" if mesh_error < math.inf else "not known"
-    return f"error, as a share of the largest displacement: {parts}, points {points}"
+        return f"error {estimate.error:.1g} of the largest displacement: {', '.join(parts)}"
+    points = f"{mesh_error:.2g}" if mesh_error < math.inf else "not known how much"
+    return (
+        f"error, as a fraction of the largest displacement: {', '.join([*parts, f'{points} to the number of points'])}"
+    )
 
 
 def _remedy(scene: Scene, grid: TimeGrid, estimate: Estimate) -> str:

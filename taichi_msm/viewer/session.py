@@ -346,7 +346,7 @@ class Session:
     def _figure_lines(self, pacing: str) -> list[str]:
         tool, speed = self.tool, ""
         if self.seconds_a_frame > 0:
-            speed = f"steps {1 / self.rate / self.seconds_a_frame:.0f} x real time"
+            speed = f"steps {1 / self.rate / self.seconds_a_frame:.2g} x real time"
         state = [word for word, on in (("paused", self.paused), ("film", self._recording.on)) if on]
         does = "pull" if self._pulls else "push"
         percent = f"{does} {abs(tool.percent):.0f} %" if tool.percent else f"tool {tool.strength:.0f} %"
