@@ -87,6 +87,6 @@ def summary(record: Mapping[str, Any], directory: Path) -> str:
         *([f"the first {record['resumed']} frames were simulated by an earlier run"] if record["resumed"] else []),
         *(f"probes.{index}: {in_words(probe)}" for index, probe in enumerate(record["probes"])),
         *record["notes"],
-        f"{times['total']:.2f} s: {stages}{' (encoding runs beside the rest)' if times['encode'] > 0 else ''}",
+        f"{times['total']:.2f} s: {stages}{' (encoding runs in parallel)' if times['encode'] > 0 else ''}",
     ]
     return "\n".join(lines)

@@ -298,9 +298,9 @@ def _pilot(
     if manifest.asks_estimate is False:
         return None, "not asked for"
     if manifest.asks_estimate is None and device.arch != "cpu":
-        return None, "a GPU does it only with --estimate-error"
+        return None, "on a GPU, this needs --estimate-error"
     if manifest.asks_estimate is None and not affords_pilot(scene, grid, error_control.refinement(scene, grid)):
-        return None, "it would take more than a third of the run; --estimate-error does it all the same"
+        return None, "it would take more than a third of the run; to have it anyway, pass --estimate-error"
     if resumed and not scene.output:
         return None, "the frames before the interruption were not kept"
     try:

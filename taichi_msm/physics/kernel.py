@@ -267,7 +267,7 @@ def spring_forces(code: Code) -> tuple[Callable[..., Any], Callable[..., Any]]:
 
     @ti.func
     def pull(weighted, square, length, to_x, to_y, to_z, tension, x, y, z):
-        """Force along the deformed spring, given k (L^2 - L0^2) and L^2, and the tension's for the difference."""
+        """Force along the deformed spring, from k (L^2 - L0^2) and L^2, plus tension times the difference (x, y, z)."""
         force = weighted / (square + length * ti.sqrt(square))
         force_x, force_y, force_z = force * to_x, force * to_y, force * to_z
         if ti.static(tense):
@@ -278,7 +278,7 @@ def spring_forces(code: Code) -> tuple[Callable[..., Any], Callable[..., Any]]:
 
     @ti.func
     def along(u: ti.template(), right, here_x, here_y, here_z, dx, stiffness, tension, exists):
-        """Force on the right neighbour, in entry `right` of u, of a point displaced by `here`; exists: 0 if none."""
+        """Force of a point displaced by `here` on its right neighbour, in entry `right` of u; exists: 0 if none."""
         x, y, z = here_x - u[0][right], here_y - u[1][right], here_z - u[2][right]
         to_x = x - dx
         rest = y * y + z * z
@@ -289,20 +289,10 @@ def spring_forces(code: Code) -> tuple[Callable[..., Any], Callable[..., Any]]:
 
     @ti.func
     def to_other_row(
-        u: ti.template(),
-        entry,
-        right: ti.template(),
-        here_x,
-        here_y,
-        here_z,
-        dx,
-        dy,
-        length,
-        stiffness,
-        tension,
-        exists,
-    ):
-        """Force on the neighbour in an entry of u, which is `right` columns on in the row dy above."""
+        u: ti.template(), entry, right: ti.template(), here_x, here_y, here_z,
+        dx, dy, length, stiffness, tension, exists,
+    ):  # fmt: skip
+        """Force of a point displaced by `here` on the neighbour in `entry`: `right` columns on, in the row dy above."""
         x, y, z = here_x - u[0][entry], here_y - u[1][entry], here_z - u[2][entry]
         to_x = x
         to_y = y - dy

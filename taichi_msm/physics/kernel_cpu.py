@@ -166,7 +166,7 @@ class Sweep:
 
     def _advance_while_resting(self, done: int, end: int, numbers: tuple[float, ...], table: NDArray[Any]) -> int:
         """Take steps with a single worker until it is time for all of them; returns how many are done."""
-        # Pieces double, as nobody knows how long a step takes.
+        # How long a step takes is not known, so pieces begin small and double.
         piece = self._s.depth
         while done < end and time.perf_counter() < self._rests_until:
             until = min(done + piece, end)
@@ -325,9 +325,9 @@ def _advance(code: Code, *, parallel: bool) -> Callable[..., None]:
         # Read once, because the compiler must assume that stores to the arrays change the table.
         now = [loads[n, c] for c in ti.static(range(columns))]
         for b in range(1, strip + 1):
-            # The neighbours are read again for every entry: to keep them would take more registers than there are.
+            # Neighbours are read again for every entry: there are too few registers to keep them.
             here_x, here_y, here_z = u[0][row + b], u[1][row + b], u[2][row + b]
-            # On the neighbours in the other row.
+            # Sum of the forces on the neighbours in the other row.
             force_x, force_y, force_z = vector(0), vector(0), vector(0)
             last_x, last_y, last_z = this_x, this_y, this_z
             this_x, this_y, this_z = coming_x, coming_y, coming_z
@@ -525,8 +525,8 @@ def _advance(code: Code, *, parallel: bool) -> Callable[..., None]:
                 turn = ti.cast(places[PLACE * worker], ti.i32)
                 k = ti.cast(places[PLACE * worker + 1], ti.i32)
                 step = ti.cast(places[PLACE * worker + 2], ti.i32)
-                # A vector that is read by a variable index stays on the stack, for which the compiler aligns the stack,
-                # and so all vectors for which there is no register: a step takes up to 7 % less.
+                # The compiler keeps a vector with a variable index on the stack, and aligns the stack for it. Then the
+                # vectors that it spills are aligned too: a step takes up to 7 % less. `goes` is True in any case.
                 aligned = vector(0)
                 aligned[workers % lanes] = 1
                 goes = aligned[count % lanes] >= 0

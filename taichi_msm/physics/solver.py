@@ -62,7 +62,7 @@ from taichi_msm.timegrid import TimeGrid
 # With fewer points per worker, one worker more costs more time in waiting than it saves in work.
 POINTS_PER_WORKER = 450
 
-# Where a band fills more of a core's cache than this [bytes], a sweep takes so many steps.
+# If a band takes more than CACHE bytes, its sweeps take DEPTH steps each.
 CACHE = 3 << 17
 DEPTH = 8
 
@@ -140,7 +140,7 @@ class Dynamics:
         grid: its steps.
         structure: what the kernels are compiled for.
         steps_done: number of steps taken.
-        launches: number of times that steps were taken without a pause.
+        launches: number of times that a series of steps was taken, each followed by a call of `pause`.
         torn: whether an exception, such as KeyboardInterrupt, came while steps were taken, so that it is not known how
             many were; then only `restart` helps.
     """
@@ -209,7 +209,7 @@ class Dynamics:
         """
         points = self.structure.rows * self.structure.cols
         most, depth = max(1, min(MAX_STEPS_PER_LAUNCH, POINT_STEPS_PER_LAUNCH // points)), self.structure.depth
-        # Whole passes, also where one takes somewhat longer than a launch should.
+        # A launch takes whole passes. If not even one is within the limit, it takes up to four times the limit.
         most = most // depth * depth or min(depth, 4 * most)
         if self.structure.workers == 0:
             most = STEPS_PER_LAUNCH

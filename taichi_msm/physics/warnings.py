@@ -51,8 +51,10 @@ def notes(
             wrong = float(f"{100 * estimate.error:.2g}")
             yield f"the run is about {wrong:g} % wrong; {_remedy(scene, grid, estimate)}"
     elif reason:
-        points = "" if mesh_error is None else f"; that due to the number of points is {mesh_error:.2g}"
-        yield f"error{' due to the time step' * bool(points)} not estimated: {reason}{points}"
+        if mesh_error is None:
+            yield f"error not estimated: {reason}"
+        else:
+            yield f"error {mesh_error:.2g} due to the number of points; due to the time step not estimated: {reason}"
     yield from probe_force.notes(scene, probe_force.probe_records(scene))
     yield from _instrument_notes(scene)
     if mesh_error is not None and WRONG < mesh_error < math.inf:
@@ -105,7 +107,7 @@ def error(estimate: Estimate, mesh_error: float | None = None) -> str:
         parts.append(f"{estimate.rounding:.1g} to rounding")
     if mesh_error is None:
         return f"error {estimate.error:.1g} of the largest displacement: {', '.join(parts)}"
-    points = f"{mesh_error:.2g}" if mesh_error < math.inf else "not known how much"
+    points = f"{mesh_error:.2g}" if mesh_error < math.inf else "an unknown part"
     return (
         f"error, as a fraction of the largest displacement: {', '.join([*parts, f'{points} to the number of points'])}"
     )

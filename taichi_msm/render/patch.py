@@ -55,7 +55,7 @@ def turn(p_x, p_y, q_x, q_y, r_x, r_y):
 
 @ti.func
 def seen_side(a_x, a_y, b_x, b_y, c_x, c_y, d_x, d_y):
-    """1 where the front of the cell with corners a, b and, below them, c, d is seen, -1 its back; 0 if it is folded."""
+    """Tell which side of a cell with corners a, b above c, d is seen: 1: front; -1: back; 0: both, as it is folded."""
     abd, bdc = turn(a_x, a_y, b_x, b_y, d_x, d_y), turn(b_x, b_y, d_x, d_y, c_x, c_y)
     dca, cab = turn(d_x, d_y, c_x, c_y, a_x, a_y), turn(c_x, c_y, a_x, a_y, b_x, b_y)
     least, most = ti.min(abd, bdc, dca, cab), ti.max(abd, bdc, dca, cab)
