@@ -6,6 +6,7 @@ and PNGs of 512 x 512 pixels, which take 18 ms: encoding in threads lengthens a 
 
 from __future__ import annotations
 
+import gc
 import os
 import pickle
 import select
@@ -209,6 +210,7 @@ def main() -> None:
         answer = RuntimeError(f"in the encoder: {type(error).__name__}: {error}")
     with suppress(BrokenPipeError):  # when the parent process was killed
         os.write(sys.stdout.fileno(), pickle.dumps(answer))
+    gc.freeze()  # The parent waits for the end, which a search for cycles would delay.
 
 
 def encode(job: Job, source: BinaryIO, hurry: Event) -> Report:

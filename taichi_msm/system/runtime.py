@@ -8,6 +8,7 @@ import io
 import os
 import re
 import tempfile
+import textwrap
 import threading
 import time
 import weakref
@@ -15,6 +16,7 @@ from collections import defaultdict
 from collections.abc import Iterator
 from dataclasses import dataclass, field, replace
 from pathlib import Path
+from types import CodeType, FunctionType, SimpleNamespace
 from typing import Any
 
 from taichi_msm.errors import ArgumentError, DeviceError, MsmError
@@ -32,6 +34,7 @@ __all__ = [
     "require_here",
     "start",
     "started",
+    "stop",
     "ti",
     "vector_bits",
 ]
@@ -51,6 +54,8 @@ os.environ.setdefault("TI_LOG_LEVEL", "error")
 
 import numpy as np
 import taichi as ti
+from taichi.lang import kernel_impl
+from taichi.lang._wrap_inspect import getsourcelines
 from taichi.lang.ast.ast_transformer_utils import ASTTransformerContext
 
 if os.environ["TI_LOG_LEVEL"] == "error":
@@ -191,6 +196,13 @@ def start(arch: str = "cpu", threads: int | None = None) -> Device:
     return _device
 
 
+def stop() -> None:
+    """Destroy what Taichi holds, and write its cache of compiled kernels; nothing of it can be used after that."""
+    global _device
+    ti.reset()
+    _device = None
+
+
 def require_here() -> None:
     """Make sure that Taichi can be used in this process and thread.
 
@@ -240,27 +252,49 @@ def our_compilation(*, optimised: bool = True) -> Iterator[None]:
         optimised: False leaves Taichi's other optimisations to LLVM too. It must be the same at every launch of a
             kernel.
     """
-    config, found = ti.lang.impl.current_cfg(), {}
-    wanted = {
-        "fast_math": False,
-        "cfg_optimization": False,
-        "advanced_optimization": optimised,
-        "real_matrix_scalarize": started().arch != "cpu",
-    }
-    for name, value in wanted.items():
-        found[name] = getattr(config, name)
-        setattr(config, name, value)
-    position = ASTTransformerContext.get_pos_info
-    if "TAICHI_MSM_TRACEBACK" not in os.environ:
-        # For every node of a kernel, Taichi prepares the source line that an error would show, which takes a third of
-        # the time of a warm compilation. It is useful only to those who change a kernel.
-        ASTTransformerContext.get_pos_info = lambda self, node: ""
+    config = ti.lang.impl.current_cfg()
+    settings = [
+        (config, "fast_math", False),
+        (config, "cfg_optimization", False),
+        (config, "advanced_optimization", optimised),
+        (config, "real_matrix_scalarize", started().arch != "cpu"),
+        *_SHORTCUTS,
+    ]
+    found = [(owner, name, getattr(owner, name)) for owner, name, _ in settings]
+    for owner, name, value in settings:
+        setattr(owner, name, value)
     try:
         yield
     finally:
-        ASTTransformerContext.get_pos_info = position
-        for name, value in found.items():
-            setattr(config, name, value)
+        for owner, name, value in found:
+            setattr(owner, name, value)
+
+
+_sources: dict[CodeType, tuple[list[str], int]] = {}
+
+
+def _source_lines(function: FunctionType) -> tuple[list[str], int]:
+    """Give the lines of a function, and the number of the first, as `inspect.getsourcelines` does, but find them once.
+
+    Taichi asks for them at every call of a function from a kernel, and it takes milliseconds to find them.
+    """
+    code = function.__code__
+    if code not in _sources:
+        _sources[code] = getsourcelines(function)
+    return _sources[code]
+
+
+# What replaces parts of Taichi while it reads our kernels, which it does in every process, as its cache is looked up by
+# what it has read. It reads them in half the time.
+_SHORTCUTS: list[tuple[Any, str, Any]] = [
+    (kernel_impl, "getsourcelines", _source_lines),
+    # Taichi expands tabs by `textwrap.fill`, which takes each line apart into words. We use no tabs.
+    (kernel_impl, "textwrap", SimpleNamespace(fill=lambda line, **how: line.rstrip(), dedent=textwrap.dedent)),
+]
+if "TAICHI_MSM_TRACEBACK" not in os.environ:
+    # For every node of a kernel, Taichi prepares the source line that an error would show. It is useful only to those
+    # who change a kernel.
+    _SHORTCUTS.append((ASTTransformerContext, "get_pos_info", lambda self, node: ""))
 
 
 def _cache() -> dict[str, Any]:
