@@ -127,11 +127,10 @@ def covering(code: Code) -> Callable[..., Any]:
 
     @ti.func
     def largest_edge(p_x, p_y, q_x, q_y, x, y, side):
-        """The largest `edge` times side in a tile whose upper left sample is at (x, y), rounded as `edge` rounds."""
-        right, down = (q_x - p_x) * side, (q_y - p_y) * side
-        x += ti.select(down > 0.0, 0.0, code.tile_width - 1.0)
-        y += ti.select(right > 0.0, code.tile_height - 1.0, 0.0)
-        return right * (y - p_y) - down * (x - p_x)
+        """The largest `edge` of the samples of a tile whose upper left sample is at (x, y)."""
+        x += ti.select((q_y - p_y) * side > 0.0, 0.0, code.tile_width - 1.0)
+        y += ti.select((q_x - p_x) * side > 0.0, code.tile_height - 1.0, 0.0)
+        return edge(p_x, p_y, q_x, q_y, x, y, side)
 
     @ti.func
     def normal_at(surface: ti.template(), cell: ti.template(), across, along):
@@ -229,14 +228,14 @@ def covering(code: Code) -> Callable[..., Any]:
         ) * cell.side >= 0.0
         if not cell.whole:
             below = floats(ti.cast(lower, ti.f32)) > 0.5
-        r_x += ti.select(below, twist[0], 0.0)
-        r_y += ti.select(below, twist[1], 0.0)
-        r_w += ti.select(below, twist[2], 0.0)
-        r_z += ti.select(below, twist[3], 0.0)
-        d_x += ti.select(below, 0.0, twist[0])
-        d_y += ti.select(below, 0.0, twist[1])
-        d_w += ti.select(below, 0.0, twist[2])
-        d_z += ti.select(below, 0.0, twist[3])
+        r_x = ti.select(below, r_x + twist[0], r_x)
+        r_y = ti.select(below, r_y + twist[1], r_y)
+        r_w = ti.select(below, r_w + twist[2], r_w)
+        r_z = ti.select(below, r_z + twist[3], r_z)
+        d_x = ti.select(below, d_x, d_x + twist[0])
+        d_y = ti.select(below, d_y, d_y + twist[1])
+        d_w = ti.select(below, d_w, d_w + twist[2])
+        d_z = ti.select(below, d_z, d_z + twist[3])
         plane = ti.static(Plane(p_x, p_y, p_w, r_x, r_y, r_w, d_x, d_y, d_w))
         s, t = on_triangle(x, y, plane)
         if not cell.whole:
@@ -362,47 +361,62 @@ def covering(code: Code) -> Callable[..., Any]:
             end_line = (end_row - band.top + (code.tile_height - 1)) // code.tile_height
             first_tile = first_column // code.tile_width
             end_tile = (end_column + (code.tile_width - 1)) // code.tile_width
-            for tile_line in range(first_line, end_line):
+            tiles = ti.max(end_line - first_line, 0) * ti.max(end_tile - first_tile, 0)
+            tile, tile_line = first_tile, first_line
+            # A tile is covered after the small quads of the next one are found: neither needs the other, so the
+            # processor works on both at once. `held` is where the tile begins that is covered next; -1: there is none.
+            held = -1
+            held_x, held_y, held_inside = floats(0), floats(0), floats(0)
+            held_column, held_line = floats(0), floats(0)
+            for n in range(tiles + 1):
+                tile_x = ti.cast(tile * code.tile_width, ti.f32)
                 tile_y = ti.cast(band.top + tile_line * code.tile_height, ti.f32)
-                for tile in range(first_tile, end_tile):
-                    tile_x = ti.cast(tile * code.tile_width, ti.f32)
-                    reached = True
-                    if whole:
-                        upper_x, upper_y = tile_x + 0.5, tile_y + 0.5
-                        reached = (
-                            largest_edge(a_x, a_y, c_x, c_y, upper_x, upper_y, -side) >= 0.0
-                            and largest_edge(b_x, b_y, d_x, d_y, upper_x, upper_y, side) > 0.0
-                            and largest_edge(a_x, a_y, b_x, b_y, upper_x, upper_y, side) >= 0.0
-                            and largest_edge(c_x, c_y, d_x, d_y, upper_x, upper_y, -side) > 0.0
+                reached = True
+                # The last round is there for the tile before it.
+                if whole and n < tiles:
+                    upper_x, upper_y = tile_x + 0.5, tile_y + 0.5
+                    reached = (
+                        largest_edge(a_x, a_y, c_x, c_y, upper_x, upper_y, -side) >= 0.0
+                        and largest_edge(b_x, b_y, d_x, d_y, upper_x, upper_y, side) > 0.0
+                        and largest_edge(a_x, a_y, b_x, b_y, upper_x, upper_y, side) >= 0.0
+                        and largest_edge(c_x, c_y, d_x, d_y, upper_x, upper_y, -side) > 0.0
+                    )
+                if reached:
+                    x = floats(columns) + tile_x
+                    y = floats(lines) + tile_y
+                    inside = floats(1) > 0.0
+                    column, line = floats(quad_s), floats(quad_t)
+                    if not whole:
+                        # Outside its bounds rounding would decide, in samples that depend on the tiles' shape.
+                        inside = (
+                            (x > ti.cast(first_column, ti.f32))
+                            & (x < ti.cast(end_column, ti.f32))
+                            & (y > ti.cast(first_row, ti.f32))
+                            & (y < ti.cast(end_row, ti.f32))
                         )
-                    if reached:
-                        x = floats(columns) + tile_x
-                        y = floats(lines) + tile_y
-                        inside = floats(1) > 0.0
-                        column, line = floats(quad_s), floats(quad_t)
-                        if not whole:
-                            # Outside its bounds rounding would decide, in samples that depend on the tiles' shape.
-                            inside = (
-                                (x > ti.cast(first_column, ti.f32))
-                                & (x < ti.cast(end_column, ti.f32))
-                                & (y > ti.cast(first_row, ti.f32))
-                                & (y < ti.cast(end_row, ti.f32))
+                    if whole:
+                        # Left and upper edges belong to a cell, right and lower ones do not.
+                        inside = (
+                            (edge(a_x, a_y, c_x, c_y, x, y, -side) >= 0.0)
+                            & (edge(b_x, b_y, d_x, d_y, x, y, side) > 0.0)
+                            & (edge(a_x, a_y, b_x, b_y, x, y, side) >= 0.0)
+                            & (edge(c_x, c_y, d_x, d_y, x, y, -side) > 0.0)
+                        )
+                        if ti.static(code.refined):
+                            column, line = small_quad(
+                                x, y, inside, surface.parts, cell.side, cell.a, cell.b, cell.c, cell.d
                             )
-                        if whole:
-                            # Left and upper edges belong to a cell, right and lower ones do not.
-                            inside = (
-                                (edge(a_x, a_y, c_x, c_y, x, y) * side <= 0.0)
-                                & (edge(b_x, b_y, d_x, d_y, x, y) * side > 0.0)
-                                & (edge(a_x, a_y, b_x, b_y, x, y) * side >= 0.0)
-                                & (edge(c_x, c_y, d_x, d_y, x, y) * side < 0.0)
-                            )
-                            if ti.static(code.refined):
-                                column, line = small_quad(
-                                    x, y, inside, surface.parts, cell.side, cell.a, cell.b, cell.c, cell.d
-                                )
+                    if held >= 0:
                         cover_tile(
-                            band.first + (tile_line * band.across + tile) * planes, x, y, inside, column, line,
+                            held, held_x, held_y, held_inside > 0.0, held_column, held_line,
                             lower, overstep, cell, surface, band,
                         )  # fmt: skip
+                    held = band.first + (tile_line * band.across + tile) * planes
+                    held_x, held_y, held_inside = x, y, ti.select(inside, 1.0, 0.0)
+                    held_column, held_line = column, line
+                tile += 1
+                if tile == end_tile:
+                    tile = first_tile
+                    tile_line += 1
 
     return cover

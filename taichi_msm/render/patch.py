@@ -42,9 +42,13 @@ def on_triangle(x, y, plane: ti.template()):
 
 
 @ti.func
-def edge(p_x, p_y, q_x, q_y, x, y):
-    """Twice the signed area of p, q and (x, y): the sign tells the side; both cells of an edge get the same bits."""
-    return (q_x - p_x) * (y - p_y) - (q_y - p_y) * (x - p_x)
+def edge(p_x, p_y, q_x, q_y, x, y, side):
+    """Twice the signed area of p, q and (x, y), times side, which is 1 or -1: the sign tells where (x, y) lies.
+
+    Both cells of an edge get the same bits, but for the sign.
+    """
+    right, down = (q_x - p_x) * side, (q_y - p_y) * side
+    return right * (y - p_y) - down * (x - p_x)
 
 
 @ti.func

@@ -235,10 +235,10 @@ def _hides(x, y, depth, index, own, own_triangle, cols, parts, near, point: ti.t
                 point[below], point[below + 1], point[below + POINT_NUMBERS], point[below + POINT_NUMBERS + 1]
             )  # fmt: skip
             if (
-                edge(a_x, a_y, c_x, c_y, x, y) * side <= 0.0
-                and edge(b_x, b_y, d_x, d_y, x, y) * side >= 0.0
-                and edge(a_x, a_y, b_x, b_y, x, y) * side >= 0.0
-                and edge(c_x, c_y, d_x, d_y, x, y) * side <= 0.0
+                edge(a_x, a_y, c_x, c_y, x, y, side) <= 0.0
+                and edge(b_x, b_y, d_x, d_y, x, y, side) >= 0.0
+                and edge(a_x, a_y, b_x, b_y, x, y, side) >= 0.0
+                and edge(c_x, c_y, d_x, d_y, x, y, side) <= 0.0
             ):
                 column, line = small_quad(x, y, True, parts, side, a, b, c, d)
                 s0, t0 = column * part, line * part
