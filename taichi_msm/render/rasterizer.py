@@ -27,8 +27,9 @@ from taichi_msm.render.shading import Out, Texture, resolving
 from taichi_msm.scene import Scene
 from taichi_msm.system.runtime import ITERATIONS_PER_THREAD, Memory, lanes, our_compilation, started, ti
 
-# Indices into the kernel's array of sizes; the last entry counts the bands that workers have taken.
-COLS, WIDTH, HEIGHT, TEXTURE_WIDTH, TEXTURE_HEIGHT, ROD_COUNT, TAKEN = range(7)
+# Indices into the kernel's array of sizes. The last three count the rows of mass points that workers have taken and
+# those that are projected, and the bands that workers have taken.
+COLS, WIDTH, HEIGHT, TEXTURE_WIDTH, TEXTURE_HEIGHT, ROD_COUNT, ROWS_TAKEN, ROWS_PROJECTED, BANDS_TAKEN = range(9)
 
 
 class Drawn(NamedTuple):
@@ -121,7 +122,7 @@ class Drawing:
         picture = np.empty((height, stride, 3) if code.picture else (1, 4, 3), np.uint8)
         pixels = width * height if code.labels else 1
         labels = np.zeros(4 * pixels, np.float32)
-        sizes = np.array([cols, width, height, *self._texture_size, len(rods), 0], np.int32)
+        sizes = np.array([cols, width, height, *self._texture_size, len(rods), 0, 0, 0], np.int32)
         with our_compilation(optimised=False):
             self._draw(
                 np.ascontiguousarray(position, np.float32),
@@ -201,6 +202,43 @@ def _kernel(code: Code) -> Callable[..., None]:
                 point[here + NORMAL + 2] = n_z
 
     @ti.func
+    def project_row(
+        position: ti.template(), numbers: ti.template(), point: ti.template(), reach: ti.template(), i, rows, cols
+    ):
+        """Project a row of mass points; store how far up and down in the picture it reaches."""
+        low, high = INFINITY, -INFINITY
+        for j in range(cols):
+            project(position, numbers, point, i, j, rows, cols)
+            here = (i * cols + j) * POINT_NUMBERS
+            if point[here + 2] > numbers[NEAR]:
+                low = ti.min(low, point[here + SEEN + 1])
+                high = ti.max(high, point[here + SEEN + 1])
+            else:
+                low, high = -INFINITY, INFINITY
+        reach[2 * i] = low
+        reach[2 * i + 1] = high
+
+    @ti.func
+    def project_all(
+        position: ti.template(), numbers: ti.template(), point: ti.template(), reach: ti.template(),
+        rows, sizes: ti.template(),
+    ):  # fmt: skip
+        """Project all rows of mass points, shared among the workers; returns when every row is done.
+
+        A worker that has not been started takes no row, so that none waits for it.
+        """
+        taking = True
+        while taking:
+            i = ti.atomic_add(sizes[ROWS_TAKEN], 1)
+            taking = i < rows
+            if taking:
+                project_row(position, numbers, point, reach, i, rows, sizes[COLS])
+                ti.atomic_add(sizes[ROWS_PROJECTED], 1)
+        projected = ti.atomic_add(sizes[ROWS_PROJECTED], 0)
+        while projected < rows:
+            projected = ti.atomic_add(sizes[ROWS_PROJECTED], 0)
+
+    @ti.func
     def draw_band(surface: ti.template(), band: ti.template(), reach: ti.template()):
         """Find what every sample of a band shows."""
         lines = (band.bottom - band.top + code.tile_height - 1) // code.tile_height
@@ -230,24 +268,16 @@ def _kernel(code: Code) -> Callable[..., None]:
         colours: ti.types.ndarray(dtype=ti.i32 if code.in_words else ti.u8, ndim=1),
         labels: ti.types.ndarray(dtype=ti.f32, ndim=1),
     ):
-        for index in range(rows * ITERATIONS_PER_THREAD):
-            if index % ITERATIONS_PER_THREAD == 0:
-                i = index // ITERATIONS_PER_THREAD
-                low, high = INFINITY, -INFINITY
-                cols = sizes[COLS]
-                for j in range(cols):
-                    project(position, numbers, point, i, j, rows, cols)
-                    here = (i * cols + j) * POINT_NUMBERS
-                    if point[here + 2] > numbers[NEAR]:
-                        low = ti.min(low, point[here + SEEN + 1])
-                        high = ti.max(high, point[here + SEEN + 1])
-                    else:
-                        low, high = -INFINITY, INFINITY
-                reach[2 * i] = low
-                reach[2 * i + 1] = high
+        # On a GPU there may be more workers than run at once, so that they cannot wait for each other.
+        if ti.static(code.lanes == 1):
+            for i in range(rows):
+                project_row(position, numbers, point, reach, i, rows, sizes[COLS])
 
         for index in range(workers * ITERATIONS_PER_THREAD):
             if index % ITERATIONS_PER_THREAD == 0:
+                if ti.static(code.lanes > 1):
+                    # One parallel loop less: to wake the workers once more would take longer than to project a sheet.
+                    project_all(position, numbers, point, reach, rows, sizes)
                 width, height = sizes[WIDTH], sizes[HEIGHT]
                 texture_width, texture_height = sizes[TEXTURE_WIDTH], sizes[TEXTURE_HEIGHT]
                 cols, rod_count, parts, near = sizes[COLS], sizes[ROD_COUNT], numbers[PARTS], numbers[NEAR]
@@ -261,7 +291,7 @@ def _kernel(code: Code) -> Callable[..., None]:
                 # Bands are taken one by one: if another program delays a worker, the others take its bands.
                 taking = True
                 while taking:
-                    row = ti.atomic_add(sizes[TAKEN], 1) * code.band_rows
+                    row = ti.atomic_add(sizes[BANDS_TAKEN], 1) * code.band_rows
                     taking = row < height
                     if taking:
                         end_row = ti.min(row + code.band_rows, height)
