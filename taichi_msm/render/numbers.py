@@ -1,4 +1,7 @@
-"""The numbers of a view, its light and its instruments, in one array, as every argument of a kernel costs time."""
+"""What kernel 2 is told of a picture, in two arrays, as every argument of a kernel costs time.
+
+One holds sizes and counters; the other the numbers of the view, its light and its instruments.
+"""
 
 from __future__ import annotations
 
@@ -15,8 +18,14 @@ from taichi_msm.scene import Render
 
 Array = NDArray[np.float64]
 
-# Indices into the array. The camera: its matrix, row after row; its axes; only what is farther than NEAR is drawn. Then
-# the number of small quads along a side of a cell, and the background's colour.
+# Indices into the array of sizes. Three entries count the rows of mass points that workers have taken and those that
+# are projected, and the bands that workers have taken. Last come the levels of the texture, each with its first texel,
+# its width and its height.
+ROWS, COLS, WIDTH, HEIGHT, ROD_COUNT, ROWS_TAKEN, ROWS_PROJECTED, BANDS_TAKEN, LEVEL_COUNT, LEVELS = range(10)
+LEVEL_SIZES = 3
+
+# Indices into the array of numbers. The camera: its matrix, row after row; its axes; only what is farther than NEAR is
+# drawn. Then the number of small quads along a side of a cell, and the background's colour.
 MATRIX, AXES, NEAR, PARTS, BACKGROUND = 0, 16, 25, 26, 27
 
 # The middle of the picture [samples]; metres per sample at w = 1; 1 for a pinhole camera, else 0.

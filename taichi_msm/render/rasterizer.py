@@ -20,16 +20,27 @@ from taichi_msm.render.coverage import NORMAL, POINT_NUMBERS, SEEN, Band, Surfac
 from taichi_msm.render.instrument import Rod
 from taichi_msm.render.instrument_coverage import instruments
 from taichi_msm.render.labels import Labels
-from taichi_msm.render.numbers import AXES, MATRIX, NEAR, PARTS, view_numbers
+from taichi_msm.render.numbers import (
+    AXES,
+    BANDS_TAKEN,
+    COLS,
+    HEIGHT,
+    LEVELS,
+    MATRIX,
+    NEAR,
+    PARTS,
+    ROD_COUNT,
+    ROWS,
+    ROWS_PROJECTED,
+    ROWS_TAKEN,
+    WIDTH,
+    view_numbers,
+)
 from taichi_msm.render.pyramid import pyramid
 from taichi_msm.render.samples import DEPTH, INFINITY, Code
 from taichi_msm.render.shading import Out, Texture, resolving
 from taichi_msm.scene import Scene
 from taichi_msm.system.runtime import ITERATIONS_PER_THREAD, Memory, lanes, our_compilation, started, ti
-
-# Indices into the kernel's array of sizes. The last three count the rows of mass points that workers have taken and
-# those that are projected, and the bands that workers have taken.
-COLS, WIDTH, HEIGHT, TEXTURE_WIDTH, TEXTURE_HEIGHT, ROD_COUNT, ROWS_TAKEN, ROWS_PROJECTED, BANDS_TAKEN = range(9)
 
 
 class Drawn(NamedTuple):
@@ -85,13 +96,13 @@ class Drawing:
         bands = -(-height // self.code.band_rows)
         self._workers = min(bands, started().threads) if started().arch == "cpu" else bands
         self._memory = memory = Memory()
-        self._point = memory.array("f32", 0, rows * cols * POINT_NUMBERS)
-        # For every row of mass points, its highest and its lowest place in the picture.
-        self._reach = memory.array("f32", 0, rows * 2)
+        # After the mass points, for every row of them, its highest and its lowest place in the picture.
+        self._point = memory.array("f32", 0, rows * (cols * POINT_NUMBERS + 2))
         self._samples = memory.array("f32", self.code.lanes, self._workers * self.code.band_vectors(width))
         self._known: tuple[View, NDArray[np.float32]] | None = None
         self._texture_size = texture.shape[1], texture.shape[0]
-        texels, self._levels = pyramid(texture, minified=self.code.tissue)
+        texels, levels = pyramid(texture, minified=self.code.tissue)
+        self._sizes = np.array([rows, cols, width, height, 0, 0, 0, 0, len(levels), *levels.flat], np.int32)
         self._texels: Any = texels
         if started().arch != "cpu":
             # The texture stays on the device; a NumPy array would be copied there and back with every picture.
@@ -116,24 +127,22 @@ class Drawing:
     def look(self, position: NDArray[Any], camera: View | None = None, rods: Sequence[Rod] = ()) -> Drawn:
         """Draw the picture, the labels or both, as the code says; arguments as for `draw`."""
         camera, code = camera or self._view, self.code
-        (rows, cols), (width, height) = self.scene.sheet.points, self.scene.render.size
+        width, height = self.scene.render.size
         # Whole tiles are written, and the last of a row may reach beyond the picture.
         stride = code.tiles_across(width) * code.tile_width if code.in_words else width
         picture = np.empty((height, stride, 3) if code.picture else (1, 4, 3), np.uint8)
-        pixels = width * height if code.labels else 1
-        labels = np.zeros(4 * pixels, np.float32)
-        sizes = np.array([cols, width, height, *self._texture_size, len(rods), 0, 0, 0], np.int32)
+        pixels = width * height
+        # Without labels nothing is written there, and an array of Taichi's costs half the time of one of NumPy's.
+        labels = np.zeros(4 * pixels, np.float32) if code.labels else self._point
+        self._sizes[ROD_COUNT : BANDS_TAKEN + 1] = len(rods), 0, 0, 0
         with our_compilation(optimised=False):
             self._draw(
                 np.ascontiguousarray(position, np.float32),
                 self._texels,
-                self._levels,
                 self._numbers(camera, rods),
-                rows,
                 self._workers,
-                sizes,
+                self._sizes,
                 self._point,
-                self._reach,
                 self._samples,
                 picture.ravel().view(np.int32) if code.in_words else picture.ravel(),
                 labels,
@@ -203,8 +212,8 @@ def _kernel(code: Code) -> Callable[..., None]:
 
     @ti.func
     def project_row(
-        position: ti.template(), numbers: ti.template(), point: ti.template(), reach: ti.template(), i, rows, cols
-    ):
+        position: ti.template(), numbers: ti.template(), point: ti.template(), i, rows, cols
+    ):  # fmt: skip
         """Project a row of mass points; store how far up and down in the picture it reaches."""
         low, high = INFINITY, -INFINITY
         for j in range(cols):
@@ -215,13 +224,12 @@ def _kernel(code: Code) -> Callable[..., None]:
                 high = ti.max(high, point[here + SEEN + 1])
             else:
                 low, high = -INFINITY, INFINITY
-        reach[2 * i] = low
-        reach[2 * i + 1] = high
+        point[rows * cols * POINT_NUMBERS + 2 * i] = low
+        point[rows * cols * POINT_NUMBERS + 2 * i + 1] = high
 
     @ti.func
     def project_all(
-        position: ti.template(), numbers: ti.template(), point: ti.template(), reach: ti.template(),
-        rows, sizes: ti.template(),
+        position: ti.template(), numbers: ti.template(), point: ti.template(), rows, cols, sizes: ti.template()
     ):  # fmt: skip
         """Project all rows of mass points, shared among the workers; returns when every row is done.
 
@@ -232,23 +240,25 @@ def _kernel(code: Code) -> Callable[..., None]:
             i = ti.atomic_add(sizes[ROWS_TAKEN], 1)
             taking = i < rows
             if taking:
-                project_row(position, numbers, point, reach, i, rows, sizes[COLS])
+                project_row(position, numbers, point, i, rows, cols)
                 ti.atomic_add(sizes[ROWS_PROJECTED], 1)
         projected = ti.atomic_add(sizes[ROWS_PROJECTED], 0)
         while projected < rows:
             projected = ti.atomic_add(sizes[ROWS_PROJECTED], 0)
 
     @ti.func
-    def draw_band(surface: ti.template(), band: ti.template(), reach: ti.template()):
+    def draw_band(surface: ti.template(), band: ti.template()):
         """Find what every sample of a band shows."""
         lines = (band.bottom - band.top + code.tile_height - 1) // code.tile_height
         for tile in range(lines * band.across):
             band.samples[band.first + tile * code.planes + DEPTH] = floats(INFINITY)
             if ti.static(code.instruments):
                 band.samples[band.first + tile * code.planes + ti.static(code.layout["instrument"])] = floats(0)
+        reach = surface.rows * surface.cols * POINT_NUMBERS
         for i in range(surface.rows - 1):
-            low = ti.min(reach[2 * i], reach[2 * i + 2])
-            high = ti.max(reach[2 * i + 1], reach[2 * i + 3])
+            row = reach + 2 * i
+            low = ti.min(surface.point[row], surface.point[row + 2])
+            high = ti.max(surface.point[row + 1], surface.point[row + 3])
             if low < band.bottom and high > band.top:
                 for j in range(surface.cols - 1):
                     cover(i, j, surface, band)
@@ -257,34 +267,31 @@ def _kernel(code: Code) -> Callable[..., None]:
     def draw(
         position: ti.types.ndarray(dtype=ti.f32, ndim=3),
         texels: ti.types.ndarray(dtype=ti.f32, ndim=1),
-        levels: ti.types.ndarray(dtype=ti.i32, ndim=2),
         numbers: ti.types.ndarray(dtype=ti.f32, ndim=1),
-        rows: ti.i32,
         workers: ti.i32,
         sizes: ti.types.ndarray(dtype=ti.i32, ndim=1),
         point: ti.types.ndarray(dtype=ti.f32, ndim=1),
-        reach: ti.types.ndarray(dtype=ti.f32, ndim=1),
         samples: ti.types.ndarray(dtype=floats, ndim=1),
         colours: ti.types.ndarray(dtype=ti.i32 if code.in_words else ti.u8, ndim=1),
         labels: ti.types.ndarray(dtype=ti.f32, ndim=1),
     ):
         # On a GPU there may be more workers than run at once, so that they cannot wait for each other.
         if ti.static(code.lanes == 1):
-            for i in range(rows):
-                project_row(position, numbers, point, reach, i, rows, sizes[COLS])
+            for i in range(sizes[ROWS]):
+                project_row(position, numbers, point, i, sizes[ROWS], sizes[COLS])
 
         for index in range(workers * ITERATIONS_PER_THREAD):
             if index % ITERATIONS_PER_THREAD == 0:
+                rows, cols, width, height = sizes[ROWS], sizes[COLS], sizes[WIDTH], sizes[HEIGHT]
                 if ti.static(code.lanes > 1):
                     # One parallel loop less: to wake the workers once more would take longer than to project a sheet.
-                    project_all(position, numbers, point, reach, rows, sizes)
-                width, height = sizes[WIDTH], sizes[HEIGHT]
-                texture_width, texture_height = sizes[TEXTURE_WIDTH], sizes[TEXTURE_HEIGHT]
-                cols, rod_count, parts, near = sizes[COLS], sizes[ROD_COUNT], numbers[PARTS], numbers[NEAR]
+                    project_all(position, numbers, point, rows, cols, sizes)
+                texture_width, texture_height = sizes[LEVELS + 1], sizes[LEVELS + 2]
+                rod_count, parts, near = sizes[ROD_COUNT], numbers[PARTS], numbers[NEAR]
                 across = (width * factor + code.tile_width - 1) // code.tile_width
                 first = index // ITERATIONS_PER_THREAD * across * (code.band_lines * code.planes)
                 surface = ti.static(Surface(point, rows, cols, parts, texture_width, texture_height))
-                texture = ti.static(Texture(texels, levels, texture_width, texture_height, numbers, rod_count))
+                texture = ti.static(Texture(texels, sizes, texture_width, texture_height, numbers, rod_count))
                 pixels = width * height
                 out = ti.static(Out(colours, labels, pixels))
                 samples_width, samples_height = width * factor, height * factor
@@ -299,7 +306,7 @@ def _kernel(code: Code) -> Callable[..., None]:
                         band = ti.static(
                             Band(samples, first, across, top, bottom, samples_width, samples_height, near, numbers)
                         )
-                        draw_band(surface, band, reach)
+                        draw_band(surface, band)
                         if ti.static(code.instruments):
                             cover_rods(rod_count, band)
                         resolve(samples, first, row, end_row, across, width, texture, out)

@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 
 from taichi_msm.render import style
 from taichi_msm.render.lighting import lighting
-from taichi_msm.render.numbers import ACROSS, BACKGROUND, SLOPE_X, SLOPE_Y, UP
+from taichi_msm.render.numbers import ACROSS, BACKGROUND, LEVEL_COUNT, LEVEL_SIZES, LEVELS, SLOPE_X, SLOPE_Y, UP
 from taichi_msm.render.samples import DEPTH, INFINITY, TEXEL_X, TEXEL_Y, Code
 from taichi_msm.system.runtime import ti
 
@@ -22,14 +22,14 @@ class Texture(NamedTuple):
 
     Attributes:
         texels: as in a `Pyramid`.
-        levels: likewise.
+        sizes: of its levels, after other sizes (`numbers`).
         width, height: of the first level.
         numbers: as `view_numbers` makes them.
         rod_count: how many instruments there are.
     """
 
     texels: Any
-    levels: Any
+    sizes: Any
     width: Any
     height: Any
     numbers: Any
@@ -131,19 +131,19 @@ def shading(code: Code) -> Callable[..., Any]:
             if most > 1.0:
                 # For every sample, the coarsest level whose texels are not larger than the sample is mixed with the
                 # next coarser one.
-                last = texture.levels.shape[0] - 1
+                last = texture.sizes[LEVEL_COUNT] - 1
                 level, bound = 0, 1.0
                 while level <= last and most >= bound:
                     larger = footprint >= bound
-                    far = ti.min(level + 1, last)
+                    here, far = LEVELS + LEVEL_SIZES * level, LEVELS + LEVEL_SIZES * ti.min(level + 1, last)
                     if level > 0:
                         texel = ti.select(larger, texel * 2.0, texel)
-                        first = ti.select(larger, texture.levels[level, 0], first)
-                        width = ti.select(larger, texture.levels[level, 1], width)
-                        height = ti.select(larger, texture.levels[level, 2], height)
-                    first_far = ti.select(larger, texture.levels[far, 0], first_far)
-                    width_far = ti.select(larger, texture.levels[far, 1], width_far)
-                    height_far = ti.select(larger, texture.levels[far, 2], height_far)
+                        first = ti.select(larger, texture.sizes[here], first)
+                        width = ti.select(larger, texture.sizes[here + 1], width)
+                        height = ti.select(larger, texture.sizes[here + 2], height)
+                    first_far = ti.select(larger, texture.sizes[far], first_far)
+                    width_far = ti.select(larger, texture.sizes[far + 1], width_far)
+                    height_far = ti.select(larger, texture.sizes[far + 2], height_far)
                     bound = bound * 4.0
                     level += 1
                 x = (x + 0.5) / texel - 0.5
