@@ -179,27 +179,24 @@ def in_lanes(s: Structure, values: NDArray[Any]) -> NDArray[Any]:
     return laid.reshape(-1, s.code.lanes)
 
 
+@cache
 def _fill_kernel(code: Code) -> Callable[..., None]:
-    """Make the kernel that copies numbers, shape (entries, lanes), to the beginning of an array of vectors."""
+    """Make the kernel that sets an array of vectors to numbers, shape (entries, lanes), and to zero after them."""
     vector, lanes = code.vector, code.lanes
 
     @ti.kernel
-    def fill(target: ti.types.ndarray(dtype=vector, ndim=1), source: ti.types.ndarray(dtype=code.real, ndim=2)):
-        for n in range(source.shape[0]):
-            target[n] = vector([source[n, lane] for lane in ti.static(range(lanes))])
+    def fill(
+        target: ti.types.ndarray(dtype=vector, ndim=1),
+        source: ti.types.ndarray(dtype=code.real, ndim=2),
+        length: ti.i32,
+    ):
+        for n in range(length):
+            if n < source.shape[0]:
+                target[n] = vector([source[n, lane] for lane in ti.static(range(lanes))])
+            else:
+                target[n] = vector(0)
 
     return fill
-
-
-def _clear_kernel(code: Code) -> Callable[..., None]:
-    """Make the kernel that sets the beginning of an array of vectors to zero."""
-
-    @ti.kernel
-    def clear(target: ti.types.ndarray(dtype=code.vector, ndim=1), length: ti.i32):
-        for n in range(length):
-            target[n] = code.vector(0)
-
-    return clear
 
 
 class SheetArrays:
@@ -215,40 +212,38 @@ class SheetArrays:
         by_column, decay, stiffness, state = start
         self._s = s
         self._memory = Memory()
-        self._fill, clear = _filling(s.code)
         self.u = [self.rows(len(stored)) for _ in range(3)]
         self.d = [self.rows(s.rows) for _ in range(3)]
         self.by_column = self.rows(len(by_column))
         self.decay = self.rows(max(1, len(decay)) * s.rows)
         self.stiffness = [self.rows(s.rows + 1 if s.code.mapped else 1) for _ in range(3)]
-        with our_compilation():
-            self._fill(self.by_column, in_lanes(s, by_column))
-            for array, values in zip(self.stiffness, stiffness or (), strict=False):
-                self._fill(array, in_lanes(s, values))
-            for c in range(3):
-                if state is None:
-                    clear(self.u[c], len(stored) * s.width)
-                    clear(self.d[c], s.rows * s.width)
-                else:
-                    held = (stored >= 0)[:, None]
-                    self._fill(self.u[c], in_lanes(s, np.where(held, state[0][stored, :, c], 0)))
-                    self._fill(self.d[c], in_lanes(s, state[1][..., c]))
+        self._set(self.by_column, by_column)
+        for array, values in zip(self.stiffness, stiffness or (), strict=False):
+            self._set(array, values)
+        for c in range(3):
+            if state is None:
+                self._set(self.u[c], np.zeros((1, s.cols)), len(stored))
+                self._set(self.d[c], np.zeros((1, s.cols)), s.rows)
+            else:
+                held = (stored >= 0)[:, None]
+                self._set(self.u[c], np.where(held, state[0][stored, :, c], 0))
+                self._set(self.d[c], state[1][..., c])
         self.set_decay(decay)
 
     def set_decay(self, decay: NDArray[Any]) -> None:
         """Replace the decays of the standing slots, shape (slots, rows, cols)."""
         if len(decay):
-            with our_compilation():
-                self._fill(self.decay, in_lanes(self._s, decay))
+            self._set(self.decay, decay)
+
+    def _set(self, array: Any, values: NDArray[Any], rows: int = 0) -> None:
+        """Set rows of an array to values, shape (..., cols), and to zero after them until there are `rows`."""
+        laid = in_lanes(self._s, values)
+        with our_compilation():
+            _fill_kernel(self._s.code)(array, laid, max(len(laid), rows * self._s.width))
 
     def rows(self, count: int) -> Any:
         """Allocate an array of `count` rows; its content is arbitrary."""
         return self._memory.array(self._s.code.precision, self._s.code.lanes, count * self._s.width)
-
-
-@cache
-def _filling(code: Code) -> tuple[Callable[..., None], Callable[..., None]]:
-    return _fill_kernel(code), _clear_kernel(code)
 
 
 def spring_forces(code: Code) -> tuple[Callable[..., Any], Callable[..., Any]]:
