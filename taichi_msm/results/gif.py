@@ -29,7 +29,7 @@ TRANSPARENT = COLOURS
 
 # The palette is chosen from this many pixels of the first frame along each axis, at these levels of light: the first
 # frame shows the sheet at rest, whose parts later turn toward the headlight and away from it. Most parts do not turn.
-SAMPLES = 64
+SAMPLES = 48
 LIGHT = (1.0, 1.0, 1.0, 1.0, 1.15, 1.3, 0.8, 0.6, 0.35, 0.15)
 
 # Pillow's lookup gives each cell of 4 x 4 x 4 colours the palette entry nearest to the cell's darkest corner. Looking
