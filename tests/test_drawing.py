@@ -51,6 +51,22 @@ def difference(a: NDArray[np.uint8], b: NDArray[np.uint8]) -> NDArray[np.int_]:
     return np.abs(a.astype(int) - b.astype(int)).max(axis=-1)
 
 
+def test_nothing_is_drawn_before_every_mass_point_is_projected(device: Device) -> None:
+    """Three rows for two workers: the one that has projected a single row must wait for the other.
+
+    The last row is seen at the top, where drawing begins. What an earlier picture has left is below the picture.
+    """
+    made = scene(sheet={**SHEET, "points": [3, 4000]}, render={"size": [8, 32], "refine": 0})
+    texture = speckle(16, 16)
+    together, alone = Drawing(made, texture), Drawing(made, texture)
+    alone._workers = 1
+    assert together._workers == 2
+    position = rest_positions(made.sheet) * [1, -1, 1]
+    for _ in range(40):
+        together.draw(position - 1)
+        assert (together.draw(position) == alone.draw(position)).all()
+
+
 @pytest.mark.parametrize(
     "render",
     [
