@@ -25,6 +25,7 @@ from taichi_msm.render.numbers import (
     BANDS_TAKEN,
     COLS,
     HEIGHT,
+    LEVEL_COUNT,
     LEVELS,
     MATRIX,
     NEAR,
@@ -102,7 +103,9 @@ class Drawing:
         self._known: tuple[View, NDArray[np.float32]] | None = None
         self._texture_size = texture.shape[1], texture.shape[0]
         texels, levels = pyramid(texture, minified=self.code.tissue)
-        self._sizes = np.array([rows, cols, width, height, 0, 0, 0, 0, len(levels), *levels.flat], np.int32)
+        self._sizes = np.zeros(LEVELS + levels.size, np.int32)
+        self._sizes[[ROWS, COLS, WIDTH, HEIGHT, LEVEL_COUNT]] = rows, cols, width, height, len(levels)
+        self._sizes[LEVELS:] = levels.flat
         self._texels: Any = texels
         if started().arch != "cpu":
             # The texture stays on the device; a NumPy array would be copied there and back with every picture.
@@ -284,7 +287,7 @@ def _kernel(code: Code) -> Callable[..., None]:
             if index % ITERATIONS_PER_THREAD == 0:
                 rows, cols, width, height = sizes[ROWS], sizes[COLS], sizes[WIDTH], sizes[HEIGHT]
                 if ti.static(code.lanes > 1):
-                    # One parallel loop less: to wake the workers once more would take longer than to project a sheet.
+                    # To start a loop for this alone would take longer than to project a small sheet.
                     project_all(position, numbers, point, rows, cols, sizes)
                 texture_width, texture_height = sizes[LEVELS + 1], sizes[LEVELS + 2]
                 rod_count, parts, near = sizes[ROD_COUNT], numbers[PARTS], numbers[NEAR]
