@@ -7,15 +7,16 @@ import sys
 
 from taichi_msm.system import signals, streams
 
-# Objects between two searches for unreachable cycles. Python's 700 are few where imports make half a million objects
-# that all stay: these searches took a twentieth of a short run.
+# New objects after which Python searches for unreachable cycles. Its own 700, or 2000, are few where imports make half
+# a million objects that stay: the searches took a twentieth of a short run.
 BETWEEN_SEARCHES = 100_000
 
 
 def main() -> int:
     """Run the command line of the process."""
     gc.set_threshold(BETWEEN_SEARCHES)
-    # NumPy starts a thread of OpenBLAS for every core; they spin although nothing here gives them work.
+    # OpenBLAS starts a thread for every core, each of which spins for a while; what we multiply is too small for two.
+    # NumPy loads it later, here and in the encoder's process.
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     streams.open_missing()
     signals.leave_at_once()
@@ -27,10 +28,10 @@ def main() -> int:
     try:
         return main()
     finally:
-        # Before it ends, the interpreter searches all objects but frozen ones for cycles, several times, 0.2 s in all.
-        # It would find Taichi's program among them, which writes its cache when it is destroyed.
-        if started := sys.modules.get("taichi_msm.system.runtime"):
-            started.stop()
+        # Taichi writes its cache of kernels when its program is destroyed, which is here, or else when the interpreter
+        # ends: it searches all objects but frozen ones for cycles then, several times, 0.2 s in all.
+        if runtime := sys.modules.get("taichi_msm.system.runtime"):
+            runtime.stop()
         gc.freeze()
 
 

@@ -137,6 +137,34 @@ def test_other_threads_and_forked_processes_are_refused(tmp_path: Path, root: Pa
     assert done.stderr == ""
 
 
+# Starts after a stop; an object that was made before a stop is dropped after it.
+AGAIN = """
+from taichi_msm.physics.lattice import rest_positions
+from taichi_msm.render.rasterizer import Drawing
+from taichi_msm.system import runtime
+from tests.scenes import scene, speckle
+
+made, sums, kept = scene(), set(), []
+for turn in range(3):
+    runtime.start()
+    drawings = [Drawing(made, speckle(8, 8)) for _ in range(2)]
+    sums.update(int(drawing.draw(rest_positions(made.sheet)).sum()) for drawing in drawings)
+    kept.append(drawings.pop())
+    runtime.stop()
+    if turn == 1:
+        kept.clear()
+print(len(sums))
+"""
+
+
+def test_taichi_starts_again_after_a_stop(tmp_path: Path, root: Path) -> None:
+    script = tmp_path / "again.py"
+    script.write_text(AGAIN)
+    environment = {**os.environ, "PYTHONPATH": str(root)}
+    done = subprocess.run([sys.executable, str(script)], capture_output=True, text=True, timeout=60, env=environment)
+    assert (done.returncode, done.stdout, done.stderr) == (0, "1\n", "")
+
+
 @pytest.mark.usefixtures("device")
 def test_pictures_are_compiled_quickly_and_steps_are_not(monkeypatch: pytest.MonkeyPatch) -> None:
     config = runtime.ti.lang.impl.current_cfg()

@@ -236,7 +236,7 @@ class SheetArrays:
             self._set(self.decay, decay)
 
     def _set(self, array: Any, values: NDArray[Any], rows: int = 0) -> None:
-        """Set rows of an array to values, shape (..., cols), and to zero after them until there are `rows`."""
+        """Set rows of an array to values, shape (..., cols), and rows after them to zero, up to `rows` in all."""
         laid = in_lanes(self._s, values)
         with our_compilation():
             _fill_kernel(self._s.code)(array, laid, max(len(laid), rows * self._s.width))

@@ -127,7 +127,10 @@ def covering(code: Code) -> Callable[..., Any]:
 
     @ti.func
     def largest_edge(p_x, p_y, q_x, q_y, x, y, side):
-        """The largest `edge` of the samples of a tile whose upper left sample is at (x, y)."""
+        """The largest `edge` of the samples of a tile whose upper left sample is at (x, y).
+
+        It is rounded as `edge` is, so that no tile with a sample inside is left out.
+        """
         x += ti.select((q_y - p_y) * side > 0.0, 0.0, code.tile_width - 1.0)
         y += ti.select((q_x - p_x) * side > 0.0, code.tile_height - 1.0, 0.0)
         return edge(p_x, p_y, q_x, q_y, x, y, side)
@@ -364,29 +367,41 @@ def covering(code: Code) -> Callable[..., Any]:
             tiles = ti.max(end_line - first_line, 0) * ti.max(end_tile - first_tile, 0)
             tile, tile_line = first_tile, first_line
             # A tile is covered after the small quads of the next one are found: neither needs the other, so the
-            # processor works on both at once. `held` is where the tile begins that is covered next; -1: there is none.
+            # processor works on both at once. `held` is the entry of the tile that waits to be covered; -1: none does.
             held = -1
             held_x, held_y, held_inside = floats(0), floats(0), floats(0)
             held_column, held_line = floats(0), floats(0)
             for n in range(tiles + 1):
                 tile_x = ti.cast(tile * code.tile_width, ti.f32)
                 tile_y = ti.cast(band.top + tile_line * code.tile_height, ti.f32)
+                x = floats(columns) + tile_x
+                y = floats(lines) + tile_y
+                inside = floats(1) > 0.0
+                column, line = floats(quad_s), floats(quad_t)
+                # The last round only covers the tile that still waits.
                 reached = True
-                # The last round is there for the tile before it.
-                if whole and n < tiles:
-                    upper_x, upper_y = tile_x + 0.5, tile_y + 0.5
-                    reached = (
-                        largest_edge(a_x, a_y, c_x, c_y, upper_x, upper_y, -side) >= 0.0
-                        and largest_edge(b_x, b_y, d_x, d_y, upper_x, upper_y, side) > 0.0
-                        and largest_edge(a_x, a_y, b_x, b_y, upper_x, upper_y, side) >= 0.0
-                        and largest_edge(c_x, c_y, d_x, d_y, upper_x, upper_y, -side) > 0.0
-                    )
-                if reached:
-                    x = floats(columns) + tile_x
-                    y = floats(lines) + tile_y
-                    inside = floats(1) > 0.0
-                    column, line = floats(quad_s), floats(quad_t)
-                    if not whole:
+                if n < tiles:
+                    if whole:
+                        upper_x, upper_y = tile_x + 0.5, tile_y + 0.5
+                        reached = (
+                            largest_edge(a_x, a_y, c_x, c_y, upper_x, upper_y, -side) >= 0.0
+                            and largest_edge(b_x, b_y, d_x, d_y, upper_x, upper_y, side) > 0.0
+                            and largest_edge(a_x, a_y, b_x, b_y, upper_x, upper_y, side) >= 0.0
+                            and largest_edge(c_x, c_y, d_x, d_y, upper_x, upper_y, -side) > 0.0
+                        )
+                        if reached:
+                            # Left and upper edges belong to a cell, right and lower ones do not.
+                            inside = (
+                                (edge(a_x, a_y, c_x, c_y, x, y, -side) >= 0.0)
+                                & (edge(b_x, b_y, d_x, d_y, x, y, side) > 0.0)
+                                & (edge(a_x, a_y, b_x, b_y, x, y, side) >= 0.0)
+                                & (edge(c_x, c_y, d_x, d_y, x, y, -side) > 0.0)
+                            )
+                            if ti.static(code.refined):
+                                column, line = small_quad(
+                                    x, y, inside, surface.parts, cell.side, cell.a, cell.b, cell.c, cell.d
+                                )
+                    else:
                         # Outside its bounds rounding would decide, in samples that depend on the tiles' shape.
                         inside = (
                             (x > ti.cast(first_column, ti.f32))
@@ -394,18 +409,7 @@ def covering(code: Code) -> Callable[..., Any]:
                             & (y > ti.cast(first_row, ti.f32))
                             & (y < ti.cast(end_row, ti.f32))
                         )
-                    if whole:
-                        # Left and upper edges belong to a cell, right and lower ones do not.
-                        inside = (
-                            (edge(a_x, a_y, c_x, c_y, x, y, -side) >= 0.0)
-                            & (edge(b_x, b_y, d_x, d_y, x, y, side) > 0.0)
-                            & (edge(a_x, a_y, b_x, b_y, x, y, side) >= 0.0)
-                            & (edge(c_x, c_y, d_x, d_y, x, y, -side) > 0.0)
-                        )
-                        if ti.static(code.refined):
-                            column, line = small_quad(
-                                x, y, inside, surface.parts, cell.side, cell.a, cell.b, cell.c, cell.d
-                            )
+                if reached:
                     if held >= 0:
                         cover_tile(
                             held, held_x, held_y, held_inside > 0.0, held_column, held_line,

@@ -18,9 +18,8 @@ from taichi_msm.scene import Render
 
 Array = NDArray[np.float64]
 
-# Indices into the array of sizes. Three entries count the rows of mass points that workers have taken and those that
-# are projected, and the bands that workers have taken. Last come the levels of the texture, each with its first texel,
-# its width and its height.
+# Indices into the array of sizes. Three are counters: rows of mass points that workers have taken, rows projected,
+# bands taken. Last come the levels of the texture, each with its first texel, its width and its height.
 ROWS, COLS, WIDTH, HEIGHT, ROD_COUNT, ROWS_TAKEN, ROWS_PROJECTED, BANDS_TAKEN, LEVEL_COUNT, LEVELS = range(10)
 LEVEL_SIZES = 3
 

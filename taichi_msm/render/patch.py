@@ -43,9 +43,9 @@ def on_triangle(x, y, plane: ti.template()):
 
 @ti.func
 def edge(p_x, p_y, q_x, q_y, x, y, side):
-    """Twice the signed area of p, q and (x, y), times side, which is 1 or -1: the sign tells where (x, y) lies.
+    """Twice the signed area of p, q and (x, y), times side, which is 1 or -1.
 
-    Both cells of an edge get the same bits, but for the sign.
+    The sign tells on which side of the line (x, y) is. Both cells of an edge get the same bits, but for the sign.
     """
     right, down = (q_x - p_x) * side, (q_y - p_y) * side
     return right * (y - p_y) - down * (x - p_x)

@@ -135,7 +135,7 @@ class Drawing:
         stride = code.tiles_across(width) * code.tile_width if code.in_words else width
         picture = np.empty((height, stride, 3) if code.picture else (1, 4, 3), np.uint8)
         pixels = width * height
-        # Without labels nothing is written there, and an array of Taichi's costs half the time of one of NumPy's.
+        # Without labels nothing is written there; an array of Taichi's is passed in half the time of one of NumPy's.
         labels = np.zeros(4 * pixels, np.float32) if code.labels else self._point
         self._sizes[ROD_COUNT : BANDS_TAKEN + 1] = len(rods), 0, 0, 0
         with our_compilation(optimised=False):
@@ -214,9 +214,7 @@ def _kernel(code: Code) -> Callable[..., None]:
                 point[here + NORMAL + 2] = n_z
 
     @ti.func
-    def project_row(
-        position: ti.template(), numbers: ti.template(), point: ti.template(), i, rows, cols
-    ):  # fmt: skip
+    def project_row(position: ti.template(), numbers: ti.template(), point: ti.template(), i, rows, cols):
         """Project a row of mass points; store how far up and down in the picture it reaches."""
         low, high = INFINITY, -INFINITY
         for j in range(cols):
@@ -233,10 +231,10 @@ def _kernel(code: Code) -> Callable[..., None]:
     @ti.func
     def project_all(
         position: ti.template(), numbers: ti.template(), point: ti.template(), rows, cols, sizes: ti.template()
-    ):  # fmt: skip
+    ):
         """Project all rows of mass points, shared among the workers; returns when every row is done.
 
-        A worker that has not been started takes no row, so that none waits for it.
+        A worker waits only for rows that a running worker has taken, so one that starts late holds up nobody.
         """
         taking = True
         while taking:
@@ -278,7 +276,7 @@ def _kernel(code: Code) -> Callable[..., None]:
         colours: ti.types.ndarray(dtype=ti.i32 if code.in_words else ti.u8, ndim=1),
         labels: ti.types.ndarray(dtype=ti.f32, ndim=1),
     ):
-        # On a GPU there may be more workers than run at once, so that they cannot wait for each other.
+        # On a GPU there may be more workers than run at once, so that they cannot wait for each other as on a CPU.
         if ti.static(code.lanes == 1):
             for i in range(sizes[ROWS]):
                 project_row(position, numbers, point, i, sizes[ROWS], sizes[COLS])
@@ -287,7 +285,7 @@ def _kernel(code: Code) -> Callable[..., None]:
             if index % ITERATIONS_PER_THREAD == 0:
                 rows, cols, width, height = sizes[ROWS], sizes[COLS], sizes[WIDTH], sizes[HEIGHT]
                 if ti.static(code.lanes > 1):
-                    # To start a loop for this alone would take longer than to project a small sheet.
+                    # To start a loop for this alone takes longer than to project a sheet of usual size.
                     project_all(position, numbers, point, rows, cols, sizes)
                 texture_width, texture_height = sizes[LEVELS + 1], sizes[LEVELS + 2]
                 rod_count, parts, near = sizes[ROD_COUNT], numbers[PARTS], numbers[NEAR]

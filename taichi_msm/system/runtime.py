@@ -108,7 +108,7 @@ class Memory:
 
     def __init__(self) -> None:
         self._taken: list[tuple[tuple[str, int], Any]] = []
-        weakref.finalize(self, _give_back, self._taken)
+        weakref.finalize(self, _give_back, self._taken, _free)
 
     def array(self, precision: str, lanes: int, length: int) -> Any:
         """Allocate a one-dimensional array, or reuse one; its content is arbitrary.
@@ -133,9 +133,9 @@ class Memory:
 _free: dict[tuple[str, int], list[Any]] = defaultdict(list)
 
 
-def _give_back(taken: list[tuple[tuple[str, int], Any]]) -> None:
+def _give_back(taken: list[tuple[tuple[str, int], Any]], free: dict[tuple[str, int], list[Any]]) -> None:
     for kind, array in taken:
-        _free[kind].append(array)
+        free[kind].append(array)
 
 
 _device: Device | None = None
@@ -197,10 +197,12 @@ def start(arch: str = "cpu", threads: int | None = None) -> Device:
 
 
 def stop() -> None:
-    """Destroy what Taichi holds, and write its cache of compiled kernels; nothing of it can be used after that."""
-    global _device
-    ti.reset()
-    _device = None
+    """Destroy Taichi's program, which writes its cache of kernels; what was made with it does not work after that."""
+    global _device, _free
+    # The cache's folder may be gone; without it, the next process compiles anew.
+    with contextlib.suppress(RuntimeError):
+        ti.reset()
+    _device, _free = None, defaultdict(list)
 
 
 def require_here() -> None:
@@ -276,7 +278,7 @@ _sources: dict[CodeType, tuple[list[str], int]] = {}
 def _source_lines(function: FunctionType) -> tuple[list[str], int]:
     """Give the lines of a function, and the number of the first, as `inspect.getsourcelines` does, but find them once.
 
-    Taichi asks for them at every call of a function from a kernel, and it takes milliseconds to find them.
+    Taichi asks for them whenever it reads a call of a function in a kernel, and it takes milliseconds to find them.
     """
     code = function.__code__
     if code not in _sources:
@@ -284,8 +286,8 @@ def _source_lines(function: FunctionType) -> tuple[list[str], int]:
     return _sources[code]
 
 
-# What replaces parts of Taichi while it reads our kernels, which it does in every process, as its cache is looked up by
-# what it has read. It reads them in half the time.
+# Faster replacements for parts of Taichi, in place while it reads our kernels. It reads them in every process, as the
+# key of its cache is made from what it reads; with these, in half the time.
 _SHORTCUTS: list[tuple[Any, str, Any]] = [
     (kernel_impl, "getsourcelines", _source_lines),
     # Taichi expands tabs by `textwrap.fill`, which takes each line apart into words. We use no tabs.
