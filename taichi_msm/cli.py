@@ -104,9 +104,9 @@ def run(
     from taichi_msm.console import Progress, summary
 
     interruption = Interruption()
-    with Progress(quiet=quiet or as_json) as bar, resumable(directory), naming(str(scene or resume)):
-        progress = interruptible(bar, interruption)
-        try:
+    try:
+        with Progress(quiet=quiet or as_json) as bar, resumable(directory), naming(str(scene or resume)):
+            progress = interruptible(bar, interruption)
             if resume is not None:
                 record = runner.resume(directory, threads=threads, started=STARTED, progress=progress)
             else:
@@ -120,9 +120,9 @@ def run(
                     started=STARTED,
                     progress=progress,
                 )
-        except KeyboardInterrupt:
-            report("interrupted", [f"interrupted; nothing was written{going_on(directory)}"], as_json)
-            return interruption.code
+    except KeyboardInterrupt:
+        report("interrupted", [f"interrupted; nothing was written{going_on(directory)}"], as_json)
+        return interruption.code
     if as_json:
         print_json({"directory": str(directory), **record})
     if record["status"] != "complete":
@@ -371,12 +371,12 @@ def export(directory: str, name: str, out: str | None, quiet: bool, as_json: boo
     from taichi_msm.export.convert import convert
 
     interruption = Interruption()
-    with Progress(quiet=quiet or as_json) as bar:
-        try:
+    try:
+        with Progress(quiet=quiet or as_json) as bar:
             done = convert(run, name, folder, partial(interruptible(bar, interruption), "export"))
-        except KeyboardInterrupt:
-            report("interrupted", ["interrupted; nothing was written"], as_json)
-            return interruption.code
+    except KeyboardInterrupt:
+        report("interrupted", ["interrupted; nothing was written"], as_json)
+        return interruption.code
     if as_json:
         print_json({"directory": str(folder), "format": name, **done._asdict()})
     elif not quiet:

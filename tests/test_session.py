@@ -517,7 +517,14 @@ def test_scenes_that_nobody_can_press(overrides: dict[str, Any], play: bool, exp
 
 @pytest.mark.parametrize(
     ("metres", "said"),
-    [(0.0, "0 mm"), (2.5e-9, "2.5e-09 m"), (8.284e-4, "0.828 mm"), (0.0621, "62.1 mm"), (12.3, "12.3 m")],
+    [
+        (0.0, "0 mm"),
+        (2.5e-9, "2.5e-09 m"),
+        (1.33e-7, "0.000133 mm"),
+        (8.284e-4, "0.828 mm"),
+        (0.0621, "62.1 mm"),
+        (12.3, "12.3 m"),
+    ],
 )
 def test_lengths_are_said_in_a_legible_unit(metres: float, said: str) -> None:
     assert live_session.length(metres) == said

@@ -382,6 +382,6 @@ def _between(values: NDArray[np.floating], across: float, down: float) -> NDArra
 
 def length(metres: float) -> str:
     """Write a length in a readable unit."""
-    if metres == 0 or 1e-6 <= metres < 1:
+    if metres == 0 or 1e-7 <= metres < 1:
         return f"{1e3 * metres:.3g} mm"
     return f"{metres:.3g} m"
