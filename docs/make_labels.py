@@ -127,7 +127,7 @@ def main() -> None:
     said = (
         f"The panels show it: frame {FRAME} of `{SCENE}.yaml` and the next, drawn without light at {SIZE} × {SIZE}\n"
         f"pixels of {SAMPLES} × {SAMPLES} samples, differ by {before:.2f} grey levels on average where the next one\n"
-        f"shows the same; fetched from where flow leads, by {after:.2f}, which is what filtering leaves. In lit\n"
+        f"shows the same; fetched from where flow leads, by {after:.2f}, due to filtering. In lit\n"
         "frames more is left, as highlights do not move with the tissue. (`docs/make_labels.py` makes the picture\n"
         "and these lines.)\n"
     )
