@@ -21,6 +21,7 @@ from taichi_msm.physics.material import material
 from taichi_msm.physics.solver import POINTS_PER_WORKER
 from taichi_msm.physics.timestep import stable_step, time_grid
 from taichi_msm.scene import Scene
+from taichi_msm.system import resources
 from taichi_msm.system.resources import available_threads
 from taichi_msm.system.runtime import Device, lanes
 from tests.motion import dynamics_of, structure_of
@@ -501,9 +502,23 @@ def test_rests_grow_while_workers_give_up_and_are_forgotten_when_they_do_not(
         now, taken[1] = now + 0.001 * steps, taken[1] + steps
         return steps, not patient
 
+    had, waited = iter(range(100_000)), 0.0
+
+    def wait_as_long_as_we_run() -> float:
+        nonlocal waited
+        waited += 1
+        return waited
+
     monkeypatch.setattr(sweep, "_advance_alone", alone)
     monkeypatch.setattr(sweep, "_launch_together", together)
     monkeypatch.setattr("time.perf_counter", lambda: now)
+    monkeypatch.setattr("time.process_time", lambda: next(had))
+    # As long as nobody wants our cores, a worker that gives up is an accident, and rests stay the shortest.
+    monkeypatch.setattr(resources, "waited_for_cores", lambda: 0.0)
+    sweep.advance(10_000, (), np.empty(0))
+    assert taken[1] > 1000
+    taken = [0, 0]
+    monkeypatch.setattr(resources, "waited_for_cores", wait_as_long_as_we_run)
     sweep.advance(10_000, (), np.empty(0))
     assert sum(taken) == 10_000
     assert taken[1] < 100

@@ -53,6 +53,7 @@ from taichi_msm.physics.kernel import (
     point_step,
     spring_forces,
 )
+from taichi_msm.system import resources
 from taichi_msm.system.runtime import ITERATIONS_PER_THREAD, our_compilation, ti
 
 # Integers between the counters of two workers, so that each has a cache line of its own.
@@ -67,9 +68,13 @@ BEGIN, END = 0, 1
 # How many times a worker checks for its neighbour before it gives up: about 0.2 ms.
 PATIENCE = 40_000
 
-# After a worker has given up, a single worker steps for some time [s]: four times the last such rest, halved for every
-# HALF_LIFE that all workers have stepped since then.
+# After a worker has given up, a single worker steps for some time [s]. Where other programs want the cores, that is
+# four times the last such rest, halved for every HALF_LIFE that all workers have stepped since then; else it is the
+# shortest.
 SHORTEST_REST, LONGEST_REST, HALF_LIFE = 0.002, 0.2, 0.02
+
+# Other programs want the cores if threads have waited for one for this share of the time that they have had one.
+CROWDED = 0.2
 
 # Numbers that record the place of a worker: pass, round and step of the round.
 PLACE = 3
@@ -103,6 +108,8 @@ class Sweep:
         self._rest = self._rests_until = 0.0
         # Time that all workers have stepped undisturbed since the last rest [s].
         self._together = 0.0
+        # When a worker last gave up: the time that this process's threads had had a core, and had waited for one [s].
+        self._had, self._waited = 0.0, 0.0
         self._first_row, self._end_row = int(s.fixed_rows[0]), s.rows - int(s.fixed_rows[1])
         # Stored after the sheet's own rows: two copies for every border of every worker.
         self._borders = self._border_rows()
@@ -181,12 +188,21 @@ class Sweep:
         count, gave_up = self._launch_together(done, end, numbers, table)
         now = time.perf_counter()
         if gave_up:
-            rest = 4 * self._rest * 0.5 ** (self._together / HALF_LIFE)
+            rest = 4 * self._rest * 0.5 ** (self._together / HALF_LIFE) if self._is_crowded() else 0.0
             self._rest = min(max(rest, SHORTEST_REST), LONGEST_REST)
             self._together, self._rests_until = 0.0, now + self._rest
         else:
             self._together += now - start
         return done + count
+
+    def _is_crowded(self) -> bool:
+        """Tell whether other programs have wanted the cores since this was last asked; True if it is not known."""
+        had, waited = time.process_time(), resources.waited_for_cores()
+        if waited is None:
+            return True
+        crowded = waited - self._waited > CROWDED * (had - self._had)
+        self._had, self._waited = had, waited
+        return crowded
 
     def _launch_together(
         self, done: int, end: int, numbers: tuple[float, ...], table: NDArray[Any]

@@ -20,6 +20,15 @@ def available_threads() -> int:
     return cores
 
 
+def waited_for_cores() -> float | None:
+    """Add up the time that this process's threads have waited for a core that others had [s]; None: not known."""
+    try:
+        waits = [int((task / "schedstat").read_text().split()[1]) for task in Path("/proc/self/task").iterdir()]
+    except (OSError, ValueError, IndexError):
+        return None
+    return 1e-9 * sum(waits)
+
+
 def processor() -> str:
     """Name the processor."""
     with contextlib.suppress(OSError):
