@@ -90,6 +90,39 @@ def test_a_process_may_have_many_sheets_and_gets_their_memory_back(device: runti
     assert not sizes or sizes[2] - sizes[1] < 4 * 2**20
 
 
+# Two of these at once on one core: each waits while the other works.
+BESIDE = """
+import os, time
+from taichi_msm.system.resources import waited_for_cores
+
+os.sched_setaffinity(0, {min(os.sched_getaffinity(0))})
+before, end = waited_for_cores(), time.perf_counter() + 1
+while time.perf_counter() < end:
+    pass
+print(waited_for_cores() - before)
+"""
+
+
+@pytest.mark.skipif(resources.waited_for_cores() is None, reason="the system does not tell")
+def test_waiting_for_a_core_is_noticed(root: Path) -> None:
+    environment = {**os.environ, "PYTHONPATH": str(root)}
+    both = [
+        subprocess.Popen([sys.executable, "-c", BESIDE], stdout=subprocess.PIPE, text=True, env=environment)
+        for _ in range(2)
+    ]
+    waited = [float(process.communicate(timeout=60)[0]) for process in both]
+    assert max(waited) > 0.1
+
+
+def test_where_the_system_does_not_tell_of_waiting(tmp_path: Path) -> None:
+    assert resources.waited_for_cores(tmp_path / "missing") is None
+    (tmp_path / "1").mkdir()
+    (tmp_path / "1" / "schedstat").write_text("5 2000000000 7\n")
+    assert resources.waited_for_cores(tmp_path) == 2.0
+    (tmp_path / "2").mkdir()
+    assert resources.waited_for_cores(tmp_path) is None
+
+
 # One simulation in another thread and another process.
 ELSEWHERE = """
 import os, threading, warnings

@@ -5,6 +5,8 @@ remap asks for every pixel where it comes from, X with X + u(X) = x; three round
 
 from __future__ import annotations
 
+from typing import Any
+
 import cv2
 import numpy as np
 from numpy.typing import NDArray
@@ -35,9 +37,9 @@ class Remap:
             place = centre - back * self._to_points
         return place * (self._to_texels / self._to_points) - 0.5
 
-    def resample(self, texels: NDArray[np.float32]) -> Picture:
-        """Take the colours of texels."""
-        return cv2.remap(self._texture, texels, None, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+    def resample(self, texels: NDArray[Any], fractions: NDArray[np.uint16] | None = None) -> Picture:
+        """Take the colours of texels: of float32, or of OpenCV's fixed point, whose fractions are apart."""
+        return cv2.remap(self._texture, texels, fractions, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
 
     def draw(self, position: NDArray[np.float32]) -> Picture:
         """Warp the picture."""

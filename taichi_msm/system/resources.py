@@ -20,10 +20,10 @@ def available_threads() -> int:
     return cores
 
 
-def waited_for_cores() -> float | None:
+def waited_for_cores(tasks: Path = Path("/proc/self/task")) -> float | None:
     """Add up the time that this process's threads have waited for a core that others had [s]; None: not known."""
     try:
-        waits = [int((task / "schedstat").read_text().split()[1]) for task in Path("/proc/self/task").iterdir()]
+        waits = [int((task / "schedstat").read_text().split()[1]) for task in tasks.iterdir()]
     except (OSError, ValueError, IndexError):
         return None
     return 1e-9 * sum(waits)
