@@ -21,13 +21,12 @@ wrong results; so unary minus, `-=`, abs, any and all are not used on vectors, a
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from functools import cache
 from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from taichi_msm.system.runtime import Memory, our_compilation, ti
+from taichi_msm.system.runtime import Memory, ti, write
 
 # Rows of the array by_column. MOVES and AREA have three each, for a first, a middle and a last row of the sheet.
 MOVES, AREA, ACROSS, HAS_LEFT, HAS_RIGHT, COLUMN_ROWS = 0, 3, 6, 7, 8, 9
@@ -179,26 +178,6 @@ def in_lanes(s: Structure, values: NDArray[Any]) -> NDArray[Any]:
     return laid.reshape(-1, s.code.lanes)
 
 
-@cache
-def _fill_kernel(code: Code) -> Callable[..., None]:
-    """Make the kernel that sets an array of vectors to numbers, shape (entries, lanes), and to zero after them."""
-    vector, lanes = code.vector, code.lanes
-
-    @ti.kernel
-    def fill(
-        target: ti.types.ndarray(dtype=vector, ndim=1),
-        source: ti.types.ndarray(dtype=code.real, ndim=2),
-        length: ti.i32,
-    ):
-        for n in range(length):
-            if n < source.shape[0]:
-                target[n] = vector([source[n, lane] for lane in ti.static(range(lanes))])
-            else:
-                target[n] = vector(0)
-
-    return fill
-
-
 class SheetArrays:
     """The arrays that both forms of kernel 1 have.
 
@@ -222,8 +201,8 @@ class SheetArrays:
             self._set(array, values)
         for c in range(3):
             if state is None:
-                self._set(self.u[c], np.zeros((1, s.cols)), len(stored))
-                self._set(self.d[c], np.zeros((1, s.cols)), s.rows)
+                self._set(self.u[c], np.zeros((0, s.cols)))
+                self._set(self.d[c], np.zeros((0, s.cols)))
             else:
                 held = (stored >= 0)[:, None]
                 self._set(self.u[c], np.where(held, state[0][stored, :, c], 0))
@@ -235,11 +214,9 @@ class SheetArrays:
         if len(decay):
             self._set(self.decay, decay)
 
-    def _set(self, array: Any, values: NDArray[Any], rows: int = 0) -> None:
-        """Set rows of an array to values, shape (..., cols), and rows after them to zero, up to `rows` in all."""
-        laid = in_lanes(self._s, values)
-        with our_compilation():
-            _fill_kernel(self._s.code)(array, laid, max(len(laid), rows * self._s.width))
+    def _set(self, array: Any, values: NDArray[Any]) -> None:
+        """Set the first rows of an array to values, shape (..., cols), and the others to zero."""
+        write(array, in_lanes(self._s, values))
 
     def rows(self, count: int) -> Any:
         """Allocate an array of `count` rows; its content is arbitrary."""

@@ -1,14 +1,14 @@
-"""The only module that imports and starts Taichi."""
+"""The only module that starts Taichi."""
 
 from __future__ import annotations
 
 import contextlib
+import ctypes
 import errno
 import io
 import os
 import re
 import tempfile
-import textwrap
 import threading
 import time
 import weakref
@@ -16,11 +16,14 @@ from collections import defaultdict
 from collections.abc import Iterator
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from types import CodeType, FunctionType, SimpleNamespace
 from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
 
 from taichi_msm.errors import ArgumentError, DeviceError, MsmError
 from taichi_msm.system import resources
+from taichi_msm.system.quick_taichi import Parts, reading, replaced, ti
 from taichi_msm.system.silence import silenced
 
 __all__ = [
@@ -37,29 +40,8 @@ __all__ = [
     "stop",
     "ti",
     "vector_bits",
+    "write",
 ]
-
-if not os.environ.get("HOME"):
-    # Without HOME, Taichi aborts the process.
-    os.environ.pop("HOME", None)
-    _folder = os.path.expanduser("~")  # noqa: PTH111  # Path.home raises where there is none
-    os.environ["HOME"] = _folder if _folder != "~" else tempfile.gettempdir()
-
-# No banner on stdout, which may be JSON, and no check for a newer version over the network.
-os.environ.setdefault("ENABLE_TAICHI_HEADER_PRINT", "0")
-os.environ.setdefault("TI_SKIP_VERSION_CHECK", "ON")
-
-# In a notebook, Taichi reports on import that it is in one. This level is for the import only; ti.init sets its own.
-os.environ.setdefault("TI_LOG_LEVEL", "error")
-
-import numpy as np
-import taichi as ti
-from taichi.lang import kernel_impl
-from taichi.lang._wrap_inspect import getsourcelines
-from taichi.lang.ast.ast_transformer_utils import ASTTransformerContext
-
-if os.environ["TI_LOG_LEVEL"] == "error":
-    del os.environ["TI_LOG_LEVEL"]
 
 _core: Any = getattr(np, "_core", None) or np.core  # NumPy 2, or 1
 _features: dict[str, bool] = _core._multiarray_umath.__cpu_features__
@@ -128,6 +110,25 @@ class Memory:
             array = ti.ndarray(ti.types.vector(lanes, real) if lanes else real, length)
         self._taken.append((kind, array))
         return array
+
+
+def write(array: Any, values: NDArray[Any]) -> None:
+    """Set the first entries of an array of vectors, and all others to zero.
+
+    Args:
+        array: one-dimensional.
+        values: shape (entries, lanes), in the precision of the array.
+    """
+    if started().arch == "cpu":
+        # A kernel that copies takes longer to read and to load than a short run takes to step.
+        address = ti.lang.impl.get_runtime().prog.get_ndarray_data_ptr_as_int(array.arr)
+        entries, lanes = array.shape[0], values.shape[1]
+        memory = (ctypes.c_char * (entries * lanes * values.itemsize)).from_address(address)
+        target = np.frombuffer(memory, values.dtype).reshape(entries, lanes)
+        target[: len(values)] = values
+        target[len(values) :] = 0
+    else:
+        array.from_numpy(np.pad(values, ((0, array.shape[0] - len(values)), (0, 0))))
 
 
 _free: dict[tuple[str, int], list[Any]] = defaultdict(list)
@@ -255,48 +256,14 @@ def our_compilation(*, optimised: bool = True) -> Iterator[None]:
             kernel.
     """
     config = ti.lang.impl.current_cfg()
-    settings = [
+    options: Parts = [
         (config, "fast_math", False),
         (config, "cfg_optimization", False),
         (config, "advanced_optimization", optimised),
         (config, "real_matrix_scalarize", started().arch != "cpu"),
-        *_SHORTCUTS,
     ]
-    found = [(owner, name, getattr(owner, name)) for owner, name, _ in settings]
-    for owner, name, value in settings:
-        setattr(owner, name, value)
-    try:
+    with replaced(options + reading()):
         yield
-    finally:
-        for owner, name, value in found:
-            setattr(owner, name, value)
-
-
-_sources: dict[CodeType, tuple[list[str], int]] = {}
-
-
-def _source_lines(function: FunctionType) -> tuple[list[str], int]:
-    """Give the lines of a function, and the number of the first, as `inspect.getsourcelines` does, but find them once.
-
-    Taichi asks for them whenever it reads a call of a function in a kernel, and it takes milliseconds to find them.
-    """
-    code = function.__code__
-    if code not in _sources:
-        _sources[code] = getsourcelines(function)
-    return _sources[code]
-
-
-# Faster replacements for parts of Taichi, in place while it reads our kernels. It reads them in every process, as the
-# key of its cache is made from what it reads; with these, in half the time.
-_SHORTCUTS: list[tuple[Any, str, Any]] = [
-    (kernel_impl, "getsourcelines", _source_lines),
-    # Taichi expands tabs by `textwrap.fill`, which takes each line apart into words. We use no tabs.
-    (kernel_impl, "textwrap", SimpleNamespace(fill=lambda line, **how: line.rstrip(), dedent=textwrap.dedent)),
-]
-if "TAICHI_MSM_TRACEBACK" not in os.environ:
-    # For every node of a kernel, Taichi prepares the source line that an error would show. It is useful only to those
-    # who change a kernel.
-    _SHORTCUTS.append((ASTTransformerContext, "get_pos_info", lambda self, node: ""))
 
 
 def _cache() -> dict[str, Any]:

@@ -1,0 +1,125 @@
+"""Import Taichi, and make it read our kernels, in half the time.
+
+Taichi reads a kernel in every process, as the key of its cache is made from what it reads. For a short run this is a
+large part of all work. The replacements here are in place only while Taichi is imported or a kernel of ours is read.
+"""
+
+from __future__ import annotations
+
+import ast
+import contextlib
+import inspect
+import linecache
+import os
+import tempfile
+import textwrap
+from collections.abc import Iterator
+from functools import cache
+from types import CodeType, FrameType, SimpleNamespace
+from typing import Any
+
+__all__ = ["Parts", "reading", "replaced", "ti"]
+
+# Attributes to replace: object, name, value.
+Parts = list[tuple[Any, str, Any]]
+
+
+@contextlib.contextmanager
+def replaced(parts: Parts) -> Iterator[None]:
+    """Give attributes of objects other values for a while."""
+    found = [(owner, name, getattr(owner, name)) for owner, name, _ in parts]
+    for owner, name, value in parts:
+        setattr(owner, name, value)
+    try:
+        yield
+    finally:
+        for owner, name, value in found:
+            setattr(owner, name, value)
+
+
+def _frame_info(frame: FrameType, context: int = 1) -> inspect.Traceback:
+    """Describe a frame as `inspect.getframeinfo` does, but do not search for the source of a frame without one.
+
+    When it is imported, Taichi asks for the frame above each of its functions, which is Python's own (50 ms in all).
+    """
+    if frame.f_code.co_filename.startswith("<frozen"):
+        raise OSError("no source")
+    return _get_frame_info(frame, context)
+
+
+_get_frame_info = inspect.getframeinfo
+
+if not os.environ.get("HOME"):
+    # Without HOME, Taichi aborts the process.
+    os.environ.pop("HOME", None)
+    _folder = os.path.expanduser("~")  # noqa: PTH111  # Path.home raises where there is none
+    os.environ["HOME"] = _folder if _folder != "~" else tempfile.gettempdir()
+
+# No banner on stdout, which may be JSON, and no check for a newer version over the network.
+os.environ.setdefault("ENABLE_TAICHI_HEADER_PRINT", "0")
+os.environ.setdefault("TI_SKIP_VERSION_CHECK", "ON")
+
+# In a notebook, Taichi reports on import that it is in one. This level is for the import only; ti.init sets its own.
+os.environ.setdefault("TI_LOG_LEVEL", "error")
+
+with replaced([(inspect, "getframeinfo", _frame_info)]):
+    import taichi as ti
+    from taichi.lang import kernel_impl
+    from taichi.lang.ast import ast_transformer
+    from taichi.lang.ast.ast_transformer_utils import ASTTransformerContext
+
+if os.environ["TI_LOG_LEVEL"] == "error":
+    del os.environ["TI_LOG_LEVEL"]
+
+
+def reading() -> Parts:
+    """List what to replace while a kernel of ours is read."""
+    # `_read_node` does not keep the source line that an error would show; Taichi asks for the last one kept.
+    return [(ti.lang.impl.get_runtime(), "src_info_stack", [""]), *_SHORTCUTS]
+
+
+@cache
+def lines_of(code: CodeType) -> tuple[list[str], int]:
+    """Find the lines of a function, and the number of the first.
+
+    Taichi asks `inspect` for them whenever it reads a call, and `inspect` takes them apart into tokens to find the end.
+    In code formatted by ruff, the next line that is indented no more than the first is not of the function any more,
+    unless it is the closing parenthesis of the arguments.
+    """
+    lines = linecache.getlines(code.co_filename)[code.co_firstlineno - 1 :]
+    margin = len(lines[0]) - len(lines[0].lstrip())
+    body = 1 + next(n for n, line in enumerate(lines) if line.lstrip().startswith("def "))
+    end = (n for n in range(body, len(lines)) if lines[n][: margin + 1].strip(" )\n"))
+    return lines[: next(end, len(lines))], code.co_firstlineno
+
+
+def _parse(source: str) -> ast.Module:
+    """Parse a kernel, or a function, once: Taichi parses it for every call, and looks at nothing left of another call.
+
+    Of a kernel, which it parses once anyway, it removes the arguments.
+    """
+    return ast.parse(source) if source.startswith("@ti.kernel") else _parse_function(source)
+
+
+_parse_function = cache(ast.parse)
+
+
+def _read_node(context: Any, node: ast.AST) -> Any:
+    """Read a node of a kernel's syntax tree, as Taichi's `build_stmt` does, but keep nothing for an error message."""
+    return getattr(ast_transformer.ASTTransformer, f"build_{type(node).__name__}")(context, node)
+
+
+_SHORTCUTS: Parts = [
+    (kernel_impl, "getsourcefile", lambda function: function.__code__.co_filename),
+    (kernel_impl, "getsourcelines", lambda function: lines_of(function.__code__)),
+    # Taichi expands tabs by `textwrap.fill`, which takes each line apart into words. We use no tabs.
+    (kernel_impl, "textwrap", SimpleNamespace(fill=lambda line, **how: line.rstrip(), dedent=textwrap.dedent)),
+    (kernel_impl, "ast", SimpleNamespace(parse=_parse)),
+]
+if "TAICHI_MSM_TRACEBACK" not in os.environ:
+    # For every node of a kernel, Taichi prepares the source line that an error would show. It is useful only to those
+    # who change a kernel.
+    _SHORTCUTS += [
+        (ASTTransformerContext, "get_pos_info", lambda self, node: ""),
+        (ast_transformer, "build_stmt", _read_node),
+    ]
