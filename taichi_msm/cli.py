@@ -143,6 +143,7 @@ def check(scene: str, image: str | None, overrides: tuple[str, ...], as_json: bo
     """Validate SCENE and print the steps, memory and disk space it needs; compute nothing."""
     from taichi_msm.physics import probe_force, timestep
     from taichi_msm.physics.probe_force import in_words, probe_records
+    from taichi_msm.render.notes import notes as drawing_notes
     from taichi_msm.scenefile import budget
     from taichi_msm.scenefile.load import load_scene
 
@@ -175,12 +176,12 @@ def check(scene: str, image: str | None, overrides: tuple[str, ...], as_json: bo
     click.echo(
         f"\n{need.points} points, {need.frames} frames, {need.steps} steps of {facts['step']:.6g} s "
         f"(limit {limit:.6g} s), {facts['steps_per_frame']} a frame{at_least}, in {facts['precision']}\n"
-        f"about {need.memory_bytes / 2**20:.0f} MiB of memory, {need.disk_bytes / 2**20:.1f} MiB on disk, "
+        f"about {need.memory_bytes / 2**20:.0f} MiB of memory, at most {need.disk_bytes / 2**20:.1f} MiB on disk, "
         f"{need.working_bytes / 2**20:.1f} MiB more while it runs"
     )
     for index, probe in enumerate(facts["probes"]):
         click.echo(f"probes.{index}: {in_words(probe)}")
-    for note in probe_force.notes(loaded, facts["probes"]):
+    for note in (*probe_force.notes(loaded, facts["probes"]), *drawing_notes(loaded)):
         click.echo(note)
     return DONE
 

@@ -31,6 +31,7 @@ from taichi_msm.physics.warnings import notes
 from taichi_msm.physics.workload import ENCODING, affords_pilot
 from taichi_msm.progress import Progress
 from taichi_msm.render.labels import Observed
+from taichi_msm.render.notes import notes as drawing_notes
 from taichi_msm.render.texture import load_texture
 from taichi_msm.results.manifest import Manifest, digest, map_digest, read_manifest
 from taichi_msm.results.record import RunRecord
@@ -346,7 +347,7 @@ def _facts(manifest: Manifest, grid: TimeGrid, progress: RunProgress, known: Kno
         "shortest_spring": progress.shortest_spring,
         "longest_spring": progress.longest_spring,
         "probes": probe_records(scene),
-        "notes": list(notes(scene, grid, progress, *known)),
+        "notes": [*notes(scene, grid, progress, *known), *drawing_notes(scene)],
         "error_estimate": None if known.estimate is None else error_record(known.estimate, known.mesh_error),
         **({"error_estimate_reason": known.reason} if known.estimate is None else {}),
     }

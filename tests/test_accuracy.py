@@ -245,19 +245,6 @@ def test_the_error_of_a_load_shorter_than_a_step_is_known(pulse: list[float], de
     assert not list(notes(made, time_grid(made), MOVED, None))
 
 
-@pytest.mark.parametrize(
-    ("instrument", "said"),
-    [
-        ({"radius": 0.01, "shaft": [0, 0.3, -1], "length": 0.1}, "probes.0.instrument: its shaft points down"),
-        ({"radius": 4, "shaft": [0, 0, 1], "length": 9}, "probes.0.instrument: 4 m is a wide rod for a sheet of 0.4 m"),
-    ],
-)
-def test_instruments_that_can_hardly_be_meant_are_noted(instrument: dict[str, Any], said: str) -> None:
-    made = scene(probes=[{**SOFT_PRESS, "instrument": instrument}])
-    (note,) = notes(made, time_grid(made), MOVED, None)
-    assert note.startswith(said)
-
-
 def test_a_scene_that_is_all_right_has_no_notes() -> None:
     assert not list(notes(scene(), time_grid(scene()), RunProgress(1, 1.0, 0.51), None))
     assert next(notes(scene(), time_grid(scene()), RunProgress(1, 0.0, 0.49), Estimate(40, 1e-3, 1e-4, 1e-3, 2))) == (

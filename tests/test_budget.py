@@ -208,6 +208,12 @@ def test_systems_without_proc(monkeypatch: pytest.MonkeyPatch) -> None:
     assert available_memory() == sys.maxsize
 
 
+def test_a_file_system_without_a_size_may_have_room(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    disk_usage = shutil.disk_usage
+    monkeypatch.setattr(shutil, "disk_usage", lambda path: disk_usage(path)._replace(total=0, used=0, free=0))
+    require_disk(scene(output=["png"]), tmp_path)
+
+
 def test_results_that_do_not_fit_on_the_disk_are_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Positions are there twice while the trajectory is written, and two states of 6 numbers a point."""
     made = scene(render={"size": [50, 60]}, output=["png", "trajectory"])

@@ -64,12 +64,13 @@ def test_another_process_gives_the_same_bytes(results: Path) -> None:
         (
             ["results", "--format", "kitti"],
             4,
-            "flow: not among the results of results; run the scene again with 'flow' in output",
+            "flow: not among the results of results; run the scene again with --set output=[png,gif,trajectory,flow]",
         ),
         (
             ["results", "--format", "tapvid"],
             4,
-            "tracks.npz: not among the results of results; run the scene again with 'tracks' in output",
+            "tracks.npz: not among the results of results; run the scene again with --set "
+            "output=[png,gif,trajectory,tracks]",
         ),
         (["", "--format", "obj"], 2, "taichi-msm: Invalid value for DIR: is empty; name a directory"),
         (
@@ -100,7 +101,8 @@ def test_a_surface_needs_a_trajectory(name: str, results: Path, program: Program
     pytest.importorskip("vtkmodules" if name == "vtk" else "numpy")
     (results / "trajectory.npz").unlink()
     done = program("export", str(results), "--format", name)
-    error = f"trajectory.npz: not among the results of {results}; run the scene again with 'trajectory' in output\n"
+    again = "run the scene again with --set output=[png,gif,trajectory]"
+    error = f"trajectory.npz: not among the results of {results}; {again}\n"
     assert (done.returncode, done.stderr) == (4, error)
 
 

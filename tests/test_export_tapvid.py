@@ -121,4 +121,5 @@ def test_frames_are_needed(tracked: Path) -> None:
     (tracked / "frames").rename(tracked / "elsewhere")
     with pytest.raises(FilesError) as caught:
         convert(tracked, "tapvid", tracked / "out")
-    assert str(caught.value) == f"frames: not among the results of {tracked}; run the scene again with 'png' in output"
+    again = "run the scene again with --set output=[png,gif,trajectory]"
+    assert str(caught.value) == f"frames: not among the results of {tracked}; {again}"

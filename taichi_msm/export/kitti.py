@@ -63,7 +63,7 @@ def write_kitti(run: FinishedRun, folder: Path, progress: Count) -> list[str]:
             _copy(run, pair + number, folder / ROOT / PICTURES / f"{pair:06}_1{number}.png")
     left_out = [(OCCLUSION, OCCLUSION, SEEN), (FRAMES, "png", PICTURES)]
     return [
-        f"{name} is left out: {output} is not among the results; run the scene again with '{key}' in output"
+        f"{name} is left out: {output} is not among the results; {run.remedy(key)}"
         for output, key, name in left_out
         if not has[output]
     ]

@@ -23,9 +23,6 @@ LONGEST = 2.0
 # If an error is above this share of the largest displacement, a remedy is named.
 WRONG = 0.01
 
-# The radius of an instrument is rarely above this share of the sheet's larger side.
-WIDEST = 0.25
-
 
 def notes(
     scene: Scene,
@@ -56,7 +53,6 @@ def notes(
         else:
             yield f"error {mesh_error:.2g} due to the number of points; due to the time step not estimated: {reason}"
     yield from probe_force.notes(scene, probe_force.probe_records(scene))
-    yield from _instrument_notes(scene)
     if mesh_error is not None and WRONG < mesh_error < math.inf:
         wrong, cut = float(f"{100 * mesh_error:.2g}"), math.sqrt(mesh_error / (WRONG / 2))
         finer = [min(MAX_POINTS, math.ceil((count - 1) * cut) + 1) for count in scene.sheet.points]
@@ -79,23 +75,6 @@ def notes(
             f"the damping stops a point within 1/{quick:.3g} of a step: velocities change their sign at every step; "
             f"take a time.step of at most {2 * grid.step / quick:.2g} s"
         )
-
-
-def _instrument_notes(scene: Scene) -> Iterator[str]:
-    """Tell of instruments that can hardly be meant as they are."""
-    for index, probe in enumerate(scene.probes):
-        if (instrument := probe.instrument) is None:
-            continue
-        if instrument.shaft[2] < 0:
-            yield (
-                f"probes.{index}.instrument: its shaft points down, through the sheet at rest; it goes from the tip "
-                "to the hand, upward for z above 0"
-            )
-        if instrument.radius > WIDEST * max(scene.sheet.size):
-            yield (
-                f"probes.{index}.instrument: {instrument.radius:g} m is a wide rod for a sheet of "
-                f"{max(scene.sheet.size):g} m; the radius is in metres"
-            )
 
 
 def error(estimate: Estimate, mesh_error: float | None = None) -> str:

@@ -68,6 +68,11 @@ class FinishedRun:
         """Tell whether a file or folder is among the results."""
         return (self.directory / output).exists()
 
+    def remedy(self, key: str) -> str:
+        """Say how to get the results of an entry of a scene's `output`, beside those that there are."""
+        outputs = ",".join(dict.fromkeys([*self.scene.output, key]))
+        return f"run the scene again with --set output=[{outputs}]"
+
     def result(self, name: str, key: str) -> Path:
         """Find a file of the results.
 
@@ -80,11 +85,9 @@ class FinishedRun:
         """
         output, path = name.partition("/")[0], self.directory / name
         if not self.has(output):
-            raise FilesError(
-                f"{output}: not among the results of {self.directory}; run the scene again with '{key}' in output"
-            )
+            raise FilesError(f"{output}: not among the results of {self.directory}; {self.remedy(key)}")
         if not path.is_file():
-            raise FilesError(f"{path}: no such file; run the scene again with '{key}' in output")
+            raise FilesError(f"{path}: no such file; {self.remedy(key)}")
         return path
 
 

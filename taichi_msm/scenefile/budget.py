@@ -7,6 +7,7 @@ import os
 import shutil
 import sys
 from collections.abc import Iterator
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -188,10 +189,10 @@ def _memory_problems(scene: Scene, budget: Budget) -> Iterator[Problem]:
 def _free_disk(directory: Path) -> int:
     """Give the free disk space for a directory [bytes]; sys.maxsize if the system does not report it."""
     for path in (directory, *directory.absolute().parents):
-        try:
-            return shutil.disk_usage(path).free
-        except OSError:
-            continue
+        with suppress(OSError):
+            usage = shutil.disk_usage(path)
+            # A file system that is not on a disk, such as /proc, has no size.
+            return usage.free if usage.total else sys.maxsize
     return sys.maxsize
 
 

@@ -1,0 +1,58 @@
+"""What a scene's pictures will hardly show as it was meant."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+from taichi_msm.render.texture import image_size
+from taichi_msm.scene import Light, Scene
+
+# A picture whose proportions differ from those of the sheet by this factor is visibly stretched.
+STRETCHED = 1.02
+
+# The radius of an instrument is rarely above this share of the sheet's larger side.
+WIDEST = 0.25
+
+
+def notes(scene: Scene) -> Iterator[str]:
+    """Say what is remarkable about how a scene is drawn, each in a line.
+
+    Args:
+        scene: a checked scene.
+    """
+    if scene.draws:
+        yield from _stretched(scene)
+        if scene.render.light != Light() and scene.render.shading != "tissue":
+            yield f"render.light has no effect with shading: {scene.render.shading}; take render.shading: tissue"
+    for index, probe in enumerate(scene.probes):
+        if (instrument := probe.instrument) is None:
+            continue
+        if instrument.shaft[2] < 0:
+            yield (
+                f"probes.{index}.instrument: its shaft points down, through the sheet at rest; it goes from the tip "
+                "to the hand, upward for z above 0"
+            )
+        if instrument.radius > WIDEST * max(scene.sheet.size):
+            yield (
+                f"probes.{index}.instrument: {instrument.radius:g} m is a wide rod for a sheet of "
+                f"{max(scene.sheet.size):g} m; the radius is in metres"
+            )
+
+
+def _stretched(scene: Scene) -> Iterator[str]:
+    """Tell of a picture that is stretched onto the sheet, and of the part in its middle that need not be."""
+    size = image_size(scene)
+    if size is None:
+        return
+    left, top, width, height = scene.region or (0, 0, *size)
+    high, wide = scene.sheet.size
+    factor = wide * height / (high * width)
+    if 1 / STRETCHED < factor < STRETCHED:
+        return
+    cut_width, cut_height = min(width, round(height * wide / high)), min(height, round(width * high / wide))
+    said = f"the picture of {width} x {height} pixels is stretched onto a sheet of {wide:g} x {high:g} m"
+    # Of fewer pixels not even the nearest whole number has these proportions.
+    if min(cut_width, cut_height) * (STRETCHED - 1) >= 0.5:
+        cut = [left + (width - cut_width) // 2, top + (height - cut_height) // 2, cut_width, cut_height]
+        said += f"; to use a part that is not, take region: {cut}"
+    yield said

@@ -1,0 +1,83 @@
+"""The notes on what a scene's pictures will hardly show as it was meant."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import pytest
+from PIL import Image
+
+from taichi_msm.render.notes import notes
+from taichi_msm.scene import Scene
+from tests.conftest import Program
+from tests.scenes import PRESS, SHEET, scene
+
+
+def carrying(tmp_path: Path, size: tuple[int, int], **changes: Any) -> Scene:
+    """Make a scene whose sheet, 0.4 m wide and 0.3 m high, carries a picture of a size."""
+    Image.new("RGB", size).save(tmp_path / "picture.png")
+    return scene(image=str(tmp_path / "picture.png"), sheet={**SHEET, "size": [0.3, 0.4]}, output=["png"], **changes)
+
+
+@pytest.mark.parametrize(
+    ("instrument", "said"),
+    [
+        ({"radius": 0.01, "shaft": [0, 0.3, -1], "length": 0.1}, "probes.0.instrument: its shaft points down"),
+        ({"radius": 4, "shaft": [0, 0, 1], "length": 9}, "probes.0.instrument: 4 m is a wide rod for a sheet of 0.4 m"),
+    ],
+)
+def test_instruments_that_can_hardly_be_meant(instrument: dict[str, Any], said: str) -> None:
+    (note,) = notes(scene(probes=[{**PRESS, "instrument": instrument}]))
+    assert note.startswith(said)
+
+
+@pytest.mark.parametrize(
+    ("size", "part"), [((300, 600), [0, 187, 300, 225]), ((800, 300), [200, 0, 400, 300]), ((90, 90), [0, 11, 90, 68])]
+)
+def test_a_stretched_picture_and_the_part_that_is_not(tmp_path: Path, size: tuple[int, int], part: list[int]) -> None:
+    (note,) = notes(carrying(tmp_path, size))
+    width, height = size
+    assert note == (
+        f"the picture of {width} x {height} pixels is stretched onto a sheet of 0.4 x 0.3 m; to use a part that is "
+        f"not, take region: {part}"
+    )
+    assert not list(notes(carrying(tmp_path, size, region=part)))
+
+
+def test_the_part_is_within_the_region(tmp_path: Path) -> None:
+    (note,) = notes(carrying(tmp_path, (800, 600), region=[100, 50, 600, 300]))
+    assert note.endswith("take region: [200, 50, 400, 300]")
+
+
+def test_a_picture_of_few_columns_has_no_such_part(tmp_path: Path) -> None:
+    (note,) = notes(carrying(tmp_path, (3, 4000)))
+    assert note.endswith("onto a sheet of 0.4 x 0.3 m")
+
+
+@pytest.mark.parametrize("size", [(400, 300), (403, 300), (64, 48)])
+def test_a_picture_like_the_sheet(tmp_path: Path, size: tuple[int, int]) -> None:
+    assert not list(notes(carrying(tmp_path, size)))
+
+
+def test_a_light_without_tissue(tmp_path: Path) -> None:
+    light = {"render": {"light": {"gloss": 0.1}, "shading": "none"}}
+    (note,) = notes(carrying(tmp_path, (400, 300), **light))
+    assert note == "render.light has no effect with shading: none; take render.shading: tissue"
+    assert not list(notes(carrying(tmp_path, (400, 300), render={"light": {"gloss": 0.1}, "shading": "tissue"})))
+
+
+def test_without_pictures_there_is_nothing_to_stretch(tmp_path: Path) -> None:
+    made = carrying(tmp_path, (10, 300))
+    assert not list(notes(made.model_copy(update={"output": ("trajectory",)})))
+
+
+def test_check_and_run_say_it(tmp_path: Path, program: Program) -> None:
+    Image.new("RGB", (128, 48)).save(tmp_path / "wide.png")
+    (tmp_path / "scene.yaml").write_text(
+        "image: wide.png\nsheet: {points: [5, 5], size: [0.1, 0.1], mass: 1e-3}\nsprings: {structural: 1}\n"
+        "time: {duration: 0.04}\nrender: {size: [16, 16]}\noutput: [gif]\n"
+    )
+    said = "the picture of 128 x 48 pixels is stretched onto a sheet of 0.1 x 0.1 m; to use a part that is not, take"
+    assert said in program("check", str(tmp_path / "scene.yaml")).stdout
+    assert said in program("run", str(tmp_path / "scene.yaml"), "--out", str(tmp_path / "out")).stdout
