@@ -9,7 +9,6 @@ casts, floor and abs of vectors are written to allow this.
 # No `from __future__ import annotations` here: Taichi reads the annotations of a kernel.
 
 from collections.abc import Callable, Sequence
-from functools import cache
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -41,6 +40,7 @@ from taichi_msm.render.pyramid import pyramid
 from taichi_msm.render.samples import DEPTH, INFINITY, Code
 from taichi_msm.render.shading import Out, Texture, resolving
 from taichi_msm.scene import Scene
+from taichi_msm.system.quick_taichi import defined_once
 from taichi_msm.system.runtime import ITERATIONS_PER_THREAD, Memory, lanes, our_compilation, started, ti
 
 
@@ -174,7 +174,7 @@ class Drawing:
         return self._known[1]
 
 
-@cache
+@defined_once
 def _kernel(code: Code) -> Callable[..., None]:
     """Make the kernel of one code."""
     factor, floats = code.supersample, code.floats

@@ -13,12 +13,18 @@ import linecache
 import os
 import tempfile
 import textwrap
-from collections.abc import Iterator
-from functools import cache
+from collections.abc import Callable, Iterator
+from functools import cache, wraps
 from types import CodeType, FrameType, SimpleNamespace
-from typing import Any
+from typing import TYPE_CHECKING, Any, TypeVar
 
-__all__ = ["Parts", "reading", "replaced", "ti"]
+if TYPE_CHECKING:
+    from functools import _lru_cache_wrapper
+
+__all__ = ["ALLOCATING", "Parts", "defined_once", "lines_of", "reading", "replaced", "ti"]
+
+Code = TypeVar("Code")
+Kernels = TypeVar("Kernels")
 
 # Attributes to replace: object, name, value.
 Parts = list[tuple[Any, str, Any]]
@@ -37,17 +43,17 @@ def replaced(parts: Parts) -> Iterator[None]:
             setattr(owner, name, value)
 
 
-def _frame_info(frame: FrameType, context: int = 1) -> inspect.Traceback:
-    """Describe a frame as `inspect.getframeinfo` does, but do not search for the source of a frame without one.
+def _frame_info(frame: FrameType) -> inspect.Traceback:
+    """Describe a frame as `inspect.getframeinfo` does, which searches all modules for that of the frame.
 
-    When it is imported, Taichi asks for the frame above each of its functions, which is Python's own (50 ms in all).
+    Taichi asks for the frame above every function that it defines, and reads its line.
     """
-    if frame.f_code.co_filename.startswith("<frozen"):
-        raise OSError("no source")
-    return _get_frame_info(frame, context)
+    code = frame.f_code
+    line = linecache.getline(code.co_filename, frame.f_lineno)
+    return inspect.Traceback(code.co_filename, frame.f_lineno, code.co_name, [line], 0)
 
 
-_get_frame_info = inspect.getframeinfo
+_DEFINING: Parts = [(inspect, "getframeinfo", _frame_info)]
 
 if not os.environ.get("HOME"):
     # Without HOME, Taichi aborts the process.
@@ -62,14 +68,31 @@ os.environ.setdefault("TI_SKIP_VERSION_CHECK", "ON")
 # In a notebook, Taichi reports on import that it is in one. This level is for the import only; ti.init sets its own.
 os.environ.setdefault("TI_LOG_LEVEL", "error")
 
-with replaced([(inspect, "getframeinfo", _frame_info)]):
+with replaced(_DEFINING):
     import taichi as ti
-    from taichi.lang import kernel_impl
+    import taichi.lang.matrix_ops  # which Taichi imports with the first kernel
+    from taichi.lang import _ndarray, kernel_impl, matrix
     from taichi.lang.ast import ast_transformer
     from taichi.lang.ast.ast_transformer_utils import ASTTransformerContext
 
 if os.environ["TI_LOG_LEVEL"] == "error":
     del os.environ["TI_LOG_LEVEL"]
+
+
+# Taichi keeps a formatted traceback with every array.
+ALLOCATING: Parts = [(module, "get_traceback", lambda: "") for module in (matrix, _ndarray)]
+
+
+def defined_once(define: Callable[[Code], Kernels]) -> _lru_cache_wrapper[Kernels]:
+    """Cache a function that defines kernels, in which Taichi is to define them sooner."""
+
+    @cache
+    @wraps(define)
+    def quickly(code: Code) -> Kernels:
+        with replaced(_DEFINING):
+            return define(code)
+
+    return quickly
 
 
 def reading() -> Parts:

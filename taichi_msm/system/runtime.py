@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 
 from taichi_msm.errors import ArgumentError, DeviceError, MsmError
 from taichi_msm.system import resources
-from taichi_msm.system.quick_taichi import Parts, reading, replaced, ti
+from taichi_msm.system.quick_taichi import ALLOCATING, Parts, reading, replaced, ti
 from taichi_msm.system.silence import silenced
 
 __all__ = [
@@ -107,7 +107,8 @@ class Memory:
             _free[kind] = [one for one in _free[kind] if one is not array]
         else:
             real = getattr(ti, precision)
-            array = ti.ndarray(ti.types.vector(lanes, real) if lanes else real, length)
+            with replaced(ALLOCATING):
+                array = ti.ndarray(ti.types.vector(lanes, real) if lanes else real, length)
         self._taken.append((kind, array))
         return array
 
