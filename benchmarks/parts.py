@@ -181,7 +181,8 @@ PARTS: dict[str, Callable[[Effort, Progress], Any]] = {
     "drawing": drawing,
     "terms": lambda effort, progress: terms.measure(effort.rounds, progress),
     "looks": lambda effort, progress: looks.measure(effort.rounds, progress),
-    "whole_run": lambda effort, progress: whole_run.measure(effort.rounds, progress),
+    # A run takes seconds, and varies by a tenth.
+    "whole_run": lambda effort, progress: whole_run.measure(3 * effort.rounds, progress),
     "size": size,
     "refine": refine,
     "resolution": resolution,
