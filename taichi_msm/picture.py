@@ -62,6 +62,16 @@ def picture_size(path: str) -> tuple[int, int]:
         return image.size
 
 
+def has_transparency(path: str) -> bool:
+    """Tell whether any pixel of a picture lets the background through.
+
+    Raises:
+        PictureError: when the file cannot be used.
+    """
+    with _open(path) as image:
+        return image.has_transparency_data and image.convert("RGBA").getchannel("A").getextrema() != (255, 255)
+
+
 @contextmanager
 def _open(path: str) -> Iterator[Image.Image]:
     """Open a picture for a block that decodes it.

@@ -67,6 +67,23 @@ def test_a_light_without_tissue(tmp_path: Path) -> None:
     assert not list(notes(carrying(tmp_path, (400, 300), render={"light": {"gloss": 0.1}, "shading": "tissue"})))
 
 
+@pytest.mark.parametrize(("alpha", "seen"), [(254, True), (255, False)])
+def test_a_picture_that_is_see_through(tmp_path: Path, alpha: int, seen: bool) -> None:
+    made = carrying(tmp_path, (400, 300), render={"background": [9, 8, 7]})
+    picture = Image.new("RGBA", (400, 300), (200, 100, 50, 255))
+    picture.putpixel((399, 299), (200, 100, 50, alpha))
+    picture.save(tmp_path / "picture.png")
+    said = ["the picture is see-through in parts, which show render.background: [9, 8, 7]"]
+    assert list(notes(made)) == (said if seen else [])
+
+
+def test_a_palette_with_a_transparent_colour_is_see_through(tmp_path: Path) -> None:
+    made = carrying(tmp_path, (400, 300))
+    Image.new("P", (400, 300)).save(tmp_path / "picture.png", transparency=0)
+    (note,) = notes(made)
+    assert note.startswith("the picture is see-through")
+
+
 def test_without_pictures_there_is_nothing_to_stretch(tmp_path: Path) -> None:
     made = carrying(tmp_path, (10, 300))
     assert not list(notes(made.model_copy(update={"output": ("trajectory",)})))

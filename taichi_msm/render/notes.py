@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 
-from taichi_msm.render.texture import image_size
+from taichi_msm.render import texture
 from taichi_msm.scene import Light, Scene
 
 # A picture whose proportions differ from those of the sheet by this factor is visibly stretched.
@@ -22,6 +22,10 @@ def notes(scene: Scene) -> Iterator[str]:
     """
     if scene.draws:
         yield from _stretched(scene)
+        if texture.is_see_through(scene):
+            yield (
+                f"the picture is see-through in parts, which show render.background: {list(scene.render.background)}"
+            )
         if scene.render.light != Light() and scene.render.shading != "tissue":
             yield f"render.light has no effect with shading: {scene.render.shading}; take render.shading: tissue"
     for index, probe in enumerate(scene.probes):
@@ -41,7 +45,7 @@ def notes(scene: Scene) -> Iterator[str]:
 
 def _stretched(scene: Scene) -> Iterator[str]:
     """Tell of a picture that is stretched onto the sheet, and of the part in its middle that need not be."""
-    size = image_size(scene)
+    size = texture.image_size(scene)
     if size is None:
         return
     left, top, width, height = scene.region or (0, 0, *size)

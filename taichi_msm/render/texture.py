@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 from taichi_msm.arguments import as_array
 from taichi_msm.errors import ArgumentError, Problem, SceneError
-from taichi_msm.picture import MAX_SIDE, PictureError, picture_size, read_rgb
+from taichi_msm.picture import MAX_SIDE, PictureError, has_transparency, picture_size, read_rgb
 from taichi_msm.scene import Scene
 
 if TYPE_CHECKING:
@@ -65,6 +65,14 @@ def image_size(scene: Scene) -> tuple[int, int] | None:
         return None if scene.image is None else picture_size(scene.image)
     except PictureError:
         return None
+
+
+def is_see_through(scene: Scene) -> bool:
+    """Tell whether the scene's picture lets the background through; False if there is no usable picture."""
+    try:
+        return scene.image is not None and has_transparency(scene.image)
+    except PictureError:
+        return False
 
 
 def problems(scene: Scene) -> Iterator[Problem]:
