@@ -12,7 +12,7 @@ averaged in the same way.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -207,7 +207,7 @@ class _Line:
     """
 
     def __init__(self, times: Array, values: Array) -> None:
-        keys = _distinct(times)
+        keys = np.unique(times)
         # The limits from the left and from the right at every key.
         before, after = values[times.searchsorted(keys, "left")], values[times.searchsorted(keys, "right") - 1]
         before[0] = 0.0
@@ -255,7 +255,7 @@ class _Line:
         """Integrate piece by piece: on each piece hat and function are linear, so that Simpson's rule is exact."""
         low, high = max(t - h, 0.0 if t <= 0 else -math.inf, begin), min(t + h, end)
         inner = self.times[(self.times > low) & (self.times < high)]
-        cuts = _distinct(np.concatenate([[low, high], inner, [t] if low < t < high else []]))
+        cuts = np.unique(np.concatenate([[low, high], inner, [t] if low < t < high else []]))
         if low >= high:
             return 0.0
         left, right = cuts[:-1], cuts[1:]
@@ -301,7 +301,7 @@ def _activity(scene: Scene) -> _Line:
     """Tell when the virtual springs act: 1 always or while the percent of any probe is not 0, else 0."""
     if material(scene).always:
         return _Line(np.array([LONG_AGO]), np.array([1.0]))
-    times = _distinct([time for probe in scene.probes for time, _ in probe.load])
+    times = np.unique([time for probe in scene.probes for time, _ in probe.load])
     if not times.size:
         return _Line(np.zeros(1), np.zeros(1))
     # A time between each two keys, and one after the last.
@@ -314,11 +314,6 @@ def _activity(scene: Scene) -> _Line:
         pressed = (line.after[after - 1] != 0) | ((line.before[following] != 0) & (after < len(line.times)))
         active[(after > 0) & pressed] = 1.0
     return _Line(np.repeat(times, 2)[1:], np.repeat(active, 2)[:-1])
-
-
-def _distinct(times: Iterable[float]) -> Array:
-    """Sort times and drop repetitions, as `np.unique` does, for which NumPy would load its masked arrays (30 ms)."""
-    return np.array(sorted(set(times)), dtype=float)
 
 
 def _key_lists(scene: Scene) -> list[Array]:

@@ -1,4 +1,4 @@
-"""Import Taichi, and make it read our kernels, in half the time.
+"""Import Taichi, and have it read our kernels, sooner.
 
 Taichi reads a kernel in every process, as the key of its cache is made from what it reads. For a short run this is a
 large part of all work. The replacements here are in place only while Taichi is imported or a kernel of ours is read.
@@ -15,13 +15,13 @@ import tempfile
 import textwrap
 from collections.abc import Callable, Iterator
 from functools import cache, wraps
-from types import CodeType, FrameType, SimpleNamespace
+from types import CodeType, FrameType, FunctionType, SimpleNamespace, TracebackType
 from typing import TYPE_CHECKING, Any, TypeVar
 
 if TYPE_CHECKING:
     from functools import _lru_cache_wrapper
 
-__all__ = ["ALLOCATING", "Parts", "defined_once", "lines_of", "reading", "replaced", "ti"]
+__all__ = ["ALLOCATING", "READING", "Parts", "defined_once", "replaced", "source_lines", "ti"]
 
 Code = TypeVar("Code")
 Kernels = TypeVar("Kernels")
@@ -43,16 +43,19 @@ def replaced(parts: Parts) -> Iterator[None]:
             setattr(owner, name, value)
 
 
-def _frame_info(frame: FrameType) -> inspect.Traceback:
+def _frame_info(frame: FrameType | TracebackType, context: int = 1) -> inspect.Traceback:
     """Describe a frame as `inspect.getframeinfo` does, which searches all modules for that of the frame.
 
     Taichi asks for the frame above every function that it defines, and reads its line.
     """
+    if context != 1 or not isinstance(frame, FrameType):
+        return _get_frame_info(frame, context)
     code = frame.f_code
     line = linecache.getline(code.co_filename, frame.f_lineno)
     return inspect.Traceback(code.co_filename, frame.f_lineno, code.co_name, [line], 0)
 
 
+_get_frame_info = inspect.getframeinfo
 _DEFINING: Parts = [(inspect, "getframeinfo", _frame_info)]
 
 if not os.environ.get("HOME"):
@@ -70,8 +73,8 @@ os.environ.setdefault("TI_LOG_LEVEL", "error")
 
 with replaced(_DEFINING):
     import taichi as ti
-    import taichi.lang.matrix_ops  # which Taichi imports with the first kernel
-    from taichi.lang import _ndarray, kernel_impl, matrix
+    from taichi.lang import _ndarray, kernel_impl, matrix, matrix_ops  # noqa: F401  # imported with the first kernel
+    from taichi.lang._wrap_inspect import getsourcelines
     from taichi.lang.ast import ast_transformer
     from taichi.lang.ast.ast_transformer_utils import ASTTransformerContext
 
@@ -79,7 +82,7 @@ if os.environ["TI_LOG_LEVEL"] == "error":
     del os.environ["TI_LOG_LEVEL"]
 
 
-# Taichi keeps a formatted traceback with every array.
+# What to replace while an array is made: Taichi keeps a formatted traceback with each.
 ALLOCATING: Parts = [(module, "get_traceback", lambda: "") for module in (matrix, _ndarray)]
 
 
@@ -95,25 +98,33 @@ def defined_once(define: Callable[[Code], Kernels]) -> _lru_cache_wrapper[Kernel
     return quickly
 
 
-def reading() -> Parts:
-    """List what to replace while a kernel of ours is read."""
-    # `_read_node` does not keep the source line that an error would show; Taichi asks for the last one kept.
-    return [(ti.lang.impl.get_runtime(), "src_info_stack", [""]), *_SHORTCUTS]
+def source_lines(function: FunctionType) -> tuple[list[str], int]:
+    """Give the lines of a function, and the number of the first, as `inspect.getsourcelines` does, but find them once.
+
+    Taichi asks for them whenever it reads a call, and `inspect` takes them apart into tokens to find the end.
+    """
+    code = function.__code__
+    if code not in _lines:
+        linecache.checkcache(code.co_filename)
+        following = linecache.getlines(code.co_filename, function.__globals__)[code.co_firstlineno - 1 :]
+        found = _until_end(following), code.co_firstlineno
+        _lines[code] = found if following else getsourcelines(function)
+    return _lines[code]
 
 
-@cache
-def lines_of(code: CodeType) -> tuple[list[str], int]:
-    """Find the lines of a function, and the number of the first.
+_lines: dict[CodeType, tuple[list[str], int]] = {}
 
-    Taichi asks `inspect` for them whenever it reads a call, and `inspect` takes them apart into tokens to find the end.
+
+def _until_end(lines: list[str]) -> list[str]:
+    """Cut lines that begin with a function after its end.
+
     In code formatted by ruff, the next line that is indented no more than the first is not of the function any more,
     unless it is the closing parenthesis of the arguments.
     """
-    lines = linecache.getlines(code.co_filename)[code.co_firstlineno - 1 :]
-    margin = len(lines[0]) - len(lines[0].lstrip())
-    body = 1 + next(n for n, line in enumerate(lines) if line.lstrip().startswith("def "))
+    margin = len(lines[0]) - len(lines[0].lstrip()) if lines else 0
+    body = next((n + 1 for n, line in enumerate(lines) if line.lstrip().startswith("def ")), len(lines))
     end = (n for n in range(body, len(lines)) if lines[n][: margin + 1].strip(" )\n"))
-    return lines[: next(end, len(lines))], code.co_firstlineno
+    return lines[: next(end, len(lines))]
 
 
 def _parse(source: str) -> ast.Module:
@@ -132,9 +143,10 @@ def _read_node(context: Any, node: ast.AST) -> Any:
     return getattr(ast_transformer.ASTTransformer, f"build_{type(node).__name__}")(context, node)
 
 
-_SHORTCUTS: Parts = [
+# What to replace while a kernel of ours is read.
+READING: Parts = [
     (kernel_impl, "getsourcefile", lambda function: function.__code__.co_filename),
-    (kernel_impl, "getsourcelines", lambda function: lines_of(function.__code__)),
+    (kernel_impl, "getsourcelines", source_lines),
     # Taichi expands tabs by `textwrap.fill`, which takes each line apart into words. We use no tabs.
     (kernel_impl, "textwrap", SimpleNamespace(fill=lambda line, **how: line.rstrip(), dedent=textwrap.dedent)),
     (kernel_impl, "ast", SimpleNamespace(parse=_parse)),
@@ -142,7 +154,7 @@ _SHORTCUTS: Parts = [
 if "TAICHI_MSM_TRACEBACK" not in os.environ:
     # For every node of a kernel, Taichi prepares the source line that an error would show. It is useful only to those
     # who change a kernel.
-    _SHORTCUTS += [
+    READING += [
         (ASTTransformerContext, "get_pos_info", lambda self, node: ""),
         (ast_transformer, "build_stmt", _read_node),
     ]

@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 
 from taichi_msm.errors import ArgumentError, DeviceError, MsmError
 from taichi_msm.system import resources
-from taichi_msm.system.quick_taichi import ALLOCATING, Parts, reading, replaced, ti
+from taichi_msm.system.quick_taichi import ALLOCATING, READING, Parts, replaced, ti
 from taichi_msm.system.silence import silenced
 
 __all__ = [
@@ -118,18 +118,19 @@ def write(array: Any, values: NDArray[Any]) -> None:
 
     Args:
         array: one-dimensional.
-        values: shape (entries, lanes), in the precision of the array.
+        values: shape (entries, lanes).
     """
+    real = np.float32 if array.dtype == ti.f32 else np.float64
     if started().arch == "cpu":
         # A kernel that copies takes longer to read and to load than a short run takes to step.
         address = ti.lang.impl.get_runtime().prog.get_ndarray_data_ptr_as_int(array.arr)
-        entries, lanes = array.shape[0], values.shape[1]
-        memory = (ctypes.c_char * (entries * lanes * values.itemsize)).from_address(address)
-        target = np.frombuffer(memory, values.dtype).reshape(entries, lanes)
+        entries = array.shape[0]
+        memory = (ctypes.c_char * (entries * array.n * np.dtype(real).itemsize)).from_address(address)
+        target = np.frombuffer(memory, real).reshape(entries, array.n)
         target[: len(values)] = values
         target[len(values) :] = 0
     else:
-        array.from_numpy(np.pad(values, ((0, array.shape[0] - len(values)), (0, 0))))
+        array.from_numpy(np.pad(values.astype(real), ((0, array.shape[0] - len(values)), (0, 0))))
 
 
 _free: dict[tuple[str, int], list[Any]] = defaultdict(list)
@@ -263,7 +264,7 @@ def our_compilation(*, optimised: bool = True) -> Iterator[None]:
         (config, "advanced_optimization", optimised),
         (config, "real_matrix_scalarize", started().arch != "cpu"),
     ]
-    with replaced(options + reading()):
+    with replaced(options + READING):
         yield
 
 
