@@ -79,7 +79,7 @@ def main() -> None:
     """Write every picture."""
     IMAGES.mkdir(exist_ok=True)
     animation("press", 340)
-    animation("retina", 320, "render.camera=oblique", image=RETINA)
+    animation("retina", 320, "render.camera=top", image=RETINA)
     live("live", 250, 10, 4.8)
     stages = frames(SCENES / "figure-3.yaml", STAGES, (560, 420))
     grid(stages, 2).save(IMAGES / "figure-3.jpg", quality=90)

@@ -163,7 +163,8 @@ def check(scene: str, image: str | None, overrides: tuple[str, ...], as_json: bo
         "memory": need.memory_bytes,
         "disk": need.disk_bytes,
         "disk_while_running": need.disk_bytes + need.working_bytes,
-        "probes": probe_records(loaded),
+        "probes": (records := probe_records(loaded)),
+        "notes": [*probe_force.notes(loaded, records), *drawing_notes(loaded)],
     }
     if as_json:
         print_json(facts)
@@ -176,12 +177,12 @@ def check(scene: str, image: str | None, overrides: tuple[str, ...], as_json: bo
     click.echo(
         f"\n{need.points} points, {need.frames} frames, {need.steps} steps of {facts['step']:.6g} s "
         f"(limit {limit:.6g} s), {facts['steps_per_frame']} a frame{at_least}, in {facts['precision']}\n"
-        f"about {need.memory_bytes / 2**20:.0f} MiB of memory, at most {need.disk_bytes / 2**20:.1f} MiB on disk, "
+        f"about {need.memory_bytes / 2**20:.0f} MiB of memory, {need.disk_bytes / 2**20:.1f} MiB on disk, "
         f"{need.working_bytes / 2**20:.1f} MiB more while it runs"
     )
     for index, probe in enumerate(facts["probes"]):
         click.echo(f"probes.{index}: {in_words(probe)}")
-    for note in (*probe_force.notes(loaded, facts["probes"]), *drawing_notes(loaded)):
+    for note in facts["notes"]:
         click.echo(note)
     return DONE
 
@@ -308,6 +309,7 @@ def view(
     loaded = load_scene(scene, overrides, image)
     directory = result_directory(out, f"{Path(scene).stem}-live")
 
+    from taichi_msm.render.notes import notes as drawing_notes
     from taichi_msm.viewer.script import load_script, timed
 
     done = load_script(script, loaded.render.size) if script is not None else None
@@ -318,6 +320,7 @@ def view(
     from taichi_msm.viewer.session import Session
     from taichi_msm.viewer.window import Window, show
 
+    tell([*drawing_notes(loaded)])
     captures, interruption = Captures(directory, scene), Interruption()
     notices: list[str] = []
 
@@ -515,7 +518,7 @@ def _run(words: list[str]) -> tuple[int, Sequence[str]]:
         click.echo(error.format_message())
         return WRONG_INPUT, ()
     except click.ClickException as error:
-        return WRONG_INPUT, [f"taichi-msm: {error.format_message()} (see taichi-msm --help)"]
+        return WRONG_INPUT, [f"taichi-msm: {' '.join(error.format_message().split())} (see taichi-msm --help)"]
     except OSError:
         raise
     except Exception as error:

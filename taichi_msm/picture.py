@@ -16,6 +16,7 @@ if TYPE_CHECKING:
     from PIL import Image
 
 FORMATS = ("PNG", "JPEG", "WEBP", "BMP", "TIFF")
+SUFFIXES = (".png", ".jpg", ".jpeg", ".webp", ".bmp", ".tif", ".tiff")
 
 # The kinds of pixels, by Pillow's names, whose colours are defined; 32-bit and floating-point greys can have any range.
 _MODES_16_BIT = ("I;16", "I;16L", "I;16B", "I;16N")
@@ -106,6 +107,8 @@ def _open(path: str) -> Iterator[Image.Image]:
         except (Image.DecompressionBombWarning, Image.DecompressionBombError):
             limit = (Image.MAX_IMAGE_PIXELS or 0) // 10**6
             raise PictureError(f"{path} has more than {limit} million pixels; scale it down") from None
+        except PermissionError:
+            raise PictureError(f"{path} may not be read; change its permissions") from None
         except Exception as error:
             raise PictureError(f"{path} cannot be decoded ({error}); save it again") from None
 

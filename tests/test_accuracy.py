@@ -253,6 +253,13 @@ def test_a_scene_that_is_all_right_has_no_notes() -> None:
     assert len(list(notes(scene(), time_grid(scene()), RunProgress(1, 0.0, 0.49), None))) == 2
 
 
+@pytest.mark.parametrize(("error", "advice"), [(0.04, "; try sheet.points: [24, 30]"), (2000.0, "")])
+def test_points_are_advised_where_they_can_help(error: float, advice: str) -> None:
+    made = scene()
+    (note,) = notes(made, time_grid(made), MOVED, None, mesh_error=error)
+    assert note == f"so few points make the run up to {100 * error:g} % wrong{advice}"
+
+
 def test_positions_written_in_f32_have_the_digits_of_the_sheet(device: Device) -> None:
     # Points move by some 4 um on a sheet of 0.4 m, whose positions f32 rounds by up to 2^-27 m: half a unit at 0.2 m.
     faint = {"probes": [{**SOFT_PRESS, "force": [0, 0, -0.5]}], "time": {"precision": "f32"}}

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from pathlib import Path
 from typing import Any
 
@@ -33,37 +34,53 @@ def test_instruments_that_can_hardly_be_meant(instrument: dict[str, Any], said: 
 
 
 @pytest.mark.parametrize(
-    ("size", "part"), [((300, 600), [0, 187, 300, 225]), ((800, 300), [200, 0, 400, 300]), ((90, 90), [0, 11, 90, 68])]
+    ("size", "sheet", "part"),
+    [
+        ((300, 600), "0.4,0.2", "0,187,300,225"),
+        ((800, 300), "0.15,0.4", "200,0,400,300"),
+        ((90, 90), "0.4,0.4", "0,11,90,68"),
+    ],
 )
-def test_a_stretched_picture_and_the_part_that_is_not(tmp_path: Path, size: tuple[int, int], part: list[int]) -> None:
+def test_a_stretched_picture_and_two_ways_out(tmp_path: Path, size: tuple[int, int], sheet: str, part: str) -> None:
     (note,) = notes(carrying(tmp_path, size))
     width, height = size
     assert note == (
-        f"the picture of {width} x {height} pixels is stretched onto a sheet of 0.4 x 0.3 m; to use a part that is "
-        f"not, take region: {part}"
+        f"the picture of {width} x {height} pixels is stretched onto a sheet 0.4 m wide and 0.3 m high; "
+        f'--set "sheet.size=[{sheet}]" makes the sheet like the picture, '
+        f'--set "region=[{part}]" cuts a part like the sheet'
     )
-    assert not list(notes(carrying(tmp_path, size, region=part)))
+    like_picture = {**SHEET, "size": [float(side) for side in sheet.split(",")]}
+    assert not list(notes(scene(image=str(tmp_path / "picture.png"), sheet=like_picture, output=["png"])))
+    assert not list(notes(carrying(tmp_path, size, region=[int(number) for number in part.split(",")])))
 
 
 def test_the_part_is_within_the_region(tmp_path: Path) -> None:
     (note,) = notes(carrying(tmp_path, (800, 600), region=[100, 50, 600, 300]))
-    assert note.endswith("take region: [200, 50, 400, 300]")
+    assert note.endswith('--set "region=[200,50,400,300]" cuts a part like the sheet')
 
 
-def test_a_picture_of_few_columns_has_no_such_part(tmp_path: Path) -> None:
-    (note,) = notes(carrying(tmp_path, (3, 4000)))
-    assert note.endswith("onto a sheet of 0.4 x 0.3 m")
+@pytest.mark.parametrize(("size", "cuts"), [((3, 4000), False), ((5, 5), False), ((20, 12), True)])
+def test_a_small_picture_may_have_no_such_part(tmp_path: Path, size: tuple[int, int], cuts: bool) -> None:
+    """Of 3 or of 5 columns, no whole number of rows has the proportions 4 : 3; of 12 rows, 16 columns have."""
+    (note,) = notes(carrying(tmp_path, size))
+    assert note.endswith("cuts a part like the sheet") == cuts
+    assert cuts or note.endswith("makes the sheet like the picture")
 
 
-@pytest.mark.parametrize("size", [(400, 300), (403, 300), (64, 48)])
+@pytest.mark.parametrize("size", [(400, 300), (407, 300), (393, 300), (64, 48)])
 def test_a_picture_like_the_sheet(tmp_path: Path, size: tuple[int, int]) -> None:
     assert not list(notes(carrying(tmp_path, size)))
 
 
-def test_a_light_without_tissue(tmp_path: Path) -> None:
-    light = {"render": {"light": {"gloss": 0.1}, "shading": "none"}}
-    (note,) = notes(carrying(tmp_path, (400, 300), **light))
-    assert note == "render.light has no effect with shading: none; take render.shading: tissue"
+@pytest.mark.parametrize("size", [(409, 300), (392, 300)])
+def test_a_picture_a_little_unlike_the_sheet(tmp_path: Path, size: tuple[int, int]) -> None:
+    assert list(notes(carrying(tmp_path, size)))
+
+
+@pytest.mark.parametrize("shading", ["none", "headlight"])
+def test_a_light_without_tissue(tmp_path: Path, shading: str) -> None:
+    (note,) = notes(carrying(tmp_path, (400, 300), render={"light": {"gloss": 0.1}, "shading": shading}))
+    assert note == f"render.light has no effect with shading: {shading}; take render.shading: tissue"
     assert not list(notes(carrying(tmp_path, (400, 300), render={"light": {"gloss": 0.1}, "shading": "tissue"})))
 
 
@@ -95,6 +112,8 @@ def test_check_and_run_say_it(tmp_path: Path, program: Program) -> None:
         "image: wide.png\nsheet: {points: [5, 5], size: [0.1, 0.1], mass: 1e-3}\nsprings: {structural: 1}\n"
         "time: {duration: 0.04}\nrender: {size: [16, 16]}\noutput: [gif]\n"
     )
-    said = "the picture of 128 x 48 pixels is stretched onto a sheet of 0.1 x 0.1 m; to use a part that is not, take"
+    said = "the picture of 128 x 48 pixels is stretched onto a sheet 0.1 m wide and 0.1 m high; --set "
     assert said in program("check", str(tmp_path / "scene.yaml")).stdout
+    (note,) = json.loads(program("check", str(tmp_path / "scene.yaml"), "--json").stdout)["notes"]
+    assert note.startswith(said)
     assert said in program("run", str(tmp_path / "scene.yaml"), "--out", str(tmp_path / "out")).stdout

@@ -64,13 +64,12 @@ def test_another_process_gives_the_same_bytes(results: Path) -> None:
         (
             ["results", "--format", "kitti"],
             4,
-            "flow: not among the results of results; run the scene again with --set output=[png,gif,trajectory,flow]",
+            'results: kitti needs flow; run the scene again with --set "output=[png,gif,trajectory,flow,occlusion]"',
         ),
         (
             ["results", "--format", "tapvid"],
             4,
-            "tracks.npz: not among the results of results; run the scene again with --set "
-            "output=[png,gif,trajectory,tracks]",
+            'results: tapvid needs tracks; run the scene again with --set "output=[png,gif,trajectory,tracks]"',
         ),
         (["", "--format", "obj"], 2, "taichi-msm: Invalid value for DIR: is empty; name a directory"),
         (
@@ -101,8 +100,8 @@ def test_a_surface_needs_a_trajectory(name: str, results: Path, program: Program
     pytest.importorskip("vtkmodules" if name == "vtk" else "numpy")
     (results / "trajectory.npz").unlink()
     done = program("export", str(results), "--format", name)
-    again = "run the scene again with --set output=[png,gif,trajectory]"
-    error = f"trajectory.npz: not among the results of {results}; {again}\n"
+    again = 'run the scene again with --set "output=[png,gif,trajectory]"'
+    error = f"{results}: {name} needs trajectory; {again}\n"
     assert (done.returncode, done.stderr) == (4, error)
 
 

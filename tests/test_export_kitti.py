@@ -131,10 +131,10 @@ def test_what_is_not_there_is_left_out_and_said(labelled: Path) -> None:
     shutil.rmtree(labelled / "frames")
     done = convert(labelled, "kitti", labelled / "out")
     assert [path.name for path in (labelled / "out" / "training").iterdir()] == ["flow_occ"]
-    again = "is not among the results; run the scene again with --set output=[png,gif,trajectory"
+    again = "is not among the results; run the scene again with --set"
     assert done.notes == [
-        f"flow_noc is left out: occlusion {again},occlusion]",
-        f"image_2 is left out: frames {again}]",
+        f'flow_noc is left out: occlusion {again} "output=[png,gif,trajectory,occlusion]"',
+        f'image_2 is left out: frames {again} "output=[png,gif,trajectory,occlusion]"',
     ]
 
 

@@ -121,5 +121,5 @@ def test_frames_are_needed(tracked: Path) -> None:
     (tracked / "frames").rename(tracked / "elsewhere")
     with pytest.raises(FilesError) as caught:
         convert(tracked, "tapvid", tracked / "out")
-    again = "run the scene again with --set output=[png,gif,trajectory]"
-    assert str(caught.value) == f"frames: not among the results of {tracked}; {again}"
+    again = 'run the scene again with --set "output=[png,gif,trajectory,tracks]"'
+    assert str(caught.value) == f"{tracked}: tapvid needs png; {again}"

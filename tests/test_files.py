@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import errno
+import io
 import json
 import os
 import shutil
@@ -10,6 +11,7 @@ import sys
 import zipfile
 from collections.abc import Callable
 from pathlib import Path
+from threading import Event
 from typing import Any
 
 import numpy as np
@@ -19,7 +21,7 @@ from PIL import Image
 
 from taichi_msm.errors import FilesError
 from taichi_msm.render.labels import Observed
-from taichi_msm.results.encoder import Encoder
+from taichi_msm.results.encoder import Encoder, Job, encode
 from taichi_msm.results.folder import Folder
 from taichi_msm.results.writer import ResultWriter
 from taichi_msm.scene import Scene
@@ -193,6 +195,25 @@ def test_an_interrupted_hand_over_leaves_whole_frames(
     assert files(tmp_path / "interrupted") == files(tmp_path / "whole")
 
 
+def test_an_encoder_in_a_hurry_takes_no_more_pictures(tmp_path: Path) -> None:
+    hurry, shown = Event(), [speckle(20, 30, frame) for frame in range(7)]
+
+    class Pictures(io.BytesIO):
+        """The pictures; while the fourth is read, there comes a hurry."""
+
+        def read(self, size: int | None = -1) -> bytes:
+            data = super().read(size)
+            if self.tell() == 4 * shown[0].nbytes:
+                hurry.set()
+            return data
+
+    with Folder.at(tmp_path) as folder:
+        job = Job(folder, (30, 20), 25.0, png=True, gif=True, background=(0, 0, 0))
+        frames = encode(job, Pictures(b"".join(one.tobytes() for one in shown)), hurry).frames
+    assert frames <= 4
+    assert sorted(path.name for path in (tmp_path / "frames").glob("*")) == [f"000{n}.png" for n in range(frames)]
+
+
 @pytest.mark.skipif(sys.platform == "win32", reason="no such signal")
 def test_in_a_hurry_frames_are_given_up_and_those_left_are_whole(tmp_path: Path) -> None:
     made = small_scene(size=[1500, 1000])
@@ -203,7 +224,8 @@ def test_in_a_hurry_frames_are_given_up_and_those_left_are_whole(tmp_path: Path)
         writer.finish(hurry=True)
         writer.publish({})
         frames = writer.frames
-    assert 0 < frames < 7
+    # On a busy machine the encoder may be done before it is told to hurry; see the test below.
+    assert 0 < frames <= 7
     assert sorted(path.name for path in (tmp_path / "frames").iterdir()) == [f"000{n}.png" for n in range(frames)]
     for frame in range(frames):
         with Image.open(tmp_path / "frames" / f"000{frame}.png") as image:

@@ -91,16 +91,16 @@ def test_what_is_missing_is_named_with_the_remedy(results: Path) -> None:
     (results / "trajectory.npz").unlink()
     (results / "frames" / "0003.png").unlink()
     run = read_run(results)
-    missing, again = f"not among the results of {results}", "run the scene again with --set output=[png,gif,trajectory"
+    missing, again = f"not among the results of {results}", 'run the scene again with --set "output=[png,gif,trajectory'
     with pytest.raises(FilesError) as caught:
         run.positions()
-    assert str(caught.value) == f"trajectory.npz: {missing}; {again}]"
+    assert str(caught.value) == f'trajectory.npz: {missing}; {again}]"'
     with pytest.raises(FilesError) as caught:
         run.result("flow/0000.flo", "flow")
-    assert str(caught.value) == f"flow: {missing}; {again},flow]"
+    assert str(caught.value) == f'flow: {missing}; {again},flow]"'
     with pytest.raises(FilesError) as caught:
         run.result("frames/0003.png", "png")
-    assert str(caught.value) == f"{results / 'frames' / '0003.png'}: no such file; {again}]"
+    assert str(caught.value) == f'{results / "frames" / "0003.png"}: no such file; {again}]"'
     assert run.has("frames")
     assert not run.has("flow")
 

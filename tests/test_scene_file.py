@@ -414,10 +414,13 @@ def test_errors(load: Load, text: str, expected: list[str]) -> None:
 @pytest.mark.parametrize(
     ("text", "expected"),
     [
-        ("", "s.yaml:1:1: no keys; a scene needs at least sheet, springs and time"),
-        ("# later\n", "s.yaml:1:1: no keys; a scene needs at least sheet, springs and time"),
-        ("- a\n", 's.yaml:1:1: ["a"] is not a scene; expected keys such as sheet, springs and time'),
-        ("just text", 's.yaml:1:1: "just text" is not a scene; expected keys such as sheet, springs and time'),
+        ("", "s.yaml:1:1: no keys; a scene needs at least sheet, tissue or springs, and time"),
+        ("# later\n", "s.yaml:1:1: no keys; a scene needs at least sheet, tissue or springs, and time"),
+        ("- a\n", 's.yaml:1:1: ["a"] is not a scene; expected keys such as sheet, tissue or springs, and time'),
+        (
+            "just text",
+            's.yaml:1:1: "just text" is not a scene; expected keys such as sheet, tissue or springs, and time',
+        ),
         ("a: b\0", "s.yaml:1:5: character U+0000 is not allowed; remove it"),
         ("a: 1\nb: \x1b[0m", "s.yaml:2:4: character U+001B is not allowed; remove it"),
         ("a: 1 # \u2028b", "s.yaml:1:8: character U+2028 is not allowed; remove it"),
@@ -548,6 +551,14 @@ def test_scalars_follow_yaml_1_2(written: str, meant: object) -> None:
 
 def test_not_a_number_is_read() -> None:
     assert math.isnan(_parse_text("k=.NaN").value)
+
+
+@pytest.mark.parametrize("name", ["photo.jpg", "PHOTO.PNG"])
+def test_a_picture_in_the_place_of_a_scene(name: str, tmp_path: Path) -> None:
+    (tmp_path / name).write_bytes(b"\x89PNG\xff\xd8")
+    with pytest.raises(SceneError) as caught:
+        load_scene(tmp_path / name)
+    assert str(caught.value) == f"{tmp_path / name}: a picture; name a scene, and the picture by --image"
 
 
 @pytest.mark.parametrize("encode", [str.encode, lambda text: b"\xef\xbb\xbf" + text.encode()], ids=["plain", "bom"])

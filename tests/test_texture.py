@@ -278,6 +278,15 @@ def test_truncated_pictures(name: str) -> None:
     assert line.endswith(("; save it again", "; convert it"))
 
 
+def test_a_picture_that_may_not_be_read(monkeypatch: pytest.MonkeyPatch) -> None:
+    def forbidden(*args: Any, **kwargs: Any) -> None:
+        raise PermissionError
+
+    Image.fromarray(COLOURS).save("secret.png")
+    monkeypatch.setattr(Image, "open", forbidden)
+    assert refusal("secret.png") == "image: secret.png may not be read; change its permissions"
+
+
 def test_a_name_is_one_line_that_steers_no_terminal() -> None:
     name = "a\n\x1b[31m.png"
     Image.fromarray(COLOURS).save(name)

@@ -449,15 +449,25 @@ def test_points_for_which_a_given_step_is_too_long_are_refused(load: Any, device
         choose_points(made, device, checked)
 
 
-@pytest.mark.parametrize("setting", ["probes.0.at=[1.9, 0.5]", "probes.0={total: [0, 0, 1], falloff: 5000}"])
-def test_a_tool_that_does_not_reach_the_sheet_is_told_of(setting: str, load: Any) -> None:
+@pytest.mark.parametrize(
+    ("setting", "told"),
+    [
+        ("probes.0.at=[1.9, 0.5]", " N reach the sheet; is the tool beside the sheet, wider than the sheet, or "),
+        ("probes.0={total: [0, 0, 1], at: [0.47, 0.47], falloff: 50000}", "of its 1 N reach the sheet; is the tool"),
+        (
+            "probes.0={total: [0, 0, 1], falloff: 5000}",
+            "237 N instead of its 1 N, as the tool is narrower than a cell of 0.00714 x 0.00833 m",
+        ),
+    ],
+)
+def test_a_tool_that_does_not_act_as_a_whole_is_told_of(setting: str, told: str, load: Any) -> None:
     def notes(made: Scene) -> list[str]:
         return list(probe_force.notes(made, probe_force.probe_records(made)))
 
     assert not notes(load())
     (said,) = notes(load(setting))
     assert said.startswith("probes.0: ")
-    assert "reach the sheet" in said
+    assert told in said
 
 
 def test_a_run_tells_of_a_tool_that_does_not_reach_it(load: Any, tmp_path: Path, device: Device) -> None:

@@ -10,6 +10,7 @@ from taichi_msm.export.formats import FORMATS
 from taichi_msm.export.staging import staging
 from taichi_msm.progress import Count
 from taichi_msm.results.finished_run import read_run
+from taichi_msm.results.publication import RESULTS
 
 
 class Exported(NamedTuple):
@@ -38,6 +39,9 @@ def convert(run: Path, name: str, directory: Path, progress: Count = lambda done
         NotInstalledError: when a package that writes the format is not installed.
     """
     finished, wanted = read_run(run), FORMATS[name]
+    if missing := [key for key in wanted.needs if not finished.has(RESULTS.get(key, key))]:
+        remedy = finished.remedy(*wanted.needs, *wanted.uses)
+        raise FilesError(f"{run}: {name} needs {' and '.join(missing)}; {remedy}")
     progress(0, finished.frames)
     try:
         with staging(directory, wanted.files) as staged:

@@ -16,19 +16,23 @@ class Format(NamedTuple):
     """An export format.
 
     Attributes:
+        needs: the entries of a scene's `output` that it is made from.
+        uses: further entries of which it would have more.
         files: the files in its folder, as patterns of names.
         write: writes the files of a run into an empty folder, reports its progress, and returns what the user should
             know about the files.
     """
 
+    needs: tuple[str, ...]
+    uses: tuple[str, ...]
     files: Tree
     write: Callable[[FinishedRun, Path, Count], list[str]]
 
 
 FORMATS = {
-    "kitti": Format(kitti.FILES, kitti.write_kitti),
-    "tapvid": Format(tapvid.FILES, tapvid.write_tapvid),
-    "vtk": Format(vtk.FILES, vtk.write_vtk),
-    "gltf": Format(gltf.FILES, gltf.write_gltf),
-    "obj": Format(obj.FILES, obj.write_obj),
+    "kitti": Format(("flow",), ("occlusion", "png"), kitti.FILES, kitti.write_kitti),
+    "tapvid": Format(("tracks", "png"), (), tapvid.FILES, tapvid.write_tapvid),
+    "vtk": Format(("trajectory",), (), vtk.FILES, vtk.write_vtk),
+    "gltf": Format(("trajectory",), (), gltf.FILES, gltf.write_gltf),
+    "obj": Format(("trajectory",), (), obj.FILES, obj.write_obj),
 }

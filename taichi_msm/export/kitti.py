@@ -61,10 +61,10 @@ def write_kitti(run: FinishedRun, folder: Path, progress: Count) -> list[str]:
             (folder / ROOT / SEEN / name).write_bytes(png16(encode(flow, ~hidden)))
         for number in (0, 1) if has[FRAMES] else ():
             _copy(run, pair + number, folder / ROOT / PICTURES / f"{pair:06}_1{number}.png")
-    left_out = [(OCCLUSION, OCCLUSION, SEEN), (FRAMES, "png", PICTURES)]
+    left_out = [(OCCLUSION, SEEN), (FRAMES, PICTURES)]
     return [
-        f"{name} is left out: {output} is not among the results; {run.remedy(key)}"
-        for output, key, name in left_out
+        f"{name} is left out: {output} is not among the results; {run.remedy(OCCLUSION, 'png')}"
+        for output, name in left_out
         if not has[output]
     ]
 

@@ -180,10 +180,14 @@ def notes(scene: Scene, records: Sequence[ProbeRecord]) -> Iterator[str]:
         scene: a checked scene.
         records: of its probes.
     """
+    across, down = spacing(scene.sheet)
+    cell = f"a cell of {across:.3g} x {down:.3g} m"
     for index, (probe, record) in enumerate(zip(scene.probes, records, strict=True)):
-        asked = math.hypot(*probe.total) if probe.total is not None else 0.0
-        if asked > 0 and not LEAST_REACHING < record["total_force"] / asked < 1 / LEAST_REACHING:
+        asked, found = math.hypot(*probe.total) if probe.total is not None else 0.0, record["total_force"]
+        if asked > 0 and found <= LEAST_REACHING * asked:
             yield (
-                f"probes.{index}: {record['total_force']:.3g} N of its {asked:.3g} N reach the sheet; is the tool "
-                "beside the sheet, wider than the sheet, or narrower than a cell?"
+                f"probes.{index}: {found:.3g} N of its {asked:.3g} N reach the sheet; is the tool beside the sheet, "
+                f"wider than the sheet, or narrower than {cell}?"
             )
+        elif asked > 0 and found * LEAST_REACHING >= asked:
+            yield f"probes.{index}: {found:.3g} N instead of its {asked:.3g} N, as the tool is narrower than {cell}"

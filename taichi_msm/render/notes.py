@@ -1,4 +1,4 @@
-"""What a scene's pictures will hardly show as it was meant."""
+"""What is drawn otherwise than it can be meant."""
 
 from __future__ import annotations
 
@@ -44,19 +44,26 @@ def notes(scene: Scene) -> Iterator[str]:
 
 
 def _stretched(scene: Scene) -> Iterator[str]:
-    """Tell of a picture that is stretched onto the sheet, and of the part in its middle that need not be."""
+    """Tell of a picture that is stretched onto the sheet, and of two ways out."""
     size = texture.image_size(scene)
     if size is None:
         return
     left, top, width, height = scene.region or (0, 0, *size)
     high, wide = scene.sheet.size
-    factor = wide * height / (high * width)
-    if 1 / STRETCHED < factor < STRETCHED:
+    if _fits(wide * height, high * width):
         return
+    side = max(high, wide) / max(height, width)
+    said = (
+        f"the picture of {width} x {height} pixels is stretched onto a sheet {wide:g} m wide and {high:g} m high; "
+        f'--set "sheet.size=[{height * side:.4g},{width * side:.4g}]" makes the sheet like the picture'
+    )
     cut_width, cut_height = min(width, round(height * wide / high)), min(height, round(width * high / wide))
-    said = f"the picture of {width} x {height} pixels is stretched onto a sheet of {wide:g} x {high:g} m"
-    # Of fewer pixels not even the nearest whole number has these proportions.
-    if min(cut_width, cut_height) * (STRETCHED - 1) >= 0.5:
-        cut = [left + (width - cut_width) // 2, top + (height - cut_height) // 2, cut_width, cut_height]
-        said += f"; to use a part that is not, take region: {cut}"
+    # Of few pixels, even the part whose proportions are nearest to the sheet's may be stretched.
+    if cut_width and cut_height and _fits(wide * cut_height, high * cut_width):
+        cut = left + (width - cut_width) // 2, top + (height - cut_height) // 2, cut_width, cut_height
+        said += f', --set "region=[{",".join(map(str, cut))}]" cuts a part like the sheet'
     yield said
+
+
+def _fits(one: float, other: float) -> bool:
+    return other / STRETCHED < one < other * STRETCHED

@@ -68,10 +68,10 @@ class FinishedRun:
         """Tell whether a file or folder is among the results."""
         return (self.directory / output).exists()
 
-    def remedy(self, key: str) -> str:
-        """Say how to get the results of an entry of a scene's `output`, beside those that there are."""
-        outputs = ",".join(dict.fromkeys([*self.scene.output, key]))
-        return f"run the scene again with --set output=[{outputs}]"
+    def remedy(self, *keys: str) -> str:
+        """Say how to get the results of further entries of a scene's `output`."""
+        outputs = ",".join(dict.fromkeys([*self.scene.output, *keys]))
+        return f'run the scene again with --set "output=[{outputs}]"'
 
     def result(self, name: str, key: str) -> Path:
         """Find a file of the results.

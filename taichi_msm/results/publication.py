@@ -38,6 +38,8 @@ ANIMATION, TRAJECTORY, TRACKS, CAMERA = FILE_NAMES = "animation.gif", "trajector
 RECORD = "run.json"
 
 # Folders with a file for every frame, and the extension of these files.
+# The result of an entry of a scene's `output`, where it has another name.
+RESULTS = {"png": FRAMES, "gif": ANIMATION, "trajectory": TRAJECTORY, "tracks": TRACKS}
 SERIES = dict(zip(SERIES_NAMES, ("png", "npy", "tiff", "flo", "png", "png"), strict=True))
 
 # A folder is a checkpoint if it has a run's manifest. Beside it are the positions of the frames and the last state.

@@ -21,8 +21,8 @@ from taichi_msm.results.labels import LabelWriter
 from taichi_msm.results.publication import (
     ANIMATION,
     CAMERA,
-    FRAMES,
     RECORD,
+    RESULTS,
     SERIES,
     TRACKS,
     TRAJECTORY,
@@ -188,8 +188,7 @@ class ResultWriter:
 
     def _outputs(self, frames: int) -> list[str]:
         """List the outputs of a run with this many frames, the record last."""
-        kinds = {"png": FRAMES, "gif": ANIMATION, "trajectory": TRAJECTORY, "tracks": TRACKS}
-        wanted = [kinds.get(kind, kind) for kind in self._scene.output] if frames else []
+        wanted = [RESULTS.get(kind, kind) for kind in self._scene.output] if frames else []
         if frames and self._scene.output_camera:
             wanted.append(CAMERA)
         order = (*SERIES, ANIMATION, TRAJECTORY, TRACKS, CAMERA)

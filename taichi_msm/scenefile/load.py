@@ -14,6 +14,7 @@ from typing import Any, NamedTuple
 from taichi_msm.errors import ArgumentError, Problem, SceneError
 from taichi_msm.errors import Path as Key
 from taichi_msm.faults import cut, flow
+from taichi_msm.picture import SUFFIXES
 from taichi_msm.scene import MAX_PATH, Scene
 from taichi_msm.scenefile.validation import validate
 from taichi_msm.scenefile.yaml_reader import MAX_DEPTH, Document, Mark, UnreadableError, mark_at, read
@@ -41,7 +42,7 @@ class Kind(NamedTuple):
     needs: str
 
 
-_SCENE = Kind("scene", "sheet, springs and time")
+_SCENE = Kind("scene", "sheet, tissue or springs, and time")
 
 _NO_KEY = Problem((), "expected KEY=VALUE, such as sheet.points=[61,61]")
 _NO_PATH = Problem((), "expected a key such as sheet.points")
@@ -303,6 +304,9 @@ def _read_text(name: str, kind: Kind) -> str:
     try:
         return raw.decode()
     except UnicodeDecodeError as error:
+        if path.suffix.lower() in SUFFIXES:
+            said = f"a picture; name a {kind.name}, and the picture by --image"
+            raise _error(name, said if kind is _SCENE else f"a picture; name a {kind.name}") from None
         before = raw[: error.start].decode()
         mark = mark_at(before, len(before))
         raise _error(f"{name}:{mark.line}:{mark.column}", "not UTF-8; save the file as UTF-8") from None
