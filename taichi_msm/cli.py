@@ -518,7 +518,10 @@ def _run(words: list[str]) -> tuple[int, Sequence[str]]:
         click.echo(error.format_message())
         return WRONG_INPUT, ()
     except click.ClickException as error:
-        return WRONG_INPUT, [f"taichi-msm: {' '.join(error.format_message().split())} (see taichi-msm --help)"]
+        said = " ".join(error.format_message().split())
+        if "--set" in words and "unexpected extra argument" in said:
+            said = f'{said.rstrip(".")}; a value with blanks needs quotes: --set "KEY=VALUE"'
+        return WRONG_INPUT, [f"taichi-msm: {said} (see taichi-msm --help)"]
     except OSError:
         raise
     except Exception as error:

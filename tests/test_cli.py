@@ -432,6 +432,17 @@ def call(capsys: pytest.CaptureFixture[str], *arguments: str) -> tuple[int, str,
             "taichi-msm: --resume continues a run with its own settings; leave out --set (see taichi-msm --help)\n",
         ),
         (["run"], "taichi-msm: Missing argument 'SCENE'. (see taichi-msm --help)\n"),
+        (["run", "a.yaml", "b.yaml"], "taichi-msm: Got unexpected extra argument (b.yaml) (see taichi-msm --help)\n"),
+        (
+            ["check", "a.yaml", "--set", "sheet.points=[61,", "61]"],
+            "taichi-msm: Got unexpected extra argument (61]); a value with blanks needs quotes: "
+            '--set "KEY=VALUE" (see taichi-msm --help)\n',
+        ),
+        (
+            ["export", "results"],
+            "taichi-msm: Missing option '--format'. Choose from: kitti, tapvid, vtk, gltf, obj (see taichi-msm --help)"
+            "\n",
+        ),
         (["jump"], "taichi-msm: No such command 'jump'. (see taichi-msm --help)\n"),
         (
             ["check", "small.yaml", "--sett=1"],

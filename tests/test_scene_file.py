@@ -718,6 +718,7 @@ def test_an_override_mends_a_fault_of_the_file(load: Load) -> None:
         ),
         (["damping"], "--set damping: expected KEY=VALUE, such as sheet.points=[61,61]"),
         (["=1"], "--set =1: expected KEY=VALUE, such as sheet.points=[61,61]"),
+        ([" damping = -1"], "--set  damping = -1: damping: -1 is not allowed; expected a number, 0 or more, in N s/m"),
         (["sheet..mass=1"], "--set sheet..mass=1: expected KEY=VALUE, such as sheet.points=[61,61]"),
         (
             ["damping={a: 1, a: 2}"],

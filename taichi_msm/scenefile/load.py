@@ -113,7 +113,7 @@ def _parse_overrides(overrides: Sequence[str] | Mapping[str, Any]) -> Iterator[_
 def _parse_text(text: str) -> _Override:
     key, equals, value = text.partition("=")
     name = f"--set {cut(key)}{equals}{cut(value)}"
-    path = _parse_key(key)
+    path = _parse_key(key.strip())
     if not equals or not path:
         return _Override(name, (), problems=[_NO_KEY])
     try:
