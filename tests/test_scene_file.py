@@ -447,6 +447,13 @@ def test_unreadable_files(load: Load, text: str | bytes, expected: str) -> None:
     [
         ("a: [1, 2\nb: 3\n", "s.yaml:2:2: not valid YAML: "),
         ("a: 1\n b: 2\n", "s.yaml:2:3: not valid YAML: "),
+        ("a:\n  x: 1\n  b 3\n  c: 4\n", 's.yaml:3:3: no ":" in "b 3"; expected KEY: VALUE'),
+        (
+            "a:\n  b 3\n  c: 4\n",
+            "s.yaml:3:4: not valid YAML: mapping values are not allowed in this context; write one KEY: VALUE a line, "
+            "also in the line before",
+        ),
+        ("a: 1\nsheet", 's.yaml:2:1: no ":" in "sheet"; expected KEY: VALUE'),
         ("a: 'x\n", "s.yaml:2:1: not valid YAML: "),
         ('a: "\\U00110000"\n', "s.yaml:1:"),
         ("a: @x\n", "s.yaml:1:4: not valid YAML: "),

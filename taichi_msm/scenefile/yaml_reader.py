@@ -14,6 +14,7 @@ from typing import Any, NamedTuple
 import yaml
 
 from taichi_msm.errors import Path
+from taichi_msm.faults import cut
 
 MAX_DEPTH = 20
 MAX_NODES = 100_000
@@ -110,9 +111,15 @@ def mark_at(text: str, index: int) -> Mark:
 
 
 def _syntax_error(text: str, error: yaml.MarkedYAMLError) -> UnreadableError:
+    if error.problem == "could not find expected ':'" and error.context_mark:
+        # It is missed only in the next line, or at the end.
+        line = text[error.context_mark.index :].partition("\n")[0]
+        return UnreadableError(_mark(error.context_mark), f'no ":" in "{cut(line.strip())}"; expected KEY: VALUE')
     mark = error.problem_mark or error.context_mark
     at = mark.index if mark else 0
     hint = "; indent with spaces, not tabs" if text[at : at + 1] == "\t" else ""
+    if error.problem == "mapping values are not allowed in this context":
+        hint = "; write one KEY: VALUE a line, also in the line before"
     said = " ".join(part for part in (error.problem, error.context) if part)
     return UnreadableError(_mark(mark) if mark else Mark(1, 1), f"not valid YAML: {said}{hint}")
 
