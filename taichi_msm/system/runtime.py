@@ -13,7 +13,6 @@ import threading
 import time
 import weakref
 from collections import defaultdict
-from collections.abc import Iterator
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -245,8 +244,7 @@ def open_window(title: str, size: tuple[int, int]) -> Any:
     return window
 
 
-@contextlib.contextmanager
-def our_compilation(*, optimised: bool = True) -> Iterator[None]:
+def our_compilation(*, optimised: bool = True) -> contextlib.AbstractContextManager[None]:
     """Set the compiler's options for kernels of this package, not for a user's own kernels in the same process.
 
     Every operation is rounded by IEEE 754, so that the bits of a result do not depend on threads, lanes or compiler
@@ -264,8 +262,7 @@ def our_compilation(*, optimised: bool = True) -> Iterator[None]:
         (config, "advanced_optimization", optimised),
         (config, "real_matrix_scalarize", started().arch != "cpu"),
     ]
-    with replaced(options + READING):
-        yield
+    return replaced(options + READING)
 
 
 def _cache() -> dict[str, Any]:
