@@ -522,6 +522,13 @@ def test_rests_grow_while_workers_give_up_and_are_forgotten_when_they_do_not(
     sweep.advance(10_000, (), np.empty(0))
     assert sum(taken) == 10_000
     assert taken[1] < 100
+    # During a rest nobody waits, which makes the next one no shorter.
+    taken = [0, 0]
+    with monkeypatch.context() as patch:
+        patch.setattr("time.process_time", lambda: now)
+        patch.setattr(resources, "waited_for_cores", lambda: 0.001 * taken[1])
+        sweep.advance(10_000, (), np.empty(0))
+    assert taken[1] < 200
     # Undisturbed for minutes, and then disturbed once: the rest is the shortest again.
     patient = True
     sweep.advance(1_000_000, (), np.empty(0))

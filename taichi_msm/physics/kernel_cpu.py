@@ -108,7 +108,7 @@ class Sweep:
         self._rest = self._rests_until = 0.0
         # Time that all workers have stepped undisturbed since the last rest [s].
         self._together = 0.0
-        # When a worker last gave up: the time that this process's threads had had a core, and had waited for one [s].
+        # At the end of the last rest: the time that this process's threads had had a core, and had waited for one [s].
         self._had, self._waited = 0.0, 0.0
         self._first_row, self._end_row = int(s.fixed_rows[0]), s.rows - int(s.fixed_rows[1])
         # Stored after the sheet's own rows: two copies for every border of every worker.
@@ -184,6 +184,10 @@ class Sweep:
 
     def _advance_together(self, done: int, end: int, numbers: tuple[float, ...], table: NDArray[Any]) -> int:
         """Take steps with all workers; returns how many are done, which may be fewer than `end` if a worker gave up."""
+        if self._rests_until:
+            # The rest itself tells nothing: a single worker waits for no core.
+            self._had, self._waited = time.process_time(), resources.waited_for_cores() or 0.0
+            self._rests_until = 0.0
         start = time.perf_counter()
         count, gave_up = self._launch_together(done, end, numbers, table)
         now = time.perf_counter()
@@ -196,13 +200,9 @@ class Sweep:
         return done + count
 
     def _is_crowded(self) -> bool:
-        """Tell whether other programs have wanted the cores since this was last asked; True if it is not known."""
+        """Tell whether other programs have wanted the cores since the last rest; True if it is not known."""
         had, waited = time.process_time(), resources.waited_for_cores()
-        if waited is None:
-            return True
-        crowded = waited - self._waited > CROWDED * (had - self._had)
-        self._had, self._waited = had, waited
-        return crowded
+        return waited is None or waited - self._waited > CROWDED * (had - self._had)
 
     def _launch_together(
         self, done: int, end: int, numbers: tuple[float, ...], table: NDArray[Any]
