@@ -70,7 +70,7 @@ def program() -> None:
 @click.option(
     "--estimate-error/--no-estimate",
     default=None,
-    help="Always or never estimate the error.  [default: if that takes less than a third of the run]",
+    help="Always or never estimate the error.  [default: if that takes at most two fifths of the run]",
 )
 @click.option("--resume", metavar="DIR", help="Continue the unfinished run in DIR, instead of running SCENE.")
 @click.option("--quiet", is_flag=True, help="Print no progress and no summary.")

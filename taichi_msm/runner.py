@@ -7,11 +7,11 @@ import platform
 import sys
 import time
 from collections.abc import Mapping, Sequence
-from contextlib import ExitStack, suppress
-from dataclasses import asdict
+from contextlib import ExitStack, closing, suppress
 from functools import partial
+from operator import attrgetter
 from pathlib import Path
-from typing import Any, NamedTuple, cast
+from typing import Any, cast
 
 import numpy as np
 import PIL
@@ -21,14 +21,16 @@ from taichi_msm import __version__
 from taichi_msm.arguments import require_path
 from taichi_msm.errors import DamagedError, DeviceError, DivergedError, FilesError, SceneError, writing
 from taichi_msm.physics import error_control
-from taichi_msm.physics.error_control import Estimate, Pilot
+from taichi_msm.physics.error_control import Estimate
 from taichi_msm.physics.lattice import rest_positions
-from taichi_msm.physics.mesh_error import MeshPilot, choose_points, coarser
+from taichi_msm.physics.mesh_error import MeshEstimate, choose_points
+from taichi_msm.physics.pilots import Pilots, choose_pilots, no_pilots
 from taichi_msm.physics.probe_force import probe_records
+from taichi_msm.physics.run_error import Known, RunError
 from taichi_msm.physics.run_progress import RunProgress
 from taichi_msm.physics.timestep import stable_step, time_grid, with_grid
 from taichi_msm.physics.warnings import notes
-from taichi_msm.physics.workload import ENCODING, affords_pilot
+from taichi_msm.physics.workload import ENCODING
 from taichi_msm.progress import Progress
 from taichi_msm.render.labels import Observed
 from taichi_msm.render.notes import notes as drawing_notes
@@ -88,8 +90,8 @@ def run(
         arch: cpu, cuda or vulkan.
         threads: number of CPU threads; None takes every core.
         overrides: the overrides that made the scene, for the record.
-        estimate_error: whether to estimate the error of the run, by a pilot beside it; None: if the pilot takes less
-            than a third of the run. For a tolerance in the scene it is estimated in any case.
+        estimate_error: whether to estimate the error of the run, by pilots; None: if they take at most two fifths of
+            the run. For a tolerance in the scene it is estimated in any case.
         started: `time.perf_counter()` when the program began; None: now.
         progress: called often, with the stage, the frames done and the frames in all; what it raises stops the run
             there. After a KeyboardInterrupt the finished frames are kept.
@@ -113,9 +115,9 @@ def run(
     device = runtime.start(arch, threads)
     texture = load_texture(scene) if scene.draws else None
     watch.lap("startup")
-    given, estimate, mesh_error = scene, None, None
+    given, estimate, mesh = scene, None, None
     if scene.sheet.tolerance is not None:
-        scene, mesh_error = choose_points(scene, device, checked, partial(progress, "pilot"))
+        scene, mesh = choose_points(scene, device, checked, partial(progress, "pilot"))
         budget.require_disk(scene, Path(directory))
         watch.lap("pilot")
     grid = time_grid(scene, device.arch)
@@ -130,7 +132,7 @@ def run(
         scene,
         tuple(overrides),
         estimate,
-        mesh_error,
+        mesh,
         estimate_error,
         here,
         arch,
@@ -219,11 +221,14 @@ def _carry_out(
         ExitStack() as opened,
     ):
         resumed = writer.stored
-        pilot, reason = _pilot(manifest, grid, device, cores, resumed=resumed > 0)
-        mesh = _mesh_pilot(manifest, grid, device, cores, reason)
-        pilots = [one for one in (pilot, mesh) if one is not None]
-        for one in pilots:
-            opened.callback(one.close)
+        pilots = _pilots(manifest, grid, device, resumed=resumed > 0)
+        run_error: RunError | None = None
+        known = Known(manifest.estimate, pilots.reason, manifest.mesh)
+        if not pilots.reason:
+            try:
+                run_error = opened.enter_context(closing(RunError(scene, grid, pilots, known, device, cores)))
+            except DeviceError:
+                known = known._replace(reason=f"{device.arch} cannot run this scene in f64")
         rest = rest_positions(scene.sheet)
         for frame in range(resumed if scene.output else 0):
             progress("check", frame, resumed)
@@ -231,15 +236,15 @@ def _carry_out(
         watch.lap("startup")
         try:
             simulation.compile(partial(progress, "compile", 0, frames))
-            for one in pilots:
-                one.compile()
+            if run_error:
+                run_error.compile()
             watch.lap("compile")
             if writer.saved:
                 simulation.restore(writer.saved)
-            for frame in range(1, writer.frames if pilots else 0):
-                for one in pilots:
-                    one.follow(writer.position(frame) - rest, partial(progress, "pilot", frame, frames))
-                watch.lap("pilot")
+            if run_error:
+                for frame in range(1, writer.frames):
+                    run_error.follow(writer.position(frame) - rest, partial(progress, "pilot", frame, frames))
+                    watch.lap("pilot")
             observed = Observed()
             for frame in range(writer.frames, frames):
                 progress("frames", frame, frames)
@@ -252,9 +257,13 @@ def _carry_out(
                 watch.lap("render")
                 writer.add(position, observed, partial(progress, "frames", frame, frames))
                 watch.lap("hand over")
-                for one in pilots if frame > 0 else ():
-                    one.follow(position - rest, partial(progress, "frames", frame, frames))
+                if run_error and frame > 0:
+                    run_error.follow(position - rest, partial(progress, "frames", frame, frames))
                     watch.lap("pilot")
+            if run_error:
+                kept = (writer.position(frame) - rest for frame in range(1, frames)) if scene.output else None
+                run_error.finish(kept, partial(progress, "pilot"))
+                watch.lap("pilot")
             writer.finish(partial(progress, "frames", frames, frames))
         except KeyboardInterrupt:
             # An interruption outside `progress` may come before the last frame is stored.
@@ -269,7 +278,7 @@ def _carry_out(
                 raise
             ending = {"status": "interrupted"}
         except DivergedError as error:
-            pilot, mesh, reason = None, None, "the run diverged"
+            run_error, known = None, Known(reason="the run diverged")
             ending = {"status": "diverged", "error": str(error), "dump": None}
             with suppress(KeyboardInterrupt):
                 found = simulation.diagnose(writer.load(), partial(progress, "diagnosis", writer.frames, frames))
@@ -278,8 +287,8 @@ def _carry_out(
                     ending["dump"] = writer.save(found.good)
         progress("write", writer.frames, frames)
         writer.finish()
-        estimate = manifest.estimate if pilot is None else pilot.estimate
-        known = Known(estimate, reason, manifest.mesh_error if mesh is None else mesh.error)
+        if run_error:
+            known = run_error.known
         record = {**ending, **_facts(manifest, grid, simulation.progress, known), "resumed": resumed}
         stages = ["startup", *(["pilot"] if "pilot" in watch.seconds else []), "compile", "simulate", "render"]
         seconds = {stage: watch.seconds.get(stage, 0.0) for stage in stages}
@@ -289,52 +298,25 @@ def _carry_out(
         return cast(RunRecord, writer.publish(record))
 
 
-def _pilot(
-    manifest: Manifest, grid: TimeGrid, device: Device, cores: int, *, resumed: bool
-) -> tuple[Pilot | None, str]:
-    """Begin the pilot of a run, or say why there is none."""
-    scene = manifest.scene
-    if manifest.estimate is not None:
-        return None, ""
-    if manifest.asks_estimate is False:
-        return None, "not asked for"
-    if manifest.asks_estimate is None and device.arch != "cpu":
-        return None, "on a GPU, this needs --estimate-error"
-    if manifest.asks_estimate is None and not affords_pilot(scene, grid, error_control.refinement(scene, grid)):
-        return None, "it would take more than a third of the run; to have it anyway, pass --estimate-error"
+def _pilots(manifest: Manifest, grid: TimeGrid, device: Device, *, resumed: bool) -> Pilots:
+    """Choose the pilots of a run, or say why there are none."""
+    scene, asked = manifest.scene, manifest.asks_estimate
+    if asked is False:
+        return no_pilots("not asked for")
+    if asked is None and device.arch != "cpu":
+        return no_pilots("on a GPU, this needs --estimate-error")
     if resumed and not scene.output:
-        return None, "the frames before the interruption were not kept"
-    try:
-        return Pilot(scene, grid, device, cores), ""
-    except DeviceError:
-        return None, f"{device.arch} cannot run this scene in f64"
-
-
-def _mesh_pilot(manifest: Manifest, grid: TimeGrid, device: Device, cores: int, reason: str) -> MeshPilot | None:
-    """Begin the runs with half and a quarter of the cells a side, where the error is estimated at all."""
-    coarse = None if reason or manifest.asks_estimate is False else coarser(manifest.scene)
-    return None if coarse is None else MeshPilot(manifest.scene, grid, coarse, device, cores)
-
-
-class Known(NamedTuple):
-    """What is known about the error of a run.
-
-    Attributes:
-        estimate: the error due to the step and to rounding; None: not estimated.
-        reason: why it was not estimated.
-        mesh_error: the error due to the number of points; None: not estimated; infinite: not known.
-    """
-
-    estimate: Estimate | None
-    reason: str
-    mesh_error: float | None
+        return no_pilots("the frames before the interruption were not kept")
+    return choose_pilots(scene, grid, asked=asked is True)
 
 
 def _facts(manifest: Manifest, grid: TimeGrid, progress: RunProgress, known: Known) -> dict[str, Any]:
     """Say what was run, and what is known of its last frame, for run.json."""
     scene, limit = manifest.scene, stable_step(manifest.scene)
     return {
-        "scene": manifest.given.model_dump(mode="json"),
+        # With the paths of pictures as they were given; only these two sections hold anything that is chosen.
+        "scene": manifest.given.model_copy(update={"sheet": scene.sheet, "time": scene.time}).model_dump(mode="json"),
+        "asked": _asked(manifest.given, scene),
         "working_directory": manifest.folder,
         "overrides": list(manifest.overrides),
         "points": list(scene.sheet.points),
@@ -348,7 +330,7 @@ def _facts(manifest: Manifest, grid: TimeGrid, progress: RunProgress, known: Kno
         "longest_spring": progress.longest_spring,
         "probes": probe_records(scene),
         "notes": [*notes(scene, grid, progress, *known), *drawing_notes(scene)],
-        "error_estimate": None if known.estimate is None else error_record(known.estimate, known.mesh_error),
+        "error_estimate": None if known.estimate is None else error_record(known.estimate, known.mesh),
         **({"error_estimate_reason": known.reason} if known.estimate is None else {}),
     }
 
@@ -362,12 +344,21 @@ def free_cores(scene: Scene, grid: TimeGrid) -> int:
     return max(1, resources.available_threads() - busy)
 
 
-def error_record(estimate: Estimate, mesh_error: float | None = None) -> dict[str, Any]:
-    """Write an estimate for run.json, where null stands for a pilot run that diverged."""
-    found = {key: asdict(estimate)[key] for key in ("error", "rounding", "in_f64", "order")}
-    if mesh_error is not None:
-        found["mesh_error"] = mesh_error
-    return {key: value if value < math.inf else None for key, value in found.items()}
+def _asked(given: Scene, scene: Scene) -> dict[str, Any]:
+    """Give the keys of a scene, by their paths, for which a run chose other values, and the values that they had."""
+    keys = ("sheet.points", "sheet.tolerance", "time.step", "time.precision", "time.tolerance")
+    pairs = [(key, attrgetter(key)(given), attrgetter(key)(scene)) for key in keys]
+    return {key: asked for key, asked, chosen in pairs if asked != chosen}
+
+
+def error_record(estimate: Estimate, mesh: MeshEstimate | None = None) -> dict[str, Any]:
+    """Write an estimate for run.json, where null stands for what is not known."""
+    found = {key: getattr(estimate, key) for key in ("error", "rounding", "in_f64", "order", "at_least")}
+    if not estimate.parted:
+        found |= {"rounding": None, "in_f64": None}
+    if mesh is not None:
+        found |= {"mesh_error": mesh.error, "mesh_doubt": mesh.doubt}
+    return {key: None if value == math.inf else value for key, value in found.items()}
 
 
 def versions() -> dict[str, str]:

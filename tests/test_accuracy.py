@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from contextlib import closing, suppress
 from functools import partial
 from typing import Any
@@ -12,7 +13,9 @@ from numpy.typing import NDArray
 
 from taichi_msm.errors import SceneError
 from taichi_msm.physics import error_control
-from taichi_msm.physics.error_control import Estimate, Trials, choose_step, estimate_error, longest, order, refinement
+from taichi_msm.physics.error_control import Estimate, Trials, choose_step, estimate_error, longest, order
+from taichi_msm.physics.mesh_error import MeshEstimate
+from taichi_msm.physics.pilots import coarse_steps, fine_steps
 from taichi_msm.physics.run_progress import RunProgress
 from taichi_msm.physics.timestep import stable_step, time_grid, with_time
 from taichi_msm.physics.warnings import notes
@@ -122,12 +125,19 @@ def test_an_error_that_is_a_power_of_the_step_is_told_exactly(
     assert estimated(made, device).error == pytest.approx(0.005**p, rel=1e-9)
 
 
-def test_how_much_finer_the_other_pilot_is() -> None:
+def test_how_many_steps_the_pilots_take() -> None:
     for kind in ("release", "between"):
         made = scene(**SCENES[kind])
-        assert refinement(made, time_grid(made)) == 2
+        grid = time_grid(made)
+        assert fine_steps(made, grid) == 2 * grid.steps_per_frame
+        assert coarse_steps(made, grid) == math.ceil(grid.steps_per_frame / 2)
     made = scene(damping=3.0, time={"step": 0.0025})
-    assert refinement(made, time_grid(made)) == 8, "g h is 7.5"
+    assert fine_steps(made, time_grid(made)) == 8 * 16, "g h is 7.5"
+    assert coarse_steps(made, time_grid(made)) == 9, "8 are not stable"
+    # Twice this step is not stable.
+    limit = stable_step(scene(damping=0.01))
+    made = with_steps(scene(damping=0.01), math.ceil(0.04 / (0.6 * limit)))
+    assert coarse_steps(made, time_grid(made)) == 0
 
 
 def test_rounding_is_part_of_the_estimate(device: Device) -> None:
@@ -256,7 +266,7 @@ def test_a_scene_that_is_all_right_has_no_notes() -> None:
 @pytest.mark.parametrize(("error", "advice"), [(0.04, "; try sheet.points: [24, 30]"), (2000.0, "")])
 def test_points_are_advised_where_they_can_help(error: float, advice: str) -> None:
     made = scene()
-    (note,) = notes(made, time_grid(made), MOVED, None, mesh_error=error)
+    (note,) = notes(made, time_grid(made), MOVED, None, mesh=MeshEstimate(error))
     assert note == f"so few points make the run up to {100 * error:g} % wrong{advice}"
 
 

@@ -11,12 +11,15 @@ from typing import Any
 import numpy as np
 import pytest
 
-from taichi_msm import load_scene, resume, run, runner
-from taichi_msm.physics import workload
+from taichi_msm import load_scene, resume, run
+from taichi_msm.physics import pilots, workload
+from taichi_msm.physics.pilots import ENOUGH, Pilots, choose_pilots
 from taichi_msm.physics.run_progress import RunProgress
+from taichi_msm.physics.solver import Dynamics
 from taichi_msm.physics.timestep import time_grid, with_time
 from taichi_msm.physics.warnings import notes
-from taichi_msm.physics.workload import affords_pilot
+from taichi_msm.physics.workload import affords_pilots
+from taichi_msm.progress import Pause
 from taichi_msm.results.record import RunRecord
 from taichi_msm.scene import Scene
 from taichi_msm.system.runtime import Device
@@ -67,10 +70,10 @@ def test_an_estimate_can_be_left_out_or_asked_for(small: Path, device: Device, m
     record = run(made, "out", threads=device.threads, estimate_error=False)
     assert (record["error_estimate"], record["error_estimate_reason"]) == (None, "not asked for")
     assert "pilot" not in record["timings"]
-    monkeypatch.setattr(runner, "affords_pilot", lambda scene, grid, ratio: False)
+    monkeypatch.setattr(pilots, "affords_pilots", lambda scene, grid, steps: False)
     record = run(made, "out", threads=device.threads)
     assert record["error_estimate"] is None
-    assert record["error_estimate_reason"].startswith("it would take more than a third of the run")
+    assert record["error_estimate_reason"].startswith("it would take more than two fifths of the run")
     assert record["notes"][0] == f"error not estimated: {record['error_estimate_reason']}"
     record = run(made, "out", threads=device.threads, estimate_error=True)
     assert told(record) < 0.1
@@ -135,12 +138,81 @@ def test_a_small_run_is_in_f64_and_a_large_one_in_f32() -> None:
     assert workload.DOUBLE * steps > workload.SMALL * workload.START >= workload.DOUBLE * steps * (1 - 3 / edge)
 
 
-def test_a_pilot_is_taken_while_it_is_a_third_of_the_run() -> None:
+def test_pilots_are_taken_while_they_are_two_fifths_of_the_run() -> None:
     small = scene(probes=[PRESS], time={"precision": "auto"})
-    assert affords_pilot(small, time_grid(small), 2)
-    large = scene(sheet={"points": [2000, 2000], "size": [0.3, 0.3], "mass": 1e-3}, time={"precision": "auto"})
-    assert not affords_pilot(large, time_grid(large), 2)
-    assert not affords_pilot(large, replace(time_grid(large), precision="f64"), 2)
+    assert affords_pilots(small, time_grid(small), 2)
+    time = {"precision": "auto", "duration": 40.0}
+    large = scene(sheet={"points": [2000, 2000], "size": [0.3, 0.3], "mass": 1e-3}, time=time)
+    single, double = time_grid(large), replace(time_grid(large), precision="f64")
+    assert single.precision == "f32"
+    # Of a run that is nearly all stepping, two thirds of the run's own steps are two fifths of the whole.
+    assert [affords_pilots(large, double, steps) for steps in (0.66, 0.67)] == [True, False]
+    assert [affords_pilots(large, single, steps) for steps in (0.33, 0.34)] == [True, False]
+    assert choose_pilots(large, double) == Pilots(math.ceil(double.steps_per_frame / 2), 0, False, "")
+    assert choose_pilots(large, single).reason
+
+
+@pytest.fixture
+def taken(monkeypatch: pytest.MonkeyPatch) -> list[int]:
+    """Steps of points that sheets take, pilots and the run itself."""
+    found: list[int] = []
+    advance = Dynamics.advance
+
+    def noted(self: Dynamics, steps: int, pause: Pause = lambda: None) -> None:
+        found.append(steps * math.prod(self.scene.sheet.points))
+        advance(self, steps, pause)
+
+    monkeypatch.setattr(Dynamics, "advance", noted)
+    return found
+
+
+@pytest.mark.parametrize(("name", "most"), [("press", 0.75), ("figure-3", 0.6)])
+def test_pilots_are_cheap(name: str, most: float, root: Path, tmp_path: Path, device: Device, taken: list[int]) -> None:
+    made = load_scene(root / f"scenes/{name}.yaml", ["output=[]", "time.duration=0.2"])
+    record = run(made, tmp_path / "out", threads=device.threads)
+    assert record["precision"] == "f64"
+    assert told(record) < ENOUGH
+    own = record["steps"] * math.prod(made.sheet.points)
+    assert 0.5 * own <= sum(taken) - own <= most * own
+
+
+# Of which a coarse pilot shows an error of 3e-3.
+WRONG = [*SHORT, "probes.0.force=[0, 3000, -10000]"]
+
+
+@pytest.mark.parametrize("output", ["[trajectory]", "[]"])
+def test_a_finer_pilot_follows_an_error_that_matters(
+    output: str, small: Path, device: Device, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    made = load_scene("small.yaml", [*WRONG, f"output={output}"])
+    record = run(made, "out", threads=device.threads)
+    error = true_error(made, time_grid(made), device, fine=32)
+    # Twice the next power of h, as in tests/test_accuracy.py.
+    assert told(record) == pytest.approx(error, rel=1 / 12)
+    monkeypatch.setattr(pilots, "affords_pilots", lambda scene, grid, steps: steps < 1)
+    record = run(made, "out", threads=device.threads)
+    found = record["error_estimate"]
+    assert found is not None
+    assert found["at_least"]
+    assert told(record) == pytest.approx(error, rel=0.5)
+    assert record["notes"][0].startswith(f"error at least {told(record):.1g} of the largest displacement: at least ")
+
+
+def test_beside_f32_a_coarse_pilot_tells_a_bound(
+    small: Path, device: Device, monkeypatch: pytest.MonkeyPatch, taken: list[int]
+) -> None:
+    monkeypatch.setattr(pilots, "affords_pilots", lambda scene, grid, steps: steps < 1)
+    made = load_scene("small.yaml", [*WRONG, "time.precision=f32"])
+    record = run(made, "out", threads=device.threads)
+    steps = math.prod(made.sheet.points) * record["steps"]
+    assert sum(taken) <= 1.6 * steps
+    error = true_error(made, time_grid(made), device, fine=32)
+    # Three times the error of the step; and all of rounding, of which there is hardly any here.
+    assert told(record) == pytest.approx(3 * error, rel=0.5)
+    found = record["error_estimate"]
+    assert found is not None
+    assert (found["rounding"], found["in_f64"], found["at_least"]) == (None, None, False)
+    assert record["notes"][0].startswith(f"error at most about {told(record):.1g} of the largest displacement: at most")
 
 
 @pytest.mark.parametrize("difference", ["central", "backward"])

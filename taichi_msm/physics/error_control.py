@@ -2,7 +2,7 @@
 
 The error of a displacement u_h is its distance from Richardson's extrapolation of runs with steps h and h / r in f64:
 
-    u* = u_{h/r} + (u_{h/r} - u_h) / (r^p - 1)        p: order of the method, r: `refinement`, mostly 2
+    u* = u_{h/r} + (u_{h/r} - u_h) / (r^p - 1)        p: order of the method, r: 2 or more (fine), or about 1/2 (coarse)
 
 So it includes the rounding of the run's own precision. Errors are the largest of any point at any frame, relative to
 the largest displacement of any point at any frame.
@@ -24,6 +24,7 @@ from taichi_msm.errors import SceneError
 from taichi_msm.physics.divergence import farthest_displacement
 from taichi_msm.physics.lattice import rest_positions
 from taichi_msm.physics.material import material
+from taichi_msm.physics.pilots import fine_steps
 from taichi_msm.physics.solver import Dynamics
 from taichi_msm.progress import Count, Pause
 from taichi_msm.scene import LARGEST_TOLERANCE, Scene
@@ -38,9 +39,6 @@ CLOSE = 0.75
 MOST_PILOTS = 12
 LARGEST_CUT = 8.0
 
-# The largest refinement of the fine pilot; if it would have to be finer, the error is not known.
-FINEST = 64
-
 
 @dataclass(frozen=True)
 class Estimate:
@@ -53,6 +51,9 @@ class Estimate:
         rounding: the part of the error that comes from f32, including that of positions in the trajectory; 0 in f64.
         in_f64: the error of the same step in f64.
         order: of the method in this scene.
+        parted: whether the two parts are known; else, by a coarse pilot beside a run in f32, neither is larger than the
+            error told.
+        at_least: whether the error may be larger, as a coarse pilot shows one that only a fine one would tell.
     """
 
     steps_per_frame: int
@@ -60,6 +61,8 @@ class Estimate:
     rounding: float
     in_f64: float
     order: int
+    parted: bool = True
+    at_least: bool = False
 
 
 def order(scene: Scene) -> int:
@@ -105,30 +108,30 @@ def choose_step(
     return replace(grid, steps_per_frame=found.steps_per_frame), found
 
 
-def refinement(scene: Scene, grid: TimeGrid) -> int:
-    """Tell how many times finer than the run the fine pilot must be: 2, unless the damping needs finer steps.
-
-    If g h / r > 1, with g = C / m, central differences make velocities change their sign at every step, and the
-    difference between the pilots does not show it.
-    """
-    return max(2, math.ceil(material(scene).drag * grid.step))
-
-
 class Pilot:
-    """Two runs in f64 beside another run, which give its error frame by frame: with finer steps, and with its own.
+    """A run in f64 beside another run, with other steps, which gives its error frame by frame.
+
+    Beside a run in f32 a fine pilot has a second one with the run's own steps, which tells the part of rounding. A
+    coarse one is alone, to be cheap, and the error told is the difference of the two runs: rounding as it is, and
+    r^-p - 1 times the error of the step.
 
     Args:
         scene: what is run.
         grid: its steps.
+        steps: steps per frame of the pilot, as in `Pilots`; 0: the error is not known.
         device: what `runtime.start` returned.
         cores: number of cores that stepping may use; None: all. With as many as the run has, its kernels are reused.
+
+    Attributes:
+        displacement: of the pilot at the last frame [m], shape (rows, cols, 3).
 
     Raises:
         DeviceError: when the device cannot run it in f64.
     """
 
-    def __init__(self, scene: Scene, grid: TimeGrid, device: Device, cores: int | None = None) -> None:
+    def __init__(self, scene: Scene, grid: TimeGrid, steps: int, device: Device, cores: int | None = None) -> None:
         self._scene, self._order = scene, order(scene)
+        coarse = 0 < steps < grid.steps_per_frame
         with ExitStack() as opened:
 
             def dynamics() -> Dynamics:
@@ -136,25 +139,26 @@ class Pilot:
                 opened.callback(made.close)
                 return made
 
-            self._fine = dynamics()
-            # A run in f64 is itself the coarse pilot.
-            self._coarse = None if grid.precision == "f64" else dynamics()
+            self._other = dynamics()
+            # A run in f64 is itself the one with its own steps.
+            self._same = None if grid.precision == "f64" or coarse else dynamics()
             self._open = opened.pop_all()
-        self.restart(grid)
+        self._parted = grid.precision == "f64" or not coarse
+        self.restart(grid, steps)
 
-    def restart(self, grid: TimeGrid) -> None:
-        """Begin again beside another run of the same scene, with its steps."""
-        self._steps, self._ratio = grid.steps_per_frame, refinement(self._scene, grid)
+    def restart(self, grid: TimeGrid, steps: int) -> None:
+        """Begin again beside another run of the same scene, with its steps and the pilot's; fine ones stay fine."""
+        self._own_steps, self._steps = grid.steps_per_frame, steps
         exact = replace(grid, precision="f64")
-        if self._ratio <= FINEST:
-            self._fine.restart(self._scene, replace(exact, steps_per_frame=self._ratio * self._steps))
-            if self._coarse:
-                self._coarse.restart(self._scene, exact)
+        if steps:
+            self._other.restart(self._scene, replace(exact, steps_per_frame=steps))
+            if self._same:
+                self._same.restart(self._scene, exact)
         self._error = self._rounding = self._in_f64 = self._largest = 0.0
 
     def compile(self) -> None:
         """Compile now what the first frame would compile."""
-        self._fine.compile()
+        self._other.compile()
 
     def follow(self, displacement: NDArray[Any], pause: Pause) -> None:
         """Step to the next frame, and compare.
@@ -163,25 +167,26 @@ class Pilot:
             displacement: of the run at that frame [m], shape (rows, cols, 3).
             pause: called several times a second; after an exception from it the pilot cannot continue.
         """
-        if self._ratio > FINEST:
+        if not self._steps:
             return
-        self._fine.advance(self._ratio * self._steps, pause)
-        if self._coarse:
-            self._coarse.advance(self._steps, pause)
-        fine = self._fine.displacement()
-        coarse = self._coarse.displacement() if self._coarse else displacement
+        self._other.advance(self._steps, pause)
+        if self._same:
+            self._same.advance(self._own_steps, pause)
+        other = self.displacement = self._other.displacement()
+        same = self._same.displacement() if self._same else displacement
         with np.errstate(all="ignore"):
-            exact = fine + (fine - coarse) / (self._ratio**self._order - 1)
+            ratio = self._steps / self._own_steps
+            exact = other + (other - same) / (ratio**self._order - 1) if self._parted else other
             self._error = max(self._error, longest(displacement - exact))
-            self._in_f64 = max(self._in_f64, longest(coarse - exact))
-            self._rounding = max(self._rounding, longest(displacement - coarse))
+            self._in_f64 = max(self._in_f64, longest(same - exact))
+            self._rounding = max(self._rounding, longest(displacement - same))
             self._largest = max(self._largest, longest(exact))
 
     @property
     def estimate(self) -> Estimate:
         """What the frames so far show."""
-        if self._ratio > FINEST:
-            return Estimate(self._steps, math.inf, 0.0, math.inf, self._order)
+        if not self._steps:
+            return Estimate(self._own_steps, math.inf, 0.0, math.inf, self._order)
         farthest = farthest_displacement(self._scene, self._scene.time.duration)
 
         def share(part: float) -> float:
@@ -189,7 +194,10 @@ class Pilot:
             relative = part / self._largest if self._largest > 0 else 0.0
             return relative if relative < math.inf and self._largest <= farthest else math.inf
 
-        return Estimate(self._steps, share(self._error), share(self._rounding), share(self._in_f64), self._order)
+        error, rounding, in_f64 = (share(part) for part in (self._error, self._rounding, self._in_f64))
+        if not self._parted:
+            rounding = in_f64 = error
+        return Estimate(self._own_steps, error, rounding, in_f64, self._order, self._parted)
 
     def close(self) -> None:
         """Free the memory."""
@@ -202,7 +210,7 @@ class Trials:
     def __init__(self, scene: Scene, grid: TimeGrid, device: Device) -> None:
         self._scene, self._grid = scene, grid
         with ExitStack() as opened:
-            self._pilot = Pilot(scene, grid, device)
+            self._pilot = Pilot(scene, grid, fine_steps(scene, grid), device)
             opened.callback(self._pilot.close)
             self._own = Dynamics(scene, grid, device)
             opened.callback(self._own.close)
@@ -216,9 +224,10 @@ class Trials:
             progress: called with the frames done and the frames in all.
         """
         grid = replace(self._grid, steps_per_frame=steps)
-        self._pilot.restart(grid)
+        fine = fine_steps(self._scene, grid)
+        self._pilot.restart(grid, fine)
         self._own.restart(self._scene, grid)
-        for frame in range(grid.frames if refinement(self._scene, grid) <= FINEST else 0):
+        for frame in range(grid.frames if fine else 0):
             pause = partial(progress, frame, grid.frames)
             pause()
             self._own.advance(steps, pause)

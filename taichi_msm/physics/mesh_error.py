@@ -3,7 +3,14 @@
 If u_c is the displacement with cells r times as long, Richardson's extrapolation gives the error of u as
 |u - u_c| / (r^p - 1). The lattice has order p = 2 in the length of its cells where the displacement is smooth, and a
 lower one at the rim of a tool's flat end, at an edge in a map, at a fixed edge without tension and in wrinkles. So p is
-measured by a third run, and limited to 1 to 2; if there are too few points for a third run, p is 1.
+measured by a third run. One above 2 shows that the coarsest run is too coarse to tell, and counts as somewhat less than
+2; one below 1 counts as 1; so does any if there are too few points for a third run.
+
+All three take the same steps, so that the error of the step is in all of them alike: where a coarse pilot goes with the
+run, it is the first of them, as half the steps make half the cost.
+
+Where the three show no order, or where tissue is pressed together that does not resist bending, and so wrinkles the
+more the finer the mesh is, the error may be larger than what is told: that is twice the estimate, and "at least".
 
 A tool that is hardly wider than a cell presses with more or less than its total, depending on where the points lie. The
 coarser runs press as hard as the first one does, and the part of the total that the first one misses is added to the
@@ -17,7 +24,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from contextlib import ExitStack, closing
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from functools import partial
 from itertools import pairwise, product
 from typing import Any
@@ -27,7 +34,7 @@ from numpy.typing import NDArray
 
 from taichi_msm.errors import SceneError
 from taichi_msm.physics.error_control import longest
-from taichi_msm.physics.material import LONGEST_CELL, cell_ratio
+from taichi_msm.physics.material import LONGEST_CELL, cell_ratio, material
 from taichi_msm.physics.probe_force import sums
 from taichi_msm.physics.solver import Dynamics
 from taichi_msm.physics.timestep import time_grid
@@ -35,6 +42,15 @@ from taichi_msm.progress import Count, Pause
 from taichi_msm.scene import MAX_POINTS, Probe, Scene, Sheet
 from taichi_msm.system.runtime import Device
 from taichi_msm.timegrid import TimeGrid
+
+# Orders between which the three runs are taken to converge.
+LOWEST_ORDER, HIGHEST_ORDER = 1.0, 3.0
+
+# An order above 2 counts as one this much of the difference below 2 (docs/decisions/0022).
+ABOVE = 1 / 4
+
+# Springs may be this much shorter than without any force before the tissue counts as pressed together.
+SLACK = 1e-4
 
 # The largest number of runs in a search; the largest and the smallest factor by which cells get shorter from one to the
 # next.
@@ -49,6 +65,19 @@ MOST_SUMMED = 4_000_000
 
 # The fewest points a side of which half as many cells still make a sheet to compare with.
 FEWEST = 7
+
+
+@dataclass(frozen=True)
+class MeshEstimate:
+    """What is known about the error that the number of points makes.
+
+    Attributes:
+        error: largest error, as a fraction of the largest displacement; infinite: not known.
+        doubt: why it may be larger; empty: it is about that.
+    """
+
+    error: float
+    doubt: str = ""
 
 
 def coarser(scene: Scene) -> Scene | None:
@@ -92,7 +121,7 @@ class MeshPilot:
 
     Args:
         scene: what is run.
-        grid: its steps, which the pilot takes too.
+        grid: the steps of the run that it is compared with, which the pilot takes too.
         coarse: what `coarser` returned for the scene.
         device: what `runtime.start` returned.
         cores: number of cores that stepping may use; None: all.
@@ -102,7 +131,7 @@ class MeshPilot:
     """
 
     def __init__(self, scene: Scene, grid: TimeGrid, coarse: Scene, device: Device, cores: int | None = None) -> None:
-        self._steps = grid.steps_per_frame
+        self._scene, self._steps = scene, grid.steps_per_frame
         exact, coarsest = replace(grid, precision="f64"), coarser(coarse)
         scenes = [coarse] if coarsest is None else [coarse, coarsest]
         with ExitStack() as opened:
@@ -113,7 +142,7 @@ class MeshPilot:
         self._ratio = min((own - 1) / (other - 1) for own, other in zip(*points[:2], strict=True))
         self._differences = [0.0 for _ in scenes]
         self._missing = missing_force(scene)
-        self._largest = 0.0
+        self._largest, self._shortest = 0.0, 1.0
 
     def compile(self) -> None:
         """Compile now what the first frame would compile."""
@@ -130,26 +159,34 @@ class MeshPilot:
         finer = displacement
         for n, (sheet, sampling) in enumerate(zip(self._sheets, self._samplings, strict=True)):
             sheet.advance(self._steps, pause)
-            found = sheet.displacement()
+            found = sheet.read()
             with np.errstate(all="ignore"):
-                self._differences[n] = max(self._differences[n], longest(finer - sampling.at(found)))
-            finer = found
+                self._differences[n] = max(self._differences[n], longest(finer - sampling.at(found.displacement)))
+            finer, self._shortest = found.displacement, min(self._shortest, found.shortest_spring)
 
     @property
-    def error(self) -> float:
-        """Error that the frames so far show, as a fraction of the largest displacement; infinite: not known."""
+    def estimate(self) -> MeshEstimate:
+        """What the frames so far show."""
         if self._largest == 0:
-            return 0.0
-        relative = self._differences[0] / (self._ratio**self.order - 1) / self._largest
-        return relative + self._missing if relative < math.inf else math.inf
+            return MeshEstimate(0.0)
+        if not self._differences[0] / self._largest < math.inf:
+            return MeshEstimate(math.inf)
+        made, order, doubt = material(self._scene), self.order, ""
+        assumed = 1.0 if order is None else max(1.0, min(order, 2 - ABOVE * (order - 2)))
+        relative = self._differences[0] / (self._ratio**assumed - 1) / self._largest
+        if order is not None and not LOWEST_ORDER <= order <= HIGHEST_ORDER:
+            doubt = "runs with fewer points do not converge"
+        elif made.bending == 0 and self._shortest < 1 - made.tension - SLACK:
+            doubt = "tissue without bending is pressed together, and with more points wrinkles more"
+        return MeshEstimate((2 if doubt else 1) * relative + self._missing, doubt)
 
     @property
-    def order(self) -> float:
-        """Order in the length of the cells that the frames so far show, from 1 to 2."""
+    def order(self) -> float | None:
+        """Order in the length of the cells that the frames so far show; None: there is no third run."""
         first, *others = self._differences
-        if not others or not 0 < first < others[0] < math.inf:
-            return 1.0
-        return min(2.0, max(1.0, math.log(others[0] / first) / math.log(self._ratio)))
+        if not others or first == 0:
+            return None
+        return math.log(others[0] / first) / math.log(self._ratio) if others[0] > 0 else -math.inf
 
     def close(self) -> None:
         """Free the memory."""
@@ -166,7 +203,7 @@ def choose_points(
     device: Device,
     check: Callable[[Scene], object],
     progress: Count = lambda done, total: None,
-) -> tuple[Scene, float]:
+) -> tuple[Scene, MeshEstimate]:
     """Find the fewest points, approximately, whose error is within the sheet's tolerance.
 
     Args:
@@ -192,22 +229,25 @@ def choose_points(
         except SceneError as error:
             asked = f"with the {rows} x {cols} points that sheet.tolerance: {tolerance:g} asks for"
             raise SceneError([f"{line} ({asked})" for line in error.lines]) from None
-        found = _error(tried, device, progress)
-        if found <= tolerance:
+        found = _estimate(tried, device, progress)
+        if found.error <= tolerance:
             return tried, found
-        if times >= most:
+        # The error falls with the square of the length of the cells, or more slowly.
+        needed = times * math.sqrt(found.error / (CLOSE * tolerance))
+        if needed > most:
             break
-        times = min(most, times * min(LARGEST_CUT, max(LEAST_CUT, math.sqrt(found / (CLOSE * tolerance)))))
+        times *= min(LARGEST_CUT, max(LEAST_CUT, needed / times))
     raise SceneError(
         [
-            f"sheet.tolerance: {tolerance:g} is out of reach: with {rows} x {cols} points the error is still "
-            f"{found:.2g}; take a wider tool (probes.N.radius, a smaller falloff), more tissue.pretension or bending "
-            "where it wrinkles, or a larger tolerance"
+            f"sheet.tolerance: {tolerance:g} is out of reach: with {rows} x {cols} points the error is "
+            f"{found.error:.2g}, and no sheet has more than {MAX_POINTS} points a side; take a wider tool "
+            "(probes.N.radius, a smaller falloff), more tissue.pretension or bending where it wrinkles, or a larger "
+            "tolerance"
         ]
     )
 
 
-def _error(scene: Scene, device: Device, progress: Count) -> float:
+def _estimate(scene: Scene, device: Device, progress: Count) -> MeshEstimate:
     """Run a scene and its pilot in f64, and give the error that the pilot shows."""
     grid, coarse = replace(time_grid(scene, device.arch), precision="f64"), coarser(scene)
     assert coarse is not None
@@ -217,7 +257,7 @@ def _error(scene: Scene, device: Device, progress: Count) -> float:
             pause()
             own.advance(grid.steps_per_frame, pause)
             pilot.follow(own.displacement(), pause)
-        return pilot.error
+        return pilot.estimate
 
 
 class CubicSampling:

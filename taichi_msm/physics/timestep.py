@@ -29,6 +29,12 @@ def stable_step(scene: Scene) -> float:
     return 4 / limit if limit > 0 else math.inf
 
 
+def stable_steps(scene: Scene) -> int:
+    """Count the fewest stable steps of a frame."""
+    # The small slack keeps a frame that is exactly n limits from being cut into n + 1 by rounding.
+    return max(1, math.ceil(1 / scene.time.frames_per_second / stable_step(scene) * (1 - 1e-12)))
+
+
 def time_grid(scene: Scene, arch: str = "cpu") -> TimeGrid:
     """Decide the steps and the precision of a scene.
 

@@ -9,6 +9,7 @@ from dataclasses import replace
 from taichi_msm.physics import probe_force
 from taichi_msm.physics.error_control import Estimate
 from taichi_msm.physics.material import material
+from taichi_msm.physics.mesh_error import MeshEstimate
 from taichi_msm.physics.run_progress import RunProgress
 from taichi_msm.scene import MAX_POINTS, Scene
 from taichi_msm.timegrid import TimeGrid
@@ -30,7 +31,7 @@ def notes(
     progress: RunProgress,
     estimate: Estimate | None,
     reason: str = "",
-    mesh_error: float | None = None,
+    mesh: MeshEstimate | None = None,
 ) -> Iterator[str]:
     """Say what is remarkable about a run, each in a line.
 
@@ -40,21 +41,23 @@ def notes(
         progress: of the last frame.
         estimate: of the error; None: there is none.
         reason: why there is no estimate.
-        mesh_error: error that the number of points makes; None: not estimated, infinite: not known.
+        mesh: the error that the number of points makes; None: not estimated.
     """
     if estimate is not None:
-        yield error(estimate, mesh_error)
+        yield error(estimate, mesh)
         if WRONG < estimate.error < math.inf:
             wrong = float(f"{100 * estimate.error:.2g}")
             yield f"the run is about {wrong:g} % wrong; {_remedy(scene, grid, estimate)}"
     elif reason:
-        if mesh_error is None:
+        if mesh is None:
             yield f"error not estimated: {reason}"
         else:
-            yield f"error {mesh_error:.2g} due to the number of points; due to the time step not estimated: {reason}"
+            yield f"error {_size(mesh)} due to the number of points; due to the time step not estimated: {reason}"
     yield from probe_force.notes(scene, probe_force.probe_records(scene))
-    if mesh_error is not None and WRONG < mesh_error < math.inf:
-        wrong, cut = float(f"{100 * mesh_error:.2g}"), math.sqrt(mesh_error / (WRONG / 2))
+    if mesh is not None and mesh.doubt:
+        yield f"the error due to the number of points may be larger: {mesh.doubt}"
+    if mesh is not None and WRONG < mesh.error < math.inf:
+        wrong, cut = float(f"{100 * mesh.error:.2g}"), math.sqrt(mesh.error / (WRONG / 2))
         finer = [min(MAX_POINTS, math.ceil((count - 1) * cut) + 1) for count in scene.sheet.points]
         remedy = f"; try sheet.points: {finer}" if max(finer) < MAX_POINTS else ""
         yield f"so few points make the run up to {wrong:g} % wrong{remedy}"
@@ -78,19 +81,26 @@ def notes(
         )
 
 
-def error(estimate: Estimate, mesh_error: float | None = None) -> str:
+def error(estimate: Estimate, mesh: MeshEstimate | None = None) -> str:
     """Say how wrong a run is."""
     if estimate.error == math.inf:
         return "error not known: a pilot run diverged, or steps do not resolve the damping"
-    parts = [f"{estimate.in_f64:.1g} due to the time step"]
-    if estimate.rounding:
+    bound = "at least " if estimate.at_least else "" if estimate.parted else "at most about "
+    parts = [f"{bound}{estimate.in_f64:.1g} due to the time step"]
+    if not estimate.parted:
+        parts = [f"{bound}{estimate.error:.1g} due to the time step and rounding"]
+    elif estimate.rounding:
         parts.append(f"{estimate.rounding:.1g} to rounding")
-    if mesh_error is None:
-        return f"error {estimate.error:.1g} of the largest displacement: {', '.join(parts)}"
-    points = f"{mesh_error:.2g}" if mesh_error < math.inf else "an unknown part"
+    if mesh is None:
+        return f"error {bound}{estimate.error:.1g} of the largest displacement: {', '.join(parts)}"
     return (
-        f"error, as a fraction of the largest displacement: {', '.join([*parts, f'{points} to the number of points'])}"
+        f"error, as a fraction of the largest displacement: {', '.join(parts)}, {_size(mesh)} to the number of points"
     )
+
+
+def _size(mesh: MeshEstimate) -> str:
+    """Say how large the error is that the number of points makes."""
+    return f"{'at least ' if mesh.doubt else ''}{mesh.error:.2g}" if mesh.error < math.inf else "an unknown part"
 
 
 def _remedy(scene: Scene, grid: TimeGrid, estimate: Estimate) -> str:

@@ -1,4 +1,4 @@
-"""How much work a run is, and what follows from it: whether f64 is cheap enough for `auto`, and whether a pilot is.
+"""How much work a run is, and what follows from it: whether f64 is cheap enough for `auto`, and whether pilots are.
 
 The unit of work is a step of one point in f32, which takes 1 to 2 ns on two cores of 2024. It is counted from the scene
 alone, so that the decisions are the same on every machine.
@@ -28,8 +28,8 @@ ENCODING, SAMPLE = 40.0, 6.0
 # Stepping in f64 is a small part of a run if it takes at most this share of the time of everything else.
 SMALL = 0.25
 
-# Unless it is asked for, a pilot is run only if it takes at most this share of the run.
-MOST_FOR_PILOT = 1 / 3
+# Unless they are asked for, pilots are run only if they take at most this share of the run.
+MOST_FOR_PILOTS = 2 / 5
 
 
 def is_small_in_f64(scene: Scene, grid: TimeGrid) -> bool:
@@ -42,22 +42,17 @@ def is_small_in_f64(scene: Scene, grid: TimeGrid) -> bool:
     return DOUBLE * _steps(scene, grid) <= SMALL * _other(scene)
 
 
-def affords_pilot(scene: Scene, grid: TimeGrid, ratio: int) -> bool:
-    """Tell whether a pilot takes at most a third of a run.
+def affords_pilots(scene: Scene, grid: TimeGrid, steps: float) -> bool:
+    """Tell whether pilots take at most two fifths of a run.
 
     Args:
         scene: a checked scene.
         grid: its steps.
-        ratio: steps of the pilot for each step of the run.
+        steps: of the pilots, all in f64, for each step of the run, counted in steps of the whole sheet.
     """
-    steps = _steps(scene, grid)
-    # For tissue there are two further pilots, with a quarter and a sixteenth of the points.
-    coarse = 0.0 if scene.tissue is None else DOUBLE * steps * 5 / 16
-    if grid.precision == "f64":
-        own, pilot = DOUBLE * steps, DOUBLE * ratio * steps + coarse
-    else:
-        own, pilot = steps, DOUBLE * (ratio + 1) * steps + coarse
-    return pilot <= MOST_FOR_PILOT * (pilot + own + _other(scene))
+    own, pilots = (DOUBLE if grid.precision == "f64" else 1.0), DOUBLE * steps
+    run = (own + pilots) * _steps(scene, grid) + _other(scene)
+    return pilots * _steps(scene, grid) <= MOST_FOR_PILOTS * run
 
 
 def _steps(scene: Scene, grid: TimeGrid) -> float:

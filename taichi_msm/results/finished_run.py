@@ -138,21 +138,13 @@ def damaged(path: Path) -> FilesError:
 
 
 def _as_run(record: Mapping[str, Any]) -> Scene:
-    """Make the scene of a record, with the points, the step and the precision that were chosen for it.
+    """Make the scene of a record.
 
     Raises:
         Exception: when the scene cannot be run, or the record lacks something.
     """
     given, folder = Scene(**record["scene"]), Path(record["working_directory"])
-    sheet = {"points": record["points"], "tolerance": None}
-    time = {"step": record["step"], "precision": record["precision"], "tolerance": None}
-    scene = given.model_copy(
-        update={
-            "sheet": given.sheet.model_copy(update=sheet),
-            "time": given.time.model_copy(update=time),
-            "image": None if given.image is None else str(folder / given.image),
-        }
-    )
+    scene = given.model_copy(update={"image": None if given.image is None else str(folder / given.image)})
     if scene.stiffness_map is not None:
         scene = scene.with_map_image(str(folder / scene.stiffness_map.image))
     found = [problem for check in (material.problems, camera.problems) for problem in check(scene)]

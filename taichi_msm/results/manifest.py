@@ -16,6 +16,7 @@ from taichi_msm.errors import DamagedError, FilesError
 from taichi_msm.physics import material, timestep
 from taichi_msm.physics.error_control import Estimate
 from taichi_msm.physics.material import factors
+from taichi_msm.physics.mesh_error import MeshEstimate
 from taichi_msm.render import camera
 from taichi_msm.render.texture import load_texture
 from taichi_msm.results.publication import CHECKPOINT, MANIFEST, STAGING, open_checkpoint
@@ -36,7 +37,7 @@ class Manifest:
         scene: the scene with the points, the step and the precision that were chosen.
         overrides: of the scene file.
         estimate: of the error, if a tolerance required it before the run; else None.
-        mesh_error: of the points, if a tolerance of the sheet required it before the run; else None.
+        mesh: error of the points, if a tolerance of the sheet required it before the run; else None.
         asks_estimate: whether to estimate the error beside the run; None: if it is cheap.
         folder: the current directory, from which the path of the scene's picture starts.
         arch: cpu, cuda or vulkan.
@@ -49,7 +50,7 @@ class Manifest:
     scene: Scene
     overrides: tuple[str, ...]
     estimate: Estimate | None
-    mesh_error: float | None
+    mesh: MeshEstimate | None
     asks_estimate: bool | None
     folder: str
     arch: str
@@ -59,9 +60,9 @@ class Manifest:
 
     def as_json(self) -> dict[str, Any]:
         """Convert the manifest to data for JSON."""
-        known = None if self.estimate is None else asdict(self.estimate)
+        known = {key: one and asdict(one) for key, one in (("estimate", self.estimate), ("mesh", self.mesh))}
         scenes = {"given": self.given.model_dump(mode="json"), "scene": self.scene.model_dump(mode="json")}
-        return {**vars(self), **scenes, "estimate": known}
+        return {**vars(self), **scenes, **known}
 
     def load_texture(self) -> NDArray[np.uint8] | None:
         """Read the picture of the scene, if the scene draws; raises what `texture.load_texture` does."""

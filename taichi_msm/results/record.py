@@ -13,18 +13,22 @@ class ErrorRecord(TypedDict):
     """The error of a run, as fractions of the largest displacement; None: not known, because a pilot diverged.
 
     Attributes:
-        error: largest error of any point at any frame.
-        rounding: the part of it that comes from f32.
-        in_f64: the error of the same step in f64.
+        error: largest error of any point at any frame, due to the step and to rounding.
+        rounding: the part of it that comes from f32; None also where a coarse pilot does not tell the parts.
+        in_f64: the error of the same step in f64; None likewise.
         order: of the method.
+        at_least: whether `error` may be larger.
         mesh_error: the error that the number of points makes; only with tissue.
+        mesh_doubt: why `mesh_error` may be larger; empty: it is about that.
     """
 
     error: float | None
     rounding: float | None
     in_f64: float | None
     order: int
+    at_least: bool
     mesh_error: NotRequired[float | None]
+    mesh_doubt: NotRequired[str]
 
 
 class RunRecord(TypedDict, total=False):
@@ -34,7 +38,8 @@ class RunRecord(TypedDict, total=False):
         status: how the run ended.
         error: where and why the run diverged; only if it did.
         dump: path of the file with the last good state; only if the run diverged. None: there is no such file.
-        scene: as it was loaded.
+        scene: as it was run, with the points, the step and the precision that were chosen.
+        asked: keys by their paths, with the values that the scene had where others were chosen.
         working_directory: directory from which the path of the scene's image starts.
         overrides: of the scene file.
         points: rows and columns of mass points.
@@ -57,6 +62,7 @@ class RunRecord(TypedDict, total=False):
     error: str
     dump: str | None
     scene: dict[str, Any]
+    asked: dict[str, Any]
     working_directory: str
     overrides: list[str]
     points: list[int]

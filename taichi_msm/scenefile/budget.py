@@ -13,8 +13,8 @@ from pathlib import Path
 
 from taichi_msm.errors import Path as Key
 from taichi_msm.errors import Problem, SceneError
+from taichi_msm.physics.pilots import choose_pilots
 from taichi_msm.physics.timestep import time_grid
-from taichi_msm.physics.workload import affords_pilot
 from taichi_msm.render import texture
 from taichi_msm.scene import Scene
 from taichi_msm.system.resources import available_memory
@@ -89,7 +89,7 @@ def estimate(scene: Scene, grid: TimeGrid) -> Budget:
     tracks = frames * scene.render.tracks**2 * TRACK_BYTES if "tracks" in scene.output else 0
     numbers = STATE_NUMBERS + OUTPUT_NUMBERS + len(scene.probes) + (MAP_NUMBERS if scene.stiffness_map else 0)
     # Pilots are up to two more sheets in f64; with tissue also two smaller ones.
-    pilot = scene.time.tolerance is not None or affords_pilot(scene, grid, 2)
+    pilot = scene.time.tolerance is not None or not choose_pilots(scene, grid).reason
     sheets = number_bytes + (8 * (2 + (scene.tissue is not None) * 5 / 16) if pilot else 0)
     return Budget(
         points=points,

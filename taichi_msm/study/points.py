@@ -127,7 +127,7 @@ class PointStudy:
         with closing(MeshPilot(scene, grid, coarse, self._device)) as pilot:
             pilot.compile()
             first = self._step_through(trial, pilot)
-            trial.estimate = pilot.error
+            trial.estimate = pilot.estimate.error
         # The faster of two runs: what disturbs one may not disturb the other.
         return min(first, self._step_through(trial))
 

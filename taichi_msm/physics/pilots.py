@@ -1,0 +1,89 @@
+"""Which pilots estimate the error of a run: the cheapest that tell it, decided from the scene alone.
+
+A pilot with half as many steps costs half a run, one with twice as many costs two. So the first pilot is coarse, where
+twice the step is stable, and a finer one follows only where the first one shows an error that matters.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+from taichi_msm.physics.material import material
+from taichi_msm.physics.timestep import stable_steps
+from taichi_msm.physics.workload import affords_pilots
+from taichi_msm.scene import Scene
+from taichi_msm.timegrid import TimeGrid
+
+# An error below this needs no finer pilot: nobody sees it, and twice as much or half of it would mean the same.
+ENOUGH = 1e-3
+
+# A coarse pilot takes at most this share of the run's steps; else it saves too little.
+COARSEST = 0.6
+
+# The largest refinement of a fine pilot; if it would have to be finer, the error is not known.
+FINEST = 64
+
+# Steps of the pilots for the points, with half and a quarter of the cells a side, in steps of the whole sheet.
+POINTS = 1 / 4 + 1 / 16
+
+
+class Pilots(NamedTuple):
+    """The pilots of a run.
+
+    Attributes:
+        beside: steps per frame of the pilot that goes with the run; 0: there is none.
+        after: steps per frame of the one that follows where the first one shows too large an error; 0: there is none.
+        points: whether pilots with fewer points go with the run.
+        reason: why there are none.
+    """
+
+    beside: int
+    after: int
+    points: bool
+    reason: str
+
+
+def choose_pilots(scene: Scene, grid: TimeGrid, *, asked: bool = False) -> Pilots:
+    """Choose the pilots of a run.
+
+    Args:
+        scene: a checked scene.
+        grid: its steps.
+        asked: whether they are wanted whatever they cost.
+    """
+    own = grid.steps_per_frame
+    coarse, fine = coarse_steps(scene, grid), fine_steps(scene, grid)
+    points = POINTS if scene.tissue is not None else 0.0
+    # Beside a run in f32 a fine pilot has another one with the run's own steps.
+    fine_cost = fine / own + (grid.precision == "f32")
+    first = (1 + points) * coarse / own if coarse else fine_cost + points
+    if not asked and not affords_pilots(scene, grid, first):
+        return no_pilots("it would take more than two fifths of the run; to have it anyway, pass --estimate-error")
+    if not coarse:
+        return Pilots(fine, 0, points > 0, "")
+    # Where no positions are kept, the run is repeated beside the pilot that follows.
+    again = 0.0 if scene.output else 1.0
+    follows = asked or affords_pilots(scene, grid, first + fine_cost + again)
+    return Pilots(coarse, fine if follows else 0, points > 0, "")
+
+
+def no_pilots(reason: str) -> Pilots:
+    """Have no pilots, and say why."""
+    return Pilots(0, 0, False, reason)
+
+
+def coarse_steps(scene: Scene, grid: TimeGrid) -> int:
+    """Count the steps per frame of the coarse pilot: half of the run's; 0: no such run is stable, or cheap enough."""
+    steps = max(math.ceil(grid.steps_per_frame / 2), stable_steps(scene))
+    return steps if steps <= COARSEST * grid.steps_per_frame else 0
+
+
+def fine_steps(scene: Scene, grid: TimeGrid) -> int:
+    """Count the steps per frame of the fine pilot: twice the run's, or as many as resolve the damping; 0: too many.
+
+    If g h / r > 1, with g = C / m, central differences make velocities change their sign at every step, and the
+    difference between runs with steps h and h / r does not show all of it. A coarse pilot shows 2 to 4 times as much.
+    """
+    refinement = max(2, math.ceil(material(scene).drag * grid.step))
+    return refinement * grid.steps_per_frame if refinement <= FINEST else 0

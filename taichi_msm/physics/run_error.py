@@ -1,0 +1,122 @@
+"""The error of a run, by the pilots that were chosen for it: some go with the run, and one may follow it."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from contextlib import ExitStack, closing
+from dataclasses import replace
+from functools import partial
+from typing import Any, NamedTuple
+
+from numpy.typing import NDArray
+
+from taichi_msm.physics.error_control import Estimate, Pilot
+from taichi_msm.physics.mesh_error import MeshEstimate, MeshPilot, coarser
+from taichi_msm.physics.pilots import ENOUGH, Pilots
+from taichi_msm.physics.solver import Dynamics
+from taichi_msm.progress import Count, Pause
+from taichi_msm.scene import Scene
+from taichi_msm.system.runtime import Device
+from taichi_msm.timegrid import TimeGrid
+
+
+class Known(NamedTuple):
+    """What is known about the error of a run.
+
+    Attributes:
+        estimate: the error due to the step and to rounding; None: not estimated.
+        reason: why it was not estimated.
+        mesh: the error due to the number of points; None: not estimated.
+    """
+
+    estimate: Estimate | None = None
+    reason: str = ""
+    mesh: MeshEstimate | None = None
+
+
+class RunError:
+    """The pilots of a run.
+
+    Args:
+        scene: what is run.
+        grid: its steps.
+        pilots: what `choose_pilots` returned.
+        known: what was found before the run, and is not estimated again.
+        device: what `runtime.start` returned.
+        cores: number of cores that stepping may use.
+
+    Raises:
+        DeviceError: when the device cannot run the scene in f64.
+    """
+
+    def __init__(self, scene: Scene, grid: TimeGrid, pilots: Pilots, known: Known, device: Device, cores: int) -> None:
+        self._scene, self._grid, self._pilots, self._known = scene, grid, pilots, known
+        self._device, self._cores = device, cores
+        self._coarse = known.estimate is None and 0 < pilots.beside < grid.steps_per_frame
+        with ExitStack() as opened:
+            self._time = self._mesh = None
+            if known.estimate is None:
+                self._time = opened.enter_context(closing(Pilot(scene, grid, pilots.beside, device, cores)))
+            coarse = coarser(scene) if pilots.points and known.mesh is None else None
+            if coarse is not None:
+                steps = replace(grid, steps_per_frame=pilots.beside) if self._coarse else grid
+                self._mesh = opened.enter_context(closing(MeshPilot(scene, steps, coarse, device, cores)))
+            self._open = opened.pop_all()
+
+    def compile(self) -> None:
+        """Compile now what the first frame would compile."""
+        for one in (self._time, self._mesh):
+            if one is not None:
+                one.compile()
+
+    def follow(self, displacement: NDArray[Any], pause: Pause) -> None:
+        """Step to the next frame, and compare.
+
+        Args:
+            displacement: of the run at that frame [m], shape (rows, cols, 3).
+            pause: called several times a second; after an exception from it the pilots cannot continue.
+        """
+        if self._time is not None:
+            self._time.follow(displacement, pause)
+        if self._mesh is not None:
+            self._mesh.follow(self._time.displacement if self._time and self._coarse else displacement, pause)
+
+    def finish(self, displacements: Iterator[NDArray[Any]] | None, progress: Count) -> None:
+        """After the last frame, take a finer pilot where the coarse one shows an error that matters.
+
+        Args:
+            displacements: of the run at all frames but the first [m]; None: not kept, and the run is repeated.
+            progress: called with the frames done and the frames in all.
+        """
+        if self._time is None or not self._pilots.after or self._time.estimate.error < ENOUGH:
+            return
+        frames = self._grid.frames
+        with closing(Pilot(self._scene, self._grid, self._pilots.after, self._device, self._cores)) as fine:
+            for frame, displacement in enumerate(displacements or self._repeated(), 1):
+                fine.follow(displacement, partial(progress, frame, frames))
+            self._known = self._known._replace(estimate=fine.estimate)
+
+    def _repeated(self) -> Iterator[NDArray[Any]]:
+        """Run the scene again; give the displacements of its frames."""
+        with closing(Dynamics(self._scene, self._grid, self._device, cores=self._cores)) as own:
+            for _ in range(self._grid.frames):
+                own.advance(self._grid.steps_per_frame)
+                yield own.displacement()
+
+    @property
+    def known(self) -> Known:
+        """What the frames so far show."""
+        found = self._known
+        if found.estimate is None and self._time is not None:
+            estimate = self._time.estimate
+            # Of a run in f32 a coarse pilot tells no less than there is.
+            at_least = self._coarse and estimate.parted and ENOUGH <= estimate.error < math.inf
+            found = found._replace(estimate=replace(estimate, at_least=at_least))
+        if self._mesh is not None:
+            found = found._replace(mesh=self._mesh.estimate)
+        return found
+
+    def close(self) -> None:
+        """Free the memory."""
+        self._open.close()
