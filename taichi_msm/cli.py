@@ -20,7 +20,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from taichi_msm import __version__
-from taichi_msm.errors import DeviceError, FilesError, NotInstalledError, SceneError, printable
+from taichi_msm.errors import DeviceError, FilesError, NotInstalledError, SceneError, did_you_mean, printable
 from taichi_msm.system.signals import Interruption
 from taichi_msm.system.streams import mute, tell
 
@@ -35,6 +35,19 @@ RESUMABLE = ("resume", "threads", "quiet", "as_json")
 FORMATS = ("kitti", "tapvid", "vtk", "gltf", "obj")
 
 EXIT_CODES = {"complete": DONE, "diverged": DIVERGED}
+
+
+class Choice(click.Choice):  # type: ignore[type-arg]  # before click 8.2 it takes none
+    """One of some words; the message about any other names the nearest."""
+
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> str:
+        """Give the word, or say which may have been meant."""
+        try:
+            return str(super().convert(value, param, ctx))
+        except click.BadParameter as error:
+            said = error.message.rstrip(".") + did_you_mean(str(value), [str(word) for word in self.choices])
+            raise click.BadParameter(said, ctx, param) from None
+
 
 scene_argument = click.argument("scene", metavar="SCENE")
 image_option = click.option("--image", metavar="FILE", help="The picture on the sheet, instead of the scene's.")
@@ -357,7 +370,7 @@ def view(
 @click.option(
     "--format",
     "name",
-    type=click.Choice(FORMATS),
+    type=Choice(FORMATS),
     metavar="FORMAT",
     required=True,
     help="kitti: optical flow; tapvid: tracks of points; vtk: for ParaView; gltf: for Blender and browsers; "

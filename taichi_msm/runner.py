@@ -238,11 +238,15 @@ def _carry_out(
                 simulation.restore(writer.saved)
             for frame in range(1, writer.frames if pilots else 0):
                 for one in pilots:
-                    one.follow(writer.position(frame) - rest, partial(progress, "pilot", frame, frames))
+                    one.follow(writer.position(frame) - rest, partial(progress, "pilot", frame, writer.frames))
                 watch.lap("pilot")
             observed = Observed()
+            # Frames that need no step are told apart, as they say nothing of the time that the others will take.
+            without_steps = max(resumed, 1)
             for frame in range(writer.frames, frames):
-                progress("frames", frame, frames)
+                stage, of = ("redraw", without_steps) if frame < without_steps else ("frames", frames)
+                told = partial(progress, stage, frame, of)
+                told()
                 watch.lap("hand over")
                 if frame > simulation.frame:
                     simulation.advance(pause=pause)
@@ -250,10 +254,10 @@ def _carry_out(
                 position = writer.position(frame) if frame < resumed else simulation.positions()
                 observed = simulation.observe(observed.labels, position, frame / scene.time.frames_per_second)
                 watch.lap("render")
-                writer.add(position, observed, partial(progress, "frames", frame, frames))
+                writer.add(position, observed, told)
                 watch.lap("hand over")
                 for one in pilots if frame > 0 else ():
-                    one.follow(position - rest, partial(progress, "frames", frame, frames))
+                    one.follow(position - rest, told)
                     watch.lap("pilot")
             writer.finish(partial(progress, "frames", frames, frames))
         except KeyboardInterrupt:
