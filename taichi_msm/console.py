@@ -106,7 +106,9 @@ def rough_time(seconds: float) -> str:
     """Write a time that is known only about: 40 s, 3 min, 2.5 h."""
     if seconds < 100:
         return f"{seconds:.0f} s" if seconds >= 1 else "1 s"
-    return f"{seconds / 60:.0f} min" if seconds < 6000 else f"{seconds / 3600:.2g} h"
+    if seconds < 6000:
+        return f"{seconds / 60:.0f} min"
+    return f"{seconds / 3600:.2g} h" if seconds < 360000 else f"{seconds / 86400:.0f} days"
 
 
 def _bar() -> Bar:

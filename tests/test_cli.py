@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import re
 import signal
 import subprocess
 import sys
@@ -380,7 +381,18 @@ def test_a_killed_run_leaves_the_results_before_it(small: Path, program: Program
     assert program("run", "small.yaml", "--out", "kept").returncode == 0
     before = {path: path.read_bytes() for path in (small / "kept").rglob("*") if path.is_file()}
     process = subprocess.Popen(
-        [sys.executable, "-m", "taichi_msm", "run", "small.yaml", "--out", "kept", "--set", "time.duration=2000"],
+        [
+            sys.executable,
+            "-m",
+            "taichi_msm",
+            "run",
+            "small.yaml",
+            "--quiet",
+            "--out",
+            "kept",
+            "--set",
+            "time.duration=2000",
+        ],
         stderr=subprocess.PIPE,
         text=True,
     )
@@ -600,6 +612,8 @@ def test_check_prints_the_resolved_scene_and_what_it_takes(small: Path, capsys: 
     assert (code, err) == (0, "")
     assert "falloff: 20.0" in out
     assert "\n99 points, 5 frames, 164 steps of 0.00243902 s (limit 0.00499221 s), 41 a frame, in f64\n" in out
+    assert re.search(r"\nabout 1?\d s to run \(a?", out)
+    assert " of memory, at most 0.1 MiB on disk, " in out
     assert not (small / "output").exists()
     facts = json.loads(call(capsys, "check", "small.yaml", "--json")[1])
     assert facts["scene"]["time"]["damping_difference"] == "central"

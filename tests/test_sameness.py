@@ -134,8 +134,8 @@ def test_tissue_gives_the_same_bytes_while_bounds_are_checked(fixed: str, root: 
 
 def test_any_name_in_any_locale(runs: Runs) -> None:
     # click takes a terminal that is said to know ASCII alone for one that is set up wrongly, and speaks UTF-8 to it.
-    assert runs.printed[0].decode().startswith(f"{NAMES[0]}: 3 frames, ")
-    assert runs.printed[1].startswith(b"two \\udcff: 3 frames, " if ODD != "two" else b"two: 3 frames, ")
+    assert f"{NAMES[0]}: 3 frames, " in runs.printed[0].decode()
+    assert (b"two \\udcff: 3 frames, " if ODD != "two" else b"two: 3 frames, ") in runs.printed[1]
 
 
 def test_nothing_is_written_elsewhere(runs: Runs) -> None:

@@ -7,6 +7,7 @@ alone, so that the decisions are the same on every machine.
 from __future__ import annotations
 
 import math
+from typing import NamedTuple
 
 from taichi_msm.physics.loads import probe_slots
 from taichi_msm.physics.material import material
@@ -30,6 +31,29 @@ SMALL = 0.25
 
 # Unless it is asked for, a pilot is run only if it takes at most this share of the run.
 MOST_FOR_PILOT = 1 / 3
+
+
+class Work(NamedTuple):
+    """The work of the parts of a run.
+
+    Attributes:
+        start: starting Python and Taichi, and compiling the kernels.
+        stepping: all steps.
+        pilots: the pilots of a run that chooses by itself whether to have some, about.
+        pictures: drawing and encoding.
+    """
+
+    start: float
+    stepping: float
+    pilots: float
+    pictures: float
+
+
+def work(scene: Scene, grid: TimeGrid) -> Work:
+    """Count the work of a run."""
+    steps = _steps(scene, grid)
+    stepping = DOUBLE * steps if grid.precision == "f64" else steps
+    return Work(START, stepping, 2 * DOUBLE * steps * affords_pilot(scene, grid, 2), _other(scene) - START)
 
 
 def is_small_in_f64(scene: Scene, grid: TimeGrid) -> bool:
