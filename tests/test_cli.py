@@ -284,7 +284,8 @@ def test_a_signal_keeps_the_frames_so_far(number: signal.Signals, code: int, sto
     frames = record["frames"]
     assert 3 < frames < 20000
     then = "continue with: taichi-msm run --resume long"
-    assert error == f"small.yaml: interrupted; frames in long: {frames}; {then}\n"
+    # On a slow machine lines of progress come first.
+    assert error.splitlines()[-1] == f"small.yaml: interrupted; frames in long: {frames}; {then}"
     assert len(list((small / "long" / "frames").iterdir())) == frames
     assert np.load(small / "long" / "trajectory.npz")["position"].shape == (frames, 9, 11, 3)
 
@@ -612,7 +613,7 @@ def test_check_prints_the_resolved_scene_and_what_it_takes(small: Path, capsys: 
     assert (code, err) == (0, "")
     assert "falloff: 20.0" in out
     assert "\n99 points, 5 frames, 164 steps of 0.00243902 s (limit 0.00499221 s), 41 a frame, in f64\n" in out
-    assert re.search(r"\nabout 1?\d s to run \(a?", out)
+    assert re.search(r"\nabout \d+ s to run \((by earlier|a guess)", out)
     assert " of memory, at most 0.1 MiB on disk, " in out
     assert not (small / "output").exists()
     facts = json.loads(call(capsys, "check", "small.yaml", "--json")[1])
