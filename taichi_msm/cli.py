@@ -20,7 +20,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from taichi_msm import __version__
-from taichi_msm.errors import DeviceError, FilesError, NotInstalledError, SceneError, printable
+from taichi_msm.errors import DeviceError, FilesError, NotInstalledError, SceneError, did_you_mean, printable
 from taichi_msm.system.signals import Interruption
 from taichi_msm.system.streams import mute, tell
 
@@ -35,6 +35,19 @@ RESUMABLE = ("resume", "threads", "quiet", "as_json")
 FORMATS = ("kitti", "tapvid", "vtk", "gltf", "obj")
 
 EXIT_CODES = {"complete": DONE, "diverged": DIVERGED}
+
+
+class Choice(click.Choice):  # type: ignore[type-arg]  # before click 8.2 it takes none
+    """One of some words; the message about any other names the nearest."""
+
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> str:
+        """Give the word, or say which may have been meant."""
+        try:
+            return str(super().convert(value, param, ctx))
+        except click.BadParameter as error:
+            said = error.message.rstrip(".") + did_you_mean(str(value), [str(word) for word in self.choices])
+            raise click.BadParameter(said, ctx, param) from None
+
 
 scene_argument = click.argument("scene", metavar="SCENE")
 image_option = click.option("--image", metavar="FILE", help="The picture on the sheet, instead of the scene's.")
@@ -102,6 +115,7 @@ def run(
 
     from taichi_msm import runner
     from taichi_msm.console import Progress, summary
+    from taichi_msm.scenefile import duration
 
     interruption = Interruption()
     try:
@@ -123,6 +137,8 @@ def run(
     except KeyboardInterrupt:
         report("interrupted", [f"interrupted; nothing was written{going_on(directory)}"], as_json)
         return interruption.code
+    if resume is None:
+        duration.learn(loaded, record)
     if as_json:
         print_json({"directory": str(directory), **record})
     if record["status"] != "complete":
@@ -140,18 +156,18 @@ def run(
 @set_option
 @json_option
 def check(scene: str, image: str | None, overrides: tuple[str, ...], as_json: bool) -> int:
-    """Validate SCENE and print the steps, memory and disk space it needs; compute nothing."""
+    """Validate SCENE and print the steps, time, memory and disk space it needs; compute nothing."""
     from taichi_msm.physics import probe_force, timestep
     from taichi_msm.physics.probe_force import in_words, probe_records
     from taichi_msm.render.notes import notes as drawing_notes
-    from taichi_msm.scenefile import budget
+    from taichi_msm.scenefile import budget, duration
     from taichi_msm.scenefile.load import load_scene
 
     loaded = load_scene(scene, overrides, image)
     with naming(scene):
         budget.require_disk(loaded, Path("output"))
     grid, limit = timestep.time_grid(loaded), timestep.stable_step(loaded)
-    need = budget.estimate(loaded, grid)
+    need, takes = budget.estimate(loaded, grid), duration.estimate(loaded, grid)
     facts: dict[str, Any] = {
         "scene": loaded.model_dump(mode="json"),
         "step": grid.step,
@@ -160,6 +176,7 @@ def check(scene: str, image: str | None, overrides: tuple[str, ...], as_json: bo
         "precision": grid.precision,
         "steps": need.steps,
         "frames": need.frames,
+        "estimated_seconds": takes.seconds,
         "memory": need.memory_bytes,
         "disk": need.disk_bytes,
         "disk_while_running": need.disk_bytes + need.working_bytes,
@@ -171,13 +188,17 @@ def check(scene: str, image: str | None, overrides: tuple[str, ...], as_json: bo
         return DONE
     import yaml
 
+    from taichi_msm.console import rough_time
+
+    source = "by earlier runs here" if takes.measured else "a guess, as no run has been timed here yet"
     asking = [f"{name}.tolerance" for name in ("sheet", "time") if getattr(loaded, name).tolerance is not None]
     at_least = f", at least, as {' and '.join(asking)} may ask for more" if asking else ""
     click.echo(yaml.safe_dump(facts["scene"], sort_keys=False, default_flow_style=None), nl=False)
     click.echo(
         f"\n{need.points} points, {need.frames} frames, {need.steps} steps of {facts['step']:.6g} s "
         f"(limit {limit:.6g} s), {facts['steps_per_frame']} a frame{at_least}, in {facts['precision']}\n"
-        f"about {need.memory_bytes / 2**20:.0f} MiB of memory, {need.disk_bytes / 2**20:.1f} MiB on disk, "
+        f"about {rough_time(takes.seconds)} to run{at_least} ({source})\n"
+        f"about {need.memory_bytes / 2**20:.0f} MiB of memory, at most {need.disk_bytes / 2**20:.1f} MiB on disk, "
         f"{need.working_bytes / 2**20:.1f} MiB more while it runs"
     )
     for index, probe in enumerate(facts["probes"]):
@@ -357,7 +378,7 @@ def view(
 @click.option(
     "--format",
     "name",
-    type=click.Choice(FORMATS),
+    type=Choice(FORMATS),
     metavar="FORMAT",
     required=True,
     help="kitti: optical flow; tapvid: tracks of points; vtk: for ParaView; gltf: for Blender and browsers; "

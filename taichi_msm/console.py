@@ -21,6 +21,7 @@ STAGES = {
     "pilot": "pilot runs",
     "compile": "compiling the kernels",
     "check": "checking the finished frames",
+    "redraw": "drawing finished frames",
     "frames": "simulating and drawing",
     "diagnosis": "finding out why it diverged",
     "stepping": "measuring the stepping",
@@ -35,26 +36,35 @@ STAGES = {
 
 
 # Time between two lines when stderr is not a terminal [s].
-LINE_EVERY = 60.0
+LINE_EVERY = 10.0
 
 
 class Progress:
-    """Progress on stderr: a bar on a terminal, else a line a minute; or nothing."""
+    """Progress on stderr: a bar on a terminal, else a line every ten seconds; or nothing."""
 
     def __init__(self, quiet: bool) -> None:
         self._quiet = quiet
         self._bar = None if quiet or not sys.stderr.isatty() else _bar()
         self._next_line = time.monotonic() + LINE_EVERY
+        self._pace = _Pace("", 0, 0.0)
         if self._bar is not None:
-            self._task = self._bar.add_task(STAGES["start"], total=None)
+            self._task = self._bar.add_task(STAGES["start"], total=None, left="")
 
     def update(self, stage: str, done: int, total: int) -> None:
-        """Show the stage and the frames done."""
+        """Show the stage, how much of it is done, and the time left."""
+        if self._quiet:
+            return
+        now = time.monotonic()
+        if stage != self._pace.stage or done < self._pace.done:
+            self._pace = _Pace(stage, done, now)
+        left = self._pace.left(done, total, now)
+        said = "" if left is None else f"{rough_time(left)} left"
         if self._bar is not None:
-            self._bar.update(self._task, description=STAGES[stage], completed=done, total=total)
-        elif not self._quiet and time.monotonic() >= self._next_line:
-            self._next_line = time.monotonic() + LINE_EVERY
-            tell([f"{STAGES[stage]}: {done} of {total}"])
+            self._bar.update(self._task, description=STAGES[stage], completed=done, total=total, left=said)
+        elif now >= self._next_line:
+            self._next_line = now + LINE_EVERY
+            much = f": {done} of {total} done" if total else ""
+            tell([f"{STAGES[stage]}{much}{said and f', about {said}'}"])
 
     def __enter__(self) -> Progress:
         if self._bar is not None:
@@ -68,13 +78,48 @@ class Progress:
             self._bar.stop()
 
 
+class _Pace:
+    """How fast a stage goes.
+
+    Args:
+        stage: its name.
+        done: how much of it was done when it began; this took no time.
+        now: when that was [s].
+    """
+
+    def __init__(self, stage: str, done: int, now: float) -> None:
+        self.stage, self.done = stage, done
+        self._begun, self._before = now, done
+        self._last = now
+
+    def left(self, done: int, total: int, now: float) -> float | None:
+        """Tell how long the rest will take [s]; None: not known yet, or nothing is left."""
+        if done > self.done:
+            self._last, self.done = now, done
+        if done == self._before or done >= total:
+            return None
+        each = (self._last - self._begun) / (done - self._before)
+        return max(0.0, (total - done) * each - (now - self._last))
+
+
+def rough_time(seconds: float) -> str:
+    """Write a time that is known only about: 40 s, 3 min, 2.5 h."""
+    if seconds < 100:
+        return f"{seconds:.0f} s" if seconds >= 1 else "1 s"
+    if seconds < 6000:
+        return f"{seconds / 60:.0f} min"
+    return f"{seconds / 3600:.2g} h" if seconds < 360000 else f"{seconds / 86400:.0f} days"
+
+
 def _bar() -> Bar:
     from rich.console import Console
-    from rich.progress import BarColumn, MofNCompleteColumn, TextColumn, TimeElapsedColumn, TimeRemainingColumn
+    from rich.progress import BarColumn, MofNCompleteColumn, TextColumn, TimeElapsedColumn
     from rich.progress import Progress as Bar
 
     columns = TextColumn("{task.description:24}"), BarColumn(), MofNCompleteColumn()
-    return Bar(*columns, TimeElapsedColumn(), TimeRemainingColumn(), console=Console(stderr=True), transient=True)
+    return Bar(
+        *columns, TimeElapsedColumn(), TextColumn("{task.fields[left]}"), console=Console(stderr=True), transient=True
+    )
 
 
 def summary(record: Mapping[str, Any], directory: Path) -> str:

@@ -3,11 +3,14 @@
 from __future__ import annotations
 
 import errno
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 
 Path = tuple[str | int, ...]
+
+# So many letters of a name are compared with those that are known.
+MAX_NAME = 60
 
 
 @dataclass(frozen=True)
@@ -95,6 +98,15 @@ class DamagedError(FilesError):
 def printable(text: str) -> str:
     """Escape line breaks, control characters for terminals, and what is not a character."""
     return "".join(c if c.isprintable() else c.encode("unicode_escape").decode() for c in text)
+
+
+def did_you_mean(name: str, known: Iterable[str]) -> str:
+    """Ask whether the nearest of the known names was meant, in words that go after a message; empty if none is near."""
+    # Imported here, as it is needed only for a message.
+    from difflib import get_close_matches
+
+    near = get_close_matches(name[:MAX_NAME].lower(), list(known), n=1)
+    return f"; did you mean '{near[0]}'?" if near and near[0] != name else ""
 
 
 @contextmanager

@@ -5,14 +5,13 @@ from __future__ import annotations
 import json
 from collections import defaultdict
 from collections.abc import Iterable, Iterator, Sequence
-from difflib import get_close_matches
 from functools import cache
 from types import UnionType
-from typing import Any, NamedTuple, Union, get_args, get_origin
+from typing import Any, Literal, NamedTuple, Union, get_args, get_origin
 
 from pydantic import BaseModel, ValidationError
 
-from taichi_msm.errors import Path, Problem
+from taichi_msm.errors import Path, Problem, did_you_mean
 
 # Beyond these limits, squares and quotients of two numbers overflow or underflow.
 LARGEST = 1e30
@@ -62,6 +61,7 @@ class _Fault(NamedTuple):
         expects: what the key may hold.
         choice: the key, or the nearest one above it, that may hold values of several kinds; None: there is none.
         branch: the kind that was tried.
+        words: those that the value may be.
     """
 
     path: Path
@@ -72,31 +72,51 @@ class _Fault(NamedTuple):
     expects: str
     choice: Path | None
     branch: str
+    words: tuple[str, ...]
 
 
 class _Key(NamedTuple):
-    """What `_fault` needs to know of a key: its section or the one below it, what it expects, whether kinds differ."""
+    """What `_fault` needs to know of a key.
+
+    Attributes:
+        section: that of the key, or the one below it.
+        expects: what it may hold.
+        has_choice: whether it may hold values of several kinds.
+        words: those that it may be, and those that the items of its list may be.
+    """
 
     section: type[BaseModel]
     expects: str
     has_choice: bool
+    words: tuple[tuple[str, ...], tuple[str, ...]]
 
 
 def _fault(error: Any, section: type[BaseModel]) -> _Fault:
     """Follow an error's location through the models, skipping pydantic's names for the kinds of a value."""
     path: Path = ()
     expects, choice, branch = "", None, ""
+    words: tuple[tuple[str, ...], tuple[str, ...]] = (), ()
     parts = iter(error["loc"])
     for part in parts:
         path += (part,)
         if part in section.model_fields:
-            section, expects, has_choice = _describe(section, part)
+            section, expects, has_choice, words = _describe(section, part)
             if has_choice:
                 choice, branch = path, next(parts, "")
     context = error.get("ctx", {})
     if "key" in context:
         path += (context["key"],)
-    return _Fault(path, error["type"], error["msg"], context, section, expects, choice, branch)
+    return _Fault(
+        path,
+        error["type"],
+        error["msg"],
+        context,
+        section,
+        expects,
+        choice,
+        branch,
+        words[bool(path) and isinstance(path[-1], int)],
+    )
 
 
 @cache
@@ -106,7 +126,17 @@ def _describe(section: type[BaseModel], name: str) -> _Key:
     assert isinstance(extra, dict)
     kinds = [kind for kind in get_args(field.annotation) if kind is not type(None)]
     has_choice = get_origin(field.annotation) in (Union, UnionType) and len(kinds) > 1
-    return _Key(next(_sections(field.annotation), section), str(extra["expects"]), has_choice)
+    words = tuple(_words(field.annotation, 0)), tuple(_words(field.annotation, 1))
+    return _Key(next(_sections(field.annotation), section), str(extra["expects"]), has_choice, words)
+
+
+def _words(annotation: Any, depth: int) -> Iterator[str]:
+    """Find the words that an annotation allows inside so many lists."""
+    if get_origin(annotation) is Literal:
+        yield from (word for word in get_args(annotation) if depth == 0)
+        return
+    for argument in get_args(annotation):
+        yield from _words(argument, depth - (get_origin(annotation) is tuple))
 
 
 def _sections(annotation: Any) -> Iterator[type[BaseModel]]:
@@ -161,9 +191,9 @@ def _message(fault: _Fault, data: Any) -> str:
     limit = fault.context.get("ge", fault.context.get("le"))
     if limit in (LARGEST, -LARGEST) or (limit == SMALLEST and data > 0):
         return f"{flow(data)} is out of range; numbers are from {SMALLEST:g} to {LARGEST:g} in size"
-    return f"{flow(data)} is not allowed; expected {fault.expects}"
+    near = did_you_mean(data, fault.words) if isinstance(data, str) else ""
+    return f"{flow(data)} is not allowed; expected {fault.expects}{near}"
 
 
 def _unknown(name: str, known: Sequence[str]) -> str:
-    near = get_close_matches(name[:MAX_SHOWN], known, n=1)
-    return f"unknown key; did you mean '{near[0]}'?" if near else f"unknown key; allowed: {', '.join(known)}"
+    return "unknown key" + (did_you_mean(name, known) or f"; allowed: {', '.join(known)}")

@@ -243,11 +243,15 @@ def _carry_out(
                 simulation.restore(writer.saved)
             if run_error:
                 for frame in range(1, writer.frames):
-                    run_error.follow(writer.position(frame) - rest, partial(progress, "pilot", frame, frames))
+                    run_error.follow(writer.position(frame) - rest, partial(progress, "pilot", frame, writer.frames))
                     watch.lap("pilot")
             observed = Observed()
+            # Frames that need no step are told apart, as they say nothing of the time that the others will take.
+            without_steps = max(resumed, 1)
             for frame in range(writer.frames, frames):
-                progress("frames", frame, frames)
+                stage, of = ("redraw", without_steps) if frame < without_steps else ("frames", frames)
+                told = partial(progress, stage, frame, of)
+                told()
                 watch.lap("hand over")
                 if frame > simulation.frame:
                     simulation.advance(pause=pause)
@@ -255,10 +259,10 @@ def _carry_out(
                 position = writer.position(frame) if frame < resumed else simulation.positions()
                 observed = simulation.observe(observed.labels, position, frame / scene.time.frames_per_second)
                 watch.lap("render")
-                writer.add(position, observed, partial(progress, "frames", frame, frames))
+                writer.add(position, observed, told)
                 watch.lap("hand over")
                 if run_error and frame > 0:
-                    run_error.follow(position - rest, partial(progress, "frames", frame, frames))
+                    run_error.follow(position - rest, told)
                     watch.lap("pilot")
             if run_error:
                 kept = (writer.position(frame) - rest for frame in range(1, frames)) if scene.output else None

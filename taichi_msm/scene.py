@@ -194,7 +194,7 @@ class Tissue(Section):
     )
     bending: Literal["plate"] | NotNegative = key(
         0.0,
-        means="bending stiffness D [N m]; plate: E t^3 / (12 (1 - nu^2))",
+        means="bending stiffness D [N m]; plate: E t^3 / (12 (1 - nu^2)); every side must be fixed, and is hinged",
         expects="plate, or a number, 0 or more, in N m",
     )
     map: StiffnessMap | None = key(

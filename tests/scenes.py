@@ -124,6 +124,8 @@ def random_tissue(seed: int, image: str, precision: str = "f64") -> Scene:
         "pretension": some(0.5, 3) if fixed == "border" and rng.random() < 0.6 else 0,
         "bending": ["plate", 0, some(1e-5, 3e-4)][rng.integers(3)],
     }
+    if fixed != "border":
+        tissue["bending"] = 0
     if rng.random() < 0.5:
         tissue["map"] = {"image": image, "range": [some(0.7, 1), some(1, 4)]}
     return Scene(

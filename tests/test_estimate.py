@@ -148,7 +148,8 @@ def test_pilots_are_taken_while_they_are_two_fifths_of_the_run() -> None:
     # Of a run that is nearly all stepping, two thirds of the run's own steps are two fifths of the whole.
     assert [affords_pilots(large, double, steps) for steps in (0.66, 0.67)] == [True, False]
     assert [affords_pilots(large, single, steps) for steps in (0.33, 0.34)] == [True, False]
-    assert choose_pilots(large, double) == Pilots(math.ceil(double.steps_per_frame / 2), 0, False, "")
+    steps = math.ceil(double.steps_per_frame / 2)
+    assert choose_pilots(large, double) == Pilots(steps, 0, False, steps / double.steps_per_frame)
     assert choose_pilots(large, single).reason
 
 

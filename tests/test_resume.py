@@ -61,7 +61,7 @@ class Stop:
         self._left = after
 
     def __call__(self, stage: str, done: int, total: int) -> None:
-        self._left -= stage == "frames"
+        self._left -= stage in ("redraw", "frames")
         if self._left < 0 and stage != "write":
             raise KeyboardInterrupt
 
@@ -106,6 +106,17 @@ def test_a_run_that_is_interrupted_goes_on_to_the_same_bits(
     for key in ("steps", "frames", "max_displacement", "shortest_spring", "notes", "outputs", "scene", "overrides"):
         assert record[key] == whole[key]
     assert not (small / "parts" / ".partial").exists()
+
+
+def test_frames_that_are_drawn_anew_are_not_told_as_simulated(small: Path, device: Device) -> None:
+    """So that the time which is left is reckoned from those that are simulated."""
+    told: list[tuple[str, int, int]] = []
+    interrupted(dragged("time.duration=0.3", "output=[gif, trajectory]"), "parts", device)
+    stored = resume("parts", threads=device.threads, progress=lambda *said: told.append(said))["resumed"]
+    assert stored > 1
+    stages = {stage: [(done, total) for of, done, total in told if of == stage] for stage in ("redraw", "frames")}
+    assert sorted(set(stages["redraw"])) == [(frame, stored) for frame in range(stored)]
+    assert sorted(set(stages["frames"])) == [(frame, 16) for frame in range(stored, 17)]
 
 
 def test_the_error_estimated_at_the_start_is_kept(small: Path, device: Device) -> None:

@@ -116,11 +116,11 @@ def test_the_same_bytes_while_bounds_are_checked(runs: Runs, root: Path, tmp_pat
 @pytest.mark.slow
 @pytest.mark.parametrize("fixed", ["border", "[left]"])
 def test_tissue_gives_the_same_bytes_while_bounds_are_checked(fixed: str, root: Path, tmp_path: Path) -> None:
-    """A map, bending, bands, edges that move and a tool that moves."""
+    """A map, bands, a tool that moves, and bending or edges that move."""
     settings = [
         "sheet.points=[33, 35]",
         f"sheet.fixed={fixed}",
-        f"tissue.pretension={1 if fixed == 'border' else 0}",
+        *(() if fixed == "border" else ("tissue.pretension=0", "tissue.bending=0")),
         "probes.0.at=[[0, 0.1, 0.1], [0.05, 0.9, 0.95]]",
         "time.duration=0.08",
         "output=[trajectory]",
@@ -134,8 +134,8 @@ def test_tissue_gives_the_same_bytes_while_bounds_are_checked(fixed: str, root: 
 
 def test_any_name_in_any_locale(runs: Runs) -> None:
     # click takes a terminal that is said to know ASCII alone for one that is set up wrongly, and speaks UTF-8 to it.
-    assert runs.printed[0].decode().startswith(f"{NAMES[0]}: 3 frames, ")
-    assert runs.printed[1].startswith(b"two \\udcff: 3 frames, " if ODD != "two" else b"two: 3 frames, ")
+    assert f"{NAMES[0]}: 3 frames, " in runs.printed[0].decode()
+    assert (b"two \\udcff: 3 frames, " if ODD != "two" else b"two: 3 frames, ") in runs.printed[1]
 
 
 def test_nothing_is_written_elsewhere(runs: Runs) -> None:

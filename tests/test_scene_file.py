@@ -72,6 +72,32 @@ def lines(load: Load, *arguments: Any, **named: Any) -> list[str]:
     return list(caught.value.lines)
 
 
+@pytest.mark.parametrize(
+    ("override", "meant"),
+    [
+        ("sheet.fixed=boarder", "border"),
+        ("sheet.fixed=[rigt]", "right"),
+        ("springs.virtual_active=load", "loaded"),
+        ("render.camera=tpo", "top"),
+        ("render.shading=Headlght", "headlight"),
+        ("output=[png, gfi]", "gif"),
+        ("time.step=atuo", "auto"),
+        ("time.precision=f23", "f32"),
+    ],
+)
+def test_a_word_like_one_that_is_allowed_is_asked_about(override: str, meant: str, load: Load) -> None:
+    (line,) = lines(load, GOOD, [override])
+    assert line.endswith(f"; did you mean '{meant}'?")
+    assert "is not allowed; expected " in line
+
+
+@pytest.mark.parametrize("override", ["sheet.fixed=all", "sheet.fixed=[boarder]", "output=png", "time.step=[auto]"])
+def test_a_value_like_no_word_that_is_allowed_there_is_only_refused(override: str, load: Load) -> None:
+    (line,) = lines(load, GOOD, [override])
+    assert "is not allowed; expected " in line
+    assert "did you mean" not in line
+
+
 def test_a_scene_and_its_defaults(load: Load) -> None:
     scene = load(GOOD)
     assert scene.sheet.points == (4, 5)
@@ -307,7 +333,7 @@ SEVERAL_KINDS = {
         GOOD.replace("points", "fixed: [top, botom]\n  points"),
         [
             's.yaml:2:16: sheet.fixed.1: "botom" is not allowed; '
-            "expected border, corners, none, or a list of top, bottom, left, right"
+            "expected border, corners, none, or a list of top, bottom, left, right; did you mean 'bottom'?"
         ],
     ),
     "step, a word": (
@@ -621,7 +647,7 @@ def test_a_faulty_section_brings_up_no_other_error(load: Load) -> None:
         "s.yaml:11:1: image: 3 is not allowed; expected the path of a picture"
     ]
     assert lines(load, GOOD.replace("[]", "[pngs]")) == [
-        f's.yaml:10:10: output.0: "pngs" is not allowed; expected a list of {OUTPUTS}'
+        f"s.yaml:10:10: output.0: \"pngs\" is not allowed; expected a list of {OUTPUTS}; did you mean 'png'?"
     ]
 
 

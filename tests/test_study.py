@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from contextlib import closing
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -18,7 +19,7 @@ from taichi_msm.physics.timestep import stable_step, time_grid, with_time
 from taichi_msm.runner import run
 from taichi_msm.scene import Scene
 from taichi_msm.study import measure, pictures, terms
-from taichi_msm.study.peer import TooSlowError, solve
+from taichi_msm.study.peer import FailedError, TooSlowError, solve
 from taichi_msm.study.pictures import PictureStudy
 from taichi_msm.study.points import ROUNDS as POINTS_ROUNDS
 from taichi_msm.study.points import PointStudy, lattices
@@ -140,6 +141,38 @@ def test_an_error_near_that_of_the_reference_is_not_known(stepping: SteppingStud
 def test_dop853_gives_up_in_time() -> None:
     with pytest.raises(TooSlowError):
         solve(scene(), 1e-3, 1e-6, 0.0, lambda: None)
+
+
+def test_dop853_fails_where_no_step_is_small_enough(monkeypatch: pytest.MonkeyPatch) -> None:
+    failed = SimpleNamespace(success=False, t=np.array([0.04, 0.08]))
+    monkeypatch.setattr("scipy.integrate.solve_ivp", lambda *_, **__: failed)
+    with pytest.raises(FailedError, match=r"^after 0.08 s$"):
+        solve(scene(), 1e-4, 1e-6, float("inf"), lambda: None)
+
+
+@pytest.mark.parametrize(
+    ("raised", "said"),
+    [
+        (TooSlowError(), "takes more than 10 s at rtol 0.0001 and was stopped"),
+        (
+            FailedError("after 0.3 s"),
+            "finds no step small enough after 0.3 s, at rtol 0.0001: forces change too suddenly for it there, as where "
+            "a spring is pressed to a point or the sheet runs away",
+        ),
+    ],
+    ids=["slow", "failed"],
+)
+def test_why_dop853_is_left_out_is_told(
+    raised: Exception, said: str, stepping: SteppingStudy, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def solve(*_: Any) -> Any:
+        raise raised
+
+    monkeypatch.setattr(measure, "solve", solve)
+    found = Study("press", scene().model_dump(), "complete", 1e-3, {})
+    measure._measure_peer(scene(), stepping, measure.QUICK, found, lambda stage, done, total: None)
+    who = "DOP853, SciPy's general integrator, which the study compares its own steps with,"
+    assert found.notes == [f"{who} {said}; no other figure depends on it"]
 
 
 def test_terms_are_left_out_of_the_kernel(device: Device) -> None:

@@ -94,7 +94,7 @@ def realistic() -> Study:
     ]
     names = ("", "springs.structural", "springs.shear", "springs.virtual", "damping", "probes.0")
     found.terms = [Term(name, spread(23e-6 - 2e-6 * len(name) / 9, 9)) for name in names]
-    found.notes = ["DOP853 takes more than 20 s at rtol 1e-08 or fails there"]
+    found.notes = ["DOP853 takes more than 20 s at rtol 1e-08 and was stopped"]
     return found
 
 
@@ -475,7 +475,7 @@ def test_the_summary_is_short_and_ends_in_the_recommendation() -> None:
     assert "DOP853 rtol 0.01 0.000100 5.00 s (once)" in rows
     assert "* 2 1 55.0 dB 10 10.0 ms (9.00 to 13.0)" in rows
     assert sum(" dB " in row for row in rows) == 3
-    assert "note: DOP853 takes more than 20 s at rtol 1e-08 or fails there" in rows
+    assert "note: DOP853 takes more than 20 s at rtol 1e-08 and was stopped" in rows
     assert "* recommended" in rows
 
 
@@ -535,3 +535,97 @@ def test_of_steppings_that_are_as_fast_the_least_wrong_is_recommended() -> None:
     assert found.best_stepping == exact
     slower = replace(exact, seconds=spread(0.0335))
     assert replace(found, stepping=[quick, slower]).best_stepping == quick, "more than a tenth is not the clock's"
+
+
+def with_points(tolerance: float, *errors: float, own: int = 31) -> Study:
+    """Sheets of 16, 31, 61, ... points a side with these errors; the scene has `own`. Cells halve each time."""
+    found = replace(realistic(), tolerance=tolerance)
+    found.settings["sheet"]["points"] = [own, own]
+    found.points = [
+        Points(count, count, 100, error, True, None, spread(0.01))
+        for count, error in zip((16, 31, 61, 121), errors, strict=False)
+    ]
+    return found
+
+
+def test_points_that_are_too_few_are_told_before_any_step() -> None:
+    found = with_points(1e-3, 0.128, 0.032, 0.008, own=61)
+    # Four times less at each halving, so that 8 times less takes sqrt(8) times the cells: 169.7 on 60.
+    assert found.more_points == (171, 171)
+    assert found.best_stepping is None
+    lines = ["sheet:", "  points: [171, 171]", "time:", "  step: auto", "  tolerance: 0.001"]
+    assert found.recommendation()[:5] == lines
+    text = terminal(found, 400)
+    assert (
+        "61 x 61 points make an error of 0.00800, whatever the step; the tolerance is 0.001. So no step is recommended "
+        "for them. No number that was measured is within it; about 171 x 171 would be, by extrapolation. With "
+        "time.tolerance a run finds the step for them.\n" in text
+    )
+    assert "*" not in text.split("refine")[0]
+    scene(**{**yaml.safe_load("\n".join(found.recommendation())), "sheet": {"points": [171, 171], "size": [0.3, 0.4]}})
+
+
+@pytest.mark.parametrize(
+    ("errors", "more"),
+    [
+        # No faster than with the second power, and no slower than with the first, whatever is seen.
+        ((0.5, 0.01), 1 + 95),
+        ((0.011, 0.01), 1 + 300),
+        ((0.009, 0.01), 1 + 300),
+        ((0.04, 0.01, 5e-4), 61),
+        ((0.04, 0.01, 0.002, 5e-4), 121),
+        ((0.04, 0.001), None),
+    ],
+    ids=str,
+)
+def test_the_points_for_a_tolerance(errors: tuple[float, ...], more: int | None) -> None:
+    found = with_points(1e-3, *errors)
+    assert found.more_points == (None if more is None else (more, more))
+    assert (found.best_stepping is None) == (more is not None)
+
+
+def test_points_that_were_measured_and_do_are_recommended(tmp_path: Path) -> None:
+    found = with_points(1e-3, 0.04, 0.01, 5e-4)
+    rows = [" ".join(line.split()) for line in terminal(found, 400).splitlines()]
+    assert any(row.startswith("* 61 x 61 100 0.000500 ") for row in rows)
+    assert any(" 61 x 61 are within it; with time.tolerance a run finds the step for them." in row for row in rows)
+    write_report(found, tmp_path)
+    assert " 61 x 61 are within it; " in page(tmp_path)
+
+
+def test_more_points_than_a_scene_may_have_are_not_recommended() -> None:
+    found = with_points(1e-6, 0.04, 0.02)
+    assert found.more_points == (600001, 600001)
+    assert found.recommendation()[0] == "render:"
+    assert "take a wider tool (probes.N.radius, a smaller falloff), or allow a larger error" in terminal(found, 500)
+
+
+def test_points_that_do_are_told_beside_the_step() -> None:
+    said = "31 x 31 points make an error of 0.0100, the recommended step one of 0.000903; the tolerance is 0.02."
+    assert said in terminal(with_points(0.02, 0.04, 0.01)).replace("\n", " ")
+    # The scene's own tolerance for points comes first.
+    found = with_points(1e-3, 0.04, 0.01)
+    found.settings["sheet"]["tolerance"] = 0.015
+    assert found.recommendation()[0] == "time:"
+    assert "an error of 0.0100, the recommended step one of 0.000903; the tolerance is 0.015." in terminal(found, 400)
+
+
+def test_labels_in_the_picture_keep_inside_their_panels() -> None:
+    """Where the recommended refinement is near the left edge, its label does not cover the axis's ticks."""
+    style = pytest.importorskip("matplotlib.style")
+    from taichi_msm.study.plot import STYLE, _figure
+
+    found = of_tissue()
+    found.drawing = [Drawn(refine, 1, 48.9, 24, spread(0.003 + 0.002 * abs(refine - 1))) for refine in (0, 1, 2, 5)]
+    found.drawing += [Drawn(4, many, 48 + 3 * many, 9, spread(0.02 * many)) for many in (2, 3)]
+    assert found.best_drawing == found.drawing[1]
+    with style.context(STYLE, after_reset=True):
+        figure = _figure(found)
+    figure.canvas.draw()
+    for name in ("Drawing", "Points"):
+        (axes,) = (one for one in figure.axes if one.get_title(loc="left") == name)
+        assert any(text.get_text() in ("refine 1", "31 x 31") for text in axes.texts)
+        for text in axes.texts:
+            box = text.get_window_extent()
+            assert axes.bbox.x0 <= box.x0, text
+            assert box.x1 <= axes.bbox.x1, text

@@ -72,7 +72,7 @@ def stop_at_the_second_frame(stage: str, done: int, total: int) -> None:
 
 
 # Together they have every term, free and fixed edges, and both ways of a tool.
-SEEDS = [0, 1, 2, 4, 7, 9]
+SEEDS = [0, 1, 2, 7, 9, 10]
 
 
 @pytest.mark.parametrize(
@@ -85,7 +85,7 @@ def test_a_random_tissue_is_like_the_twin(seed: int, image: str, device: Device)
 
 
 @pytest.mark.parametrize(
-    "seed", [0, 4, pytest.param(7, marks=pytest.mark.fuzz), pytest.param(9, marks=pytest.mark.fuzz)]
+    "seed", [0, 7, pytest.param(4, marks=pytest.mark.fuzz), pytest.param(9, marks=pytest.mark.fuzz)]
 )
 def test_in_f32_it_is_like_the_twin_but_for_rounding(seed: int, image: str, device: Device) -> None:
     made = checked(random_tissue(seed, image, "f32"))
@@ -102,7 +102,7 @@ def test_the_random_tissues_have_every_term(image: str, device: Device) -> None:
 
 
 @pytest.mark.parametrize(
-    "seed", [1, 5, pytest.param(2, marks=pytest.mark.fuzz), pytest.param(4, marks=pytest.mark.fuzz)]
+    "seed", [1, 5, pytest.param(10, marks=pytest.mark.fuzz), pytest.param(4, marks=pytest.mark.fuzz)]
 )
 def test_bands_do_not_change_the_bits(seed: int, image: str, device: Device) -> None:
     made = random_tissue(seed, image)
@@ -117,7 +117,7 @@ def test_bands_do_not_change_the_bits(seed: int, image: str, device: Device) -> 
     dynamics.close()
 
 
-@pytest.mark.parametrize("seed", [1, pytest.param(5, marks=pytest.mark.fuzz), pytest.param(0, marks=pytest.mark.fuzz)])
+@pytest.mark.parametrize("seed", [1, 5, pytest.param(0, marks=pytest.mark.fuzz)])
 def test_the_form_of_a_gpu_gives_the_same_bits(
     seed: int, image: str, device: Device, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -249,6 +249,18 @@ def test_what_cannot_be_is_refused_with_the_remedy(load: Any, override: str, mes
     with pytest.raises(SceneError) as refused:
         load(override)
     assert list(refused.value.lines) == [f"--set {override}: {message}"]
+
+
+@pytest.mark.parametrize(("bending", "value"), [("plate", "plate"), ("2e-4", "0.0002 N m")])
+@pytest.mark.parametrize("fixed", ["none", "corners", "[left, right]", "[top, left, bottom]"])
+def test_bending_needs_every_side_fixed(bending: str, value: str, fixed: str, load: Any) -> None:
+    """Without, a harmonic shape has no energy, so that a strip between two fixed sides would give way for ever."""
+    with pytest.raises(SceneError) as refused:
+        load(f"tissue.bending={bending}", f"sheet.fixed={fixed}")
+    said = f"{value} needs every side fixed; set sheet.fixed: border, or bending: 0"
+    assert list(refused.value.lines) == [f"--set tissue.bending={bending}: tissue.bending: {said}"]
+    load(f"tissue.bending={bending}", "sheet.fixed=[top, left, bottom, right]")
+    load("tissue.bending=0", f"sheet.fixed={fixed}")
 
 
 def test_the_points_that_would_do_do(load: Any) -> None:

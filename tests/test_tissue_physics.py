@@ -176,13 +176,13 @@ def test_the_linear_stiffness_is_that_of_the_forces(seed: int, tmp_path: Path) -
     """Of a deformed sheet, so that every term of it counts."""
     made = random_tissue(seed, picture(tmp_path))
     rng, shape = np.random.default_rng(seed), (*made.sheet.points, 3)
-    here, way, small = 1e-3 * rng.normal(size=shape), rng.normal(size=shape), 1e-7
+    here, way, small = 1e-3 * rng.normal(size=shape), rng.normal(size=shape), 3e-8
     # At the end, when all tools press and so the foundation acts.
     loads = loads_at(made, np.array([made.time.duration]))
     ends = [reference.force(made, here + sign * small * way, loads, 0) for sign in (1, -1)]
     found = (ends[1] - ends[0]).ravel() / (2 * small)
     expected = stiffness(made, here) @ way.ravel()
-    # Of central differences over 1e-5 of a cell: its square, and the rounding of lengths over it.
+    # Of central differences over some 1e-5 of a cell: its square, and the rounding of lengths over it.
     np.testing.assert_allclose(found, expected, rtol=0, atol=1e-9 * np.abs(expected).max())
 
 
@@ -332,10 +332,10 @@ def test_a_tool_presses_as_deep_at_any_number_of_points(device: Device) -> None:
     assert middle == pytest.approx(fine, rel=0.01)
 
 
-@pytest.mark.parametrize("term", ["none", "bending", "map"])
+@pytest.mark.parametrize("term", ["none", "map"])
 def test_a_thrown_sheet_keeps_its_momenta(term: str, device: Device, tmp_path: Path) -> None:
     stiff = {"image": picture(tmp_path), "range": [0.5, 3]}
-    terms: dict[str, dict[str, Any]] = {"none": {}, "bending": {"bending": "plate"}, "map": {"map": stiff}}
+    terms: dict[str, dict[str, Any]] = {"none": {}, "map": {"map": stiff}}
     thrown = {"at": [0.3, 0.2], "total": [0.2, -0.1, 0.4], "falloff": 40, "load": [[0, 100], [0.04, 100], [0.04, 0]]}
     made = tissue((9, 11), size=(0.08, 0.13), fixed="none", probes=[thrown], **terms[term])
     mass, rest, h = assembled(made).mass[..., None], rest_positions(made.sheet), time_grid(made).step
@@ -371,10 +371,9 @@ LIMITED: dict[str, tuple[dict[str, Any], float]] = {
     "pretension": ({"pretension": 20}, 1.25),
     "plate": ({"bending": "plate"}, 1.25),
     "stiff plate": ({"bending": 1e-2}, 1.25),
-    "stiff free plate": ({"bending": 1e-2, "fixed": "none"}, 1.25),
     "map": ({"range": (0.2, 5)}, 1.6),
     "map, pretension, bending": ({"range": (5, 0.2), "pretension": 10, "bending": 1e-3}, 1.6),
-    "map, bending, free edges": ({"range": (0.2, 5), "bending": 1e-3, "fixed": ["left"]}, 1.6),
+    "map, free edges": ({"range": (0.2, 5), "fixed": ["left"]}, 1.6),
 }
 
 
@@ -421,7 +420,7 @@ def test_the_bound_holds_for_any_tissue(seed: int, tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    "name", ["uniform", "pretension", "stiff free plate", "map, pretension, bending", "map, bending, free edges"]
+    "name", ["uniform", "pretension", "stiff plate", "map, pretension, bending", "map, free edges", "free"]
 )
 def test_just_under_the_limit_tissue_stays_bounded(name: str, device: Device, tmp_path: Path) -> None:
     """Kicked at random places in the first step, and then left alone for 10^5."""

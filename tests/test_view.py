@@ -108,7 +108,7 @@ def test_what_view_refuses(
             "events:\n  - {t: 1, do: pres}",
             [
                 's.yaml:2:12: events.0.do: "pres" is not allowed; '
-                "expected press, pull, drag, release, turn, percent or key"
+                "expected press, pull, drag, release, turn, percent or key; did you mean 'press'?"
             ],
         ),
         ("events:\n  - {t: 1, do: press}", ["s.yaml:2:5: events.0.at: missing; press needs it"]),

@@ -201,8 +201,7 @@ def highest_frequency(scene: Scene) -> float:
 
     and hence no mode of the sheet. If factors differ, each cell takes the share of a point's mass that it has of the
     point's stiffness; the maximum is then multiplied by the largest mean of the factors around a point. Bending adds
-    the square of the largest Laplacian, (4 / dx^2 + 4 / dy^2)^2 D dx dy / m. This holds at free edges too: mirror the
-    moments in the edge, and a point there, which has half the mass, becomes one of a sheet without edges.
+    the square of the largest Laplacian, (4 / dx^2 + 4 / dy^2)^2 D dx dy / m.
     """
     made, (dx, dy) = material(scene), spacing(scene.sheet)
     pairs = (made.across + made.down, made.across + 2 * made.shear, made.down + 2 * made.shear)
@@ -292,10 +291,13 @@ def _tissue_problems(scene: Scene, *, has_map: bool) -> Iterator[Problem]:
             f"{list(sheet.points)} make cells {longest:.3g} times as long as wide, and tissue allows "
             f"{LONGEST_CELL:.3g} times; {remedy}",
         )
+    if not has_fixed_border(sheet):
+        bending = "plate" if tissue.bending == "plate" else f"{tissue.bending:g} N m"
+        for name, value in (("pretension", f"{tissue.pretension:g} N/m"), ("bending", bending)):
+            if getattr(tissue, name) != 0:
+                said = f"{value} needs every side fixed; set sheet.fixed: border, or {name}: 0"
+                yield Problem(("tissue", name), said)
     if tissue.pretension > 0:
-        if not has_fixed_border(sheet):
-            said = f"{tissue.pretension:g} N/m needs every side fixed; set sheet.fixed: border, or pretension: 0"
-            yield Problem(("tissue", "pretension"), said)
         softest = float(factors(scene).min()) if has_map else 1.0
         most = 1.5 * tissue.young * tissue.thickness * softest
         if tissue.pretension >= most:

@@ -35,13 +35,15 @@ class Pilots(NamedTuple):
         beside: steps per frame of the pilot that goes with the run; 0: there is none.
         after: steps per frame of the one that follows where the first one shows too large an error; 0: there is none.
         points: whether pilots with fewer points go with the run.
+        cost: of those that go with the run: their steps for each step of the run, counted in steps of the whole sheet.
         reason: why there are none.
     """
 
     beside: int
     after: int
     points: bool
-    reason: str
+    cost: float
+    reason: str = ""
 
 
 def choose_pilots(scene: Scene, grid: TimeGrid, *, asked: bool = False) -> Pilots:
@@ -61,16 +63,16 @@ def choose_pilots(scene: Scene, grid: TimeGrid, *, asked: bool = False) -> Pilot
     if not asked and not affords_pilots(scene, grid, first):
         return no_pilots("it would take more than two fifths of the run; to have it anyway, pass --estimate-error")
     if not coarse:
-        return Pilots(fine, 0, points > 0, "")
+        return Pilots(fine, 0, points > 0, first)
     # Where no positions are kept, the run is repeated beside the pilot that follows.
     again = 0.0 if scene.output else 1.0
     follows = asked or affords_pilots(scene, grid, first + fine_cost + again)
-    return Pilots(coarse, fine if follows else 0, points > 0, "")
+    return Pilots(coarse, fine if follows else 0, points > 0, first)
 
 
 def no_pilots(reason: str) -> Pilots:
     """Have no pilots, and say why."""
-    return Pilots(0, 0, False, reason)
+    return Pilots(0, 0, False, 0.0, reason)
 
 
 def coarse_steps(scene: Scene, grid: TimeGrid) -> int:

@@ -8,7 +8,7 @@ from dataclasses import replace
 
 from taichi_msm.physics import probe_force
 from taichi_msm.physics.error_control import Estimate
-from taichi_msm.physics.material import material
+from taichi_msm.physics.material import has_fixed_border, material
 from taichi_msm.physics.mesh_error import MeshEstimate
 from taichi_msm.physics.run_progress import RunProgress
 from taichi_msm.scene import MAX_POINTS, Scene
@@ -109,7 +109,8 @@ def _remedy(scene: Scene, grid: TimeGrid, estimate: Estimate) -> str:
     if estimate.rounding > WRONG / 2:
         said.append("time.precision: f64")
         if material(scene).has_springs:
-            support = "springs.virtual" if scene.tissue is None else "tissue.pretension or bending"
+            held = "tissue.pretension or bending" if has_fixed_border(scene.sheet) else "tissue.foundation"
+            support = "springs.virtual" if scene.tissue is None else held
             said.append(f"more {support}, where the sheet buckles")
     if estimate.in_f64 > WRONG / 2:
         needed = grid.steps_per_frame * (estimate.in_f64 / (WRONG / 2)) ** (1 / estimate.order)

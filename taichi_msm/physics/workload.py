@@ -7,6 +7,7 @@ alone, so that the decisions are the same on every machine.
 from __future__ import annotations
 
 import math
+from typing import NamedTuple
 
 from taichi_msm.physics.loads import probe_slots
 from taichi_msm.physics.material import material
@@ -32,6 +33,35 @@ SMALL = 0.25
 MOST_FOR_PILOTS = 2 / 5
 
 
+class Work(NamedTuple):
+    """The work of the parts of a run.
+
+    Attributes:
+        start: starting Python and Taichi, and compiling the kernels.
+        stepping: all steps.
+        pilots: those that go with the run.
+        pictures: drawing and encoding.
+    """
+
+    start: float
+    stepping: float
+    pilots: float
+    pictures: float
+
+
+def work(scene: Scene, grid: TimeGrid, pilots: float) -> Work:
+    """Count the work of a run.
+
+    Args:
+        scene: a checked scene.
+        grid: its steps.
+        pilots: their steps in f64 for each step of the run, counted in steps of the whole sheet.
+    """
+    steps = _steps(scene, grid)
+    stepping = DOUBLE * steps if grid.precision == "f64" else steps
+    return Work(START, stepping, DOUBLE * pilots * steps, _other(scene) - START)
+
+
 def is_small_in_f64(scene: Scene, grid: TimeGrid) -> bool:
     """Tell whether stepping in f64 is a small part of a run, so that `auto` chooses it.
 
@@ -42,17 +72,10 @@ def is_small_in_f64(scene: Scene, grid: TimeGrid) -> bool:
     return DOUBLE * _steps(scene, grid) <= SMALL * _other(scene)
 
 
-def affords_pilots(scene: Scene, grid: TimeGrid, steps: float) -> bool:
-    """Tell whether pilots take at most two fifths of a run.
-
-    Args:
-        scene: a checked scene.
-        grid: its steps.
-        steps: of the pilots, all in f64, for each step of the run, counted in steps of the whole sheet.
-    """
-    own, pilots = (DOUBLE if grid.precision == "f64" else 1.0), DOUBLE * steps
-    run = (own + pilots) * _steps(scene, grid) + _other(scene)
-    return pilots * _steps(scene, grid) <= MOST_FOR_PILOTS * run
+def affords_pilots(scene: Scene, grid: TimeGrid, pilots: float) -> bool:
+    """Tell whether pilots take at most two fifths of a run; arguments as for `work`."""
+    found = work(scene, grid, pilots)
+    return found.pilots <= MOST_FOR_PILOTS * sum(found)
 
 
 def _steps(scene: Scene, grid: TimeGrid) -> float:

@@ -29,8 +29,21 @@ BAND_ROWS = 16  # rows of samples that a thread holds at a time
 PIXEL_BYTES = 3 * 12  # per pixel of the frame: its colours, from sums to bytes
 PICTURE_PIXEL_BYTES = 20  # per pixel of the picture's file, while it is decoded and converted; its texture takes less
 
-# Size of a pixel in a file [bytes]; masks are compressed.
-PIXEL_FILE_BYTES = {"png": 2, "gif": 1, "coordinates": 8, "depth": 4, "flow": 8, "occlusion": 0.05, "instrument": 0.05}
+# The most that a pixel takes in a file [bytes], as one of noise: PNGs store it, codes of a GIF have 12 bits, and masks
+# have two values. Most pictures take a half or a third of it.
+PIXEL_FILE_BYTES = {
+    "png": 3.01,
+    "gif": 1.51,
+    "coordinates": 8,
+    "depth": 4,
+    "flow": 8,
+    "occlusion": 0.5,
+    "instrument": 0.5,
+}
+
+# The most that a file takes besides [bytes], but for a byte for every row of a PNG; and run.json besides its scene.
+FILE_BYTES = 1024
+RECORD_BYTES = 1 << 16
 
 # Bytes of a pixel while its labels are found and written; and of a tracked point in a frame, held until the end.
 LABEL_PIXEL_BYTES = 60
@@ -54,8 +67,9 @@ class Budget:
         simulation_bytes: memory for the state of the sheet and its output.
         drawing_bytes: memory for a frame and the texture; 0 if nothing is drawn.
         track_bytes: memory for the tracks, which are held until the run ends, and size of their file.
-        picture_bytes: approximate size of the files with pictures and labels.
+        picture_bytes: size of the files with pictures and labels, at most.
         trajectory_bytes: size of the trajectory.
+        record_bytes: size of the record and of the camera, at most.
         working_bytes: additional disk space that is used until the run ends.
     """
 
@@ -67,6 +81,7 @@ class Budget:
     track_bytes: int
     picture_bytes: int
     trajectory_bytes: int
+    record_bytes: int
     working_bytes: int
 
     @property
@@ -76,17 +91,19 @@ class Budget:
 
     @property
     def disk_bytes(self) -> int:
-        """Size of all files."""
-        return self.picture_bytes + self.track_bytes + self.trajectory_bytes
+        """Size of all files, at most."""
+        return self.picture_bytes + self.track_bytes + self.trajectory_bytes + self.record_bytes
 
 
 def estimate(scene: Scene, grid: TimeGrid) -> Budget:
     """Estimate what a scene needs with the steps of a grid."""
     rows, cols = scene.sheet.points
     points, number_bytes = rows * cols, 4 if grid.precision == "f32" else 8
-    frames, pixels = grid.frames + 1, math.prod(scene.render.size)
+    frames, (width, height) = grid.frames + 1, scene.render.size
+    drawn = [PIXEL_FILE_BYTES[kind] for kind in set(scene.output) if kind in PIXEL_FILE_BYTES]
+    picture = sum(width * height * each + height + FILE_BYTES for each in drawn)
     positions = frames * points * 3 * number_bytes
-    tracks = frames * scene.render.tracks**2 * TRACK_BYTES if "tracks" in scene.output else 0
+    tracks = scene.render.tracks**2 * (frames * TRACK_BYTES + 16) + FILE_BYTES if "tracks" in scene.output else 0
     numbers = STATE_NUMBERS + OUTPUT_NUMBERS + len(scene.probes) + (MAP_NUMBERS if scene.stiffness_map else 0)
     # Pilots are up to two more sheets in f64; with tissue also two smaller ones.
     pilot = scene.time.tolerance is not None or not choose_pilots(scene, grid).reason
@@ -98,8 +115,9 @@ def estimate(scene: Scene, grid: TimeGrid) -> Budget:
         simulation_bytes=round(points * sheets * numbers),
         drawing_bytes=drawing_bytes(scene) if scene.renders else 0,
         track_bytes=tracks,
-        picture_bytes=round(frames * sum(pixels * PIXEL_FILE_BYTES.get(kind, 0) for kind in set(scene.output))),
-        trajectory_bytes=positions if "trajectory" in scene.output else 0,
+        picture_bytes=math.ceil(frames * picture),
+        trajectory_bytes=positions + 8 * frames + FILE_BYTES if "trajectory" in scene.output else 0,
+        record_bytes=2 * len(scene.model_dump_json(indent=2)) + RECORD_BYTES,
         # Two saved states from which the run could continue, and all positions so far.
         working_bytes=2 * points * STATE_NUMBERS * number_bytes + (positions if scene.output else 0),
     )
@@ -129,13 +147,13 @@ def require_disk(scene: Scene, directory: Path) -> None:
     rows, cols = scene.sheet.points
     (width, height), tracks = scene.render.size, scene.render.tracks
     parts = [
-        (needed - budget.picture_bytes - budget.track_bytes, "sheet.points", f"positions of {rows} x {cols} points"),
+        (budget.trajectory_bytes + budget.working_bytes, "sheet.points", f"positions of {rows} x {cols} points"),
         (budget.track_bytes, "render.tracks", f"tracks of {tracks} x {tracks} points"),
         (budget.picture_bytes, "render.size", f"pictures of {width} x {height} pixels"),
     ]
     size, key, name = max(parts)
     said = (
-        f"{budget.frames} frames need {_in_words(needed)} on disk, {_in_words(size)} of it for {name}, but "
+        f"{budget.frames} frames may need {_in_words(needed)} on disk, {_in_words(size)} of it for {name}, but "
         f"{_in_words(free)} is free for {directory}; reduce it, time.frames_per_second or output, or choose "
         "another --out"
     )

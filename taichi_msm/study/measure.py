@@ -16,7 +16,7 @@ from taichi_msm.progress import Progress
 from taichi_msm.render.texture import load_texture
 from taichi_msm.runner import versions
 from taichi_msm.scene import Scene
-from taichi_msm.study.peer import TooSlowError, solve
+from taichi_msm.study.peer import FailedError, TooSlowError, solve
 from taichi_msm.study.pictures import PictureStudy
 from taichi_msm.study.points import PointStudy
 from taichi_msm.study.result import Peer, Study, Timing
@@ -26,6 +26,10 @@ from taichi_msm.system import resources, runtime
 from taichi_msm.system.runtime import Device
 
 TOLERANCE = 1e-3
+
+# What notes say of the integrator that the study compares with.
+DOP853 = "DOP853, SciPy's general integrator, which the study compares its own steps with,"
+APART = "no other figure depends on it"
 
 # Number of trajectories in memory at one time: the reference, and those that it is made of or compared with.
 TRAJECTORIES = 6
@@ -158,8 +162,16 @@ def _measure_peer(scene: Scene, stepping: SteppingStudy, effort: Effort, found: 
             return
         except TooSlowError:
             if not samples:
-                found.notes.append(f"DOP853 takes more than {effort.peer:g} s at rtol {rtol:g} or fails there")
+                found.notes.append(
+                    f"{DOP853} takes more than {effort.peer:g} s at rtol {rtol:g} and was stopped; {APART}"
+                )
                 return
+        except FailedError as failure:
+            found.notes.append(
+                f"{DOP853} finds no step small enough {failure}, at rtol {rtol:g}: forces change too suddenly for it "
+                f"there, as where a spring is pressed to a point or the sheet runs away; {APART}"
+            )
+            return
         error = stepping.relative(frames)
         found.peers.append(Peer(rtol, error, stepping.known(error), evaluations, Timing.of(samples)))
 

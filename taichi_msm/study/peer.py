@@ -22,7 +22,11 @@ Array = NDArray[np.float64]
 
 
 class TooSlowError(Exception):
-    """The time limit is exceeded, or the solver fails."""
+    """The time limit is exceeded."""
+
+
+class FailedError(Exception):
+    """The solver finds no step that is small enough; the message says when."""
 
 
 def solve(scene: Scene, rtol: float, atol: float, deadline: float, tick: Callable[[], None]) -> tuple[Array, int]:
@@ -39,7 +43,8 @@ def solve(scene: Scene, rtol: float, atol: float, deadline: float, tick: Callabl
         Displacements at every frame but the first [m], shape (F, rows, cols, 3); and the number of evaluations.
 
     Raises:
-        TooSlowError: at the deadline, or when SciPy fails.
+        TooSlowError: at the deadline.
+        FailedError: when SciPy fails.
         ImportError: when SciPy is not installed.
     """
     from scipy.integrate import solve_ivp
@@ -67,7 +72,7 @@ def solve(scene: Scene, rtol: float, atol: float, deadline: float, tick: Callabl
         times = np.union1d(frames, end)
         solved = solve_ivp(motion, (start, end), state, "DOP853", t_eval=times, rtol=rtol, atol=atol)
         if not solved.success:
-            raise TooSlowError
+            raise FailedError(f"after {solved.t[-1] if solved.t.size else start:.3g} s")
         state = solved.y[:, -1]
         evaluations += solved.nfev
         found += [column[: state.size // 2].reshape(shape) for column in solved.y.T[: len(frames)]]

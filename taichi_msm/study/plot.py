@@ -158,14 +158,17 @@ def _write_header(figure: Figure, study: Study) -> None:
     versions = study.machine["versions"]
     machine = f"{where(study)}; taichi-msm {versions['taichi-msm']}, Taichi {versions['taichi']}"
     title = f"{shown(study.scene)}: speed against error"
-    step, drawn = study.best_stepping, study.best_drawing
+    step, drawn, own, more = study.best_stepping, study.best_drawing, study.own_points, study.more_points
     advice = []
     if step is not None:
         advice.append(f"step {_duration(step.step)}, {step.damping_difference} damping difference, {step.precision}")
     if drawn is not None:
         advice.append(f"refine {drawn.refine}, supersample {drawn.supersample}")
     said = f"Recommended (ringed): {'; '.join(advice)}. " if advice else ""
-    if study.stepping and step is None:
+    if own is not None and more is not None:
+        much = f"{'at most about ' if not own.known else ''}{number(own.error or 0.0)}"
+        said += f"{own.name} points make an error of {much}; about {more[0]} x {more[1]} are needed."
+    elif study.stepping and step is None:
         said += f"No step measured is within the tolerance of {study.tolerance:g}."
     lines = [
         (title + (" (interrupted)" if study.status == "interrupted" else ""), 11, "bold", INK),
@@ -199,9 +202,7 @@ def _plot_stepping(axes: Axes, study: Study) -> None:
             axes.annotate(text, middle, (3, 3), **LABEL, ha="left", va="bottom", bbox=BLANK)
         else:
             axes.annotate(text, middle, (-3, -3), **LABEL, ha="right", va="top", bbox=BLANK)
-    axes.axvline(study.tolerance, color=GREY, linewidth=0.8, linestyle=(0, (6, 3)))
-    top = axes.get_xaxis_transform()
-    axes.annotate("tolerance", (study.tolerance, 1), (-3, 0), xycoords=top, **LABEL, ha="right", va="top", rotation=90)
+    _mark_tolerance(axes, study.tolerance)
     methods = dict.fromkeys(point.method for point in study.stepping)
     handles = [_plot_method(axes, study, method) for method in methods]
     if peers:
@@ -221,6 +222,12 @@ def _plot_stepping(axes: Axes, study: Study) -> None:
         columnspacing=3,
         handlelength=2.8,
     )
+
+
+def _mark_tolerance(axes: Axes, tolerance: float) -> None:
+    axes.axvline(tolerance, color=GREY, linewidth=0.8, linestyle=(0, (6, 3)))
+    top = axes.get_xaxis_transform()
+    axes.annotate("tolerance", (tolerance, 1), (-3, 0), xycoords=top, **LABEL, ha="right", va="top", rotation=90)
 
 
 def _plot_method(axes: Axes, study: Study, method: str) -> Line2D:
@@ -317,7 +324,7 @@ def _label_refinements(axes: Axes, study: Study) -> None:
     lines, best = _by_supersample(study), study.best_drawing
     # Lengths are in typographic points.
     paths = [axes.transData.transform([_place(drawn) for drawn in line]) * 72 / DPI for line in lines]
-    taken = [Bbox.from_bounds(x - 2, y - 2, 4, 4) for path in paths for x, y in _dots(path)]
+    taken = [_legend(axes), *(Bbox.from_bounds(x - 2, y - 2, 4, 4) for path in paths for x, y in _dots(path))]
     points = zip(chain(*lines), chain(*paths), strict=True)
     for drawn, (x, y) in sorted(points, key=lambda point: point[0] is not best):
         text = f"refine {drawn.refine}" if drawn is best else str(drawn.refine)
@@ -325,12 +332,25 @@ def _label_refinements(axes: Axes, study: Study) -> None:
         width = 4.3 * len(text)
         for side, left in (("right", -away - width), ("left", away)):
             box = Bbox.from_bounds(x + left, y - 3, width, 6)
-            if not box.count_overlaps(taken):
+            if _has_room(axes, box, taken):
                 axes.annotate(text, _place(drawn), (-away if left < 0 else away, 0), **LABEL, ha=side, va="center")
                 taken.append(box)
                 break
         if drawn is best:
             taken.append(Bbox.from_bounds(x - 6, y - 6, 12, 12))
+
+
+def _legend(axes: Axes) -> Bbox:
+    """Give the place of a panel's legend, in typographic points."""
+    legend = axes.get_legend()
+    assert legend is not None
+    return Bbox(legend.get_window_extent().get_points() * 72 / DPI)
+
+
+def _has_room(axes: Axes, box: Bbox, taken: Sequence[Bbox]) -> bool:
+    """Tell whether a label is within its panel, so that it covers no ticks, and covers nothing that is drawn there."""
+    panel = Bbox(axes.bbox.get_points() * 72 / DPI)
+    return all(panel.contains(*corner) for corner in (box.p0, box.p1)) and not box.count_overlaps(taken)
 
 
 def _place(drawn: Drawn) -> tuple[float, float]:
@@ -350,11 +370,15 @@ def _plot_points(axes: Axes, study: Study) -> None:
     axes.set(title="Points", xscale="log", yscale="log", ylabel="time of the scene [s]")
     axes.set_xlabel("error, as a fraction of the largest displacement")
     errors = [*(one.error or 0.0 for one in points), *(one.estimate or 0.0 for one in estimated)]
-    _span(axes.set_xlim, errors, 2)
+    _span(axes.set_xlim, [*errors, study.points_tolerance], 2)
     _span(axes.set_ylim, _extremes(points), 1)
     axes.xaxis.set_minor_formatter(NullFormatter())
     _tick_plainly(axes.yaxis)
+    _mark_tolerance(axes, study.points_tolerance)
     handles = [_plot_series(axes, points, POINTS_LINE, "error")]
+    for one in points:
+        if (one.rows, one.cols) == study.more_points:
+            axes.plot([one.error or 0.0], [one.seconds.median], **RING)
     for one in estimated:
         height = one.seconds.median
         axes.plot([one.error or 0.0, one.estimate or 0.0], [height] * 2, color=ORANGE, linewidth=0.7)
@@ -376,7 +400,7 @@ def _label_points(axes: Axes, study: Study) -> None:
     path, ends, spread = (axes.transData.transform(each) * 72 / DPI for each in (places, estimates, spreads))
     strokes = [*zip(path, ends, strict=True), *zip(spread[::2], spread[1::2], strict=True)]
     dots = chain(_dots(path), *(_dots(np.array(stroke)) for stroke in strokes))
-    taken = [Bbox.from_bounds(x - 2.5, y - 2.5, 5, 5) for x, y in dots]
+    taken = [_legend(axes), *(Bbox.from_bounds(x - 2.5, y - 2.5, 5, 5) for x, y in dots)]
     for one, place, (x, y), (end, _) in zip(points, places, path, ends, strict=True):
         own = [one.rows, one.cols] == list(study.settings["sheet"]["points"])
         width = (4.3 if own else 4.0) * len(one.name)
@@ -384,8 +408,7 @@ def _label_points(axes: Axes, study: Study) -> None:
         sides = [(right, 0, "left"), (4, 8, "left"), (-4, -8, "right"), (left, 0, "right")]
         for across, up, side in sides:
             box = Bbox.from_bounds(x + across - (width if side == "right" else 0), y + up - 3.5, width, 7)
-            inside = box.x1 * DPI / 72 <= axes.bbox.x1 and box.x0 * DPI / 72 >= axes.bbox.x0
-            if inside and not box.count_overlaps(taken):
+            if _has_room(axes, box, taken):
                 look = {**LABEL, "weight": "bold", "color": INK} if own else LABEL
                 axes.annotate(one.name, place, (across, up), **look, ha=side, va="center")
                 taken.append(box)

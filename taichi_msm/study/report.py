@@ -20,7 +20,7 @@ from taichi_msm.study.table import (
     estimated,
     markdown,
     number,
-    shortfall,
+    remarks,
     shown,
     timing,
     where,
@@ -182,8 +182,7 @@ def _page(study: Study) -> str:
     if study.notes:
         blocks += ["## Notes", "\n".join(f"- {note}" for note in study.notes)]
     blocks.append("## Recommendation")
-    if (reason := shortfall(study)) is not None:
-        blocks.append(reason)
+    blocks += remarks(study)
     if lines := study.recommendation():
         blocks.append("\n".join(["```yaml", *lines, "```"]))
     return "\n\n".join(blocks) + "\n"
@@ -274,7 +273,9 @@ def _points(study: Study) -> Iterator[str]:
             wrong(one),
             estimated(one),
             timing(one.seconds),
-            "of the scene" if (one.rows, one.cols) == own else "",
+            "of the scene"
+            if (one.rows, one.cols) == own
+            else "recommended" * ((one.rows, one.cols) == study.more_points),
         )
         for one in study.points
     ]

@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+import math
 import statistics
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Any
+
+from taichi_msm.scene import MAX_POINTS
 
 # A picture is refined enough if no other one of the same supersampling has a PSNR higher by more than this [dB].
 REFINED_ENOUGH = 0.1
@@ -192,11 +195,48 @@ class Study:
     notes: list[str] = field(default_factory=list)
 
     @property
+    def points_tolerance(self) -> float:
+        """Largest allowed error due to the number of points, as a fraction of the largest displacement."""
+        return float(self.settings["sheet"]["tolerance"] or self.tolerance)
+
+    @property
+    def own_points(self) -> Points | None:
+        """Find the sheet with the scene's own points; None: it was not measured, or diverged."""
+        own = list(self.settings["sheet"]["points"])
+        return next((one for one in self.points if [one.rows, one.cols] == own and one.error is not None), None)
+
+    @property
+    def more_points(self) -> tuple[int, int] | None:
+        """Tell how many points have an error within the tolerance, where the scene's own have not; None elsewhere.
+
+        These are the fewest that were measured, or else an extrapolation: the error falls with the power of the cells'
+        size that the two finest sheets show, at least the first and at most the second. They may be more than allowed.
+        """
+        own, allowed = self.own_points, self.points_tolerance
+        if own is None or own.error is None or own.error <= allowed:
+            return None
+        errors = [(one.rows, one.cols, one.error) for one in self.points if one.error is not None]
+        for rows, cols, error in errors:
+            if error <= allowed:
+                return rows, cols
+        order = 1.0
+        rows, cols, error = errors[-1]
+        if len(errors) > 1:
+            coarser_rows, _, coarser_error = errors[-2]
+            shown = math.log(coarser_error / error) / math.log((rows - 1) / (coarser_rows - 1))
+            order = min(2.0, max(1.0, shown))
+        times = (error / allowed) ** (1 / order)
+        return math.ceil((rows - 1) * times) + 1, math.ceil((cols - 1) * times) + 1
+
+    @property
     def best_stepping(self) -> Stepping | None:
         """Find the fastest stepping within the tolerance, or one that is as fast and less wrong; None if there is none.
 
-        Of every method only its largest step counts, so that noise of the clock cannot prefer a smaller one.
+        None, too, where the scene needs other points, for which no step was measured. Of every method only
+        its largest step counts, so that noise of the clock cannot prefer a smaller one.
         """
+        if self.more_points is not None:
+            return None
         good = [one for one in self.stepping if one.error is not None and one.error <= self.tolerance]
         largest = {one.method: one for one in sorted(good, key=lambda one: one.step)}
         fastest = min((one.seconds.median for one in largest.values()), default=0.0)
@@ -215,6 +255,15 @@ class Study:
     def recommendation(self) -> list[str]:
         """Write the recommended settings as lines of a scene file."""
         lines = []
+        if (points := self.more_points) is not None and max(points) <= MAX_POINTS:
+            # A run finds the step for these points.
+            lines += [
+                "sheet:",
+                f"  points: {list(points)}",
+                "time:",
+                "  step: auto",
+                f"  tolerance: {self.tolerance:g}",
+            ]
         if (step := self.best_stepping) is not None:
             lines.append("time:")
             if self.settings["time"]["tolerance"] is not None:

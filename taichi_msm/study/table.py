@@ -12,6 +12,7 @@ from rich.console import Console
 from rich.table import Table
 from rich.text import Text
 
+from taichi_msm.scene import MAX_POINTS
 from taichi_msm.study.result import Drawn, Peer, Points, Stepping, Study, Timing
 
 UNITS = ((1, "s"), (1e3, "ms"), (1e6, "us"))
@@ -85,6 +86,38 @@ def shortfall(study: Study) -> str | None:
     )
 
 
+def remarks(study: Study) -> Iterator[str]:
+    """Say what the recommendation leaves open, and what the points make of the error."""
+    own, more = study.own_points, study.more_points
+    if more is None and (reason := shortfall(study)) is not None:
+        yield reason
+    if own is None:
+        return
+    size = f"{'' if own.known else 'at most about '}{number(own.error or 0.0)}"
+    if more is None:
+        step = study.best_stepping
+        beside = "" if step is None else f", the recommended step one of {number(step.error or 0.0)}"
+        yield f"{own.name} points make an error of {size}{beside}; the tolerance is {study.points_tolerance:g}."
+        return
+    said = (
+        f"{own.name} points make an error of {size}, whatever the step; the tolerance is {study.points_tolerance:g}. "
+        "So no step is recommended for them."
+    )
+    rows, cols = more
+    if max(more) > MAX_POINTS:
+        yield (
+            f"{said} About {rows} x {cols} would be within it, and a scene may have {MAX_POINTS} a side: take a wider "
+            "tool (probes.N.radius, a smaller falloff), or allow a larger error with --tolerance."
+        )
+    elif any((one.rows, one.cols) == more for one in study.points):
+        yield f"{said} {rows} x {cols} are within it; with time.tolerance a run finds the step for them."
+    else:
+        yield (
+            f"{said} No number that was measured is within it; about {rows} x {cols} would be, by extrapolation. "
+            "With time.tolerance a run finds the step for them."
+        )
+
+
 def print_summary(study: Study, console: Console) -> None:
     """Print the most important results of a study, and last the lines to put in the scene."""
 
@@ -106,8 +139,8 @@ def print_summary(study: Study, console: Console) -> None:
         console.print(_points_table(study))
     for note in study.notes:
         say(f"note: {shown(note)}")
-    if (reason := shortfall(study)) is not None:
-        say(reason)
+    for remark in remarks(study):
+        say(remark)
     if lines := study.recommendation():
         say("To put in the scene:\n")
         say("\n".join(lines) + "\n")
@@ -159,8 +192,9 @@ def _drawing_table(study: Study) -> Table:
 def _points_table(study: Study) -> Table:
     table = _table("points", "steps/frame", "error", "estimate", "time (spread)")
     for points in study.points:
-        cells = points.name, str(points.steps_per_frame), wrong(points), estimated(points), timing(points.seconds)
-        _add(table, False, *cells)
+        is_it = (points.rows, points.cols) == study.more_points
+        cells = str(points.steps_per_frame), wrong(points), estimated(points), timing(points.seconds)
+        _add(table, is_it, _starred(points.name, is_it), *cells)
     return table
 
 

@@ -20,7 +20,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from taichi_msm.errors import ArgumentError, DeviceError, MsmError
+from taichi_msm.errors import ArgumentError, DeviceError, MsmError, did_you_mean
 from taichi_msm.system import resources
 from taichi_msm.system.quick_taichi import ALLOCATING, READING, Parts, replaced, ti
 from taichi_msm.system.silence import silenced
@@ -185,7 +185,8 @@ def start(arch: str = "cpu", threads: int | None = None) -> Device:
     if threads is not None and not (type(threads) is int and 1 <= threads <= MOST_THREADS):
         raise ArgumentError(f"threads: {threads!r}; take a whole number, 1 to {MOST_THREADS}, or None for every core")
     if arch not in ARCHS:
-        raise DeviceError(f"--arch {arch}: not supported; take one of: {', '.join(ARCHS)}")
+        near = did_you_mean(str(arch), ARCHS)
+        raise DeviceError(f"--arch {arch}: not supported; take one of: {', '.join(ARCHS)}{near}")
     wanted = Device(arch, resources.available_threads() if threads is None else threads)
     if _device is None:
         _device = replace(wanted, name=_initialise(wanted))
