@@ -42,7 +42,7 @@ def position(frame: int) -> Any:
 
 def manifest() -> Manifest:
     made = small_scene()
-    return Manifest(made, made, (), None, None, None, "/", "cpu", "", "", {"taichi": "1.7"})
+    return Manifest(made, made, (), None, None, None, "/", "cpu", {}, {"taichi": "1.7"})
 
 
 def state(**changes: Any) -> Saved:
