@@ -182,7 +182,7 @@ def resume(
     if too_large := [str(problem) for problem in budget.problems(manifest.scene)]:
         raise SceneError(too_large)
     manifest.require_same(versions())
-    texture = load_texture(manifest.scene, manifest.sha256["image"]) if manifest.scene.draws else None
+    texture = load_texture(manifest.scene, manifest.sha256.get("image")) if manifest.scene.draws else None
     device = runtime.start(manifest.arch, threads)
     watch.lap("startup")
     return _carry_out(manifest, Path(directory), device, texture, watch, progress, resumes=True)
