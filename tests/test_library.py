@@ -333,7 +333,10 @@ def test_a_directory_is_a_path(directory: Any, device: Device) -> None:
         resume(directory)
 
 
-@pytest.mark.parametrize("time", [10**400, -(10**400), np.inf, np.float16(np.nan), np.complex64(1), True, "1", [0.1]])
+NO_TIMES = [10**400, -(10**400), np.inf, np.float16(np.nan), np.complex64(1), True, "1", [0.1]]
+
+
+@pytest.mark.parametrize("time", NO_TIMES, ids=lambda time: repr(time)[:20])
 def test_what_is_no_time_is_refused(time: Any, simulation: Simulation) -> None:
     for call in (simulation.labels, simulation.draw):
         with pytest.raises(ArgumentError, match=r"^time: .*; take a number, in seconds, or None for now$"):
