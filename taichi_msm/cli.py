@@ -446,7 +446,7 @@ def without_link(folder: Path, option: str) -> Path:
     try:
         is_link = folder.is_symlink()
     except OSError as error:
-        raise FilesError(f"{folder}: {(error.strerror or str(error)).lower()}; choose another {option}") from None
+        raise FilesError(f"{folder}: {(error.strerror or str(error)).lower()}") from None
     if is_link:
         raise FilesError(f"{folder}: a symbolic link; name the folder it leads to with {option}")
     return folder

@@ -114,16 +114,13 @@ class FinishedRun:
         for key, path in self.scene.pictures.items():
             if key == "image" and not drawn:
                 continue
+            fault = f"{path} is not the file that was run, as its SHA-256 tells"
             try:
-                fault = (
-                    ""
-                    if file_sha256(path) == self.sha256.get(key)
-                    else f"{path} is not the file that was run, as its SHA-256 tells"
-                )
+                if file_sha256(path) == self.sha256.get(key):
+                    continue
             except PictureError as error:
                 fault = str(error).partition(";")[0]
-            if fault:
-                raise FilesError(f"{self.directory}: {key}: {fault}; {PUT_BACK}")
+            raise FilesError(f"{self.directory}: {key}: {fault}; {PUT_BACK}")
 
     def has(self, output: str) -> bool:
         """Tell whether a file or folder is among the results."""
