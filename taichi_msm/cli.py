@@ -26,10 +26,12 @@ from taichi_msm.system.streams import mute, tell
 
 if TYPE_CHECKING:
     from taichi_msm.console import Progress
+    from taichi_msm.scene import Scene
 
 DONE, BUG, WRONG_INPUT, DIVERGED, FILES = 0, 1, 2, 3, 4
-# The options that may be given together with --resume.
+# What may be given together with --resume, and with --again.
 RESUMABLE = ("resume", "threads", "quiet", "as_json")
+REPEATABLE = ("again", "out", "arch", "threads", "estimate_error", "quiet", "as_json")
 
 # What results can be converted to.
 FORMATS = ("kitti", "tapvid", "vtk", "gltf", "obj")
@@ -75,7 +77,11 @@ def program() -> None:
 
 @program.command()
 @click.argument("scene", metavar="SCENE", required=False)
-@click.option("--out", metavar="DIR", help="Directory for the results.  [default: output/<name of the scene file>]")
+@click.option(
+    "--out",
+    metavar="DIR",
+    help="Directory for the results.  [default: output/<name of the scene file>; with --again, its DIR]",
+)
 @image_option
 @set_option
 @arch_option
@@ -86,6 +92,7 @@ def program() -> None:
     help="Always or never estimate the error.  [default: if that takes at most two fifths of the run]",
 )
 @click.option("--resume", metavar="DIR", help="Continue the unfinished run in DIR, instead of running SCENE.")
+@click.option("--again", metavar="DIR", help="Repeat the run that run.json in DIR tells of, instead of running SCENE.")
 @click.option("--quiet", is_flag=True, help="Print no progress and no summary.")
 @json_option
 @click.pass_context
@@ -99,12 +106,19 @@ def run(
     threads: int | None,
     estimate_error: bool | None,
     resume: str | None,
+    again: str | None,
     quiet: bool,
     as_json: bool,
 ) -> int:
     """Simulate SCENE, draw its frames and write them."""
+    typed = [*overrides, *([f"image={image}"] if image is not None else [])]
     if resume is not None:
-        directory = unfinished(context, resume)
+        require_alone(context, "--resume continues", RESUMABLE)
+        directory = unfinished(resume)
+    elif again is not None:
+        require_alone(context, "--again repeats", REPEATABLE)
+        directory = result_directory(again, option="--again") if out is None else result_directory(out)
+        loaded, typed = repeated(again)
     elif scene is None:
         raise click.MissingParameter(param_hint="'SCENE'", param_type="argument")
     else:
@@ -117,9 +131,9 @@ def run(
     from taichi_msm.console import Progress, summary
     from taichi_msm.scenefile import duration
 
-    interruption = Interruption()
+    interruption, name = Interruption(), str(scene or resume or again)
     try:
-        with Progress(quiet=quiet or as_json) as bar, resumable(directory), naming(str(scene or resume)):
+        with Progress(quiet=quiet or as_json) as bar, resumable(directory), naming(name):
             progress = interruptible(bar, interruption)
             if resume is not None:
                 record = runner.resume(directory, threads=threads, started=STARTED, progress=progress)
@@ -129,7 +143,7 @@ def run(
                     directory,
                     arch=arch,
                     threads=threads,
-                    overrides=[*overrides, *([f"image={image}"] if image is not None else [])],
+                    overrides=typed,
                     estimate_error=estimate_error,
                     started=STARTED,
                     progress=progress,
@@ -142,7 +156,7 @@ def run(
     if as_json:
         print_json({"directory": str(directory), **record})
     if record["status"] != "complete":
-        said = f"{scene or resume}: {record.get('error', 'interrupted')}; frames in {directory}: {record['frames']}"
+        said = f"{name}: {record.get('error', 'interrupted')}; frames in {directory}: {record['frames']}"
         then = f"; last good state: {record['dump']}" if record.get("dump") else going_on(directory)
         tell([said + then])
     elif not quiet and not as_json:
@@ -412,13 +426,26 @@ def export(directory: str, name: str, out: str | None, quiet: bool, as_json: boo
     return DONE
 
 
-def unfinished(context: click.Context, directory: str) -> Path:
-    """Make sure that a directory has a run to resume, and that no scene and no settings were given with it."""
+def require_alone(context: click.Context, does: str, allowed: Sequence[str]) -> None:
+    """Make sure that no scene and no settings were given with an option that takes those of an earlier run."""
     for option in context.command.params:
         typed = context.get_parameter_source(str(option.name)) is click.core.ParameterSource.COMMANDLINE
-        if typed and option.name not in RESUMABLE:
+        if typed and option.name not in allowed:
             name = option.opts[0] if isinstance(option, click.Option) else "SCENE"
-            raise click.UsageError(f"--resume continues a run with its own settings; leave out {name}")
+            raise click.UsageError(f"{does} a run with its own settings; leave out {name}")
+
+
+def repeated(directory: str) -> tuple[Scene, list[str]]:
+    """Give the scene of an earlier run, with its pictures where they are, and the overrides that made it."""
+    from taichi_msm.results.finished_run import read_run
+
+    earlier = read_run(result_directory(directory, option="--again"))
+    earlier.require_pictures(drawn=earlier.scene.draws or "image" in earlier.sha256)
+    return earlier.scene, earlier.overrides
+
+
+def unfinished(directory: str) -> Path:
+    """Make sure that a directory has a run to resume."""
     if not going_on(result_directory(directory, option="--resume")):
         raise click.BadParameter(f"there is no unfinished run in {directory}", param_hint="--resume")
     return Path(directory)
@@ -437,7 +464,11 @@ def result_directory(out: str | None, default: str = "", option: str = "--out") 
 
 def without_link(folder: Path, option: str) -> Path:
     """Make sure that a folder which the user did not name is no symbolic link: it may have come with the scene."""
-    if folder.is_symlink():
+    try:
+        is_link = folder.is_symlink()
+    except OSError as error:
+        raise FilesError(f"{folder}: {(error.strerror or str(error)).lower()}") from None
+    if is_link:
         raise FilesError(f"{folder}: a symbolic link; name the folder it leads to with {option}")
     return folder
 
@@ -514,7 +545,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
         # The reader of stdout is gone, or its disk is full.
         mute(sys.stdout)
         if not isinstance(error, BrokenPipeError):
-            tell([f"taichi-msm: cannot read or write: {error.strerror or error}"])
+            where = f" {error.filename}" if error.filename else ""
+            tell([f"taichi-msm: cannot read or write{where}: {error.strerror or error}"])
         return FILES
 
 

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+import hashlib
 import stat
 import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager
 from mmap import ACCESS_READ, mmap
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, BinaryIO
 
 from taichi_msm.system.silence import silenced
 
@@ -37,17 +38,22 @@ class PictureError(Exception):
     """The file cannot be used as a picture; the message says why and what to do."""
 
 
-def read_rgb(path: str, background: tuple[int, int, int]) -> Image.Image:
+def read_rgb(path: str, background: tuple[int, int, int], sha256: str | None = None) -> Image.Image:
     """Read a picture, upright, in 8-bit RGB; a transparent one is laid over the background.
 
     If a file has several pictures, the first is taken.
+
+    Args:
+        path: of the file.
+        background: colour.
+        sha256: the SHA-256 that the file must have, in hexadecimal; None: any.
 
     Raises:
         PictureError: when the file cannot be used.
     """
     from PIL import ImageOps
 
-    with _open(path) as opened:
+    with _open(path, sha256) as opened:
         return _to_rgb(ImageOps.exif_transpose(opened), background)
 
 
@@ -73,9 +79,27 @@ def has_transparency(path: str) -> bool:
         return image.has_transparency_data and image.convert("RGBA").getchannel("A").getextrema() != (255, 255)
 
 
+def file_sha256(path: str) -> str:
+    """Compute the SHA-256 of a picture's file, in hexadecimal.
+
+    Raises:
+        PictureError: when the file cannot be read.
+    """
+    _require_file(path)
+    try:
+        with Path(path).open("rb") as file:
+            return _sha256(file)
+    except OSError as error:
+        raise _unreadable(path, error) from None
+
+
 @contextmanager
-def _open(path: str) -> Iterator[Image.Image]:
+def _open(path: str, sha256: str | None = None) -> Iterator[Image.Image]:
     """Open a picture for a block that decodes it.
+
+    Args:
+        path: of the file.
+        sha256: the SHA-256 that the file must have; None: any.
 
     Raises:
         PictureError: instead of any error of Pillow, here or in the block; broken pictures raise many types.
@@ -88,12 +112,12 @@ def _open(path: str) -> Iterator[Image.Image]:
         warnings.simplefilter("ignore")
         warnings.simplefilter("error", Image.DecompressionBombWarning)
         try:
-            with Image.open(path, formats=FORMATS) as image:
+            with Path(path).open("rb") as file, Image.open(_of(path, file, sha256), formats=FORMATS) as image:
                 if max(image.size) > MAX_SIDE:
                     said = f"has {image.width} x {image.height} pixels; a side may have at most {MAX_SIDE}, cut it"
                     raise PictureError(f"{path} {said}")
                 if image.format in ("JPEG", "MPO"):
-                    scans = _scans(path)
+                    scans = _scans(file)
                     most = max(USUAL_SCANS, SCANNED_PIXELS // (image.width * image.height))
                     if scans > most:
                         raise PictureError(f"{path} has {scans} scans, and {most} are allowed; save it again")
@@ -113,9 +137,25 @@ def _open(path: str) -> Iterator[Image.Image]:
             raise PictureError(f"{path} cannot be decoded ({error}); save it again") from None
 
 
-def _scans(path: str) -> int:
+def _of(path: str, file: BinaryIO, sha256: str | None) -> BinaryIO:
+    """Make sure that an open file has a SHA-256, and give it at its beginning; raises PictureError."""
+    if sha256 is not None:
+        if _sha256(file) != sha256:
+            raise PictureError(f"{path} is not the file that was run, as its SHA-256 tells; put that one back")
+        file.seek(0)
+    return file
+
+
+def _sha256(file: BinaryIO) -> str:
+    found = hashlib.sha256()
+    while data := file.read(1 << 20):
+        found.update(data)
+    return found.hexdigest()
+
+
+def _scans(file: BinaryIO) -> int:
     """Count the scans of a JPEG, which may be broken."""
-    with Path(path).open("rb") as file, mmap(file.fileno(), 0, access=ACCESS_READ) as data:
+    with mmap(file.fileno(), 0, access=ACCESS_READ) as data:
         return _count_scans(data)
 
 
@@ -138,12 +178,14 @@ def _require_file(path: str) -> None:
     except ValueError:
         raise PictureError(f"{path} is not a path; name a picture") from None
     except OSError as error:
-        raise PictureError(
-            f"{path}: {(error.strerror or str(error)).lower()}; name a picture that can be read"
-        ) from None
+        raise _unreadable(path, error) from None
     if not stat.S_ISREG(mode):
         kind = "a directory" if stat.S_ISDIR(mode) else "not a regular file"
         raise PictureError(f"{path} is {kind}; name a picture")
+
+
+def _unreadable(path: str, error: OSError) -> PictureError:
+    return PictureError(f"{path}: {(error.strerror or str(error)).lower()}; name a picture that can be read")
 
 
 def _to_rgb(image: Image.Image, background: tuple[int, int, int]) -> Image.Image:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import cache, partial
 from pathlib import Path
 from types import TracebackType
 
@@ -40,11 +41,19 @@ class Playback:
 
     def __init__(self, directory: str | Path, arch: str = "cpu", threads: int | None = None) -> None:
         run = read_run(directory)
-        self.scene, self.time, self.positions = run.scene, run.time, run.positions()
+        with run.unchanged():
+            self.scene, self.time, self.positions = run.scene, run.time, run.positions()
+        run.require_pictures(drawn=False)
+        self._require_picture = cache(partial(run.require_pictures, drawn=True))
         self._simulation = Simulation(run.scene, arch, threads)
 
     def draw(self, frame: int, camera: CameraLike = None) -> NDArray[np.uint8]:
-        """Draw a frame; as `Simulation.draw`."""
+        """Draw a frame; as `Simulation.draw`.
+
+        Raises:
+            FilesError: when the scene's picture is not the one that was run.
+        """
+        self._require_picture()
         return self._simulation.draw(camera, *self._at(frame))
 
     def labels(self, frame: int, camera: CameraLike = None) -> Labels:

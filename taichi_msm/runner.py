@@ -35,7 +35,7 @@ from taichi_msm.progress import Progress
 from taichi_msm.render.labels import Observed
 from taichi_msm.render.notes import notes as drawing_notes
 from taichi_msm.render.texture import load_texture
-from taichi_msm.results.manifest import Manifest, digest, map_digest, read_manifest
+from taichi_msm.results.manifest import Manifest, digests, read_manifest
 from taichi_msm.results.record import RunRecord
 from taichi_msm.results.writer import ResultWriter
 from taichi_msm.scene import Scene
@@ -113,7 +113,8 @@ def run(
     require_path(directory)
     budget.require_disk(scene, Path(directory))
     device = runtime.start(arch, threads)
-    texture = load_texture(scene) if scene.draws else None
+    sha256 = digests(scene)
+    texture = load_texture(scene, sha256.get("image")) if scene.draws else None
     watch.lap("startup")
     given, estimate, mesh = scene, None, None
     if scene.sheet.tolerance is not None:
@@ -136,8 +137,7 @@ def run(
         estimate_error,
         here,
         arch,
-        digest(texture),
-        map_digest(scene),
+        sha256,
         versions(),
     )
     if _is_begun(manifest, Path(directory)):
@@ -183,8 +183,8 @@ def resume(
     manifest = read_manifest(Path(directory))
     if too_large := [str(problem) for problem in budget.problems(manifest.scene)]:
         raise SceneError(too_large)
-    texture = manifest.load_texture()
-    manifest.require_same(digest(texture), map_digest(manifest.scene), versions())
+    manifest.require_same(versions())
+    texture = load_texture(manifest.scene, manifest.sha256.get("image")) if manifest.scene.draws else None
     device = runtime.start(manifest.arch, threads)
     watch.lap("startup")
     return _carry_out(manifest, Path(directory), device, texture, watch, progress, resumes=True)
@@ -322,6 +322,7 @@ def _facts(manifest: Manifest, grid: TimeGrid, progress: RunProgress, known: Kno
         "scene": manifest.given.model_copy(update={"sheet": scene.sheet, "time": scene.time}).model_dump(mode="json"),
         "asked": _asked(manifest.given, scene),
         "working_directory": manifest.folder,
+        "sha256": dict(manifest.sha256),
         "overrides": list(manifest.overrides),
         "points": list(scene.sheet.points),
         "step": grid.step,

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from typing import TYPE_CHECKING, Annotated, Any, Literal, get_args
 
 from pydantic import (
@@ -28,6 +28,11 @@ MAX_PIXELS = 8192
 MAX_REFINE = 64
 MAX_TRACKS = 256
 MAX_RELIEF = 10
+MAX_SUPERSAMPLE = 4
+
+# The smallest field of view [degrees]. Directions that differ by less than 2^-24, 3.4e-6 degrees, are one in f32; so a
+# narrower picture would have fewer than about 300 distinct rows.
+MIN_FOV = 1e-3
 
 # Operating systems limit the length of a path to about this.
 MAX_PATH = 4096
@@ -386,10 +391,10 @@ class Camera(Section):
     up: Vector = key(
         (0.0, 1.0, 0.0), means="the direction that is up in the picture", expects="three numbers: [x, y, z]"
     )
-    fov: Annotated[Number, Field(gt=0, lt=180)] = key(
+    fov: Annotated[Number, Field(ge=MIN_FOV, lt=180)] = key(
         40.0,
         means="angle from the picture's bottom to its top [degrees]",
-        expects="a number between 0 and 180, in degrees",
+        expects=f"a number from {MIN_FOV:g} to below 180, in degrees",
     )
 
 
@@ -430,8 +435,8 @@ class Render(Section):
     )
     light: Light = key(Light(), means="the light, with shading: tissue", expects="a mapping")
     wireframe: StrictBool = key(False, means="draw the mass-point mesh over the surface", expects="true or false")
-    supersample: Annotated[Whole, Field(ge=1, le=4)] = key(
-        1, means="samples per pixel along each axis", expects="a whole number, 1 to 4"
+    supersample: Annotated[Whole, Field(ge=1, le=MAX_SUPERSAMPLE)] = key(
+        1, means="samples per pixel along each axis", expects=f"a whole number, 1 to {MAX_SUPERSAMPLE}"
     )
     background: tuple[Byte, Byte, Byte] = key(
         (0, 0, 0), means="colour where no surface is", expects="three whole numbers, 0 to 255: [red, green, blue]"
@@ -514,13 +519,24 @@ class Scene(Section):
         sheet = self.tissue or self.springs
         return None if sheet is None else sheet.map
 
-    def with_map_image(self, image: str) -> Scene:
-        """Give the map, if there is one, another image."""
-        for name, sheet in (("tissue", self.tissue), ("springs", self.springs)):
-            if sheet is not None and sheet.map is not None:
-                other = sheet.model_copy(update={"map": sheet.map.model_copy(update={"image": image})})
-                return self.model_copy(update={name: other})
-        return self
+    @property
+    def maps(self) -> dict[str, StiffnessMap]:
+        """The maps of the springs or the tissue, by the keys that name them: map."""
+        return {name: value for name, value in (self.tissue or self.springs or ()) if isinstance(value, StiffnessMap)}
+
+    @property
+    def pictures(self) -> dict[str, str]:
+        """The paths of the picture and the maps, by the keys that name them, such as image and tissue.map.image."""
+        image = {} if self.image is None else {"image": self.image}
+        return image | {f"{self.kind}.{name}.image": found.image for name, found in self.maps.items()}
+
+    def with_pictures(self, path: Callable[[str], str]) -> Scene:
+        """Give the picture and the maps other paths, each by its present one."""
+        maps = {name: found.model_copy(update={"image": path(found.image)}) for name, found in self.maps.items()}
+        image = None if self.image is None else path(self.image)
+        sheet = self.tissue or self.springs
+        made = None if sheet is None else sheet.model_copy(update=maps)
+        return self.model_copy(update={"image": image, self.kind: made})
 
     @model_validator(mode="after")
     def _picture_given(self) -> Scene:

@@ -466,6 +466,10 @@ class Simulation:
     ) -> None:
         self.close()
 
+    def __reduce__(self) -> Any:
+        remedy = "keep its `scene` and what `save` returns, and `restore` that in a new one"
+        raise MsmError(f"a Simulation cannot be pickled or copied; {remedy}")
+
     def _require_open(self) -> None:
         # The kernels would write to memory that was freed.
         if self._closed:
@@ -503,8 +507,7 @@ class Simulation:
             found, expected = positions.shape, self._position.shape
             if found != expected or positions.dtype.kind not in "fiu":
                 raise ArgumentError(f"positions: {positions.dtype} of shape {found}; take numbers of shape {expected}")
-        number = time is None or (isinstance(time, int | float | np.number) and not isinstance(time, bool))
-        if not number or (time is not None and not math.isfinite(time)):
+        if time is not None and not _is_finite(time):
             raise ArgumentError(f"time: {time!r}; take a number, in seconds, or None for now")
         return positions, rods(self.scene, positions, self.time if time is None else time)
 
@@ -537,3 +540,13 @@ class Simulation:
         np.add(position[..., 1], y, out=position[..., 1], casting="same_kind")
         position.flags.writeable = False
         return position
+
+
+def _is_finite(number: Any) -> bool:
+    """Tell whether a value is a number that a float can hold."""
+    if isinstance(number, bool) or not isinstance(number, int | float | np.integer | np.floating):
+        return False
+    try:
+        return math.isfinite(number)
+    except OverflowError:
+        return False

@@ -6,8 +6,11 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from taichi_msm.errors import SceneError
 from taichi_msm.render.camera import problems, view
-from taichi_msm.scene import Scene
+from taichi_msm.scene import MAX_SUPERSAMPLE, Camera, Scene
+from taichi_msm.simulation import Simulation
+from taichi_msm.system.runtime import Device
 from tests.scenes import scene
 
 
@@ -70,3 +73,62 @@ def test_cameras_that_see_nothing_are_refused() -> None:
         "render.camera.up: [0.0, 1.0, 0.0] is zero or along the line of sight; take a direction across it"
     ]
     assert not list(problems(with_camera({"eye": [0, 0, 1]})))
+
+
+@pytest.mark.parametrize("fov", [0, 1e-300, 9.99e-4, 180])
+def test_an_angle_that_no_picture_can_have_is_refused(fov: float) -> None:
+    with pytest.raises(SceneError) as caught:
+        Camera(eye=(0, 0, 1), fov=fov)
+    assert str(caught.value) == f"fov: {fov} is not allowed; expected a number from 0.001 to below 180, in degrees"
+
+
+@pytest.mark.parametrize("length", [5e-324, 1e-300, 1e-160, 1e-30, 1e30])
+def test_the_length_of_up_does_not_matter(length: float) -> None:
+    expected = view(with_camera({"eye": [0.1, -0.3, 0.4]})).axes
+    found = view(with_camera({"eye": [0.1, -0.3, 0.4], "up": [0, length, 0]})).axes
+    # Some roundings, of numbers up to 1.
+    np.testing.assert_allclose(found, expected, rtol=0, atol=4 * np.finfo(float).eps)
+
+
+@pytest.mark.parametrize("away", [0, 1e-300, 1e-31])
+def test_an_eye_at_its_target_is_told_of(away: float) -> None:
+    with pytest.raises(SceneError, match="is also the target; move one of them"):
+        view(with_camera({"eye": [0.1, 0.2, away], "target": [0.1, 0.2, 0]}))
+
+
+@pytest.mark.parametrize("zero", [[0, 0, 0], [0, 0, 1e-300]])
+def test_no_direction_up_is_told_of(zero: list[float]) -> None:
+    with pytest.raises(SceneError, match="is zero or along the line of sight"):
+        view(with_camera({"eye": [0, 0, 1], "up": zero}))
+
+
+def test_an_eye_too_far_for_its_angle_is_told_of() -> None:
+    """Kernels have the camera's matrix in f32, where 1e30 m times 4.7e8 px, for the smallest angle, overflows."""
+    far = {"eye": [0, 0, 1e30], "target": [1e30, 0, 0], "fov": 1e-3}
+    made = with_camera({**far, "fov": 40})
+    assert np.isfinite((view(made).matrix * MAX_SUPERSAMPLE).astype(np.float32)).all()
+    with pytest.raises(SceneError) as caught:
+        view(with_camera(far, size=(100, 8192)))
+    said = "render.camera.eye: [0.0, 0.0, 1e+30] is too far away for 0.001 degrees; move it nearer or widen fov"
+    assert str(caught.value) == said
+
+
+@pytest.mark.parametrize("distance", [1e-30, 1e-15, 1.0, 1e15, 1e30])
+@pytest.mark.parametrize("fov", [1e-3, 40, 179.9999999999999])
+@pytest.mark.parametrize("size", [1e-30, 0.1, 1e30])
+def test_extreme_cameras_draw_without_a_warning_or_are_refused(
+    distance: float, fov: float, size: float, device: Device
+) -> None:
+    """Tests turn every warning into an error."""
+    camera = {"eye": [0, -distance, distance], "fov": fov}
+    rod = {"radius": max(size / 9, 1e-30), "shaft": [0, 0, 1], "length": size}
+    made = scene(
+        sheet={"points": [3, 3], "size": [size, size], "mass": 1e-3},
+        render={"camera": camera, "size": [8, 8], "shading": "tissue", "supersample": 1},
+        probes=[{"force": [0, 0, 0], "instrument": rod}],
+    )
+    if list(problems(made)):
+        return
+    with Simulation(made, threads=device.threads, texture=np.zeros((2, 2, 3), np.uint8)) as simulation:
+        assert simulation.draw().shape == (8, 8, 3)
+        simulation.flow(simulation.labels())

@@ -42,7 +42,7 @@ def position(frame: int) -> Any:
 
 def manifest() -> Manifest:
     made = small_scene()
-    return Manifest(made, made, (), None, None, None, "/", "cpu", "", "", {"taichi": "1.7"})
+    return Manifest(made, made, (), None, None, None, "/", "cpu", {}, {"taichi": "1.7"})
 
 
 def state(**changes: Any) -> Saved:
@@ -235,7 +235,7 @@ def test_frames_that_are_exchanged_are_found(out: Path) -> None:
         {"arch": "toaster"},
         {"estimate": {"steps_per_frame": 1, "error": -math.inf, "rounding": 0, "in_f64": 0, "order": 2}},
         {"estimate": {"steps_per_frame": 1, "error": math.nan, "rounding": 0, "in_f64": 0, "order": 2}},
-        {"picture": {}},
+        {"sha256": {"image": 3}},
         {"given": {}},
         {"scene": {**small_scene().model_dump(mode="json"), "output": ["exe"]}},
         {"scene": {**small_scene().model_dump(mode="json"), "time": {"duration": 0.4, "step": 0.2}}},

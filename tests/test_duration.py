@@ -11,6 +11,7 @@ from typing import Any
 
 import pytest
 
+from taichi_msm.physics.pilots import choose_pilots
 from taichi_msm.physics.timestep import time_grid
 from taichi_msm.physics.workload import Work, work
 from taichi_msm.scene import Scene
@@ -58,8 +59,13 @@ def record(**other: Any) -> dict[str, Any]:
     return {"status": "complete", "arch": "cpu", "threads": CORES, "resumed": 0, "timings": timings, **other}
 
 
+def parts_of(made: Scene) -> Work:
+    grid = time_grid(made)
+    return work(made, grid, choose_pilots(made, grid).cost)
+
+
 def guess(made: Scene) -> float:
-    return 2 * UNIT * sum(work(made, time_grid(made)))
+    return 2 * UNIT * sum(parts_of(made))
 
 
 def test_without_an_earlier_run_a_calibration_tells(made: Scene, folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -74,12 +80,12 @@ def test_the_calibration_is_soon_done() -> None:
 
 
 def test_an_earlier_run_tells_how_long_the_next_one_takes(made: Scene, folder: Path) -> None:
-    parts = work(made, time_grid(made))
+    parts = parts_of(made)
     assert min(parts) > 0
     duration.learn(made, record())
     assert estimate(made) == (pytest.approx(31), True)
     longer = made.model_copy(update={"time": made.time.model_copy(update={"duration": 10 * made.time.duration})})
-    more = [later / now for later, now in zip(work(longer, time_grid(longer)), parts, strict=True)]
+    more = [later / now for later, now in zip(parts_of(longer), parts, strict=True)]
     took = Work(start=3.0, stepping=8.0, pilots=4.0, pictures=16.0)
     assert estimate(longer)[0] == pytest.approx(sum(times * part for times, part in zip(more, took, strict=True)))
 

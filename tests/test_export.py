@@ -4,19 +4,28 @@ from __future__ import annotations
 
 import errno
 import json
+import re
 import subprocess
 import sys
 from pathlib import Path
 
+import numpy as np
 import pytest
+from numpy.typing import NDArray
+from PIL import Image
 
 from taichi_msm import cli, console
 from taichi_msm.errors import FilesError, ForeignError
 from taichi_msm.export.convert import convert
-from taichi_msm.export.formats import FORMATS
-from taichi_msm.export.staging import staging
+from taichi_msm.export.formats import FILES, FORMATS
+from taichi_msm.results.finished_run import PUT_BACK, read_run
+from taichi_msm.results.folder import Folder
+from taichi_msm.runner import run
+from taichi_msm.system.runtime import Device
 from tests.conftest import Program
 from tests.outputs import files
+from tests.scenes import speckle
+from tests.test_finished_run import RUN_AGAIN, change, change_scene, rewrite
 
 
 def exported(results: Path, out: Path) -> list[str]:
@@ -110,9 +119,7 @@ def test_a_picture_that_is_gone_is_named(results: Path, program: Program) -> Non
     record["scene"]["image"] = "gone.png"
     (results / "run.json").write_text(json.dumps(record))
     done = program("export", str(results), "--format", "gltf")
-    gone = Path(record["working_directory"]) / "gone.png"
-    remedy = "put back the picture that it was run with, or run the scene again"
-    error = f"{results}: image: {gone}: no such file or directory; {remedy}\n"
+    error = f"{results}: image: gone.png: no such file or directory; {PUT_BACK}\n"
     assert (done.returncode, done.stderr) == (4, error)
 
 
@@ -121,14 +128,14 @@ def test_a_new_export_takes_the_place_of_the_earlier_one(results: Path) -> None:
     out = results / "here"
     names = exported(results, out)
     whole = files(out)
-    (out / ".partial-x1").mkdir()
+    (out / ".partial" / "new").mkdir(parents=True)
     stale = ["0099.obj", "0001.obj"]
-    for name in (*stale, ".partial-x1/0000.obj"):
+    for name in (*stale, ".partial/new/0000.obj"):
         (out / name).write_text("of an earlier export")
     (out / "export.json").write_text(json.dumps({"files": stale + names}))
     assert exported(results, out) == names == sorted(set(whole) - {"export.json"})
     assert files(out) == whole
-    assert not (out / ".partial-x1").exists()
+    assert not (out / ".partial").exists()
 
 
 def test_a_file_that_is_named_like_ours_is_not_touched(results: Path) -> None:
@@ -144,34 +151,213 @@ def test_a_file_that_is_named_like_ours_is_not_touched(results: Path) -> None:
 
 def test_two_exports_do_not_write_into_one_folder(results: Path) -> None:
     out = results / "here"
+    refused: list[str] = []
+
+    def second(done: int, total: int) -> None:
+        if done == 2 and not refused:
+            with pytest.raises(FilesError) as caught:
+                exported(results, out)
+            refused.append(str(caught.value))
+
+    names = convert(results, "obj", out, second).files
+    assert refused == [f"{out}: another export is writing there; choose another --out"]
+    assert set(files(out)) == {*names, "export.json"}
+
+
+KILLED = """
+import os, signal, sys
+from pathlib import Path
+from taichi_msm.export.convert import convert
+
+def progress(done, total):
+    if done == 3:
+        os.kill(os.getpid(), signal.SIGKILL)
+
+convert(Path(sys.argv[1]), "obj", Path(sys.argv[2]), progress)
+"""
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="kills with SIGKILL")
+@pytest.mark.parametrize("name", ["obj", "gltf"])
+def test_an_export_that_is_killed_is_known_to_the_next_one(name: str, results: Path) -> None:
+    """Also to one of another format."""
+    out = results / "here"
     exported(results, out)
     before = files(out)
-    with (
-        staging(out, {r".*": None}) as staged,
-        pytest.raises(FilesError, match="another export is writing there; choose another --out"),
-    ):
-        exported(results, out)
-    assert not staged.exists()
-    assert set(files(out)) == {"export.json"}, "the first one had no files"
-    assert before
+    killed = subprocess.run([sys.executable, "-c", KILLED, str(results), str(out)], check=False)
+    assert killed.returncode < 0
+    left = {path: data for path, data in files(out).items() if not path.startswith(".")}
+    assert left == before
+    assert set(files(out)) > set(before), "it had begun"
+    names = convert(results, name, out).files
+    assert {path.name for path in out.iterdir()} == {*names, "export.json"}
 
 
-def test_an_export_that_is_killed_is_known_to_the_next_one(results: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_record_that_was_made_up_takes_no_file_of_the_user(results: Path, program: Program) -> None:
     out = results / "here"
+    exported(results, out)
+    before = files(out)
+    for listed in (["a/" * 5000 + "b"], ["../run.json", "training", 3], []):
+        (out / "export.json").write_text(json.dumps({"files": [*json.loads(before["export.json"])["files"], *listed]}))
+        done = program("export", str(results), "--format", "obj", "--out", str(out))
+        assert (done.returncode, done.stderr) == (0, "")
+        assert files(out) == before
+    (out / "notes.txt").write_text("mine")
+    (out / "export.json").write_text(json.dumps({"files": [*json.loads(before["export.json"])["files"], "notes.txt"]}))
+    done = program("export", str(results), "--format", "obj", "--out", str(out))
+    assert (done.returncode, (out / "notes.txt").read_text()) == (4, "mine")
+    assert done.stderr.startswith(f"{out}/notes.txt: a file that no run has put there")
+    for record in ("[" * 10**5, '{"files": [[]]}', '{"files": null}', "3", "{}"):
+        (out / "export.json").write_text(record)
+        done = program("export", str(results), "--format", "obj", "--out", str(out))
+        assert (done.returncode, done.stderr.count("\n")) == (4, 1)
+        assert done.stderr.startswith(f"{out}/export.json: a file that no run has put there")
+
+
+def test_many_files_are_compared_in_time_proportional_to_their_number(
+    results: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    out, count = results / "here", 300
+    names = [f"{number:04}.obj" for number in range(count)]
+    out.mkdir()
+    for name in names:
+        (out / name).write_text("of an earlier export")
+    (out / "export.json").write_text(json.dumps({"files": names}))
+    calls: list[str] = []
+    fullmatch = re.fullmatch
+
+    def counted(pattern: str, name: str) -> re.Match[str] | None:
+        calls.append(name)
+        return fullmatch(pattern, name)
+
+    monkeypatch.setattr(re, "fullmatch", counted)
+    assert len(exported(results, out)) == 7
+    # A name is looked up some times among the patterns of all formats, and never beside each of the others.
+    assert count < len(calls) < 10 * len(FILES) * count < count**2
+
+
+def test_a_link_in_the_place_of_the_staging_folder_leads_nowhere(results: Path) -> None:
+    out, elsewhere = results / "here", results.parent / "elsewhere"
+    elsewhere.mkdir()
+
+    def swap(done: int, total: int) -> None:
+        if done == 2:
+            (found,) = (path for path in out.iterdir() if path.name.startswith(".partial"))
+            found.rename(results.parent / "moved")
+            found.symlink_to(elsewhere)
+            (elsewhere / "new").mkdir(exist_ok=True)
+
+    names = convert(results, "obj", out, swap).files
+    assert files(elsewhere) == {}
+    assert set(files(out)) == {*names, "export.json"}
+
+
+def test_files_of_another_format_go_with_their_folders(results: Path) -> None:
+    out = results / "here"
+    (out / "training" / "flow_occ").mkdir(parents=True)
+    (out / "training" / "flow_occ" / "000000_10.png").write_text("of an earlier export")
+    (out / "export.json").write_text(json.dumps({"files": ["training/flow_occ/000000_10.png"]}))
     names = exported(results, out)
-    whole = files(out)
+    assert {path.name for path in out.iterdir()} == {*names, "export.json"}
 
-    def killed(self: Path, target: Path) -> None:
-        raise SystemExit
 
-    # While it moves its files into place.
-    with monkeypatch.context() as patch:
-        patch.setattr(Path, "rename", killed)
-        with pytest.raises(SystemExit):
-            exported(results, out)
-    assert set(files(out)) == {"export.json"}
-    assert exported(results, out) == names
-    assert files(out) == whole
+@pytest.mark.parametrize("moment", [0, 2])
+def test_a_run_that_publishes_meanwhile_is_noticed(moment: int, results: Path, device: Device) -> None:
+    """No file of an export is of another run than the others."""
+    out = results / "here"
+    exported(results, out)
+    before = files(out)
+
+    def publish(done: int, total: int) -> None:
+        if done == moment and not (results / "trajectory.npz").stat().st_mtime_ns > begun:
+            run(read_run(results).scene, results, threads=device.threads, estimate_error=False)
+
+    begun = (results / "trajectory.npz").stat().st_mtime_ns
+    with pytest.raises(FilesError) as caught:
+        convert(results, "obj", out, publish)
+    assert str(caught.value) == f"{results}: another run replaced these results while they were read; try again"
+    assert files(out) == before
+
+
+def test_results_that_go_meanwhile_are_no_fault_of_the_files(results: Path) -> None:
+    def take_away(done: int, total: int) -> None:
+        (results / "run.json").unlink(missing_ok=True)
+        (results / "trajectory.npz").unlink(missing_ok=True)
+
+    with pytest.raises(FilesError, match="another run replaced these results"):
+        convert(results, "obj", results / "here", take_away)
+
+
+def secret(results: Path) -> str:
+    """A picture of the user that is no concern of the results."""
+    path = results.parent / "private" / "secret.png"
+    path.parent.mkdir()
+    Image.fromarray(speckle(5, 6, 3)).save(path)
+    return str(path)
+
+
+@pytest.mark.parametrize("name", ["gltf", "obj", "vtk"])
+def test_a_record_that_names_a_picture_elsewhere_gets_nothing_of_it(name: str, results: Path, program: Program) -> None:
+    pytest.importorskip("vtkmodules" if name == "vtk" else "numpy")
+    path = secret(results)
+    change_scene(results, image=path)
+    fault = f"{path} is not the file that was run, as its SHA-256 tells"
+    done = program("export", str(results), "--format", name)
+    assert (done.returncode, done.stderr) == (4, f"{results}: image: {fault}; {PUT_BACK}\n")
+    change(results, sha256={})
+    assert program("export", str(results), "--format", name).stderr == done.stderr
+    assert not (results / f"export-{name}").exists()
+
+
+def test_a_record_that_names_a_map_elsewhere_gets_nothing_of_it(results: Path, program: Program) -> None:
+    pytest.importorskip("vtkmodules")
+    path = secret(results)
+    change_scene(results, springs={"map": {"image": path, "range": [1.0, 2.0]}})
+    done = program("export", str(results), "--format", "vtk")
+    fault = f"springs.map.image: {path} is not the file that was run, as its SHA-256 tells"
+    assert (done.returncode, done.stderr) == (4, f"{results}: {fault}; {PUT_BACK}\n")
+
+
+@pytest.mark.parametrize("name", ["trajectory.npz", "frames/0001.png", "frames"])
+def test_results_that_are_links_get_nothing_of_what_they_lead_to(name: str, results: Path) -> None:
+    (results.parent / "elsewhere").mkdir()
+    moved = (results / name).rename(results.parent / "elsewhere" / Path(name).name)
+    (results / name).symlink_to(moved)
+    found = read_run(results)
+    with pytest.raises(FilesError, match="a symbolic link, which no run writes"):
+        found.positions() if name == "trajectory.npz" else found.result("frames/0001.png", "png")
+
+
+@pytest.mark.parametrize("name", ["gltf", "obj", "vtk"])
+def test_positions_that_no_run_reaches_are_damage(name: str, results: Path, program: Program) -> None:
+    pytest.importorskip("vtkmodules" if name == "vtk" else "numpy")
+
+    def far(position: NDArray[np.float64]) -> NDArray[np.float64]:
+        position[2:] *= 1e300
+        return position
+
+    rewrite(results, edit=far)
+    done = program("export", str(results), "--format", name)
+    assert (done.returncode, done.stderr) == (4, f"{results / 'trajectory.npz'}: {RUN_AGAIN}\n")
+
+
+def test_numbers_that_a_format_cannot_hold_are_one_line(results: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def overflow(*_: object) -> list[str]:
+        return [str(np.float32(1) * np.array([1e300]).astype(np.float32))]
+
+    monkeypatch.setitem(FORMATS, "obj", FORMATS["obj"]._replace(write=overflow))
+    with pytest.raises(FilesError, match="its numbers are too large for obj; run the scene again"):
+        exported(results, results / "here")
+    assert not (results / "here").exists()
+
+
+def test_a_folder_that_cannot_be_is_named(results: Path, program: Program) -> None:
+    long = "x" * 300
+    done = program("export", str(results), "--format", "obj", "--out", long)
+    said = f"{long}: cannot write: File name too long; choose another --out\n"
+    assert (done.returncode, done.stderr) == (4, said)
+    done = program("export", long, "--format", "obj")
+    assert (done.returncode, done.stderr) == (4, f"{long}/export-obj: file name too long\n")
 
 
 def test_an_export_that_fails_leaves_the_earlier_one(results: Path) -> None:
@@ -220,10 +406,10 @@ def test_a_full_disk_leaves_the_earlier_files(results: Path, monkeypatch: pytest
     exported(results, out)
     before = files(out)
 
-    def full(path: Path, data: bytes) -> int:
+    def full(*_: object) -> None:
         raise OSError(errno.ENOSPC, "No space left on device")
 
-    monkeypatch.setattr(Path, "write_bytes", full)
+    monkeypatch.setattr(Folder, "create", full)
     with pytest.raises(FilesError, match=r"here: cannot write: No space left on device; free some space or choose"):
         exported(results, out)
     with pytest.raises(FilesError, match="cannot write"):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import pickle
 import subprocess
 import sys
@@ -330,3 +331,25 @@ def test_a_directory_is_a_path(directory: Any, device: Device) -> None:
         run(scene(), directory, threads=device.threads)
     with pytest.raises(ArgumentError, match=r"directory: .*; take a path"):
         resume(directory)
+
+
+NO_TIMES = [10**400, -(10**400), np.inf, np.float16(np.nan), np.complex64(1), True, "1", [0.1]]
+
+
+@pytest.mark.parametrize("time", NO_TIMES, ids=lambda time: repr(time)[:20])
+def test_what_is_no_time_is_refused(time: Any, simulation: Simulation) -> None:
+    for call in (simulation.labels, simulation.draw):
+        with pytest.raises(ArgumentError, match=r"^time: .*; take a number, in seconds, or None for now$"):
+            call(time=time)
+
+
+@pytest.mark.parametrize("call", [pickle.dumps, copy.copy, copy.deepcopy])
+def test_a_simulation_that_is_pickled_names_what_can_be(call: Any, simulation: Simulation, device: Device) -> None:
+    with pytest.raises(MsmError) as caught:
+        call(simulation)
+    remedy = "keep its `scene` and what `save` returns, and `restore` that in a new one"
+    assert str(caught.value) == f"a Simulation cannot be pickled or copied; {remedy}"
+    saved, made = pickle.loads(pickle.dumps((simulation.save(), simulation.scene)))
+    with Simulation(made, threads=device.threads) as other:
+        other.restore(saved)
+        np.testing.assert_array_equal(other.positions(), simulation.positions())

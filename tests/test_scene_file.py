@@ -791,7 +791,7 @@ def test_errors_below_a_later_override_are_its_own(load: Load) -> None:
     found = lines(load, GOOD, ["render.camera.fov=30", "render={camera: {fov: x, eye: [0, 0, 1]}}"])
     assert found == [
         "--set render={camera: {fov: x, eye: [0, 0, 1]}}: render.camera.fov: "
-        '"x" is not allowed; expected a number between 0 and 180, in degrees'
+        '"x" is not allowed; expected a number from 0.001 to below 180, in degrees'
     ]
 
 

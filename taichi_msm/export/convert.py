@@ -2,15 +2,17 @@
 
 from __future__ import annotations
 
+import json
 from pathlib import Path
 from typing import NamedTuple
 
-from taichi_msm.errors import FilesError, SceneError
-from taichi_msm.export.formats import FORMATS
-from taichi_msm.export.staging import staging
+import numpy as np
+
+from taichi_msm.errors import FilesError, SceneError, writing
+from taichi_msm.export.formats import EXPORT, FORMATS, RECORD
 from taichi_msm.progress import Count
-from taichi_msm.results.finished_run import read_run
-from taichi_msm.results.publication import RESULTS
+from taichi_msm.results.finished_run import PUT_BACK, read_run
+from taichi_msm.results.publication import RESULTS, Publication
 
 
 class Exported(NamedTuple):
@@ -39,17 +41,21 @@ def convert(run: Path, name: str, directory: Path, progress: Count = lambda done
         NotInstalledError: when a package that writes the format is not installed.
     """
     finished, wanted = read_run(run), FORMATS[name]
-    if missing := [key for key in wanted.needs if not finished.has(RESULTS.get(key, key))]:
-        remedy = finished.remedy(*wanted.needs, *wanted.uses)
-        raise FilesError(f"{run}: {name} needs {' and '.join(missing)}; {remedy}")
     progress(0, finished.frames)
     try:
-        with staging(directory, wanted.files) as staged:
-            notes = wanted.write(finished, staged, progress)
-            files = sorted(path.relative_to(staged).as_posix() for path in staged.rglob("*") if path.is_file())
+        with writing(directory), Publication(directory, kind=EXPORT) as publication:
+            with finished.unchanged(), np.errstate(over="raise", divide="raise", invalid="raise"):
+                if missing := [key for key in wanted.needs if not finished.has(RESULTS.get(key, key))]:
+                    remedy = finished.remedy(*wanted.needs, *wanted.uses)
+                    raise FilesError(f"{run}: {name} needs {' and '.join(missing)}; {remedy}")
+                notes = wanted.write(finished, publication.staged, progress)
+            files = sorted(publication.staged.files(EXPORT.files))
+            publication.staged.add(RECORD, (json.dumps({"files": files}, indent=1) + "\n").encode())
+            publication.publish([*files, RECORD])
     except SceneError as error:
         # The fault names what the scene is to change; here the picture itself must be put back.
         fault = error.lines[0].partition(";")[0]
-        said = f"{run}: {fault}; put back the picture that it was run with, or run the scene again"
-        raise FilesError(said) from None
+        raise FilesError(f"{run}: {fault}; {PUT_BACK}") from None
+    except FloatingPointError:
+        raise FilesError(f"{run}: its numbers are too large for {name}; run the scene again") from None
     return Exported(files, notes)

@@ -1,15 +1,15 @@
-"""The export formats by name: the files of each, and the function that writes them."""
+"""The export formats by name: the files of each, and the function that writes them; and how they are published."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
-from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 from taichi_msm.export import gltf, kitti, obj, tapvid, vtk
 from taichi_msm.progress import Count
 from taichi_msm.results.finished_run import FinishedRun
-from taichi_msm.results.folder import Tree
+from taichi_msm.results.folder import Folder, Tree, allows
+from taichi_msm.results.publication import Kind
 
 
 class Format(NamedTuple):
@@ -26,7 +26,7 @@ class Format(NamedTuple):
     needs: tuple[str, ...]
     uses: tuple[str, ...]
     files: Tree
-    write: Callable[[FinishedRun, Path, Count], list[str]]
+    write: Callable[[FinishedRun, Folder, Count], list[str]]
 
 
 FORMATS = {
@@ -36,3 +36,24 @@ FORMATS = {
     "gltf": Format(("trajectory",), (), gltf.FILES, gltf.write_gltf),
     "obj": Format(("trajectory",), (), obj.FILES, obj.write_obj),
 }
+
+# The file that lists the others.
+RECORD = "export.json"
+
+# The files of all formats: any of them may have been exported to a folder before, or been about to be.
+FILES: Tree = {
+    r"export\.json": None,
+    **{name: below for one in FORMATS.values() for name, below in one.files.items()},
+}
+
+
+def _is_ours(name: object) -> bool:
+    return isinstance(name, str) and allows(FILES, name)
+
+
+def _listed(record: Any) -> Callable[[str], bool]:
+    return {RECORD, *record["files"]}.__contains__
+
+
+# A folder with anything else in it is refused, as nobody would find it again among so many files.
+EXPORT = Kind("export", RECORD, FILES, _is_ours, _listed, alone=True, beside={})

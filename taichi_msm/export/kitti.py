@@ -15,9 +15,6 @@ Source: the development kit of KITTI's scene flow benchmark 2015, readme.txt and
 
 from __future__ import annotations
 
-import shutil
-from pathlib import Path
-
 import numpy as np
 from numpy.typing import NDArray
 
@@ -25,9 +22,9 @@ from taichi_msm.errors import FilesError
 from taichi_msm.export.frames import frame_path, read_picture
 from taichi_msm.export.png16 import png16
 from taichi_msm.progress import Count
-from taichi_msm.results.finished_run import FinishedRun
+from taichi_msm.results.finished_run import FinishedRun, reading
 from taichi_msm.results.flo import read_flo
-from taichi_msm.results.folder import Tree
+from taichi_msm.results.folder import Folder, Tree
 from taichi_msm.results.publication import FLOW, FRAMES, OCCLUSION, series_file
 
 ROOT, PICTURES, ALL, SEEN = "training", "image_2", "flow_occ", "flow_noc"
@@ -37,7 +34,7 @@ FILES: Tree = {ROOT: {PICTURES: {r"[0-9]{6,}_1[01]\.png": None}, ALL: FIRST, SEE
 SCALE, ZERO, LARGEST = 64.0, 32768.0, 65535.0
 
 
-def write_kitti(run: FinishedRun, folder: Path, progress: Count) -> list[str]:
+def write_kitti(run: FinishedRun, folder: Folder, progress: Count) -> list[str]:
     """Write the flow of a run, and its frames and occlusion if it has them.
 
     Raises:
@@ -47,20 +44,21 @@ def write_kitti(run: FinishedRun, folder: Path, progress: Count) -> list[str]:
     if pairs == 0:
         raise FilesError(f"{run.directory}: has only one frame, and flow needs two; run the scene to its end")
     has = {output: run.has(output) for output in (OCCLUSION, FRAMES)}
-    wanted = [ALL, *([SEEN] if has[OCCLUSION] else []), *([PICTURES] if has[FRAMES] else [])]
-    for name in wanted:
-        (folder / ROOT / name).mkdir(parents=True)
-    for pair in range(pairs):
-        progress(pair, pairs)
-        flow, name = read_flo(run.result(f"{FLOW}/{series_file(FLOW, pair)}", FLOW), size), f"{pair:06}_10.png"
-        (folder / ROOT / ALL / name).write_bytes(png16(encode(flow)))
-        if has[OCCLUSION]:
-            hidden = (
-                read_picture(run.result(f"{OCCLUSION}/{series_file(OCCLUSION, pair)}", OCCLUSION), size)[..., 0] > 0
-            )
-            (folder / ROOT / SEEN / name).write_bytes(png16(encode(flow, ~hidden)))
-        for number in (0, 1) if has[FRAMES] else ():
-            _copy(run, pair + number, folder / ROOT / PICTURES / f"{pair:06}_1{number}.png")
+    with (
+        folder.folder(ROOT, create=True) as root,
+        root.folder(ALL, create=True) as flows,
+        root.folder(SEEN, create=True) as seen,
+        root.folder(PICTURES, create=True) as pictures,
+    ):
+        for pair in range(pairs):
+            progress(pair, pairs)
+            flow, name = read_flo(run.result(f"{FLOW}/{series_file(FLOW, pair)}", FLOW), size), f"{pair:06}_10.png"
+            flows.add(name, png16(encode(flow)))
+            if has[OCCLUSION]:
+                path = run.result(f"{OCCLUSION}/{series_file(OCCLUSION, pair)}", OCCLUSION)
+                seen.add(name, png16(encode(flow, ~(read_picture(path, size)[..., 0] > 0))))
+            for number in (0, 1) if has[FRAMES] else ():
+                _copy(run, pair + number, pictures, f"{pair:06}_1{number}.png")
     left_out = [(OCCLUSION, SEEN), (FRAMES, PICTURES)]
     return [
         f"{name} is left out: {output} is not among the results; {run.remedy(OCCLUSION, 'png')}"
@@ -90,8 +88,10 @@ def encode(flow: NDArray[np.float32], seen: NDArray[np.bool_] | None = None) -> 
     return colours
 
 
-def _copy(run: FinishedRun, number: int, path: Path) -> None:
+def _copy(run: FinishedRun, number: int, folder: Folder, name: str) -> None:
     """Copy a frame, after checking that it is a whole picture of the right size."""
     source = frame_path(run, number)
     read_picture(source, run.scene.render.size)
-    shutil.copyfile(source, path)
+    with reading(source):
+        data = source.read_bytes()
+    folder.add(name, data)

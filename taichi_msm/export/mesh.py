@@ -28,7 +28,7 @@ def picture_png(run: FinishedRun) -> bytes | None:
     if run.scene.image is None:
         return None
     file = io.BytesIO()
-    Image.fromarray(load_texture(run.scene)).save(file, "PNG")
+    Image.fromarray(load_texture(run.scene, run.sha256.get("image", ""))).save(file, "PNG")
     return file.getvalue()
 
 

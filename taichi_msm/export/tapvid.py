@@ -16,7 +16,6 @@ from __future__ import annotations
 
 import pickle
 import zipfile
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -26,7 +25,7 @@ from taichi_msm.errors import FilesError
 from taichi_msm.export.frames import frame_path, read_picture
 from taichi_msm.progress import Count
 from taichi_msm.results.finished_run import FinishedRun, damaged, reading
-from taichi_msm.results.folder import Tree
+from taichi_msm.results.folder import Folder, Tree
 from taichi_msm.results.npz import read_rows
 from taichi_msm.results.publication import TRACKS
 from taichi_msm.system.resources import available_memory
@@ -47,7 +46,7 @@ class _Pickler(pickle.Pickler):
         return NotImplemented
 
 
-def write_tapvid(run: FinishedRun, folder: Path, progress: Count) -> list[str]:
+def write_tapvid(run: FinishedRun, folder: Folder, progress: Count) -> list[str]:
     """Write the tracks of a run and its frames.
 
     Raises:
@@ -67,7 +66,7 @@ def write_tapvid(run: FinishedRun, folder: Path, progress: Count) -> list[str]:
         progress(frame, run.frames)
         video[frame] = read_picture(frame_path(run, frame), (width, height))
     scaled = (points / (width, height)).astype(np.float32)
-    with (folder / FILE).open("wb") as file:
+    with folder.create(FILE) as file:
         name = run.directory.resolve().name
         _Pickler(file, PROTOCOL).dump({name: {"video": video, "points": scaled, "occluded": occluded}})
     return []

@@ -14,7 +14,6 @@ Source: VTK's own writer; for the .pvd file, ParaView's guide.
 
 from __future__ import annotations
 
-from pathlib import Path
 from typing import Any
 from xml.etree import ElementTree
 
@@ -28,7 +27,7 @@ from taichi_msm.progress import Count
 from taichi_msm.reference import energy_density
 from taichi_msm.render.surface import surface
 from taichi_msm.results.finished_run import FinishedRun
-from taichi_msm.results.folder import Tree
+from taichi_msm.results.folder import Folder, Tree
 
 COLLECTION = "surface.pvd"
 FILES: Tree = dict.fromkeys((r"[0-9]{4,}\.vtu", r"surface\.pvd", r"picture\.png"))
@@ -39,7 +38,7 @@ UNITS = {DISPLACEMENT: "m", SPEED: "m/s", ENERGY: "J/m2"}
 Array = NDArray[np.floating]
 
 
-def write_vtk(run: FinishedRun, folder: Path, progress: Count) -> list[str]:
+def write_vtk(run: FinishedRun, folder: Folder, progress: Count) -> list[str]:
     """Write the surface of every frame, their times and the picture.
 
     Raises:
@@ -53,6 +52,7 @@ def write_vtk(run: FinishedRun, folder: Path, progress: Count) -> list[str]:
         said = '--format vtk: needs VTK, which is not installed; pip install "taichi-msm[export]"'
         raise NotInstalledError(said) from None
     positions, picture = run.positions(), picture_png(run)
+    run.require_pictures(drawn=False)
     rest = rest_positions(run.scene.sheet)
     for frame in range(run.frames):
         progress(frame, run.frames)
@@ -62,10 +62,10 @@ def write_vtk(run: FinishedRun, folder: Path, progress: Count) -> list[str]:
             SPEED: speed(positions, run.time, frame).ravel(),
             ENERGY: energy_density(run.scene, displacement).ravel(),
         }
-        _write_grid(folder / _name(frame), positions[frame], values)
+        folder.add(_name(frame), _grid(positions[frame], values))
     if picture is not None:
-        (folder / PICTURE).write_bytes(picture)
-    _write_collection(folder / COLLECTION, run.time)
+        folder.add(PICTURE, picture)
+    folder.add(COLLECTION, _collection(run.time))
     return []
 
 
@@ -93,8 +93,8 @@ def _name(frame: int) -> str:
     return f"{frame:04}.vtu"
 
 
-def _write_grid(path: Path, position: Array, values: dict[str, Array]) -> None:
-    """Write a surface with the data of its points."""
+def _grid(position: Array, values: dict[str, Array]) -> bytes:
+    """Write a surface with the data of its points as a file's content."""
     from vtkmodules.util.numpy_support import numpy_to_vtk, numpy_to_vtkIdTypeArray
     from vtkmodules.vtkCommonCore import vtkDataArray, vtkPoints
     from vtkmodules.vtkCommonDataModel import VTK_TRIANGLE, vtkCellArray, vtkUnstructuredGrid
@@ -127,14 +127,14 @@ def _write_grid(path: Path, position: Array, values: dict[str, Array]) -> None:
     writer.WriteToOutputStringOn()
     writer.SetInputData(grid)
     writer.Write()
-    path.write_text(writer.GetOutputString(), encoding="ascii", newline="")
+    return bytes(writer.GetOutputString(), "ascii")
 
 
-def _write_collection(path: Path, time: Array) -> None:
-    """Write the list of the files with their times."""
+def _collection(time: Array) -> bytes:
+    """Write the list of the files with their times as a file's content."""
     root = ElementTree.Element("VTKFile", type="Collection", version="0.1")
     collection = ElementTree.SubElement(root, "Collection")
     for frame, seconds in enumerate(time.tolist()):
         ElementTree.SubElement(collection, "DataSet", timestep=repr(seconds), part="0", file=_name(frame))
     ElementTree.indent(root)
-    ElementTree.ElementTree(root).write(path, encoding="utf-8", xml_declaration=True)
+    return bytes(ElementTree.tostring(root, encoding="utf-8", xml_declaration=True))

@@ -13,7 +13,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from taichi_msm.picture import read_rgb
+from taichi_msm.picture import file_sha256, read_rgb
 from taichi_msm.scene import StiffnessMap
 
 Array = NDArray[np.float64]
@@ -21,8 +21,8 @@ Array = NDArray[np.float64]
 # The number of files whose content is kept.
 MOST_KEPT = 16
 
-# By file name: the time of its last change, and its grey, 0 to 255, shape (height, width).
-_kept: dict[str, tuple[int, NDArray[np.uint8]]] = {}
+# By file name: the time of its last change, its SHA-256, and its grey, 0 to 255, shape (height, width).
+_kept: dict[str, tuple[int, str, NDArray[np.uint8]]] = {}
 
 
 def read(stiffness_map: StiffnessMap) -> None:
@@ -38,12 +38,24 @@ def read(stiffness_map: StiffnessMap) -> None:
         changed = Path(image).stat().st_mtime_ns
     if image in _kept and _kept[image][0] == changed:
         return
-    grey = np.asarray(read_rgb(image, (0, 0, 0)).convert("L"))
+    found_sha256 = file_sha256(image)
+    grey = np.asarray(read_rgb(image, (0, 0, 0), found_sha256).convert("L"))
     for found in (_sampled, largest, largest_mean):
         found.cache_clear()
     if len(_kept) >= MOST_KEPT:
         del _kept[next(iter(_kept))]
-    _kept[image] = changed, grey
+    _kept[image] = changed, found_sha256, grey
+
+
+def sha256(stiffness_map: StiffnessMap) -> str:
+    """Give the SHA-256 of the file of a map, as it was read.
+
+    Raises:
+        PictureError: when the file cannot be used.
+    """
+    if stiffness_map.image not in _kept:
+        read(stiffness_map)
+    return _kept[stiffness_map.image][1]
 
 
 def factors(stiffness_map: StiffnessMap, rows: int, cols: int) -> Array:
@@ -60,7 +72,7 @@ def factors(stiffness_map: StiffnessMap, rows: int, cols: int) -> Array:
 @lru_cache(maxsize=8)
 def _sampled(stiffness_map: StiffnessMap, rows: int, cols: int) -> Array:
     """Interpolate at the centres of the cells: bilinearly between the centres of texels, constant beyond them."""
-    grey = _kept[stiffness_map.image][1].astype(float)
+    grey = _kept[stiffness_map.image][2].astype(float)
     height, width = grey.shape
     row = np.clip((np.arange(rows) + 0.5) / rows * height - 0.5, 0, height - 1)
     column = np.clip((np.arange(cols) + 0.5) / cols * width - 0.5, 0, width - 1)

@@ -10,7 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from taichi_msm.errors import Problem, SceneError
-from taichi_msm.scene import Camera, Scene
+from taichi_msm.faults import SMALLEST
+from taichi_msm.scene import MAX_SUPERSAMPLE, Camera, Scene
 
 Array = NDArray[np.float64]
 
@@ -21,6 +22,9 @@ OBLIQUE_MARGIN = 1.04
 
 # The near plane: only what is farther from the eye than this fraction of the sheet's diagonal is drawn.
 NEAR = 1e-6
+
+# The largest number of a camera's matrix that kernels can hold, in f32 and multiplied by the samples along a pixel.
+LARGEST_NUMBER = float(np.finfo(np.float32).max) / MAX_SUPERSAMPLE
 
 
 class View(NamedTuple):
@@ -94,17 +98,22 @@ def view(scene: Scene) -> View:
 
 
 def problems(scene: Scene) -> Iterator[Problem]:
-    """Say why a pinhole camera sees nothing, if it does."""
+    """Say why a pinhole camera sees nothing, or cannot be computed, if so."""
     camera = scene.render.camera
     if not isinstance(camera, Camera):
         return
-    sight = np.subtract(camera.eye, camera.target)
-    if not np.linalg.norm(sight) > 0:
+    sight, up = _unit(np.subtract(camera.eye, camera.target)), _unit(np.array(camera.up))
+    if math.dist(camera.eye, camera.target) < SMALLEST:
         yield Problem(("render", "camera", "eye"), f"{list(camera.eye)} is also the target; move one of them")
-    elif not np.linalg.norm(np.cross(sight, camera.up)) > 1e-9 * np.linalg.norm(sight) * np.linalg.norm(camera.up):
+    elif not np.linalg.norm(np.cross(sight, up)) > 1e-9:
         yield Problem(
             ("render", "camera", "up"),
             f"{list(camera.up)} is zero or along the line of sight; take a direction across it",
+        )
+    elif np.abs(_pinhole(camera, scene).matrix).max() > LARGEST_NUMBER:
+        yield Problem(
+            ("render", "camera", "eye"),
+            f"{list(camera.eye)} is too far away for {camera.fov:g} degrees; move it nearer or widen fov",
         )
 
 
@@ -160,11 +169,20 @@ def _top(scene: Scene) -> View:
 
 def _axes(camera: Camera) -> Array:
     """Give the camera's unit vectors right, up and toward the eye, as rows, shape (3, 3)."""
-    toward = np.subtract(camera.eye, camera.target)
-    toward = toward / np.linalg.norm(toward)
-    right = np.cross(camera.up, toward)
-    right = right / np.linalg.norm(right)
+    toward = _unit(np.subtract(camera.eye, camera.target))
+    right = _unit(np.cross(_scaled(np.array(camera.up)), toward))
     return np.stack([right, np.cross(toward, right), toward])
+
+
+def _unit(vector: Array) -> Array:
+    """Give a vector the length 1; a vector of zeros stays."""
+    scaled = _scaled(vector)
+    return scaled / (float(np.linalg.norm(scaled)) or 1.0)
+
+
+def _scaled(vector: Array) -> Array:
+    """Multiply a vector by a power of 2, which is exact, so that squares of it neither overflow nor vanish."""
+    return np.ldexp(vector, -math.frexp(float(np.abs(vector).max()))[1])
 
 
 def _pinhole(camera: Camera, scene: Scene) -> View:

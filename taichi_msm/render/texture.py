@@ -15,10 +15,14 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
 
-def load_texture(scene: Scene) -> NDArray[np.uint8]:
+def load_texture(scene: Scene, sha256: str | None = None) -> NDArray[np.uint8]:
     """Read the scene's picture: upright, in 8-bit RGB, cut to the scene's region.
 
     If a file has several pictures, the first is taken; a transparent one is laid over the scene's background.
+
+    Args:
+        scene: which names it.
+        sha256: the SHA-256 that its file must have; None: any.
 
     Returns:
         Colours, 0 to 255, shape (height, width, 3), top row first.
@@ -31,7 +35,7 @@ def load_texture(scene: Scene) -> NDArray[np.uint8]:
     if scene.image is None:
         raise SceneError(["image: no picture is named"])
     try:
-        image = read_rgb(scene.image, scene.render.background)
+        image = read_rgb(scene.image, scene.render.background, sha256)
     except PictureError as error:
         raise SceneError([f"image: {error}"]) from None
     x, y, width, height = region = scene.region or (0, 0, *image.size)

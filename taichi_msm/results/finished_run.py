@@ -5,22 +5,30 @@ from __future__ import annotations
 import errno
 import json
 from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
-from dataclasses import dataclass
+from contextlib import contextmanager, suppress
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from pydantic import TypeAdapter
+from typing_extensions import TypedDict
 
 from taichi_msm.arguments import require_path
-from taichi_msm.errors import FilesError, SceneError
+from taichi_msm.errors import FilesError, MsmError, SceneError
 from taichi_msm.physics import material
 from taichi_msm.physics.lattice import rest_positions
+from taichi_msm.picture import PictureError, file_sha256
 from taichi_msm.render import camera
 from taichi_msm.results.npz import map_array
 from taichi_msm.results.publication import MAX_RECORD, RECORD, TRAJECTORY
 from taichi_msm.scene import Scene
+
+# The largest number of f32.
+MOST = float(np.finfo(np.float32).max)
+
+PUT_BACK = "put back the picture that it was run with, or run the scene again"
 
 
 @dataclass(frozen=True)
@@ -33,12 +41,17 @@ class FinishedRun:
         scene: the scene as it was run: with the points, the step and the precision that were chosen, without a
             tolerance, and with paths of pictures that are relative to the current directory.
         frames: how many were simulated.
+        sha256: of the files of its pictures, by the keys that name them.
+        overrides: that made the scene from its file.
     """
 
     directory: Path
     record: Mapping[str, Any]
     scene: Scene
     frames: int
+    sha256: Mapping[str, str]
+    overrides: list[str]
+    _data: bytes = field(repr=False)
 
     @property
     def time(self) -> NDArray[np.float64]:
@@ -59,14 +72,58 @@ class FinishedRun:
         rest = rest_positions(self.scene.sheet)
         with reading(path):
             found = map_array(path, "position", dtype, (self.frames, *rest.shape))
-        # Every run begins at rest; this is checked, as anybody may have written the file.
-        if not np.array_equal(found[0], rest.astype(dtype)) or not all(np.isfinite(frame).all() for frame in found):
+        # Every run begins at rest; this is checked, as anybody may have written the file. Kernels and other programs
+        # take numbers in f32. Written so that NaN is found too.
+        if not np.array_equal(found[0], rest.astype(dtype)) or not all(np.abs(frame).max() <= MOST for frame in found):
             raise damaged(path)
         return found
 
+    @contextmanager
+    def unchanged(self) -> Iterator[None]:
+        """Make sure that everything that is read in the block is of this run.
+
+        Raises:
+            FilesError: when another run has published its results meanwhile; also instead of what the block raises.
+        """
+        try:
+            yield
+        except MsmError:
+            self._require_unchanged()
+            raise
+        self._require_unchanged()
+
+    def _require_unchanged(self) -> None:
+        # A run removes this file before it moves any other.
+        data = b""
+        with suppress(OSError):
+            data = (self.directory / RECORD).read_bytes()
+        if data != self._data:
+            raise FilesError(f"{self.directory}: another run replaced these results while they were read; try again")
+
+    def require_pictures(self, *, drawn: bool) -> None:
+        """Make sure that the maps are those that were run, by their SHA-256.
+
+        Args:
+            drawn: whether the picture is used too.
+
+        Raises:
+            FilesError: when one of them is missing or has changed.
+        """
+        for key, path in self.scene.pictures.items():
+            if key == "image" and not drawn:
+                continue
+            fault = f"{path} is not the file that was run, as its SHA-256 tells"
+            try:
+                if file_sha256(path) == self.sha256.get(key):
+                    continue
+            except PictureError as error:
+                fault = str(error).partition(";")[0]
+            raise FilesError(f"{self.directory}: {key}: {fault}; {PUT_BACK}")
+
     def has(self, output: str) -> bool:
         """Tell whether a file or folder is among the results."""
-        return (self.directory / output).exists()
+        with reading(self.directory / output):
+            return (self.directory / output).exists()
 
     def remedy(self, *keys: str) -> str:
         """Say how to get the results of further entries of a scene's `output`."""
@@ -88,6 +145,9 @@ class FinishedRun:
             raise FilesError(f"{output}: not among the results of {self.directory}; {self.remedy(key)}")
         if not path.is_file():
             raise FilesError(f"{path}: no such file; {self.remedy(key)}")
+        # The results may come from anybody, and what is read here may be given to others.
+        if (self.directory / output).is_symlink() or path.is_symlink():
+            raise FilesError(f"{path}: a symbolic link, which no run writes; {self.remedy(key)}")
         return path
 
 
@@ -107,11 +167,13 @@ def read_run(directory: str | Path) -> FinishedRun:
         if not path.is_file():
             raise FilesError(f"{path.parent}: no results of a run; name the folder that `run --out` wrote")
         with path.open("rb") as file:
-            record = json.loads(file.read(MAX_RECORD))
+            data = file.read(MAX_RECORD)
+        record = json.loads(data)
         scene, frames = _as_run(record), record["frames"]
+        facts = _FACTS.validate_python(record)
         if not isinstance(frames, int) or not 1 <= frames <= scene.time.frames + 1 or scene.time.precision == "auto":
             raise damaged(path)
-    return FinishedRun(path.parent, record, scene, frames)
+    return FinishedRun(path.parent, record, scene, frames, facts["sha256"], facts["overrides"], data)
 
 
 @contextmanager
@@ -137,16 +199,23 @@ def damaged(path: Path) -> FilesError:
     return FilesError(f"{path}: damaged, or not of this run; run the scene again")
 
 
+class _Facts(TypedDict):
+    sha256: dict[str, str]
+    overrides: list[str]
+
+
+_FACTS = TypeAdapter(_Facts)
+
+
 def _as_run(record: Mapping[str, Any]) -> Scene:
-    """Make the scene of a record.
+    """Make the scene of a record, whose pictures are found from the current directory.
 
     Raises:
         Exception: when the scene cannot be run, or the record lacks something.
     """
-    given, folder = Scene(**record["scene"]), Path(record["working_directory"])
-    scene = given.model_copy(update={"image": None if given.image is None else str(folder / given.image)})
-    if scene.stiffness_map is not None:
-        scene = scene.with_map_image(str(folder / scene.stiffness_map.image))
+    scene, folder = Scene(**record["scene"]), Path(record["working_directory"])
+    if folder != Path.cwd():
+        scene = scene.with_pictures(lambda path: str(folder / path))
     found = [problem for check in (material.problems, camera.problems) for problem in check(scene)]
     # A picture that is missing, or has changed, is reported by the code that needs it.
     if any(problem.path[-1:] != ("image",) for problem in found):

@@ -90,6 +90,16 @@ class Folder:
             if (kind := self.kind(name)) is not None:
                 yield name, kind
 
+    def files(self, tree: Tree) -> Iterator[str]:
+        """List the names of the files here and below that a tree allows, each with its folders."""
+        for name, kind in self.entries():
+            for below in _allowed(tree, name):
+                if below is not None:
+                    with self.folder(name) as inner:
+                        yield from [f"{name}/{file}" for file in inner.files(below)]
+                elif kind == FILE:
+                    yield name
+
     def folder(self, name: str, *, create: bool = False) -> Folder:
         """Open a folder in this one; `create`: make it if it is missing."""
         if create:
@@ -121,6 +131,11 @@ class Folder:
         """Make a new file, and open it for writing and reading; `buffering` as for Python's open."""
         return self._open(name, os.O_RDWR | os.O_CREAT | os.O_EXCL, buffering)
 
+    def add(self, name: str, data: bytes) -> None:
+        """Write a new file."""
+        with self.create(name) as file:
+            file.write(data)
+
     def lock(self, name: str) -> BinaryIO:
         """Lock a file, made if missing, until it is closed here and in all processes that have inherited it.
 
@@ -147,8 +162,7 @@ class Folder:
         """Write a file as a whole or not at all: write a draft, then rename it."""
         self.remove(draft)
         try:
-            with self.create(draft) as file:
-                file.write(data)
+            self.add(draft, data)
             self.replace(draft, self, name)
         except BaseException:
             self.remove(draft)
@@ -226,6 +240,15 @@ def write_all(file: BinaryIO, data: bytes | memoryview) -> None:
     rest = memoryview(data)
     while rest:
         rest = rest[file.write(rest) :]
+
+
+def allows(tree: Tree, name: str) -> bool:
+    """Tell whether a tree allows a file; its name may begin with folders."""
+    head, _, rest = name.partition("/")
+    found = _allowed(tree, head)
+    if not found or not rest:
+        return found == [None]
+    return found[0] is not None and allows(found[0], rest)
 
 
 def _allowed(tree: Tree, name: str) -> list[Tree | None]:

@@ -2,23 +2,23 @@
 
 from __future__ import annotations
 
-import hashlib
+import os
 from collections.abc import Mapping
+from contextlib import suppress
 from dataclasses import asdict, dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-from numpy.typing import NDArray
 from pydantic import TypeAdapter
 
 from taichi_msm.errors import DamagedError, FilesError
-from taichi_msm.physics import material, timestep
+from taichi_msm.physics import material, stiffness_map, timestep
 from taichi_msm.physics.error_control import Estimate
 from taichi_msm.physics.material import factors
 from taichi_msm.physics.mesh_error import MeshEstimate
+from taichi_msm.picture import PictureError, file_sha256
 from taichi_msm.render import camera
-from taichi_msm.render.texture import load_texture
 from taichi_msm.results.publication import CHECKPOINT, MANIFEST, STAGING, open_checkpoint
 from taichi_msm.results.sealed import unseal
 from taichi_msm.scene import Scene
@@ -39,10 +39,9 @@ class Manifest:
         estimate: of the error, if a tolerance required it before the run; else None.
         mesh: error of the points, if a tolerance of the sheet required it before the run; else None.
         asks_estimate: whether to estimate the error beside the run; None: if it is cheap.
-        folder: the current directory, from which the path of the scene's picture starts.
+        folder: the current directory, from which the paths of the scene's pictures start.
         arch: cpu, cuda or vulkan.
-        picture: digest of the picture on the sheet.
-        map: digest of the map's factors.
+        sha256: of the files of the picture and the maps, by the keys that name them.
         versions: of all that the results depend on.
     """
 
@@ -54,8 +53,7 @@ class Manifest:
     asks_estimate: bool | None
     folder: str
     arch: str
-    picture: str
-    map: str
+    sha256: Mapping[str, str]
     versions: Mapping[str, str]
 
     def as_json(self) -> dict[str, Any]:
@@ -64,38 +62,26 @@ class Manifest:
         scenes = {"given": self.given.model_dump(mode="json"), "scene": self.scene.model_dump(mode="json")}
         return {**vars(self), **scenes, **known}
 
-    def load_texture(self) -> NDArray[np.uint8] | None:
-        """Read the picture of the scene, if the scene draws; raises what `texture.load_texture` does."""
-        if not self.scene.draws:
-            return None
-        image = str(Path(self.folder) / str(self.scene.image))
-        return load_texture(self.scene.model_copy(update={"image": image}))
-
-    def require_same(self, picture: str, map_: str, versions: Mapping[str, str]) -> None:
+    def require_same(self, versions: Mapping[str, str]) -> None:
         """Make sure that the rest of the run would have the same bits as if it had not been interrupted.
 
         Raises:
-            FilesError: when the picture, the map or a version has changed.
+            FilesError: when the picture, a map or a version has changed.
         """
-        if picture != self.picture:
-            raise FilesError(f"{self.scene.image} has changed since the run began; run the scene again")
-        if map_ != self.map:
-            image = getattr(self.scene.stiffness_map, "image", None)
-            raise FilesError(f"{image} has changed since the run began; run the scene again")
+        sha256 = digests(self.scene)
+        for key, path in self.scene.pictures.items():
+            if sha256.get(key) != self.sha256.get(key):
+                raise FilesError(f"{path} has changed since the run began; put it back, or run the scene again")
         others = [f"{key} {self.versions.get(key)}" for key in versions if versions[key] != self.versions.get(key)]
         if others:
             raise FilesError(f"the run began with {', '.join(others)}; use these versions, or run the scene again")
 
     def gives_the_bits_of(self, other: Manifest) -> bool:
         """Tell whether the results of both runs have the same bits, so that one can continue the other."""
-        renamed = other.scene.model_copy(update={"image": self.scene.image})
-        if self.scene.stiffness_map is not None:
-            renamed = renamed.with_map_image(self.scene.stiffness_map.image)
         mine, its = (
-            (self.arch, self.picture, self.map, self.versions),
-            (other.arch, other.picture, other.map, other.versions),
+            (one.scene.with_pictures(lambda path: "any"), one.arch, one.sha256, one.versions) for one in (self, other)
         )
-        return self.scene == renamed and mine == its
+        return mine == its
 
 
 _PLAN = TypeAdapter(Manifest)
@@ -113,7 +99,9 @@ def read_manifest(directory: Path) -> Manifest:
     try:
         with open_checkpoint(directory) as folder, folder.open(MANIFEST) as file:
             data = file.read(MAX_BYTES + 1)
-        manifest = _found_from_here(_PLAN.validate_python(unseal(data)))
+        manifest = _PLAN.validate_python(unseal(data))
+        # The current directory may be another one now.
+        manifest = replace(manifest, scene=manifest.scene.with_pictures(partial(os.path.join, manifest.folder)))
     except (FileNotFoundError, NotADirectoryError):
         raise FilesError(f"{directory}: there is no unfinished run to resume") from None
     except OSError as error:
@@ -130,28 +118,12 @@ def read_manifest(directory: Path) -> Manifest:
     return manifest
 
 
-def _found_from_here(manifest: Manifest) -> Manifest:
-    """Change the path of the map so that it starts from the current directory."""
-    stiffness_map = manifest.scene.stiffness_map
-    if stiffness_map is None:
-        return manifest
-    image = str(Path(manifest.folder) / stiffness_map.image)
-    return replace(manifest, scene=manifest.scene.with_map_image(image))
+def digests(scene: Scene) -> dict[str, str]:
+    """Compute the SHA-256 of the files of a checked scene's picture and maps, by the keys that name them.
 
-
-def digest(array: NDArray[Any] | None) -> str:
-    """Compute a digest of an array; empty if there is none."""
-    if array is None:
-        return ""
-    found = hashlib.sha256(repr(array.shape).encode())
-    found.update(np.ascontiguousarray(array).data)
-    return found.hexdigest()
-
-
-def map_digest(scene: Scene) -> str:
-    """Compute a digest of the factors of a scene's map; empty if there is none.
-
-    Raises:
-        SceneError: when the map cannot be read.
+    There is none of a picture that cannot be read. That of a map is of the file as it was read for the check.
     """
-    return digest(None if scene.stiffness_map is None else factors(scene))
+    found = {f"{scene.kind}.{name}.image": stiffness_map.sha256(one) for name, one in scene.maps.items()}
+    with suppress(PictureError):
+        found |= {} if scene.image is None else {"image": file_sha256(scene.image)}
+    return found

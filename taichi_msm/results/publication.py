@@ -1,4 +1,4 @@
-"""Replace the results in a directory, whole or not at all, and only what a run has written.
+"""Replace the results in a directory, whole or not at all, and only what a run, or an export, has written.
 
 New files are staged below the directory, so that every move is a rename within one file system. When all are there, a
 marker with their names is written. Then the record of the earlier results is removed, the other files are moved, and
@@ -6,7 +6,7 @@ the new record is moved last: where there is a record, the results are whole and
 killed before the marker is written, the directory stays as it was; if later, the next publication first completes the
 moves.
 
-The record lists what a run has written, and only that is ever replaced or removed. If anything else is in the way, that
+The record lists what was written, and only that is ever replaced or removed. If anything else is in the way, that
 is an error before anything is touched.
 """
 
@@ -16,13 +16,13 @@ import errno
 import json
 import os
 import re
-from collections.abc import Collection, Iterable, Iterator
+from collections.abc import Callable, Collection, Iterable, Mapping
 from contextlib import ExitStack, suppress
 from pathlib import Path
-from typing import BinaryIO
+from typing import Any, BinaryIO, NamedTuple
 
 from taichi_msm.errors import DamagedError, FilesError, ForeignError
-from taichi_msm.results.folder import FILE, HAS_DESCRIPTORS, INHERITS, Folder, Tree
+from taichi_msm.results.folder import FILE, FOLDER, HAS_DESCRIPTORS, INHERITS, Folder, Tree
 from taichi_msm.results.sealed import seal, unseal
 from taichi_msm.scene import UNTIL_NEXT
 
@@ -54,7 +54,6 @@ NEW_TREE: Tree = {
     **{folder: {rf"[0-9]{{4,}}\.{kind}": None} for folder, kind in SERIES.items()},
     **{re.escape(name): None for name in (*FILE_NAMES, RECORD)},
 }
-STAGING_TREE: Tree = {**dict.fromkeys((LOCK, MARKER, DRAFT)), NEW: NEW_TREE, CHECKPOINT: CHECKPOINT_TREE}
 
 # How often the staging directory is tried again while ending runs remove it; then it counts as missing.
 ATTEMPTS = 100
@@ -104,12 +103,35 @@ def result_names(outputs: Iterable[str], frames: int) -> list[str]:
     return names
 
 
+class Kind(NamedTuple):
+    """What is published.
+
+    Attributes:
+        name: what writes it, in messages.
+        record: the file that lists what was written; it is moved last.
+        files: all that may be written, the record among it.
+        is_result: tells whether this may be the name of a file.
+        listed: turns the content of a record into what tells whether it lists a file.
+        alone: whether nothing else may be in the directory.
+        beside: what else may be in the staging directory.
+    """
+
+    name: str
+    record: str
+    files: Tree
+    is_result: Callable[[object], bool]
+    listed: Callable[[Any], Callable[[str], bool]]
+    alone: bool
+    beside: Tree
+
+
 class Publication:
     """New contents for a directory. Leaving the with statement without `publish` discards them.
 
     Args:
         directory: where the results go; made if it does not exist.
         names: all that may be published; it is an error if anything but earlier results has one of these names.
+        kind: what is published; None: the results of a run.
 
     Raises:
         FilesError: on entering, when another process publishes there, or something is in the way that no run has put
@@ -126,8 +148,14 @@ class Publication:
     staging: Folder
     staged: Folder
 
-    def __init__(self, directory: Path, names: Collection[str] = ()) -> None:
+    def __init__(self, directory: Path, names: Collection[str] = (), kind: Kind | None = None) -> None:
         self.keep = True
+        self._kind = kind or RUN
+        self._tree: Tree = {
+            **dict.fromkeys((LOCK, MARKER, DRAFT)),
+            NEW: self._kind.files,
+            **self._kind.beside,
+        }
         self._path = directory
         self._names = names
         self._open = ExitStack()
@@ -143,7 +171,7 @@ class Publication:
         """Replace earlier results by the staged files.
 
         Args:
-            names: the names of the files, all staged, with RECORD among them.
+            names: the names of the files, all staged, with the record among them.
 
         Raises:
             FilesError: when a staged file was removed, or something that no run has written is in its place.
@@ -152,7 +180,8 @@ class Publication:
             staged = _Files(self.staged, opened)
             for name in names:
                 if staged.kind(name) != FILE:
-                    raise FilesError(f"{self.staged.path / name} was removed during the run; run it again")
+                    said = f"was removed during the {self._kind.name}; run it again"
+                    raise FilesError(f"{self.staged.path / name} {said}")
         earlier = self._earlier()
         self._require_free(names, earlier)
         with ExitStack() as opened:
@@ -170,10 +199,14 @@ class Publication:
             try:
                 self._acquire(opened)
             except BlockingIOError:
-                raise FilesError(f"{self._path}: another run is writing there; choose another --out") from None
+                said = f"another {self._kind.name} is writing there; choose another --out"
+                raise FilesError(f"{self._path}: {said}") from None
             self._complete()
             self._clear()
-            self._require_free(self._names, self._earlier())
+            earlier = self._earlier()
+            if self._kind.alone:
+                _require_only(self._here, earlier)
+            self._require_free(self._names, earlier)
             self.staged = opened.enter_context(self.staging.folder(NEW, create=True))
             self._open = opened.pop_all()
         return self
@@ -186,24 +219,24 @@ class Publication:
         self._open.close()
 
     def _earlier(self) -> set[str]:
-        """List the results of the earlier run that are there, according to its record."""
-        if self._here.kind(RECORD) is None:
+        """List the earlier results, according to their record."""
+        record = self._kind.record
+        if self._here.kind(record) is None:
             return set()
         try:
-            with self._here.open(RECORD) as file:
-                record = json.loads(file.read(MAX_RECORD))
-            outputs, frames = set(record["outputs"]), int(record["frames"])
+            with self._here.open(record) as file:
+                listed = self._kind.listed(json.loads(file.read(MAX_RECORD)))
         except (ValueError, KeyError, TypeError, RecursionError, OverflowError):
-            raise ForeignError.at(self._path / RECORD, "a file") from None
-        return {name for name in _results(self._here) if _belongs(name, outputs, frames)}
+            raise ForeignError.at(self._path / record, "a file") from None
+        return {name for name in self._here.files(self._kind.files) if self._kind.is_result(name) and listed(name)}
 
-    def _require_free(self, names: Collection[str], earlier: Collection[str]) -> None:
+    def _require_free(self, names: Collection[str], earlier: set[str]) -> None:
         """Make sure that results can be put in place, and that only earlier results are in their places."""
         with ExitStack() as opened:
             here = _Files(self._here, opened)
             # Checked here, so that it fails before the run, and not halfway through the moves.
-            for folder in {name.partition("/")[0] for name in names if "/" in name}:
-                if here.has_folder(folder) and not self._here.is_writable(folder):
+            for folder in _folders(names):
+                if here.has_folder(folder) and not here.is_writable(folder):
                     raise PermissionError(errno.EACCES, f"{folder} is not a writable directory")
             for name in names:
                 kind = here.kind(name)
@@ -216,6 +249,7 @@ class Publication:
             with self.staging.open(MARKER) as file:
                 marker = unseal(file.read(MAX_RECORD))
             # The marker is not trusted, as anybody may have written it.
+            is_result = self._kind.is_result
             names = [name for name in marker["names"] if is_result(name)]
             known = {name: identity for name, identity in marker["earlier"].items() if is_result(name)}
         except FileNotFoundError:
@@ -229,21 +263,22 @@ class Publication:
             new = opened.enter_context(self.staging.folder(NEW))
             here, staged = _Files(self._here, opened), _Files(new, opened)
             left = [name for name in names if staged.kind(name) is not None]
-            if RECORD not in left:
+            record = self._kind.record
+            if record not in left:
                 return  # The record is moved last, so all is done.
-            earlier = [name for name, identity in known.items() if here.identity(name) == identity]
+            earlier = {name for name, identity in known.items() if here.identity(name) == identity}
             self._require_free(left, earlier)
-            here.remove(RECORD)
+            here.remove(record)
             for name in left:
-                if name != RECORD:
+                if name != record:
                     staged.replace(name, here)
-            gone = [name for name in set(earlier).difference(names) if here.kind(name) == FILE]
+            gone = [name for name in earlier.difference(names) if here.kind(name) == FILE]
             for name in gone:
                 here.remove(name)
-            for folder in {name.partition("/")[0] for name in gone if "/" in name}:
+            for folder in sorted(_folders(gone), reverse=True):
                 with suppress(OSError):  # not empty
-                    self._here.remove_folder(folder)
-            staged.replace(RECORD, here)
+                    here.remove_folder(folder)
+            staged.replace(record, here)
 
     def _clear(self) -> None:
         """Empty the staging directory, except for the lock and what is to be kept."""
@@ -251,7 +286,7 @@ class Publication:
             with self.staging.folder(CHECKPOINT) as checkpoint:
                 # The manifest is removed first, so that a half-removed checkpoint does not count as one.
                 checkpoint.remove(MANIFEST)
-        self.staging.clear(STAGING_TREE, keep=(LOCK, CHECKPOINT) if self.keep else (LOCK,))
+        self.staging.clear(self._tree, keep=(LOCK, CHECKPOINT) if self.keep else (LOCK,))
 
     def _acquire(self, opened: ExitStack) -> None:
         """Make the staging directory and lock it. The lock is released when the processes that hold it have ended."""
@@ -260,7 +295,7 @@ class Publication:
             with suppress(FileNotFoundError), ExitStack() as tried:
                 self.staging = tried.enter_context(self._here.folder(STAGING, create=True))
                 # Checked before anything is written there.
-                self.staging.require_only(STAGING_TREE)
+                self.staging.require_only(self._tree)
                 tried.callback(self._remove_staging)
                 lock = tried.enter_context(self.staging.lock(LOCK))
                 if HAS_DESCRIPTORS:
@@ -288,7 +323,7 @@ class Publication:
 
 
 class _Files:
-    """Files by their names, which may begin with a folder; each folder is opened once.
+    """Files by their names, which may begin with folders; each folder is opened once.
 
     Args:
         top: the folder of names that begin with none.
@@ -296,14 +331,26 @@ class _Files:
     """
 
     def __init__(self, top: Folder, opened: ExitStack) -> None:
-        self._top, self._opened = top, opened
+        self._opened = opened
         self._folders = {"": top}
 
-    def has_folder(self, name: str) -> bool:
-        """Tell whether a folder is there; raises ForeignError if something else has its name."""
-        if name not in self._folders and self._top.kind(name) is not None:
-            self._folders[name] = self._opened.enter_context(self._top.folder(name))
+    def has_folder(self, name: str, *, create: bool = False) -> bool:
+        """Tell whether a folder is there; raises ForeignError if something else has its name; `create`: make it."""
+        if name not in self._folders:
+            folder, _, last = name.rpartition("/")
+            if self.has_folder(folder, create=create) and (create or self._folders[folder].kind(last) is not None):
+                self._folders[name] = self._opened.enter_context(self._folders[folder].folder(last, create=create))
         return name in self._folders
+
+    def is_writable(self, name: str) -> bool:
+        """Tell whether this process may write to a folder, which is there."""
+        folder, _, last = name.rpartition("/")
+        return self._folders[folder].is_writable(last)
+
+    def remove_folder(self, name: str) -> None:
+        """Remove an empty folder, whose files were removed here."""
+        folder, _, last = name.rpartition("/")
+        self._folders[folder].remove_folder(last)
 
     def kind(self, name: str) -> str | None:
         """Say what has this name."""
@@ -324,21 +371,36 @@ class _Files:
     def replace(self, name: str, other: _Files) -> None:
         """Move a file to the same name among other files."""
         folder, _, file = name.rpartition("/")
-        if not other.has_folder(folder):
-            other._top.folder(folder, create=True).close()
-            other.has_folder(folder)
+        other.has_folder(folder, create=True)
         self._folders[folder].replace(file, other._folders[folder], file)
 
 
-def _results(directory: Folder) -> Iterator[str]:
-    """List the files in a directory whose names are those of results."""
-    for name, kind in directory.entries():
-        if name in SERIES:
-            with directory.folder(name) as series:
-                names = [f"{name}/{inner}" for inner, kind in series.entries() if kind == FILE]
-            yield from filter(is_result, names)
-        elif kind == FILE and is_result(name):
-            yield name
+def _folders(names: Iterable[str]) -> set[str]:
+    """List the folders that files are in, and those around them."""
+    found = {name.rpartition("/")[0] for name in names if "/" in name}
+    return found | _folders(found) if found else found
+
+
+def _require_only(directory: Folder, names: set[str]) -> None:
+    """Make sure that a directory contains only these files, and its staging directory; raises ForeignError."""
+    folders = _folders(names)
+
+    def look(folder: Folder, prefix: str) -> None:
+        for last, kind in folder.entries():
+            name = prefix + last
+            if kind == FOLDER and name in folders:
+                with folder.folder(last) as inner:
+                    look(inner, f"{name}/")
+            elif name != STAGING and not (kind == FILE and name in names):
+                raise ForeignError.at(directory.path / name, kind)
+
+    look(directory, "")
+
+
+def _listed(record: Mapping[str, Any]) -> Callable[[str], bool]:
+    """Tell of a result whether it is one of the run with this record."""
+    outputs, frames = set(record["outputs"]), int(record["frames"])
+    return lambda name: _belongs(name, outputs, frames)
 
 
 def is_result(name: object) -> bool:
@@ -361,3 +423,7 @@ def _frame(name: str) -> tuple[str, int] | None:
     if not found or found[1] not in SERIES or name != f"{found[1]}/{series_file(found[1], int(found[2]))}":
         return None
     return found[1], int(found[2])
+
+
+# The results of a run, and beside them the checkpoint from which it can go on.
+RUN = Kind("run", RECORD, NEW_TREE, is_result, _listed, alone=False, beside={CHECKPOINT: CHECKPOINT_TREE})

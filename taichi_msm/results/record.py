@@ -40,7 +40,9 @@ class RunRecord(TypedDict, total=False):
         dump: path of the file with the last good state; only if the run diverged. None: there is no such file.
         scene: as it was run, with the points, the step and the precision that were chosen.
         asked: keys by their paths, with the values that the scene had where others were chosen.
-        working_directory: directory from which the path of the scene's image starts.
+        working_directory: directory from which the paths of the scene's pictures start.
+        sha256: of the files of the picture and the maps, by the keys that name them, such as image and
+            tissue.map.image; without one that could not be read and was not drawn.
         overrides: of the scene file.
         points: rows and columns of mass points.
         step, stable_step: the step, and the largest stable one [s]; None: every step is stable.
@@ -64,6 +66,7 @@ class RunRecord(TypedDict, total=False):
     scene: dict[str, Any]
     asked: dict[str, Any]
     working_directory: str
+    sha256: dict[str, str]
     overrides: list[str]
     points: list[int]
     step: float

@@ -57,11 +57,8 @@ class Captures:
     def keep_scene(self, scene: Scene) -> Path:
         """Save a scene, and beside it copies of its pictures, where a scene file must have them; returns its file."""
         with _draft(self.folder) as draft:
-            if scene.stiffness_map is not None:
-                scene = scene.with_map_image(self._copied(Path(scene.stiffness_map.image)).name)
+            scene = scene.with_pictures(lambda path: self._copied(Path(path)).name)
             data = scene.model_dump(mode="json", exclude_none=True)
-            if scene.image is not None:
-                data["image"] = self._copied(Path(scene.image)).name
             text = yaml.dump(
                 data, Dumper=_DUMPER, sort_keys=False, default_flow_style=None, width=120, allow_unicode=True
             )
