@@ -209,12 +209,12 @@ def test_check_says_how_long_a_run_takes(
     def check(*options: str) -> str:
         return program("check", "small.yaml", *options).stdout
 
-    assert "s to run (a guess, as no run has been timed here yet)\n" in check()
+    assert " to run (a guess, as no run has been timed here yet)\n" in check()
     monkeypatch.setattr(resources, "available_threads", lambda: 2)
     monkeypatch.setattr(duration, "SHORTEST", 0)
     record = json.loads(program("run", "small.yaml", "--json").stdout)
     # A run of the same scene takes what this one took.
     assert json.loads(check("--json"))["estimated_seconds"] == pytest.approx(record["timings"]["total"])
-    assert "s to run (by earlier runs here)\n" in check()
+    assert " to run (by earlier runs here)\n" in check()
     said = check("--set", "time.step=auto", "--set", "time.tolerance=0.01")
-    assert "s to run, at least, as time.tolerance may ask for more (by earlier runs here)\n" in said
+    assert " to run, at least, as time.tolerance may ask for more (by earlier runs here)\n" in said

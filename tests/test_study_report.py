@@ -558,8 +558,8 @@ def test_points_that_are_too_few_are_told_before_any_step() -> None:
     text = terminal(found, 400)
     assert (
         "61 x 61 points make an error of 0.00800, whatever the step; the tolerance is 0.001. So no step is recommended "
-        "for them. No number that was measured is within it; about 171 x 171 would be, by extrapolation. With "
-        "time.tolerance a run finds the step for them.\n" in text
+        "for them. No number that was measured is known to be within it; about 171 x 171 would be, by "
+        "extrapolation. With time.tolerance a run finds the step for them.\n" in text
     )
     assert "*" not in text.split("refine")[0]
     scene(**{**yaml.safe_load("\n".join(found.recommendation())), "sheet": {"points": [171, 171], "size": [0.3, 0.4]}})

@@ -113,8 +113,8 @@ def remarks(study: Study) -> Iterator[str]:
         yield f"{said} {rows} x {cols} are within it; with time.tolerance a run finds the step for them."
     else:
         yield (
-            f"{said} No number that was measured is within it; about {rows} x {cols} would be, by extrapolation. "
-            "With time.tolerance a run finds the step for them."
+            f"{said} No number that was measured is known to be within it; about {rows} x {cols} would be, by "
+            "extrapolation. With time.tolerance a run finds the step for them."
         )
 
 
