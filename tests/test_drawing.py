@@ -14,6 +14,7 @@ from taichi_msm.physics.lattice import rest_positions
 from taichi_msm.render.camera import view
 from taichi_msm.render.instrument import rods
 from taichi_msm.render.rasterizer import Drawing, structure
+from taichi_msm.render.rasterizer_cpu import Bands
 from taichi_msm.scene import Scene
 from taichi_msm.system.runtime import Device
 from tests.scenes import SHEET, scene, speckle
@@ -59,8 +60,10 @@ def test_nothing_is_drawn_before_every_mass_point_is_projected(device: Device) -
     made = scene(sheet={**SHEET, "points": [3, 4000]}, render={"size": [8, 32], "refine": 0})
     texture = speckle(16, 16)
     together, alone = Drawing(made, texture), Drawing(made, texture)
-    alone._workers = 1
-    assert together._workers == 2
+    assert isinstance(together._form, Bands)
+    assert isinstance(alone._form, Bands)
+    alone._form._workers = 1
+    assert together._form._workers == 2
     position = rest_positions(made.sheet) * [1, -1, 1]
     for _ in range(40):
         together.draw(position - 1)

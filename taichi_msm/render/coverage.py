@@ -53,12 +53,13 @@ class Surface(NamedTuple):
 
 
 class Band(NamedTuple):
-    """A band of the picture, and the view.
+    """A band of the picture, or a part of one, and the view.
 
     Attributes:
-        samples: the planes of the tiles of all workers.
-        first: entry of `samples` where the band begins.
+        samples: the planes of all tiles that are kept.
+        first: entry of `samples` where the band begins, from the left edge of the picture.
         across: tiles in a row.
+        left, right: first column of samples, and the column after the last.
         top, bottom: first row of samples, and the row after the last.
         width, height: of the picture [samples].
         near: only what is farther than this is drawn.
@@ -68,6 +69,8 @@ class Band(NamedTuple):
     samples: Any
     first: Any
     across: Any
+    left: Any
+    right: Any
     top: Any
     bottom: Any
     width: Any
@@ -253,6 +256,12 @@ def covering(code: Code) -> Callable[..., Any]:
             )
         z = p_z + r_z * s + d_z * t
         visible = inside & (z < band.samples[at + DEPTH])
+        if ti.static(code.unordered):
+            # Of points that are equally far, that of the cell is seen which comes first on the sheet.
+            number = cell.i * cell.cells_across + cell.j
+            before = number < band.samples[at + ti.static(code.layout["cell"])]
+            visible = visible | (inside & (z == band.samples[at + DEPTH]) & before)
+            keep(at + ti.static(code.layout["cell"]), visible, number, band.samples)
         across = (column + s) * part
         along = (line + t) * part
         keep(at + DEPTH, visible, z, band.samples)
@@ -358,8 +367,8 @@ def covering(code: Code) -> Callable[..., Any]:
                     high_x = -1.0
             first_row = ti.cast(ti.math.clamp(ti.floor(low_y - 0.5), band.top, band.bottom), ti.i32)
             end_row = ti.cast(ti.math.clamp(ti.ceil(high_y + 0.5), band.top, band.bottom), ti.i32)
-            first_column = ti.cast(ti.math.clamp(ti.floor(low_x - 0.5), 0.0, band.width), ti.i32)
-            end_column = ti.cast(ti.math.clamp(ti.ceil(high_x + 0.5), 0.0, band.width), ti.i32)
+            first_column = ti.cast(ti.math.clamp(ti.floor(low_x - 0.5), band.left, band.right), ti.i32)
+            end_column = ti.cast(ti.math.clamp(ti.ceil(high_x + 0.5), band.left, band.right), ti.i32)
             first_line = (first_row - band.top) // code.tile_height
             end_line = (end_row - band.top + (code.tile_height - 1)) // code.tile_height
             first_tile = first_column // code.tile_width
