@@ -20,7 +20,7 @@ from taichi_msm.render.numbers import COLS, HEIGHT, LEVEL_COUNT, LEVELS, NEAR, P
 from taichi_msm.render.projection import projection
 from taichi_msm.render.samples import DEPTH, INFINITY, Code
 from taichi_msm.render.shading import Out, Texture, resolving
-from taichi_msm.system.launches import MOST_ROUNDS, THREADS, Launches, end_thread
+from taichi_msm.system.launches import THREADS, Launches, end_thread
 from taichi_msm.system.quick_taichi import defined_once
 from taichi_msm.system.runtime import our_compilation, ti
 
@@ -77,18 +77,16 @@ class Threads:
         bins = binned(launches, self._bounds, self._cells, (across, down), bin_size)
         # A sample takes one round for a cell, and for each of its pieces one and one or two for tiles.
         rounds_of_cell = 1 + 3 * pieces
-        most = MOST_ROUNDS // (rounds_of_cell + 4)
         rounds_of_rods = rods * (1 + factor * (1 + factor))
         rounds_of_shading = factor * (1 + factor * (1 + int(sizes[LEVEL_COUNT]) + rods)) + 2
         for row in range(0, height, self._rows):
             rows = min(self._rows, height - row)
             top, bottom = row * factor, (row + rows) * factor
             longest = int(bins.lengths[top // bins.size : (bottom - 1) // bins.size + 1].max())
-            for first in range(0, max(1, longest), most):
-                count = min(most, max(1, longest - first))
+            for listed, count in launches.parts(longest, rounds_of_cell):
                 launches.launch(
                     kernels.cover, rows * factor * across,
-                    top, first, count, *view, self._point, self._bounds,
+                    top, listed, count, *view, self._point, self._bounds,
                     bins.size, bins.across, bins.starts, bins.entries, self._samples,
                     rounds=count * rounds_of_cell,
                 )  # fmt: skip

@@ -7,7 +7,7 @@ kernel says which.
 
 # No `from __future__ import annotations` here: Taichi reads the annotations of a kernel.
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from typing import Any
 
 import numpy as np
@@ -22,6 +22,9 @@ THREADS = 1 << 17
 
 # The largest number of rounds of loops in a thread, which also bounds the time that a launch takes.
 MOST_ROUNDS = 1 << 15
+
+# Of these, so many are left to other loops than that through a list.
+SPARE = 1 << 8
 
 # The rounds of the loop that shows that a thread was not cut short.
 PROOF = 2
@@ -58,6 +61,22 @@ class Launches:
     def take(self, array: Any) -> NDArray[Any]:
         """Bring an array back from the device."""
         return array.to_numpy() if self.bounded else array
+
+    def parts(self, length: int, rounds: int) -> Iterator[tuple[int, int]]:
+        """Split a list that threads go through into parts for one launch each, at least one.
+
+        Args:
+            length: of the list.
+            rounds: most rounds that a thread takes for an entry.
+
+        Returns:
+            The first entry of each part, and its length.
+        """
+        most = max(1, length)
+        if self.bounded:
+            most = min(most, (MOST_ROUNDS - SPARE) // rounds)
+        for first in range(0, max(1, length), most):
+            yield first, most
 
     def launch(self, kernel: Callable[..., None], total: int, *arguments: Any, rounds: int) -> None:
         """Launch a kernel for the indices below `total`.
