@@ -138,12 +138,12 @@ def _fill(
 
 
 @ti.func
-def _cell_of(entry, cells, ends: ti.template()):
-    """Find the cell that an entry is of, where `ends` counts the entries of all cells up to each."""
-    low, high = 0, cells - 1
+def owner(item, count, ends: ti.template()):
+    """Find which of `count` owners an item is of, where `ends` counts the items of all owners up to each."""
+    low, high = 0, count - 1
     while low < high:
         middle = (low + high) // 2
-        if ends[middle] > entry:
+        if ends[middle] > item:
             high = middle
         else:
             low = middle + 1
@@ -166,7 +166,7 @@ def _enter(
 ):
     """Find the bin and the place in its list of every entry, and so the length of every list."""
     for entry in range(first, end):
-        cell = _cell_of(entry, cells, ends)
+        cell = owner(entry, cells, ends)
         left, right, top, bottom = _reached(cell, size, bounds)
         # The cell's last entry is that before its end.
         n = (right - left) * (bottom - top) + entry - ends[cell]
@@ -189,5 +189,5 @@ def _enlist(
 ):
     """Put every entry into its place."""
     for entry in range(first, end):
-        entries[starts[squares[entry]] + places[entry]] = _cell_of(entry, cells, ends)
+        entries[starts[squares[entry]] + places[entry]] = owner(entry, cells, ends)
         end_thread(ended)

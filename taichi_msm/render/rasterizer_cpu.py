@@ -145,7 +145,7 @@ def _kernel(code: Code) -> Callable[..., None]:
             high = ti.max(surface.point[row + 1], surface.point[row + 3])
             if low < band.bottom and high > band.top:
                 for j in range(surface.cols - 1):
-                    cover(i, j, surface, band)
+                    cover(i, j, (), surface, band)
 
     @ti.kernel
     def draw(

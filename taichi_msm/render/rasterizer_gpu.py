@@ -1,8 +1,9 @@
 """Kernel 2 on a GPU: every mass point, cell, sample and pixel is a thread.
 
-The cells are listed in bins (bins.py). A sample tries the cells of its bin's list, so many in a launch that no thread
-takes long, however long the list is; what is nearest is kept in between. Then a pixel covers its samples with the
-instruments and shades them. The picture is drawn in strips of rows, of which each has a sample a thread.
+Cells, or the triangles of those that are drawn triangle by triangle, are listed in bins (bins.py). A sample tries those
+of its bin's list, so many in a launch that no thread takes long, however long the list is; what is nearest is kept in
+between. Then a pixel covers its samples with the instruments and shades them. The picture is drawn in strips of rows, of
+which each has a sample a thread.
 """
 
 # No `from __future__ import annotations` here: Taichi reads the annotations of a kernel.
@@ -13,10 +14,11 @@ from collections.abc import Callable
 import numpy as np
 from numpy.typing import NDArray
 
-from taichi_msm.render.bins import BOUNDS, FIRST_X, FIRST_Y, LAST_X, LAST_Y, Bins, binned
-from taichi_msm.render.coverage import FARTHEST, POINT_NUMBERS, SEEN, Band, Surface, covering
+from taichi_msm.render.bins import BOUNDS, FIRST_X, FIRST_Y, LAST_X, LAST_Y, ROUNDS_OF_SEARCH, binned, owner
+from taichi_msm.render.coverage import FARTHEST, POINT_NUMBERS, SEEN, Band, Part, Surface, corners, covering, triangle_bounds
 from taichi_msm.render.instrument_coverage import instruments
 from taichi_msm.render.numbers import COLS, HEIGHT, LEVEL_COUNT, LEVELS, NEAR, PARTS, ROD_COUNT, ROWS, WIDTH
+from taichi_msm.render.patch import seen_side
 from taichi_msm.render.projection import projection
 from taichi_msm.render.samples import DEPTH, INFINITY, Code
 from taichi_msm.render.shading import Out, Texture, resolving
@@ -27,14 +29,18 @@ from taichi_msm.system.runtime import our_compilation, ti
 # The smallest width of a bin [samples].
 SMALLEST_BIN = 8
 
-# A cell reaches at most so much farther than its mass points, by rounding and to the centres of samples [samples].
+# A part reaches at most so much farther than its corners, by rounding and to the centres of samples [samples].
 MARGIN = 1.5
+
+# The largest number of parts. If cells would have more, several of their triangles make one.
+MOST_PARTS = 1 << 22
 
 
 class Kernels(NamedTuple):
     """The kernels of one code."""
 
     project: Callable[..., None]
+    bound: Callable[..., None]
     cover: Callable[..., None]
     resolve: Callable[..., None]
 
@@ -54,7 +60,7 @@ class Threads:
         self._rows = min(max(1, THREADS // (across * code.supersample)), height)
         self._texels = launches.give(texels)
         self._point = launches.array(np.float32, rows * cols * POINT_NUMBERS)
-        self._bounds = launches.array(np.int32, self._cells * BOUNDS)
+        self._pieces = launches.array(np.int32, self._cells)
         self._samples = ti.ndarray(code.floats, self._rows * code.supersample * across * code.planes)
         self._colours = launches.array(np.uint8, 3 * width * height if code.picture else 1)
         self._labels = launches.array(np.float32, 4 * width * height if code.labels else 1)
@@ -69,26 +75,36 @@ class Threads:
         """
         launches, kernels, factor = self._launches, self._kernels, self._code.supersample
         (width, height), rods = self._size, int(sizes[ROD_COUNT])
-        across, down, pieces = width * factor, height * factor, 2 * int(numbers[PARTS]) ** 2
+        across, down = width * factor, height * factor
         view = launches.give(numbers), launches.give(sizes)
         with our_compilation(optimised=False):
-            kernels.project(position, *view, self._point, self._bounds)
+            kernels.project(position, *view, self._point, self._pieces)
+        pieces = launches.take(self._pieces)
+        together = -(-int(pieces.sum(dtype=np.int64)) // MOST_PARTS) or 1
+        # What is behind the eye makes one empty part.
+        ends = np.cumsum(np.maximum(-(-pieces // together), 1), dtype=np.int32)
+        parts = int(ends[-1])
+        owners, bounds = launches.array(np.int32, 2 * parts), launches.array(np.int32, BOUNDS * parts)
+        launches.launch(
+            kernels.bound, parts, together, *view, launches.give(ends), self._point, self._pieces, owners, bounds,
+            rounds=ROUNDS_OF_SEARCH + together,
+        )  # fmt: skip
         bin_size = max(SMALLEST_BIN, round((across * down / self._cells) ** 0.5))
-        bins = binned(launches, self._bounds, self._cells, (across, down), bin_size)
-        # A sample takes one round for a cell, and for each of its pieces one and one or two for tiles.
-        rounds_of_cell = 1 + 3 * pieces
+        bins = binned(launches, bounds, parts, (across, down), bin_size)
+        # A sample takes one round for a part, and for each of its triangles one and one or two for tiles.
+        rounds_of_part = 1 + 3 * together
         rounds_of_rods = rods * (1 + factor * (1 + factor))
         rounds_of_shading = factor * (1 + factor * (1 + int(sizes[LEVEL_COUNT]) + rods)) + 2
         for row in range(0, height, self._rows):
             rows = min(self._rows, height - row)
             top, bottom = row * factor, (row + rows) * factor
             longest = int(bins.lengths[top // bins.size : (bottom - 1) // bins.size + 1].max())
-            for listed, count in launches.parts(longest, rounds_of_cell):
+            for listed, count in launches.parts(longest, rounds_of_part):
                 launches.launch(
                     kernels.cover, rows * factor * across,
-                    top, listed, count, *view, self._point, self._bounds,
+                    top, listed, count, together, *view, self._point, self._pieces, owners, bounds,
                     bins.size, bins.across, bins.starts, bins.entries, self._samples,
-                    rounds=count * rounds_of_cell,
+                    rounds=count * rounds_of_part,
                 )  # fmt: skip
             launches.launch(
                 kernels.resolve, rows * width,
@@ -108,29 +124,22 @@ def _kernels(code: Code) -> Kernels:
     cover_rods, resolve_samples = instruments(code), resolving(code)
 
     @ti.func
-    def bound(cell, near, cols, width, height, point: ti.template(), bounds: ti.template()):
-        """Find the samples that a cell may cover."""
-        corner = (cell // (cols - 1) * cols + cell % (cols - 1)) * POINT_NUMBERS
-        low_x, high_x, low_y, high_y = INFINITY, -INFINITY, INFINITY, -INFINITY
+    def count_pieces(cell, near, parts, cols, point: ti.template()):
+        """Give 1 for a cell that is drawn as a whole, else the number of its triangles; 0 if it is behind the eye."""
+        at = (cell // (cols - 1) * cols + cell % (cols - 1)) * POINT_NUMBERS
+        below = at + cols * POINT_NUMBERS
         before, behind, resolved = True, True, True
-        for n in ti.static(range(4)):
-            at = corner + (n % 2 + n // 2 * cols) * POINT_NUMBERS
-            x, y = point[at + SEEN], point[at + SEEN + 1]
-            low_x, high_x, low_y, high_y = ti.min(low_x, x), ti.max(high_x, x), ti.min(low_y, y), ti.max(high_y, y)
-            before = before and point[at + 2] > near
-            behind = behind and point[at + 2] <= near
-            # False for NaN.
-            resolved = resolved and abs(x) < FARTHEST and abs(y) < FARTHEST
-        here = cell * BOUNDS
-        bounds[here + FIRST_X], bounds[here + FIRST_Y] = 0, 0
-        bounds[here + LAST_X], bounds[here + LAST_Y] = width - 1, height - 1
-        if behind:
-            bounds[here + LAST_X], bounds[here + LAST_Y] = -1, -1
-        elif before and resolved:
-            bounds[here + FIRST_X] = ti.max(ti.cast(ti.floor(low_x - MARGIN), ti.i32), 0)
-            bounds[here + FIRST_Y] = ti.max(ti.cast(ti.floor(low_y - MARGIN), ti.i32), 0)
-            bounds[here + LAST_X] = ti.math.clamp(ti.cast(ti.floor(high_x + MARGIN), ti.i32), -1, width - 1)
-            bounds[here + LAST_Y] = ti.math.clamp(ti.cast(ti.floor(high_y + MARGIN), ti.i32), -1, height - 1)
+        for corner in ti.static((at, at + POINT_NUMBERS, below, below + POINT_NUMBERS)):
+            before = before and point[corner + 2] > near
+            behind = behind and point[corner + 2] <= near
+            resolved = resolved and abs(point[corner + SEEN]) < FARTHEST and abs(point[corner + SEEN + 1]) < FARTHEST
+        at, below = at + SEEN, below + SEEN
+        side = seen_side(
+            point[at], point[at + 1], point[at + POINT_NUMBERS], point[at + POINT_NUMBERS + 1],
+            point[below], point[below + 1], point[below + POINT_NUMBERS], point[below + POINT_NUMBERS + 1],
+        )  # fmt: skip
+        per_side = ti.cast(parts, ti.i32)
+        return ti.select(behind, 0, ti.select(before and resolved and side != 0, 1, 2 * per_side * per_side))
 
     @ti.kernel
     def project(
@@ -138,15 +147,65 @@ def _kernels(code: Code) -> Kernels:
         numbers: ti.types.ndarray(dtype=ti.f32, ndim=1),
         sizes: ti.types.ndarray(dtype=ti.i32, ndim=1),
         point: ti.types.ndarray(dtype=ti.f32, ndim=1),
-        bounds: ti.types.ndarray(dtype=ti.i32, ndim=1),
+        pieces: ti.types.ndarray(dtype=ti.i32, ndim=1),
     ):
-        """Project the mass points, and find the bounds of the cells [samples]."""
+        """Project the mass points, and tell in how many pieces each cell is drawn."""
         for index in range(sizes[ROWS] * sizes[COLS]):
             rows, cols = sizes[ROWS], sizes[COLS]
             project_point(position, numbers, point, index // cols, index % cols, rows, cols)
 
         for cell in range((sizes[ROWS] - 1) * (sizes[COLS] - 1)):
-            bound(cell, numbers[NEAR], sizes[COLS], sizes[WIDTH] * factor, sizes[HEIGHT] * factor, point, bounds)
+            pieces[cell] = count_pieces(cell, numbers[NEAR], numbers[PARTS], sizes[COLS], point)
+
+    @ti.kernel
+    def bound(
+        first: ti.i32,
+        end: ti.i32,
+        ended: ti.types.ndarray(dtype=ti.i32, ndim=1),
+        together: ti.i32,
+        numbers: ti.types.ndarray(dtype=ti.f32, ndim=1),
+        sizes: ti.types.ndarray(dtype=ti.i32, ndim=1),
+        ends: ti.types.ndarray(dtype=ti.i32, ndim=1),
+        point: ti.types.ndarray(dtype=ti.f32, ndim=1),
+        pieces: ti.types.ndarray(dtype=ti.i32, ndim=1),
+        owners: ti.types.ndarray(dtype=ti.i32, ndim=1),
+        bounds: ti.types.ndarray(dtype=ti.i32, ndim=1),
+    ):
+        """Find the cell and the first piece of every part, which has `together` pieces; and its bounds [samples]."""
+        for item in range(first, end):
+            cols, width, height = sizes[COLS], sizes[WIDTH] * factor, sizes[HEIGHT] * factor
+            cell = owner(item, (sizes[ROWS] - 1) * (cols - 1), ends)
+            parts_of_cell = ti.max((pieces[cell] + together - 1) // together, 1)
+            piece = (item - ends[cell] + parts_of_cell) * together
+            owners[2 * item], owners[2 * item + 1] = cell, piece
+            corner = (cell // (cols - 1) * cols + cell % (cols - 1)) * POINT_NUMBERS
+            a, right, down, far = corners(corner, cols, point)
+            left, right_end, top, bottom = INFINITY, -INFINITY, INFINITY, -INFINITY
+            if pieces[cell] == 1:
+                for n in ti.static(range(4)):
+                    at = corner + (n % 2 + n // 2 * cols) * POINT_NUMBERS + SEEN
+                    left, right_end = ti.min(left, point[at]), ti.max(right_end, point[at])
+                    top, bottom = ti.min(top, point[at + 1]), ti.max(bottom, point[at + 1])
+            else:
+                b, c, d = right - a, down - a, far - right - (down - a)
+                per_side = ti.cast(numbers[PARTS], ti.i32)
+                for n in range(piece, ti.min(piece + together, pieces[cell])):
+                    s, t = ti.cast(n // 2 % per_side, ti.f32), ti.cast(n // 2 // per_side, ti.f32)
+                    low_x, high_x, low_y, high_y, _ = triangle_bounds(
+                        s, t, n % 2 == 0, 1.0 / numbers[PARTS], numbers[NEAR], width, height, a, b, c, d
+                    )
+                    if not high_x < low_x:
+                        # Where it is NaN it may be anywhere.
+                        if not (low_x <= high_x and low_y <= high_y):
+                            low_x, high_x, low_y, high_y = -INFINITY, INFINITY, -INFINITY, INFINITY
+                        left, right_end = ti.min(left, low_x), ti.max(right_end, high_x)
+                        top, bottom = ti.min(top, low_y), ti.max(bottom, high_y)
+            at = item * BOUNDS
+            bounds[at + FIRST_X] = ti.cast(ti.floor(ti.math.clamp(left - MARGIN, 0.0, FARTHEST)), ti.i32)
+            bounds[at + FIRST_Y] = ti.cast(ti.floor(ti.math.clamp(top - MARGIN, 0.0, FARTHEST)), ti.i32)
+            bounds[at + LAST_X] = ti.cast(ti.floor(ti.math.clamp(right_end + MARGIN, -1.0, width - 1.0)), ti.i32)
+            bounds[at + LAST_Y] = ti.cast(ti.floor(ti.math.clamp(bottom + MARGIN, -1.0, height - 1.0)), ti.i32)
+            end_thread(ended)
 
     @ti.kernel
     def cover(
@@ -156,9 +215,12 @@ def _kernels(code: Code) -> Kernels:
         top: ti.i32,
         listed: ti.i32,
         count: ti.i32,
+        together: ti.i32,
         numbers: ti.types.ndarray(dtype=ti.f32, ndim=1),
         sizes: ti.types.ndarray(dtype=ti.i32, ndim=1),
         point: ti.types.ndarray(dtype=ti.f32, ndim=1),
+        pieces: ti.types.ndarray(dtype=ti.i32, ndim=1),
+        owners: ti.types.ndarray(dtype=ti.i32, ndim=1),
         bounds: ti.types.ndarray(dtype=ti.i32, ndim=1),
         bin_size: ti.i32,
         bins_across: ti.i32,
@@ -166,7 +228,7 @@ def _kernels(code: Code) -> Kernels:
         entries: ti.types.ndarray(dtype=ti.i32, ndim=1),
         samples: ti.types.ndarray(dtype=floats, ndim=1),
     ):
-        """Cover the samples of a strip that begins at row `top`, with `count` cells of their lists from `listed` on."""
+        """Cover the samples of a strip that begins at row `top`, with `count` parts of their lists from `listed` on."""
         for index in range(first, end):
             rows, cols, width, height = sizes[ROWS], sizes[COLS], sizes[WIDTH] * factor, sizes[HEIGHT] * factor
             x, y = index % width, top + index // width
@@ -182,15 +244,17 @@ def _kernels(code: Code) -> Kernels:
             square = y // bin_size * bins_across + x // bin_size
             begin = starts[square] + listed
             for n in range(begin, ti.min(begin + count, starts[square + 1])):
-                cell = entries[n]
-                here = cell * BOUNDS
+                here = entries[n] * BOUNDS
                 if (
                     bounds[here + FIRST_X] <= x
                     and x <= bounds[here + LAST_X]
                     and bounds[here + FIRST_Y] <= y
                     and y <= bounds[here + LAST_Y]
                 ):
-                    cover_with(cell // (cols - 1), cell % (cols - 1), surface, band)
+                    cell, piece = owners[2 * entries[n]], owners[2 * entries[n] + 1]
+                    whole, last = pieces[cell] == 1, ti.min(piece + together, pieces[cell])
+                    part = ti.static(Part(whole, piece, last))
+                    cover_with(cell // (cols - 1), cell % (cols - 1), part, surface, band)
             end_thread(ended)
 
     @ti.kernel
@@ -226,4 +290,4 @@ def _kernels(code: Code) -> Kernels:
             resolve_samples(samples, line, y, y + 1, x, x + 1, across, width, texture, out)
             end_thread(ended)
 
-    return Kernels(project, cover, resolve)
+    return Kernels(project, bound, cover, resolve)

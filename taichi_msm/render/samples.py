@@ -99,7 +99,7 @@ class Code:
             **dict.fromkeys(("across", "down"), self.labels),  # the material point, fractions of the sheet
             "instrument": self.instruments,  # 1 where an instrument is seen, else 0
             **dict.fromkeys(("normal_x", "normal_y", "normal_z"), self.tissue or self.metal),  # in the camera's frame
-            "cell": self.unordered,  # number of the cell that is seen
+            **dict.fromkeys(("cell", "triangle"), self.unordered),  # their numbers
             "footprint": self.tissue,  # square of the texels of a sample's longer side
             **dict.fromkeys(("red", "green", "blue"), self.picture and self.supersample > 1),  # to be averaged
         }
