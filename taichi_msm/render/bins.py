@@ -49,10 +49,12 @@ def binned(launches: Launches, bounds: Any, cells: int, extent: tuple[int, int],
         extent: width and height of the picture.
         size: width of a bin; wider ones are taken where the lists would be too long.
     """
-    return (_at_once if launches.bounded else _in_turn)(launches, bounds, cells, extent, size)
+    return (
+        _at_once(launches, bounds, cells, extent, size) if launches.bounded else _in_turn(bounds, cells, extent, size)
+    )
 
 
-def _in_turn(launches: Launches, bounds: Any, cells: int, extent: tuple[int, int], size: int) -> Bins:
+def _in_turn(bounds: Any, cells: int, extent: tuple[int, int], size: int) -> Bins:
     while True:
         across, down = (-(-side // size) for side in extent)
         ends = np.zeros(across * down + 1, np.int32)

@@ -1,9 +1,10 @@
 """Kernel 2: bilinear refinement, projection, rasterisation of textured triangles, shading.
 
-The picture is cut into bands of rows. A worker takes the next band and finds what each of its samples shows: the sheet
-(coverage.py) or an instrument in front of it (instrument_coverage.py). From that it writes the colours of pixels, their
-labels, or both (shading.py). As in kernel 1, vectors stay vectors down to the machine code (docs/decisions/0010), and
-casts, floor and abs of vectors are written to allow this.
+It finds what each sample of the picture shows: the sheet (coverage.py) or an instrument in front of it
+(instrument_coverage.py). From that it writes the colours of pixels, their labels, or both (shading.py). Samples are
+shared among the workers of a CPU in bands (rasterizer_cpu.py), and are threads of a GPU (rasterizer_gpu.py). As in
+kernel 1, vectors stay vectors down to the machine code (docs/decisions/0010), and casts, floor and abs of vectors are
+written to allow this.
 """
 
 from __future__ import annotations

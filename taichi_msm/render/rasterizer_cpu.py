@@ -43,9 +43,7 @@ class Bands:
         texels: as in a `Pyramid`.
     """
 
-    def __init__(
-        self, code: Code, points: tuple[int, int], size: tuple[int, int], texels: NDArray[np.float32]
-    ) -> None:
+    def __init__(self, code: Code, points: tuple[int, int], size: tuple[int, int], texels: NDArray[np.float32]) -> None:
         self._code, self._size, self._texels = code, size, texels
         self._draw = _kernel(code)
         (rows, cols), (width, height) = points, size
@@ -66,7 +64,7 @@ class Bands:
             sizes: of the sheet, the picture, the instruments and the texture (numbers.py).
 
         Returns:
-            Colours, shape (height, width, 3), and labels as in `shading.Out`; neither means anything unless it is drawn.
+            Colours, shape (height, width, 3), and labels as in `shading.Out`; each has meaning only if drawn.
         """
         code, (width, height) = self._code, self._size
         # Whole tiles are written, and the last of a row may reach beyond the picture.

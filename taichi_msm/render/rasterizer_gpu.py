@@ -1,21 +1,31 @@
 """Kernel 2 on a GPU: every mass point, cell, sample and pixel is a thread.
 
-Cells, or the triangles of those that are drawn triangle by triangle, are listed in bins (bins.py). A sample tries those
-of its bin's list, so many in a launch that no thread takes long, however long the list is; what is nearest is kept in
-between. Then a pixel covers its samples with the instruments and shades them. The picture is drawn in strips of rows, of
-which each has a sample a thread.
+Cells, or the triangles of those that are drawn triangle by triangle, are listed in bins (bins.py): the parts of the
+sheet. A sample tries the parts of its bin's list, in as many launches as it takes for no thread to take long; what is
+nearest is kept in between. Then a pixel covers its samples with the instruments and shades them. A strip of rows is
+drawn at a time, with a sample a thread.
 """
 
 # No `from __future__ import annotations` here: Taichi reads the annotations of a kernel.
 
-from typing import Any, NamedTuple
 from collections.abc import Callable
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from taichi_msm.render.bins import BOUNDS, FIRST_X, FIRST_Y, LAST_X, LAST_Y, ROUNDS_OF_SEARCH, binned, owner
-from taichi_msm.render.coverage import FARTHEST, POINT_NUMBERS, SEEN, Band, Part, Surface, corners, covering, triangle_bounds
+from taichi_msm.render.coverage import (
+    FARTHEST,
+    POINT_NUMBERS,
+    SEEN,
+    Band,
+    Part,
+    Surface,
+    corners,
+    covering,
+    triangle_bounds,
+)
 from taichi_msm.render.instrument_coverage import instruments
 from taichi_msm.render.numbers import COLS, HEIGHT, LEVEL_COUNT, LEVELS, NEAR, PARTS, ROD_COUNT, ROWS, WIDTH
 from taichi_msm.render.patch import seen_side
@@ -48,11 +58,9 @@ class Kernels(NamedTuple):
 class Threads:
     """The memory of one sheet's pictures on a GPU, and their kernels; arguments as for `rasterizer_cpu.Bands`."""
 
-    def __init__(
-        self, code: Code, points: tuple[int, int], size: tuple[int, int], texels: NDArray[np.float32]
-    ) -> None:
+    def __init__(self, code: Code, points: tuple[int, int], size: tuple[int, int], texels: NDArray[np.float32]) -> None:
         self._code, self._size, self._kernels = code, size, _kernels(code)
-        self._launches = launches = Launches(bounded=True)
+        launches = Launches(bounded=True)
         (rows, cols), (width, height) = points, size
         self._cells = (rows - 1) * (cols - 1)
         across = width * code.supersample
@@ -73,14 +81,14 @@ class Threads:
         Raises:
             DeviceError: when the device cut threads short.
         """
-        launches, kernels, factor = self._launches, self._kernels, self._code.supersample
+        launches, kernels, factor = Launches(bounded=True), self._kernels, self._code.supersample
         (width, height), rods = self._size, int(sizes[ROD_COUNT])
         across, down = width * factor, height * factor
         view = launches.give(numbers), launches.give(sizes)
         with our_compilation(optimised=False):
             kernels.project(position, *view, self._point, self._pieces)
         pieces = launches.take(self._pieces)
-        together = -(-int(pieces.sum(dtype=np.int64)) // MOST_PARTS) or 1
+        together = max(1, min(-(-int(pieces.sum(dtype=np.int64)) // MOST_PARTS), int(pieces.max())))
         # What is behind the eye makes one empty part.
         ends = np.cumsum(np.maximum(-(-pieces // together), 1), dtype=np.int32)
         parts = int(ends[-1])
@@ -238,9 +246,7 @@ def _kernels(code: Code) -> Kernels:
                     samples[index * planes + ti.static(code.layout["instrument"])] = floats(0)
             surface = ti.static(Surface(point, rows, cols, numbers[PARTS], sizes[LEVELS + 1], sizes[LEVELS + 2]))
             line = index // width * width * planes
-            band = ti.static(
-                Band(samples, line, width, x, x + 1, y, y + 1, width, height, numbers[NEAR], numbers)
-            )
+            band = ti.static(Band(samples, line, width, x, x + 1, y, y + 1, width, height, numbers[NEAR], numbers))
             square = y // bin_size * bins_across + x // bin_size
             begin = starts[square] + listed
             for n in range(begin, ti.min(begin + count, starts[square + 1])):

@@ -85,6 +85,9 @@ def _search(
     moved: bool,
 ) -> tuple[NDArray[np.float32], NDArray[np.uint8]]:
     """Find material points, or how far they are from the centres of all pixels, row by row; and which are hidden."""
+    total = len(coordinates)
+    if total == 0:
+        return np.empty((0, 2), np.float32), np.empty(0, np.uint8)
     (rows, cols), (width, height) = scene.sheet.points, scene.render.size
     cells = (rows - 1) * (cols - 1)
     # If a bin is half as wide as a cell, the cells of most bins are around one mass point only.
@@ -99,7 +102,6 @@ def _search(
     simple = launches.array(np.uint8, bins.lengths.size)
     launches.launch(judge, bins.lengths.size, cell, cols, bins.starts, bins.entries, simple, rounds=3 * AROUND)
     given = launches.give(np.ascontiguousarray(coordinates, np.float32).ravel())
-    total = len(coordinates)
     pixels, hidden = launches.array(np.float32, 2 * total), launches.array(np.uint8, total)
     # A point takes one round for a cell, and one for each of its triangles.
     rounds = 1 + 2 * (scene.render.refine + 1) ** 2

@@ -2,7 +2,8 @@
 
 llvmpipe ends all loops of a thread after 65,535 rounds in all and says nothing; other drivers have limits of their own.
 So the loops of a thread must have a bound that does not grow with the picture or the sheet, and whoever launches a
-kernel says which.
+kernel says which. An inner loop has no atomic operation: in Mesa 22.3, llvmpipe leaves such a loop after two rounds
+where a group of threads is not full.
 """
 
 # No `from __future__ import annotations` here: Taichi reads the annotations of a kernel.
@@ -31,7 +32,7 @@ PROOF = 2
 
 
 class Launches:
-    """Launches kernels of pictures and labels, and makes their arrays.
+    """Launches the kernels of one picture, or of one search, and makes their arrays.
 
     Attributes:
         bounded: whether threads are bounded and counted, as on a GPU; else every kernel is one launch.
@@ -74,6 +75,7 @@ class Launches:
         """
         most = max(1, length)
         if self.bounded:
+            assert rounds <= MOST_ROUNDS - SPARE, rounds
             most = min(most, (MOST_ROUNDS - SPARE) // rounds)
         for first in range(0, max(1, length), most):
             yield first, most
@@ -109,8 +111,8 @@ class Launches:
         missing = (self._begun - int(self.take(self._ended)[0])) % (1 << 32)
         if missing:
             raise DeviceError(
-                f"--arch {started().arch}: the device left out part of the work ({missing} of {self._begun} pieces), so "
-                "pictures and labels would be wrong; take --arch cpu"
+                f"--arch {started().arch}: the device left out part of the work ({missing} of {self._begun} pieces), "
+                "so pictures and labels would be wrong; take --arch cpu"
             )
 
 
