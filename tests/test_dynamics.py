@@ -22,8 +22,8 @@ from taichi_msm.physics.solver import POINTS_PER_WORKER
 from taichi_msm.physics.timestep import stable_step, time_grid
 from taichi_msm.scene import MAX_POINTS, Scene
 from taichi_msm.system import resources
-from taichi_msm.system.resources import available_threads
 from taichi_msm.system.launches import MOST_ROUNDS, THREADS
+from taichi_msm.system.resources import available_threads
 from taichi_msm.system.runtime import Device, lanes
 from tests.motion import dynamics_of, structure_of
 from tests.scenes import PRESS, SHEET, SPRINGS, random_scene, scene, with_steps
