@@ -108,6 +108,25 @@ runtime.start("vulkan")
 np.savez(sys.argv[1], **looks())
 """
 
+# Prints by how much the process grows while it draws and finds as often as before [bytes].
+AGAIN = """
+import os
+from pathlib import Path
+from tests.test_vulkan import Drawing, drawable, find, rest_positions, speckle, track_grid, view
+from taichi_msm.system import runtime
+
+def again():
+    for _ in range(6):
+        drawing.draw(position)
+        find(made, track_grid(2), position, view(made))
+    return int(Path("/proc/self/statm").read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE")
+
+runtime.start("vulkan")
+made = drawable((200, 200), size=[128, 96], refine=0)
+drawing, position = Drawing(made, speckle(8, 8)), rest_positions(made.sheet)
+print(-again() + again())
+"""
+
 # A run with threads that have no bound.
 CUT_SHORT = """
 import sys
@@ -175,6 +194,13 @@ def test_large_pictures_labels_and_tracks_are_those_of_the_cpu(tmp_path: Path, r
     for name in ("label_instrument", "occlusion", "hidden"):
         assert 0 < (here[name] > 0).mean() < 1, "some are, some are not"
         assert (there[name] != here[name]).mean() < 1e-4, name
+
+
+def test_what_a_picture_takes_is_given_back(root: Path) -> None:
+    done = vulkan(str(DRIVERS[0]), "-c", AGAIN, root=root)
+    assert done.returncode == 0, done.stderr
+    # Bounds and owners of 199 x 199 cells alone are 24 bytes each, and were kept 6 times.
+    assert int(done.stdout) < 6 * 24 * 199**2 / 2
 
 
 @pytest.mark.parametrize("output", ["png", "depth", "tracks"])

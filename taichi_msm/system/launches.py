@@ -41,6 +41,8 @@ class Launches:
     def __init__(self, *, bounded: bool) -> None:
         self.bounded = bounded
         self._begun = 0
+        # Taichi never frees an array that is dropped before the kernels that use it have ended.
+        self._held: list[Any] = []
         self._ended = self.give(np.array([0, PROOF if bounded else 0], np.int32))
 
     def array(self, dtype: DTypeLike, length: int) -> Any:
@@ -49,7 +51,8 @@ class Launches:
             return np.empty(length, dtype)
         kind = np.dtype(dtype)
         with replaced(ALLOCATING):
-            return ti.ndarray(getattr(ti, f"{kind.kind}{8 * kind.itemsize}"), length)
+            self._held.append(ti.ndarray(getattr(ti, f"{kind.kind}{8 * kind.itemsize}"), length))
+        return self._held[-1]
 
     def give(self, values: NDArray[Any]) -> Any:
         """Put a one-dimensional array onto the device, where it stays for any number of launches."""
