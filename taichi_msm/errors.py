@@ -48,7 +48,7 @@ class SceneError(MsmError):
 
 
 class DeviceError(MsmError):
-    """The requested arch or number of threads is not available."""
+    """The requested arch or number of threads is not available, or the device left out part of its work."""
 
 
 class NotInstalledError(MsmError):

@@ -300,6 +300,7 @@ class Simulation:
         Raises:
             ArgumentError: when the positions are of another shape.
             SceneError: when the scene's picture cannot be read, or the camera is not valid.
+            DeviceError: when the driver of a GPU ended part of the work early.
         """
         picture = self._look(camera, positions, time, picture=True, labels=False).picture
         assert picture is not None
@@ -316,7 +317,7 @@ class Simulation:
             time: as for `draw`.
 
         Raises:
-            ArgumentError: as for `draw`.
+            ArgumentError, DeviceError: as for `draw`.
             SceneError: when the camera is not valid.
         """
         labels = self._look(camera, positions, time, picture=False, labels=True).labels
@@ -341,6 +342,7 @@ class Simulation:
         Raises:
             ArgumentError: as for `draw`, and when `before` is of another size.
             SceneError: when the camera is not valid.
+            DeviceError: as for `draw`.
         """
         width, height = self.scene.render.size
         points = as_array(before.coordinates, "before") if isinstance(before, Labels) else np.empty(0)
@@ -371,6 +373,7 @@ class Simulation:
         Raises:
             ArgumentError: as for `draw`, and when the coordinates are not numbers of that shape from 0 to 1.
             SceneError: when the camera is not valid.
+            DeviceError: as for `draw`.
         """
         found = as_array(coordinates, "coordinates")
         numbers = found.dtype.kind in "fiu" and found.ndim == 2 and found.shape[1] == 2

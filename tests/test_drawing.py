@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
@@ -11,10 +12,13 @@ from numpy.typing import NDArray
 
 from taichi_msm import reference
 from taichi_msm.physics.lattice import rest_positions
+from taichi_msm.render import bins, rasterizer_gpu
 from taichi_msm.render.camera import view
 from taichi_msm.render.instrument import rods
 from taichi_msm.render.rasterizer import Drawing, structure
+from taichi_msm.render.rasterizer_cpu import Bands
 from taichi_msm.scene import Scene
+from taichi_msm.system import launches
 from taichi_msm.system.runtime import Device
 from tests.scenes import SHEET, scene, speckle
 
@@ -59,8 +63,10 @@ def test_nothing_is_drawn_before_every_mass_point_is_projected(device: Device) -
     made = scene(sheet={**SHEET, "points": [3, 4000]}, render={"size": [8, 32], "refine": 0})
     texture = speckle(16, 16)
     together, alone = Drawing(made, texture), Drawing(made, texture)
-    alone._workers = 1
-    assert together._workers == 2
+    assert isinstance(together._form, Bands)
+    assert isinstance(alone._form, Bands)
+    alone._form._workers = 1
+    assert together._form._workers == 2
     position = rest_positions(made.sheet) * [1, -1, 1]
     for _ in range(40):
         together.draw(position - 1)
@@ -119,6 +125,58 @@ def test_the_shape_of_a_tile_does_not_change_the_bits(lanes: int, device: Device
         np.testing.assert_array_equal(alone.picture, expected.picture)
         for label, other in zip(alone.labels or (), expected.labels or (), strict=True):
             np.testing.assert_array_equal(label, other)
+
+
+@pytest.mark.parametrize("parts", [rasterizer_gpu.MOST_PARTS, 100])
+def test_launches_do_not_change_the_bits(parts: int, device: Device, monkeypatch: pytest.MonkeyPatch) -> None:
+    """On a GPU, many strips, many launches for the lists of a strip, several triangles taken together, shuffled lists.
+
+    The sheet is crumpled in its plane, so that all of it is equally far.
+    """
+    made = with_instruments(drawable((9, 11), size=[60, 50], refine=2, camera="top", supersample=2))
+    rng = np.random.default_rng(6)
+    position = rest_positions(made.sheet) + rng.normal(0, 0.03, (9, 11, 3)) * [1, 1, 0]
+    placed, texture, code = rods(made, position, 0), speckle(30, 20), replace(structure(made), lanes=1)
+    begun: list[int] = []
+    launch = launches.Launches.launch
+
+    def counted(self: launches.Launches, kernel: Any, total: int, *arguments: Any, rounds: int) -> None:
+        begun.append(rounds)
+        launch(self, kernel, total, *arguments, rounds=rounds)
+
+    def shuffled(of: launches.Launches, *arguments: Any) -> bins.Bins:
+        found = bins.binned(of, *arguments)
+        entries, starts = of.take(found.entries), of.take(found.starts)
+        for first, end in pairwise(starts):
+            rng.shuffle(entries[first:end])
+        return found._replace(entries=of.give(entries))
+
+    monkeypatch.setattr(launches.Launches, "launch", counted)
+    monkeypatch.setattr(rasterizer_gpu, "binned", shuffled)
+    pictures = [Drawing(made, texture, code).draw(position, rods=placed)]
+    few = len(begun)
+    monkeypatch.setattr(launches, "MOST_ROUNDS", launches.SPARE + 250)
+    monkeypatch.setattr(launches, "THREADS", 700)
+    monkeypatch.setattr(rasterizer_gpu, "THREADS", 700)
+    monkeypatch.setattr(rasterizer_gpu, "MOST_PARTS", parts)
+    pictures += [Drawing(made, texture, code).draw(position, rods=placed) for _ in range(3)]
+    assert len(begun) > 30 * few
+    expected = Drawing(made, texture).draw(position, rods=placed)
+    for picture in pictures:
+        np.testing.assert_array_equal(picture, expected)
+
+
+def test_the_bound_of_a_thread_is_asserted(device: Device, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The finest cells, folded, with so many that all triangles of a cell are taken together, and all instruments."""
+    made = with_instruments(drawable((4, 4), size=[9, 7], refine=64, camera="oblique", supersample=4))
+    made = made.model_copy(update={"probes": made.probes * 8})
+    position = np.random.default_rng(4).normal(0, 0.2, (4, 4, 3))
+    drawing = Drawing(made, speckle(8, 8), replace(structure(made), lanes=1))
+    monkeypatch.setattr(rasterizer_gpu, "MOST_PARTS", 1)
+    drawing.draw(position, rods=rods(made, position, 0))
+    monkeypatch.setattr(launches, "MOST_ROUNDS", launches.SPARE + 3 * 2 * 65**2)
+    with pytest.raises(AssertionError):
+        drawing.draw(position, rods=rods(made, position, 0))
 
 
 @pytest.mark.parametrize("camera", ["top", "oblique", NEAR])

@@ -20,8 +20,9 @@ from taichi_msm.physics.lattice import rest_positions
 from taichi_msm.physics.material import material
 from taichi_msm.physics.solver import POINTS_PER_WORKER
 from taichi_msm.physics.timestep import stable_step, time_grid
-from taichi_msm.scene import Scene
+from taichi_msm.scene import MAX_POINTS, Scene
 from taichi_msm.system import resources
+from taichi_msm.system.launches import MOST_ROUNDS, THREADS
 from taichi_msm.system.resources import available_threads
 from taichi_msm.system.runtime import Device, lanes
 from tests.motion import dynamics_of, structure_of
@@ -156,6 +157,11 @@ def test_the_depth_of_a_pass_is_chosen_from_the_size(device: Device) -> None:
         for n in (61, 331, 4096)
     ]
     assert depths == [1, 8, 8]
+
+
+def test_no_thread_of_a_gpu_takes_long() -> None:
+    """It steps points without a loop, and reads a row; threads share what are more points than threads."""
+    assert MAX_POINTS + MAX_POINTS**2 // THREADS < MOST_ROUNDS
 
 
 @pytest.mark.parametrize("widths", [(16, 2), pytest.param((16, 8, 4, 2), marks=pytest.mark.fuzz)])

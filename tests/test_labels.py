@@ -10,12 +10,14 @@ from numpy.typing import NDArray
 
 from taichi_msm.physics.lattice import rest_positions
 from taichi_msm.reference import labels as twin
+from taichi_msm.render import tracking
 from taichi_msm.render.camera import view
 from taichi_msm.render.instrument import rods
 from taichi_msm.render.labels import Labels
 from taichi_msm.render.rasterizer import Drawing, structure
 from taichi_msm.render.tracking import find, find_flow
 from taichi_msm.scene import Scene
+from taichi_msm.system import launches
 from taichi_msm.system.runtime import Device
 from tests.test_drawing import NEAR, dented, drawable, with_instruments
 
@@ -81,6 +83,25 @@ def test_points_are_found_and_hidden_as_the_twin_says(shape: Any, refine: int, c
     # Beyond rounding: a point that is on an edge to 1e-9 of the sheet may be on either side.
     assert (found.hidden != hidden).sum() == 0
     assert 0 < hidden.mean() < 1 or shape is dented
+
+
+@pytest.mark.parametrize("shape", [dented, folded, crumpled])
+def test_on_a_gpu_the_same_points_are_found(shape: Any, device: Device, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The form for a GPU, on the CPU: with the lists in one launch, and in many."""
+    made = with_instruments(drawable(camera="oblique", refine=2))
+    position, coordinates = shape(made), np.random.default_rng(9).uniform(0, 1, (3000, 2)).astype(np.float32)
+    placed = rods(made, position, 0)
+    expected = find(made, coordinates, position, view(made), placed)
+    monkeypatch.setattr(tracking, "lanes", lambda precision: 1)
+    assert find(made, coordinates[:0], position, view(made), placed).pixels.shape == (0, 2)
+    found = [find(made, coordinates, position, view(made), placed)]
+    # Two cells in a launch.
+    monkeypatch.setattr(launches, "MOST_ROUNDS", launches.SPARE + 2 * (1 + 2 * 3**2))
+    monkeypatch.setattr(launches, "THREADS", 100)
+    found.append(find(made, coordinates, position, view(made), placed))
+    for sight in found:
+        np.testing.assert_array_equal(sight.pixels, expected.pixels)
+        np.testing.assert_array_equal(sight.hidden, expected.hidden)
 
 
 def test_what_is_seen_is_not_hidden_in_the_same_frame(device: Device) -> None:

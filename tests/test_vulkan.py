@@ -7,16 +7,27 @@ import os
 import subprocess
 import sys
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
+from numpy.typing import NDArray
 from PIL import Image
 
 from taichi_msm import run
+from taichi_msm.physics.lattice import rest_positions
+from taichi_msm.render.camera import view
+from taichi_msm.render.instrument import rods
+from taichi_msm.render.labels import track_grid
+from taichi_msm.render.rasterizer import Drawing, structure
+from taichi_msm.render.tracking import find, find_flow
 from taichi_msm.results.flo import read_flo
+from taichi_msm.scene import Scene
 from taichi_msm.scenefile.load import load_scene
 from taichi_msm.system.runtime import Device
 from tests.outputs import results
+from tests.scenes import speckle
+from tests.test_drawing import dented, drawable, with_instruments
 
 DRIVERS = sorted(Path("/usr/share/vulkan/icd.d").glob("lvp_icd*.json"))
 
@@ -85,6 +96,130 @@ def test_runs_on_a_gpu_are_those_on_the_cpu(small: Path, root: Path, device: Dev
         assert (np.abs(flows[0] - flows[1]).max(axis=-1) > 0.01).mean() < 0.002
         masks = [np.asarray(Image.open(f"{name}/occlusion/{frame:04}.png")) for name in ("whole", "cpu")]
         assert (masks[0] != masks[1]).mean() < 0.002
+
+
+# Prints what `looks` gives, by name, into a file.
+LOOKS = """
+import sys
+import numpy as np
+from taichi_msm.system import runtime
+from tests.test_vulkan import looks
+runtime.start("vulkan")
+np.savez(sys.argv[1], **looks())
+"""
+
+# Prints by how much the process grows while it draws and finds as often as before [bytes].
+AGAIN = """
+import os
+from pathlib import Path
+from tests.test_vulkan import Drawing, drawable, find, rest_positions, speckle, track_grid, view
+from taichi_msm.system import runtime
+
+def again():
+    for _ in range(6):
+        drawing.draw(position)
+        find(made, track_grid(2), position, view(made))
+    return int(Path("/proc/self/statm").read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE")
+
+runtime.start("vulkan")
+made = drawable((200, 200), size=[128, 96], refine=0)
+drawing, position = Drawing(made, speckle(8, 8)), rest_positions(made.sheet)
+print(-again() + again())
+"""
+
+# A run with threads that have no bound.
+CUT_SHORT = """
+import sys
+from taichi_msm.cli import main
+from taichi_msm.system import launches
+launches.MOST_ROUNDS = 1 << 30
+sys.exit(main(sys.argv[1:]))
+"""
+
+# All of the sheet is in the middle four of 4 x 4 pixels.
+TINY = {"eye": [0, 0, 4], "fov": 10}
+
+
+def looks() -> dict[str, NDArray[Any]]:
+    """Draw and find, on the device that was started, what one thread alone would take long for."""
+    seen: dict[str, NDArray[Any]] = {}
+    made = with_instruments(
+        drawable(
+            (121, 121), size=[512, 512], camera="oblique", supersample=2, wireframe=True, shading="tissue",
+            light={"relief": -0.2, "vignette": 0.3},
+        )
+    )  # fmt: skip
+    position, view_now = draped(made), view(made)
+    placed, texture = rods(made, position, 0), speckle(300, 400)
+    seen["picture"] = Drawing(made, texture).draw(position, rods=placed)
+    labels = Drawing(made, texture, structure(made, picture=False, labels=True)).look(position, rods=placed).labels
+    assert labels is not None
+    seen |= {f"label_{name}": value for name, value in labels._asdict().items()}
+    moved = position + np.array([0.002, 0.001, 0])
+    seen["flow"], seen["occlusion"] = find_flow(made, labels.coordinates, moved, view_now, rods(made, moved, 0))
+    rough = position + np.random.default_rng(5).normal(0, 0.004, position.shape)
+    seen["pixels"], seen["hidden"] = find(made, track_grid(60), rough, view_now, placed)
+    # One cell, larger than the picture, which is a single row.
+    made = drawable((2, 2), size=[1400, 1], refine=0, supersample=4, camera={"eye": [0, 0, 1e-4]})
+    seen["row"] = Drawing(made, texture).draw(rest_positions(made.sheet))
+    # More cells in a bin than a thread may try.
+    made = drawable((200, 200), size=[4, 4], refine=0, camera=TINY)
+    seen["dot"] = Drawing(made, texture).draw(dented(made))
+    return seen
+
+
+def draped(made: Scene) -> NDArray[np.float64]:
+    """A sheet with a dent, whose right third is folded over the middle."""
+    position = rest_positions(made.sheet)
+    x, y = position[..., 0], position[..., 1]
+    position[..., 2] = -0.05 * np.exp(-((x + 0.1) ** 2 + y**2) / 0.005) + 0.06 / (1 + np.exp((0.08 - x) / 0.005))
+    position[..., 0] = np.where(x > 0.08, 0.16 - x, x)
+    return position
+
+
+def test_large_pictures_labels_and_tracks_are_those_of_the_cpu(tmp_path: Path, root: Path, device: Device) -> None:
+    done = vulkan(str(DRIVERS[0]), "-c", LOOKS, str(tmp_path / "seen.npz"), root=root)
+    assert done.returncode == 0, done.stderr
+    there, here = np.load(tmp_path / "seen.npz"), looks()
+    # f32 has a place in 512 pixels to 2^-15 px. So of all outlines, some 5,000 px long, less than a pixel's centre lies
+    # where they may be drawn otherwise, and in the picture four samples; 26 pixels are allowed.
+    for name in ("picture", "row", "dot"):
+        assert here[name].std() > 20, "something is drawn"
+        apart = np.abs(there[name].astype(int) - here[name].astype(int)).max(axis=-1)
+        assert (apart > 1).mean() < 1e-4, name
+        assert (apart == 1).mean() < 1e-3, name
+    for name in ("label_coordinates", "label_depth", "flow", "pixels"):
+        # NaN where no sheet is seen.
+        assert (~np.isclose(there[name], here[name], rtol=1e-5, atol=1e-5, equal_nan=True)).mean() < 1e-4, name
+    for name in ("label_instrument", "occlusion", "hidden"):
+        assert 0 < (here[name] > 0).mean() < 1, "some are, some are not"
+        assert (there[name] != here[name]).mean() < 1e-4, name
+
+
+def test_what_a_picture_takes_is_given_back(root: Path) -> None:
+    done = vulkan(str(DRIVERS[0]), "-c", AGAIN, root=root)
+    assert done.returncode == 0, done.stderr
+    # Bounds and owners of 199 x 199 cells alone are 24 bytes each, and were kept 6 times.
+    assert int(done.stdout) < 6 * 24 * 199**2 / 2
+
+
+@pytest.mark.parametrize("output", ["png", "depth", "tracks"])
+def test_a_kernel_that_is_cut_short_is_an_error_of_one_line(output: str, small: Path, root: Path) -> None:
+    """And nothing of it is kept."""
+    settings = [
+        # More cells than llvmpipe's 65,535 rounds.
+        "sheet.points=[300, 300]",
+        "time.duration=0.1",
+        f"output=[{output}]",
+        f"render={{size: [4, 4], refine: 0, camera: {json.dumps(TINY)}}}",
+    ]
+    words = ["run", "small.yaml", "--arch", "vulkan", *(word for setting in settings for word in ("--set", setting))]
+    done = vulkan(str(DRIVERS[0]), "-c", CUT_SHORT, *words, root=root)
+    assert (done.returncode, done.stdout) == (2, ""), done.stderr
+    assert done.stderr.startswith("--arch vulkan: the device left out part of the work")
+    assert done.stderr.endswith("take --arch cpu\n")
+    assert done.stderr.count("\n") == 1
+    assert not [path for path in (small / "output").rglob("*") if path.is_file()]
 
 
 def test_without_a_gpu_it_is_one_line(small: Path, root: Path) -> None:

@@ -53,12 +53,13 @@ class Surface(NamedTuple):
 
 
 class Band(NamedTuple):
-    """A band of the picture, and the view.
+    """A band of the picture, or a part of one, and the view.
 
     Attributes:
-        samples: the planes of the tiles of all workers.
-        first: entry of `samples` where the band begins.
+        samples: the planes of all tiles that are kept.
+        first: entry of `samples` where the band begins, from the left edge of the picture.
         across: tiles in a row.
+        left, right: first column of samples, and the column after the last.
         top, bottom: first row of samples, and the row after the last.
         width, height: of the picture [samples].
         near: only what is farther than this is drawn.
@@ -68,12 +69,27 @@ class Band(NamedTuple):
     samples: Any
     first: Any
     across: Any
+    left: Any
+    right: Any
     top: Any
     bottom: Any
     width: Any
     height: Any
     near: Any
     numbers: Any
+
+
+class Part(NamedTuple):
+    """A part of a cell, for a thread of a GPU.
+
+    Attributes:
+        whole: whether the cell is drawn as a whole; then the part is all of it.
+        first, end: else, its first triangle, and that after its last.
+    """
+
+    whole: Any
+    first: Any
+    end: Any
 
 
 class Cell(NamedTuple):
@@ -108,6 +124,62 @@ class Cell(NamedTuple):
     j: Any
     cells_down: Any
     cells_across: Any
+
+
+@ti.func
+def corners(corner, cols, point: ti.template()):
+    """Give (X, Y, w, depth) of a cell's mass points: upper left and right, lower left and right."""
+    below = corner + cols * POINT_NUMBERS
+    return (
+        vec4([point[corner + n] for n in ti.static(range(4))]),
+        vec4([point[corner + POINT_NUMBERS + n] for n in ti.static(range(4))]),
+        vec4([point[below + n] for n in ti.static(range(4))]),
+        vec4([point[below + POINT_NUMBERS + n] for n in ti.static(range(4))]),
+    )
+
+
+@ti.func
+def triangle_bounds(
+    quad_s, quad_t, lower, part, near, width, height,
+    a: ti.template(), b: ti.template(), c: ti.template(), d: ti.template(),
+):  # fmt: skip
+    """Find the bounds of a small triangle in the picture.
+
+    Args:
+        quad_s: column of its small quad in the cell.
+        quad_t: its line.
+        lower: whether it is the one below the diagonal.
+        part: side of a small quad, as a fraction of the cell's.
+        near: only what is farther than this is drawn.
+        width: of the picture [samples].
+        height: likewise.
+        a: coefficient A of the cell.
+        b: likewise B.
+        c: likewise C.
+        d: likewise D.
+
+    Returns:
+        Least and largest x, least and largest y; and by what fraction of its side it is enlarged.
+    """
+    low_x, high_x, low_y, high_y = 0.0, ti.cast(width, ti.f32), -INFINITY, INFINITY
+    overstep = OVERSTEP
+    s0, t0 = quad_s * part, quad_t * part
+    s1, t1 = (quad_s + 1) * part, (quad_t + 1) * part
+    one = a + b * s0 + (c + d * s0) * t0
+    two = a + b * s1 + (c + d * s1) * t1
+    three = a + b * s0 + (c + d * s0) * t1
+    if not lower:
+        three = a + b * s1 + (c + d * s1) * t0
+    if one[2] > near and two[2] > near and three[2] > near:
+        low_x = ti.min(one[0] / one[2], two[0] / two[2], three[0] / three[2])
+        high_x = ti.max(one[0] / one[2], two[0] / two[2], three[0] / three[2])
+        low_y = ti.min(one[1] / one[2], two[1] / two[2], three[1] / three[2])
+        high_y = ti.max(one[1] / one[2], two[1] / two[2], three[1] / three[2])
+        extent = ti.max(high_x - low_x, high_y - low_y, 1e-3)
+        overstep += OVERSTEP_OF_PICTURE * (width + height) / extent
+    elif one[2] <= near and two[2] <= near and three[2] <= near:
+        high_x = -1.0
+    return low_x, high_x, low_y, high_y, overstep
 
 
 @cache
@@ -253,6 +325,16 @@ def covering(code: Code) -> Callable[..., Any]:
             )
         z = p_z + r_z * s + d_z * t
         visible = inside & (z < band.samples[at + DEPTH])
+        if ti.static(code.unordered):
+            # Of points that are equally far, that of the cell or triangle is seen which comes first.
+            number = cell.i * cell.cells_across + cell.j
+            triangle = (line * surface.parts + column) * 2.0 + ti.select(below, 0.0, 1.0)
+            at_cell, at_triangle = at + ti.static(code.layout["cell"]), at + ti.static(code.layout["triangle"])
+            kept, kept_triangle = band.samples[at_cell], band.samples[at_triangle]
+            before = (number < kept) | ((number == kept) & (triangle < kept_triangle))
+            visible = visible | (inside & (z == band.samples[at + DEPTH]) & before)
+            keep(at_cell, visible, number, band.samples)
+            keep(at_triangle, visible, triangle, band.samples)
         across = (column + s) * part
         along = (line + t) * part
         keep(at + DEPTH, visible, z, band.samples)
@@ -282,8 +364,16 @@ def covering(code: Code) -> Callable[..., Any]:
             keep(at + code.layout["wire"], visible, wire, band.samples)
 
     @ti.func
-    def cover(i, j, surface: ti.template(), band: ti.template()):
-        """Cover the samples of a band with the cell to the right and below of mass point (i, j)."""
+    def cover(i, j, drawn: ti.template(), surface: ti.template(), band: ti.template()):
+        """Cover the samples of a band with the cell to the right and below of mass point (i, j).
+
+        Args:
+            i: row of the mass point.
+            j: its column.
+            drawn: the part of the cell that is drawn, where cells are unordered.
+            surface: the surface.
+            band: the band.
+        """
         point, near = ti.static((surface.point, band.near))
         corner = (i * surface.cols + j) * POINT_NUMBERS
         corner_b, corner_c = corner + POINT_NUMBERS, corner + surface.cols * POINT_NUMBERS
@@ -292,10 +382,7 @@ def covering(code: Code) -> Callable[..., Any]:
         b_x, b_y = point[corner_b + SEEN], point[corner_b + SEEN + 1]
         c_x, c_y = point[corner_c + SEEN], point[corner_c + SEEN + 1]
         d_x, d_y = point[corner_d + SEEN], point[corner_d + SEEN + 1]
-        a = vec4([point[corner + n] for n in ti.static(range(4))])
-        right = vec4([point[corner_b + n] for n in ti.static(range(4))])
-        down = vec4([point[corner_c + n] for n in ti.static(range(4))])
-        far = vec4([point[corner_d + n] for n in ti.static(range(4))])
+        a, right, down, far = corners(corner, surface.cols, point)
         b = right - a
         c = down - a
         d = far - right - c
@@ -309,6 +396,8 @@ def covering(code: Code) -> Callable[..., Any]:
             and ti.max(-left_end, right_end) < FARTHEST
             and ti.max(-upper_end, lower_end) < FARTHEST
         )
+        if ti.static(code.unordered):
+            whole = drawn.whole
         # The cell's place on the texture in texels; in f64, so that it is exact to a fraction of one on any sheet.
         texel_x = ti.cast(j, ti.f64) * surface.texture_width / (surface.cols - 1) - 0.5
         texel_y = ti.cast(i, ti.f64) * surface.texture_height / (surface.rows - 1) - 0.5
@@ -328,38 +417,24 @@ def covering(code: Code) -> Callable[..., Any]:
         count = ti.cast(surface.parts, ti.i32)
         part = 1.0 / surface.parts
 
-        pieces = ti.select(whole, 1, 2 * count * count)
-        for piece in range(pieces):
+        first, end = 0, ti.select(whole, 1, 2 * count * count)
+        if ti.static(code.unordered):
+            first, end = drawn.first, drawn.end
+        for piece in range(first, end):
             # For a triangle that is drawn by itself: its quad, and whether it is below the diagonal.
             quad = piece // 2
             quad_s = ti.cast(quad % count, ti.f32)
             quad_t = ti.cast(quad // count, ti.f32)
             lower = piece % 2 == 0
-            low_x, high_x, low_y, high_y = 0.0, ti.cast(band.width, ti.f32), -INFINITY, INFINITY
-            overstep = OVERSTEP
-            if whole:
-                low_x, high_x, low_y, high_y = left_end, right_end, upper_end, lower_end
-            else:
-                s0, t0 = quad_s * part, quad_t * part
-                s1, t1 = (quad_s + 1) * part, (quad_t + 1) * part
-                one = a + b * s0 + (c + d * s0) * t0
-                two = a + b * s1 + (c + d * s1) * t1
-                three = a + b * s0 + (c + d * s0) * t1
-                if not lower:
-                    three = a + b * s1 + (c + d * s1) * t0
-                if one[2] > near and two[2] > near and three[2] > near:
-                    low_x = ti.min(one[0] / one[2], two[0] / two[2], three[0] / three[2])
-                    high_x = ti.max(one[0] / one[2], two[0] / two[2], three[0] / three[2])
-                    low_y = ti.min(one[1] / one[2], two[1] / two[2], three[1] / three[2])
-                    high_y = ti.max(one[1] / one[2], two[1] / two[2], three[1] / three[2])
-                    extent = ti.max(high_x - low_x, high_y - low_y, 1e-3)
-                    overstep += OVERSTEP_OF_PICTURE * (band.width + band.height) / extent
-                elif one[2] <= near and two[2] <= near and three[2] <= near:
-                    high_x = -1.0
+            low_x, high_x, low_y, high_y, overstep = left_end, right_end, upper_end, lower_end, OVERSTEP
+            if not whole:
+                low_x, high_x, low_y, high_y, overstep = triangle_bounds(
+                    quad_s, quad_t, lower, part, near, band.width, band.height, a, b, c, d
+                )
             first_row = ti.cast(ti.math.clamp(ti.floor(low_y - 0.5), band.top, band.bottom), ti.i32)
             end_row = ti.cast(ti.math.clamp(ti.ceil(high_y + 0.5), band.top, band.bottom), ti.i32)
-            first_column = ti.cast(ti.math.clamp(ti.floor(low_x - 0.5), 0.0, band.width), ti.i32)
-            end_column = ti.cast(ti.math.clamp(ti.ceil(high_x + 0.5), 0.0, band.width), ti.i32)
+            first_column = ti.cast(ti.math.clamp(ti.floor(low_x - 0.5), band.left, band.right), ti.i32)
+            end_column = ti.cast(ti.math.clamp(ti.ceil(high_x + 0.5), band.left, band.right), ti.i32)
             first_line = (first_row - band.top) // code.tile_height
             end_line = (end_row - band.top + (code.tile_height - 1)) // code.tile_height
             first_tile = first_column // code.tile_width

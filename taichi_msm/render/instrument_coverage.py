@@ -134,8 +134,10 @@ def instruments(code: Code) -> Callable[..., Any]:
                 end_row = ti.cast(ti.min(ti.ceil(numbers[rod + BOTTOM]), band.bottom), ti.i32)
                 first_line = (first_row - band.top) // code.tile_height
                 end_line = (end_row - band.top + (code.tile_height - 1)) // code.tile_height
-                first_tile = ti.cast(ti.floor(numbers[rod + LEFT]), ti.i32) // code.tile_width
-                end_tile = (ti.cast(ti.ceil(numbers[rod + RIGHT]), ti.i32) + (code.tile_width - 1)) // code.tile_width
+                first_column = ti.cast(ti.max(ti.floor(numbers[rod + LEFT]), band.left), ti.i32)
+                end_column = ti.cast(ti.min(ti.ceil(numbers[rod + RIGHT]), band.right), ti.i32)
+                first_tile = first_column // code.tile_width
+                end_tile = (end_column + (code.tile_width - 1)) // code.tile_width
                 for line in range(first_line, end_line):
                     for tile in range(first_tile, end_tile):
                         x = floats(columns) + ti.cast(tile * code.tile_width, ti.f32)

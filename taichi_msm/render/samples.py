@@ -1,8 +1,8 @@
 """What is stored of every sample of the picture between covering and shading, and its layout in memory.
 
 Samples are pixels, or parts of pixels where these are supersampled. A tile of samples is one vector: 4 x 4 samples for
-the 16 lanes of AVX-512, 4 x 2 for 8 lanes, 4 x 1 for 4, a single one on a GPU. Bands of rows of tiles are the unit of
-parallel work; a worker stores one band at a time, with `planes` vectors per tile.
+the 16 lanes of AVX-512, 4 x 2 for 8 lanes, 4 x 1 for 4, a single one on a GPU. A tile takes `planes` vectors. On a CPU
+bands of rows of tiles are the unit of parallel work; a worker stores one band at a time.
 """
 
 from __future__ import annotations
@@ -66,6 +66,11 @@ class Code:
         return self.lanes // self.tile_width
 
     @property
+    def unordered(self) -> bool:
+        """Whether cells come to a sample in any order, as on a GPU, and not row by row."""
+        return self.lanes == 1
+
+    @property
     def headlit(self) -> bool:
         """Whether the sheet is lit by the headlight."""
         return self.picture and self.shading == "headlight"
@@ -94,6 +99,7 @@ class Code:
             **dict.fromkeys(("across", "down"), self.labels),  # the material point, fractions of the sheet
             "instrument": self.instruments,  # 1 where an instrument is seen, else 0
             **dict.fromkeys(("normal_x", "normal_y", "normal_z"), self.tissue or self.metal),  # in the camera's frame
+            **dict.fromkeys(("cell", "triangle"), self.unordered),  # their numbers
             "footprint": self.tissue,  # square of the texels of a sample's longer side
             **dict.fromkeys(("red", "green", "blue"), self.picture and self.supersample > 1),  # to be averaged
         }
@@ -106,8 +112,8 @@ class Code:
 
     @property
     def band_rows(self) -> int:
-        """Rows of pixels in a band, a whole number of rows of tiles; one on a GPU."""
-        return 1 if self.lanes == 1 else max(1, BAND_ROWS // self.supersample)
+        """Rows of pixels in a band on a CPU, a whole number of rows of tiles."""
+        return max(1, BAND_ROWS // self.supersample)
 
     @property
     def band_lines(self) -> int:

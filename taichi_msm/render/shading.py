@@ -254,10 +254,10 @@ def resolving(code: Code) -> Callable[..., Any]:
                         colours[((row + line) * across + tile) * 3 + n] = ti.cast((pixels[0] >> (8 * n)) & 255, ti.u8)
 
     @ti.func
-    def give_means(samples: ti.template(), first, row, end_row, across, width, colours: ti.template()):
+    def give_means(samples: ti.template(), first, row, end_row, left, right, across, width, colours: ti.template()):
         """Write the colours of pixels, each the mean of its samples."""
         for y in range(row, end_row):
-            for x in range(width):
+            for x in range(left, right):
                 for n in ti.static(range(3)):
                     total = 0.0
                     for v, u in ti.static(ti.ndrange(factor, factor)):
@@ -292,15 +292,18 @@ def resolving(code: Code) -> Callable[..., Any]:
 
     @ti.func
     def resolve(
-        samples: ti.template(), first, row, end_row, across, width, texture: ti.template(), out: ti.template()
+        samples: ti.template(), first, row, end_row, left, right, across, width,
+        texture: ti.template(), out: ti.template(),
     ):  # fmt: skip
-        """Shade the samples of a band and write its pixels.
+        """Shade the samples of a band, or of a part of one, and write its pixels.
 
         Args:
             samples: the planes of the tiles.
-            first: entry where the band begins.
+            first: entry where the band begins, from the left edge of the picture.
             row: first row of pixels of the band.
             end_row: the row after its last.
+            left: first column of pixels.
+            right: the column after its last.
             across: tiles in a row.
             width: of the picture [px].
             texture: the texture and the light.
@@ -308,13 +311,13 @@ def resolving(code: Code) -> Callable[..., Any]:
         """
         lines = ((end_row - row) * factor + tile_height - 1) // tile_height
         for line in range(lines):
-            for tile in range(across):
+            for tile in range(left * factor // tile_width, (right * factor + tile_width - 1) // tile_width):
                 at = first + (line * across + tile) * planes
-                left, top = tile * tile_width, line * tile_height
+                column, top = tile * tile_width, line * tile_height
                 if ti.static(code.labels):
-                    give_labels(samples, at, left, row + top, end_row, width, out)
+                    give_labels(samples, at, column, row + top, end_row, width, out)
                 if ti.static(code.picture):
-                    red, green, blue = shade(samples, at, left, row * factor + top, texture)
+                    red, green, blue = shade(samples, at, column, row * factor + top, texture)
                     if ti.static(factor == 1):
                         give_tile(red, green, blue, row + top, end_row, tile, across, out.colours)
                     else:
@@ -322,6 +325,6 @@ def resolving(code: Code) -> Callable[..., Any]:
                         samples[at + ti.static(code.layout["green"])] = green
                         samples[at + ti.static(code.layout["blue"])] = blue
         if ti.static(code.picture and factor > 1):
-            give_means(samples, first, row, end_row, across, width, out.colours)
+            give_means(samples, first, row, end_row, left, right, across, width, out.colours)
 
     return resolve

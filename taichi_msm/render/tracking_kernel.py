@@ -1,14 +1,16 @@
-"""The kernels of tracking.py, in f64: cells and their bins, and the search for what hides a point."""
+"""The kernels of tracking.py, in f64: cells and their bounds, and the search for what hides a point."""
 
 # No `from __future__ import annotations` here: Taichi reads the annotations of a kernel.
 
 import math
 
+from taichi_msm.render.bins import BOUNDS, FIRST_X, FIRST_Y, LAST_X, LAST_Y
 from taichi_msm.render.instrument_coverage import meet
 from taichi_msm.render.labels import NO_FLOW
 from taichi_msm.render.numbers import BOTTOM, LEFT, MATRIX, NEAR, PARTS, PINHOLE, RIGHT, ROD_NUMBERS, RODS, TOP
 from taichi_msm.render.patch import Plane, edge, on_triangle, seen_side, small_quad
 from taichi_msm.render.samples import INFINITY
+from taichi_msm.system.launches import end_thread
 from taichi_msm.system.runtime import ti
 
 # The numbers of a mass point: (X, Y, w, depth), its place in the picture. The numbers of a cell: its bounds in the
@@ -16,6 +18,12 @@ from taichi_msm.system.runtime import ti
 # is seen.
 SEEN, POINT_NUMBERS = 4, 6
 MIN_X, MIN_Y, MAX_X, MAX_Y, NEAREST, SIDE, CELL_NUMBERS = range(7)
+
+# Farther from the picture than any cell is followed [px].
+FARTHEST = 1e6
+
+# The cells around a mass point.
+AROUND = 4
 
 # The pixel of a point that is seen nowhere.
 NOWHERE = math.nan
@@ -29,10 +37,13 @@ def project(
     numbers: ti.types.ndarray(dtype=ti.f64, ndim=1),
     rows: ti.i32,
     cols: ti.i32,
+    width: ti.i32,
+    height: ti.i32,
     point: ti.types.ndarray(dtype=ti.f64, ndim=1),
     cell: ti.types.ndarray(dtype=ti.f64, ndim=1),
+    bounds: ti.types.ndarray(dtype=ti.i32, ndim=1),
 ):
-    """Project the mass points, and find the outlines of the cells."""
+    """Project the mass points, and find the outlines of the cells, and their bounds in whole pixels."""
     for index in range(rows * cols):
         i, j, here = index // cols, index % cols, index * POINT_NUMBERS
         for n in ti.static(range(4)):
@@ -64,62 +75,20 @@ def project(
             cell[here + SIDE] = 0.0
             cell[here + MIN_X], cell[here + MAX_X] = -1e9, 1e9
             cell[here + MIN_Y], cell[here + MAX_Y] = -1e9, 1e9
-
-
-@ti.func
-def _bins(here, bin_size, across, down, cell: ti.template()):
-    """Give the bins that a cell reaches: their first and end column, their first and end row."""
-    size = ti.cast(bin_size, ti.f64)
-    left = ti.cast(ti.floor(ti.math.clamp(cell[here + MIN_X] / size, 0.0, 1e6)), ti.i32)
-    right = ti.cast(ti.floor(ti.math.clamp(cell[here + MAX_X] / size, -1.0, 1e6)), ti.i32) + 1
-    top = ti.cast(ti.floor(ti.math.clamp(cell[here + MIN_Y] / size, 0.0, 1e6)), ti.i32)
-    bottom = ti.cast(ti.floor(ti.math.clamp(cell[here + MAX_Y] / size, -1.0, 1e6)), ti.i32) + 1
-    return left, ti.min(right, across), top, ti.min(bottom, down)
-
-
-@ti.kernel
-def count(
-    cell: ti.types.ndarray(dtype=ti.f64, ndim=1),
-    cells: ti.i32,
-    bin_size: ti.i32,
-    across: ti.i32,
-    down: ti.i32,
-    ends: ti.types.ndarray(dtype=ti.i32, ndim=1),
-):
-    """Count the cells of every bin; the count of bin n is in entry n + 1."""
-    ti.loop_config(serialize=True)
-    for index in range(cells):
-        left, right, top, bottom = _bins(index * CELL_NUMBERS, bin_size, across, down, cell)
-        for row in range(top, bottom):
-            for column in range(left, right):
-                ends[row * across + column + 1] += 1
-
-
-@ti.kernel
-def fill(
-    cell: ti.types.ndarray(dtype=ti.f64, ndim=1),
-    cells: ti.i32,
-    bin_size: ti.i32,
-    across: ti.i32,
-    down: ti.i32,
-    ends: ti.types.ndarray(dtype=ti.i32, ndim=1),
-    entries: ti.types.ndarray(dtype=ti.i32, ndim=1),
-):
-    """List the cells of every bin; `ends` holds where each list begins, and afterwards where it ends."""
-    ti.loop_config(serialize=True)
-    for index in range(cells):
-        left, right, top, bottom = _bins(index * CELL_NUMBERS, bin_size, across, down, cell)
-        for row in range(top, bottom):
-            for column in range(left, right):
-                entries[ends[row * across + column]] = index
-                ends[row * across + column] += 1
+        at = index * BOUNDS
+        bounds[at + FIRST_X] = ti.cast(ti.floor(ti.math.clamp(cell[here + MIN_X], 0.0, FARTHEST)), ti.i32)
+        bounds[at + FIRST_Y] = ti.cast(ti.floor(ti.math.clamp(cell[here + MIN_Y], 0.0, FARTHEST)), ti.i32)
+        bounds[at + LAST_X] = ti.cast(ti.floor(ti.math.clamp(cell[here + MAX_X], -1.0, width - 1.0)), ti.i32)
+        bounds[at + LAST_Y] = ti.cast(ti.floor(ti.math.clamp(cell[here + MAX_Y], -1.0, height - 1.0)), ti.i32)
 
 
 @ti.kernel
 def judge(
+    first: ti.i32,
+    end: ti.i32,
+    ended: ti.types.ndarray(dtype=ti.i32, ndim=1),
     cell: ti.types.ndarray(dtype=ti.f64, ndim=1),
     cols: ti.i32,
-    bins: ti.i32,
     starts: ti.types.ndarray(dtype=ti.i32, ndim=1),
     entries: ti.types.ndarray(dtype=ti.i32, ndim=1),
     simple: ti.types.ndarray(dtype=ti.u8, ndim=1),
@@ -130,13 +99,14 @@ def judge(
     and seen from the same side: each is convex, so it lies within the angle between its two edges at the point, and
     the four angles add up to 360 degrees without overlapping.
     """
-    for square in range(bins):
+    for square in range(first, end):
         first_i, last_i, first_j, last_j = 1 << 30, -1, 1 << 30, -1
-        for n in range(starts[square], starts[square + 1]):
+        length = starts[square + 1] - starts[square]
+        for n in range(starts[square], starts[square] + ti.min(length, AROUND)):
             i, j = entries[n] // (cols - 1), entries[n] % (cols - 1)
             first_i, last_i = ti.min(first_i, i), ti.max(last_i, i)
             first_j, last_j = ti.min(first_j, j), ti.max(last_j, j)
-        around_a_point = last_i - first_i <= 1 and last_j - first_j <= 1
+        around_a_point = length <= AROUND and last_i - first_i <= 1 and last_j - first_j <= 1
         if around_a_point:
             sides, around = 0.0, 0.0
             # All four matter, even those that do not reach the bin.
@@ -146,6 +116,7 @@ def judge(
                     around += 1.0
             around_a_point = abs(sides) == around
         simple[square] = ti.cast(around_a_point, ti.u8)
+        end_thread(ended)
 
 
 @ti.func
@@ -258,8 +229,12 @@ def _hides(x, y, depth, index, own, own_triangle, cols, parts, near, point: ti.t
 
 @ti.kernel
 def search(
-    coordinates: ti.types.ndarray(dtype=ti.f32, ndim=1),
+    first: ti.i32,
+    end: ti.i32,
+    ended: ti.types.ndarray(dtype=ti.i32, ndim=1),
+    listed: ti.i32,
     count: ti.i32,
+    coordinates: ti.types.ndarray(dtype=ti.f32, ndim=1),
     row: ti.i32,
     point: ti.types.ndarray(dtype=ti.f64, ndim=1),
     cell: ti.types.ndarray(dtype=ti.f64, ndim=1),
@@ -278,12 +253,12 @@ def search(
     pixels: ti.types.ndarray(dtype=ti.f32, ndim=1),
     hidden: ti.types.ndarray(dtype=ti.u8, ndim=1),
 ):
-    """Find where `count` material points are seen, and which are hidden.
+    """Find where material points are seen, and which are hidden by `count` cells of their lists from `listed` on.
 
     If `row` is 0, `pixels` gets their places [px]. Otherwise they are what the pixels of another frame showed, `row` of
     them in a row of the picture, and `pixels` gets how far each has moved from its pixel's centre [px].
     """
-    for k in range(count):
+    for k in range(first, end):
         near, parts = numbers[NEAR], numbers[PARTS]
         u, v = coordinates[2 * k], coordinates[2 * k + 1]
         x, y, out_of_sight = ti.cast(NOWHERE, ti.f64), ti.cast(NOWHERE, ti.f64), False
@@ -308,7 +283,8 @@ def search(
                     depth = p[3] - touching
                     square = ti.cast(y, ti.i32) // bin_size * across + ti.cast(x, ti.i32) // bin_size
                     if simple[square] == 0:
-                        for n in range(starts[square], starts[square + 1]):
+                        begin = starts[square] + listed
+                        for n in range(begin, ti.min(begin + count, starts[square + 1])):
                             if not out_of_sight:
                                 out_of_sight = _hides(
                                     x, y, depth, entries[n], own, own_triangle, cols, parts, near, point, cell
@@ -326,4 +302,7 @@ def search(
             y = ti.select(seen, y - ti.cast(k // row, ti.f64) - 0.5, NO_FLOW)
         pixels[2 * k] = ti.cast(x, ti.f32)
         pixels[2 * k + 1] = ti.cast(y, ti.f32)
+        if listed > 0:
+            out_of_sight = out_of_sight or hidden[k] > 0
         hidden[k] = ti.cast(out_of_sight, ti.u8)
+        end_thread(ended)

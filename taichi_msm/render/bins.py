@@ -1,0 +1,195 @@
+"""Bins: squares of the picture, each with a list of the cells whose bounds reach it."""
+
+# No `from __future__ import annotations` here: Taichi reads the annotations of a kernel.
+
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from taichi_msm.system.launches import Launches, end_thread
+from taichi_msm.system.runtime import our_compilation, ti
+
+# The bounds of a cell: its first and last column and row, within the picture; the last is before the first for a cell
+# that is not seen.
+FIRST_X, FIRST_Y, LAST_X, LAST_Y, BOUNDS = range(5)
+
+# The largest number of entries in all lists, per cell and bin.
+MOST_ENTRIES = 64
+
+# Rounds of a search among as many cells as a sheet may have.
+ROUNDS_OF_SEARCH = 32
+
+
+class Bins(NamedTuple):
+    """Lists of cells.
+
+    Attributes:
+        size: width and height of a bin.
+        across: bins in a row.
+        lengths: of the lists, shape (rows of bins, bins in a row).
+        starts: where each list begins, and the end of the last; on the device.
+        entries: the cells of all lists, on the device. On a GPU, the order within a list is arbitrary.
+    """
+
+    size: int
+    across: int
+    lengths: NDArray[np.int32]
+    starts: Any
+    entries: Any
+
+
+def binned(launches: Launches, bounds: Any, cells: int, extent: tuple[int, int], size: int) -> Bins:
+    """List the cells of every bin: on a CPU one after the other, on a GPU all at once.
+
+    Args:
+        launches: of the device.
+        bounds: of all cells, on the device.
+        cells: how many there are.
+        extent: width and height of the picture.
+        size: width of a bin; wider ones are taken where the lists would be too long.
+    """
+    return (
+        _at_once(launches, bounds, cells, extent, size) if launches.bounded else _in_turn(bounds, cells, extent, size)
+    )
+
+
+def _in_turn(bounds: Any, cells: int, extent: tuple[int, int], size: int) -> Bins:
+    while True:
+        across, down = (-(-side // size) for side in extent)
+        ends = np.zeros(across * down + 1, np.int32)
+        with our_compilation(optimised=False):
+            _count(cells, size, across, bounds, ends)
+        starts = np.cumsum(ends, dtype=np.int64)
+        if starts[-1] <= MOST_ENTRIES * (cells + across * down):
+            break
+        size *= 2
+    entries = np.empty(max(1, starts[-1]), np.int32)
+    with our_compilation(optimised=False):
+        _fill(cells, size, across, bounds, starts[:-1].astype(np.int32), entries)
+    return Bins(size, across, ends[1:].reshape(down, across), starts.astype(np.int32), entries)
+
+
+def _at_once(launches: Launches, bounds: Any, cells: int, extent: tuple[int, int], size: int) -> Bins:
+    found = launches.take(bounds).reshape(cells, 2, 2)
+    while True:
+        across, down = (-(-side // size) for side in extent)
+        reached = np.maximum(found[:, 1] // size - found[:, 0] // size + 1, 0).prod(axis=1, dtype=np.int64)
+        ends = np.cumsum(reached)
+        if ends[-1] <= MOST_ENTRIES * (cells + across * down):
+            break
+        size *= 2
+    total = int(ends[-1])
+    counts, of_cells = launches.give(np.zeros(across * down, np.int32)), launches.give(ends.astype(np.int32))
+    squares, places, entries = (launches.array(np.int32, max(1, total)) for _ in range(3))
+    launches.launch(
+        _enter, total, cells, size, across, bounds, of_cells, counts, squares, places, rounds=ROUNDS_OF_SEARCH
+    )
+    lengths = launches.take(counts)
+    starts = launches.give(np.concatenate([[0], np.cumsum(lengths)]).astype(np.int32))
+    launches.launch(_enlist, total, cells, of_cells, squares, places, starts, entries, rounds=ROUNDS_OF_SEARCH)
+    return Bins(size, across, lengths.reshape(down, across), starts, entries)
+
+
+@ti.func
+def _reached(cell, size, bounds: ti.template()):
+    """Give the bins that a cell reaches: their first and end column, their first and end row."""
+    here = cell * BOUNDS
+    return (
+        bounds[here + FIRST_X] // size,
+        bounds[here + LAST_X] // size + 1,
+        bounds[here + FIRST_Y] // size,
+        bounds[here + LAST_Y] // size + 1,
+    )
+
+
+@ti.kernel
+def _count(
+    cells: ti.i32,
+    size: ti.i32,
+    across: ti.i32,
+    bounds: ti.types.ndarray(dtype=ti.i32, ndim=1),
+    ends: ti.types.ndarray(dtype=ti.i32, ndim=1),
+):
+    """Count the cells of every bin; the count of bin n is in entry n + 1."""
+    ti.loop_config(serialize=True)
+    for cell in range(cells):
+        left, right, top, bottom = _reached(cell, size, bounds)
+        for row in range(top, bottom):
+            for column in range(left, right):
+                ends[row * across + column + 1] += 1
+
+
+@ti.kernel
+def _fill(
+    cells: ti.i32,
+    size: ti.i32,
+    across: ti.i32,
+    bounds: ti.types.ndarray(dtype=ti.i32, ndim=1),
+    ends: ti.types.ndarray(dtype=ti.i32, ndim=1),
+    entries: ti.types.ndarray(dtype=ti.i32, ndim=1),
+):
+    """List the cells of every bin; `ends` holds where each list begins, and afterwards where it ends."""
+    ti.loop_config(serialize=True)
+    for cell in range(cells):
+        left, right, top, bottom = _reached(cell, size, bounds)
+        for row in range(top, bottom):
+            for column in range(left, right):
+                entries[ends[row * across + column]] = cell
+                ends[row * across + column] += 1
+
+
+@ti.func
+def owner(item, count, ends: ti.template()):
+    """Find which of `count` owners an item is of, where `ends` counts the items of all owners up to each."""
+    low, high = 0, count - 1
+    while low < high:
+        middle = (low + high) // 2
+        if ends[middle] > item:
+            high = middle
+        else:
+            low = middle + 1
+    return low
+
+
+@ti.kernel
+def _enter(
+    first: ti.i32,
+    end: ti.i32,
+    ended: ti.types.ndarray(dtype=ti.i32, ndim=1),
+    cells: ti.i32,
+    size: ti.i32,
+    across: ti.i32,
+    bounds: ti.types.ndarray(dtype=ti.i32, ndim=1),
+    ends: ti.types.ndarray(dtype=ti.i32, ndim=1),
+    counts: ti.types.ndarray(dtype=ti.i32, ndim=1),
+    squares: ti.types.ndarray(dtype=ti.i32, ndim=1),
+    places: ti.types.ndarray(dtype=ti.i32, ndim=1),
+):
+    """Find the bin and the place in its list of every entry, and so the length of every list."""
+    for entry in range(first, end):
+        cell = owner(entry, cells, ends)
+        left, right, top, bottom = _reached(cell, size, bounds)
+        # The cell's last entry is that before its end.
+        n = (right - left) * (bottom - top) + entry - ends[cell]
+        squares[entry] = (top + n // (right - left)) * across + left + n % (right - left)
+        places[entry] = ti.atomic_add(counts[squares[entry]], 1)
+        end_thread(ended)
+
+
+@ti.kernel
+def _enlist(
+    first: ti.i32,
+    end: ti.i32,
+    ended: ti.types.ndarray(dtype=ti.i32, ndim=1),
+    cells: ti.i32,
+    ends: ti.types.ndarray(dtype=ti.i32, ndim=1),
+    squares: ti.types.ndarray(dtype=ti.i32, ndim=1),
+    places: ti.types.ndarray(dtype=ti.i32, ndim=1),
+    starts: ti.types.ndarray(dtype=ti.i32, ndim=1),
+    entries: ti.types.ndarray(dtype=ti.i32, ndim=1),
+):
+    """Put every entry into its place."""
+    for entry in range(first, end):
+        entries[starts[squares[entry]] + places[entry]] = owner(entry, cells, ends)
+        end_thread(ended)
