@@ -183,9 +183,10 @@ class Pilot:
             ratio = self._steps / self._own_steps
             exact = other + (other - same) / (ratio**self._order - 1) if self._parted else other
             self._error = max(self._error, longest(displacement - exact))
-            self._in_f64 = max(self._in_f64, longest(same - exact))
-            self._rounding = max(self._rounding, longest(displacement - same))
             self._largest = max(self._largest, longest(exact))
+            if self._same:
+                self._in_f64 = max(self._in_f64, longest(same - exact))
+                self._rounding = max(self._rounding, longest(displacement - same))
 
     @property
     def estimate(self) -> Estimate:
@@ -200,8 +201,8 @@ class Pilot:
             return relative if relative < math.inf and self._largest <= farthest else math.inf
 
         error, rounding, in_f64 = (share(part) for part in (self._error, self._rounding, self._in_f64))
-        if not self._parted:
-            rounding = in_f64 = error
+        if not self._same:
+            rounding, in_f64 = 0.0 if self._parted else error, error
         return Estimate(self._own_steps, error, rounding, in_f64, self._order, self._parted)
 
     def close(self) -> None:

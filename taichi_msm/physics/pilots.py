@@ -24,8 +24,9 @@ COARSEST = 0.6
 # The largest refinement of a fine pilot; if it would have to be finer, the error is not known.
 FINEST = 64
 
-# Steps of the pilots for the points, with half and a quarter of the cells a side, in steps of the whole sheet.
-POINTS = 1 / 4 + 1 / 16
+# Steps of the pilots for the points, for each step of what they are compared with, in steps of the whole sheet: half
+# and a quarter of the cells a side, and of the steps.
+POINTS = 1 / 4 / 2 + 1 / 16 / 4
 
 
 class Pilots(NamedTuple):
