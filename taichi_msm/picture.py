@@ -45,7 +45,7 @@ def read_rgb(path: str, background: tuple[int, int, int], sha256: str | None = N
 
     Args:
         path: of the file.
-        background: colour.
+        background: red, green and blue under a transparent picture.
         sha256: the SHA-256 that the file must have, in hexadecimal; None: any.
 
     Raises:
