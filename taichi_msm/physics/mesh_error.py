@@ -245,8 +245,8 @@ def choose_points(
         [
             f"sheet.tolerance: {tolerance:g} is out of reach: with {rows} x {cols} points the error is "
             f"{found.error:.2g}, and no sheet has more than {MAX_POINTS} points a side; take a wider tool "
-            "(probes.N.radius, a smaller falloff), more tissue.pretension or bending where it wrinkles, or a larger "
-            "tolerance"
+            "(probes.N.radius, a smaller falloff), tissue.pretension or bending where it wrinkles and every side is "
+            "fixed, or a larger tolerance"
         ]
     )
 
