@@ -206,12 +206,12 @@ def check(scene: str, image: str | None, overrides: tuple[str, ...], as_json: bo
 
     source = "by earlier runs here" if takes.measured else "a guess, as no run has been timed here yet"
     asking = [f"{name}.tolerance" for name in ("sheet", "time") if getattr(loaded, name).tolerance is not None]
-    at_least = f", at least, as {' and '.join(asking)} may ask for more" if asking else ""
+    more, longer = (", or more", f", or longer, as {' and '.join(asking)} may ask for more") if asking else ("", "")
     click.echo(yaml.safe_dump(facts["scene"], sort_keys=False, default_flow_style=None), nl=False)
     click.echo(
         f"\n{need.points} points, {need.frames} frames, {need.steps} steps of {facts['step']:.6g} s "
-        f"(limit {limit:.6g} s), {facts['steps_per_frame']} a frame{at_least}, in {facts['precision']}\n"
-        f"about {rough_time(takes.seconds)} to run{at_least} ({source})\n"
+        f"(limit {limit:.6g} s), {facts['steps_per_frame']} a frame{more}, in {facts['precision']}\n"
+        f"about {rough_time(takes.seconds)} to run{longer} ({source})\n"
         f"about {need.memory_bytes / 2**20:.0f} MiB of memory, at most {need.disk_bytes / 2**20:.1f} MiB on disk, "
         f"{need.working_bytes / 2**20:.1f} MiB more while it runs"
     )

@@ -3,14 +3,17 @@
 from __future__ import annotations
 
 import json
+import re
 from pathlib import Path
 from typing import Any
 
 import pytest
 from PIL import Image
 
+from taichi_msm.physics.lattice import spacing
 from taichi_msm.render.notes import notes
 from taichi_msm.scene import Scene
+from taichi_msm.scenefile.load import load_scene
 from tests.conftest import Program
 from tests.scenes import PRESS, SHEET, scene
 
@@ -52,6 +55,20 @@ def test_a_stretched_picture_and_two_ways_out(tmp_path: Path, size: tuple[int, i
     like_picture = {**SHEET, "size": [float(side) for side in sheet.split(",")]}
     assert not list(notes(scene(image=str(tmp_path / "picture.png"), sheet=like_picture, output=["png"])))
     assert not list(notes(carrying(tmp_path, size, region=[int(number) for number in part.split(",")])))
+
+
+@pytest.mark.parametrize("size", [(900, 500), (300, 700)])
+def test_tissue_like_the_picture_has_square_cells(tmp_path: Path, size: tuple[int, int], root: Path) -> None:
+    Image.new("RGB", size).save(tmp_path / "picture.png")
+    press = ["image=picture.png", "probes.0.instrument=null"]
+    (tmp_path / "press.yaml").write_text((root / "scenes/press.yaml").read_text())
+    (note,) = notes(load_scene(tmp_path / "press.yaml", press))
+    settings = re.findall(r'--set "(sheet[^"]+)"', note)
+    assert [setting.partition("=")[0] for setting in settings] == ["sheet.size", "sheet.points"]
+    made = load_scene(tmp_path / "press.yaml", [*press, *settings])
+    assert not list(notes(made))
+    down, across = spacing(made.sheet)
+    assert down == pytest.approx(across, rel=0.02)
 
 
 def test_the_part_is_within_the_region(tmp_path: Path) -> None:

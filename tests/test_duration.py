@@ -217,4 +217,4 @@ def test_check_says_how_long_a_run_takes(
     assert json.loads(check("--json"))["estimated_seconds"] == pytest.approx(record["timings"]["total"])
     assert " to run (by earlier runs here)\n" in check()
     said = check("--set", "time.step=auto", "--set", "time.tolerance=0.01")
-    assert " to run, at least, as time.tolerance may ask for more (by earlier runs here)\n" in said
+    assert " to run, or longer, as time.tolerance may ask for more (by earlier runs here)\n" in said

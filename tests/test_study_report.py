@@ -556,11 +556,10 @@ def test_points_that_are_too_few_are_told_before_any_step() -> None:
     lines = ["sheet:", "  points: [171, 171]", "time:", "  step: auto", "  tolerance: 0.001"]
     assert found.recommendation()[:5] == lines
     text = terminal(found, 400)
-    assert (
-        "61 x 61 points make an error of 0.00800, whatever the step; the tolerance is 0.001. So no step is recommended "
-        "for them. No number that was measured is known to be within it; about 171 x 171 would be, by "
-        "extrapolation. With time.tolerance a run finds the step for them.\n" in text
+    said = (
+        "61 x 61 points make an error of 0.00800, which no step can mend; the tolerance is 0.001. Take about 171 x 171"
     )
+    assert f"{said} (extrapolated, not measured); with time.tolerance a run finds the step for them.\n" in text
     assert "*" not in text.split("refine")[0]
     scene(**{**yaml.safe_load("\n".join(found.recommendation())), "sheet": {"points": [171, 171], "size": [0.3, 0.4]}})
 

@@ -60,7 +60,7 @@ def notes(
         wrong, cut = float(f"{100 * mesh.error:.2g}"), math.sqrt(mesh.error / (WRONG / 2))
         finer = [min(MAX_POINTS, math.ceil((count - 1) * cut) + 1) for count in scene.sheet.points]
         remedy = f"; try sheet.points: {finer}" if max(finer) < MAX_POINTS else ""
-        yield f"so few points make the run up to {wrong:g} % wrong{remedy}"
+        yield f"so few points make the run {'at least' if mesh.doubt else 'up to'} {wrong:g} % wrong{remedy}"
     if progress.max_displacement == 0 and progress.frame > 0:
         yield "nothing moved: does a probe press where and when it should?"
     if progress.longest_spring > LONGEST:

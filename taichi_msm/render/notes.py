@@ -53,9 +53,15 @@ def _stretched(scene: Scene) -> Iterator[str]:
     if _fits(wide * height, high * width):
         return
     side = max(high, wide) / max(height, width)
+    settings = f'--set "sheet.size=[{height * side:.4g},{width * side:.4g}]"'
+    if scene.tissue is not None:
+        # With cells that stay square, as tissue allows none that are much longer than wide.
+        cells = (max(scene.sheet.points) - 1) / max(height, width)
+        rows, cols = (max(1, round(cells * count)) + 1 for count in (height, width))
+        settings += f' --set "sheet.points=[{rows},{cols}]"'
     said = (
         f"the picture of {width} x {height} pixels is stretched onto a sheet {wide:g} m wide and {high:g} m high; "
-        f'--set "sheet.size=[{height * side:.4g},{width * side:.4g}]" makes the sheet like the picture'
+        f"{settings} makes the sheet like the picture"
     )
     cut_width, cut_height = min(width, round(height * wide / high)), min(height, round(width * high / wide))
     # Of few pixels, even the part whose proportions are nearest to the sheet's may be stretched.

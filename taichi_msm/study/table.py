@@ -100,8 +100,8 @@ def remarks(study: Study) -> Iterator[str]:
         yield f"{own.name} points make an error of {size}{beside}; the tolerance is {study.points_tolerance:g}."
         return
     said = (
-        f"{own.name} points make an error of {size}, whatever the step; the tolerance is {study.points_tolerance:g}. "
-        "So no step is recommended for them."
+        f"{own.name} points make an error of {size}, which no step can mend; the tolerance is "
+        f"{study.points_tolerance:g}."
     )
     rows, cols = more
     if max(more) > MAX_POINTS:
@@ -113,8 +113,8 @@ def remarks(study: Study) -> Iterator[str]:
         yield f"{said} {rows} x {cols} are within it; with time.tolerance a run finds the step for them."
     else:
         yield (
-            f"{said} No number that was measured is known to be within it; about {rows} x {cols} would be, by "
-            "extrapolation. With time.tolerance a run finds the step for them."
+            f"{said} Take about {rows} x {cols} (extrapolated, not measured); with time.tolerance a run finds the step "
+            "for them."
         )
 
 
