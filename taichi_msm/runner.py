@@ -264,11 +264,16 @@ def _carry_out(
                 if run_error and frame > 0:
                     run_error.follow(position - rest, told)
                     watch.lap("pilot")
-            if run_error:
-                kept = (writer.position(frame) - rest for frame in range(1, frames)) if scene.output else None
-                run_error.finish(kept, partial(progress, "pilot"))
-                watch.lap("pilot")
-            writer.finish(partial(progress, "frames", frames, frames))
+            try:
+                if run_error:
+                    kept = (writer.position(frame) - rest for frame in range(1, frames)) if scene.output else None
+                    run_error.finish(kept, partial(progress, "pilot"))
+                    watch.lap("pilot")
+            except KeyboardInterrupt:
+                # All frames are done, and what the coarse pilot tells stands.
+                writer.finish()
+            else:
+                writer.finish(partial(progress, "frames", frames, frames))
         except KeyboardInterrupt:
             # An interruption outside `progress` may come before the last frame is stored.
             if simulation.steps > 0 and simulation.frame < writer.stored and not simulation.torn:

@@ -56,7 +56,8 @@ def record(**other: Any) -> dict[str, Any]:
         "encode": 7.0,
         "total": 31.0,
     }
-    return {"status": "complete", "arch": "cpu", "threads": CORES, "resumed": 0, "timings": timings, **other}
+    known = {"error_estimate": None, "timings": timings}
+    return {"status": "complete", "arch": "cpu", "threads": CORES, "resumed": 0, **known, **other}
 
 
 def parts_of(made: Scene) -> Work:
@@ -103,6 +104,11 @@ def test_what_a_run_left_out_is_learnt_from_no_other(made: Scene, folder: Path) 
     kept = json.loads((folder / NAME).read_text())["parts"]
     assert set(kept) == {"start", "stepping", "pictures"}
     assert estimate(made)[1]
+
+
+def test_pilots_are_not_learnt_where_a_finer_one_may_have_followed(made: Scene, folder: Path) -> None:
+    duration.learn(made, record(error_estimate={"error": 2e-3}))
+    assert set(json.loads((folder / NAME).read_text())["parts"]) == {"start", "stepping", "pictures"}
 
 
 @pytest.mark.parametrize(
@@ -163,6 +169,11 @@ def test_a_file_that_no_run_has_written_is_as_none(content: str, made: Scene, fo
     (folder / NAME).write_text(content)
     duration.learn(made, record())
     assert estimate(made) == (pytest.approx(31), True)
+
+
+def test_large_numbers_make_no_infinite_time(made: Scene, folder: Path) -> None:
+    (folder / NAME).write_text(kept(**dict.fromkeys(Work._fields, [1e303, 1e308])))
+    assert estimate(made).seconds == pytest.approx(1e-5 * sum(parts_of(made)))
 
 
 def a_folder(file: Path) -> None:

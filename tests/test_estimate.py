@@ -199,6 +199,34 @@ def test_a_finer_pilot_follows_an_error_that_matters(
     assert record["notes"][0].startswith(f"error at least {told(record):.1g} of the largest displacement: at least ")
 
 
+@pytest.mark.parametrize("output", ["[png]", "[]"])
+def test_ctrl_c_in_the_finer_pilot_leaves_a_complete_run(output: str, small: Path, device: Device) -> None:
+    asked: list[str] = []
+
+    def stop(stage: str, done: int, total: int) -> None:
+        """Stop in the finer pilot; as after a signal, whatever is interruptible is interrupted from then on."""
+        asked.extend([stage] if stage == "pilot" else [])
+        if asked and stage != "write":
+            raise KeyboardInterrupt
+
+    made = load_scene("small.yaml", [*WRONG, f"output={output}"])
+    record = run(made, "out", threads=device.threads, progress=stop)
+    assert (asked, record["status"], record["frames"]) == (["pilot"], "complete", 5)
+    found = record["error_estimate"]
+    assert found is not None
+    assert found["at_least"]
+
+
+def test_beside_f32_a_coarse_pilot_of_order_1_tells_a_bound(small: Path, device: Device) -> None:
+    step = ["time.frames_per_second=50", "time.step=0.004", "time.damping_difference=backward", "time.precision=f32"]
+    soft = ["springs.structural=8", "springs.shear=4", "output=[trajectory]"]
+    made = load_scene("small.yaml", [*step, *soft, "probes.0.load=[[0, 0], [0.4, 100]]"])
+    assert choose_pilots(made, time_grid(made)).beside == 3
+    record = run(made, "out", threads=device.threads)
+    error = true_error(made, time_grid(made), device, fine=32)
+    assert error < told(record) < 4 * error
+
+
 def test_beside_f32_a_coarse_pilot_tells_a_bound(
     small: Path, device: Device, monkeypatch: pytest.MonkeyPatch, taken: list[int]
 ) -> None:

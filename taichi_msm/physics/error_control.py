@@ -35,8 +35,8 @@ from taichi_msm.timegrid import TimeGrid
 # largest possible one.
 CLOSE = 0.75
 
-# What a coarse pilot tells is so many times what its difference from the run shows: the kinks of a load meet its steps
-# otherwise than those of the run (docs/decisions/0021).
+# The error of the step that a coarse pilot tells is so many times what its difference from the run shows: the kinks of
+# a load meet its steps otherwise than those of the run (docs/decisions/0021).
 MARGIN = 1.25
 
 # The largest number of pilot runs in a search, and the largest factor by which steps get finer from one to the next.
@@ -117,7 +117,7 @@ class Pilot:
 
     Beside a run in f32 a fine pilot has a second one with the run's own steps, which tells the part of rounding. A
     coarse one is alone, to be cheap, and the error told is the difference of the two runs: rounding as it is, and
-    r^-p - 1 times the error of the step.
+    r^-p - 1 times the error of the step; where that is less than MARGIN times, the difference is enlarged accordingly.
 
     Args:
         scene: what is run.
@@ -148,7 +148,10 @@ class Pilot:
             self._same = None if grid.precision == "f64" or coarse else dynamics()
             self._open = opened.pop_all()
         self._parted = grid.precision == "f64" or not coarse
-        self._margin = MARGIN if self._parted and coarse else 1.0
+        self._margin = 1.0
+        if coarse:
+            shown = (grid.steps_per_frame / steps) ** self._order - 1
+            self._margin = MARGIN if self._parted else max(1.0, MARGIN / shown)
         self.restart(grid, steps)
 
     def restart(self, grid: TimeGrid, steps: int) -> None:

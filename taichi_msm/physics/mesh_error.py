@@ -224,9 +224,9 @@ def choose_points(
     """
     tolerance, given = scene.sheet.tolerance, scene.sheet.points
     assert tolerance is not None
-    times, most = 1.0, (MAX_POINTS - 1) / (max(given) - 1)
+    times, most = max(1.0, (FEWEST - 1) / (min(given) - 1)), (MAX_POINTS - 1) / (max(given) - 1)
     for _ in range(MOST_TRIALS):
-        rows, cols = (max(FEWEST - 1, round((count - 1) * times)) + 1 for count in given)
+        rows, cols = (round((count - 1) * times) + 1 for count in given)
         tried = with_points(scene, (rows, cols))
         try:
             check(tried)

@@ -110,7 +110,7 @@ class RunError:
         found = self._known
         if found.estimate is None and self._time is not None:
             estimate = self._time.estimate
-            # Of a run in f32 a coarse pilot tells no less than there is.
+            # What a coarse pilot tells of a run in f32 is an upper bound.
             at_least = self._coarse and estimate.parted and ENOUGH <= estimate.error < math.inf
             found = found._replace(estimate=replace(estimate, at_least=at_least))
         if self._mesh is not None:

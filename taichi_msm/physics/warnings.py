@@ -47,7 +47,8 @@ def notes(
         yield error(estimate, mesh)
         if WRONG < estimate.error < math.inf:
             wrong = float(f"{100 * estimate.error:.2g}")
-            yield f"the run is about {wrong:g} % wrong; {_remedy(scene, grid, estimate)}"
+            bound = "about" if estimate.parted else "up to"
+            yield f"the run is {bound} {wrong:g} % wrong; {_remedy(scene, grid, estimate)}"
     elif reason:
         if mesh is None:
             yield f"error not estimated: {reason}"
@@ -105,6 +106,8 @@ def _size(mesh: MeshEstimate) -> str:
 
 def _remedy(scene: Scene, grid: TimeGrid, estimate: Estimate) -> str:
     """Say what would reduce the error."""
+    if not estimate.parted:
+        return "pass --estimate-error to learn whether the step or rounding makes it"
     said = []
     if estimate.rounding > WRONG / 2:
         said.append("time.precision: f64")

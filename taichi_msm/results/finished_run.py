@@ -171,7 +171,8 @@ def read_run(directory: str | Path) -> FinishedRun:
         record = json.loads(data)
         scene, frames = _as_run(record), record["frames"]
         facts = _FACTS.validate_python(record)
-        if not isinstance(frames, int) or not 1 <= frames <= scene.time.frames + 1 or scene.time.precision == "auto":
+        chosen = scene.time.precision != "auto" and scene.sheet.tolerance is scene.time.tolerance is None
+        if not isinstance(frames, int) or not 1 <= frames <= scene.time.frames + 1 or not chosen:
             raise damaged(path)
     return FinishedRun(path.parent, record, scene, frames, facts["sha256"], facts["overrides"], data)
 

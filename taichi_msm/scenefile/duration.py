@@ -18,7 +18,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from taichi_msm.physics.pilots import choose_pilots
+from taichi_msm.physics.pilots import ENOUGH, choose_pilots
 from taichi_msm.physics.timestep import time_grid
 from taichi_msm.physics.workload import work
 from taichi_msm.scene import Scene
@@ -69,7 +69,7 @@ def estimate(scene: Scene, grid: TimeGrid) -> Duration:
             kept["calibration"] = _calibrate(), CALIBRATION / UNIT
             _write(kept)
         kept |= dict.fromkeys(missing, kept["calibration"])
-    seconds = sum(amount * kept[name][0] / kept[name][1] for name, amount in parts.items())
+    seconds = sum(amount * (kept[name][0] / kept[name][1]) for name, amount in parts.items())
     return Duration(seconds, "start" not in missing)
 
 
@@ -91,6 +91,8 @@ def learn(scene: Scene, record: Mapping[str, Any]) -> None:
         "pilots": times.get("pilot", 0.0),
     }
     took["pictures"] = times["total"] - sum(took.values())
+    if ((record["error_estimate"] or {}).get("error") or 0.0) >= ENOUGH:
+        took["pilots"] = 0.0  # A finer one may have followed.
     grid = time_grid(scene)
     for name, amount in work(scene, grid, choose_pilots(scene, grid).cost)._asdict().items():
         if amount > 0 and took[name] > SHORTEST:
