@@ -46,6 +46,9 @@ class SceneError(MsmError):
         self.lines = tuple(dict.fromkeys(printable(line) for line in lines))
         super().__init__("\n".join(self.lines))
 
+    def __reduce__(self) -> tuple[type[SceneError], tuple[tuple[str, ...]]]:
+        return type(self), (self.lines,)
+
 
 class DeviceError(MsmError):
     """The requested arch or number of threads is not available, or the device left out part of its work."""

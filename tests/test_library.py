@@ -245,6 +245,11 @@ def test_a_divergence_says_where_it_is(device: Device) -> None:
     assert (str(again), again.step, again.time, again.point) == (str(error), error.step, error.time, error.point)
 
 
+def test_a_pickled_scene_error_has_its_lines() -> None:
+    again = pickle.loads(pickle.dumps(SceneError(["first", "second"])))
+    assert (str(again), again.lines) == ("first\nsecond", ("first", "second"))
+
+
 def test_all_errors_are_ours(simulation: Simulation) -> None:
     assert issubclass(ArgumentError, MsmError)
     assert issubclass(ArgumentError, ValueError)

@@ -399,6 +399,13 @@ def test_a_tolerance_that_no_points_meet_is_refused(load: Any, device: Device, m
         choose_points(load("sheet.tolerance=0.0001"), device, checked)
 
 
+def test_a_tolerance_keeps_the_shape_of_the_cells(load: Any, device: Device) -> None:
+    made = load("sheet.tolerance=0.2", *SMOOTH, "sheet.size=[0.1, 0.2]", "sheet.points=[3, 5]")
+    found, _ = choose_points(made, device, checked)
+    rows, cols = found.sheet.points
+    assert (cols - 1) / (rows - 1) == pytest.approx(2, rel=0.1)
+
+
 def test_a_tolerance_far_out_of_reach_is_refused_after_one_run(
     load: Any, device: Device, monkeypatch: pytest.MonkeyPatch
 ) -> None:
