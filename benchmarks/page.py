@@ -18,6 +18,7 @@ from taichi_msm.physics.timestep import time_grid
 from taichi_msm.study import measure
 from taichi_msm.study.result import Timing
 from taichi_msm.study.table import duration, markdown, number, timing
+from taichi_msm.system.compiler import chosen
 from taichi_msm.system.resources import available_threads
 from taichi_msm.system.runtime import Device, vector_bits
 
@@ -34,7 +35,7 @@ Entry = dict[str, Any]
 def machine() -> Results:
     """Describe where the benchmarks run."""
     found = measure.machine(Device("cpu", available_threads()))
-    versions = {"Taichi": found["versions"]["taichi"], "NumPy": found["versions"]["numpy"]}
+    versions = {chosen().title: chosen().version, "NumPy": found["versions"]["numpy"]}
     for package in PACKAGES:
         try:
             versions[package] = metadata.version(package)

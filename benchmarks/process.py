@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from taichi_msm.system import runtime
+from taichi_msm.system.compiler import chosen
 
 ROOT = Path(__file__).parent.parent
 
@@ -81,7 +82,7 @@ def _environment(threads: int | None, bits: int | None) -> dict[str, str]:
         **os.environ,
         "JAX_PLATFORMS": "cpu",
         "NUMBA_CACHE_DIR": str(CACHE / "numba"),
-        "TI_OFFLINE_CACHE_FILE_PATH": str(CACHE / "taichi"),
+        chosen().folder_variable: str(CACHE / chosen().name),
         "WARP_CACHE_PATH": str(CACHE / "warp"),
     }
     if threads is not None:

@@ -11,6 +11,7 @@ import time
 
 from benchmarks.process import ROOT
 from benchmarks.race import Progress
+from taichi_msm.system.compiler import chosen
 
 SCENE = "scenes/press.yaml"
 
@@ -25,7 +26,7 @@ def command(*arguments: str, cache: str) -> tuple[float, str]:
     done = subprocess.run(
         [sys.executable, "-m", "taichi_msm", *arguments],
         cwd=ROOT,
-        env={**environment, "TI_OFFLINE_CACHE_FILE_PATH": cache},
+        env={**environment, chosen().folder_variable: cache},
         check=True,
         capture_output=True,
         text=True,

@@ -23,6 +23,7 @@ from taichi_msm.study.pictures import FINEST
 from taichi_msm.study.result import REFINED_ENOUGH
 from taichi_msm.study.stepping import MARGIN
 from taichi_msm.study.table import markdown
+from taichi_msm.system.compiler import named
 
 ROOT = Path(__file__).parent.parent
 PAGE, TEMPLATE = ROOT / "docs" / "accuracy.md", ROOT / "docs" / "accuracy.template"
@@ -247,7 +248,7 @@ def main() -> None:
             cpu=machine["cpu"],
             threads=machine["threads"],
             vectors=machine["vectors"],
-            taichi=versions["taichi"],
+            compiler=named(versions),
             python=versions["python"],
             margin=MARGIN,
             coarse_step=f"{1000 * first['step']:.3g} ms",

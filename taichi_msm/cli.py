@@ -69,8 +69,19 @@ threads_option = click.option(
 json_option = click.option("--json", "as_json", is_flag=True, help="Print one JSON object on stdout and nothing else.")
 
 
+def tell_version(context: click.Context, _option: click.Parameter, asked: bool) -> None:
+    """Print the versions of the program and of its compiler, and end, if that was asked for."""
+    if asked:
+        from taichi_msm.system.compiler import chosen
+
+        click.echo(f"taichi-msm {__version__}, {chosen().title} {chosen().version}")
+        context.exit()
+
+
 @click.group(context_settings={"help_option_names": ["-h", "--help"]})
-@click.version_option(__version__, prog_name="taichi-msm")
+@click.option(
+    "--version", is_flag=True, is_eager=True, expose_value=False, callback=tell_version, help="Print the versions."
+)
 def program() -> None:
     """Deform an image as tissue deforms."""
 

@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from rich.progress import Progress as Bar
 
 STAGES = {
-    "start": "starting Taichi",
+    "start": "starting",
     "pilot": "pilot runs",
     "compile": "compiling the kernels",
     "check": "checking the finished frames",

@@ -43,6 +43,7 @@ from taichi_msm.scenefile import budget
 from taichi_msm.scenefile.validation import checked
 from taichi_msm.simulation import Simulation
 from taichi_msm.system import resources, runtime
+from taichi_msm.system.compiler import chosen
 from taichi_msm.system.runtime import Device
 from taichi_msm.timegrid import TimeGrid
 
@@ -303,7 +304,7 @@ def _carry_out(
         seconds = {stage: watch.seconds.get(stage, 0.0) for stage in stages}
         record["timings"] = {**seconds, "encode": writer.encode_seconds, "total": watch.total()}
         record |= {"arch": device.arch, "device": device.name, "threads": device.threads, "lanes": simulation.lanes}
-        record |= {"workers": simulation.workers, "versions": manifest.versions}
+        record |= {"workers": simulation.workers, "versions": {**manifest.versions, **versions()}}
         return cast(RunRecord, writer.publish(record))
 
 
@@ -376,7 +377,7 @@ def versions() -> dict[str, str]:
     return {
         "taichi-msm": __version__,
         "python": platform.python_version(),
-        "taichi": ".".join(str(part) for part in runtime.ti.__version__),
+        chosen().name: chosen().version,
         "numpy": np.__version__,
         "pillow": PIL.__version__,
         "platform": f"{sys.platform} {platform.machine()}",

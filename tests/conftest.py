@@ -14,6 +14,7 @@ from taichi_msm.cli import main
 from taichi_msm.runner import run
 from taichi_msm.scenefile.load import load_scene
 from taichi_msm.system import runtime
+from taichi_msm.system.compiler import chosen
 from taichi_msm.system.signals import SIGNALS
 from tests.scenes import SMALL, speckle
 
@@ -35,7 +36,7 @@ def own_kernel_cache(tmp_path_factory: pytest.TempPathFactory) -> None:
     base = tmp_path_factory.getbasetemp()
     # All workers of pytest-xdist share one.
     shared = base.parent if "PYTEST_XDIST_WORKER" in os.environ else base
-    os.environ["TI_OFFLINE_CACHE_FILE_PATH"] = str(shared / "ticache")
+    os.environ[chosen().folder_variable] = str(shared / "kernels")
 
 
 @pytest.fixture

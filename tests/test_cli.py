@@ -20,6 +20,7 @@ from PIL import Image
 from taichi_msm import console, reference
 from taichi_msm.cli import main
 from taichi_msm.scenefile.load import load_scene
+from taichi_msm.system.compiler import chosen
 from tests.conftest import Program
 from tests.outputs import files
 from tests.scenes import SMALL, speckle
@@ -326,28 +327,30 @@ def test_a_signal_before_the_first_frame_changes_nothing(number: signal.Signals,
 
 def test_without_a_place_for_compiled_kernels(small: Path) -> None:
     (small / "file").touch()
-    environment = {**os.environ, "TI_OFFLINE_CACHE_FILE_PATH": str(small / "file" / "below")}
+    environment = {**os.environ, chosen().folder_variable: str(small / "file" / "below")}
     settings = ["--set", "output=[]", "--set", "springs={structural: 20}", "--set", "probes=[]"]
     done = own_process("run", "small.yaml", *settings, env=environment)
     assert (done.returncode, done.stderr) == (0, "")
 
 
 def test_a_stale_lock_does_not_cost_the_cache(small: Path) -> None:
-    environment = {**os.environ, "TI_OFFLINE_CACHE_FILE_PATH": str(small / "cache")}
-    (small / "cache").mkdir()
-    lock = small / "cache" / "ticache.lock"
+    environment = {**os.environ, chosen().folder_variable: str(small / "cache")}
+    lock = small / "cache" / chosen().lock
+    lock.parent.mkdir(parents=True)
+
+    def kernels() -> list[Path]:
+        return [path for path in lock.parent.iterdir() if path.suffix in (".tic", ".qdc")]
+
     # Soon compiled.
     bare = ["--set", "output=[]", "--set", "springs={structural: 20}", "--set", "probes=[]", "--set", "damping=0"]
     for age, kept in ((3600, True), (0, False)):
         lock.touch()
         os.utime(lock, (time.time() - age, time.time() - age))
-        for path in (small / "cache").glob("*.tic"):
+        for path in kernels():
             path.unlink()
         done = own_process("run", "small.yaml", *bare, "--out", "here", env=environment)
         assert done.returncode == 0, done.stderr
-        assert bool(list((small / "cache").glob("*.tic"))) == kept, (
-            "someone else's lock is respected, a dead one's is not"
-        )
+        assert bool(kernels()) == kept, "someone else's lock is respected, a dead one's is not"
 
 
 def test_more_threads_than_cores_are_no_harm(small: Path) -> None:

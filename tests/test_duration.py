@@ -18,6 +18,7 @@ from taichi_msm.scene import Scene
 from taichi_msm.scenefile import duration
 from taichi_msm.scenefile.duration import CALIBRATION, UNIT
 from taichi_msm.system import resources
+from taichi_msm.system.compiler import chosen
 from tests.conftest import Program
 from tests.scenes import scene as small_scene
 
@@ -35,7 +36,7 @@ def made() -> Scene:
 def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """The empty folder of the cache, on a machine that is half as fast as the one of the constants."""
     (tmp_path / "cache").mkdir()
-    monkeypatch.setenv("TI_OFFLINE_CACHE_FILE_PATH", str(tmp_path / "cache"))
+    monkeypatch.setenv(chosen().folder_variable, str(tmp_path / "cache"))
     monkeypatch.setattr(duration, "_calibrate", lambda: 2 * CALIBRATION)
     monkeypatch.setattr(resources, "processor", lambda: "Abacus")
     monkeypatch.setattr(resources, "available_threads", lambda: CORES)
@@ -209,7 +210,7 @@ def test_without_a_home_there_is_an_estimate(made: Scene, folder: Path, monkeypa
     def homeless() -> Path:
         raise RuntimeError("Could not determine home directory.")
 
-    monkeypatch.delenv("TI_OFFLINE_CACHE_FILE_PATH")
+    monkeypatch.delenv(chosen().folder_variable)
     monkeypatch.setattr(Path, "home", homeless)
     assert estimate(made)[0] == pytest.approx(guess(made))
     duration.learn(made, record())

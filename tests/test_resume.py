@@ -26,6 +26,7 @@ from taichi_msm.results.publication import MANIFEST, POSITIONS, STATE
 from taichi_msm.results.record import RunRecord
 from taichi_msm.scene import Scene
 from taichi_msm.scenefile.load import load_scene
+from taichi_msm.system.compiler import chosen
 from taichi_msm.system.runtime import Device
 from tests.outputs import files, results
 from tests.scenes import speckle
@@ -227,11 +228,12 @@ def test_another_picture_or_version_is_not_gone_on_with(
 ) -> None:
     interrupted(dragged("time.duration=0.2"), "parts", device)
     before = files(small / "parts")
-    others = {**runner.versions(), "taichi": "1.7.99"}
+    others = {**runner.versions(), chosen().name: "1.7.99"}
     with monkeypatch.context() as patch:
         patch.setattr(runner, "versions", lambda: others)
         with pytest.raises(
-            FilesError, match=r"^the run began with taichi 1\.7\.\d; use these versions, or run the scene"
+            FilesError,
+            match=rf"^the run began with {chosen().name} {chosen().version}; use these versions, or run",
         ):
             resume("parts", threads=device.threads)
     Image.fromarray(speckle(30, 40, 1)).save(small / "speckle.png")

@@ -14,6 +14,7 @@ import pytest
 from taichi_msm.physics.lattice import rest_positions
 from taichi_msm.render.rasterizer import Drawing
 from taichi_msm.system import resources, runtime
+from taichi_msm.system.compiler import chosen
 from tests.motion import dynamics_of
 from tests.scenes import SHEET, scene, speckle
 
@@ -163,9 +164,9 @@ def test_other_threads_and_forked_processes_are_refused(tmp_path: Path, root: Pa
     done = subprocess.run(
         [sys.executable, str(script)], capture_output=True, text=True, timeout=60, check=True, env=environment
     )
-    thread = "Taichi works in the thread that started it; simulate and draw there"
-    fork = "Taichi was started before this process was forked from another, and would hang here; start processes by "
-    fork += "multiprocessing's 'spawn' or 'forkserver'"
+    thread = f"{chosen().title} works in the thread that started it; simulate and draw there"
+    fork = f"{chosen().title} was started before this process was forked from another, and would hang here; start "
+    fork += "processes by multiprocessing's 'spawn' or 'forkserver'"
     assert done.stdout.splitlines() == [*4 * [thread], *2 * [fork], "2"]
     assert done.stderr == ""
 

@@ -11,6 +11,7 @@ from pathlib import Path
 
 import pytest
 
+from taichi_msm.system.compiler import chosen
 from tests.outputs import results
 
 # Large enough for two workers to step it.
@@ -62,7 +63,11 @@ def runs(tmp_path_factory: pytest.TempPathFactory, root: Path) -> Runs:
     for name in ("here", "home", "temporary", "watch"):
         (folder / name).mkdir()
     (folder / "watch" / "sitecustomize.py").write_text(WATCH)
-    kept = {name: value for name, value in os.environ.items() if not name.startswith(("TI_", "PYTHON", "LC_", "XDG_"))}
+    kept = {
+        name: value
+        for name, value in os.environ.items()
+        if not name.startswith(("TI_", "QD_", "PYTHON", "LC_", "XDG_"))
+    }
     kept |= {"HOME": str(folder / "home"), "TMPDIR": str(folder / "temporary"), "WATCH": str(folder / "watched")}
     kept |= {"PYTHONPATH": os.pathsep.join((str(folder / "watch"), str(root))), "PYTHONDONTWRITEBYTECODE": "1"}
     plain = {"PYTHONUTF8": "0", "PYTHONCOERCECLOCALE": "0", "LC_ALL": "C"}
@@ -109,7 +114,9 @@ def test_the_same_bytes_while_bounds_are_checked(runs: Runs, root: Path, tmp_pat
     """Taichi stops at an access outside a field; what its debug mode cannot compile would show here, too."""
     overrides = [word for setting in SETTINGS for word in ("--set", setting)]
     command = [sys.executable, "-m", "taichi_msm", "run", str(root / "scenes" / "press.yaml"), *overrides]
-    subprocess.run([*command, "--out", str(tmp_path / "out")], env={**os.environ, "TI_DEBUG": "1"}, check=True)
+    subprocess.run(
+        [*command, "--out", str(tmp_path / "out")], env={**os.environ, f"{chosen().prefix}_DEBUG": "1"}, check=True
+    )
     assert results(tmp_path / "out") == results(runs.folder / "here" / NAMES[0])
 
 
@@ -128,7 +135,11 @@ def test_tissue_gives_the_same_bytes_while_bounds_are_checked(fixed: str, root: 
     overrides = [word for setting in settings for word in ("--set", setting)]
     command = [sys.executable, "-m", "taichi_msm", "run", str(root / "scenes" / "tumour.yaml"), *overrides]
     for debug in ("0", "1"):
-        subprocess.run([*command, "--out", str(tmp_path / debug)], env={**os.environ, "TI_DEBUG": debug}, check=True)
+        subprocess.run(
+            [*command, "--out", str(tmp_path / debug)],
+            env={**os.environ, f"{chosen().prefix}_DEBUG": debug},
+            check=True,
+        )
     assert results(tmp_path / "0") == results(tmp_path / "1")
 
 
@@ -149,7 +160,7 @@ def test_nothing_is_written_elsewhere(runs: Runs) -> None:
             "trajectory.npz",
         ]
     files = [path.relative_to(home).parts for path in home.rglob("*") if path.is_file()]
-    assert {parts[:3] for parts in files} == {(".cache", "taichi", "ticache")}
+    assert {parts[:3] for parts in files} == {Path(chosen().cache).parts}
     assert list((runs.folder / "temporary").iterdir()) == []
     lines = (runs.folder / "watched").read_text().splitlines()
     written = [Path(line.removeprefix("write ")) for line in lines if line.startswith("write ")]

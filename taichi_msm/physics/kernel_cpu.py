@@ -30,6 +30,7 @@ workers have taken the same steps. After that a single worker takes over for som
 
 import time
 from collections.abc import Callable
+from functools import cache
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -53,7 +54,6 @@ from taichi_msm.physics.kernel import (
     spring_forces,
 )
 from taichi_msm.system import resources
-from taichi_msm.system.quick_taichi import defined_once
 from taichi_msm.system.runtime import ITERATIONS_PER_THREAD, our_compilation, ti
 
 # Integers between the counters of two workers, so that each has a cache line of its own.
@@ -262,7 +262,7 @@ class Sweep:
         return np.array(rows, np.int32)
 
 
-@defined_once
+@cache
 def _kernels(code: Code) -> Kernels:
     """Make the kernels of one code; each is compiled when it is first launched."""
     return Kernels(

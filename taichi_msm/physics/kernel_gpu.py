@@ -7,6 +7,7 @@ and u_{n+1} by turns.
 # No `from __future__ import annotations` here: Taichi reads the annotations of a kernel.
 
 from collections.abc import Callable
+from functools import cache
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -29,7 +30,6 @@ from taichi_msm.physics.kernel import (
     point_step,
     spring_forces,
 )
-from taichi_msm.system.quick_taichi import defined_once
 from taichi_msm.system.runtime import our_compilation, ti
 
 # A launch is a chain of this many kernels, one for each step.
@@ -82,7 +82,7 @@ class Gather:
             )
 
 
-@defined_once
+@cache
 def _kernels(code: Code) -> Kernels:
     """Make the kernels of one code; each is compiled when it is first launched."""
     real, vector, columns = code.real, code.vector, code.load_columns

@@ -6,6 +6,7 @@ What is kept of a band fits into the cache, and no two workers write to one samp
 # No `from __future__ import annotations` here: Taichi reads the annotations of a kernel.
 
 from collections.abc import Callable
+from functools import cache
 from typing import Any
 
 import numpy as np
@@ -29,7 +30,6 @@ from taichi_msm.render.numbers import (
 from taichi_msm.render.projection import projection
 from taichi_msm.render.samples import DEPTH, INFINITY, Code
 from taichi_msm.render.shading import Out, Texture, resolving
-from taichi_msm.system.quick_taichi import defined_once
 from taichi_msm.system.runtime import ITERATIONS_PER_THREAD, Memory, our_compilation, started, ti
 
 
@@ -88,7 +88,7 @@ class Bands:
         return picture[:, :width], labels
 
 
-@defined_once
+@cache
 def _kernel(code: Code) -> Callable[..., None]:
     """Make the kernel of one code."""
     factor, floats = code.supersample, code.floats

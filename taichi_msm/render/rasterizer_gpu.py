@@ -9,6 +9,7 @@ drawn at a time, with a sample a thread.
 # No `from __future__ import annotations` here: Taichi reads the annotations of a kernel.
 
 from collections.abc import Callable
+from functools import cache
 from typing import NamedTuple
 
 import numpy as np
@@ -33,7 +34,6 @@ from taichi_msm.render.projection import projection
 from taichi_msm.render.samples import DEPTH, INFINITY, Code
 from taichi_msm.render.shading import Out, Texture, resolving
 from taichi_msm.system.launches import THREADS, Launches, end_thread
-from taichi_msm.system.quick_taichi import defined_once
 from taichi_msm.system.runtime import our_compilation, ti
 
 # The smallest width of a bin [samples].
@@ -124,7 +124,7 @@ class Threads:
         return colours.reshape(-1, width, 3), launches.take(self._labels)
 
 
-@defined_once
+@cache
 def _kernels(code: Code) -> Kernels:
     """Make the kernels of one code."""
     factor, floats, planes = code.supersample, code.floats, code.planes

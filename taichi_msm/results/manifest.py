@@ -22,6 +22,7 @@ from taichi_msm.render import camera
 from taichi_msm.results.publication import CHECKPOINT, MANIFEST, STAGING, open_checkpoint
 from taichi_msm.results.sealed import unseal
 from taichi_msm.scene import Scene
+from taichi_msm.system.compiler import what_decides_bits
 from taichi_msm.system.runtime import ARCHS
 
 # A manifest contains its scene twice; each may come from a file of 1 MiB.
@@ -72,14 +73,20 @@ class Manifest:
         for key, path in self.scene.pictures.items():
             if sha256.get(key) != self.sha256.get(key):
                 raise FilesError(f"{path} has changed since the run began; put it back, or run the scene again")
-        others = [f"{key} {self.versions.get(key)}" for key in versions if versions[key] != self.versions.get(key)]
-        if others:
+        if what_decides_bits(self.versions, self.arch) != what_decides_bits(versions, self.arch):
+            others = [f"{name} {found}" for name, found in self.versions.items() if found != versions.get(name)]
             raise FilesError(f"the run began with {', '.join(others)}; use these versions, or run the scene again")
 
     def gives_the_bits_of(self, other: Manifest) -> bool:
         """Tell whether the results of both runs have the same bits, so that one can continue the other."""
         mine, its = (
-            (one.scene.with_pictures(lambda path: "any"), one.arch, one.sha256, one.versions) for one in (self, other)
+            (
+                one.scene.with_pictures(lambda path: "any"),
+                one.arch,
+                one.sha256,
+                what_decides_bits(one.versions, one.arch),
+            )
+            for one in (self, other)
         )
         return mine == its
 

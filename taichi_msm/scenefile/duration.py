@@ -1,6 +1,6 @@
 """How long a run will take: its work, times how long earlier runs on this machine took for theirs.
 
-What earlier runs took is kept beside Taichi's cache of compiled kernels, as a few numbers; where there are none yet, a
+What earlier runs took is kept beside the compiled kernels, as a few numbers; where there are none yet, a
 short calibration tells how fast the machine is. A file that cannot be read or written, or that another machine has
 written, is as none.
 """
@@ -23,6 +23,7 @@ from taichi_msm.physics.timestep import time_grid
 from taichi_msm.physics.workload import work
 from taichi_msm.scene import Scene
 from taichi_msm.system import resources
+from taichi_msm.system.compiler import chosen
 from taichi_msm.timegrid import TimeGrid
 
 # Time of a unit of work [s], and of the calibration, on two cores of an AMD EPYC of 2024.
@@ -113,9 +114,8 @@ def _calibrate() -> float:
 
 
 def _file() -> Path:
-    """Name the file, in the folder of Taichi's cache; RuntimeError: there is no home."""
-    given = os.environ.get("TI_OFFLINE_CACHE_FILE_PATH")
-    return Path(given or Path.home() / ".cache" / "taichi" / "ticache") / "taichi-msm.json"
+    """Name the file, in the folder of compiled kernels; RuntimeError: there is no home."""
+    return chosen().folder() / "taichi-msm.json"
 
 
 def _machine() -> str:
@@ -139,7 +139,7 @@ def _read() -> Kept:
 
 
 def _write(kept: Kept) -> None:
-    """Replace what is kept, whole or not at all, if Taichi's cache has a folder."""
+    """Replace what is kept, whole or not at all, if there is a folder of compiled kernels."""
     with suppress(OSError, RuntimeError):
         file = _file()
         staged = file.with_name(f".taichi-msm-{os.getpid()}")

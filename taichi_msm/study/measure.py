@@ -157,9 +157,6 @@ def _measure_peer(scene: Scene, stepping: SteppingStudy, effort: Effort, found: 
                 start = time.perf_counter()
                 frames, evaluations = solve(scene, rtol, atol, deadline, tick)
                 samples.append(time.perf_counter() - start)
-        except ImportError:
-            found.notes.append('DOP853 was left out: it needs SciPy; pip install "taichi-msm[report]"')
-            return
         except TooSlowError:
             if not samples:
                 found.notes.append(

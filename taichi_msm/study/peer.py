@@ -45,7 +45,6 @@ def solve(scene: Scene, rtol: float, atol: float, deadline: float, tick: Callabl
     Raises:
         TooSlowError: at the deadline.
         FailedError: when SciPy fails.
-        ImportError: when SciPy is not installed.
     """
     from scipy.integrate import solve_ivp
 

@@ -23,6 +23,7 @@ from numpy.typing import NDArray
 
 from taichi_msm.study.result import Drawn, Peer, Points, Stepping, Study, Timing
 from taichi_msm.study.table import duration, number, shown, unit, where
+from taichi_msm.system.compiler import named
 
 # The colours of Okabe and Ito, which the colour-blind can tell apart too.
 BLUE, VERMILION, GREEN, ORANGE, PURPLE, SKY = "#0072B2", "#D55E00", "#009E73", "#E69F00", "#CC79A7", "#56B4E9"
@@ -156,7 +157,7 @@ def _figure(study: Study) -> Figure:
 def _write_header(figure: Figure, study: Study) -> None:
     """Write above the panels what was studied, on which machine, and with what result."""
     versions = study.machine["versions"]
-    machine = f"{where(study)}; taichi-msm {versions['taichi-msm']}, Taichi {versions['taichi']}"
+    machine = f"{where(study)}; taichi-msm {versions['taichi-msm']}, {named(versions)}"
     title = f"{shown(study.scene)}: speed against error"
     step, drawn, own, more = study.best_stepping, study.best_drawing, study.own_points, study.more_points
     advice = []

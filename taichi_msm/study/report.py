@@ -26,6 +26,7 @@ from taichi_msm.study.table import (
     where,
     wrong,
 )
+from taichi_msm.system.compiler import named
 
 PICTURE, FLAT, PAGE, RECORD = "study.png", "study.csv", "study.md", "study.json"
 
@@ -171,7 +172,7 @@ def _page(study: Study) -> str:
     state = "" if study.status == "complete" else f" ({study.status})"
     blocks = [
         f"# {shown(study.scene)}: speed against error{state}",
-        f"Measured on {where(study)}, with taichi-msm {versions['taichi-msm']}, Taichi {versions['taichi']}, "
+        f"Measured on {where(study)}, with taichi-msm {versions['taichi-msm']}, {named(versions)}, "
         f"NumPy {versions['numpy']} and Python {versions['python']} ({versions['platform']}). "
         "Times are medians, with the fastest and the slowest in brackets.",
         *_stepping(study),

@@ -15,7 +15,6 @@ import numpy as np
 from numpy.typing import DTypeLike, NDArray
 
 from taichi_msm.errors import DeviceError
-from taichi_msm.system.quick_taichi import ALLOCATING, replaced
 from taichi_msm.system.runtime import our_compilation, started, ti
 
 # Taichi starts at most this many threads on Vulkan, which share the indices of a kernel's outermost loop.
@@ -50,8 +49,7 @@ class Launches:
         if not self.bounded:
             return np.empty(length, dtype)
         kind = np.dtype(dtype)
-        with replaced(ALLOCATING):
-            self._held.append(ti.ndarray(getattr(ti, f"{kind.kind}{8 * kind.itemsize}"), length))
+        self._held.append(ti.ndarray(getattr(ti, f"{kind.kind}{8 * kind.itemsize}"), length))
         return self._held[-1]
 
     def give(self, values: NDArray[Any]) -> Any:

@@ -1,4 +1,4 @@
-"""The only module that starts Taichi."""
+"""The only module that starts Taichi, or Quadrants, of which all that is said of Taichi here is true as well."""
 
 from __future__ import annotations
 
@@ -13,7 +13,9 @@ import threading
 import time
 import weakref
 from collections import defaultdict
+from collections.abc import Iterator
 from dataclasses import dataclass, field, replace
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -22,7 +24,7 @@ from numpy.typing import NDArray
 
 from taichi_msm.errors import ArgumentError, DeviceError, MsmError, did_you_mean
 from taichi_msm.system import resources
-from taichi_msm.system.quick_taichi import ALLOCATING, READING, Parts, replaced, ti
+from taichi_msm.system.compiler import Parts, chosen
 from taichi_msm.system.silence import silenced
 
 __all__ = [
@@ -41,6 +43,8 @@ __all__ = [
     "vector_bits",
     "write",
 ]
+
+ti = chosen().load()
 
 _core: Any = getattr(np, "_core", None) or np.core  # NumPy 2, or 1
 _features: dict[str, bool] = _core._multiarray_umath.__cpu_features__
@@ -106,8 +110,7 @@ class Memory:
             _free[kind] = [one for one in _free[kind] if one is not array]
         else:
             real = getattr(ti, precision)
-            with replaced(ALLOCATING):
-                array = ti.ndarray(ti.types.vector(lanes, real) if lanes else real, length)
+            array = ti.ndarray(ti.types.vector(lanes, real) if lanes else real, length)
         self._taken.append((kind, array))
         return array
 
@@ -193,7 +196,7 @@ def start(arch: str = "cpu", threads: int | None = None) -> Device:
         _home = os.getpid(), threading.get_ident()
     elif wanted != _device:
         raise DeviceError(
-            f"Taichi already runs on {_device.arch} with {_device.threads} threads in this process; "
+            f"{chosen().title} already runs on {_device.arch} with {_device.threads} threads in this process; "
             f"start another process for {wanted.arch} with {wanted.threads}"
         )
     return _device
@@ -217,11 +220,11 @@ def require_here() -> None:
     process, thread = _home
     if process != os.getpid():
         raise MsmError(
-            "Taichi was started before this process was forked from another, and would hang here; start processes by "
-            "multiprocessing's 'spawn' or 'forkserver'"
+            f"{chosen().title} was started before this process was forked from another, and would hang here; start "
+            "processes by multiprocessing's 'spawn' or 'forkserver'"
         )
     if thread != threading.get_ident():
-        raise MsmError("Taichi works in the thread that started it; simulate and draw there")
+        raise MsmError(f"{chosen().title} works in the thread that started it; simulate and draw there")
 
 
 def open_window(title: str, size: tuple[int, int]) -> Any:
@@ -263,23 +266,39 @@ def our_compilation(*, optimised: bool = True) -> contextlib.AbstractContextMana
         (config, "advanced_optimization", optimised),
         (config, "real_matrix_scalarize", started().arch != "cpu"),
     ]
-    return replaced(options + READING)
+    return _replaced(options + _shortcuts())
+
+
+_shortcuts = cache(chosen().shortcuts)
+
+
+@contextlib.contextmanager
+def _replaced(parts: Parts) -> Iterator[None]:
+    """Give attributes of objects other values for a while."""
+    found = [(owner, name, getattr(owner, name)) for owner, name, _ in parts]
+    for owner, name, value in parts:
+        setattr(owner, name, value)
+    try:
+        yield
+    finally:
+        for owner, name, value in found:
+            setattr(owner, name, value)
 
 
 def _cache() -> dict[str, Any]:
     """Give Taichi's options for the cache of compiled kernels, which later processes use."""
-    folder = Path(os.environ.get("TI_OFFLINE_CACHE_FILE_PATH") or ti.lang.impl.default_cfg().offline_cache_file_path)
     try:
+        folder = chosen().folder()
         folder.mkdir(parents=True, exist_ok=True)
         with tempfile.TemporaryFile(dir=folder):
             pass
         _require_room(folder)
     except OSError:
         # When a process ends, Taichi crashes if it cannot write to the folder, even if the cache is off.
-        os.environ.pop("TI_OFFLINE_CACHE_FILE_PATH", None)
+        os.environ.pop(chosen().folder_variable, None)
         return {"offline_cache": False, "offline_cache_file_path": tempfile.gettempdir()}
     # The lock is held for milliseconds. A killed process leaves it behind, which blocks the cache for all others.
-    lock = folder / "ticache.lock"
+    lock = folder / chosen().lock
     with contextlib.suppress(OSError):
         if time.time() - lock.stat().st_mtime > STALE_LOCK:
             lock.unlink()
@@ -304,8 +323,8 @@ def _require_address_space() -> None:
     limit = resource.getrlimit(resource.RLIMIT_AS)[0]
     if limit != resource.RLIM_INFINITY and limit < ADDRESS_SPACE:
         raise DeviceError(
-            f"Taichi needs {ADDRESS_SPACE >> 20} MiB of address space, and this process may have {limit >> 20} MiB; "
-            "raise its limit (ulimit -v)"
+            f"{chosen().title} needs {ADDRESS_SPACE >> 20} MiB of address space, and this process may have "
+            f"{limit >> 20} MiB; raise its limit (ulimit -v)"
         )
 
 
@@ -350,7 +369,7 @@ def _initialise(device: Device) -> str:
                 ti.set_logging_level(ti.ERROR)
             named = GPU_NAME.search(told.read())
     except Exception as error:
-        said = f"Taichi says: {' '.join(str(error).split())}" if on_cpu else "take --arch cpu"
+        said = f"{chosen().title} says: {' '.join(str(error).split())}" if on_cpu else "take --arch cpu"
         raise DeviceError(f"--arch {device.arch}: not available on this machine; {said}") from error
     # The threads of the pool are the last that Taichi starts.
     _pin([thread for thread in _threads() if thread not in before][-device.threads :])

@@ -1,0 +1,187 @@
+"""The compiler of our kernels: Taichi, or Quadrants, its kept fork. No other module knows which of them it is."""
+
+from __future__ import annotations
+
+import ast
+import os
+import tempfile
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import cache
+from importlib import import_module
+from importlib.util import find_spec
+from pathlib import Path
+from typing import Any
+
+from taichi_msm.errors import NotInstalledError, did_you_mean
+
+__all__ = ["Compiler", "Parts", "chosen", "named", "what_decides_bits"]
+
+# The environment variable that chooses.
+CHOICE = "TAICHI_MSM_COMPILER"
+
+# Attributes to replace: object, name, value.
+Parts = list[tuple[Any, str, Any]]
+
+
+@dataclass(frozen=True)
+class Compiler:
+    """A compiler that can be imported.
+
+    Attributes:
+        name: of its package, also in run.json.
+        title: its name in a sentence.
+        prefix: of its environment variables.
+        cache: folder of compiled kernels, from the home directory.
+        lock: on that folder, from the folder.
+        tested: the version whose results on a CPU have the same bits as those of the other compiler.
+        pythons: that it can be installed for.
+    """
+
+    name: str
+    title: str
+    prefix: str
+    cache: str
+    lock: str
+    tested: str
+    pythons: str
+
+    @property
+    def version(self) -> str:
+        """The version that is installed."""
+        from importlib import metadata
+
+        return metadata.version(self.name)
+
+    @property
+    def remedy(self) -> str:
+        """What to do where it is not installed."""
+        return f"pip install {self.name}=={self.tested} ({self.pythons})"
+
+    @property
+    def folder_variable(self) -> str:
+        """The environment variable that names another folder of compiled kernels."""
+        return f"{self.prefix}_OFFLINE_CACHE_FILE_PATH"
+
+    def folder(self) -> Path:
+        """Give the folder of compiled kernels.
+
+        Raises:
+            RuntimeError: when there is no home directory.
+        """
+        return Path(os.environ.get(self.folder_variable) or Path.home() / self.cache)
+
+    def load(self) -> Any:
+        """Import it, without its banner on stdout, which may be JSON, and its look for a newer version."""
+        if not os.environ.get("HOME"):
+            # Without HOME, it aborts the process.
+            os.environ.pop("HOME", None)
+            folder = os.path.expanduser("~")  # noqa: PTH111  # Path.home raises where there is none
+            os.environ["HOME"] = folder if folder != "~" else tempfile.gettempdir()
+        os.environ.setdefault(f"ENABLE_{self.name.upper()}_HEADER_PRINT", "0")
+        os.environ.setdefault(f"{self.prefix}_SKIP_VERSION_CHECK", "ON")
+        # In a notebook, it reports on import that it is in one. This level is for the import only; `init` sets its own.
+        level = f"{self.prefix}_LOG_LEVEL"
+        silent = os.environ.setdefault(level, "error") == "error"
+        compiler = import_module(self.name)
+        if silent:
+            del os.environ[level]
+        return compiler
+
+    def shortcuts(self) -> Parts:
+        """List what to replace while a kernel of ours is read.
+
+        A compiler reads every kernel in every process, as the key of its cache is made from what it reads. Meanwhile it
+        prepares, for every node, the source lines that an error would show: useful only to those who change a kernel.
+        """
+        if "TAICHI_MSM_TRACEBACK" in os.environ:
+            return []
+        nodes = import_module(f"{self.name}.lang.ast.ast_transformer_utils")
+        if self.name == "taichi":
+            reader = import_module("taichi.lang.ast.ast_transformer")
+
+            def read(context: Any, node: ast.AST) -> Any:
+                return getattr(reader.ASTTransformer, f"build_{type(node).__name__}")(context, node)
+
+            return [
+                (nodes.ASTTransformerContext, "get_pos_info", lambda context, node: ""),
+                (reader, "build_stmt", read),
+            ]
+        kernels = import_module("quadrants.lang.kernel")
+        look_up = kernels.Kernel._try_load_fastcache
+
+        def use_none(kernel: Any, arguments: Any, key: Any) -> Any:
+            look_up(kernel, arguments, key)
+            return kernel.used_py_dataclass_parameters_by_key_enforcing.setdefault(key, set())
+
+        return [
+            (nodes.ASTTransformerFuncContext, "memoized_get_pos_info", lambda context, node: ""),
+            # Quadrants reads every kernel twice, to find which fields of dataclasses it uses. Ours take none.
+            (kernels.Kernel, "_try_load_fastcache", use_none),
+            (kernels._kernel_impl_dataclass, "unpack_ast_struct_expressions", lambda tree, struct_locals: tree),
+        ]
+
+
+# The first of them that is installed is taken.
+COMPILERS = {
+    one.name: one
+    for one in (
+        Compiler(
+            name="taichi",
+            title="Taichi",
+            prefix="TI",
+            cache=".cache/taichi/ticache",
+            lock="ticache.lock",
+            tested="1.7.4",
+            pythons="Python 3.10 to 3.13",
+        ),
+        Compiler(
+            name="quadrants",
+            title="Quadrants",
+            prefix="QD",
+            cache=".cache/quadrants/qdcache",
+            lock="kernel_compilation_manager/qdcache.lock",
+            tested="1.4.0",
+            pythons="Python 3.12 to 3.14",
+        ),
+    )
+}
+
+
+@cache
+def chosen() -> Compiler:
+    """Choose the compiler, without importing it.
+
+    Raises:
+        NotInstalledError: when the one that the environment asks for is not known or not installed, or none is.
+    """
+    wanted = os.environ.get(CHOICE)
+    if wanted and wanted not in COMPILERS:
+        near = did_you_mean(wanted, list(COMPILERS))
+        raise NotInstalledError(f"{CHOICE}: {wanted!r} is not a compiler; take {' or '.join(COMPILERS)}{near}")
+    candidates = [COMPILERS[wanted]] if wanted else list(COMPILERS.values())
+    for one in candidates:
+        if find_spec(one.name) is not None:
+            return one
+    if wanted:
+        raise NotInstalledError(f"{CHOICE}: {wanted} is not installed; {candidates[0].remedy}, or unset {CHOICE}")
+    raise NotInstalledError(f"no compiler is installed; {' or '.join(one.remedy for one in candidates)}")
+
+
+def named(versions: Mapping[str, str]) -> str:
+    """Name the compiler, and its version, that was used where these versions were: Taichi 1.7.4."""
+    return next(f"{one.title} {versions[one.name]}" for one in COMPILERS.values() if one.name in versions)
+
+
+def what_decides_bits(versions: Mapping[str, str], arch: str) -> dict[str, str]:
+    """Leave out of some versions that of the compiler, if its results have the same bits as another one's.
+
+    Args:
+        versions: by name.
+        arch: cpu, cuda or vulkan; the bits are known to be the same on a CPU only.
+    """
+    return {
+        name: version
+        for name, version in versions.items()
+        if arch != "cpu" or name not in COMPILERS or version != COMPILERS[name].tested
+    }
