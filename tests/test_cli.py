@@ -570,6 +570,9 @@ def test_scenes_of_any_name(stem: str, small: Path, capsys: pytest.CaptureFixtur
     assert call(capsys, "check", "--", f"{stem}.yaml") == (2, "", error)
 
 
+@pytest.mark.skipif(
+    sys.version_info >= (3, 14), reason="there these names have no suffix and give folders of their own"
+)
 @pytest.mark.parametrize(("name", "folder"), [("...yaml", ".."), ("..yaml", ".")])
 def test_a_name_that_is_no_folder_of_its_own_is_refused(
     name: str, folder: str, small: Path, capsys: pytest.CaptureFixture[str]
