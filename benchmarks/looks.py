@@ -11,6 +11,7 @@ import time
 from collections.abc import Callable
 from typing import Any
 
+from benchmarks.clock import seconds
 from benchmarks.drawing.problem import Problem
 from benchmarks.process import call
 from benchmarks.race import Progress
@@ -28,6 +29,8 @@ REFINE = 10
 
 # What others are compared with.
 HEADLIGHT = "headlight"
+
+LABELS = "labels alone"
 
 # Pictures of every kind in a round.
 PICTURES = 8
@@ -67,7 +70,7 @@ def variants(problem: Problem) -> dict[str, Callable[[], Any]]:
         "tissue, relief": picture(scene("tissue", light={"relief": -0.2})),
         "tissue, instrument": picture(tissue.model_copy(update={"probes": [held]})),
         "headlight and labels": picture(plain, labels=True),
-        "labels alone": picture(plain, picture=False, labels=True),
+        LABELS: picture(plain, picture=False, labels=True),
         "flow and occlusion": lambda: find_flow(plain, seen, problem.rest, camera),
     }
 
@@ -85,6 +88,14 @@ def cost(pixels: int, rounds: int) -> Samples:
             samples[name].append((time.perf_counter() - start) / PICTURES)
     # In the first round kernels are compiled.
     return {name: times[1:] for name, times in samples.items()}
+
+
+def labels(pixels: int) -> float:
+    """Time the labels of a picture without its colours [s]."""
+    runtime.start("cpu", available_threads())
+    draw = variants(Problem(pixels, REFINE, lit=True))[LABELS]
+    draw()
+    return seconds(lambda count: [draw() for _ in range(count)])
 
 
 def rates(rounds: int) -> Samples:

@@ -18,7 +18,7 @@ from taichi_msm.physics.timestep import time_grid
 from taichi_msm.study import measure
 from taichi_msm.study.result import Timing
 from taichi_msm.study.table import duration, markdown, number, timing
-from taichi_msm.system.compiler import chosen
+from taichi_msm.system.compiler import COMPILERS, chosen
 from taichi_msm.system.resources import available_threads
 from taichi_msm.system.runtime import Device, vector_bits
 
@@ -80,6 +80,7 @@ def tables(results: Results) -> dict[str, str]:
         "terms_table": ("terms", lambda: terms_table(results["terms"])),
         "looks_table": ("looks", lambda: looks_table(results["looks"]["pictures"])),
         "rates_table": ("looks", lambda: rates_table(results["looks"]["rates"])),
+        "compilers_table": ("compilers", lambda: compilers_table(results["compilers"])),
         "size_table": ("size", lambda: size_table(results["size"])),
         "threads_table": ("threads", lambda: threads_table(results["threads"])),
         "machine_table": ("bounds", lambda: machine_table(results["bounds"])),
@@ -230,6 +231,18 @@ def whole_run_table(measured: dict[str, dict[str, list[float]]]) -> str:
         for kind, times in measured.items()
     ]
     return table(["[s]", *stages], rows)
+
+
+def compilers_table(measured: dict[str, dict[str, list[float]]]) -> str:
+    """Show the time of everything with each compiler, and how many times the first one's the other takes."""
+    if not measured:
+        return "(not measured: needs both compilers)"
+    names = list(COMPILERS)
+    rows = []
+    for work, samples in measured.items():
+        times = [Timing.of(samples[name]) for name in names]
+        rows.append([work, *map(timing, times), f"{times[1].median / times[0].median:.2f}"])
+    return table(["time", *(COMPILERS[name].title for name in names), "ratio"], rows)
 
 
 def terms_table(measured: dict[str, dict[str, list[float]]]) -> str:

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from taichi_msm.system import runtime
-from taichi_msm.system.compiler import chosen
+from taichi_msm.system.compiler import CHOICE, COMPILERS, chosen
 
 ROOT = Path(__file__).parent.parent
 
@@ -41,20 +41,21 @@ def call(task: str, **arguments: Any) -> Any:
 
     Args:
         task: "module:function"; what it takes and gives is JSON.
-        arguments: of the function; `threads` also sizes the pools that look into the environment. `bits`, which is
-            not passed on, is the width of vectors that peers may take; None: the processor's.
+        arguments: of the function; `threads` also sizes the pools that look into the environment. Not passed on are
+            `bits`, the width of vectors that peers may take (None: the processor's), and `compiler`, the name of the
+            compiler of this program's kernels (None: that of this process).
 
     Raises:
         UnavailableError: when what it needs is not installed.
         FailedError: when it ends with another error or takes too long.
     """
-    bits = arguments.pop("bits", None)
+    bits, compiler = arguments.pop("bits", None), arguments.pop("compiler", None)
     command = [sys.executable, "-m", "benchmarks.child", task, json.dumps(arguments)]
     try:
         done = subprocess.run(
             command,
             cwd=ROOT,
-            env=_environment(arguments.get("threads"), bits),
+            env=_environment(arguments.get("threads"), bits, compiler or chosen().name),
             capture_output=True,
             text=True,
             check=False,
@@ -77,12 +78,13 @@ def vector_bits() -> int:
     return int(os.environ.get(NARROW) or runtime.vector_bits())
 
 
-def _environment(threads: int | None, bits: int | None) -> dict[str, str]:
+def _environment(threads: int | None, bits: int | None, compiler: str) -> dict[str, str]:
     environment = {
         **os.environ,
         "JAX_PLATFORMS": "cpu",
         "NUMBA_CACHE_DIR": str(CACHE / "numba"),
-        chosen().folder_variable: str(CACHE / chosen().name),
+        CHOICE: compiler,
+        COMPILERS[compiler].folder_variable: str(CACHE / compiler),
         "WARP_CACHE_PATH": str(CACHE / "warp"),
     }
     if threads is not None:

@@ -11,22 +11,29 @@ import time
 
 from benchmarks.process import ROOT
 from benchmarks.race import Progress
-from taichi_msm.system.compiler import chosen
+from taichi_msm.system.compiler import CHOICE, COMPILERS, chosen
 
 SCENE = "scenes/press.yaml"
 
 Samples = dict[str, dict[str, list[float]]]
 
 
-def command(*arguments: str, cache: str) -> tuple[float, str]:
-    """Run the program; gives its time from start to end [s], and what it printed."""
+def command(*arguments: str, cache: str, compiler: str | None = None) -> tuple[float, str]:
+    """Run the program; gives its time from start to end [s], and what it printed.
+
+    Args:
+        arguments: of the command line.
+        cache: folder of compiled kernels.
+        compiler: name of the compiler; None: that of this process.
+    """
+    used = COMPILERS[compiler] if compiler else chosen()
     # Python keeps what it compiles, as it does for a user.
     environment = {name: value for name, value in os.environ.items() if name != "PYTHONDONTWRITEBYTECODE"}
     start = time.perf_counter()
     done = subprocess.run(
         [sys.executable, "-m", "taichi_msm", *arguments],
         cwd=ROOT,
-        env={**environment, chosen().folder_variable: cache},
+        env={**environment, CHOICE: used.name, used.folder_variable: cache},
         check=True,
         capture_output=True,
         text=True,

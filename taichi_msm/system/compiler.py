@@ -15,7 +15,7 @@ from typing import Any
 
 from taichi_msm.errors import NotInstalledError, did_you_mean
 
-__all__ = ["Compiler", "Parts", "chosen", "named", "what_decides_bits"]
+__all__ = ["CHOICE", "COMPILERS", "Compiler", "Parts", "chosen", "named", "what_decides_bits"]
 
 # The environment variable that chooses.
 CHOICE = "TAICHI_MSM_COMPILER"
