@@ -11,10 +11,10 @@ import time
 from collections.abc import Callable, Iterator
 from itertools import islice
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
+import pygame
 import pytest
 from PIL import Image
 
@@ -23,12 +23,11 @@ from taichi_msm.cli import main
 from taichi_msm.errors import SceneError
 from taichi_msm.results.folder import Folder
 from taichi_msm.scene import Scene
-from taichi_msm.system.runtime import ti
 from taichi_msm.viewer.events import Drag, Harder, Key, Percent, Point, Press, Release, Turn
 from taichi_msm.viewer.film import Film
 from taichi_msm.viewer.pacing import LONGEST, Pacing
 from taichi_msm.viewer.script import load_script, timed
-from taichi_msm.viewer.window import QUIT, Hand
+from taichi_msm.viewer.window import QUIT, Hand, opening, placed
 from tests.conftest import Program
 from tests.outputs import duration
 
@@ -200,7 +199,8 @@ def test_without_a_display_it_says_what_to_do(small: Path, program: Program, mon
         monkeypatch.setenv("DISPLAY", display)
         done = program("view", "small.yaml")
         expected = (
-            "there is no display to open a window on; set DISPLAY, or film without one: --record FILE.gif --seconds N"
+            "there is no display to open a window on; set DISPLAY (or WAYLAND_DISPLAY), or film without one: "
+            "--record FILE.gif --seconds N"
         )
         assert (done.returncode, done.stdout, done.stderr) == (2, "", expected + "\n")
 
@@ -277,42 +277,117 @@ events:
         assert film.n_frames >= 1
 
 
-def event(kind: Any, key: str, x: float = 0, y: float = 0, shift: bool = False, wheel: int = 0) -> SimpleNamespace:
-    """What ti.GUI tells of a window of 400 x 300 pixels, of pixel (x, y) from its top left."""
-    at = x / 400, (299 - y) / 300
-    return SimpleNamespace(type=kind, key=key, pos=at, modifier=["Shift"] if shift else [], delta=(0, wheel))
+AREA = pygame.Rect(0, 0, 400, 300)
+
+
+def motion(*at: int) -> pygame.Event:
+    return pygame.Event(pygame.MOUSEMOTION, pos=at)
+
+
+def button(number: int, *at: int) -> pygame.Event:
+    return pygame.Event(pygame.MOUSEBUTTONDOWN, pos=at, button=number)
+
+
+def let_go(number: int, *at: int) -> pygame.Event:
+    return pygame.Event(pygame.MOUSEBUTTONUP, pos=at, button=number)
+
+
+def key(code: int, typed: str = "", place: int = 0) -> pygame.Event:
+    """A key that goes down: its code, what it types, and where it is on the keyboard."""
+    return pygame.Event(pygame.KEYDOWN, key=code, unicode=typed, scancode=place)
+
+
+def key_up(code: int) -> pygame.Event:
+    return pygame.Event(pygame.KEYUP, key=code)
 
 
 def test_what_the_hand_does() -> None:
-    press, release, motion = ti.GUI.PRESS, ti.GUI.RELEASE, ti.GUI.MOTION
     hand = Hand((400, 300))
 
-    def understood(*told: SimpleNamespace) -> list[Any]:
-        return list(hand.events(told))
+    def understood(*told: pygame.Event) -> list[Any]:
+        return list(hand.events(told, AREA))
 
-    assert understood(event(press, "LMB", 0, 0)) == [Press(0, 0)]
-    assert understood(event(motion, "Motion", 399, 299)) == [Drag(399, 299)]
-    assert understood(event(release, "LMB", 20, 30), event(motion, "Motion", 30, 30)) == [Release(), Point(30, 30)]
-    assert understood(event(press, "LMB", 200, 149, shift=True)) == [Press(200, 149, pull=True)]
-    understood(event(release, "LMB"))
-    one, other, after = understood(
-        event(press, "RMB", 100, 99),
-        event(motion, "Motion", 110, 99),
-        event(motion, "Motion", 115, 89),
-        event(release, "RMB", 115, 89),
-        event(motion, "Motion", 300, 10),
-    )
-    assert (one, other) == (pytest.approx(Turn(10, 0)), pytest.approx(Turn(5, -10)))
-    assert after == pytest.approx(Point(300, 10))
-    assert understood(event(motion, "Wheel", wheel=120), event(release, "Button4")) == [Harder(5)]
-    assert understood(event(motion, "Wheel", wheel=-120)) == [Harder(-5)]
-    for key, name in [(" ", "space"), ("m", "m"), ("=", "up"), ("KP_Add", "up"), ("Down", "down"), ("Escape", "q")]:
-        assert understood(event(press, key), event(release, key)) == [Key(name)]
-    held = [event(press, "p"), *[event(kind, "p") for kind in (release, press)] * 5]
-    assert understood(*held) == [Key("p")]
-    held = [event(press, "Up"), *[event(kind, "Up") for kind in (release, press)] * 5]
-    assert understood(*held) == [Key("up")] * 6
-    assert understood(event(press, "WMClose")) == [QUIT]
+    assert understood(motion(0, 0), motion(7, 8)) == [Point(0, 0), Point(7, 8)]
+    assert understood(button(1, 0, 0)) == [Press(0, 0)]
+    assert understood(motion(399, 299), motion(-20, 350)) == [Drag(399, 299), Drag(-20, 350)]
+    assert understood(let_go(1, 20, 30), motion(30, 30)) == [Release(), Point(30, 30)]
+    assert understood(key(pygame.K_RSHIFT), button(1, 200, 149)) == [Press(200, 149, pull=True)]
+    assert understood(key_up(pygame.K_RSHIFT), let_go(1, 0, 0), button(1, 0, 0)) == [Release(), Press(0, 0)]
+    understood(let_go(1, 0, 0))
+    assert understood(button(3, 100, 99), motion(110, 99), motion(115, 89), let_go(3, 115, 89), motion(300, 10)) == [
+        Turn(10, 0),
+        Turn(5, -10),
+        Point(300, 10),
+    ]
+    assert understood(button(2, 1, 1), motion(2, 2), let_go(2, 2, 2)) == [Point(2, 2)]
+    # The wheel is reported as buttons 4 and 5, too.
+    assert understood(button(4, 0, 0), let_go(4, 0, 0), pygame.Event(pygame.MOUSEWHEEL, x=0, y=1)) == [Harder(5)]
+    assert understood(pygame.Event(pygame.MOUSEWHEEL, x=1, y=-2)) == [Harder(-10)]
+    assert understood(pygame.Event(pygame.MOUSEWHEEL, x=1, y=0)) == []
+    assert understood(pygame.Event(pygame.QUIT)) == [QUIT]
+
+
+@pytest.mark.parametrize(
+    ("event", "name"),
+    [
+        (key(pygame.K_SPACE, " "), "space"),
+        (key(pygame.K_PERIOD, "."), "."),
+        (key(pygame.K_m, "m"), "m"),
+        (key(pygame.K_m, "M"), "m"),
+        (key(pygame.K_EQUALS, "="), "up"),
+        (key(pygame.K_KP_PLUS, "+"), "up"),
+        (key(pygame.K_UP), "up"),
+        (key(pygame.K_DOWN), "down"),
+        (key(pygame.K_MINUS, "-"), "down"),
+        (key(pygame.K_KP_MINUS, "-"), "down"),
+        (key(pygame.K_ESCAPE, "\x1b"), "q"),
+        # A French, a Swiss, and a Russian keyboard.
+        (key(pygame.K_SEMICOLON, ".", pygame.KSCAN_COMMA), "."),
+        (key(pygame.K_m, "m", pygame.KSCAN_SEMICOLON), "m"),
+        (key(pygame.K_1, "+", pygame.KSCAN_1), "up"),
+        (key(0x44C, "\u044c", pygame.KSCAN_M), "m"),
+        (key(pygame.K_c, "\x03"), None),
+        (key(pygame.K_TAB, "\t"), None),
+        (key(pygame.K_LCTRL), None),
+        (key(0xE9, "\u00e9", pygame.KSCAN_2), None),
+    ],
+)
+def test_keys_are_what_they_type(event: pygame.Event, name: str | None) -> None:
+    hand = Hand((400, 300))
+    expected = [Key(name)] if name else []
+    assert list(hand.events([event, key_up(event.key)], AREA)) == expected
+    assert list(hand.events([event] * 3, AREA)) == expected * (3 if name in ("up", "down") else 1), "held down"
+
+
+def test_a_hand_lets_go_where_another_window_gets_the_release() -> None:
+    lost = pygame.Event(pygame.WINDOWFOCUSLOST)
+    pressing, turning = Hand((400, 300)), Hand((400, 300))
+    told = [button(1, 9, 9), lost, motion(5, 5), let_go(1, 5, 5)]
+    assert list(pressing.events(told, AREA)) == [Press(9, 9), Release(), Point(5, 5)]
+    assert list(turning.events([button(3, 9, 9), lost, motion(5, 5)], AREA)) == [Point(5, 5)]
+
+
+def test_a_picture_fills_its_window_and_pixels_are_found_in_it() -> None:
+    assert placed((400, 300), (400, 300)) == AREA
+    assert placed((400, 300), (1000, 600)) == pygame.Rect(100, 0, 800, 600)
+    assert placed((400, 300), (200, 800)) == pygame.Rect(0, 325, 200, 150)
+    assert placed((400, 300), (1, 1)).size == (1, 1)
+    told = [motion(100, 0), motion(101, 1), motion(899, 599), motion(99, 600)]
+    assert list(Hand((400, 300)).events(told, placed((400, 300), (1000, 600)))) == [
+        # Every pixel takes 2 x 2; the first of them is a quarter of a pixel from its centre.
+        Point(-0.25, -0.25),
+        Point(0.25, 0.25),
+        Point(399.25, 299.25),
+        Point(-0.75, 299.75),
+    ]
+
+
+@pytest.mark.parametrize(
+    ("screen", "size"),
+    [((1920, 1080), (512, 512)), ((3840, 2160), (1024, 1024)), ((640, 480), (480, 480)), ((512, 512), (512, 512))],
+)
+def test_a_window_opens_as_large_as_its_screen_asks_for(screen: tuple[int, int], size: tuple[int, int]) -> None:
+    assert opening((512, 512), screen) == size
 
 
 class Clock:
