@@ -16,6 +16,7 @@ from typing import Any
 import numpy as np
 import pygame
 import pytest
+from numpy.typing import NDArray
 from PIL import Image
 
 from taichi_msm import load_scene
@@ -384,7 +385,7 @@ def test_a_picture_fills_its_window_and_pixels_are_found_in_it() -> None:
 
 @pytest.mark.parametrize(
     ("screen", "size"),
-    [((1920, 1080), (512, 512)), ((3840, 2160), (1024, 1024)), ((640, 480), (480, 480)), ((512, 512), (512, 512))],
+    [((1920, 1080), (512, 512)), ((3840, 2160), (1024, 1024)), ((1100, 3840), (512, 512)), ((640, 480), (480, 480))],
 )
 def test_a_window_opens_as_large_as_its_screen_asks_for(screen: tuple[int, int], size: tuple[int, int]) -> None:
     assert opening((512, 512), screen) == size
@@ -436,13 +437,43 @@ def test_what_was_missed_is_not_made_up_for() -> None:
     assert len(list(pacing.due())) <= LONGEST * 50 + 1
 
 
+class Screen:
+    """An X server of its own, without a screen, and a hand at its mouse and keyboard.
+
+    Args:
+        number: of the X server.
+        folder: where the server keeps what it shows.
+    """
+
+    def __init__(self, number: str, folder: Path) -> None:
+        self.environment = os.environ | {"DISPLAY": f":{number}"}
+        self._folder = folder
+
+    def hand(self, *words: str) -> str:
+        """Do what xdotool calls these words."""
+        return subprocess.run(
+            ["xdotool", *words], env=self.environment, check=True, stdout=subprocess.PIPE, text=True
+        ).stdout
+
+    def shown(self) -> NDArray[np.uint8]:
+        """What a person would see, shape (600, 800, 3)."""
+        content = (self._folder / "Xvfb_screen0").read_bytes()
+        # A file of xwd: a header, a table of colours of 12 bytes each, and rows of blue, green, red, unused.
+        header = np.frombuffer(content, ">u4", 25)
+        pixels = np.frombuffer(content, np.uint8, 600 * header[12], int(header[0] + 12 * header[19]))
+        return pixels.reshape(600, -1, 4)[:, :800, 2::-1]
+
+
 @pytest.fixture
-def screen(tmp_path: Path) -> Iterator[str]:
-    """An X server of its own without a screen."""
+def screen(tmp_path: Path) -> Iterator[Screen]:
+    if not (shutil.which("Xvfb") and shutil.which("xdotool")):
+        pytest.skip("needs Xvfb and xdotool")
+    folder = tmp_path / "screen"
+    folder.mkdir()
     read, write = os.pipe()
     with subprocess.Popen(
         # It would begin anew, and let nobody in meanwhile, whenever its last client goes.
-        ["Xvfb", "-noreset", "-displayfd", str(write), "-screen", "0", "800x600x24"],
+        ["Xvfb", "-noreset", "-displayfd", str(write), "-screen", "0", "800x600x24", "-fbdir", str(folder)],
         pass_fds=[write],
         stderr=subprocess.DEVNULL,
     ) as server:
@@ -450,64 +481,158 @@ def screen(tmp_path: Path) -> Iterator[str]:
         with os.fdopen(read) as answer:
             number = answer.readline().strip()
         try:
-            yield f":{number}"
+            yield Screen(number, folder)
         finally:
             server.terminate()
 
 
-@pytest.mark.skipif(not (shutil.which("Xvfb") and shutil.which("xdotool")), reason="needs Xvfb and xdotool")
-def test_the_window(small: Path, screen: str) -> None:
-    environment = os.environ | {"DISPLAY": screen}
+class Live:
+    """`taichi-msm view` in a window of 320 x 240 pixels.
 
-    def hand(*words: str) -> None:
-        subprocess.run(["xdotool", *words], env=environment, check=True)
+    Args:
+        screen: the screen.
+    """
 
-    size = ["--set", "render.size=[320,240]", "--set", "render.camera=oblique"]
+    def __init__(self, screen: Screen) -> None:
+        self._screen = screen
+        size = ["--set", "render.size=[320,240]", "--set", "render.camera=oblique"]
+        self.process = subprocess.Popen(
+            [sys.executable, "-m", "taichi_msm", "view", "small.yaml", "--threads", "2", "--out", "kept", *size],
+            env=screen.environment,
+            stdout=subprocess.PIPE,
+            stderr=subprocess.PIPE,
+            text=True,
+        )
+        self._window = screen.hand("search", "--sync", "--onlyvisible", "--pid", str(self.process.pid)).split()[0]
+
+    def hand(self, *words: str) -> None:
+        """Do what xdotool calls these words."""
+        self._screen.hand(*words)
+
+    def move(self, x: int, y: int, *words: str) -> None:
+        """Move the pointer to a pixel of the picture, and do what xdotool calls these words."""
+        self.hand("mousemove", "--window", self._window, str(x), str(y), *words)
+
+    def kept(self, kind: str, key: str, x: int = 160) -> Path:
+        """Press the key that keeps something until it is there: the window listens when all is compiled."""
+        known = set(Path("kept").glob(f"{kind}-*"))
+        for n in range(300):
+            self.move(x, 119 + n % 2, "key", key)
+            time.sleep(0.1)
+            if new := set(Path("kept").glob(f"{kind}-*")) - known:
+                return new.pop()
+            if self.process.poll() is not None:
+                break
+        self.process.kill()
+        raise AssertionError(f"there is no {kind}: {self.process.communicate()}")
+
+    def picture(self) -> NDArray[np.int64]:
+        """What the key keeps as a picture."""
+        with Image.open(self.kept("picture", "p")) as image:
+            return np.array(image).astype(int)
+
+    def until(self, met: Callable[[Scene], bool], x: int = 160) -> None:
+        """Wait for what a session has in its scene, as long as a busy machine may need."""
+        for _ in range(60):
+            if met(load_scene(self.kept("session", "w", x))):
+                return
+        self.process.kill()
+        raise AssertionError(f"never met: {self.process.communicate()}")
+
+
+def percents(scene: Scene) -> list[float]:
+    return [percent for _, percent in scene.probes[0].load]
+
+
+def test_the_window(small: Path, screen: Screen) -> None:
+    live = Live(screen)
+    before = live.picture()
+    live.move(160, 120, "mousedown", "1")
+    live.until(lambda scene: max(percents(scene)) == 100)
+    # The first place is where the tool began.
+    live.until(lambda scene: np.ptp(np.array(scene.probes[0].at)[1:, 1]) > 0.05, x=200)
+    # A notch of the wheel less, and pulling.
+    live.hand("mouseup", "1", "click", "5", "keydown", "shift", "mousedown", "1")
+    live.until(lambda scene: min(percents(scene)) == -95)
+    live.hand("mouseup", "1", "keyup", "shift", "mousedown", "3")
+    live.move(230, 140, "mouseup", "3")
+    live.until(lambda scene: scene.render.camera not in ("top", "oblique"))
+    live.hand("key", "minus", "key", "KP_Subtract", "key", "Down", "key", "Down")
+    live.hand("click", "4", "key", "plus", "key", "KP_Add", "mousedown", "1")
+    live.until(lambda scene: percents(scene)[-1] == 90)
+    # A key that is held down repeats, here until nothing is left.
+    live.hand("mouseup", "1", "keydown", "Down")
+    time.sleep(2)
+    live.hand("keyup", "Down", "key", "plus", "key", "plus", "key", "plus", "mousedown", "1")
+    live.until(lambda scene: percents(scene)[-1] == 15)
+    live.hand("mouseup", "1")
+    after = live.picture()
+    live.hand("key", "Escape")
+    out, err = live.process.communicate(timeout=60)
+    assert (live.process.returncode, err) == (0, "")
+    assert out.splitlines()[-1].startswith("kept/picture-")
+    assert np.abs(after - before).max() > 50
+
+
+@pytest.mark.parametrize(("number", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)])
+def test_signals_close_the_window(small: Path, screen: Screen, number: int, code: int) -> None:
+    live = Live(screen)
+    live.kept("picture", "p")
+    live.process.send_signal(number)
+    assert live.process.communicate(timeout=60)[1] == "interrupted\n"
+    assert live.process.returncode == code
+
+
+SHOWING = """\
+import sys
+import numpy as np
+from taichi_msm.viewer.window import Window
+picture = np.load("picture.npy")
+with Window("a", (320, 240)) as window:
+    for _ in sys.stdin:
+        print([*window.events()], flush=True)
+        window.show(picture)
+"""
+
+
+def test_the_screen_shows_the_picture(tmp_path: Path, screen: Screen) -> None:
+    """To the last bit, and where the window is larger, as large as fits, between black bars."""
+    random = np.random.default_rng(1)
+    picture = np.kron(random.integers(0, 256, (6, 8, 3), np.uint8), np.ones((40, 40, 1), np.uint8))
+    picture[:4] = random.integers(0, 256, (4, 320, 3), np.uint8)
+    np.save(tmp_path / "picture.npy", picture)
     with subprocess.Popen(
-        [sys.executable, "-m", "taichi_msm", "view", "small.yaml", "--threads", "2", "--out", "kept", *size],
-        env=environment,
+        [sys.executable, "-c", SHOWING],
+        env=screen.environment,
+        cwd=tmp_path,
+        stdin=subprocess.PIPE,
         stdout=subprocess.PIPE,
-        stderr=subprocess.PIPE,
         text=True,
     ) as process:
 
-        def kept(kind: str, key: str, x: int = 160) -> Path:
-            """Press the key that keeps something until it is there: the window listens when all is compiled."""
-            known = set(Path("kept").glob(f"{kind}-*"))
-            for n in range(300):
-                # Without a window manager keys go to the window into which the pointer moved.
-                hand("mousemove", str(x), str(119 + n % 2), "key", key)
-                time.sleep(0.1)
-                if new := set(Path("kept").glob(f"{kind}-*")) - known:
-                    return new.pop()
-                if process.poll() is not None:
-                    break
-            process.kill()
-            raise AssertionError(f"there is no {kind}: {process.communicate()}")
+        def shown() -> tuple[NDArray[np.uint8], str]:
+            """What is on the screen after some rounds, and the events of each."""
+            assert process.stdin is not None
+            assert process.stdout is not None
+            told = ""
+            for _ in range(20):
+                process.stdin.write("show\n")
+                process.stdin.flush()
+                told += process.stdout.readline()
+                time.sleep(0.02)
+            return screen.shown(), told
 
-        def until(met: Callable[[Scene], bool], x: int = 160) -> None:
-            """Wait for what a session has in its scene, as long as a busy machine may need."""
-            for _ in range(60):
-                if met(load_scene(kept("session", "w", x))):
-                    return
-            process.kill()
-            raise AssertionError(f"never met: {process.communicate()}")
-
-        with Image.open(kept("picture", "p")) as image:
-            before = np.array(image).astype(int)
-        hand("mousemove", "160", "120", "mousedown", "1")
-        until(lambda scene: max(percent for _, percent in scene.probes[0].load) == 100)
-        # The first place is where the tool began.
-        until(lambda scene: np.ptp(np.array(scene.probes[0].at)[1:, 1]) > 0.05, x=200)
-        # A notch of the wheel less, and pulling.
-        hand("mouseup", "1", "click", "5", "keydown", "shift", "mousedown", "1")
-        until(lambda scene: min(percent for _, percent in scene.probes[0].load) == -95)
-        hand("mouseup", "1", "keyup", "shift", "mousedown", "3", "mousemove", "230", "140", "mouseup", "3")
-        until(lambda scene: scene.render.camera not in ("top", "oblique"))
-        with Image.open(kept("picture", "p")) as image:
-            after = np.array(image).astype(int)
-        hand("key", "Escape")
-        out, err = process.communicate(timeout=60)
-    assert (process.returncode, err) == (0, "")
-    assert out.splitlines()[-1].startswith("kept/picture-")
-    assert np.abs(after - before).max() > 50
+        window = screen.hand("search", "--sync", "--onlyvisible", "--pid", str(process.pid)).split()[0]
+        whole, _ = shown()
+        np.testing.assert_array_equal(whole[180:420, 240:560], picture)
+        screen.hand("windowmove", window, "0", "0", "windowsize", "--sync", window, "800", "480")
+        shown()
+        screen.hand("mousemove", "100", "50")
+        whole, told = shown()
+        assert "[Point(x=9.75, y=24.75)]" in told
+        # The middles of the fields of 80 x 80 that are whole.
+        np.testing.assert_allclose(whole[39:480:80, 119:680:80], picture[19::40, 19::40], atol=1)
+        assert not whole[:, :80].any()
+        assert not whole[:, 720:].any()
+        assert not whole[480:].any()
+        process.communicate()
