@@ -8,6 +8,8 @@ import time
 from collections.abc import Iterable, Iterator
 from types import TracebackType
 
+import numpy as np
+
 from taichi_msm.errors import DeviceError, FilesError
 from taichi_msm.progress import Pause
 from taichi_msm.results.gif import Picture
@@ -25,7 +27,6 @@ if sys.platform not in ("win32", "darwin"):
 for _name, _value in ENVIRONMENT.items():
     os.environ.setdefault(_name, _value)
 
-import numpy as np  # noqa: E402
 import pygame  # noqa: E402
 
 # Our names for keys: by what they type, and by their codes in pygame.
@@ -61,7 +62,7 @@ class Window:
             with silenced(2):
                 pygame.display.init()
                 if pygame.display.get_driver() == "x11":
-                    # By way of OpenGL a picture takes longer, without a GPU ten times as long.
+                    # By way of OpenGL a picture takes longer, without a GPU several times as long.
                     os.environ.setdefault("SDL_FRAMEBUFFER_ACCELERATION", "0")
                 screen = pygame.display.get_desktop_sizes()[0]
                 self._window = pygame.Window(title, opening(size, screen), resizable=True)
@@ -120,9 +121,8 @@ def opening(picture: tuple[int, int], screen: tuple[int, int]) -> tuple[int, int
         picture: width, height [px].
         screen: width, height [px].
     """
-    times = min(screen[0] // (2 * picture[0]), screen[1] // (2 * picture[1]))
-    room = (picture[0] * max(1, times), picture[1] * max(1, times))
-    return placed(picture, (min(room[0], screen[0]), min(room[1], screen[1]))).size
+    times = max(1, min(screen[0] // (2 * picture[0]), screen[1] // (2 * picture[1])))
+    return placed(picture, (min(times * picture[0], screen[0]), min(times * picture[1], screen[1]))).size
 
 
 def placed(picture: tuple[int, int], window: tuple[int, int]) -> pygame.Rect:
