@@ -364,7 +364,6 @@ def view(
     from taichi_msm.viewer import recorder
     from taichi_msm.viewer.captures import Captures
     from taichi_msm.viewer.session import Session
-    from taichi_msm.viewer.window import Window, show
 
     tell([*drawing_notes(loaded)])
     captures, interruption = Captures(directory, scene), Interruption()
@@ -378,6 +377,8 @@ def view(
     try:
         with naming(scene):
             if record is None or seconds is None:
+                from taichi_msm.viewer.window import Window, show
+
                 with Window(f"taichi-msm {scene}", loaded.render.size) as window:
                     window.say("one moment: compiling")
                     with begin() as session:

@@ -106,3 +106,22 @@ def test_light_commands_do_not_import_the_compiler(arguments: list[str], root: P
 def test_importing_the_package_starts_nothing() -> None:
     code = "import sys, taichi_msm; sys.exit(bool({'taichi', 'quadrants', 'numpy'} & set(sys.modules)))"
     subprocess.run([sys.executable, "-c", code], check=True)
+
+
+def test_only_the_window_imports_pygame() -> None:
+    assert [path.stem for path in MODULES if "pygame" in third_party(path)] == ["window"]
+    assert [path.stem for path in MODULES if "viewer.window" in imports(path)] == ["cli"]
+
+
+def test_what_needs_no_window_does_not_load_pygame(small: Path) -> None:
+    commands = [
+        ["check", "small.yaml"],
+        ["run", "small.yaml", "--quiet"],
+        ["export", "output/small", "--format", "obj", "--quiet"],
+        ["view", "small.yaml", "--record", "a.gif", "--seconds", "0.2"],
+    ]
+    code = (
+        f"import sys; from taichi_msm.cli import main; codes = [main(words) for words in {commands}]; "
+        "sys.exit(any(codes) or 'pygame' in sys.modules)"
+    )
+    subprocess.run([sys.executable, "-c", code], check=True, stdout=subprocess.DEVNULL)

@@ -11,11 +11,12 @@ import time
 from collections.abc import Callable, Iterator
 from itertools import islice
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
+import pygame
 import pytest
+from numpy.typing import NDArray
 from PIL import Image
 
 from taichi_msm import load_scene
@@ -23,12 +24,11 @@ from taichi_msm.cli import main
 from taichi_msm.errors import SceneError
 from taichi_msm.results.folder import Folder
 from taichi_msm.scene import Scene
-from taichi_msm.system.runtime import ti
 from taichi_msm.viewer.events import Drag, Harder, Key, Percent, Point, Press, Release, Turn
 from taichi_msm.viewer.film import Film
 from taichi_msm.viewer.pacing import LONGEST, Pacing
 from taichi_msm.viewer.script import load_script, timed
-from taichi_msm.viewer.window import QUIT, Hand
+from taichi_msm.viewer.window import QUIT, Hand, opening, placed
 from tests.conftest import Program
 from tests.outputs import duration
 
@@ -200,7 +200,8 @@ def test_without_a_display_it_says_what_to_do(small: Path, program: Program, mon
         monkeypatch.setenv("DISPLAY", display)
         done = program("view", "small.yaml")
         expected = (
-            "there is no display to open a window on; set DISPLAY, or film without one: --record FILE.gif --seconds N"
+            "there is no display to open a window on; set DISPLAY (or WAYLAND_DISPLAY), or film without one: "
+            "--record FILE.gif --seconds N"
         )
         assert (done.returncode, done.stdout, done.stderr) == (2, "", expected + "\n")
 
@@ -277,42 +278,117 @@ events:
         assert film.n_frames >= 1
 
 
-def event(kind: Any, key: str, x: float = 0, y: float = 0, shift: bool = False, wheel: int = 0) -> SimpleNamespace:
-    """What ti.GUI tells of a window of 400 x 300 pixels, of pixel (x, y) from its top left."""
-    at = x / 400, (299 - y) / 300
-    return SimpleNamespace(type=kind, key=key, pos=at, modifier=["Shift"] if shift else [], delta=(0, wheel))
+AREA = pygame.Rect(0, 0, 400, 300)
+
+
+def motion(*at: int) -> pygame.Event:
+    return pygame.Event(pygame.MOUSEMOTION, pos=at)
+
+
+def button(number: int, *at: int) -> pygame.Event:
+    return pygame.Event(pygame.MOUSEBUTTONDOWN, pos=at, button=number)
+
+
+def let_go(number: int, *at: int) -> pygame.Event:
+    return pygame.Event(pygame.MOUSEBUTTONUP, pos=at, button=number)
+
+
+def key(code: int, typed: str = "", place: int = 0) -> pygame.Event:
+    """A key that goes down: its code, what it types, and where it is on the keyboard."""
+    return pygame.Event(pygame.KEYDOWN, key=code, unicode=typed, scancode=place)
+
+
+def key_up(code: int) -> pygame.Event:
+    return pygame.Event(pygame.KEYUP, key=code)
 
 
 def test_what_the_hand_does() -> None:
-    press, release, motion = ti.GUI.PRESS, ti.GUI.RELEASE, ti.GUI.MOTION
     hand = Hand((400, 300))
 
-    def understood(*told: SimpleNamespace) -> list[Any]:
-        return list(hand.events(told))
+    def understood(*told: pygame.Event) -> list[Any]:
+        return list(hand.events(told, AREA))
 
-    assert understood(event(press, "LMB", 0, 0)) == [Press(0, 0)]
-    assert understood(event(motion, "Motion", 399, 299)) == [Drag(399, 299)]
-    assert understood(event(release, "LMB", 20, 30), event(motion, "Motion", 30, 30)) == [Release(), Point(30, 30)]
-    assert understood(event(press, "LMB", 200, 149, shift=True)) == [Press(200, 149, pull=True)]
-    understood(event(release, "LMB"))
-    one, other, after = understood(
-        event(press, "RMB", 100, 99),
-        event(motion, "Motion", 110, 99),
-        event(motion, "Motion", 115, 89),
-        event(release, "RMB", 115, 89),
-        event(motion, "Motion", 300, 10),
-    )
-    assert (one, other) == (pytest.approx(Turn(10, 0)), pytest.approx(Turn(5, -10)))
-    assert after == pytest.approx(Point(300, 10))
-    assert understood(event(motion, "Wheel", wheel=120), event(release, "Button4")) == [Harder(5)]
-    assert understood(event(motion, "Wheel", wheel=-120)) == [Harder(-5)]
-    for key, name in [(" ", "space"), ("m", "m"), ("=", "up"), ("KP_Add", "up"), ("Down", "down"), ("Escape", "q")]:
-        assert understood(event(press, key), event(release, key)) == [Key(name)]
-    held = [event(press, "p"), *[event(kind, "p") for kind in (release, press)] * 5]
-    assert understood(*held) == [Key("p")]
-    held = [event(press, "Up"), *[event(kind, "Up") for kind in (release, press)] * 5]
-    assert understood(*held) == [Key("up")] * 6
-    assert understood(event(press, "WMClose")) == [QUIT]
+    assert understood(motion(0, 0), motion(7, 8)) == [Point(0, 0), Point(7, 8)]
+    assert understood(button(1, 0, 0)) == [Press(0, 0)]
+    assert understood(motion(399, 299), motion(-20, 350)) == [Drag(399, 299), Drag(-20, 350)]
+    assert understood(let_go(1, 20, 30), motion(30, 30)) == [Release(), Point(30, 30)]
+    assert understood(key(pygame.K_RSHIFT), button(1, 200, 149)) == [Press(200, 149, pull=True)]
+    assert understood(key_up(pygame.K_RSHIFT), let_go(1, 0, 0), button(1, 0, 0)) == [Release(), Press(0, 0)]
+    understood(let_go(1, 0, 0))
+    assert understood(button(3, 100, 99), motion(110, 99), motion(115, 89), let_go(3, 115, 89), motion(300, 10)) == [
+        Turn(10, 0),
+        Turn(5, -10),
+        Point(300, 10),
+    ]
+    assert understood(button(2, 1, 1), motion(2, 2), let_go(2, 2, 2)) == [Point(2, 2)]
+    # The wheel is reported as buttons 4 and 5, too.
+    assert understood(button(4, 0, 0), let_go(4, 0, 0), pygame.Event(pygame.MOUSEWHEEL, x=0, y=1)) == [Harder(5)]
+    assert understood(pygame.Event(pygame.MOUSEWHEEL, x=1, y=-2)) == [Harder(-10)]
+    assert understood(pygame.Event(pygame.MOUSEWHEEL, x=1, y=0)) == []
+    assert understood(pygame.Event(pygame.QUIT)) == [QUIT]
+
+
+@pytest.mark.parametrize(
+    ("event", "name"),
+    [
+        (key(pygame.K_SPACE, " "), "space"),
+        (key(pygame.K_PERIOD, "."), "."),
+        (key(pygame.K_m, "m"), "m"),
+        (key(pygame.K_m, "M"), "m"),
+        (key(pygame.K_EQUALS, "="), "up"),
+        (key(pygame.K_KP_PLUS, "+"), "up"),
+        (key(pygame.K_UP), "up"),
+        (key(pygame.K_DOWN), "down"),
+        (key(pygame.K_MINUS, "-"), "down"),
+        (key(pygame.K_KP_MINUS, "-"), "down"),
+        (key(pygame.K_ESCAPE, "\x1b"), "q"),
+        # A French, a Swiss, and a Russian keyboard.
+        (key(pygame.K_SEMICOLON, ".", pygame.KSCAN_COMMA), "."),
+        (key(pygame.K_m, "m", pygame.KSCAN_SEMICOLON), "m"),
+        (key(pygame.K_1, "+", pygame.KSCAN_1), "up"),
+        (key(0x44C, "\u044c", pygame.KSCAN_M), "m"),
+        (key(pygame.K_c, "\x03"), None),
+        (key(pygame.K_TAB, "\t"), None),
+        (key(pygame.K_LCTRL), None),
+        (key(0xE9, "\u00e9", pygame.KSCAN_2), None),
+    ],
+)
+def test_keys_are_what_they_type(event: pygame.Event, name: str | None) -> None:
+    hand = Hand((400, 300))
+    expected = [Key(name)] if name else []
+    assert list(hand.events([event, key_up(event.key)], AREA)) == expected
+    assert list(hand.events([event] * 3, AREA)) == expected * (3 if name in ("up", "down") else 1), "held down"
+
+
+def test_a_hand_lets_go_where_another_window_gets_the_release() -> None:
+    lost = pygame.Event(pygame.WINDOWFOCUSLOST)
+    pressing, turning = Hand((400, 300)), Hand((400, 300))
+    told = [button(1, 9, 9), lost, motion(5, 5), let_go(1, 5, 5)]
+    assert list(pressing.events(told, AREA)) == [Press(9, 9), Release(), Point(5, 5)]
+    assert list(turning.events([button(3, 9, 9), lost, motion(5, 5)], AREA)) == [Point(5, 5)]
+
+
+def test_a_picture_fills_its_window_and_pixels_are_found_in_it() -> None:
+    assert placed((400, 300), (400, 300)) == AREA
+    assert placed((400, 300), (1000, 600)) == pygame.Rect(100, 0, 800, 600)
+    assert placed((400, 300), (200, 800)) == pygame.Rect(0, 325, 200, 150)
+    assert placed((400, 300), (1, 1)).size == (1, 1)
+    told = [motion(100, 0), motion(101, 1), motion(899, 599), motion(99, 600)]
+    assert list(Hand((400, 300)).events(told, placed((400, 300), (1000, 600)))) == [
+        # Every pixel takes 2 x 2; the first of them is a quarter of a pixel from its centre.
+        Point(-0.25, -0.25),
+        Point(0.25, 0.25),
+        Point(399.25, 299.25),
+        Point(-0.75, 299.75),
+    ]
+
+
+@pytest.mark.parametrize(
+    ("screen", "size"),
+    [((1920, 1080), (512, 512)), ((3840, 2160), (1024, 1024)), ((1100, 3840), (512, 512)), ((640, 480), (480, 480))],
+)
+def test_a_window_opens_as_large_as_its_screen_asks_for(screen: tuple[int, int], size: tuple[int, int]) -> None:
+    assert opening((512, 512), screen) == size
 
 
 class Clock:
@@ -361,13 +437,43 @@ def test_what_was_missed_is_not_made_up_for() -> None:
     assert len(list(pacing.due())) <= LONGEST * 50 + 1
 
 
+class Screen:
+    """An X server of its own, without a screen, and a hand at its mouse and keyboard.
+
+    Args:
+        number: of the X server.
+        folder: where the server keeps what it shows.
+    """
+
+    def __init__(self, number: str, folder: Path) -> None:
+        self.environment = os.environ | {"DISPLAY": f":{number}"}
+        self._folder = folder
+
+    def hand(self, *words: str) -> str:
+        """Do what xdotool calls these words."""
+        return subprocess.run(
+            ["xdotool", *words], env=self.environment, check=True, stdout=subprocess.PIPE, text=True
+        ).stdout
+
+    def shown(self) -> NDArray[np.uint8]:
+        """What a person would see, shape (600, 800, 3)."""
+        content = (self._folder / "Xvfb_screen0").read_bytes()
+        # A file of xwd: a header, a table of colours of 12 bytes each, and rows of blue, green, red, unused.
+        header = np.frombuffer(content, ">u4", 25)
+        pixels = np.frombuffer(content, np.uint8, 600 * header[12], int(header[0] + 12 * header[19]))
+        return pixels.reshape(600, -1, 4)[:, :800, 2::-1]
+
+
 @pytest.fixture
-def screen(tmp_path: Path) -> Iterator[str]:
-    """An X server of its own without a screen."""
+def screen(tmp_path: Path) -> Iterator[Screen]:
+    if not (shutil.which("Xvfb") and shutil.which("xdotool")):
+        pytest.skip("needs Xvfb and xdotool")
+    folder = tmp_path / "screen"
+    folder.mkdir()
     read, write = os.pipe()
     with subprocess.Popen(
         # It would begin anew, and let nobody in meanwhile, whenever its last client goes.
-        ["Xvfb", "-noreset", "-displayfd", str(write), "-screen", "0", "800x600x24"],
+        ["Xvfb", "-noreset", "-displayfd", str(write), "-screen", "0", "800x600x24", "-fbdir", str(folder)],
         pass_fds=[write],
         stderr=subprocess.DEVNULL,
     ) as server:
@@ -375,64 +481,158 @@ def screen(tmp_path: Path) -> Iterator[str]:
         with os.fdopen(read) as answer:
             number = answer.readline().strip()
         try:
-            yield f":{number}"
+            yield Screen(number, folder)
         finally:
             server.terminate()
 
 
-@pytest.mark.skipif(not (shutil.which("Xvfb") and shutil.which("xdotool")), reason="needs Xvfb and xdotool")
-def test_the_window(small: Path, screen: str) -> None:
-    environment = os.environ | {"DISPLAY": screen}
+class Live:
+    """`taichi-msm view` in a window of 320 x 240 pixels.
 
-    def hand(*words: str) -> None:
-        subprocess.run(["xdotool", *words], env=environment, check=True)
+    Args:
+        screen: the screen.
+    """
 
-    size = ["--set", "render.size=[320,240]", "--set", "render.camera=oblique"]
+    def __init__(self, screen: Screen) -> None:
+        self._screen = screen
+        size = ["--set", "render.size=[320,240]", "--set", "render.camera=oblique"]
+        self.process = subprocess.Popen(
+            [sys.executable, "-m", "taichi_msm", "view", "small.yaml", "--threads", "2", "--out", "kept", *size],
+            env=screen.environment,
+            stdout=subprocess.PIPE,
+            stderr=subprocess.PIPE,
+            text=True,
+        )
+        self._window = screen.hand("search", "--sync", "--onlyvisible", "--pid", str(self.process.pid)).split()[0]
+
+    def hand(self, *words: str) -> None:
+        """Do what xdotool calls these words."""
+        self._screen.hand(*words)
+
+    def move(self, x: int, y: int, *words: str) -> None:
+        """Move the pointer to a pixel of the picture, and do what xdotool calls these words."""
+        self.hand("mousemove", "--window", self._window, str(x), str(y), *words)
+
+    def kept(self, kind: str, key: str, x: int = 160) -> Path:
+        """Press the key that keeps something until it is there: the window listens when all is compiled."""
+        known = set(Path("kept").glob(f"{kind}-*"))
+        for n in range(300):
+            self.move(x, 119 + n % 2, "key", key)
+            time.sleep(0.1)
+            if new := set(Path("kept").glob(f"{kind}-*")) - known:
+                return new.pop()
+            if self.process.poll() is not None:
+                break
+        self.process.kill()
+        raise AssertionError(f"there is no {kind}: {self.process.communicate()}")
+
+    def picture(self) -> NDArray[np.int64]:
+        """What the key keeps as a picture."""
+        with Image.open(self.kept("picture", "p")) as image:
+            return np.array(image).astype(int)
+
+    def until(self, met: Callable[[Scene], bool], x: int = 160) -> None:
+        """Wait for what a session has in its scene, as long as a busy machine may need."""
+        for _ in range(60):
+            if met(load_scene(self.kept("session", "w", x))):
+                return
+        self.process.kill()
+        raise AssertionError(f"never met: {self.process.communicate()}")
+
+
+def percents(scene: Scene) -> list[float]:
+    return [percent for _, percent in scene.probes[0].load]
+
+
+def test_the_window(small: Path, screen: Screen) -> None:
+    live = Live(screen)
+    before = live.picture()
+    live.move(160, 120, "mousedown", "1")
+    live.until(lambda scene: max(percents(scene)) == 100)
+    # The first place is where the tool began.
+    live.until(lambda scene: np.ptp(np.array(scene.probes[0].at)[1:, 1]) > 0.05, x=200)
+    # A notch of the wheel less, and pulling.
+    live.hand("mouseup", "1", "click", "5", "keydown", "shift", "mousedown", "1")
+    live.until(lambda scene: min(percents(scene)) == -95)
+    live.hand("mouseup", "1", "keyup", "shift", "mousedown", "3")
+    live.move(230, 140, "mouseup", "3")
+    live.until(lambda scene: scene.render.camera not in ("top", "oblique"))
+    live.hand("key", "minus", "key", "KP_Subtract", "key", "Down", "key", "Down")
+    live.hand("click", "4", "key", "plus", "key", "KP_Add", "mousedown", "1")
+    live.until(lambda scene: percents(scene)[-1] == 90)
+    # A key that is held down repeats, here until nothing is left.
+    live.hand("mouseup", "1", "keydown", "Down")
+    time.sleep(2)
+    live.hand("keyup", "Down", "key", "plus", "key", "plus", "key", "plus", "mousedown", "1")
+    live.until(lambda scene: percents(scene)[-1] == 15)
+    live.hand("mouseup", "1")
+    after = live.picture()
+    live.hand("key", "Escape")
+    out, err = live.process.communicate(timeout=60)
+    assert (live.process.returncode, err) == (0, "")
+    assert out.splitlines()[-1].startswith("kept/picture-")
+    assert np.abs(after - before).max() > 50
+
+
+@pytest.mark.parametrize(("number", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)])
+def test_signals_close_the_window(small: Path, screen: Screen, number: int, code: int) -> None:
+    live = Live(screen)
+    live.kept("picture", "p")
+    live.process.send_signal(number)
+    assert live.process.communicate(timeout=60)[1] == "interrupted\n"
+    assert live.process.returncode == code
+
+
+SHOWING = """\
+import sys
+import numpy as np
+from taichi_msm.viewer.window import Window
+picture = np.load("picture.npy")
+with Window("a", (320, 240)) as window:
+    for _ in sys.stdin:
+        print([*window.events()], flush=True)
+        window.show(picture)
+"""
+
+
+def test_the_screen_shows_the_picture(tmp_path: Path, screen: Screen) -> None:
+    """To the last bit, and where the window is larger, as large as fits, between black bars."""
+    random = np.random.default_rng(1)
+    picture = np.kron(random.integers(0, 256, (6, 8, 3), np.uint8), np.ones((40, 40, 1), np.uint8))
+    picture[:4] = random.integers(0, 256, (4, 320, 3), np.uint8)
+    np.save(tmp_path / "picture.npy", picture)
     with subprocess.Popen(
-        [sys.executable, "-m", "taichi_msm", "view", "small.yaml", "--threads", "2", "--out", "kept", *size],
-        env=environment,
+        [sys.executable, "-c", SHOWING],
+        env=screen.environment,
+        cwd=tmp_path,
+        stdin=subprocess.PIPE,
         stdout=subprocess.PIPE,
-        stderr=subprocess.PIPE,
         text=True,
     ) as process:
 
-        def kept(kind: str, key: str, x: int = 160) -> Path:
-            """Press the key that keeps something until it is there: the window listens when all is compiled."""
-            known = set(Path("kept").glob(f"{kind}-*"))
-            for n in range(300):
-                # Without a window manager keys go to the window into which the pointer moved.
-                hand("mousemove", str(x), str(119 + n % 2), "key", key)
-                time.sleep(0.1)
-                if new := set(Path("kept").glob(f"{kind}-*")) - known:
-                    return new.pop()
-                if process.poll() is not None:
-                    break
-            process.kill()
-            raise AssertionError(f"there is no {kind}: {process.communicate()}")
+        def shown() -> tuple[NDArray[np.uint8], str]:
+            """What is on the screen after some rounds, and the events of each."""
+            assert process.stdin is not None
+            assert process.stdout is not None
+            told = ""
+            for _ in range(20):
+                process.stdin.write("show\n")
+                process.stdin.flush()
+                told += process.stdout.readline()
+                time.sleep(0.02)
+            return screen.shown(), told
 
-        def until(met: Callable[[Scene], bool], x: int = 160) -> None:
-            """Wait for what a session has in its scene, as long as a busy machine may need."""
-            for _ in range(60):
-                if met(load_scene(kept("session", "w", x))):
-                    return
-            process.kill()
-            raise AssertionError(f"never met: {process.communicate()}")
-
-        with Image.open(kept("picture", "p")) as image:
-            before = np.array(image).astype(int)
-        hand("mousemove", "160", "120", "mousedown", "1")
-        until(lambda scene: max(percent for _, percent in scene.probes[0].load) == 100)
-        # The first place is where the tool began.
-        until(lambda scene: np.ptp(np.array(scene.probes[0].at)[1:, 1]) > 0.05, x=200)
-        # A notch of the wheel less, and pulling.
-        hand("mouseup", "1", "click", "5", "keydown", "shift", "mousedown", "1")
-        until(lambda scene: min(percent for _, percent in scene.probes[0].load) == -95)
-        hand("mouseup", "1", "keyup", "shift", "mousedown", "3", "mousemove", "230", "140", "mouseup", "3")
-        until(lambda scene: scene.render.camera not in ("top", "oblique"))
-        with Image.open(kept("picture", "p")) as image:
-            after = np.array(image).astype(int)
-        hand("key", "Escape")
-        out, err = process.communicate(timeout=60)
-    assert (process.returncode, err) == (0, "")
-    assert out.splitlines()[-1].startswith("kept/picture-")
-    assert np.abs(after - before).max() > 50
+        window = screen.hand("search", "--sync", "--onlyvisible", "--pid", str(process.pid)).split()[0]
+        whole, _ = shown()
+        np.testing.assert_array_equal(whole[180:420, 240:560], picture)
+        screen.hand("windowmove", window, "0", "0", "windowsize", "--sync", window, "800", "480")
+        shown()
+        screen.hand("mousemove", "100", "50")
+        whole, told = shown()
+        assert "[Point(x=9.75, y=24.75)]" in told
+        # The middles of the fields of 80 x 80 that are whole.
+        np.testing.assert_allclose(whole[39:480:80, 119:680:80], picture[19::40, 19::40], atol=1)
+        assert not whole[:, :80].any()
+        assert not whole[:, 720:].any()
+        assert not whole[480:].any()
+        process.communicate()

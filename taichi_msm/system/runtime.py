@@ -33,7 +33,6 @@ __all__ = [
     "Device",
     "Memory",
     "lanes",
-    "open_window",
     "our_compilation",
     "require_here",
     "start",
@@ -225,27 +224,6 @@ def require_here() -> None:
         )
     if thread != threading.get_ident():
         raise MsmError(f"{chosen().title} works in the thread that started it; simulate and draw there")
-
-
-def open_window(title: str, size: tuple[int, int]) -> Any:
-    """Open Taichi's window, which needs no GPU. Its `img` takes the pixels, one number each, rows from the top.
-
-    Args:
-        title: of the window.
-        size: width, height [px].
-
-    Raises:
-        DeviceError: when there is no display.
-    """
-    try:
-        with silenced(1, 2):
-            window = ti.GUI(title, res=size, fast_gui=True)
-    except RuntimeError:
-        raise DeviceError(
-            "there is no display to open a window on; set DISPLAY, or film without one: --record FILE.gif --seconds N"
-        ) from None
-    window.fps_limit = None
-    return window
 
 
 def our_compilation(*, optimised: bool = True) -> contextlib.AbstractContextManager[None]:

@@ -2,35 +2,49 @@
 
 from __future__ import annotations
 
+import os
 import sys
 import time
 from collections.abc import Iterable, Iterator
 from types import TracebackType
-from typing import Any
 
 import numpy as np
 
-from taichi_msm.errors import FilesError
+from taichi_msm.errors import DeviceError, FilesError
 from taichi_msm.progress import Pause
 from taichi_msm.results.gif import Picture
-from taichi_msm.system.runtime import open_window, ti
+from taichi_msm.system.silence import silenced
 from taichi_msm.viewer import hud
-from taichi_msm.viewer.events import NOTCH, Drag, Event, Harder, Key, Point, Press, Release, Turn
+from taichi_msm.viewer.events import KEYS, NOTCH, Drag, Event, Harder, Key, Point, Press, Release, Turn
 from taichi_msm.viewer.pacing import Pacing
 from taichi_msm.viewer.session import Session
 
-# Our names for the window's names of keys.
-NAMES = {" ": "space", "Escape": "q"}
-NAMES |= dict.fromkeys(("Up", "=", "+", "KP_Add"), "up") | dict.fromkeys(("Down", "-", "KP_Subtract"), "down")
+# No greeting on stdout, and the desktop's effects stay on.
+ENVIRONMENT = {"PYGAME_HIDE_SUPPORT_PROMPT": "1", "SDL_VIDEO_X11_NET_WM_BYPASS_COMPOSITOR": "0"}
+if sys.platform not in ("win32", "darwin"):
+    # Without this SDL draws into memory that nobody sees where there is no display.
+    ENVIRONMENT["SDL_VIDEODRIVER"] = "x11,wayland"
+for _name, _value in ENVIRONMENT.items():
+    os.environ.setdefault(_name, _value)
 
-# These keys repeat while they are held down; for all others, the keyboard's repetition is ignored.
+import pygame  # noqa: E402
+
+# Our names for keys: by what they type, and by their codes in pygame.
+TYPED = {" ": "space", "=": "up", "+": "up", "-": "down", "\x1b": "q"}
+ARROWS = {pygame.K_UP: "up", pygame.K_DOWN: "down"}
+SHIFT = {pygame.K_LSHIFT, pygame.K_RSHIFT}
+
+# These keys repeat while they are held down: after this time, and at this interval [ms].
 REPEATED = ("up", "down")
+REPETITION = 400, 40
+
+LEFT, RIGHT = 1, 3
 
 QUIT = Key("q")
 
 
 class Window:
-    """A window with a picture. Usable in a with statement, which closes it.
+    """A window with a picture, which is as large as fits into it. Usable in a with statement, which closes it.
 
     Args:
         title: of the window.
@@ -41,31 +55,52 @@ class Window:
     """
 
     def __init__(self, title: str, size: tuple[int, int]) -> None:
-        self._gui = open_window(title, size)
-        # The memory that the window shows: rows from the top; blue, green, red, an unused byte; on a Mac red is first.
-        self._shown = self._gui.img.view(np.uint8).reshape(size[1], size[0], 4)
-        self._shown[..., 3] = 255
-        self._places = (0, 1, 2) if sys.platform == "darwin" else (2, 1, 0)
+        self._size = size
         self._hand = Hand(size)
+        self._shown: Picture = np.zeros((size[1], size[0], 3), np.uint8)
+        try:
+            with silenced(2):
+                pygame.display.init()
+                if pygame.display.get_driver() == "x11":
+                    # By way of OpenGL a picture takes longer, without a GPU several times as long.
+                    os.environ.setdefault("SDL_FRAMEBUFFER_ACCELERATION", "0")
+                screen = pygame.display.get_desktop_sizes()[0]
+                self._window = pygame.Window(title, opening(size, screen), resizable=True)
+                self._window.get_surface()
+        except pygame.error:
+            raise DeviceError(
+                "there is no display to open a window on; set DISPLAY (or WAYLAND_DISPLAY), or film without one: "
+                "--record FILE.gif --seconds N"
+            ) from None
+        pygame.display.set_allow_screensaver(True)
+        pygame.key.set_repeat(*REPETITION)
 
     def show(self, picture: Picture) -> None:
         """Show a picture, shape (height, width, 3)."""
-        # One colour at a time takes an eighth of the time of all at once.
-        for channel, place in enumerate(self._places):
-            self._shown[..., place] = picture[..., channel]
-        self._gui.show()
+        self._shown = picture
+        # After the window was resized, its surface is another.
+        surface = self._window.get_surface()
+        area = placed(self._size, surface.get_size())
+        drawn = pygame.image.frombuffer(picture.data, self._size, "RGB")
+        if surface.get_size() == self._size:
+            surface.blit(drawn, area)
+        else:
+            surface.fill("black")
+            pygame.transform.smoothscale(drawn.convert(surface), area.size, surface.subsurface(area))
+        self._window.flip()
 
     def say(self, text: str) -> None:
         """Write a text over the picture that is shown."""
-        picture = self._shown[..., self._places]
+        # Some systems show a new window only when it asks for its events.
+        pygame.event.pump()
+        picture = self._shown.copy()
         hud.announce(picture, text)
         self.show(picture)
 
     def events(self) -> Iterator[Event]:
         """Give the events since the last call."""
-        # A window collects its events when it is shown.
-        self._gui.show()
-        yield from self._hand.events(self._gui.get_events())
+        told = pygame.event.get()
+        yield from self._hand.events(told, placed(self._size, self._window.get_surface().get_size()))
 
     def __enter__(self) -> Window:
         return self
@@ -73,7 +108,28 @@ class Window:
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        self._gui.close()
+        self._window.destroy()
+
+
+def opening(picture: tuple[int, int], screen: tuple[int, int]) -> tuple[int, int]:
+    """Choose the size of a new window.
+
+    It is the largest whole multiple of the picture's that takes at most half of the screen each way, or the picture's
+    own, or less if the screen is smaller.
+
+    Args:
+        picture: width, height [px].
+        screen: width, height [px].
+    """
+    times = max(1, min(screen[0] // (2 * picture[0]), screen[1] // (2 * picture[1])))
+    return placed(picture, (min(times * picture[0], screen[0]), min(times * picture[1], screen[1]))).size
+
+
+def placed(picture: tuple[int, int], window: tuple[int, int]) -> pygame.Rect:
+    """Place a picture in the middle of a window, as large as fits; both sizes are width, height [px]."""
+    scale = min(window[0] / picture[0], window[1] / picture[1])
+    width, height = (max(1, round(scale * side)) for side in picture)
+    return pygame.Rect((window[0] - width) // 2, (window[1] - height) // 2, width, height)
 
 
 class Hand:
@@ -87,41 +143,81 @@ class Hand:
         self._size = size
         self._pressing = False
         self._turning: tuple[float, float] | None = None
+        self._down: set[int] = set()
 
-    def events(self, told: Iterable[Any]) -> Iterator[Event]:
-        """Turn the reports of one moment, events of `ti.GUI`, into our events."""
-        before = None
+    def events(self, told: Iterable[pygame.Event], area: pygame.Rect) -> Iterator[Event]:
+        """Turn reports into our events.
+
+        Args:
+            told: events of pygame, in their order.
+            area: where the picture is in the window.
+        """
         for event in told:
-            # For a key that is held down, a release and a press are reported at the same time, again and again.
-            repeated = before is not None and before.type == ti.GUI.RELEASE and before.key == event.key
-            before = event
-            for understood in self._understood(event):
-                if not (repeated and isinstance(understood, Key) and understood.name not in REPEATED):
-                    yield understood
+            if event.type == pygame.QUIT:
+                yield QUIT
+            elif event.type == pygame.KEYDOWN:
+                name = named(event)
+                # A key that is held down is reported again and again.
+                if name is not None and (event.key not in self._down or name in REPEATED):
+                    yield Key(name)
+                self._down.add(event.key)
+            elif event.type == pygame.KEYUP:
+                self._down.discard(event.key)
+            elif event.type == pygame.MOUSEWHEEL:
+                if event.y != 0:
+                    yield Harder(NOTCH * event.y)
+            elif event.type in (pygame.MOUSEBUTTONDOWN, pygame.MOUSEBUTTONUP):
+                yield from self._button(event, *self._pixel(event.pos, area))
+            elif event.type == pygame.MOUSEMOTION:
+                yield from self._motion(*self._pixel(event.pos, area))
+            elif event.type == pygame.WINDOWFOCUSLOST:
+                # Whatever took the focus may get the release.
+                yield from self._release()
+                self._turning = None
 
-    def _understood(self, event: Any) -> Iterator[Event]:
-        width, height = self._size
-        x, y = event.pos[0] * width, height - 1 - event.pos[1] * height
-        pressed = event.type == ti.GUI.PRESS
-        if event.key == ti.GUI.EXIT:
-            yield QUIT
-        elif event.key == ti.GUI.LMB:
-            self._pressing = pressed
-            yield Press(x, y, "Shift" in event.modifier) if pressed else Release()
-        elif event.key == ti.GUI.RMB:
+    def _pixel(self, position: tuple[int, int], area: pygame.Rect) -> tuple[float, float]:
+        """Find the picture's pixel that is shown at a position in the window; whole numbers are pixels' centres."""
+        x, y = (
+            (at + 0.5 - begin) * pixels / extent - 0.5
+            for at, begin, pixels, extent in zip(position, area.topleft, self._size, area.size, strict=True)
+        )
+        return x, y
+
+    def _button(self, event: pygame.Event, x: float, y: float) -> Iterator[Event]:
+        pressed = event.type == pygame.MOUSEBUTTONDOWN
+        if event.button == LEFT and pressed:
+            self._pressing = True
+            yield Press(x, y, not SHIFT.isdisjoint(self._down))
+        elif event.button == LEFT:
+            yield from self._release()
+        elif event.button == RIGHT:
             self._turning = (x, y) if pressed else None
-        elif event.key == ti.GUI.WHEEL:
-            yield Harder(NOTCH if event.delta[1] > 0 else -NOTCH)
-        elif event.key == ti.GUI.MOVE:
-            if self._pressing:
-                yield Drag(x, y)
-            elif self._turning is None:
-                yield Point(x, y)
-            if self._turning is not None:
-                yield Turn(x - self._turning[0], y - self._turning[1])
-                self._turning = (x, y)
-        elif pressed:
-            yield Key(NAMES.get(event.key, event.key))
+
+    def _motion(self, x: float, y: float) -> Iterator[Event]:
+        if self._pressing:
+            yield Drag(x, y)
+        elif self._turning is None:
+            yield Point(x, y)
+        if self._turning is not None:
+            yield Turn(x - self._turning[0], y - self._turning[1])
+            self._turning = (x, y)
+
+    def _release(self) -> Iterator[Event]:
+        if self._pressing:
+            self._pressing = False
+            yield Release()
+
+
+def named(event: pygame.Event) -> str | None:
+    """Name the key that was pressed, as in `KEYS`; None if it is none of them.
+
+    A key is what it types, on every layout; where that is no Latin letter, it is the letter of a US keyboard there.
+    """
+    typed = event.unicode.lower()
+    if not typed.isascii():
+        typed = chr(ord("a") + event.scancode - pygame.KSCAN_A)
+    name = ARROWS.get(event.key) or TYPED.get(typed, typed)
+    return name if name in KEYS else None
 
 
 def show(session: Session, window: Window, pause: Pause) -> None:
