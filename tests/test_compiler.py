@@ -7,6 +7,7 @@ import os
 import subprocess
 import sys
 from collections.abc import Iterator
+from dataclasses import replace
 from importlib.util import find_spec
 from pathlib import Path
 from types import ModuleType
@@ -181,6 +182,10 @@ def test_replacements_are_in_place_for_a_while(device: runtime.Device) -> None:
     with pytest.raises(KeyboardInterrupt):
         interrupted()
     assert parts() == before
+
+
+def test_nothing_is_replaced_in_a_version_that_was_not_tested() -> None:
+    assert replace(chosen(), tested="0.0.1").shortcuts() == []
 
 
 @pytest.mark.parametrize(

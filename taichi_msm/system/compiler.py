@@ -1,4 +1,4 @@
-"""The compiler of our kernels: Taichi, or Quadrants, its kept fork. No other module knows which of them it is."""
+"""The compiler of our kernels: Taichi, or Quadrants, its maintained fork. No other module knows which of them it is."""
 
 from __future__ import annotations
 
@@ -89,12 +89,12 @@ class Compiler:
         return compiler
 
     def shortcuts(self) -> Parts:
-        """List what to replace while a kernel of ours is read.
+        """List what to replace while a kernel of ours is read; nothing in a version that was not tested.
 
         A compiler reads every kernel in every process, as the key of its cache is made from what it reads. Meanwhile it
         prepares, for every node, the source lines that an error would show: useful only to those who change a kernel.
         """
-        if "TAICHI_MSM_TRACEBACK" in os.environ:
+        if "TAICHI_MSM_TRACEBACK" in os.environ or self.version != self.tested:
             return []
         nodes = import_module(f"{self.name}.lang.ast.ast_transformer_utils")
         if self.name == "taichi":
