@@ -54,6 +54,7 @@ from taichi_msm.physics.kernel import (
     spring_forces,
 )
 from taichi_msm.system import resources
+from taichi_msm.system.compiler import chosen
 from taichi_msm.system.runtime import ITERATIONS_PER_THREAD, our_compilation, ti
 
 # Integers between the counters of two workers, so that each has a cache line of its own.
@@ -65,8 +66,8 @@ PAGE = 4096
 # The borders of a band: where its worker begins and where it ends.
 BEGIN, END = 0, 1
 
-# How many times a worker checks for its neighbour before it gives up: about 0.2 ms.
-PATIENCE = 40_000
+# How many times a worker looks for its neighbour before it gives up: for about 1.3 ms.
+PATIENCE = round(1.32e-3 / chosen().look)
 
 # After a worker has given up, a single worker steps for some time [s]. Where other programs want the cores, that is
 # four times the last such rest, halved for every HALF_LIFE that all workers have stepped since then; else it is the
