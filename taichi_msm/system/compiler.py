@@ -36,7 +36,7 @@ class Compiler:
         lock: on that folder, from the folder.
         tested: the version whose results on a CPU have the same bits as those of the other compiler.
         pythons: that it can be installed for.
-        look: time that a thread takes to look at what another one counts [s]; measured on Zen 5. Taichi's LLVM fences by
+        look: time that a thread takes to look at what another one counts [s]; measured on Zen 4. Taichi's LLVM fences by
             `mfence`, that of Quadrants by a locked `or`.
     """
 
