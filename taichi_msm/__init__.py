@@ -8,7 +8,15 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from taichi_msm.errors import ArgumentError, DeviceError, DivergedError, FilesError, MsmError, SceneError
+    from taichi_msm.errors import (
+        ArgumentError,
+        DeviceError,
+        DivergedError,
+        FilesError,
+        MsmError,
+        NotInstalledError,
+        SceneError,
+    )
     from taichi_msm.playback import Playback
     from taichi_msm.render.labels import Flow, Labels, Sight
     from taichi_msm.render.surface import Surface
@@ -21,7 +29,8 @@ __version__ = "0.1.0"
 
 _HOMES = {
     **dict.fromkeys(
-        ("ArgumentError", "DeviceError", "DivergedError", "FilesError", "MsmError", "SceneError"), "errors"
+        ("ArgumentError", "DeviceError", "DivergedError", "FilesError", "MsmError", "NotInstalledError", "SceneError"),
+        "errors",
     ),
     **dict.fromkeys(("Camera", "Instrument", "Light", "Probe", "Render", "Scene", "Sheet", "Springs", "Time"), "scene"),
     **dict.fromkeys(("Flow", "Labels", "Sight"), "render.labels"),
@@ -43,6 +52,7 @@ __all__ = [
     "Labels",
     "Light",
     "MsmError",
+    "NotInstalledError",
     "Playback",
     "Probe",
     "Render",

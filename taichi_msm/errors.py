@@ -51,11 +51,11 @@ class SceneError(MsmError):
 
 
 class DeviceError(MsmError):
-    """The requested arch or number of threads is not available, or the device left out part of its work."""
+    """The requested arch, number of threads or compiler is not available, or the device left out part of its work."""
 
 
 class NotInstalledError(MsmError):
-    """An optional package that the request needs is not installed; the message says how to install it."""
+    """A package that the request needs is not installed; the message says how to install it."""
 
 
 class ArgumentError(MsmError, ValueError):

@@ -119,6 +119,6 @@ def test_without_vtk_there_is_one_line(
 ) -> None:
     monkeypatch.setitem(sys.modules, "vtkmodules.vtkIOXML", None)
     done = program("export", str(ran), "--format", "vtk", "--out", str(tmp_path / "out"))
-    error = '--format vtk: needs VTK, which is not installed; pip install "taichi-msm[export]"\n'
+    error = "--format vtk: needs VTK, which is not installed; pip install vtk\n"
     assert (done.returncode, done.stdout, done.stderr) == (2, "", error)
     assert not (tmp_path / "out").exists()

@@ -49,7 +49,7 @@ def write_vtk(run: FinishedRun, folder: Folder, progress: Count) -> list[str]:
     try:
         import vtkmodules.vtkIOXML  # noqa: F401
     except ImportError:
-        said = '--format vtk: needs VTK, which is not installed; pip install "taichi-msm[export]"'
+        said = "--format vtk: needs VTK, which is not installed; pip install vtk"
         raise NotInstalledError(said) from None
     positions, picture = run.positions(), picture_png(run)
     run.require_pictures(drawn=False)

@@ -30,7 +30,7 @@ from taichi_msm.system.compiler import named
 
 PICTURE, FLAT, PAGE, RECORD = "study.png", "study.csv", "study.md", "study.json"
 
-WITHOUT_MATPLOTLIB = 'study.png needs matplotlib: pip install "taichi-msm[report]"'
+WITHOUT_MATPLOTLIB = "study.png needs matplotlib: pip install matplotlib"
 
 COLUMNS = (
     "part",

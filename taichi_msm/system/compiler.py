@@ -13,7 +13,7 @@ from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
-from taichi_msm.errors import NotInstalledError, did_you_mean
+from taichi_msm.errors import DeviceError, NotInstalledError, did_you_mean
 
 __all__ = ["CHOICE", "COMPILERS", "Compiler", "Parts", "chosen", "named", "what_decides_bits"]
 
@@ -36,7 +36,7 @@ class Compiler:
         lock: on that folder, from the folder.
         tested: the version whose results on a CPU have the same bits as those of the other compiler.
         pythons: that it can be installed for.
-        look: time that a thread takes to look at what another one counts [s]; measured on Zen 4. Taichi's LLVM fences by
+        look: time of a look at a counter that another thread writes [s], measured on Zen 4: Taichi's LLVM fences it by
             `mfence`, that of Quadrants by a locked `or`.
     """
 
@@ -158,12 +158,13 @@ def chosen() -> Compiler:
     """Choose the compiler, without importing it.
 
     Raises:
-        NotInstalledError: when the one that the environment asks for is not known or not installed, or none is.
+        DeviceError: when the one that the environment asks for is not known.
+        NotInstalledError: when it, or any, is not installed.
     """
     wanted = os.environ.get(CHOICE)
     if wanted and wanted not in COMPILERS:
         near = did_you_mean(wanted, list(COMPILERS))
-        raise NotInstalledError(f"{CHOICE}: {wanted!r} is not a compiler; take {' or '.join(COMPILERS)}{near}")
+        raise DeviceError(f"{CHOICE}: {wanted!r} is not a compiler; take {' or '.join(COMPILERS)}{near}")
     candidates = [COMPILERS[wanted]] if wanted else list(COMPILERS.values())
     for one in candidates:
         if find_spec(one.name) is not None:
