@@ -301,7 +301,7 @@ def machine_table(found: Results) -> str:
     ]
     for points, bandwidth in found["bandwidth"].items():
         rows.append([f"triad over the state of {points} × {points} points", f"{bandwidth / 1e9:.0f} GB/s"])
-    rows.append(["launch of an empty kernel of Taichi", duration(found["launch"])])
+    rows.append(["launch of an empty kernel", duration(found["launch"])])
     rows.append([f"`advance(1)` of {bounds.SMALLEST} × {bounds.SMALLEST} points", duration(found["one_step"])])
     return table(["what", "measured"], rows)
 

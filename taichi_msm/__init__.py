@@ -1,6 +1,6 @@
 """Deform an image as tissue deforms.
 
-The names of the API are imported when they are first used, so that `import taichi_msm` does not start Taichi.
+The names of the API are imported when they are first used, so that `import taichi_msm` does not start the compiler.
 """
 
 from __future__ import annotations

@@ -74,7 +74,8 @@ def tell_version(context: click.Context, _option: click.Parameter, asked: bool) 
     if asked:
         from taichi_msm.system.compiler import chosen
 
-        click.echo(f"taichi-msm {__version__}, {chosen().title} {chosen().version}")
+        click.echo(f"taichi-msm {__version__}")
+        click.echo(f"{chosen().title} {chosen().version}")
         context.exit()
 
 

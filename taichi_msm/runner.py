@@ -8,6 +8,7 @@ import sys
 import time
 from collections.abc import Mapping, Sequence
 from contextlib import ExitStack, closing, suppress
+from dataclasses import replace
 from functools import partial
 from operator import attrgetter
 from pathlib import Path
@@ -141,18 +142,24 @@ def run(
         sha256,
         versions(),
     )
-    if _is_begun(manifest, Path(directory)):
+    if begun := _begun(manifest, Path(directory)):
         with suppress(DamagedError):
-            return _carry_out(manifest, Path(directory), device, texture, watch, progress, resumes=True)
+            return _carry_out(_with_versions(begun), Path(directory), device, texture, watch, progress, resumes=True)
     return _carry_out(manifest, Path(directory), device, texture, watch, progress, resumes=False)
 
 
-def _is_begun(manifest: Manifest, directory: Path) -> bool:
-    """Tell whether a directory has an unfinished run whose results have the same bits as those of this one."""
+def _begun(manifest: Manifest, directory: Path) -> Manifest | None:
+    """Find the unfinished run in a directory whose results have the same bits as those of this one."""
     try:
-        return manifest.gives_the_bits_of(read_manifest(directory))
+        found = read_manifest(directory)
     except (FilesError, SceneError):
-        return False
+        return None
+    return replace(manifest, versions=found.versions) if manifest.gives_the_bits_of(found) else None
+
+
+def _with_versions(begun: Manifest) -> Manifest:
+    """Add the versions of this process, whose compiler may be another one, to those of the process that began a run."""
+    return replace(begun, versions={**begun.versions, **versions()})
 
 
 def resume(
@@ -188,7 +195,7 @@ def resume(
     texture = load_texture(manifest.scene, manifest.sha256.get("image")) if manifest.scene.draws else None
     device = runtime.start(manifest.arch, threads)
     watch.lap("startup")
-    return _carry_out(manifest, Path(directory), device, texture, watch, progress, resumes=True)
+    return _carry_out(_with_versions(manifest), Path(directory), device, texture, watch, progress, resumes=True)
 
 
 def _carry_out(
@@ -304,7 +311,7 @@ def _carry_out(
         seconds = {stage: watch.seconds.get(stage, 0.0) for stage in stages}
         record["timings"] = {**seconds, "encode": writer.encode_seconds, "total": watch.total()}
         record |= {"arch": device.arch, "device": device.name, "threads": device.threads, "lanes": simulation.lanes}
-        record |= {"workers": simulation.workers, "versions": {**manifest.versions, **versions()}}
+        record |= {"workers": simulation.workers, "versions": manifest.versions}
         return cast(RunRecord, writer.publish(record))
 
 

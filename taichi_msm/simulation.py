@@ -58,7 +58,7 @@ class Simulation:
         MsmError: here and in all methods, in any thread but that of the first simulation, or in a process that was
             forked after it.
         ArgumentError: here and in all methods, when an argument is not what it must be.
-        DeviceError: when the arch is not available, or Taichi already runs on another one in this process.
+        DeviceError: when the arch is not available, or the compiler already runs on another one in this process.
         SceneError: when the scene cannot be run, or no step meets its tolerance.
 
     Attributes:

@@ -10,15 +10,14 @@ from collections.abc import Iterator
 from dataclasses import replace
 from importlib.util import find_spec
 from pathlib import Path
-from types import ModuleType
 
 import pytest
 
 from taichi_msm import load_scene, run
 from taichi_msm.cli import main
 from taichi_msm.errors import DeviceError, NotInstalledError
-from taichi_msm.system import compiler, runtime
-from taichi_msm.system.compiler import COMPILERS, chosen, named, what_decides_bits
+from taichi_msm.system import runtime
+from taichi_msm.system.compiler import COMPILERS, Compiler, chosen, named, what_decides_bits
 from tests.outputs import results
 
 # Run kernels with an error: one of a user, after one of ours was read; and one in the place of ours.
@@ -55,7 +54,7 @@ except Exception as error:
 def installed(monkeypatch: pytest.MonkeyPatch) -> Iterator[set[str]]:
     """The compilers that can be found; those of this environment are not looked for."""
     found = {"taichi", "quadrants"}
-    monkeypatch.setattr(compiler, "find_spec", lambda name: ModuleType(name) if name in found else None)
+    monkeypatch.setattr(Compiler, "version", property(lambda one: one.tested if one.name in found else ""))
     monkeypatch.delenv("TAICHI_MSM_COMPILER", raising=False)
     chosen.cache_clear()
     yield found
@@ -108,23 +107,53 @@ def test_a_compiler_that_is_not_there(
     assert str(caught.value).startswith(said)
 
 
-@pytest.mark.parametrize("command", [["run", "scenes/press.yaml"], ["--version"]])
-def test_the_command_line_says_so_in_a_line(command: list[str], root: Path) -> None:
+@pytest.mark.parametrize(
+    ("command", "code", "shown"), [("run", 2, ""), ("--version", 2, "taichi-msm 0.1.0\n"), ("check", 0, "image: ")]
+)
+def test_the_command_line_says_so_in_a_line_where_it_needs_one(command: str, code: int, shown: str, root: Path) -> None:
     done = subprocess.run(
-        [sys.executable, "-m", "taichi_msm", *command],
+        [sys.executable, "-m", "taichi_msm", command, *(() if command == "--version" else ("scenes/press.yaml",))],
         cwd=root,
         env={**os.environ, "TAICHI_MSM_COMPILER": "numba"},
         capture_output=True,
         text=True,
     )
-    said = "TAICHI_MSM_COMPILER: 'numba' is not a compiler; take taichi or quadrants\n"
+    said = "TAICHI_MSM_COMPILER: 'numba' is not a compiler; take taichi or quadrants\n" if code else ""
+    assert (done.returncode, done.stdout[: len(shown) or None], done.stderr) == (code, shown, said)
+
+
+def test_a_compiler_that_cannot_be_imported(tmp_path: Path, root: Path) -> None:
+    (tmp_path / chosen().name).mkdir()
+    (tmp_path / chosen().name / "__init__.py").write_text("raise ImportError('libfoo.so is missing')")
+    done = subprocess.run(
+        [sys.executable, "-m", "taichi_msm", "run", root / "scenes" / "press.yaml"],
+        cwd=tmp_path,
+        env={**os.environ, "PYTHONPATH": os.pathsep.join((str(tmp_path), str(root)))},
+        capture_output=True,
+        text=True,
+    )
+    said = f"{chosen().title} cannot be imported: libfoo.so is missing; {chosen().remedy}\n"
     assert (done.returncode, done.stdout, done.stderr) == (2, "", said)
+
+
+def test_a_folder_with_its_name_is_no_compiler(tmp_path: Path, root: Path) -> None:
+    for name in COMPILERS:
+        (tmp_path / name).mkdir()
+    done = subprocess.run(
+        [sys.executable, "-m", "taichi_msm", "--version"],
+        cwd=tmp_path,
+        env={**os.environ, "PYTHONPATH": str(root)},
+        capture_output=True,
+        text=True,
+        check=True,
+    )
+    assert done.stdout.endswith(f"\n{chosen().title} {chosen().version}\n")
 
 
 def test_the_version_names_the_compiler(capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["--version"]) == 0
     version = ".".join(str(part) for part in runtime.ti.__version__)
-    assert capsys.readouterr().out == f"taichi-msm 0.1.0, {chosen().title} {version}\n"
+    assert capsys.readouterr().out == f"taichi-msm 0.1.0\n{chosen().title} {version}\n"
 
 
 def test_a_record_names_its_compiler() -> None:

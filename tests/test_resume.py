@@ -26,7 +26,7 @@ from taichi_msm.results.publication import MANIFEST, POSITIONS, STATE
 from taichi_msm.results.record import RunRecord
 from taichi_msm.scene import Scene
 from taichi_msm.scenefile.load import load_scene
-from taichi_msm.system.compiler import chosen
+from taichi_msm.system.compiler import COMPILERS, chosen
 from taichi_msm.system.runtime import Device
 from tests.outputs import files, results
 from tests.scenes import speckle
@@ -221,6 +221,21 @@ def test_what_is_damaged_is_not_gone_on_with(
     assert files(small / "parts") == before
     # The scene itself is run as if nothing were there, or what there is were another's.
     assert run(made, "parts", threads=device.threads)["resumed"] == 0
+
+
+def test_a_run_begins_anew_unless_its_compiler_has_the_same_bits(
+    small: Path, device: Device, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    made, mine = dragged("time.duration=0.2", "output=[trajectory]"), runner.versions()
+    other = next(one for one in COMPILERS.values() if one is not chosen())
+    rest = {name: version for name, version in mine.items() if name != chosen().name}
+    for there, goes_on in (({other.name: other.tested}, True), ({chosen().name: "0.0.1"}, False)):
+        interrupted(made, "parts", device)
+        with monkeypatch.context() as patch:
+            patch.setattr(runner, "versions", lambda there=there: {**rest, **there})
+            record = run(made, "parts", threads=device.threads)
+        assert (record["resumed"] > 0) == goes_on
+        assert record["versions"] == {**(mine if goes_on else rest), **there}
 
 
 def test_another_picture_or_version_is_not_gone_on_with(

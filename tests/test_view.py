@@ -200,8 +200,8 @@ def test_without_a_display_it_says_what_to_do(small: Path, program: Program, mon
         monkeypatch.setenv("DISPLAY", display)
         done = program("view", "small.yaml")
         expected = (
-            "there is no display to open a window on; set DISPLAY (or WAYLAND_DISPLAY), or film without one: "
-            "--record FILE.gif --seconds N"
+            "no window can be opened (SDL: x11,wayland not available); set DISPLAY (or WAYLAND_DISPLAY), or film "
+            "without one: --record FILE.gif --seconds N"
         )
         assert (done.returncode, done.stdout, done.stderr) == (2, "", expected + "\n")
 

@@ -18,6 +18,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from taichi_msm.errors import MsmError
 from taichi_msm.physics.pilots import ENOUGH, choose_pilots
 from taichi_msm.physics.timestep import time_grid
 from taichi_msm.physics.workload import work
@@ -114,7 +115,7 @@ def _calibrate() -> float:
 
 
 def _file() -> Path:
-    """Name the file, in the folder of compiled kernels; RuntimeError: there is no home."""
+    """Name the file, in the folder of compiled kernels; RuntimeError: there is no home; MsmError: no compiler."""
     return chosen().folder() / "taichi-msm.json"
 
 
@@ -133,14 +134,14 @@ def _read() -> Kept:
             found = json.loads(opened.read(MAX_BYTES))
         parts = found["parts"] if found["machine"] == _machine() else {}
         pairs = {str(name): (float(seconds), float(amount)) for name, (seconds, amount) in parts.items()}
-    except (OSError, ValueError, TypeError, LookupError, AttributeError, ArithmeticError, RuntimeError):
+    except (OSError, ValueError, TypeError, LookupError, AttributeError, ArithmeticError, RuntimeError, MsmError):
         return {}
     return {name: pair for name, pair in pairs.items() if pair[1] > 0 and FASTEST <= pair[0] / pair[1] <= SLOWEST}
 
 
 def _write(kept: Kept) -> None:
     """Replace what is kept, whole or not at all, if there is a folder of compiled kernels."""
-    with suppress(OSError, RuntimeError):
+    with suppress(OSError, RuntimeError, MsmError):
         file = _file()
         staged = file.with_name(f".taichi-msm-{os.getpid()}")
         with staged.open("x") as new:

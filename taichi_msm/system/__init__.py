@@ -1,1 +1,1 @@
-"""The machine: Taichi, cores and memory, signals, streams."""
+"""The machine: the compiler, cores and memory, signals, streams."""

@@ -9,7 +9,6 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cache
 from importlib import import_module
-from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
@@ -51,10 +50,13 @@ class Compiler:
 
     @property
     def version(self) -> str:
-        """The version that is installed."""
+        """The version that is installed; empty if none is."""
         from importlib import metadata
 
-        return metadata.version(self.name)
+        try:
+            return metadata.version(self.name)
+        except metadata.PackageNotFoundError:
+            return ""
 
     @property
     def remedy(self) -> str:
@@ -75,7 +77,11 @@ class Compiler:
         return Path(os.environ.get(self.folder_variable) or Path.home() / self.cache)
 
     def load(self) -> Any:
-        """Import it, without its banner on stdout, which may be JSON, and its look for a newer version."""
+        """Import it, without its banner on stdout, which may be JSON, and its look for a newer version.
+
+        Raises:
+            NotInstalledError: when it cannot be imported.
+        """
         if not os.environ.get("HOME"):
             # Without HOME, it aborts the process.
             os.environ.pop("HOME", None)
@@ -86,10 +92,13 @@ class Compiler:
         # In a notebook, it reports on import that it is in one. This level is for the import only; `init` sets its own.
         level = f"{self.prefix}_LOG_LEVEL"
         silent = os.environ.setdefault(level, "error") == "error"
-        compiler = import_module(self.name)
-        if silent:
-            del os.environ[level]
-        return compiler
+        try:
+            return import_module(self.name)
+        except ImportError as error:
+            raise NotInstalledError(f"{self.title} cannot be imported: {error}; {self.remedy}") from error
+        finally:
+            if silent:
+                del os.environ[level]
 
     def shortcuts(self) -> Parts:
         """List what to replace while a kernel of ours is read; nothing in a version that was not tested.
@@ -167,7 +176,7 @@ def chosen() -> Compiler:
         raise DeviceError(f"{CHOICE}: {wanted!r} is not a compiler; take {' or '.join(COMPILERS)}{near}")
     candidates = [COMPILERS[wanted]] if wanted else list(COMPILERS.values())
     for one in candidates:
-        if find_spec(one.name) is not None:
+        if one.version:
             return one
     if wanted:
         raise NotInstalledError(f"{CHOICE}: {wanted} is not installed; {candidates[0].remedy}, or unset {CHOICE}")

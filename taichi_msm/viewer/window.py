@@ -46,6 +46,8 @@ QUIT = Key("q")
 class Window:
     """A window with a picture, which is as large as fits into it. Usable in a with statement, which closes it.
 
+    There may be one window at a time: it takes all events of the process.
+
     Args:
         title: of the window.
         size: width, height of the picture [px].
@@ -67,9 +69,9 @@ class Window:
                 screen = pygame.display.get_desktop_sizes()[0]
                 self._window = pygame.Window(title, opening(size, screen), resizable=True)
                 self._window.get_surface()
-        except pygame.error:
+        except pygame.error as error:
             raise DeviceError(
-                "there is no display to open a window on; set DISPLAY (or WAYLAND_DISPLAY), or film without one: "
+                f"no window can be opened (SDL: {error}); set DISPLAY (or WAYLAND_DISPLAY), or film without one: "
                 "--record FILE.gif --seconds N"
             ) from None
         pygame.display.set_allow_screensaver(True)
@@ -86,7 +88,7 @@ class Window:
             surface.blit(drawn, area)
         else:
             surface.fill("black")
-            pygame.transform.smoothscale(drawn.convert(surface), area.size, surface.subsurface(area))
+            surface.blit(pygame.transform.smoothscale(drawn, area.size), area)
         self._window.flip()
 
     def say(self, text: str) -> None:
