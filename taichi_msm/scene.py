@@ -92,7 +92,7 @@ class _Checked(ModelMetaclass):
         try:
             return super().__call__(**keys)  # type: ignore[misc]
         except ValidationError as error:
-            raise SceneError([str(problem) for problem in faults.problems(error, cls, keys)]) from None
+            raise SceneError([str(problem) for problem in faults.key_problems(error, cls, keys)]) from None
 
 
 class Section(BaseModel, metaclass=_Checked):

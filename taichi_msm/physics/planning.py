@@ -56,7 +56,7 @@ def try_plan(scene: Scene, image: MapImage | None = None) -> tuple[Plan | None, 
     steps = timestep.steps_per_frame(scene.time, limit)
     grid = TimeGrid(scene.time.frames_per_second, scene.time.frames, steps, "f64")
     plan = on(Plan(scene, image, fixed, made, limit, grid, probe_slots(scene.probes, scene.sheet, grid.step)), "cpu")
-    return plan, list(timestep.problems(plan))
+    return plan, list(timestep.step_problems(plan))
 
 
 def on(plan: Plan, arch: str) -> Plan:

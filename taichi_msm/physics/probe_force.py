@@ -173,7 +173,7 @@ def in_words(record: ProbeRecord) -> str:
     return f"{record['total_force']:.3g} N in all{flat}, at most {record['largest_pressure'] / 1000:.3g} kPa"
 
 
-def notes(scene: Scene, records: Sequence[ProbeRecord]) -> Iterator[str]:
+def force_notes(scene: Scene, records: Sequence[ProbeRecord]) -> Iterator[str]:
     """Note the probes whose forces do not add up to their total on this sheet.
 
     Args:
