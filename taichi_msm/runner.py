@@ -455,12 +455,12 @@ def _asked(given: Scene, scene: Scene) -> dict[str, Any]:
 
 def error_record(estimate: Estimate, mesh: MeshEstimate | None = None) -> dict[str, Any]:
     """Write an estimate for run.json, where null stands for what is not known."""
-    found = {key: getattr(estimate, key) for key in ("error", "rounding", "in_f64", "order", "at_least")}
+    fields = {key: getattr(estimate, key) for key in ("error", "rounding", "in_f64", "order", "at_least")}
     if not estimate.parted:
-        found |= {"rounding": None, "in_f64": None}
+        fields |= {"rounding": None, "in_f64": None}
     if mesh is not None:
-        found |= {"mesh_error": mesh.error, "mesh_doubt": mesh.doubt}
-    return {key: None if value == math.inf else value for key, value in found.items()}
+        fields |= {"mesh_error": mesh.error, "mesh_doubt": mesh.doubt}
+    return {key: None if value == math.inf else value for key, value in fields.items()}
 
 
 def versions() -> dict[str, str]:

@@ -116,7 +116,7 @@ def load_script(path: str | Path, size: tuple[int, int]) -> Script:
     script, problems = parse(Script, draft.data)
     draft.report(problems)
     draft.report(_outside(script, size) if script is not None else ())
-    if script is None or draft.found:
+    if script is None or draft.problems:
         raise SceneError(draft.lines())
     return script
 
