@@ -353,7 +353,7 @@ def test_a_film_without_a_picture_is_none(begin: Begin) -> None:
     session = begin(TILTED)
     session.handle(Key("g"))
     session.handle(Key("g"))
-    assert session.notice == "the film had no picture yet"
+    assert session.notice == "no film was saved: it had no picture yet"
     assert list(Path("captures").iterdir()) == []
 
 
@@ -433,7 +433,7 @@ def test_two_albums_of_one_folder_keep_both_films(begin: Begin) -> None:
 
 def test_a_name_of_two_lines_is_one_in_the_comment(small: Path) -> None:
     keeper = Captures(Path("captures"), "a\nb: [.yaml")
-    assert load_scene(keeper.keep_scene(load_scene("small.yaml"))).sheet == load_scene("small.yaml").sheet
+    assert load_scene(keeper.save_scene(load_scene("small.yaml"))).sheet == load_scene("small.yaml").sheet
 
 
 def test_a_sheet_that_nothing_holds_may_fly_after_a_press(begin: Begin) -> None:

@@ -23,9 +23,9 @@ from taichi_msm import load_scene
 from taichi_msm.cli import main
 from taichi_msm.errors import SceneError
 from taichi_msm.results.folder import Folder
-from taichi_msm.scene import Scene
+from taichi_msm.scene import Render, Scene
+from taichi_msm.viewer.captures import Film
 from taichi_msm.viewer.events import Drag, Harder, Key, Percent, Point, Press, Release, Turn
-from taichi_msm.viewer.film import Film
 from taichi_msm.viewer.pacing import LONGEST, Pacing
 from taichi_msm.viewer.script import load_script, timed
 from taichi_msm.viewer.window import QUIT, Hand, opening, placed
@@ -232,7 +232,7 @@ def test_what_a_killed_film_left_is_cleared_by_the_next(tmp_path: Path) -> None:
         (tmp_path / name / "animation.gif").write_text("half")
     (tmp_path / (".film-" + 16 * "b") / "notes.txt").write_text("mine")
     living = Folder.at(tmp_path / (".film-" + 16 * "c"))
-    with living, living.lock("lock"), Film(tmp_path, (4, 3), 10.0, (0, 0, 0)):
+    with living, living.lock("lock"), Film(tmp_path, Render(size=(4, 3)), 10.0, 1):
         assert len(list(tmp_path.iterdir())) == 4
     assert sorted(path.name for path in tmp_path.iterdir()) == [".film-" + 16 * "b", ".film-" + 16 * "c", ".film-mine"]
 

@@ -4,12 +4,11 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable
-from types import TracebackType
 
 import numpy as np
 from numpy.typing import NDArray
 
-from taichi_msm.errors import DivergedError, SceneError
+from taichi_msm.errors import DivergedError, FilesError, SceneError
 from taichi_msm.physics.error_control import choose_step
 from taichi_msm.physics.lattice import rest_positions
 from taichi_msm.physics.mesh_error import choose_points
@@ -24,7 +23,7 @@ from taichi_msm.scenefile.yaml_reader import MAX_NODES
 from taichi_msm.simulation import Simulation
 from taichi_msm.system import runtime
 from taichi_msm.viewer import hud
-from taichi_msm.viewer.captures import Captures, values
+from taichi_msm.viewer.captures import Captures, Film, probe_values
 from taichi_msm.viewer.controller import Controller
 from taichi_msm.viewer.events import (
     KEYS,
@@ -41,7 +40,6 @@ from taichi_msm.viewer.events import (
     Turn,
 )
 from taichi_msm.viewer.held_tool import HeldTool
-from taichi_msm.viewer.recording import Recording
 from taichi_msm.viewer.viewport import Viewport
 
 # A session has at most this many frames per second, what a screen shows; each is a whole part of a frame of the scene.
@@ -118,7 +116,7 @@ class Session:
         _require_usable(scene, play=play)
         progress("start")
         device = runtime.start(arch, threads)
-        given, texture = scene, load_texture(scene)
+        texture = load_texture(scene)
         if scene.sheet.tolerance is not None:
             scene, _ = choose_points(scene, device, checked, lambda done, total: progress("pilot"))
         scene, self.parts = with_live_frames(scene)
@@ -126,15 +124,12 @@ class Session:
         if scene.time.tolerance is not None:
             grid, _ = choose_step(scene, grid, device, lambda done, total: progress("pilot"))
         scene = with_grid(scene, grid)
-        rate = scene.time.frames_per_second
         self._captures = captures
-        self._recording = Recording(captures, scene, given.time.frames_per_second, self.parts)
+        self._film: Film | None = None
         self._others = scene.probes if play else ()
-        self.tool = HeldTool(scene.probes[0], rate)
+        self.tool = HeldTool(scene.probes[0], scene.time.frames_per_second)
         self.scene = scene.model_copy(update={"probes": (*self._others, self.tool.recorded(0))})
         self._rest = rest_positions(scene.sheet)
-        self.viewport = Viewport(scene, texture)
-        self._controller = Controller(self.tool, self.viewport, scene)
         self._figures, self._keys = True, False
         self._once = False
         self._beats = 0
@@ -144,10 +139,12 @@ class Session:
         self.paused = False
         self.seconds_a_frame = 0.0
         progress("compile")
-        # The pictures are drawn here.
-        self._simulation = Simulation(self.scene.model_copy(update={"output": ()}), arch, threads)
+        # Without outputs nothing is compiled for them.
+        self._simulation = Simulation(self.scene.model_copy(update={"output": ()}), arch, threads, texture)
         self._simulation.compile(lambda: progress("compile"))
         self._beginning = self._simulation.save()
+        self.viewport = Viewport(self._simulation.renderer)
+        self._controller = Controller(self.tool, self.viewport, self._simulation)
         self._draw()
 
     @property
@@ -188,7 +185,7 @@ class Session:
             case Point(x, y):
                 self._controller.point(x, y)
             case Press(x, y, pull):
-                if self._controller.press(self.positions(), x, y, -1 if pull else 1):
+                if self._controller.press(x, y, -1 if pull else 1):
                     self._notice_until = 0
                 else:
                     self.say(f"no tissue at pixel {x:g}, {y:g}")
@@ -240,7 +237,13 @@ class Session:
             seen = self.viewport.pixel(_between(self.positions(), *self.tool.place))
             if seen is not None:
                 hud.mark(picture, seen, pulls=self._pulls)
-        self._tell(self._recording.expose(picture, self._beats))
+        if self._film is not None:
+            try:
+                self._film.show(picture, self._beats)
+            except FilesError as error:
+                self._film.close()
+                self._film = None
+                self.say(str(error))
         above = self._figure_lines(pacing) if self._figures else ["paused"] if self.paused else []
         hud.write(picture, above, self.notice, POINTER | KEYS if self._keys else None)
         return picture
@@ -257,20 +260,17 @@ class Session:
     def close(self) -> None:
         """Save the film that is on, and free the memory."""
         self._simulation.close()
-        self.viewport.close()
-        self._tell(self._recording.end())
+        self._end_film()
 
     def __enter__(self) -> Session:
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         self.close()
 
     def _warn_of_length(self) -> None:
         """Warn once before the session becomes too long for a scene file."""
-        if self.frame % CHECKED == 0 and not self._warned and values(self.recorded()) > NEARLY * MAX_NODES:
+        if self.frame % CHECKED == 0 and not self._warned and probe_values(self.recorded()) > NEARLY * MAX_NODES:
             self._warned = True
             self.say("this session will soon be too long for a scene: save it now (w), then reset it (r)")
 
@@ -283,7 +283,7 @@ class Session:
             if probe.instrument is not None
         ]
         if (instrument := self.tool.instrument) is not None:
-            across, down = self._controller.over(positions) or self.tool.place
+            across, down = self._controller.over() or self.tool.place
             height, width = self.scene.sheet.size
             rest = np.array([(across - 0.5) * width, (0.5 - down) * height])
             placed.append(rod(instrument, self.scene, positions, rest))
@@ -320,23 +320,30 @@ class Session:
                 self._warned = False
                 self.fault = ""
             case "p":
-                self.say(f"saved {self._captures.keep_picture(self._draw())}")
+                self.say(f"saved {self._captures.save_picture(self._draw())}")
             case "g":
-                if self._recording.on:
-                    self._tell(self._recording.end())
+                if self._film is None:
+                    rate = self.rate / self.parts
+                    self._film = Film(self._captures.folder, self.scene.render, rate, self.parts, self._beats)
                 else:
-                    self._recording.start(self._beats)
+                    self._end_film()
             case "w":
-                self.say(f"saved {self._captures.keep_scene(self.recorded())}")
+                self.say(f"saved {self._captures.save_scene(self.recorded())}")
             case "i":
                 self._figures = not self._figures
             case "h":
                 self._keys = not self._keys
 
-    def _tell(self, notice: str) -> None:
-        """Show a notice, if there is one."""
-        if notice:
-            self.say(notice)
+    def _end_film(self) -> None:
+        """End the film that is on, and save it if it has a picture."""
+        film, self._film = self._film, None
+        if film is None:
+            return
+        if film.pictures > 0:
+            self.say(f"saved {self._captures.save_film(film)}")
+        else:
+            film.close()
+            self.say("no film was saved: it had no picture yet")
 
     @property
     def _pulls(self) -> bool:
@@ -347,7 +354,7 @@ class Session:
         tool, speed = self.tool, ""
         if self.seconds_a_frame > 0:
             speed = f"steps {1 / self.rate / self.seconds_a_frame:.2g} x real time"
-        state = [word for word, on in (("paused", self.paused), ("film", self._recording.on)) if on]
+        state = [word for word, on in (("paused", self.paused), ("film", self._film is not None)) if on]
         does = "pull" if self._pulls else "push"
         percent = f"{does} {abs(tool.percent):.0f} %" if tool.percent else f"tool {tool.strength:.0f} %"
         moved = self.displacement()
