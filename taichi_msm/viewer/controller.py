@@ -12,13 +12,7 @@ from taichi_msm.viewer.viewport import Viewport
 
 
 class Controller:
-    """Moves a tool with a pointer over a picture.
-
-    Args:
-        tool: the tool.
-        viewport: how the tissue is shown.
-        simulation: the tissue.
-    """
+    """Moves a tool with a pointer over the picture of a simulation."""
 
     def __init__(self, tool: HeldTool, viewport: Viewport, simulation: Simulation) -> None:
         self._tool = tool

@@ -10,36 +10,22 @@ from numpy.typing import NDArray
 
 from taichi_msm.errors import DivergedError, FilesError, SceneError
 from taichi_msm.physics.error_control import choose_step
-from taichi_msm.physics.lattice import rest_positions
 from taichi_msm.physics.mesh_error import choose_points
-from taichi_msm.physics.probe_force import control_point, probe_force
+from taichi_msm.physics.probe_force import probe_force
 from taichi_msm.physics.timestep import time_grid, with_grid, with_time
-from taichi_msm.render.instrument import rod
+from taichi_msm.render.instrument import rod, rods
+from taichi_msm.render.surface import touched
 from taichi_msm.render.texture import load_texture
 from taichi_msm.results.gif import Picture
-from taichi_msm.scene import MAX_PROBES, Camera, Scene
+from taichi_msm.scene import MAX_PROBES, Scene
 from taichi_msm.scenefile.validation import checked
 from taichi_msm.scenefile.yaml_reader import MAX_NODES
 from taichi_msm.simulation import Simulation
 from taichi_msm.system import runtime
-from taichi_msm.viewer import hud
+from taichi_msm.viewer import events, hud
 from taichi_msm.viewer.captures import Captures, Film, probe_values
 from taichi_msm.viewer.controller import Controller
-from taichi_msm.viewer.events import (
-    KEYS,
-    NOTCH,
-    POINTER,
-    Drag,
-    Event,
-    Harder,
-    Key,
-    Percent,
-    Point,
-    Press,
-    Release,
-    Turn,
-)
-from taichi_msm.viewer.held_tool import HeldTool
+from taichi_msm.viewer.held_tool import HeldTool, Place
 from taichi_msm.viewer.viewport import Viewport
 
 # A session has at most this many frames per second, what a screen shows; each is a whole part of a frame of the scene.
@@ -127,9 +113,9 @@ class Session:
         self._captures = captures
         self._film: Film | None = None
         self._others = scene.probes if play else ()
+        self._instrument = scene.probes[0].instrument
         self.tool = HeldTool(scene.probes[0], scene.time.frames_per_second)
         self.scene = scene.model_copy(update={"probes": (*self._others, self.tool.recorded(0))})
-        self._rest = rest_positions(scene.sheet)
         self._figures, self._keys = True, False
         self._once = False
         self._beats = 0
@@ -163,9 +149,7 @@ class Session:
 
     def displacement(self) -> float:
         """Tell how far the tissue at the tool is from rest [m]."""
-        across, down = self.tool.place
-        moved = _between(self.positions(), across, down) - _between(self._rest, across, down)
-        return float(np.linalg.norm(moved))
+        return float(np.linalg.norm(self._touched() - [*self._rest_point(self.tool.place), 0.0]))
 
     def recorded(self) -> Scene:
         """Give what was done as a scene; a run of it has the same bits."""
@@ -175,32 +159,32 @@ class Session:
         probes = (*self._others, self.tool.recorded(frames))
         return self.scene.model_copy(update={"probes": probes, "time": time, "render": self.viewport.render})
 
-    def handle(self, event: Event) -> None:
+    def handle(self, event: events.Event) -> None:
         """Do what an event asks for; its effect on the tissue is seen in the next frame.
 
         Raises:
             FilesError: when a file cannot be saved.
         """
         match event:
-            case Point(x, y):
+            case events.Point(x, y):
                 self._controller.point(x, y)
-            case Press(x, y, pull):
+            case events.Press(x, y, pull):
                 if self._controller.press(x, y, -1 if pull else 1):
                     self._notice_until = 0
                 else:
                     self.say(f"no tissue at pixel {x:g}, {y:g}")
-            case Drag(x, y):
+            case events.Drag(x, y):
                 self._controller.drag(x, y)
-            case Release():
+            case events.Release():
                 self._controller.release()
-            case Turn(right, down):
+            case events.Turn(right, down):
                 self.viewport.turn(right, down)
                 self._controller.hold_on()
-            case Percent(percent):
+            case events.Percent(percent):
                 self.tool.strength = min(100.0, max(0.0, percent))
-            case Harder(percent):
-                self.handle(Percent(self.tool.strength + percent))
-            case Key(name):
+            case events.Harder(percent):
+                self.handle(events.Percent(self.tool.strength + percent))
+            case events.Key(name):
                 self._do(name)
 
     def advance(self) -> None:
@@ -233,10 +217,8 @@ class Session:
             Colours, shape (height, width, 3).
         """
         picture = self._draw()
-        if self.tool.percent != 0 and self.tool.instrument is None:
-            seen = self.viewport.pixel(_between(self.positions(), *self.tool.place))
-            if seen is not None:
-                hud.mark(picture, seen, pulls=self._pulls)
+        if self.tool.percent != 0 and self._instrument is None and (pixel := self.viewport.pixel(self._touched())):
+            hud.mark(picture, pixel, pulls=self._pulls)
         if self._film is not None:
             try:
                 self._film.show(picture, self._beats)
@@ -245,7 +227,7 @@ class Session:
                 self._film = None
                 self.say(str(error))
         above = self._figure_lines(pacing) if self._figures else ["paused"] if self.paused else []
-        hud.write(picture, above, self.notice, POINTER | KEYS if self._keys else None)
+        hud.write(picture, above, self.notice, events.POINTER | events.KEYS if self._keys else None)
         return picture
 
     def say(self, notice: str) -> None:
@@ -276,35 +258,31 @@ class Session:
 
     def _draw(self) -> Picture:
         """Draw the tissue and the instruments; the tool's is where the tool acts, or would if it were pressed."""
-        positions, rate = self.positions(), self.rate
-        placed = [
-            rod(probe.instrument, self.scene, positions, control_point(probe, self.scene.sheet, self.frame / rate))
-            for probe in self._others
-            if probe.instrument is not None
-        ]
-        if (instrument := self.tool.instrument) is not None:
-            across, down = self._controller.over() or self.tool.place
-            height, width = self.scene.sheet.size
-            rest = np.array([(across - 0.5) * width, (0.5 - down) * height])
-            placed.append(rod(instrument, self.scene, positions, rest))
-        return self.viewport.draw(positions, placed)
+        positions, scene = self.positions(), self._simulation.scene
+        instruments = rods(scene, positions, self._simulation.time)
+        if self._instrument is not None and (place := self._controller.over()):
+            instruments[-1] = rod(self._instrument, scene, positions, self._rest_point(place))
+        return self.viewport.draw(positions, instruments)
 
-    def _look(self, camera: str | Camera) -> None:
-        self.viewport.look(camera)
-        self._controller.hold_on()
+    def _rest_point(self, place: Place) -> NDArray[np.float64]:
+        """Give x and y of a place on the sheet at rest [m]."""
+        (across, down), (height, width) = place, self.scene.sheet.size
+        return np.array([(across - 0.5) * width, (0.5 - down) * height])
+
+    def _touched(self) -> NDArray[np.float64]:
+        """Find the point of the sheet at which the tool acts [m]."""
+        rest = self._rest_point(self.tool.place)
+        return touched(self.positions(), self.scene.render.refine, self.scene.sheet, rest)[0]
 
     def _do(self, key: str) -> None:
         match key:
             case "up":
-                self.handle(Harder(NOTCH))
+                self.handle(events.Harder(events.NOTCH))
             case "down":
-                self.handle(Harder(-NOTCH))
-            case "c":
-                self._look(self.scene.render.camera)
-            case "t":
-                self._look("top")
-            case "o":
-                self._look("oblique")
+                self.handle(events.Harder(-events.NOTCH))
+            case "c" | "t" | "o":
+                self.viewport.look({"c": self.scene.render.camera, "t": "top", "o": "oblique"}[key])
+                self._controller.hold_on()
             case "m":
                 self.viewport.mesh()
             case "l":
@@ -317,8 +295,8 @@ class Session:
                 self._once = False
                 self._simulation.restore(self._beginning)
                 self._controller.forget()
-                self._warned = False
-                self.fault = ""
+                self._simulation.steer((*self._others, self.tool.recorded(0)))
+                self._warned, self.fault = False, ""
             case "p":
                 self.say(f"saved {self._captures.save_picture(self._draw())}")
             case "g":
@@ -374,17 +352,6 @@ def _require_usable(scene: Scene, *, play: bool) -> None:
         problems.append(f"probes: {MAX_PROBES} leave no room for the tool; remove one, or leave out --play")
     if problems:
         raise SceneError(problems)
-
-
-def _between(values: NDArray[np.floating], across: float, down: float) -> NDArray[np.float64]:
-    """Interpolate values of the mass points, shape (rows, cols, 3), bilinearly at a place on the sheet."""
-    rows, cols = values.shape[:2]
-    y, x = down * (rows - 1), across * (cols - 1)
-    i, j = min(int(y), rows - 2), min(int(x), cols - 2)
-    t, s = y - i, x - j
-    corners = values[i : i + 2, j : j + 2].astype(np.float64)
-    rows_between: NDArray[np.float64] = corners[0] + t * (corners[1] - corners[0])
-    return rows_between[0] + s * (rows_between[1] - rows_between[0])
 
 
 def length(metres: float) -> str:

@@ -17,10 +17,7 @@ from taichi_msm.scene import Camera, Render
 
 
 class Viewport:
-    """Draws a sheet in the way chosen now.
-
-    Args:
-        renderer: draws it; the camera and the `render` of its scene come first.
+    """Shows what a renderer draws in the way chosen now, at first as its scene says.
 
     Attributes:
         render: how the sheet is drawn now.
