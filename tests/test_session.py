@@ -23,7 +23,7 @@ from taichi_msm.system.runtime import Device
 from taichi_msm.viewer import captures
 from taichi_msm.viewer import session as live_session
 from taichi_msm.viewer.captures import Captures
-from taichi_msm.viewer.events import KEYS, Drag, Event, Harder, Key, Percent, Point, Press, Release, Turn
+from taichi_msm.viewer.events import KEYS, Drag, Event, Harder, Hover, Key, Percent, Press, Release, Turn
 from taichi_msm.viewer.recorder import record
 from taichi_msm.viewer.session import Session, with_live_frames
 from tests.outputs import duration
@@ -541,13 +541,13 @@ def rod_pixels(session: Session) -> set[tuple[int, int]]:
 def test_the_instrument_is_under_the_pointer(begin: Begin) -> None:
     session = begin({**TILTED, **ROD})
     for x, y in ((40, 60), (80, 50)):
-        session.handle(Point(x, y))
+        session.handle(Hover(x, y))
         pixels = rod_pixels(session)
         assert any(abs(column - x) <= 3 and abs(row - y) <= 3 for column, row in pixels), "the tip is there"
         assert 20 < len(pixels) < 3000
     session.handle(Press(60, 55))
     session.advance()
-    session.handle(Point(20, 20))
+    session.handle(Hover(20, 20))
     held = rod_pixels(session)
     assert any(abs(column - 60) <= 4 and abs(row - 55) <= 4 for column, row in held), "while it presses it stays"
 
@@ -555,7 +555,7 @@ def test_the_instrument_is_under_the_pointer(begin: Begin) -> None:
 def test_without_an_instrument_the_pointer_changes_nothing(begin: Begin) -> None:
     session = begin(TILTED)
     before = session.picture()
-    session.handle(Point(40, 60))
+    session.handle(Hover(40, 60))
     np.testing.assert_array_equal(session.picture(), before)
 
 

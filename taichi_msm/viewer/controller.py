@@ -39,7 +39,7 @@ class Controller:
             return None
         return self._simulation.pick(self._hovering, self._viewport.view)
 
-    def point(self, x: float, y: float) -> None:
+    def hover(self, x: float, y: float) -> None:
         """Note where a pointer is that presses nothing."""
         self._hovering = x, y
 

@@ -118,7 +118,8 @@ class Session:
         self.scene = scene.model_copy(update={"probes": (*self._others, self.tool.recorded(0))})
         self._figures, self._keys = True, False
         self._once = False
-        self._beats = 0
+        # Frames whose time went by, those while it was paused too.
+        self._elapsed = 0
         self._notice, self._notice_until = "", 0
         self._warned = False
         self.fault = ""
@@ -166,8 +167,8 @@ class Session:
             FilesError: when a file cannot be saved.
         """
         match event:
-            case events.Point(x, y):
-                self._controller.point(x, y)
+            case events.Hover(x, y):
+                self._controller.hover(x, y)
             case events.Press(x, y, pull):
                 if self._controller.press(x, y, -1 if pull else 1):
                     self._notice_until = 0
@@ -189,7 +190,7 @@ class Session:
 
     def advance(self) -> None:
         """Let a frame's time pass: the tissue moves, unless it is paused."""
-        self._beats += 1
+        self._elapsed += 1
         if (self.paused and not self._once) or self.fault:
             return
         self._once = False
@@ -221,7 +222,7 @@ class Session:
             hud.mark(picture, pixel, pulls=self._pulls)
         if self._film is not None:
             try:
-                self._film.show(picture, self._beats)
+                self._film.show(picture, self._elapsed)
             except FilesError as error:
                 self._film.close()
                 self._film = None
@@ -232,12 +233,12 @@ class Session:
 
     def say(self, notice: str) -> None:
         """Show a notice for a few seconds."""
-        self._notice, self._notice_until = notice, self._beats + round(NOTICE * self.rate)
+        self._notice, self._notice_until = notice, self._elapsed + round(NOTICE * self.rate)
 
     @property
     def notice(self) -> str:
         """The notice that is shown now."""
-        return self._notice if self._beats < self._notice_until else self.fault
+        return self._notice if self._elapsed < self._notice_until else self.fault
 
     def close(self) -> None:
         """Save the film that is on, and free the memory."""
@@ -302,7 +303,7 @@ class Session:
             case "g":
                 if self._film is None:
                     rate = self.rate / self.parts
-                    self._film = Film(self._captures.folder, self.scene.render, rate, self.parts, self._beats)
+                    self._film = Film(self._captures.folder, self.scene.render, rate, self.parts, self._elapsed)
                 else:
                     self._end_film()
             case "w":

@@ -14,7 +14,7 @@ from taichi_msm.progress import Pause
 from taichi_msm.results.gif import Picture
 from taichi_msm.system.silence import silenced
 from taichi_msm.viewer import hud
-from taichi_msm.viewer.events import KEYS, NOTCH, Drag, Event, Harder, Key, Point, Press, Release, Turn
+from taichi_msm.viewer.events import KEYS, NOTCH, Drag, Event, Harder, Hover, Key, Press, Release, Turn
 from taichi_msm.viewer.pacing import Pacing
 from taichi_msm.viewer.session import Session
 
@@ -142,7 +142,7 @@ class Hand:
                 yield QUIT
             elif event.type == pygame.KEYDOWN:
                 # A key that is held down is reported again and again.
-                if (name := named(event)) and (event.key not in self._down or name in REPEATED):
+                if (name := key_name(event)) and (event.key not in self._down or name in REPEATED):
                     yield Key(name)
                 self._down.add(event.key)
             elif event.type == pygame.KEYUP:
@@ -181,7 +181,7 @@ class Hand:
         if self._pressing:
             yield Drag(x, y)
         elif self._turning is None:
-            yield Point(x, y)
+            yield Hover(x, y)
         if self._turning is not None:
             yield Turn(x - self._turning[0], y - self._turning[1])
             self._turning = (x, y)
@@ -192,7 +192,7 @@ class Hand:
             yield Release()
 
 
-def named(event: pygame.Event) -> str | None:
+def key_name(event: pygame.Event) -> str | None:
     """Name the key that was pressed, as in `KEYS`; None if it is none of them.
 
     A key is what it types, on every layout; where that is no Latin letter, it is the letter of a US keyboard there.
