@@ -24,6 +24,7 @@ from taichi_msm.physics.timestep import time_grid, with_grid
 from taichi_msm.progress import Pause
 from taichi_msm.render.instrument import rods
 from taichi_msm.render.labels import Flow, Labels, Observed, Sight
+from taichi_msm.render.picking import pick
 from taichi_msm.render.renderer import Array, CameraLike, Renderer, Shot
 from taichi_msm.render.surface import Surface, surface
 from taichi_msm.render.texture import require_texture
@@ -147,7 +148,9 @@ class Simulation:
         for _ in range(frames):
             end = (self.frame + 1) * self._grid.steps_per_frame
             self._dynamics.advance(end - self.steps, pause)
-            self._position = self._read()
+            reading = self._dynamics.read()
+            self._require_good(reading, self._watch.follow(reading))
+            self._position = self._place(reading.displacement)
 
     def steer(self, probes: Sequence[Probe | Mapping[str, Any]]) -> None:
         """Replace the loads from here on.
@@ -318,16 +321,14 @@ class Simulation:
             Fractions of the sheet's width from its left and of its height from its top, as in a probe's `at`;
             None if no surface is there.
         """
-        return self.renderer.pick(pixel, self._position, self.renderer.set_up(camera))
+        point = as_array(pixel, "pixel")
+        if not (are_numbers(point, (2,)) and np.isfinite(point).all()):
+            raise ArgumentError(f"pixel: {pixel!r}; take two numbers, x to the right and y down")
+        x, y = point.tolist()
+        return pick(self._position, self.scene.render.refine, self.renderer.set_up(camera), (x, y))
 
     def observe(self, before: Labels | None, positions: Array, time: float) -> Observed:
-        """Give everything that the scene's output asks for of one frame.
-
-        Args:
-            before: the labels of the frame before; None: there was none.
-            positions: of the points [m], shape (rows, cols, 3).
-            time: of the frame [s].
-        """
+        """Give all that the scene's output asks for of a frame; `before`: the labels of the frame before, if any."""
         return self.renderer.observe(before, self._shot(None, positions, time))
 
     def play(self, frames: int, camera: CameraLike = None) -> Player:
@@ -408,20 +409,15 @@ class Simulation:
             time = self.time
         elif not (are_numbers(as_array(time, "time"), ()) and math.isfinite(time)):
             raise ArgumentError(f"time: {time!r}; take a number, in seconds, or None for now")
-        return Shot(positions, rods(self.scene, positions, time), self.renderer.set_up(camera))
+        return Shot(positions, self.renderer.set_up(camera), rods(self.scene, positions, time))
 
-    def _read(self) -> Array:
-        """Read where the points are, after checking that the simulation has not diverged since the last frame."""
-        reading = self._dynamics.read()
-        self._require_good(reading, self._watch.follow(reading))
-        return self._place(reading.displacement)
-
-    def _require_good(self, reading: Reading, wrong: str) -> None:
-        if wrong:
+    def _require_good(self, reading: Reading, fault: str) -> None:
+        """Raise the error of a divergence, if there is a fault."""
+        if fault:
             self._diverged = True
             steps, time = reading.steps, self._grid.time(reading.steps)
             point = farthest(reading.displacement)[:2]
-            raise DivergedError(divergence.message(time, steps, wrong, exact=False), steps, time, point)
+            raise DivergedError(divergence.message(time, steps, fault, exact=False), steps, time, point)
 
     def _place(self, displacement: Array) -> Array:
         """Turn displacements into positions."""

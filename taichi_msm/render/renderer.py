@@ -13,12 +13,11 @@ from taichi_msm.errors import ArgumentError
 from taichi_msm.render.camera import View, view
 from taichi_msm.render.instrument import Rod
 from taichi_msm.render.labels import Flow, Labels, Observed, Sight, track_grid
-from taichi_msm.render.picking import pick
 from taichi_msm.render.texture import load_texture
 from taichi_msm.scene import UNTIL_NEXT, Camera, Render, Scene
 
 if TYPE_CHECKING:
-    from taichi_msm.render.rasterizer import Drawing, Drawn
+    from taichi_msm.render.rasterizer import Drawing
 
 # A camera in one of the forms that a scene may have; or a `View`, which was set up already; None: the scene's own.
 CameraLike = str | Mapping[str, Any] | Camera | View | None
@@ -31,13 +30,13 @@ class Shot(NamedTuple):
 
     Attributes:
         positions: of the mass points [m], shape (rows, cols, 3).
-        rods: the instruments.
         view: the camera.
+        rods: the instruments.
     """
 
     positions: Array
-    rods: Sequence[Rod]
     view: View
+    rods: Sequence[Rod] = ()
 
 
 class Renderer:
@@ -48,7 +47,7 @@ class Renderer:
         texture: the picture on the sheet, shape (height, width, 3); None: the scene's own, read when it is drawn.
 
     Raises:
-        ArgumentError: in the methods, when a pixel, coordinates or labels are not what they must be.
+        ArgumentError: in the methods, when coordinates or labels are not what they must be.
 
     Attributes:
         scene: the scene; may be replaced by one that differs in its probes alone.
@@ -67,11 +66,7 @@ class Renderer:
         self.scene, self.view = scene, view(scene)
 
     def set_up(self, camera: CameraLike) -> View:
-        """Set up a camera.
-
-        Raises:
-            SceneError: when it is not valid, or sees nothing.
-        """
+        """Set up a camera; raises a SceneError if it is not valid, or sees nothing."""
         if isinstance(camera, View):
             return camera
         if camera is None:
@@ -82,9 +77,7 @@ class Renderer:
 
     def draw(self, shot: Shot, style: Render | None = None) -> NDArray[np.uint8]:
         """Draw a picture; `style`: the scene's `render` with another shading, or with the mesh shown or hidden."""
-        picture = self._look(shot, picture=True, labels=False, style=style).picture
-        assert picture is not None
-        return picture
+        return self._drawing(style, picture=True, labels=False).draw(*shot)
 
     def is_compiled(self, style: Render) -> bool:
         """Tell whether a picture in a style, as for `draw`, has been drawn before."""
@@ -92,7 +85,7 @@ class Renderer:
 
     def labels(self, shot: Shot) -> Labels:
         """Give what each pixel shows at its centre."""
-        labels = self._look(shot, picture=False, labels=True).labels
+        labels = self._drawing(picture=False, labels=True).look(*shot).labels
         assert labels is not None
         return labels
 
@@ -105,7 +98,7 @@ class Renderer:
             raise ArgumentError(f"before: take what `labels` gave for a picture of {width} x {height} pixels")
         from taichi_msm.render.tracking import find_flow
 
-        return find_flow(self.scene, points, shot.positions, shot.view, shot.rods)
+        return find_flow(self.scene, points, *shot)
 
     def locate(self, coordinates: Array, shot: Shot) -> Sight:
         """Find where material points are seen, and whether anything hides them."""
@@ -116,14 +109,7 @@ class Renderer:
             )
         from taichi_msm.render.tracking import find
 
-        return find(self.scene, points, shot.positions, shot.view, shot.rods)
-
-    def pick(self, pixel: tuple[float, float], positions: Array, camera: View) -> tuple[float, float] | None:
-        """Find the material point that is seen at the centre of a pixel, behind any instrument."""
-        point = as_array(pixel, "pixel")
-        if not (are_numbers(point, (2,)) and np.isfinite(point).all()):
-            raise ArgumentError(f"pixel: {pixel!r}; take two numbers, x to the right and y down")
-        return pick(positions, self.scene.render.refine, camera, (float(point[0]), float(point[1])))
+        return find(self.scene, points, *shot)
 
     def observe(self, before: Labels | None, shot: Shot) -> Observed:
         """Give everything that the scene's output asks for; `before`: the labels of the frame before, if any."""
@@ -132,7 +118,7 @@ class Renderer:
         together = scene.render.supersample == 1
         picture = labels = flow = tracks = None
         if scene.draws:
-            picture, labels = self._look(shot, picture=True, labels=scene.labels_pixels and together)
+            picture, labels = self._drawing(picture=True, labels=scene.labels_pixels and together).look(*shot)
         if scene.labels_pixels and labels is None:
             labels = self.labels(shot)
         if before is not None and any(kind in UNTIL_NEXT for kind in scene.output):
@@ -145,7 +131,7 @@ class Renderer:
         """Free the memory."""
         self._drawings.clear()
 
-    def _look(self, shot: Shot, *, picture: bool, labels: bool, style: Render | None = None) -> Drawn:
+    def _drawing(self, style: Render | None = None, *, picture: bool, labels: bool) -> Drawing:
         key = self._key(style or self.scene.render, picture=picture, labels=labels)
         if key not in self._drawings:
             from taichi_msm.render.rasterizer import Drawing, structure
@@ -153,7 +139,7 @@ class Renderer:
             scene = self.scene if style is None else self.scene.model_copy(update={"render": style})
             texture = self._texture() if picture else np.zeros((1, 1, 3), np.uint8)
             self._drawings[key] = Drawing(scene, texture, structure(scene, picture=picture, labels=labels))
-        return self._drawings[key].look(shot.positions, shot.view, shot.rods)
+        return self._drawings[key]
 
     def _key(self, style: Render, *, picture: bool, labels: bool) -> tuple[object, ...]:
         """Give all that tells the drawings of this scene apart."""

@@ -57,7 +57,7 @@ class Viewport:
 
     def draw(self, positions: NDArray[Any], rods: Sequence[Rod] = ()) -> Picture:
         """Draw the sheet with some instruments; positions and picture as those of `Simulation`."""
-        return self._renderer.draw(Shot(positions, rods, self.view), self.render)
+        return self._renderer.draw(Shot(positions, self.view, rods), self.render)
 
     def pixel(self, point: NDArray[np.floating]) -> tuple[float, float] | None:
         """Find where a point [m] is seen; None if it is behind the camera."""
