@@ -50,9 +50,11 @@ def simulation(device: Device) -> Iterator[Simulation]:
 
 def test_what_is_exported_is_there_and_nothing_else() -> None:
     for name in taichi_msm.__all__:
-        assert getattr(taichi_msm, name).__name__ == name
+        exported = getattr(taichi_msm, name)
+        assert exported.__name__ == name
+        assert exported.__doc__
     assert (Path(taichi_msm.__file__).parent / "py.typed").exists()
-    with pytest.raises(AttributeError):
+    with pytest.raises(AttributeError, match="no attribute 'nothing'"):
         taichi_msm.nothing  # noqa: B018
 
 
@@ -279,6 +281,7 @@ def test_all_errors_are_ours(simulation: Simulation) -> None:
     for call in (*calls, simulation.save):
         with pytest.raises(MsmError, match="this simulation is closed"):
             call()
+    assert np.isfinite(simulation.positions()).all()
 
 
 @pytest.mark.parametrize("threads", [0, -1, 10**6, True, 1.5, "2"])
