@@ -14,13 +14,11 @@ from taichi_msm.errors import ArgumentError, DivergedError, MsmError
 from taichi_msm.physics import divergence
 from taichi_msm.physics.diagnosis import Diagnosis, diagnose
 from taichi_msm.physics.divergence import Watch, farthest
-from taichi_msm.physics.error_control import choose_step
 from taichi_msm.physics.lattice import axes
-from taichi_msm.physics.mesh_error import choose_points
+from taichi_msm.physics.plan import Plan
 from taichi_msm.physics.run_progress import RunProgress, Saved
 from taichi_msm.physics.solver import Dynamics
 from taichi_msm.physics.state import Reading
-from taichi_msm.physics.timestep import time_grid, with_grid
 from taichi_msm.progress import Pause
 from taichi_msm.render.instrument import rods
 from taichi_msm.render.labels import Flow, Labels, Observed, Sight
@@ -29,9 +27,9 @@ from taichi_msm.render.renderer import Array, CameraLike, Renderer, Shot
 from taichi_msm.render.surface import Surface, surface
 from taichi_msm.render.texture import require_texture
 from taichi_msm.scene import Probe, Scene
+from taichi_msm.scenefile.resolve import resolve
 from taichi_msm.scenefile.validation import checked
 from taichi_msm.system import runtime
-from taichi_msm.timegrid import TimeGrid
 
 if TYPE_CHECKING:
     from taichi_msm.notebook import Player
@@ -57,7 +55,6 @@ class Simulation:
         SceneError: when the scene cannot be run, or no step meets its tolerance.
 
     Attributes:
-        scene: the scene, with the step and the precision that were chosen.
         renderer: what draws and labels it.
 
     Example:
@@ -71,30 +68,26 @@ class Simulation:
 
     def __init__(
         self,
-        scene: Scene | Mapping[str, Any],
+        scene: Plan | Scene | Mapping[str, Any],
         arch: str = "cpu",
         threads: int | None = None,
         texture: NDArray[np.uint8] | None = None,
         cores: int | None = None,
     ) -> None:
-        scene = checked(scene)
+        plan = checked(scene)
         texture = None if texture is None else require_texture(texture)
         self.device = runtime.start(arch, threads)
-        self.scene, self._grid = self._resolved(scene)
-        self._watch = Watch(self.scene, self._grid)
+        self._plan = resolve(plan, self.device).plan
+        self._watch = Watch(self._plan)
         self._closed = self._diverged = False
-        self._dynamics = Dynamics(self.scene, self._grid, self.device, cores=cores)
+        self._dynamics = Dynamics(self._plan, self.device, cores=cores)
         self._position = self._place(self._dynamics.displacement())
         self.renderer = Renderer(self.scene, texture)
 
-    def _resolved(self, scene: Scene) -> tuple[Scene, TimeGrid]:
-        """Choose what the scene leaves open: the points and the step for a tolerance, and the precision."""
-        if scene.sheet.tolerance is not None:
-            scene, _ = choose_points(scene, self.device, checked)
-        grid = time_grid(scene, self.device.arch)
-        if scene.time.tolerance is not None:
-            grid, _ = choose_step(scene, grid, self.device)
-        return with_grid(scene, grid), grid
+    @property
+    def scene(self) -> Scene:
+        """The scene, with the points, the step and the precision that were chosen."""
+        return self._plan.scene
 
     @property
     def frame(self) -> int:
@@ -146,7 +139,7 @@ class Simulation:
         require_frame_count(frames)
         self._require_open()
         for _ in range(frames):
-            end = (self.frame + 1) * self._grid.steps_per_frame
+            end = (self.frame + 1) * self._plan.grid.steps_per_frame
             self._dynamics.advance(end - self.steps, pause)
             reading = self._dynamics.read()
             self._require_good(reading, self._watch.follow(reading))
@@ -166,10 +159,10 @@ class Simulation:
         self._require_open()
         if not isinstance(probes, Sequence):
             raise ArgumentError(f"probes: {probes!r}; take a list of them")
-        scene = self.scene.model_copy(update={"probes": tuple(probes)})
-        self._dynamics.steer(scene)
-        self._watch.steer(scene)
-        self.scene = self.renderer.scene = scene
+        plan = self._plan.with_probes(probes)
+        self._dynamics.steer(plan)
+        self._watch.steer(plan)
+        self._plan, self.renderer.scene = plan, plan.scene
 
     def restart(self, scene: Scene | Mapping[str, Any] | None = None) -> None:
         """Begin again at rest. Nothing is compiled if the terms of the model and the precision stay the same.
@@ -182,11 +175,11 @@ class Simulation:
         """
         self._require_open()
         if scene is not None:
-            self.scene, self._grid = self._resolved(checked(scene))
+            self._plan = resolve(checked(scene), self.device).plan
             self.renderer.restart(self.scene)
-        self._watch = Watch(self.scene, self._grid)
+        self._watch = Watch(self._plan)
         self._diverged = False
-        self._dynamics.restart(self.scene, self._grid)
+        self._dynamics.restart(self._plan)
         self._position = self._place(self._dynamics.displacement())
 
     def save(self) -> Saved:
@@ -209,7 +202,7 @@ class Simulation:
         self._require_open()
         if not isinstance(saved, Saved):
             raise ArgumentError(f"{type(saved).__name__} is not what `save` returns")
-        state, per_frame = saved.state, self._grid.steps_per_frame
+        state, per_frame = saved.state, self._plan.grid.steps_per_frame
         since = state.steps - saved.progress.frame * per_frame
         alike = (state.displacement.shape, state.displacement.dtype) == (self._position.shape, self._position.dtype)
         if not (alike and 0 <= since <= per_frame):
@@ -218,7 +211,7 @@ class Simulation:
                 f"{state.displacement.shape}; take what was saved with this scene's points, precision and step"
             )
         self._diverged = False
-        self._dynamics.restart(self.scene, self._grid, saved.state)
+        self._dynamics.restart(self._plan, saved.state)
         self._position = self._place(self._dynamics.displacement())
         self._watch.progress = saved.progress
 
@@ -237,7 +230,7 @@ class Simulation:
             Velocities [m/s], shape (rows, cols, 3), in the scene's precision; 0 at the start.
         """
         self._require_open()
-        return self._dynamics.state().difference / self._position.dtype.type(self._grid.step)
+        return self._dynamics.state().difference / self._position.dtype.type(self._plan.grid.step)
 
     def surface(self) -> Surface:
         """Give the refined surface as textured triangles: vertices, triangles, texture coordinates."""
@@ -415,7 +408,7 @@ class Simulation:
         """Raise the error of a divergence, if there is a fault."""
         if fault:
             self._diverged = True
-            steps, time = reading.steps, self._grid.time(reading.steps)
+            steps, time = reading.steps, self._plan.grid.time(reading.steps)
             point = farthest(reading.displacement)[:2]
             raise DivergedError(divergence.message(time, steps, fault, exact=False), steps, time, point)
 

@@ -4,20 +4,22 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from taichi_msm.errors import DivergedError, FilesError, SceneError
-from taichi_msm.physics.error_control import choose_step
-from taichi_msm.physics.mesh_error import choose_points
+from taichi_msm.physics.plan import Plan
+from taichi_msm.physics.planning import make_plan
 from taichi_msm.physics.probe_force import probe_force
-from taichi_msm.physics.timestep import time_grid, with_grid, with_time
+from taichi_msm.physics.timestep import with_time
 from taichi_msm.render.instrument import rod, rods
 from taichi_msm.render.surface import touched
 from taichi_msm.render.texture import load_texture
 from taichi_msm.results.gif import Picture
 from taichi_msm.scene import MAX_PROBES, Scene
+from taichi_msm.scenefile.resolve import resolve
 from taichi_msm.scenefile.validation import checked
 from taichi_msm.scenefile.yaml_reader import MAX_NODES
 from taichi_msm.simulation import Simulation
@@ -48,18 +50,19 @@ NEARLY = 0.75
 AVERAGED = 20
 
 
-def with_live_frames(scene: Scene) -> tuple[Scene, int]:
+def with_live_frames(plan: Plan) -> tuple[Plan, int]:
     """Divide the frames of a scene into shorter ones, for as many per second as a screen shows; a given step stays.
 
     Returns:
-        The scene, and how many of its frames make one of the given scene's.
+        The plan of that scene, and how many of its frames make one of the given scene's.
     """
+    scene = plan.scene
     parts = max(1, int(MOST_FRAMES / scene.time.frames_per_second * (1 + 1e-9)))
     if scene.time.step != "auto":
-        steps = time_grid(scene).steps_per_frame
+        steps = plan.grid.steps_per_frame
         while steps % parts:
             parts -= 1
-    return with_time(scene, frames_per_second=scene.time.frames_per_second * parts), parts
+    return make_plan(with_time(scene, frames_per_second=scene.time.frames_per_second * parts), plan.image), parts
 
 
 class Session:
@@ -103,19 +106,16 @@ class Session:
         progress("start")
         device = runtime.start(arch, threads)
         texture = load_texture(scene)
-        if scene.sheet.tolerance is not None:
-            scene, _ = choose_points(scene, device, checked, lambda done, total: progress("pilot"))
-        scene, self.parts = with_live_frames(scene)
-        grid = time_grid(scene, device.arch)
-        if scene.time.tolerance is not None:
-            grid, _ = choose_step(scene, grid, device, lambda done, total: progress("pilot"))
-        scene = with_grid(scene, grid)
+        live, self.parts = with_live_frames(checked(scene))
+        plan = resolve(live, device, lambda done, total: progress("pilot")).plan
+        scene = plan.scene
         self._captures = captures
         self._film: Film | None = None
         self._others = scene.probes if play else ()
         self._instrument = scene.probes[0].instrument
         self.tool = HeldTool(scene.probes[0], scene.time.frames_per_second)
-        self.scene = scene.model_copy(update={"probes": (*self._others, self.tool.recorded(0))})
+        plan = plan.with_probes((*self._others, self.tool.recorded(0)))
+        self.scene = plan.scene
         self._figures, self._keys = True, False
         self._once = False
         # Frames whose time went by, those while it was paused too.
@@ -127,7 +127,8 @@ class Session:
         self.seconds_a_frame = 0.0
         progress("compile")
         # Without outputs nothing is compiled for them.
-        self._simulation = Simulation(self.scene.model_copy(update={"output": ()}), arch, threads, texture)
+        plan = replace(plan, scene=plan.scene.model_copy(update={"output": ()}))
+        self._simulation = Simulation(plan, arch, threads, texture)
         self._simulation.compile(lambda: progress("compile"))
         self._beginning = self._simulation.save()
         self.viewport = Viewport(self._simulation.renderer)
