@@ -273,7 +273,7 @@ class Simulation:
     def labels(self, camera: CameraLike = None, positions: Array | None = None, time: float | None = None) -> Labels:
         """Give what each pixel shows at its centre: the material point, the depth, whether it is an instrument.
 
-        Arguments and errors as for `draw`, here and in the methods below.
+        `camera`, `positions` and `time` are as for `draw`, here and in the methods below, and so are the errors.
         """
         return self.renderer.labels(self._shot(camera, positions, time))
 
@@ -282,11 +282,7 @@ class Simulation:
     ) -> Flow:
         """Give the optical flow from an earlier or later frame to this one, and which of its material is now hidden.
 
-        Args:
-            before: what `labels` returned for the other frame, with the same size of the picture.
-            camera: as for `draw`.
-            positions: as for `draw`.
-            time: as for `draw`.
+        `before` is what `labels` returned for the other frame, with the same size of the picture.
         """
         return self.renderer.flow(before, self._shot(camera, positions, time))
 
@@ -295,20 +291,14 @@ class Simulation:
     ) -> Sight:
         """Find where material points are seen, and whether anything hides them; the inverse of `pick`.
 
-        Args:
-            coordinates: fractions of the sheet's width from its left and of its height from its top, shape (n, 2).
-            camera: as for `draw`.
-            positions: as for `draw`.
-            time: as for `draw`.
+        `coordinates` are fractions of the sheet's width from its left and of its height from its top, shape (n, 2).
         """
         return self.renderer.locate(coordinates, self._shot(camera, positions, time))
 
     def pick(self, pixel: tuple[float, float], camera: CameraLike = None) -> tuple[float, float] | None:
         """Find the material point that is seen at the centre of a pixel.
 
-        Args:
-            pixel: x to the right and y down from the picture's top-left pixel, which is (0, 0).
-            camera: as for `draw`.
+        `pixel` is x to the right and y down from the picture's top-left pixel, which is (0, 0).
 
         Returns:
             Fractions of the sheet's width from its left and of its height from its top, as in a probe's `at`;
@@ -325,12 +315,7 @@ class Simulation:
         return self.renderer.observe(before, self._shot(None, positions, time))
 
     def play(self, frames: int, camera: CameraLike = None) -> Player:
-        """Draw the present frame, simulate and draw more of them, and show them in a notebook.
-
-        Args:
-            frames: how many, 0 or more.
-            camera: as for `draw`.
-        """
+        """Draw the present frame, simulate and draw that many more, and show them in a notebook."""
         from taichi_msm.notebook import Player
 
         require_frame_count(frames)
@@ -354,8 +339,7 @@ class Simulation:
     def compile(self, pause: Pause = lambda: None) -> None:
         """Compile the kernels now that would otherwise be compiled at the first frame.
 
-        Args:
-            pause: called between kernels; what it raises stops here.
+        `pause` is called between kernels; what it raises stops here.
         """
         self._require_open()
         self._dynamics.compile()
