@@ -395,7 +395,7 @@ def view(
         return interruption.code
     finally:
         tell(notices)
-        for path in captures.kept:
+        for path in captures.saved:
             click.echo(printable(str(path)))
     return DIVERGED if record is not None and session.fault else DONE
 
