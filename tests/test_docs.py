@@ -3,19 +3,24 @@
 from __future__ import annotations
 
 import ast
+import doctest
 import json
 import re
 import subprocess
 import sys
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 import pytest
+from PIL import Image
 
+import taichi_msm
 from taichi_msm.scenefile.load import load_scene
 from taichi_msm.system import resources
 from taichi_msm.system.runtime import Device
 from taichi_msm.viewer.script import load_script
+from tests.scenes import speckle
 
 SCENES = ["press", "figure-3", "drag", "grasp", "two-tools", "tumour"]
 
@@ -23,6 +28,18 @@ SCENES = ["press", "figure-3", "drag", "grasp", "two-tools", "tumour"]
 def blocks(root: Path, language: str) -> list[str]:
     text = (root / "README.md").read_text(encoding="utf-8")
     return re.findall(rf"```{language}\n(.*?)```", text, flags=re.DOTALL)
+
+
+@pytest.fixture(scope="module")
+def examples_folder(root: Path, device: Device, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
+    """The current directory, with the shipped scenes and a picture, photo.jpg; as many threads as `device` has."""
+    folder = tmp_path_factory.mktemp("examples")
+    (folder / "scenes").symlink_to(root / "scenes")
+    Image.fromarray(speckle(90, 120)).save(folder / "photo.jpg")
+    with pytest.MonkeyPatch.context() as patch:
+        patch.chdir(folder)
+        patch.setattr(resources, "available_threads", lambda: device.threads)
+        yield folder
 
 
 def test_what_is_shown_is_what_is_shipped(root: Path) -> None:
@@ -59,6 +76,19 @@ def test_the_python_shown_runs(root: Path, tmp_path: Path) -> None:
     done = subprocess.run([sys.executable, "example.py"], cwd=tmp_path, check=True, capture_output=True, text=True)
     assert done.stdout == "(512, 512, 2) (512, 512) (512, 512, 2) (512, 512)\n"
     assert (tmp_path / "output" / "from-python" / "animation.gif").exists()
+
+
+# Those whose examples stand in their docstrings. The example of Playback reads what that of run writes.
+WITH_EXAMPLES = ["run", "Playback", "load_scene", "Scene"]
+
+
+@pytest.mark.parametrize("name", WITH_EXAMPLES)
+def test_the_example_of_a_docstring_gives_what_it_shows(name: str, examples_folder: Path) -> None:
+    tests = doctest.DocTestFinder(recurse=False).find(getattr(taichi_msm, name), name, globs={})
+    assert sum(len(test.examples) for test in tests) >= 3, f"{name} has no example"
+    for test in tests:
+        outcome = doctest.DocTestRunner().run(test)
+        assert outcome.failed == 0, f"the example of {name} fails; see above"
 
 
 def test_the_notebook_runs(
