@@ -29,7 +29,7 @@ from taichi_msm.render.labels import Flow, Labels, Observed, Sight, track_grid
 from taichi_msm.render.picking import pick
 from taichi_msm.render.surface import Surface, surface
 from taichi_msm.render.texture import load_texture, require_texture
-from taichi_msm.scene import UNTIL_NEXT, Camera, Probe, Scene
+from taichi_msm.scene import Camera, Probe, Scene
 from taichi_msm.scenefile.validation import checked
 from taichi_msm.system import runtime
 from taichi_msm.timegrid import TimeGrid
@@ -402,9 +402,9 @@ class Simulation:
             picture, labels = self._look(None, positions, time, picture=True, labels=scene.labels_pixels and together)
         if scene.labels_pixels and labels is None:
             labels = self.labels(None, positions, time)
-        if before is not None and any(kind in UNTIL_NEXT for kind in scene.output):
+        if before is not None and scene.asks_for("flow"):
             flow = self.flow(before, None, positions, time)
-        if "tracks" in scene.output:
+        if scene.asks_for("tracks"):
             tracks = self.locate(track_grid(scene.render.tracks), None, positions, time)
         return Observed(picture, labels, flow, tracks)
 

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from PIL import Image
 from scipy.spatial import cKDTree
 
-from taichi_msm.results.gif import LONGEST, SHORTEST, TRANSPARENT, GifWriter, Palette
+from taichi_msm.outputs.gif import LONGEST, SHORTEST, TRANSPARENT, GifWriter, Palette
 from tests.scenes import speckle
 
 Picture = NDArray[np.uint8]

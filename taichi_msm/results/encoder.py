@@ -20,6 +20,7 @@ from collections.abc import Callable, Iterator
 from concurrent.futures import CancelledError, Future, ThreadPoolExecutor
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
+from pathlib import Path
 from threading import Event
 from typing import BinaryIO
 
@@ -27,10 +28,10 @@ import numpy as np
 from PIL import Image
 
 from taichi_msm.errors import FilesError
+from taichi_msm.outputs.gif import GifWriter, Palette, Picture, shades
+from taichi_msm.outputs.table import OUTPUTS
 from taichi_msm.progress import Pause
-from taichi_msm.results.folder import Folder
-from taichi_msm.results.gif import GifWriter, Palette, Picture, shades
-from taichi_msm.results.publication import ANIMATION, FRAMES, series_file
+from taichi_msm.results.whole import create
 
 # Of 512 x 512 pixels of shaded tissue Pillow's default takes 93 ms, its level 1 takes 17 ms and 348 kB. With a search
 # for runs of equal bytes alone it takes 16 ms and 314 kB: tissue has no other repetitions, and a background has these.
@@ -61,7 +62,7 @@ class Job:
         background: a colour that the animation keeps exactly.
     """
 
-    folder: Folder
+    folder: Path
     size: tuple[int, int]
     rate: float
     png: bool
@@ -100,8 +101,7 @@ class Encoder:
                 bufsize=0,
                 stdin=subprocess.PIPE,
                 stdout=subprocess.PIPE,
-                # The folder keeps its descriptor in the child.
-                pass_fds=(*inherit, *([] if job.folder.descriptor is None else [job.folder.descriptor])),
+                pass_fds=inherit,
                 # Ctrl-C must reach only us: the child still finishes the pictures so far, as it does after a SIGTERM.
                 start_new_session=True,
                 creationflags=getattr(subprocess, "CREATE_NEW_PROCESS_GROUP", 0),
@@ -240,8 +240,8 @@ def encode(job: Job, source: BinaryIO, hurry: Event) -> Report:
     with ThreadPoolExecutor(min(depth, os.cpu_count() or 1)) as stills, ThreadPoolExecutor(1) as reel:
         for picture in _pictures(source, job.size):
             if job.png and begun == 0:
-                folder = job.folder.folder(FRAMES, create=True)
-            still = stills.submit(_seconds, _write_png, picture, folder, begun) if job.png else None
+                _still(job, 0).parent.mkdir()
+            still = stills.submit(_seconds, _write_png, picture, _still(job, begun)) if job.png else None
             begun += 1
             pending.append(reel.submit(shoot, picture, still))
             while len(pending) > depth and not hurry.is_set():
@@ -259,7 +259,7 @@ def encode(job: Job, source: BinaryIO, hurry: Event) -> Report:
                 seconds += task.result()
                 frames += 1
     for number in range(frames, begun) if job.png else ():
-        folder.remove(series_file(FRAMES, number))
+        _still(job, number).unlink(missing_ok=True)
     seconds += _seconds(film.close)
     return Report(frames, seconds)
 
@@ -280,7 +280,9 @@ class _Film:
     def add(self, picture: Picture) -> None:
         if self._gif is None:
             palette = Palette(shades(picture), self._job.background)
-            self._gif = GifWriter(self._job.folder.create(ANIMATION), self._job.size, self._job.rate, palette)
+            self._gif = GifWriter(
+                create(self._job.folder / OUTPUTS["gif"].path()), self._job.size, self._job.rate, palette
+            )
         self._gif.add(picture)
 
     def close(self) -> None:
@@ -298,8 +300,12 @@ def _pictures(source: BinaryIO, size: tuple[int, int]) -> Iterator[Picture]:
         yield np.frombuffer(data, np.uint8).reshape(height, width, 3)
 
 
-def _write_png(picture: Picture, folder: Folder, number: int) -> None:
-    with folder.create(series_file(FRAMES, number)) as file:
+def _still(job: Job, number: int) -> Path:
+    return job.folder / OUTPUTS["png"].path(number)
+
+
+def _write_png(picture: Picture, path: Path) -> None:
+    with create(path) as file:
         Image.fromarray(picture).save(file, "PNG", **COMPRESSION)
 
 

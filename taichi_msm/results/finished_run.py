@@ -17,12 +17,13 @@ from typing_extensions import TypedDict
 
 from taichi_msm.arguments import require_path
 from taichi_msm.errors import FilesError, MsmError, SceneError
+from taichi_msm.outputs.npz import map_array
+from taichi_msm.outputs.table import OUTPUTS, RECORD
 from taichi_msm.physics import material
 from taichi_msm.physics.lattice import rest_positions
-from taichi_msm.picture import PictureError, file_sha256
+from taichi_msm.picture import PictureError, file_sha256, read_rgb
 from taichi_msm.render import camera
-from taichi_msm.results.npz import map_array
-from taichi_msm.results.publication import MAX_RECORD, RECORD, TRAJECTORY
+from taichi_msm.results.publication import MAX_RECORD
 from taichi_msm.scene import Scene
 
 # The largest number of f32.
@@ -67,16 +68,39 @@ class FinishedRun:
         Raises:
             FilesError: when there is none, or it is damaged or belongs to another run.
         """
-        path = self.result(TRAJECTORY, "trajectory")
+        path = self.result("trajectory")
         dtype = np.dtype(np.float32 if self.scene.time.precision == "f32" else np.float64)
         rest = rest_positions(self.scene.sheet)
         with reading(path):
-            found = map_array(path, "position", dtype, (self.frames, *rest.shape))
+            positions = map_array(path, "position", dtype, (self.frames, *rest.shape))
         # Every run begins at rest; this is checked, as anybody may have written the file. Kernels and other programs
         # take numbers in f32. Written so that NaN is found too.
-        if not np.array_equal(found[0], rest.astype(dtype)) or not all(np.abs(frame).max() <= MOST for frame in found):
+        begins_at_rest = np.array_equal(positions[0], rest.astype(dtype))
+        if not begins_at_rest or not all(np.abs(position).max() <= MOST for position in positions):
             raise damaged(path)
-        return found
+        return positions
+
+    def picture(self, key: str, frame: int) -> NDArray[np.uint8]:
+        """Read a picture of the results.
+
+        Args:
+            key: the entry of `output` that it was written for.
+            frame: its number.
+
+        Returns:
+            Colours, shape (height, width, 3).
+
+        Raises:
+            FilesError: when it is missing or cannot be read, or has another size than the scene's.
+        """
+        path = self.result(key, frame)
+        try:
+            image = read_rgb(str(path), (0, 0, 0))
+        except PictureError as error:
+            raise FilesError(f"{error}, or run the scene again") from None
+        if image.size != self.scene.render.size:
+            raise damaged(path)
+        return np.asarray(image)
 
     @contextmanager
     def unchanged(self) -> Iterator[None]:
@@ -120,33 +144,34 @@ class FinishedRun:
                 fault = str(error).partition(";")[0]
             raise FilesError(f"{self.directory}: {key}: {fault}; {PUT_BACK}")
 
-    def has(self, output: str) -> bool:
-        """Tell whether a file or folder is among the results."""
-        with reading(self.directory / output):
-            return (self.directory / output).exists()
+    def has(self, key: str) -> bool:
+        """Tell whether the results have what an entry of `output` asks for."""
+        path = self.directory / OUTPUTS[key].result
+        with reading(path):
+            return path.exists()
 
     def remedy(self, *keys: str) -> str:
         """Say how to get the results of further entries of a scene's `output`."""
         outputs = ",".join(dict.fromkeys([*self.scene.output, *keys]))
         return f'run the scene again with --set "output=[{outputs}]"'
 
-    def result(self, name: str, key: str) -> Path:
+    def result(self, key: str, frame: int = 0) -> Path:
         """Find a file of the results.
 
         Args:
-            name: of the file, with its folder.
-            key: the entry of a scene's `output` that makes a run write it.
+            key: the entry of `output` that it was written for.
+            frame: its number, if there is a file for every frame.
 
         Raises:
             FilesError: when it is not there.
         """
-        output, path = name.partition("/")[0], self.directory / name
-        if not self.has(output):
-            raise FilesError(f"{output}: not among the results of {self.directory}; {self.remedy(key)}")
+        result, path = OUTPUTS[key].result, self.directory / OUTPUTS[key].path(frame)
+        if not self.has(key):
+            raise FilesError(f"{result}: not among the results of {self.directory}; {self.remedy(key)}")
         if not path.is_file():
             raise FilesError(f"{path}: no such file; {self.remedy(key)}")
         # The results may come from anybody, and what is read here may be given to others.
-        if (self.directory / output).is_symlink() or path.is_symlink():
+        if (self.directory / result).is_symlink() or path.is_symlink():
             raise FilesError(f"{path}: a symbolic link, which no run writes; {self.remedy(key)}")
         return path
 
@@ -217,8 +242,8 @@ def _as_run(record: Mapping[str, Any]) -> Scene:
     scene, folder = Scene(**record["scene"]), Path(record["working_directory"])
     if folder != Path.cwd():
         scene = scene.with_pictures(lambda path: str(folder / path))
-    found = [problem for check in (material.problems, camera.problems) for problem in check(scene)]
+    faults = [problem for check in (material.problems, camera.problems) for problem in check(scene)]
     # A picture that is missing, or has changed, is reported by the code that needs it.
-    if any(problem.path[-1:] != ("image",) for problem in found):
-        raise SceneError([str(problem) for problem in found])
+    if any(problem.path[-1:] != ("image",) for problem in faults):
+        raise SceneError([str(problem) for problem in faults])
     return scene

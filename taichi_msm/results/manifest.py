@@ -19,7 +19,8 @@ from taichi_msm.physics.material import factors
 from taichi_msm.physics.mesh_error import MeshEstimate
 from taichi_msm.picture import PictureError, file_sha256
 from taichi_msm.render import camera
-from taichi_msm.results.publication import CHECKPOINT, MANIFEST, STAGING, open_checkpoint
+from taichi_msm.results.checkpoint import CHECKPOINT, MANIFEST, open_manifest
+from taichi_msm.results.publication import STAGING
 from taichi_msm.results.sealed import unseal
 from taichi_msm.scene import Scene
 from taichi_msm.system.compiler import what_decides_bits
@@ -107,7 +108,7 @@ def read_manifest(directory: Path) -> Manifest:
     """
     path = directory / STAGING / CHECKPOINT / MANIFEST
     try:
-        with open_checkpoint(directory) as folder, folder.open(MANIFEST) as file:
+        with open_manifest(directory) as file:
             data = file.read(MAX_BYTES + 1)
         manifest = _PLAN.validate_python(unseal(data))
         # The current directory may be another one now.

@@ -9,29 +9,38 @@ from pathlib import Path
 from types import TracebackType
 from typing import Any
 
+import numpy as np
 from numpy.typing import NDArray
 
 from taichi_msm.errors import writing
+from taichi_msm.outputs import table
+from taichi_msm.outputs.npz import Pieces, write_arrays
 from taichi_msm.physics.run_progress import Saved
 from taichi_msm.progress import Pause
 from taichi_msm.render.labels import Observed
-from taichi_msm.results.checkpoint import Checkpoint
+from taichi_msm.results.checkpoint import CHECKPOINT, PATTERNS, Checkpoint
 from taichi_msm.results.encoder import Encoder, Job
 from taichi_msm.results.labels import LabelWriter
-from taichi_msm.results.publication import (
-    ANIMATION,
-    CAMERA,
-    RECORD,
-    RESULTS,
-    SERIES,
-    TRACKS,
-    TRAJECTORY,
-    Publication,
-    result_names,
-)
-from taichi_msm.results.trajectory import write_trajectory
+from taichi_msm.results.publication import Kind, Listed, Publication
+from taichi_msm.results.whole import add, create
 from taichi_msm.scene import Scene
 from taichi_msm.timegrid import TimeGrid
+
+
+def _listed(record: Mapping[str, Any]) -> Listed:
+    """Tell of a file whether it is one of the run with this record."""
+    results, frames = set(record["outputs"]), int(record["frames"])
+    counts = {output.result: output.count(frames) for output in table.OUTPUTS.values() if output.is_series}
+
+    def is_listed(name: str) -> bool:
+        result, _, file = name.partition("/")
+        return result in results and (not file or int(Path(file).stem) < counts[result])
+
+    return is_listed
+
+
+# The results of a run, and beside them the checkpoint from which it can go on.
+RUN = Kind("run", table.RECORD, table.PATTERNS, _listed, beside=(CHECKPOINT, PATTERNS))
 
 
 class ResultWriter:
@@ -71,7 +80,7 @@ class ResultWriter:
         self._grid = grid
         self._manifest = manifest
         self._resumes = resumes
-        self._publication = Publication(directory, self._names(scene.time.frames + 1))
+        self._publication = Publication(directory, RUN, self._names(scene.time.frames + 1))
         self._checkpoint: Checkpoint
         self._labels: LabelWriter
         self._encoder: Encoder | None = None
@@ -151,17 +160,8 @@ class ResultWriter:
                 report = self._encoder.finish(pause, hurry=hurry)
                 self._frames, self._encode_seconds = report.frames, report.seconds
             self._labels.finish(self._frames)
-            if TRAJECTORY in self._outputs(self._frames):
-                scene = self._scene
-                with self._publication.staged.create(TRAJECTORY) as file:
-                    write_trajectory(
-                        file,
-                        self._checkpoint.positions(self._frames),
-                        self._frames,
-                        scene.sheet.points,
-                        self._checkpoint.precision,
-                        scene.time.frames_per_second,
-                    )
+            if self._frames and "trajectory" in self._scene.output:
+                self._write_trajectory()
         self._finished = True
 
     def publish(self, record: Mapping[str, Any]) -> dict[str, Any]:
@@ -178,33 +178,40 @@ class ResultWriter:
         with writing(self._directory):
             # By these names the next run into the directory recognises our files.
             facts = {**record, "frames": self._frames, "outputs": self._outputs(self._frames)}
-            text = json.dumps(facts, indent=2, ensure_ascii=False, allow_nan=False)
-            with self._publication.staged.create(RECORD) as file:
-                # A file name that is not UTF-8 has surrogates; escaped with a backslash they are valid JSON.
-                file.write((text + "\n").encode("utf-8", "backslashreplace"))
+            text = json.dumps(facts, indent=2, ensure_ascii=False, allow_nan=False) + "\n"
+            # A file name that is not UTF-8 has surrogates; escaped with a backslash they are valid JSON.
+            add(self._publication.staged / table.RECORD, text.encode("utf-8", "backslashreplace"))
             self._publication.publish(self._names(self._frames))
-            self._publication.keep &= record.get("status") != "complete"
+            if record.get("status") == "complete":
+                self._checkpoint.forget()
+                self._publication.keep = False
         return facts
 
+    def _write_trajectory(self) -> None:
+        """Write the time [s] and the positions [m] of all frames, which may be larger than memory."""
+        checkpoint, frames = self._checkpoint, self._frames
+        shape = (frames, *self._scene.sheet.points, 3)
+        arrays: dict[str, NDArray[Any] | Pieces] = {
+            "time": np.arange(frames) / self._scene.time.frames_per_second,
+            "position": Pieces(checkpoint.precision, shape, checkpoint.positions(frames)),
+        }
+        with create(self._publication.staged / table.OUTPUTS["trajectory"].path()) as file:
+            write_arrays(file, arrays)
+
     def _outputs(self, frames: int) -> list[str]:
-        """List the outputs of a run with this many frames, the record last."""
-        wanted = [RESULTS.get(kind, kind) for kind in self._scene.output] if frames else []
-        if frames and self._scene.output_camera:
-            wanted.append(CAMERA)
-        order = (*SERIES, ANIMATION, TRAJECTORY, TRACKS, CAMERA)
-        return [*(name for name in order if name in wanted), RECORD]
+        """List the results of a run with this many frames, the record last."""
+        return table.results(self._scene.output if frames else ())
 
     def _names(self, frames: int) -> list[str]:
         """List the files of a run with this many frames."""
-        return result_names(self._outputs(frames), frames)
+        return table.file_names(self._outputs(frames), frames)
 
     def __enter__(self) -> ResultWriter:
         scene = self._scene
         with writing(self._directory), ExitStack() as opened:
             opened.enter_context(self._publication)
-            self._checkpoint = Checkpoint(
-                self._publication.staging, self._grid, scene.sheet.points, keeps_positions=bool(scene.output)
-            )
+            folder = self._publication.staging / CHECKPOINT
+            self._checkpoint = Checkpoint(folder, self._grid, scene.sheet.points, keeps_positions=bool(scene.output))
             self._labels = LabelWriter(self._publication.staged, scene)
             if scene.draws:
                 job = Job(

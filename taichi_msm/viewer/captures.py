@@ -4,10 +4,7 @@ from __future__ import annotations
 
 import filecmp
 import os
-import secrets
 import shutil
-from collections.abc import Iterator
-from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -15,7 +12,8 @@ import yaml
 from PIL import Image
 
 from taichi_msm.errors import FilesError, printable, writing
-from taichi_msm.results.gif import Picture
+from taichi_msm.outputs.gif import Picture
+from taichi_msm.results.whole import place, staged
 from taichi_msm.scene import Scene
 from taichi_msm.scenefile.load import MAX_BYTES
 from taichi_msm.scenefile.yaml_reader import MAX_NODES
@@ -50,13 +48,13 @@ class Captures:
         Raises:
             FilesError: here and below, when the folder cannot be written.
         """
-        with _draft(self.folder) as draft:
-            Image.fromarray(picture).save(draft, "PNG")
-            return self._place(draft, "picture", ".png")
+        with writing(self.folder), staged(self.folder) as hidden:
+            Image.fromarray(picture).save(hidden / "picture", "PNG")
+            return self._place(hidden / "picture", "picture", ".png")
 
     def keep_scene(self, scene: Scene) -> Path:
         """Save a scene, and beside it copies of its pictures, where a scene file must have them; returns its file."""
-        with _draft(self.folder) as draft:
+        with writing(self.folder), staged(self.folder) as hidden:
             scene = scene.with_pictures(lambda path: self._copied(Path(path)).name)
             data = scene.model_dump(mode="json", exclude_none=True)
             text = yaml.dump(
@@ -65,8 +63,8 @@ class Captures:
             text = f"# What was done in a live session of {printable(self._name)}; `run` repeats it.\n{text}"
             if len(text.encode()) > MAX_BYTES or values(scene) + VALUES_BESIDES > MAX_NODES:
                 raise FilesError("this session is too long for a scene file; reset it, and do less")
-            draft.write_text(text, "utf-8")
-            return self._place(draft, "session", ".yaml")
+            (hidden / "session").write_text(text, "utf-8")
+            return self._place(hidden / "session", "session", ".yaml")
 
     def film(self, size: tuple[int, int], rate: float, background: tuple[int, int, int]) -> Film:
         """Begin a film."""
@@ -79,11 +77,8 @@ class Captures:
 
     def _place(self, draft: Path, stem: str, suffix: str) -> Path:
         """Give a file the next free name."""
-        number = 1
-        while not _named(draft, path := self.folder / f"{stem}-{number}{suffix}"):
-            number += 1
-        self.kept.append(path)
-        return path
+        self.kept.append(place(draft, self.folder, stem, suffix))
+        return self.kept[-1]
 
     def _copied(self, image: Path) -> Path:
         """Make sure that the folder has a copy of a picture, under the picture's own name if that is free."""
@@ -94,40 +89,12 @@ class Captures:
             number += 1
             copy = self.folder / f"{image.stem}-{number}{image.suffix}"
         if not os.path.lexists(copy):
-            with _draft(self.folder) as draft:
-                shutil.copyfile(image, draft)
-                draft.replace(copy)
+            with staged(self.folder) as hidden:
+                shutil.copyfile(image, hidden / "copy")
+                (hidden / "copy").replace(copy)
         return copy
-
-
-@contextmanager
-def _draft(folder: Path) -> Iterator[Path]:
-    """Give a hidden name to write a file under; the name is removed in the end."""
-    # The name is random, as a killed process may have left its draft, which can be a hard link to a file that it saved.
-    draft = folder / f".draft-{secrets.token_hex(8)}"
-    with writing(folder):
-        folder.mkdir(parents=True, exist_ok=True)
-        try:
-            yield draft
-        finally:
-            draft.unlink(missing_ok=True)
 
 
 def values(scene: Scene) -> int:
     """Count the values that the keys of a scene's probes add to its file, which may have `MAX_NODES` in all."""
     return sum(4 * len(probe.at) + 3 * len(probe.load) for probe in scene.probes)
-
-
-def _named(draft: Path, path: Path) -> bool:
-    """Give a file a name, unless another has it."""
-    try:
-        # Unlike a rename, a link does not replace another file.
-        os.link(draft, path)
-    except FileExistsError:
-        return False
-    except OSError:
-        # The file system has no links.
-        if path.exists():
-            return False
-        draft.replace(path)
-    return True

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from taichi_msm.errors import FilesError
-from taichi_msm.results.gif import Picture
+from taichi_msm.outputs.gif import Picture
 from taichi_msm.scene import Scene
 from taichi_msm.viewer.captures import Captures
 from taichi_msm.viewer.film import Film

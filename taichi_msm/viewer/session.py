@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from taichi_msm.errors import DivergedError, SceneError
+from taichi_msm.outputs.gif import Picture
 from taichi_msm.physics.error_control import choose_step
 from taichi_msm.physics.lattice import rest_positions
 from taichi_msm.physics.mesh_error import choose_points
@@ -17,7 +18,6 @@ from taichi_msm.physics.probe_force import control_point, probe_force
 from taichi_msm.physics.timestep import time_grid, with_grid, with_time
 from taichi_msm.render.instrument import rod
 from taichi_msm.render.texture import load_texture
-from taichi_msm.results.gif import Picture
 from taichi_msm.scene import MAX_PROBES, Camera, Scene
 from taichi_msm.scenefile.validation import checked
 from taichi_msm.scenefile.yaml_reader import MAX_NODES
