@@ -15,9 +15,8 @@ import pytest
 from taichi_msm.errors import DamagedError
 from taichi_msm.physics.run_progress import RunProgress, Saved
 from taichi_msm.physics.state import State
-from taichi_msm.results.checkpoint import MANIFEST, POSITIONS, STATE, Checkpoint
+from taichi_msm.results.checkpoint import MANIFEST, POSITIONS, STATE, Checkpoint, seal, unseal
 from taichi_msm.results.manifest import Manifest, read_manifest
-from taichi_msm.results.sealed import seal, unseal
 from taichi_msm.scene import Scene
 from tests.scenes import scene, scene_and_grid
 

@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+from contextlib import closing
 from pathlib import Path
 from typing import NamedTuple
 
@@ -31,7 +32,7 @@ def grey(number: int) -> Picture:
 
 def write(path: Path, pictures: list[Picture], rate: float, palette: Palette) -> None:
     height, width, _ = pictures[0].shape if pictures else (HEIGHT, WIDTH, 3)
-    with GifWriter(path.open("wb"), (width, height), rate, palette) as gif:
+    with closing(GifWriter(path.open("wb"), (width, height), rate, palette)) as gif:
         for picture in pictures:
             gif.add(picture)
 

@@ -52,13 +52,7 @@ def _parts(array: NDArray[Any]) -> Iterable[bytes | memoryview]:
 
 
 def read_array(archive: zipfile.ZipFile, name: str, dtype: DTypeLike, shape: Shape) -> NDArray[Any]:
-    """Read an array that `write_arrays` wrote.
-
-    Args:
-        archive: open for reading.
-        name: of the array.
-        dtype: that the numbers must have.
-        shape: that the array must have.
+    """Read an array that `write_arrays` wrote; it must have this dtype and shape.
 
     Raises:
         ValueError: when dtype or shape differ; raised before memory is allocated for the array.
@@ -80,20 +74,10 @@ def read_rows(archive: zipfile.ZipFile, name: str, dtype: DTypeLike, row: Shape)
 
 
 def map_array(path: Path, name: str, dtype: DTypeLike, shape: Shape) -> NDArray[Any]:
-    """Map an array that `write_arrays` wrote, which may be larger than memory, after its checksum was verified.
+    """Map an array that `write_arrays` wrote, after its checksum was verified.
 
-    Args:
-        path: of the archive.
-        name: of the array.
-        dtype: that the numbers must have.
-        shape: that the array must have; not empty.
-
-    Returns:
-        The array, read-only; the system reads it when it is accessed.
-
-    Raises:
-        ValueError: when dtype or shape differ, or the array is damaged.
-        Exception: whatever `zipfile` raises for a damaged archive.
+    It may be larger than memory, but not empty. It is read-only, and the system reads it when it is accessed. Raises
+    what `read_array` does.
     """
     header = _header(dtype, shape)
     with path.open("rb") as file, zipfile.ZipFile(file) as archive:

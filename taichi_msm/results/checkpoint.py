@@ -1,12 +1,14 @@
 """The files from which another process can continue an unfinished run: its manifest, its frames and its last state.
 
 Every part has a checksum, which is verified before the part is used: a SHA-256 for the manifest, one for the positions
-of every frame, and the CRC-32 of the archive for the arrays of the state.
+of every frame, and the CRC-32 of the archive for the arrays of the state. What
+they say is not trusted, as anybody may have written them.
 """
 
 from __future__ import annotations
 
 import hashlib
+import json
 import math
 import os
 import re
@@ -27,7 +29,6 @@ from taichi_msm.physics.run_progress import RunProgress, Saved
 from taichi_msm.physics.state import State
 from taichi_msm.results.entries import FILE, FOLDER, clear, require
 from taichi_msm.results.publication import STAGING
-from taichi_msm.results.sealed import seal
 from taichi_msm.results.whole import DRAFT, create, replacing
 from taichi_msm.timegrid import TimeGrid
 
@@ -75,11 +76,7 @@ class Checkpoint:
         return time.perf_counter() >= self._due
 
     def begin(self, manifest: Mapping[str, Any]) -> None:
-        """Begin without frames, replacing the checkpoint of any other run.
-
-        Args:
-            manifest: what another process must know to continue the run, in JSON.
-        """
+        """Begin a run with this manifest, without frames, replacing the checkpoint of any other run."""
         self.close()
         self._folder.mkdir(exist_ok=True)
         self.forget()
@@ -131,13 +128,10 @@ class Checkpoint:
         self.frames += 1
 
     def position(self, frame: int) -> NDArray[Any]:
-        """Read the positions of a frame.
-
-        Returns:
-            Positions [m], shape (rows, cols, 3).
+        """Read the positions of a frame [m], shape (rows, cols, 3).
 
         Raises:
-            DamagedError: when the positions are not as they were written.
+            DamagedError: when they are not as they were written.
         """
         assert self._positions is not None, "begin or reopen comes first"
         record = np.empty(self._record_bytes, np.uint8)
@@ -147,7 +141,6 @@ class Checkpoint:
             rest = rest[count:]
         data = record[DIGEST_BYTES:]
         position = data.view(self.precision).reshape(self._shape)
-        # Not trusted: anybody may have written it.
         if rest or record[:DIGEST_BYTES].tobytes() != self._digest(frame, data.data) or not np.isfinite(position).all():
             raise self._damaged(POSITIONS)
         return position
@@ -191,7 +184,6 @@ class Checkpoint:
         progress = RunProgress(**{field.name: arrays[field.name].item() for field in fields(RunProgress)})
         saved = Saved(State(int(arrays["steps"]), arrays["displacement"], arrays["difference"]), progress)
         every = self._grid.steps_per_frame
-        # Not trusted: anybody may have written it.
         if not (
             progress.frame <= self._grid.frames
             and progress.frame * every <= saved.state.steps <= (progress.frame + 1) * every
@@ -237,6 +229,22 @@ def is_unfinished(directory: Path) -> bool:
     except (OSError, FilesError):
         return False
     return True
+
+
+def seal(content: Any) -> bytes:
+    """Write a value as JSON together with its SHA-256."""
+    return json.dumps({"sha256": _digest(json.dumps(content).encode()).hex(), "content": content}).encode()
+
+
+def unseal(data: bytes) -> Any:
+    """Read what `seal` wrote; raises ValueError when any bit of it, even of white space, is not as it was written."""
+    try:
+        content = json.loads(data)["content"]
+        if seal(content) == data:
+            return content
+    except (KeyError, TypeError, RecursionError):
+        pass
+    raise ValueError("damaged")
 
 
 def _digest(*parts: bytes | memoryview) -> bytes:

@@ -13,7 +13,6 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 from pydantic import TypeAdapter
-from typing_extensions import TypedDict
 
 from taichi_msm.arguments import require_path
 from taichi_msm.errors import FilesError, MsmError, SceneError
@@ -29,6 +28,8 @@ from taichi_msm.scene import Scene
 # The largest number of f32.
 MOST = float(np.finfo(np.float32).max)
 
+_DIGESTS, _OVERRIDES = TypeAdapter(dict[str, str]), TypeAdapter(list[str])
+
 PUT_BACK = "put back the picture that it was run with, or run the scene again"
 
 
@@ -38,7 +39,6 @@ class FinishedRun:
 
     Attributes:
         directory: where its results are.
-        record: the content of run.json.
         scene: the scene as it was run: with the points, the step and the precision that were chosen, without a
             tolerance, and with paths of pictures that are relative to the current directory.
         frames: how many were simulated.
@@ -47,7 +47,6 @@ class FinishedRun:
     """
 
     directory: Path
-    record: Mapping[str, Any]
     scene: Scene
     frames: int
     sha256: Mapping[str, str]
@@ -81,14 +80,7 @@ class FinishedRun:
         return positions
 
     def picture(self, key: str, frame: int) -> NDArray[np.uint8]:
-        """Read a picture of the results.
-
-        Args:
-            key: the entry of `output` that it was written for.
-            frame: its number.
-
-        Returns:
-            Colours, shape (height, width, 3).
+        """Read a picture that was written for an entry of `output`; colours, shape (height, width, 3).
 
         Raises:
             FilesError: when it is missing or cannot be read, or has another size than the scene's.
@@ -125,10 +117,7 @@ class FinishedRun:
             raise FilesError(f"{self.directory}: another run replaced these results while they were read; try again")
 
     def require_pictures(self, *, drawn: bool) -> None:
-        """Make sure that the maps are those that were run, by their SHA-256.
-
-        Args:
-            drawn: whether the picture is used too.
+        """Make sure that the maps, and if it is `drawn` the picture, are those that were run, by their SHA-256.
 
         Raises:
             FilesError: when one of them is missing or has changed.
@@ -156,11 +145,7 @@ class FinishedRun:
         return f'run the scene again with --set "output=[{outputs}]"'
 
     def result(self, key: str, frame: int = 0) -> Path:
-        """Find a file of the results.
-
-        Args:
-            key: the entry of `output` that it was written for.
-            frame: its number, if there is a file for every frame.
+        """Find a file that was written for an entry of `output`, of a frame if there is one for each.
 
         Raises:
             FilesError: when it is not there.
@@ -195,11 +180,11 @@ def read_run(directory: str | Path) -> FinishedRun:
             data = file.read(MAX_RECORD)
         record = json.loads(data)
         scene, frames = _as_run(record), record["frames"]
-        facts = _FACTS.validate_python(record)
+        sha256, overrides = _DIGESTS.validate_python(record["sha256"]), _OVERRIDES.validate_python(record["overrides"])
         chosen = scene.time.precision != "auto" and scene.sheet.tolerance is scene.time.tolerance is None
         if not isinstance(frames, int) or not 1 <= frames <= scene.time.frames + 1 or not chosen:
             raise damaged(path)
-    return FinishedRun(path.parent, record, scene, frames, facts["sha256"], facts["overrides"], data)
+    return FinishedRun(path.parent, scene, frames, sha256, overrides, data)
 
 
 @contextmanager
@@ -223,14 +208,6 @@ def reading(path: Path) -> Iterator[None]:
 def damaged(path: Path) -> FilesError:
     """Make the error for a result that is not what the run has written."""
     return FilesError(f"{path}: damaged, or not of this run; run the scene again")
-
-
-class _Facts(TypedDict):
-    sha256: dict[str, str]
-    overrides: list[str]
-
-
-_FACTS = TypeAdapter(_Facts)
 
 
 def _as_run(record: Mapping[str, Any]) -> Scene:
