@@ -12,11 +12,11 @@ from typing import Any, cast
 
 from pydantic import TypeAdapter
 
-from taichi_msm.errors import DamagedError, FilesError
-from taichi_msm.physics import material, stiffness_map, timestep
+from taichi_msm.errors import DamagedError, FilesError, SceneError
 from taichi_msm.physics.error_control import Estimate
-from taichi_msm.physics.material import factors
 from taichi_msm.physics.mesh_error import MeshEstimate
+from taichi_msm.physics.plan import Plan
+from taichi_msm.physics.planning import try_plan
 from taichi_msm.picture import PictureError, file_sha256
 from taichi_msm.render import camera
 from taichi_msm.results.checkpoint import CHECKPOINT, MANIFEST, open_manifest, unseal
@@ -61,13 +61,16 @@ class Manifest:
         """Convert the manifest to data for JSON."""
         return cast(dict[str, Any], _MANIFEST.dump_python(self, mode="json"))
 
-    def require_same(self, versions: Mapping[str, str]) -> None:
+    def require_same(self, sha256: Mapping[str, str], versions: Mapping[str, str]) -> None:
         """Make sure that the rest of the run would have the same bits as if it had not been interrupted.
+
+        Args:
+            sha256: of its picture and map now, by `digests`.
+            versions: of this process.
 
         Raises:
             FilesError: when the picture, a map or a version has changed.
         """
-        sha256 = digests(self.scene)
         for key, path in self.scene.pictures.items():
             if sha256.get(key) != self.sha256.get(key):
                 raise FilesError(f"{path} has changed since the run began; put it back, or run the scene again")
@@ -91,8 +94,8 @@ class Manifest:
 _MANIFEST = TypeAdapter(Manifest)
 
 
-def read_manifest(directory: Path) -> Manifest:
-    """Read the manifest of the unfinished run into a directory.
+def read_manifest(directory: Path) -> tuple[Manifest, Plan]:
+    """Read the manifest of the unfinished run into a directory, and plan its scene.
 
     Raises:
         FilesError: when there is no such run.
@@ -112,22 +115,25 @@ def read_manifest(directory: Path) -> Manifest:
         raise FilesError(f"{path}: {(error.strerror or str(error)).lower()}") from None
     except ValueError:  # pydantic's too
         raise DamagedError(f"{path} is damaged; run the scene again") from None
-    factors(manifest.scene)
+    plan, problems = try_plan(manifest.scene)
+    if unreadable := [str(problem) for problem in problems if problem.path[-1:] == ("image",)]:
+        raise SceneError(unreadable)
     # Not trusted: anybody may have written it.
     numbers = () if manifest.estimate is None else asdict(manifest.estimate).values()
     possible = manifest.arch in ARCHS and all(number >= 0 for number in numbers)
-    checks = (material.problems, timestep.problems, camera.problems)
-    if not possible or any(list(check(manifest.scene)) for check in checks):
+    if plan is None or problems or not possible or list(camera.problems(manifest.scene)):
         raise DamagedError(f"{path} is of a scene that cannot be run; run the scene again")
-    return manifest
+    return manifest, plan
 
 
-def digests(scene: Scene) -> dict[str, str]:
-    """Compute the SHA-256 of the files of a checked scene's picture and maps, by the keys that name them.
+def digests(plan: Plan) -> dict[str, str]:
+    """Compute the SHA-256 of the files of a scene's picture and map, by the keys that name them.
 
-    There is none of a picture that cannot be read. That of a map is of the file as it was read for the check.
+    There is none of a picture that cannot be read. That of the map is of the file as it was read for the plan.
     """
-    sha256 = {f"{scene.kind}.{name}.image": stiffness_map.sha256(value) for name, value in scene.maps.items()}
+    scene, sha256 = plan.scene, {}
+    if plan.image is not None:
+        sha256[f"{scene.kind}.map.image"] = plan.image.sha256
     if scene.image is not None:
         with suppress(PictureError):
             sha256["image"] = file_sha256(scene.image)
