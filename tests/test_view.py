@@ -23,7 +23,7 @@ from taichi_msm import load_scene
 from taichi_msm.cli import main
 from taichi_msm.errors import SceneError
 from taichi_msm.scene import Scene
-from taichi_msm.viewer.events import Drag, Harder, Key, Percent, Point, Press, Release, Turn
+from taichi_msm.viewer.events import Drag, Harder, Hover, Key, Percent, Press, Release, Turn
 from taichi_msm.viewer.pacing import LONGEST, Pacing
 from taichi_msm.viewer.script import load_script, timed
 from taichi_msm.viewer.window import QUIT, Hand, opening, placed
@@ -290,19 +290,19 @@ def test_what_the_hand_does() -> None:
     def understood(*told: pygame.Event) -> list[Any]:
         return list(hand.events(told, AREA))
 
-    assert understood(motion(0, 0), motion(7, 8)) == [Point(0, 0), Point(7, 8)]
+    assert understood(motion(0, 0), motion(7, 8)) == [Hover(0, 0), Hover(7, 8)]
     assert understood(button(1, 0, 0)) == [Press(0, 0)]
     assert understood(motion(399, 299), motion(-20, 350)) == [Drag(399, 299), Drag(-20, 350)]
-    assert understood(let_go(1, 20, 30), motion(30, 30)) == [Release(), Point(30, 30)]
+    assert understood(let_go(1, 20, 30), motion(30, 30)) == [Release(), Hover(30, 30)]
     assert understood(key(pygame.K_RSHIFT), button(1, 200, 149)) == [Press(200, 149, pull=True)]
     assert understood(key_up(pygame.K_RSHIFT), let_go(1, 0, 0), button(1, 0, 0)) == [Release(), Press(0, 0)]
     understood(let_go(1, 0, 0))
     assert understood(button(3, 100, 99), motion(110, 99), motion(115, 89), let_go(3, 115, 89), motion(300, 10)) == [
         Turn(10, 0),
         Turn(5, -10),
-        Point(300, 10),
+        Hover(300, 10),
     ]
-    assert understood(button(2, 1, 1), motion(2, 2), let_go(2, 2, 2)) == [Point(2, 2)]
+    assert understood(button(2, 1, 1), motion(2, 2), let_go(2, 2, 2)) == [Hover(2, 2)]
     # The wheel is reported as buttons 4 and 5, too.
     assert understood(button(4, 0, 0), let_go(4, 0, 0), pygame.Event(pygame.MOUSEWHEEL, x=0, y=1)) == [Harder(5)]
     assert understood(pygame.Event(pygame.MOUSEWHEEL, x=1, y=-2)) == [Harder(-10)]
@@ -346,8 +346,8 @@ def test_a_hand_lets_go_where_another_window_gets_the_release() -> None:
     lost = pygame.Event(pygame.WINDOWFOCUSLOST)
     pressing, turning = Hand((400, 300)), Hand((400, 300))
     told = [button(1, 9, 9), lost, motion(5, 5), let_go(1, 5, 5)]
-    assert list(pressing.events(told, AREA)) == [Press(9, 9), Release(), Point(5, 5)]
-    assert list(turning.events([button(3, 9, 9), lost, motion(5, 5)], AREA)) == [Point(5, 5)]
+    assert list(pressing.events(told, AREA)) == [Press(9, 9), Release(), Hover(5, 5)]
+    assert list(turning.events([button(3, 9, 9), lost, motion(5, 5)], AREA)) == [Hover(5, 5)]
 
 
 def test_a_picture_fills_its_window_and_pixels_are_found_in_it() -> None:
@@ -358,10 +358,10 @@ def test_a_picture_fills_its_window_and_pixels_are_found_in_it() -> None:
     told = [motion(100, 0), motion(101, 1), motion(899, 599), motion(99, 600)]
     assert list(Hand((400, 300)).events(told, placed((400, 300), (1000, 600)))) == [
         # Every pixel takes 2 x 2; the first of them is a quarter of a pixel from its centre.
-        Point(-0.25, -0.25),
-        Point(0.25, 0.25),
-        Point(399.25, 299.25),
-        Point(-0.75, 299.75),
+        Hover(-0.25, -0.25),
+        Hover(0.25, 0.25),
+        Hover(399.25, 299.25),
+        Hover(-0.75, 299.75),
     ]
 
 
@@ -611,7 +611,7 @@ def test_the_screen_shows_the_picture(tmp_path: Path, screen: Screen) -> None:
         shown()
         screen.hand("mousemove", "100", "50")
         whole, told = shown()
-        assert "[Point(x=9.75, y=24.75)]" in told
+        assert "[Hover(x=9.75, y=24.75)]" in told
         # The middles of the fields of 80 x 80 that are whole.
         np.testing.assert_allclose(whole[39:480:80, 119:680:80], picture[19::40, 19::40], atol=1)
         assert not whole[:, :80].any()
