@@ -21,6 +21,7 @@ import click
 
 from taichi_msm import __version__
 from taichi_msm.errors import DeviceError, FilesError, NotInstalledError, SceneError, did_you_mean, printable
+from taichi_msm.export.formats import FORMATS
 from taichi_msm.system.signals import Interruption
 from taichi_msm.system.streams import mute, tell
 
@@ -32,9 +33,6 @@ DONE, BUG, WRONG_INPUT, DIVERGED, FILES = 0, 1, 2, 3, 4
 # What may be given together with --resume, and with --again.
 RESUMABLE = ("resume", "threads", "quiet", "as_json")
 REPEATABLE = ("again", "out", "arch", "threads", "estimate_error", "quiet", "as_json")
-
-# What results can be converted to.
-FORMATS = ("kitti", "tapvid", "vtk", "gltf", "obj")
 
 EXIT_CODES = {"complete": DONE, "diverged": DIVERGED}
 
@@ -408,8 +406,7 @@ def view(
     type=Choice(FORMATS),
     metavar="FORMAT",
     required=True,
-    help="kitti: optical flow; tapvid: tracks of points; vtk: for ParaView; gltf: for Blender and browsers; "
-    "obj: for other programs with surfaces.",
+    help="; ".join(f"{name}: {row.means}" for name, row in FORMATS.items()) + ".",
 )
 @click.option("--out", metavar="DIR2", help="Directory for the files.  [default: DIR/export-FORMAT]")
 @click.option("--quiet", is_flag=True, help="Print no progress and no summary.")
@@ -489,7 +486,7 @@ def without_link(folder: Path, option: str) -> Path:
 
 def going_on(directory: Path) -> str:
     """Say how to continue the unfinished run in a directory; empty if there is none."""
-    from taichi_msm.results.publication import is_unfinished
+    from taichi_msm.results.checkpoint import is_unfinished
 
     if not is_unfinished(directory):
         return ""

@@ -6,13 +6,13 @@ import csv
 import io
 import json
 import math
-import tempfile
 from collections.abc import Iterator, Sequence
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
 from taichi_msm.errors import writing
+from taichi_msm.results.whole import staged
 from taichi_msm.study.result import Peer, Points, Stepping, Study, Timing
 from taichi_msm.study.table import (
     decibels,
@@ -67,13 +67,8 @@ def require_writable(directory: Path) -> None:
     Raises:
         FilesError: when it cannot.
     """
-    with writing(directory):
-        existed = directory.exists()
-        directory.mkdir(parents=True, exist_ok=True)
-        with tempfile.TemporaryDirectory(prefix=".partial-", dir=directory):
-            pass
-        if not existed:
-            directory.rmdir()
+    with writing(directory), staged(directory):
+        pass
 
 
 def write_report(study: Study, directory: Path) -> list[str]:
@@ -91,20 +86,17 @@ def write_report(study: Study, directory: Path) -> list[str]:
     Raises:
         FilesError: when the directory cannot be written.
     """
-    with writing(directory):
-        directory.mkdir(parents=True, exist_ok=True)
-        with tempfile.TemporaryDirectory(prefix=".partial-", dir=directory) as name:
-            staged = Path(name)
-            outputs = [PICTURE] if _draw(study, staged / PICTURE) else []
-            outputs += [FLAT, PAGE, RECORD]
-            _write(staged / FLAT, _flat(study))
-            _write(staged / PAGE, _page(study))
-            record = {**as_record(study), "outputs": outputs}
-            _write(staged / RECORD, json.dumps(record, indent=2, ensure_ascii=False, allow_nan=False) + "\n")
-            if PICTURE not in outputs:
-                (directory / PICTURE).unlink(missing_ok=True)
-            for output in outputs:
-                (staged / output).replace(directory / output)
+    with writing(directory), staged(directory) as hidden:
+        outputs = [PICTURE] if _draw(study, hidden / PICTURE) else []
+        outputs += [FLAT, PAGE, RECORD]
+        _write(hidden / FLAT, _flat(study))
+        _write(hidden / PAGE, _page(study))
+        record = {**as_record(study), "outputs": outputs}
+        _write(hidden / RECORD, json.dumps(record, indent=2, ensure_ascii=False, allow_nan=False) + "\n")
+        if PICTURE not in outputs:
+            (directory / PICTURE).unlink(missing_ok=True)
+        for output in outputs:
+            (hidden / output).replace(directory / output)
     return outputs
 
 
