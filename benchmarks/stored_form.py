@@ -15,12 +15,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from taichi_msm import load_scene
-from taichi_msm.physics.lattice import fixed_points, rest_positions, springs
+from taichi_msm.physics.lattice import fixed_points, rest_positions
 from taichi_msm.physics.loads import Schedule, decay, schedule
 from taichi_msm.physics.material import material
 from taichi_msm.physics.timestep import time_grid
 from taichi_msm.scene import Scene
 from taichi_msm.timegrid import TimeGrid
+from tests.reference.neighbours import springs
 
 SCENE = Path(__file__).parent.parent / "scenes" / "figure-3.yaml"
 STEPS_PER_SECOND = 18000

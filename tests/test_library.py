@@ -26,7 +26,6 @@ from taichi_msm import (
     Sheet,
     Simulation,
     load_scene,
-    reference,
     resume,
     run,
 )
@@ -35,6 +34,7 @@ from taichi_msm.physics.timestep import stable_step, time_grid, with_time
 from taichi_msm.render.camera import view
 from taichi_msm.system.resources import processor
 from taichi_msm.system.runtime import Device
+from tests import reference
 from tests.scenes import PRESS, SHEET, scene, speckle
 
 HAND = {"at": [[0, 0.5, 0.5]], "force": [0, 0, -20], "falloff": 20, "offset": 0}

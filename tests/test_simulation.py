@@ -6,11 +6,12 @@ import numpy as np
 import pytest
 
 import taichi_msm
-from taichi_msm import DivergedError, MsmError, Simulation, reference, runner
+from taichi_msm import DivergedError, MsmError, Simulation, runner
 from taichi_msm.physics.timestep import time_grid
 from taichi_msm.system import resources
 from taichi_msm.system.compiler import chosen
 from taichi_msm.system.runtime import Device
+from tests import reference
 from tests.scenes import scene, speckle
 
 

@@ -6,10 +6,10 @@ from typing import Any
 import numpy as np
 import pytest
 
-from taichi_msm import reference
 from taichi_msm.physics.lattice import rest_positions
 from taichi_msm.physics.material import highest_frequency, material
 from taichi_msm.physics.timestep import problems, stable_step, time_grid
+from tests import reference
 from tests.scenes import SHEET, scene
 
 

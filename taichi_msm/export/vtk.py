@@ -23,8 +23,8 @@ from numpy.typing import NDArray
 from taichi_msm.errors import NotInstalledError
 from taichi_msm.export.mesh import PICTURE, REFINE, picture_png
 from taichi_msm.physics.lattice import rest_positions
+from taichi_msm.physics.springs import energy_density
 from taichi_msm.progress import Count
-from taichi_msm.reference import energy_density
 from taichi_msm.render.surface import surface
 from taichi_msm.results.finished_run import FinishedRun
 from taichi_msm.results.folder import Folder, Tree
