@@ -26,7 +26,7 @@ from taichi_msm.system.streams import mute, tell
 
 if TYPE_CHECKING:
     from taichi_msm.console import Progress
-    from taichi_msm.scene import Scene
+    from taichi_msm.physics.plan import Plan
 
 DONE, BUG, WRONG_INPUT, DIVERGED, FILES = 0, 1, 2, 3, 4
 # What may be given together with --resume, and with --again.
@@ -130,13 +130,13 @@ def run(
     elif again is not None:
         require_alone(context, "--again repeats", REPEATABLE)
         directory = result_directory(again, option="--again") if out is None else result_directory(out)
-        loaded, typed = repeated(again)
+        plan, typed = repeated(again)
     elif scene is None:
         raise click.MissingParameter(param_hint="'SCENE'", param_type="argument")
     else:
-        from taichi_msm.scenefile.load import load_scene
+        from taichi_msm.scenefile.load import load_plan
 
-        loaded = load_scene(scene, overrides, image)
+        plan = load_plan(scene, overrides, image)
         directory = result_directory(out, Path(scene).stem)
 
     from taichi_msm import runner
@@ -151,7 +151,7 @@ def run(
                 record = runner.resume(directory, threads=threads, started=STARTED, progress=progress)
             else:
                 record = runner.run(
-                    loaded,
+                    plan,
                     directory,
                     arch=arch,
                     threads=threads,
@@ -164,7 +164,7 @@ def run(
         report("interrupted", [f"interrupted; nothing was written{going_on(directory)}"], as_json)
         return interruption.code
     if resume is None:
-        duration.learn(loaded, record)
+        duration.learn(plan, record)
     if as_json:
         print_json({"directory": str(directory), **record})
     if record["status"] != "complete":
@@ -183,17 +183,17 @@ def run(
 @json_option
 def check(scene: str, image: str | None, overrides: tuple[str, ...], as_json: bool) -> int:
     """Validate SCENE and print the steps, time, memory and disk space it needs; compute nothing."""
-    from taichi_msm.physics import probe_force, timestep
+    from taichi_msm.physics import probe_force
     from taichi_msm.physics.probe_force import in_words, probe_records
     from taichi_msm.render.notes import notes as drawing_notes
     from taichi_msm.scenefile import budget, duration
-    from taichi_msm.scenefile.load import load_scene
+    from taichi_msm.scenefile.load import load_plan
 
-    loaded = load_scene(scene, overrides, image)
+    plan = load_plan(scene, overrides, image)
     with naming(scene):
-        budget.require_disk(loaded, Path("output"))
-    grid, limit = timestep.time_grid(loaded), timestep.stable_step(loaded)
-    need, takes = budget.estimate(loaded, grid), duration.estimate(loaded, grid)
+        budget.require_disk(plan, Path("output"))
+    loaded, grid, limit = plan.scene, plan.grid, plan.stable_step
+    need, takes = budget.estimate(plan), duration.estimate(plan)
     facts: dict[str, Any] = {
         "scene": loaded.model_dump(mode="json"),
         "step": grid.step,
@@ -446,13 +446,14 @@ def require_alone(context: click.Context, does: str, allowed: Sequence[str]) -> 
             raise click.UsageError(f"{does} a run with its own settings; leave out {name}")
 
 
-def repeated(directory: str) -> tuple[Scene, list[str]]:
-    """Give the scene of an earlier run, with its pictures where they are, and the overrides that made it."""
+def repeated(directory: str) -> tuple[Plan, list[str]]:
+    """Plan the scene of an earlier run, with its pictures where they are, and the overrides that made it."""
     from taichi_msm.results.finished_run import read_run
+    from taichi_msm.scenefile.validation import checked
 
     earlier = read_run(result_directory(directory, option="--again"))
     earlier.require_pictures(drawn=earlier.scene.draws or "image" in earlier.sha256)
-    return earlier.scene, earlier.overrides
+    return checked(earlier.scene), earlier.overrides
 
 
 def unfinished(directory: str) -> Path:

@@ -15,13 +15,11 @@ from taichi_msm.errors import ArgumentError, DivergedError, MsmError
 from taichi_msm.physics import divergence
 from taichi_msm.physics.diagnosis import Diagnosis, diagnose
 from taichi_msm.physics.divergence import Watch, farthest
-from taichi_msm.physics.error_control import choose_step
 from taichi_msm.physics.lattice import axes
-from taichi_msm.physics.mesh_error import choose_points
+from taichi_msm.physics.plan import Plan
 from taichi_msm.physics.run_progress import RunProgress, Saved
 from taichi_msm.physics.solver import Dynamics
 from taichi_msm.physics.state import Reading
-from taichi_msm.physics.timestep import time_grid, with_grid
 from taichi_msm.progress import Pause
 from taichi_msm.render.camera import View, view
 from taichi_msm.render.instrument import Rod, rods
@@ -30,9 +28,9 @@ from taichi_msm.render.picking import pick
 from taichi_msm.render.surface import Surface, surface
 from taichi_msm.render.texture import load_texture, require_texture
 from taichi_msm.scene import UNTIL_NEXT, Camera, Probe, Scene
+from taichi_msm.scenefile.resolve import resolve
 from taichi_msm.scenefile.validation import checked
 from taichi_msm.system import runtime
-from taichi_msm.timegrid import TimeGrid
 
 if TYPE_CHECKING:
     from taichi_msm.notebook import Player
@@ -61,39 +59,33 @@ class Simulation:
         DeviceError: when the arch is not available, or the compiler already runs on another one in this process.
         SceneError: when the scene cannot be run, or no step meets its tolerance.
 
-    Attributes:
-        scene: the scene, with the step and the precision that were chosen.
     """
 
     def __init__(
         self,
-        scene: Scene | Mapping[str, Any],
+        scene: Plan | Scene | Mapping[str, Any],
         arch: str = "cpu",
         threads: int | None = None,
         texture: NDArray[np.uint8] | None = None,
         cores: int | None = None,
     ) -> None:
-        scene = checked(scene)
+        plan = checked(scene)
         texture = None if texture is None else require_texture(texture)
         self.device = runtime.start(arch, threads)
-        self.scene, self._grid = self._resolved(scene)
-        self._watch = Watch(self.scene, self._grid)
+        self._plan = resolve(plan, self.device).plan
+        self._watch = Watch(self._plan)
         self._closed = self._diverged = False
-        self._dynamics = Dynamics(self.scene, self._grid, self.device, cores=cores)
+        self._dynamics = Dynamics(self._plan, self.device, cores=cores)
         self._position = self._place(self._dynamics.displacement())
         self._texture = texture
         self._own_texture = texture is None
         # The keys tell whether a drawing gives a picture, and whether it gives labels.
         self._drawings: dict[tuple[bool, bool], Drawing] = {}
 
-    def _resolved(self, scene: Scene) -> tuple[Scene, TimeGrid]:
-        """Choose what the scene leaves open: the points and the step for a tolerance, and the precision."""
-        if scene.sheet.tolerance is not None:
-            scene, _ = choose_points(scene, self.device, checked)
-        grid = time_grid(scene, self.device.arch)
-        if scene.time.tolerance is not None:
-            grid, _ = choose_step(scene, grid, self.device)
-        return with_grid(scene, grid), grid
+    @property
+    def scene(self) -> Scene:
+        """The scene, with the points, the step and the precision that were chosen."""
+        return self._plan.scene
 
     @property
     def frame(self) -> int:
@@ -146,7 +138,7 @@ class Simulation:
         require_frame_count(frames)
         self._require_open()
         for _ in range(frames):
-            end = (self.frame + 1) * self._grid.steps_per_frame
+            end = (self.frame + 1) * self._plan.grid.steps_per_frame
             self._dynamics.advance(end - self.steps, pause)
             self._position = self._read()
 
@@ -165,10 +157,10 @@ class Simulation:
         self._require_open()
         if not isinstance(probes, Sequence):
             raise ArgumentError(f"probes: {probes!r}; take a list of them")
-        scene = self.scene.model_copy(update={"probes": tuple(probes)})
-        self._dynamics.steer(scene)
-        self._watch.steer(scene)
-        self.scene = scene
+        plan = self._plan.with_probes(probes)
+        self._dynamics.steer(plan)
+        self._watch.steer(plan)
+        self._plan = plan
 
     def restart(self, scene: Scene | Mapping[str, Any] | None = None) -> None:
         """Begin again at rest. Nothing is compiled if the terms of the model and the precision stay the same.
@@ -182,13 +174,13 @@ class Simulation:
         """
         self._require_open()
         if scene is not None:
-            scene, grid = self._resolved(checked(scene))
-            if self._own_texture and (scene.image, scene.region) != (self.scene.image, self.scene.region):
+            plan = resolve(checked(scene), self.device).plan
+            if self._own_texture and (plan.scene.image, plan.scene.region) != (self.scene.image, self.scene.region):
                 self._texture = None
-            self.scene, self._grid = scene, grid
-        self._watch = Watch(self.scene, self._grid)
+            self._plan = plan
+        self._watch = Watch(self._plan)
         self._diverged = False
-        self._dynamics.restart(self.scene, self._grid)
+        self._dynamics.restart(self._plan)
         self._drawings.clear()
         self._position = self._place(self._dynamics.displacement())
 
@@ -214,7 +206,7 @@ class Simulation:
         self._require_open()
         if not isinstance(saved, Saved):
             raise ArgumentError(f"{type(saved).__name__} is not what `save` returns")
-        state, per_frame = saved.state, self._grid.steps_per_frame
+        state, per_frame = saved.state, self._plan.grid.steps_per_frame
         since = state.steps - saved.progress.frame * per_frame
         alike = (state.displacement.shape, state.displacement.dtype) == (self._position.shape, self._position.dtype)
         if not (alike and 0 <= since <= per_frame):
@@ -223,7 +215,7 @@ class Simulation:
                 f"{state.displacement.shape}; take what was saved with this scene's points, precision and step"
             )
         self._diverged = False
-        self._dynamics.restart(self.scene, self._grid, saved.state)
+        self._dynamics.restart(self._plan, saved.state)
         self._position = self._place(self._dynamics.displacement())
         self._watch.progress = saved.progress
 
@@ -242,7 +234,7 @@ class Simulation:
             Velocities [m/s], shape (rows, cols, 3), in the scene's precision; 0 at the start.
         """
         self._require_open()
-        return self._dynamics.state().difference / self._position.dtype.type(self._grid.step)
+        return self._dynamics.state().difference / self._position.dtype.type(self._plan.grid.step)
 
     def surface(self) -> Surface:
         """Give the refined surface as textured triangles: vertices, triangles, texture coordinates."""
@@ -531,7 +523,7 @@ class Simulation:
     def _require_good(self, reading: Reading, wrong: str) -> None:
         if wrong:
             self._diverged = True
-            steps, time = reading.steps, self._grid.time(reading.steps)
+            steps, time = reading.steps, self._plan.grid.time(reading.steps)
             point = farthest(reading.displacement)[:2]
             raise DivergedError(divergence.message(time, steps, wrong, exact=False), steps, time, point)
 

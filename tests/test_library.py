@@ -30,12 +30,12 @@ from taichi_msm import (
     run,
 )
 from taichi_msm.physics.lattice import rest_positions
-from taichi_msm.physics.timestep import stable_step, time_grid, with_time
+from taichi_msm.physics.timestep import with_time
 from taichi_msm.render.camera import view
 from taichi_msm.system.resources import processor
 from taichi_msm.system.runtime import Device
 from tests import reference
-from tests.scenes import PRESS, SHEET, scene, speckle
+from tests.scenes import PRESS, SHEET, plan_of, scene, speckle
 
 HAND = {"at": [[0, 0.5, 0.5]], "force": [0, 0, -20], "falloff": 20, "offset": 0}
 
@@ -123,7 +123,7 @@ def test_scenes_made_in_python_are_checked(device: Device, tmp_path: Path) -> No
         Probe()
     broken = {"sheet": SHEET, "springs": {}, "time": {"duration": -1}, "output": []}
     unstable = with_time(good, step=0.04)
-    assert stable_step(good) < 0.04
+    assert plan_of(good).stable_step < 0.04
     for attempt in (lambda made: Simulation(made, threads=device.threads), lambda made: run(made, tmp_path / "out")):
         with pytest.raises(SceneError, match=r"time\.duration: -1 is not allowed"):
             attempt(broken)
@@ -181,9 +181,9 @@ def test_restarted_it_is_a_new_simulation(simulation: Simulation, device: Device
 def test_velocities_are_the_mean_of_the_last_step(simulation: Simulation) -> None:
     assert not simulation.velocities().any()
     simulation.advance(2)
-    h = time_grid(simulation.scene).step
+    h = plan_of(simulation.scene).grid.step
     made = with_time(simulation.scene, duration=2 * 0.04, frames_per_second=round(1 / h), step=h)
-    states = list(reference.displacements(made, time_grid(made)))
+    states = list(reference.displacements(plan_of(made)))
     np.testing.assert_allclose(simulation.velocities(), (states[-1] - states[-2]) / h, atol=1e-12)
 
 
@@ -239,7 +239,7 @@ def test_a_divergence_says_where_it_is(device: Device) -> None:
         simulation.advance(10)
     error = caught.value
     assert error.step > 0
-    assert error.time == pytest.approx(error.step * time_grid(made).step)
+    assert error.time == pytest.approx(error.step * plan_of(made).grid.step)
     assert f"point {error.point}" in str(error)
     again = pickle.loads(pickle.dumps(error))
     assert (str(again), again.step, again.time, again.point) == (str(error), error.step, error.time, error.point)
@@ -271,7 +271,7 @@ def test_what_was_saved_elsewhere_is_not_gone_on_with(simulation: Simulation, de
     simulation.advance(3)
     before = simulation.positions()
     others = (
-        scene(time={"step": time_grid(simulation.scene).step / 4}),
+        scene(time={"step": plan_of(simulation.scene).grid.step / 4}),
         scene(sheet={**SHEET, "points": [5, 5]}),
         scene(time={"precision": "f32"}),
     )

@@ -18,7 +18,6 @@ from taichi_msm import load_scene, run
 from taichi_msm.errors import FilesError, SceneError
 from taichi_msm.physics.lattice import rest_positions
 from taichi_msm.physics.loads import schedule
-from taichi_msm.physics.timestep import time_grid
 from taichi_msm.system.runtime import Device
 from taichi_msm.viewer import captures
 from taichi_msm.viewer import session as live_session
@@ -27,6 +26,7 @@ from taichi_msm.viewer.events import KEYS, Drag, Event, Harder, Key, Percent, Po
 from taichi_msm.viewer.recorder import record
 from taichi_msm.viewer.session import Session, with_live_frames
 from tests.outputs import duration
+from tests.scenes import plan_of
 
 # small.yaml with a force that dimples it as tissue, and a camera that sees it tilted.
 TILTED = {
@@ -194,8 +194,8 @@ def test_virtual_springs_vanish_when_the_tool_is_released(begin: Begin) -> None:
     session.handle(Release())
     advance(session, 1)
     recorded = session.recorded()
-    count = time_grid(recorded).steps_per_frame
-    active = schedule(recorded, time_grid(recorded), 0, 16 * count).active
+    count = plan_of(recorded).grid.steps_per_frame
+    active = schedule(plan_of(recorded), 0, 16 * count).active
     assert (active[: 15 * count] == 1).all()
     assert active[15 * count] == 0.5, "the mean at the instant of the release"
     assert (active[15 * count + 1 :] == 0).all()
@@ -482,15 +482,15 @@ def test_a_session_that_diverged_says_so_and_can_be_reset(begin: Begin) -> None:
 )
 def test_a_session_has_as_many_frames_as_a_screen_shows(rate: float, step: Any, parts: int, small: Path) -> None:
     scene = load_scene("small.yaml", {"time.frames_per_second": rate, "time.duration": 1, "time.step": step})
-    live, found = with_live_frames(scene)
-    assert (live.time.frames_per_second, found) == (rate * parts, parts)
+    live, found = with_live_frames(plan_of(scene))
+    assert (live.scene.time.frames_per_second, found) == (rate * parts, parts)
 
 
 def test_a_given_step_stays(small: Path) -> None:
     scene = load_scene("small.yaml", {"time.frames_per_second": 20, "time.duration": 1, "time.step": 0.002})
-    live, parts = with_live_frames(scene)
+    live, parts = with_live_frames(plan_of(scene))
     assert parts == 1, "25 steps a frame cannot be cut into three frames, nor two"
-    assert time_grid(live).steps_per_frame == 25
+    assert live.grid.steps_per_frame == 25
 
 
 @pytest.mark.parametrize(

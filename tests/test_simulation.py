@@ -7,12 +7,11 @@ import pytest
 
 import taichi_msm
 from taichi_msm import DivergedError, MsmError, Simulation, runner
-from taichi_msm.physics.timestep import time_grid
 from taichi_msm.system import resources
 from taichi_msm.system.compiler import chosen
 from taichi_msm.system.runtime import Device
 from tests import reference
-from tests.scenes import scene, speckle
+from tests.scenes import plan_of, scene, speckle
 
 
 def test_frames_positions_and_pictures(device: Device) -> None:
@@ -101,12 +100,12 @@ def test_the_names_of_the_api() -> None:
 def test_the_encoder_has_a_core_of_its_own_while_it_works(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(resources, "available_threads", lambda: 4)
     made = scene(render={"size": [512, 512]}, time={"step": 0.001})
-    assert runner.free_cores(made, time_grid(made)) == 4, "nothing to encode"
+    assert runner.free_cores(plan_of(made)) == 4, "nothing to encode"
     made = made.model_copy(update={"image": "a.png", "output": ("gif",)})
-    assert runner.free_cores(made, time_grid(made)) == 3
+    assert runner.free_cores(plan_of(made)) == 3
     # 40 steps of 10^6 points a frame take longer than its 512 x 512 pixels.
     large = made.sheet.model_copy(update={"points": (1000, 1000)})
     large_scene = made.model_copy(update={"sheet": large})
-    assert runner.free_cores(large_scene, time_grid(large_scene)) == 4
+    assert runner.free_cores(plan_of(large_scene)) == 4
     monkeypatch.setattr(resources, "available_threads", lambda: 1)
-    assert runner.free_cores(made, time_grid(made)) == 1
+    assert runner.free_cores(plan_of(made)) == 1

@@ -10,8 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from taichi_msm.physics.lattice import spacing
-from taichi_msm.physics.material import area_shares, material, stiffness
-from taichi_msm.scene import Scene
+from taichi_msm.physics.material import area_shares, stiffness
+from taichi_msm.physics.plan import Plan
 
 Array = NDArray[np.float64]
 Window = tuple[slice, slice]
@@ -41,14 +41,10 @@ class Springs(NamedTuple):
         return between, np.linalg.norm(between, axis=-1)
 
 
-def springs(scene: Scene) -> Iterator[Springs]:
-    """List the springs along rows, along columns and along both diagonals, each spring once.
-
-    Raises:
-        SceneError: when the map cannot be read.
-    """
-    (rows, cols), (dx, dy) = scene.sheet.points, spacing(scene.sheet)
-    sheet, k = material(scene), stiffness(scene)
+def springs(plan: Plan) -> Iterator[Springs]:
+    """List the springs along rows, along columns and along both diagonals, each spring once."""
+    (rows, cols), (dx, dy), sheet = plan.scene.sheet.points, spacing(plan.scene.sheet), plan.material
+    k = stiffness(sheet, np.ones((rows - 1, cols - 1)) if sheet.factors is None else sheet.factors)
     # Under tension a spring pulls at rest as if there were no map; at edges half as strongly, like its stiffness.
     shares = (np.where(np.isin(np.arange(count), (0, count - 1)), 0.5, 1.0) for count in (rows, cols))
     of_rows, of_columns = np.ix_(*shares) if sheet.by_area else (1.0, 1.0)
@@ -87,21 +83,21 @@ def elastic_force(every: Sequence[Springs], displacement: Array) -> Array:
     return force
 
 
-def energy_density(scene: Scene, displacement: Array) -> Array:
+def energy_density(plan: Plan, displacement: Array) -> Array:
     """Give the elastic energy of springs above that at rest, per area, without bending and the virtual springs.
 
     Each end of a spring gets half of its energy, and a point has the share of the sheet's area at rest that
     `area_shares` gives it, so that the sum of density times area is the energy of all springs.
 
     Args:
-        scene: the scene.
+        plan: of the scene.
         displacement: x - X [m], shape (rows, cols, 3).
 
     Returns:
         Energy per area at rest [J/m2], shape (rows, cols).
     """
-    at_points, (dx, dy) = np.zeros(displacement.shape[:2]), spacing(scene.sheet)
-    for family in springs(scene):
+    at_points, (dx, dy) = np.zeros(displacement.shape[:2]), spacing(plan.scene.sheet)
+    for family in springs(plan):
         between, length = family.apart(displacement)
         rest = family.length - family.unstretched
         # The part that is linear in the displacements cancels in the sum, as the sheet is in equilibrium at rest.
@@ -109,4 +105,4 @@ def energy_density(scene: Scene, displacement: Array) -> Array:
         energy = family.stiffness * ((length - family.unstretched) ** 2 / 2 - rest**2 / 2 - linear)
         at_points[family.here] += energy / 2
         at_points[family.there] += energy / 2
-    return at_points / (dx * dy * area_shares(scene.sheet))
+    return at_points / (dx * dy * area_shares(plan.scene.sheet))

@@ -11,9 +11,9 @@ from itertools import chain
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from taichi_msm.errors import ArgumentError, Problem, SceneError
-from taichi_msm.errors import Path as Key
+from taichi_msm.errors import ArgumentError, Key, Problem, SceneError
 from taichi_msm.faults import cut, flow
+from taichi_msm.physics.plan import Plan
 from taichi_msm.picture import SUFFIXES
 from taichi_msm.scene import MAX_PATH, Scene
 from taichi_msm.scenefile.validation import validate
@@ -69,6 +69,13 @@ def load_scene(
         ArgumentError: when the overrides are neither a sequence of texts nor a mapping from texts.
         SceneError: with all problems of the scene, one line each, in the order of their places in the file.
     """
+    return load_plan(path, overrides, image).scene
+
+
+def load_plan(
+    path: str | Path, overrides: Sequence[str] | Mapping[str, Any] = (), image: str | Path | None = None
+) -> Plan:
+    """Read and check a scene as `load_scene` does, and plan it for a CPU."""
     if isinstance(overrides, str) or not (
         isinstance(overrides, (Sequence, Mapping)) and all(isinstance(one, str) for one in overrides)
     ):
@@ -79,11 +86,11 @@ def load_scene(
     draft.find_pictures(Path(path).parent, PICTURES if image is None else MAPS)
     if image is not None:
         draft.override(_Override(f"--image {cut(str(image))}", IMAGE, str(image)))
-    scene, problems = validate(draft.data)
+    plan, problems = validate(draft.data)
     draft.report(problems)
-    if scene is None or draft.found:
+    if plan is None or draft.found:
         raise SceneError(draft.lines())
-    return scene
+    return plan
 
 
 def schema() -> dict[str, Any]:

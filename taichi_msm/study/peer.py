@@ -9,9 +9,10 @@ from itertools import pairwise
 import numpy as np
 from numpy.typing import NDArray
 
-from taichi_msm.physics.lattice import axes, fixed_points, spacing
+from taichi_msm.physics.lattice import axes, spacing
 from taichi_msm.physics.loads import Schedule, key_times, loads_at
-from taichi_msm.physics.material import area_shares, material
+from taichi_msm.physics.material import area_shares
+from taichi_msm.physics.plan import Plan
 from taichi_msm.physics.probe_force import probe_force
 from taichi_msm.physics.springs import elastic_force, springs
 from taichi_msm.scene import Scene
@@ -30,11 +31,11 @@ class FailedError(Exception):
     """The solver finds no step that is small enough; the message says when."""
 
 
-def solve(scene: Scene, rtol: float, atol: float, deadline: float, tick: Callable[[], None]) -> tuple[Array, int]:
+def solve(plan: Plan, rtol: float, atol: float, deadline: float, tick: Callable[[], None]) -> tuple[Array, int]:
     """Integrate from key to key of the loads, between which they are smooth.
 
     Args:
-        scene: a checked scene.
+        plan: of the scene.
         rtol: relative tolerance.
         atol: absolute tolerance of displacements [m] and velocities [m/s].
         deadline: `time.perf_counter()` at which to give up.
@@ -49,14 +50,15 @@ def solve(scene: Scene, rtol: float, atol: float, deadline: float, tick: Callabl
     """
     from scipy.integrate import solve_ivp
 
+    scene = plan.scene
     shape = (*scene.sheet.points, 3)
-    accelerate, moves = acceleration(scene), ~fixed_points(scene.sheet)[..., None]
+    accelerate, moves = acceleration(plan), ~plan.fixed[..., None]
     state = np.zeros(2 * int(np.prod(shape)))
     evaluations = 0
     found = []
     for start, end, frames in _pieces(scene):
         margin = INSIDE * (end - start)
-        first = loads_at(scene, np.array([start + margin, end - margin]))
+        first = loads_at(plan, np.array([start + margin, end - margin]))
 
         def motion(t: float, y: Array, start: float = start, end: float = end, ends: Schedule = first) -> Array:
             if time.perf_counter() > deadline:
@@ -78,14 +80,15 @@ def solve(scene: Scene, rtol: float, atol: float, deadline: float, tick: Callabl
     return np.array(found), evaluations
 
 
-def acceleration(scene: Scene) -> Callable[[Array, Array, Schedule], Array]:
+def acceleration(plan: Plan) -> Callable[[Array, Array, Schedule], Array]:
     """Prepare the right side of eq. 1 over the mass.
 
     Returns:
         A function of displacements [m], velocities [m/s], and a schedule of one step, that gives accelerations
         [m/s2]; its arrays have the shape (rows, cols, 3).
     """
-    sheet, every, (dx, dy), (x, y) = material(scene), tuple(springs(scene)), spacing(scene.sheet), axes(scene.sheet)
+    scene, sheet, every = plan.scene, plan.material, tuple(springs(plan))
+    (dx, dy), (x, y) = spacing(scene.sheet), axes(scene.sheet)
     shares = area_shares(scene.sheet)
     area = shares if sheet.by_area else np.ones_like(shares)
     probes = [probe_force(probe, scene.sheet) for probe in scene.probes]

@@ -10,15 +10,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from taichi_msm.errors import DivergedError, SceneError
-from taichi_msm.physics.error_control import choose_step
 from taichi_msm.physics.lattice import rest_positions
-from taichi_msm.physics.mesh_error import choose_points
+from taichi_msm.physics.plan import Plan
+from taichi_msm.physics.planning import make_plan
 from taichi_msm.physics.probe_force import control_point, probe_force
-from taichi_msm.physics.timestep import time_grid, with_grid, with_time
+from taichi_msm.physics.timestep import with_time
 from taichi_msm.render.instrument import rod
 from taichi_msm.render.texture import load_texture
 from taichi_msm.results.gif import Picture
 from taichi_msm.scene import MAX_PROBES, Camera, Scene
+from taichi_msm.scenefile.resolve import resolve
 from taichi_msm.scenefile.validation import checked
 from taichi_msm.scenefile.yaml_reader import MAX_NODES
 from taichi_msm.simulation import Simulation
@@ -64,18 +65,19 @@ NEARLY = 0.75
 AVERAGED = 20
 
 
-def with_live_frames(scene: Scene) -> tuple[Scene, int]:
+def with_live_frames(plan: Plan) -> tuple[Plan, int]:
     """Divide the frames of a scene into shorter ones, for as many per second as a screen shows; a given step stays.
 
     Returns:
-        The scene, and how many of its frames make one of the given scene's.
+        The plan of that scene, and how many of its frames make one of the given scene's.
     """
+    scene = plan.scene
     parts = max(1, int(MOST_FRAMES / scene.time.frames_per_second * (1 + 1e-9)))
     if scene.time.step != "auto":
-        steps = time_grid(scene).steps_per_frame
+        steps = plan.grid.steps_per_frame
         while steps % parts:
             parts -= 1
-    return with_time(scene, frames_per_second=scene.time.frames_per_second * parts), parts
+    return make_plan(with_time(scene, frames_per_second=scene.time.frames_per_second * parts), plan.image), parts
 
 
 class Session:
@@ -119,13 +121,8 @@ class Session:
         progress("start")
         device = runtime.start(arch, threads)
         given, texture = scene, load_texture(scene)
-        if scene.sheet.tolerance is not None:
-            scene, _ = choose_points(scene, device, checked, lambda done, total: progress("pilot"))
-        scene, self.parts = with_live_frames(scene)
-        grid = time_grid(scene, device.arch)
-        if scene.time.tolerance is not None:
-            grid, _ = choose_step(scene, grid, device, lambda done, total: progress("pilot"))
-        scene = with_grid(scene, grid)
+        live, self.parts = with_live_frames(checked(scene))
+        scene = resolve(live, device, lambda done, total: progress("pilot")).plan.scene
         rate = scene.time.frames_per_second
         self._captures = captures
         self._recording = Recording(captures, scene, given.time.frames_per_second, self.parts)
