@@ -17,10 +17,11 @@ import pytest
 import yaml
 from PIL import Image
 
-from taichi_msm import console, reference
+from taichi_msm import console
 from taichi_msm.cli import main
 from taichi_msm.scenefile.load import load_scene
 from taichi_msm.system.compiler import chosen
+from tests import reference
 from tests.conftest import Program
 from tests.outputs import files
 from tests.scenes import SMALL, speckle

@@ -21,6 +21,8 @@ from PIL import Image
 
 import taichi_msm
 from taichi_msm import cli, scene
+from taichi_msm.export.formats import FORMATS
+from taichi_msm.outputs.table import OUTPUTS
 from taichi_msm.results.record import ErrorRecord, RunRecord
 from taichi_msm.runner import run
 from taichi_msm.scenefile.load import load_scene, schema
@@ -175,7 +177,7 @@ def test_all_parts_of_a_scene_are_exported() -> None:
 
 def test_every_output_has_its_row() -> None:
     results, labels = table(DOCS / "command-line.md", "outputs"), table(DOCS / "labels.md", "labels")
-    assert words(results) + words(labels) == list(scene.OUTPUTS)
+    assert words(results) + words(labels) == list(OUTPUTS)
 
 
 def test_every_key_of_the_record_has_its_row() -> None:
@@ -191,7 +193,7 @@ def test_every_exit_code_has_its_row() -> None:
 
 
 def test_every_format_has_its_row() -> None:
-    assert sorted(words(table(DOCS / "export.md", "formats"))) == sorted(cli.FORMATS)
+    assert sorted(words(table(DOCS / "export.md", "formats"))) == sorted(FORMATS)
 
 
 def test_every_option_of_the_command_line_is_shown() -> None:
