@@ -63,7 +63,7 @@ class Simulation:
         ...     simulation.advance(10)
         ...     picture = simulation.draw("oblique")
         ...     simulation.positions().shape, picture.shape
-        ((31, 31, 3), (512, 512, 3))
+        ((61, 61, 3), (512, 512, 3))
     """
 
     def __init__(
