@@ -207,7 +207,7 @@ def check(scene: str, image: str | None, overrides: tuple[str, ...], as_json: bo
         "disk": need.disk_bytes,
         "disk_while_running": need.disk_bytes + need.working_bytes,
         "probes": (records := probe_records(loaded)),
-        "notes": [*probe_force.notes(loaded, records), *drawing_notes(loaded)],
+        "notes": [*probe_force.force_notes(loaded, records), *drawing_notes(loaded)],
     }
     if as_json:
         print_json(facts)
@@ -291,7 +291,7 @@ def study(
     require_writable(directory)
     interruption = Interruption()
     with Progress(quiet=as_json) as bar, naming(scene):
-        found = measure(
+        results = measure(
             loaded,
             Path(scene).stem,
             tolerance=tolerance,
@@ -300,19 +300,19 @@ def study(
             threads=threads,
             progress=interruptible(bar, interruption),
         )
-    if not found.stepping:
+    if not results.stepping:
         report("interrupted", ["interrupted; nothing was written"], as_json)
         return interruption.code
-    if found.status == "interrupted" and (directory / RECORD).exists():
+    if results.status == "interrupted" and (directory / RECORD).exists():
         # An earlier study is not replaced by part of a new one.
         directory = without_link(directory / "interrupted", "--out")
-    outputs = write_report(found, directory)
+    outputs = write_report(results, directory)
     if as_json:
-        print_json({"directory": str(directory), **as_record(found), "outputs": outputs})
+        print_json({"directory": str(directory), **as_record(results), "outputs": outputs})
     else:
-        print_summary(found, Console())
+        print_summary(results, Console())
         click.echo(printable(f"{directory}: {', '.join(outputs)}"))
-    return EXIT_CODES.get(found.status, interruption.code)
+    return EXIT_CODES.get(results.status, interruption.code)
 
 
 @program.command()

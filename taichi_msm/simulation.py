@@ -62,7 +62,7 @@ class Simulation:
         >>> with Simulation(load_scene("scenes/press.yaml")) as simulation:
         ...     simulation.advance(10)
         ...     picture = simulation.draw("oblique")
-        ...     simulation.positions().shape, picture.shape
+        >>> simulation.positions().shape, picture.shape
         ((61, 61, 3), (512, 512, 3))
     """
 

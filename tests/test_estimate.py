@@ -14,10 +14,10 @@ from taichi_msm import load_scene, resume, run
 from taichi_msm.physics import pilots, workload
 from taichi_msm.physics.pilots import ENOUGH, Pilots, choose_pilots
 from taichi_msm.physics.planning import on
+from taichi_msm.physics.run_notes import run_notes
 from taichi_msm.physics.run_progress import RunProgress
 from taichi_msm.physics.solver import Dynamics
 from taichi_msm.physics.timestep import with_time
-from taichi_msm.physics.warnings import notes
 from taichi_msm.physics.workload import affords_pilots
 from taichi_msm.progress import Pause
 from taichi_msm.results.record import RunRecord
@@ -101,7 +101,7 @@ def test_a_run_that_is_wrong_says_what_helps() -> None:
     from taichi_msm.physics.error_control import Estimate
 
     def said(error: float, rounding: float, in_f64: float) -> list[str]:
-        return list(notes(plan_of(scene()), (), MOVED, Estimate(10, error, rounding, in_f64, 2)))
+        return list(run_notes(plan_of(scene()), (), MOVED, Estimate(10, error, rounding, in_f64, 2)))
 
     assert len(said(0.009, 0.0, 0.009)) == 1
     (_, step) = said(0.04, 0.0, 0.04)

@@ -123,7 +123,7 @@ def estimate(plan: Plan) -> Budget:
     )
 
 
-def problems(plan: Plan) -> Iterator[Problem]:
+def size_problems(plan: Plan) -> Iterator[Problem]:
     """Find what makes a scene too large, with the numbers and the key to change."""
     yield from _step_problems(plan.scene, plan.grid)
     yield from _memory_problems(plan.scene, estimate(plan))

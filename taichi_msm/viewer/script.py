@@ -106,7 +106,7 @@ def load_script(path: str | Path, size: tuple[int, int]) -> Script:
     script, problems = parse(Script, draft.data)
     draft.report(problems)
     draft.report(_outside(script, script.size or size) if script is not None else ())
-    if script is None or draft.found:
+    if script is None or draft.problems:
         raise SceneError(draft.lines())
     return script
 
