@@ -113,6 +113,7 @@ class Session:
         self._film: Film | None = None
         self._others = scene.probes if play else ()
         self._instrument = scene.probes[0].instrument
+        self._lift = probe_force(scene.probes[0], scene.sheet).force[2]
         self.tool = HeldTool(scene.probes[0], scene.time.frames_per_second)
         plan = plan.with_probes((*self._others, self.tool.recorded(0)))
         self.scene = plan.scene
@@ -328,7 +329,7 @@ class Session:
     @property
     def _pulls(self) -> bool:
         """Whether the force of the tool points away from the sheet; a scene's force may do so by itself."""
-        return self.tool.percent * probe_force(self.scene.probes[-1], self.scene.sheet).force[2] > 0
+        return self.tool.percent * self._lift > 0
 
     def _figure_lines(self, pacing: str) -> list[str]:
         tool, speed = self.tool, ""
