@@ -8,8 +8,8 @@ import pytest
 
 from taichi_msm import reference
 from taichi_msm.physics.lattice import rest_positions
-from taichi_msm.physics.material import highest_frequency
 from taichi_msm.physics.planning import try_plan
+from taichi_msm.physics.terms import highest_frequency
 from taichi_msm.physics.timestep import problems
 from tests.scenes import SHEET, plan_of, scene
 
