@@ -13,7 +13,6 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from taichi_msm import reference
 from taichi_msm.console import summary
 from taichi_msm.errors import ArgumentError, FilesError, SceneError
 from taichi_msm.physics import kernel_gpu, probe_force
@@ -33,6 +32,7 @@ from taichi_msm.scenefile.load import load_scene
 from taichi_msm.scenefile.validation import checked
 from taichi_msm.simulation import Simulation
 from taichi_msm.system.runtime import Device
+from tests import reference
 from tests.motion import dynamics_of, frames, structure_of
 from tests.outputs import results
 from tests.scenes import plan_of, random_scene, random_tissue
@@ -539,7 +539,7 @@ def test_points_for_which_a_given_step_is_too_long_are_refused(load: Any, device
 )
 def test_a_tool_that_does_not_act_as_a_whole_is_told_of(setting: str, told: str, load: Any) -> None:
     def notes(made: Scene) -> list[str]:
-        return list(probe_force.notes(made, probe_force.probe_records(made)))
+        return list(probe_force.force_notes(made, probe_force.probe_records(made)))
 
     assert not notes(load())
     (said,) = notes(load(setting))

@@ -59,7 +59,7 @@ def try_plan(scene: Scene, image: MapImage | None = None) -> tuple[Plan | None, 
     plan = on(
         Plan(scene, image, fixed, material, limit, grid, probe_slots(scene.probes, scene.sheet, grid.step)), "cpu"
     )
-    return plan, list(timestep.problems(plan))
+    return plan, list(timestep.step_problems(plan))
 
 
 def on(plan: Plan, arch: str) -> Plan:
