@@ -67,18 +67,10 @@ class RowBand(NamedTuple):
     progress: Any
 
 
-class Sharing(NamedTuple):
-    """Taichi's functions by which workers share rows."""
-
-    copy_row: Callable[..., Any]
-    row_at: Callable[..., Any]
-    has_come: Callable[..., Any]
-    publish: Callable[..., None]
-
-
-def sharing(code: StepCode, *, parallel: bool) -> Sharing:
-    """Make the functions by which workers share rows."""
-    copied = code.reach
+def stepping_row(code: StepCode, *, parallel: bool) -> Callable[..., Any]:
+    """Make the function that takes a step of a row of a band, as soon as the neighbours' rows allow it."""
+    vector, lanes, bending, copied = code.vector, code.lanes, code.get(BendingTerm), code.reach
+    sweep_row, storing = sweeping(code), [bending.storing(code)] if bending else []
 
     @ti.func
     def copy_row(rows, worker, border, n, behind):
@@ -116,16 +108,6 @@ def sharing(code: StepCode, *, parallel: bool) -> Sharing:
                 for c in ti.static(range(3)):
                     sheet.u[c][copy * sheet.width + b] = sheet.u[c][(i + behind * inward) * sheet.width + b]
         ti.atomic_add(band.progress[WORKER_STRIDE * band.worker + COUNTER_STRIDE * border], 1)
-
-    return Sharing(copy_row, row_at, has_come, publish)
-
-
-def stepping_row(code: StepCode, *, parallel: bool) -> Callable[..., Any]:
-    """Make the function that takes a step of a row of a band, as soon as the neighbours' rows allow it."""
-    vector, lanes, bending, copied = code.vector, code.lanes, code.get(BendingTerm), code.reach
-    sweep_row = sweeping(code)
-    copy_row, row_at, has_come, publish = sharing(code, parallel=parallel)
-    storing = [bending.storing(code)] if bending else []
 
     @ti.func
     def join_strips(u: ti.template(), p, width):

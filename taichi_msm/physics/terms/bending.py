@@ -63,9 +63,8 @@ class BendingTerm(Term):
 
     def storing(self, code: StepCode) -> Callable[..., None]:
         """Make the function that stores the moment of an entry."""
-        from taichi_msm.system.runtime import ti
-
-        vector, number, laplacian = code.vector, code.first_number(BendingTerm), five_point()
+        ti = code.ti
+        vector, number, laplacian = code.vector, code.first_number(BendingTerm), five_point(code)
 
         @ti.func
         def store_moment(sheet: ti.template(), i, before, row, after, b, target):
@@ -84,10 +83,8 @@ class BendingTerm(Term):
 
     def forces(self, code: StepCode) -> Sequence[Callable[..., Any]]:
         """Make the function that adds the force on an entry."""
-        from taichi_msm.system.runtime import ti
-
-        del code
-        laplacian = five_point()
+        ti = code.ti
+        laplacian = five_point(code)
 
         @ti.func
         def add(force_x, force_y, force_z, sheet: ti.template(), entry: ti.template(), _now: ti.template()):
@@ -103,9 +100,8 @@ class BendingTerm(Term):
 
     def measuring(self, code: StepCode) -> Sequence[Callable[..., None]]:
         """Make the function that adds up the square of the Laplacian, which is 0 at edges."""
-        from taichi_msm.system.runtime import ti
-
-        real, vector, first, laplacian = code.real, code.vector, code.first_measure(BendingTerm), five_point()
+        ti = code.ti
+        real, vector, first, laplacian = code.real, code.vector, code.first_measure(BendingTerm), five_point(code)
 
         @ti.func
         def measure(measures: ti.template(), sheet: ti.template(), p, _i, kind, b):
@@ -123,9 +119,9 @@ class BendingTerm(Term):
         return (measure,)
 
 
-def five_point() -> Callable[..., Any]:
+def five_point(code: StepCode) -> Callable[..., Any]:
     """Make the function that gives the five-point Laplacian of an array."""
-    from taichi_msm.system.runtime import ti
+    ti = code.ti
 
     @ti.func
     def laplacian(field: ti.template(), width, before, row, after, b, across, down):

@@ -68,8 +68,7 @@ class DampingTerm(Term):
 
     def reducing(self, code: StepCode) -> Sequence[Callable[..., Any]]:
         """Make the function that reduces the last difference."""
-        from taichi_msm.system.runtime import ti
-
+        ti = code.ti
         keep = code.first_number(DampingTerm)
 
         @ti.func

@@ -64,8 +64,7 @@ class FoundationTerm(Term):
 
     def forces(self, code: StepCode) -> Sequence[Callable[..., Any]]:
         """Make the function that adds -K u."""
-        from taichi_msm.system.runtime import ti
-
+        ti = code.ti
         by_area, column = self.by_area, code.first_column(FoundationTerm)
 
         @ti.func

@@ -64,8 +64,7 @@ class ProbeTerm(Term):
 
     def forces(self, code: StepCode) -> Sequence[Callable[..., Any]]:
         """Make the function that adds the forces of all slots."""
-        from taichi_msm.system.runtime import ti
-
+        ti = code.ti
         moves, by_area, first = self.moves, self.by_area, code.first_column(ProbeTerm)
         vector, lanes = code.vector, code.lanes
         standing = [moves[:n].count(False) for n in range(len(moves))]

@@ -152,8 +152,7 @@ class SpringTerm(Term):
 
     def between(self, code: StepCode) -> SpringFunctions:
         """Make the functions for the forces of springs."""
-        from taichi_msm.system.runtime import ti
-
+        ti = code.ti
         tense, mapped, by_area = self.tense, self.mapped, self.by_area and not self.mapped
         leaves_out, real, first = self.open_edges and not self.mapped, code.real, code.first_number(SpringTerm)
         first_tension = first + 3
@@ -233,8 +232,7 @@ class SpringTerm(Term):
 
     def measuring(self, code: StepCode) -> Sequence[Callable[..., None]]:
         """Make the function that measures the springs to the right of an entry and to the row below it."""
-        from taichi_msm.system.runtime import ti
-
+        ti = code.ti
         tense, mapped, by_area, open_edges = self.tense, self.mapped, self.by_area, self.open_edges
         vector, first, functions = code.vector, code.first_measure(SpringTerm), self.between(code)
         # Of every family that there is: rows and columns from one end to the other, for each of its springs.

@@ -32,7 +32,7 @@ class Term:
     """A term of the model as kernels are compiled for it: a frozen dataclass, without the numbers of a sheet.
 
     The kernels know by name the terms that act between points, springs and bending; others need only the functions
-    here. A compiler is imported only where Taichi's functions are made, because `check` needs the bounds without one.
+    here.
 
     Attributes:
         reach: how many rows away a point may be that the force depends on.
@@ -131,25 +131,26 @@ class StepCode:
         return max(term.reach for term in self.terms)
 
     @property
-    def real(self) -> Any:
-        """Taichi's type of a number."""
+    def ti(self) -> Any:
+        """Taichi; terms import it only here, because `check` needs their bounds without a compiler."""
         from taichi_msm.system.runtime import ti
 
-        return getattr(ti, self.precision)
+        return ti
+
+    @property
+    def real(self) -> Any:
+        """Taichi's type of a number."""
+        return getattr(self.ti, self.precision)
 
     @property
     def vector(self) -> Any:
         """Taichi's type of a vector of lanes."""
-        from taichi_msm.system.runtime import ti
-
-        return ti.types.vector(self.lanes, self.real)
+        return self.ti.types.vector(self.lanes, self.real)
 
     @property
     def vectors(self) -> Any:
         """Taichi's type of an array of vectors."""
-        from taichi_msm.system.runtime import ti
-
-        return ti.types.ndarray(dtype=self.vector, ndim=1)
+        return self.ti.types.ndarray(dtype=self.vector, ndim=1)
 
     def get(self, kind: type[AnyTerm]) -> AnyTerm | None:
         """Give the term of a kind; None if there is none."""
