@@ -22,9 +22,9 @@ records its place and ends, which frees its own core. Further launches continue 
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
-from taichi_msm.physics.sweep import SweptRow, sweeping
+from taichi_msm.physics.sweep import sweeping
 from taichi_msm.physics.terms.bending import BendingTerm
-from taichi_msm.physics.terms.term import DY, KernelSheet, StepCode
+from taichi_msm.physics.terms.term import DY, KernelRow, KernelSheet, StepCode
 from taichi_msm.system.runtime import ITERATIONS_PER_THREAD, ti
 
 # The sizes that a launch is given: steps taken before; steps to take; workers; steps of a pass; rows of `carried` for a
@@ -164,8 +164,8 @@ def stepping_row(code: StepCode, *, parallel: bool) -> Callable[..., Any]:
                 up = -band.way * sheet.numbers[DY]
                 before, middle = moments + (row + 2) % MOMENTS, moments + row % MOMENTS
                 after = moments + (row + 1) % MOMENTS
-                line = ti.static(SweptRow(i, kind, here, other, exists, up, carry, before, middle, after))
-                sweep_row(sheet, carried, line, loads, n, row >= 0)
+                line = ti.static(KernelRow(i, kind, before, middle, after))
+                sweep_row(sheet, carried, carry, line, here, other, exists, up, loads, n, row >= 0)
             else:
                 for b in range(1, sheet.width - 1):
                     for c in ti.static(range(3)):

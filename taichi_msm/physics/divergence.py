@@ -8,6 +8,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from taichi_msm.physics.lattice import spacing
 from taichi_msm.physics.loads import Envelope
 from taichi_msm.physics.plan import Plan
 from taichi_msm.physics.run_progress import RunProgress
@@ -172,5 +173,8 @@ def farthest(displacement: NDArray[np.floating]) -> Farthest:
 def _underflow(plan: Plan) -> float:
     """Give the energy below which the squares that it is summed from underflow [J]."""
     tiny = float(np.finfo(np.float32 if plan.grid.precision == "f32" else np.float64).tiny)
-    units = sum(term.energy_of_unit(plan.material, plan.scene.sheet) for term in TERMS)
-    return math.prod(plan.scene.sheet.points) * tiny * (plan.material.mass / plan.grid.step**2 + units)
+    (dx, dy), material = spacing(plan.scene.sheet), plan.material
+    inertia = material.mass / plan.grid.step**2
+    # Squares are summed, and squares times a stiffness.
+    springs = max(1.0, sum(term.bound(material, plan.scene.sheet) for term in TERMS)) * (dx**2 + dy**2)
+    return math.prod(plan.scene.sheet.points) * tiny * (inertia + springs)

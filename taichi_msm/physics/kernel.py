@@ -205,8 +205,8 @@ def point_step(code: StepCode) -> Callable[..., None]:
         for force in ti.static(forces):
             force_x, force_y, force_z = force(force_x, force_y, force_z, sheet, entry, now)
 
-        gain = now[GAIN] * sheet.by_column[(MOVES + entry.kind) * sheet.width + entry.b]
-        at = entry.i * sheet.width + entry.b
+        gain = now[GAIN] * sheet.by_column[(MOVES + entry.row.kind) * sheet.width + entry.b]
+        at = entry.row.i * sheet.width + entry.b
         d_x, d_y, d_z = sheet.d[0][at], sheet.d[1][at], sheet.d[2][at]
         for reduce in ti.static(reducing):
             d_x, d_y, d_z = reduce(d_x, d_y, d_z, sheet)

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from taichi_msm.physics.kernel import SheetArrays, SheetLayout, SheetReading, Start, point_step, reading
 from taichi_msm.physics.terms.bending import BendingTerm
 from taichi_msm.physics.terms.springs import SpringTerm
-from taichi_msm.physics.terms.term import DX, DY, HAS_LEFT, HAS_RIGHT, Entry, KernelSheet, StepCode
+from taichi_msm.physics.terms.term import DX, DY, HAS_LEFT, HAS_RIGHT, Entry, KernelRow, KernelSheet, StepCode
 from taichi_msm.system.runtime import our_compilation, ti
 
 # A launch is a chain of this many kernels, one for each step.
@@ -132,7 +132,8 @@ def _gathering(code: StepCode) -> Callable[..., None]:
         row = [loads[n, c] for c in ti.static(range(columns))]
         x, y, z = sheet.u[0][p * width + b], sheet.u[1][p * width + b], sheet.u[2][p * width + b]
         before, at, after = 2 * (rows + 2) + i, 2 * (rows + 2) + i + 1, 2 * (rows + 2) + i + 2
-        entry = ti.static(Entry(i, b, kind, x, y, z, before, at, after))
+        line = ti.static(KernelRow(i, kind, before, at, after))
+        entry = ti.static(Entry(line, b, x, y, z))
         move(sheet, entry, (1 - now) * (rows + 2) + i + 1, force_x, force_y, force_z, row)
 
     return step

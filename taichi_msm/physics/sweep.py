@@ -10,37 +10,11 @@ depends on the old displacements of this row, so it is stepped in place.
 # No `from __future__ import annotations` here: Taichi reads the annotations of a kernel.
 
 from collections.abc import Callable
-from typing import Any, NamedTuple
 
 from taichi_msm.physics.kernel import point_step
 from taichi_msm.physics.terms.springs import SpringTerm
 from taichi_msm.physics.terms.term import DX, DY, HAS_LEFT, HAS_RIGHT, Entry, StepCode
 from taichi_msm.system.runtime import ti
-
-
-class SweptRow(NamedTuple):
-    """A row that is swept, within a kernel.
-
-    Attributes:
-        i: row of the sheet.
-        kind: 0 for the first row of the sheet, 2 for the last, else 1.
-        here, other: rows of u that hold this row and the next one.
-        exists: 1 if there is a next row, else 0.
-        up: how far the next row is above this one [m].
-        carry: row of the carried forces.
-        before, at, after: with bending, rows of u with the moments of the row before, of row i and of the row after.
-    """
-
-    i: Any
-    kind: Any
-    here: Any
-    other: Any
-    exists: Any
-    up: Any
-    carry: Any
-    before: Any
-    at: Any
-    after: Any
 
 
 def sweeping(code: StepCode) -> Callable[..., None]:
@@ -52,15 +26,31 @@ def sweeping(code: StepCode) -> Callable[..., None]:
     move = point_step(code)
 
     @ti.func
-    def sweep_row(sheet: ti.template(), carried: ti.template(), line: ti.template(), loads: ti.template(), n, moving):
-        """Sweep a row, and step it if `moving`; n: row of the table of loads."""
-        width, strip = sheet.width, sheet.width - 2
-        up, exists, i, kind = line.up, line.exists, line.i, line.kind
+    def sweep_row(
+        sheet: ti.template(), carried: ti.template(), carried_row, line: ti.template(), here, next_row, exists, up,
+        loads: ti.template(), n, moving,
+    ):  # fmt: skip
+        """Sweep a row, and step it if `moving`.
+
+        Args:
+            sheet: the sheet.
+            carried: forces carried from row to row, three arrays.
+            carried_row: the row of them.
+            line: the row.
+            here: row of u that holds it.
+            next_row: row of u that holds the next row.
+            exists: 1 if there is a next row, else 0.
+            up: how far the next row is above this one [m].
+            loads: the table of loads.
+            n: its row.
+            moving: whether the row is stepped.
+        """
+        width, strip, i, kind = sheet.width, sheet.width - 2, line.i, line.kind
         diagonal = ti.sqrt(sheet.numbers[DX] * sheet.numbers[DX] + sheet.numbers[DY] * sheet.numbers[DY])
         # The lower one of the two rows.
         lower = i + ti.select(up < 0, 1, 0)
         # Where u has this row and the other one, and where the forces between them are carried; all from entry 0 on.
-        row, other, carry = line.here * width, line.other * width, line.carry * width
+        row, other, carry = here * width, next_row * width, carried_row * width
         # Force of the left neighbour.
         left_x, left_y, left_z = vector(0), vector(0), vector(0)
         # Forces carried to the other row: for the entry before this one, this one and the next one.
@@ -131,8 +121,8 @@ def sweeping(code: StepCode) -> Callable[..., None]:
             carried[1][carry + b - 1] = last_y
             carried[2][carry + b - 1] = last_z
             if moving:
-                entry = ti.static(Entry(i, b, kind, here_x, here_y, here_z, line.before, line.at, line.after))
-                move(sheet, entry, line.here, force_x, force_y, force_z, now)
+                entry = ti.static(Entry(line, b, here_x, here_y, here_z))
+                move(sheet, entry, here, force_x, force_y, force_z, now)
         if ti.static(shear):
             if ti.static(leaves_out):
                 has_left = sheet.by_column[HAS_LEFT * width + strip + 1]

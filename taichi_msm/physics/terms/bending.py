@@ -89,7 +89,7 @@ class BendingTerm(Term):
         @ti.func
         def add(force_x, force_y, force_z, sheet: ti.template(), entry: ti.template(), _now: ti.template()):
             width, b = sheet.width, entry.b
-            before, at, after = entry.before, entry.at, entry.after
+            before, at, after = entry.row.before, entry.row.at, entry.row.after
             across, down = 1 / (sheet.numbers[DX] * sheet.numbers[DX]), 1 / (sheet.numbers[DY] * sheet.numbers[DY])
             force_x = force_x - laplacian(sheet.u[0], width, before, at, after, b, across, down)
             force_y = force_y - laplacian(sheet.u[1], width, before, at, after, b, across, down)

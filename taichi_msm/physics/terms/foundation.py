@@ -70,7 +70,7 @@ class FoundationTerm(Term):
         @ti.func
         def add(force_x, force_y, force_z, sheet: ti.template(), entry: ti.template(), now: ti.template()):
             if ti.static(by_area):
-                held = now[column] * sheet.by_column[(AREA + entry.kind) * sheet.width + entry.b]
+                held = now[column] * sheet.by_column[(AREA + entry.row.kind) * sheet.width + entry.b]
                 force_x = force_x - held * entry.x
                 force_y = force_y - held * entry.y
                 force_z = force_z - held * entry.z

@@ -76,14 +76,14 @@ class ProbeTerm(Term):
                 share = vector(0)
                 if ti.static(moves[n]):
                     off_x = sheet.by_column[ACROSS * sheet.width + entry.b] - now[column + POINT]
-                    off_y = sheet.numbers[TOP] - entry.i * sheet.numbers[DY] - now[column + POINT + 1]
+                    off_y = sheet.numbers[TOP] - entry.row.i * sheet.numbers[DY] - now[column + POINT + 1]
                     exponent = now[column + FALLOFF] * ti.sqrt(off_x * off_x + off_y * off_y) + now[column + SHIFT]
                     exponent = ti.max(exponent, now[column + OFFSET])
                     share = vector([ti.exp(-exponent[lane]) for lane in ti.static(range(lanes))])
                     if ti.static(by_area[n]):
-                        share *= sheet.by_column[(AREA + entry.kind) * sheet.width + entry.b]
+                        share *= sheet.by_column[(AREA + entry.row.kind) * sheet.width + entry.b]
                 else:
-                    share = sheet.decay[(standing[n] * sheet.rows + entry.i) * sheet.width + entry.b]
+                    share = sheet.decay[(standing[n] * sheet.rows + entry.row.i) * sheet.width + entry.b]
                 force_x += now[column] * share
                 force_y += now[column + 1] * share
                 force_z += now[column + 2] * share

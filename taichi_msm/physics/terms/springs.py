@@ -44,8 +44,8 @@ from taichi_msm.scene import Scene, Sheet
 # Families of springs.
 ALONG_ROW, ALONG_COLUMN, DIAGONAL = range(3)
 
-# Measures: the smallest and the largest (L^2 - L0^2) / L0^2; for every family the sum of (L / L0 - 1)^2, times the
-# stiffness if there is a map; and then, under tension, the sum of |q|^2 / L0^2.
+# Measures: the smallest and the largest (L^2 - L0^2) / L0^2; for every family the sum of (k - tau) (L / L0 - 1)^2;
+# and then, under tension, the sum of |q|^2 / L0^2.
 LEAST, MOST, STRETCHED, TENSE = 0, 1, 2, 5
 
 # Prevents a division by 0 at L = 0, where the force is then 0, as P - Q is. A literal in a kernel is always f32.
@@ -133,22 +133,15 @@ class SpringTerm(Term):
             largest = largest_mean(material.factors) if material.by_area else float(material.factors.max())
         return 4 * max(across + down, across + 2 * shear, down + 2 * shear) * largest
 
-    @staticmethod
-    def energy_of_unit(material: Material, sheet: Sheet) -> float:
-        """Give the energy of springs that are stretched to twice their length [J]."""
-        dx, dy = spacing(sheet)
-        return (max(material.across, material.down) + material.shear) * (dx**2 + dy**2)
-
     def numbers(self, plan: Plan) -> tuple[float, ...]:
         """Give k - tau and tau of every family [N/m]."""
         return *plan.material.stiffness, *plan.material.tensions
 
     def energy(self, sums: NDArray[Any], plan: Plan) -> float:
         """Give twice the energy [J]."""
-        material, (dx, dy) = plan.material, spacing(plan.scene.sheet)
+        dx, dy = spacing(plan.scene.sheet)
         squares = np.array([dx**2, dy**2, dx**2 + dy**2])
-        k = np.ones(3) if self.mapped else np.array(material.stiffness)
-        return float((k * sums[STRETCHED:TENSE] + material.tensions * sums[TENSE:]) @ squares)
+        return float((sums[STRETCHED:TENSE] + plan.material.tensions * sums[TENSE:]) @ squares)
 
     def between(self, code: StepCode) -> SpringFunctions:
         """Make the functions for the forces of springs."""
@@ -233,8 +226,8 @@ class SpringTerm(Term):
     def measuring(self, code: StepCode) -> Sequence[Callable[..., None]]:
         """Make the function that measures the springs to the right of an entry and to the row below it."""
         ti = code.ti
-        tense, mapped, by_area, open_edges = self.tense, self.mapped, self.by_area, self.open_edges
-        vector, first, functions = code.vector, code.first_measure(SpringTerm), self.between(code)
+        tense, open_edges, vector, first = self.tense, self.open_edges, code.vector, code.first_measure(SpringTerm)
+        _, _, of_row, of_column, of_diagonal = self.between(code)
         # Of every family that there is: rows and columns from one end to the other, for each of its springs.
         structural = ((ALONG_ROW, 0, (1,)), (ALONG_COLUMN, 1, (0,))) if self.structural else ()
         families = structural + (((DIAGONAL, 1, (-1, 1)),) if self.shear else ())
@@ -256,34 +249,25 @@ class SpringTerm(Term):
             return share, apart
 
         @ti.func
-        def weight(sheet: ti.template(), family: ti.template(), i, kind, b):
-            """What the square of a spring's stretch is multiplied by, other than its uniform stiffness."""
-            if ti.static(mapped and family == ALONG_ROW):
-                return functions.of_row(sheet, i, kind, b)
-            elif ti.static(mapped and family == ALONG_COLUMN):  # noqa: RET505  # Taichi would compile the rest as well.
-                return functions.of_column(sheet, i + 1, b)
-            elif ti.static(mapped):
-                return functions.of_diagonal(sheet, i + 1, b)
-            elif ti.static(by_area and family == ALONG_ROW):
-                return ti.select(kind == 1, 1.0, 0.5)
-            elif ti.static(by_area and family == ALONG_COLUMN):
-                return sheet.by_column[(AREA + 1) * sheet.width + b]
-            else:
-                return 1.0
-
-        @ti.func
         def measure(measures: ti.template(), sheet: ti.template(), p, i, kind, b):
             dx, dy = sheet.numbers[DX], sheet.numbers[DY]
             for family, down, rights in ti.static(families):
                 if i + down < sheet.rows:
                     stretched, tense_part = vector(0), vector(0)
                     for right in ti.static(rights):
+                        k = vector(0)
+                        if ti.static(family == ALONG_ROW):
+                            k += of_row(sheet, i, kind, b)
+                        elif ti.static(family == ALONG_COLUMN):
+                            k += of_column(sheet, i + 1, b)
+                        else:
+                            k += of_diagonal(sheet, i + 1, b + ti.static(min(right, 0)))
                         share, apart = longer(sheet, p, p + down, b, right, right * dx, -down * dy)
                         measures[first + LEAST] = ti.min(measures[first + LEAST], share)
                         measures[first + MOST] = ti.max(measures[first + MOST], share)
                         # L / L0 - 1; rounding may put the share below -1.
                         stretch = share / (1 + ti.sqrt(ti.max(share + 1, vector(0))))
-                        stretched += stretch * stretch * weight(sheet, family, i, kind, b + ti.static(min(right, 0)))
+                        stretched += stretch * stretch * k
                         tense_part += apart
                     measures[first + STRETCHED + family] += stretched
                     if ti.static(tense):

@@ -61,12 +61,6 @@ class Term:
         del material, sheet
         return 0.0
 
-    @staticmethod
-    def energy_of_unit(material: Material, sheet: Sheet) -> float:
-        """Give the energy of a measure of 1 at one point [J]."""
-        del material, sheet
-        return 0.0
-
     def numbers(self, plan: Plan) -> tuple[float, ...]:
         """Give its numbers."""
         del plan
@@ -200,23 +194,27 @@ class KernelSheet(NamedTuple):
     width: Any
 
 
-class Entry(NamedTuple):
-    """An entry of a row within a kernel, which is a point in each lane.
+class KernelRow(NamedTuple):
+    """A row of the sheet within a kernel.
 
     Attributes:
-        i: row of the sheet.
-        b: entry of the row.
-        kind: 0 in the first row of the sheet, 2 in the last, else 1.
-        x, y, z: displacement [m].
+        i: its number.
+        kind: 0 for the first row of the sheet, 2 for the last, else 1.
         before, at, after: with bending, rows of u with the moments of the row before, of row i and of the row after.
     """
 
     i: Any
-    b: Any
     kind: Any
-    x: Any
-    y: Any
-    z: Any
     before: Any
     at: Any
     after: Any
+
+
+class Entry(NamedTuple):
+    """An entry b of a row within a kernel, which is a point in each lane, displaced by (x, y, z) [m]."""
+
+    row: KernelRow
+    b: Any
+    x: Any
+    y: Any
+    z: Any
