@@ -491,13 +491,13 @@ class Simulation:
     def _look(
         self, camera: CameraLike, positions: NDArray[Any] | None, time: float | None, *, picture: bool, labels: bool
     ) -> Drawn:
-        from taichi_msm.render.rasterizer import Drawing, structure
+        from taichi_msm.render.rasterizer import Drawing, drawing_config
 
         positions, rods = self._placed(positions, time)
         view = None if camera is None else self._view(camera)
         if (picture, labels) not in self._drawings:
-            code = structure(self.scene, picture=picture, labels=labels)
-            self._drawings[picture, labels] = Drawing(self.scene, self._require_texture(picture=picture), code)
+            config = drawing_config(self.scene, picture=picture, labels=labels)
+            self._drawings[picture, labels] = Drawing(self.scene, self._require_texture(picture=picture), config)
         return self._drawings[picture, labels].look(positions, view, rods)
 
     def _placed(self, positions: NDArray[Any] | None, time: float | None) -> tuple[NDArray[Any], list[Rod]]:

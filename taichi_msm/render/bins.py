@@ -14,6 +14,9 @@ from taichi_msm.system.runtime import our_compilation, ti
 # that is not seen.
 FIRST_X, FIRST_Y, LAST_X, LAST_Y, BOUNDS = range(5)
 
+# Farther from the picture nothing is followed.
+FARTHEST = 1e6
+
 # The largest number of entries in all lists, per cell and bin.
 MOST_ENTRIES = 64
 
@@ -71,10 +74,10 @@ def _in_turn(bounds: Any, cells: int, extent: tuple[int, int], size: int) -> Bin
 
 
 def _at_once(launches: Launches, bounds: Any, cells: int, extent: tuple[int, int], size: int) -> Bins:
-    found = launches.take(bounds).reshape(cells, 2, 2)
+    corners = launches.take(bounds).reshape(cells, 2, 2)
     while True:
         across, down = (-(-side // size) for side in extent)
-        reached = np.maximum(found[:, 1] // size - found[:, 0] // size + 1, 0).prod(axis=1, dtype=np.int64)
+        reached = np.maximum(corners[:, 1] // size - corners[:, 0] // size + 1, 0).prod(axis=1, dtype=np.int64)
         ends = np.cumsum(reached)
         if ends[-1] <= MOST_ENTRIES * (cells + across * down):
             break
@@ -89,6 +92,28 @@ def _at_once(launches: Launches, bounds: Any, cells: int, extent: tuple[int, int
     starts = launches.give(np.concatenate([[0], np.cumsum(lengths)]).astype(np.int32))
     launches.launch(_enlist, total, cells, of_cells, squares, places, starts, entries, rounds=ROUNDS_OF_SEARCH)
     return Bins(size, across, lengths.reshape(down, across), starts, entries)
+
+
+@ti.func
+def store_bounds(cell, left, right, top, bottom, width, height, bounds: ti.template()):
+    """Store the bounds of a cell in a picture of this width and height."""
+    here = cell * BOUNDS
+    bounds[here + FIRST_X] = ti.cast(ti.floor(ti.math.clamp(left, 0.0, FARTHEST)), ti.i32)
+    bounds[here + FIRST_Y] = ti.cast(ti.floor(ti.math.clamp(top, 0.0, FARTHEST)), ti.i32)
+    bounds[here + LAST_X] = ti.cast(ti.floor(ti.math.clamp(right, -1.0, width - 1.0)), ti.i32)
+    bounds[here + LAST_Y] = ti.cast(ti.floor(ti.math.clamp(bottom, -1.0, height - 1.0)), ti.i32)
+
+
+@ti.func
+def reaches(cell, x, y, bounds: ti.template()):
+    """Tell whether (x, y) is within the bounds of a cell."""
+    here = cell * BOUNDS
+    return (
+        bounds[here + FIRST_X] <= x
+        and x <= bounds[here + LAST_X]
+        and bounds[here + FIRST_Y] <= y
+        and y <= bounds[here + LAST_Y]
+    )
 
 
 @ti.func

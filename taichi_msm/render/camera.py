@@ -63,6 +63,21 @@ class View(NamedTuple):
         """Unit vector toward the camera, shape (3,)."""
         return self.axes[2]
 
+    def project(self, points: Array) -> Array:
+        """Map points [m], shape (..., 3), to (X, Y, w, depth), shape (..., 4)."""
+        return points @ self.matrix[:, :3].T + self.matrix[:, 3]
+
+    def sight(self, pixel: tuple[float, float]) -> View:
+        """Give a view in which what is seen at the centre of a pixel has X = 0 and Y = 0.
+
+        Args:
+            pixel: x to the right and y down from the picture's top-left pixel, which is (0, 0).
+        """
+        matrix = self.matrix.copy()
+        for row in (0, 1):
+            matrix[row] -= (pixel[row] + 0.5) * matrix[2]
+        return self._replace(matrix=matrix)
+
 
 def calibration(camera: View) -> dict[str, list[list[float]]]:
     """Describe a camera by the matrices that other programs use.

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from typing import NamedTuple
+import math
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -26,6 +27,72 @@ class Labels(NamedTuple):
     coordinates: NDArray[np.float32]
     depth: NDArray[np.float32]
     instrument: NDArray[np.uint8]
+
+
+class Label(NamedTuple):
+    """How kernel 2 writes a label: a number or several for every pixel, row by row.
+
+    Attributes:
+        planes: where a tile of samples has the numbers (samples.py).
+        nothing: the number where nothing is seen.
+        of_sheet: whether it tells of the sheet alone; then it is `nothing` too where an instrument is seen.
+        dtype: of its values.
+    """
+
+    planes: tuple[str, ...]
+    nothing: float
+    of_sheet: bool
+    dtype: type[np.generic]
+
+
+# The fields of `Labels`. The kernel writes one after the other.
+LABELS = {
+    "coordinates": Label(("across", "down"), math.nan, of_sheet=True, dtype=np.float32),
+    "depth": Label(("depth",), 0.0, of_sheet=False, dtype=np.float32),
+    "instrument": Label(("instrument",), 0.0, of_sheet=False, dtype=np.uint8),
+}
+LABEL_NUMBERS = sum(len(label.planes) for label in LABELS.values())
+
+
+class Channel(NamedTuple):
+    """One number of a label; that of a pixel is entry first * pixels + stride * pixel + offset."""
+
+    plane: int
+    nothing: float
+    of_sheet: bool
+    first: int
+    stride: int
+    offset: int
+
+
+def label_channels(plane: Any) -> list[Channel]:
+    """List what is written of a tile that has these planes; a label whose plane it lacks stays 0."""
+    channels, first = [], 0
+    for label in LABELS.values():
+        channels += [
+            Channel(getattr(plane, name), label.nothing, label.of_sheet, first, len(label.planes), offset)
+            for offset, name in enumerate(label.planes)
+            if hasattr(plane, name)
+        ]
+        first += len(label.planes)
+    return channels
+
+
+def labels_of(numbers: NDArray[np.float32], size: tuple[int, int]) -> Labels:
+    """Split what the kernel wrote into labels.
+
+    Args:
+        numbers: of all labels of all pixels.
+        size: width and height of the picture [px].
+    """
+    (width, height), first, values = size, 0, []
+    for label in LABELS.values():
+        count = len(label.planes)
+        value = numbers[first * width * height : (first + count) * width * height]
+        shape = (height, width, count) if count > 1 else (height, width)
+        values.append(value.reshape(shape).astype(label.dtype, copy=False))
+        first += count
+    return Labels(*values)
 
 
 class Flow(NamedTuple):

@@ -1,16 +1,17 @@
-"""What is stored of every sample of the picture between covering and shading, and its layout in memory.
+"""What kernel 2 is compiled for, and what is stored of every sample of the picture between covering and shading.
 
 Samples are pixels, or parts of pixels where these are supersampled. A tile of samples is one vector: 4 x 4 samples for
-the 16 lanes of AVX-512, 4 x 2 for 8 lanes, 4 x 1 for 4, a single one on a GPU. A tile takes `planes` vectors. On a CPU
-bands of rows of tiles are the unit of parallel work; a worker stores one band at a time.
+the 16 lanes of AVX-512, 4 x 2 for 8 lanes, 4 x 1 for 4, a single one on a GPU. A tile takes several vectors, its
+planes. On a CPU bands of rows of tiles are the unit of parallel work; a worker stores one band at a time.
 """
 
-from __future__ import annotations
+# No `from __future__ import annotations` here: Taichi reads the annotations of a kernel.
 
-from dataclasses import dataclass
-from functools import cached_property
-from typing import Any
+from collections import namedtuple
+from functools import cache
+from typing import Any, NamedTuple
 
+from taichi_msm.render.labels import LABELS
 from taichi_msm.system.runtime import ti
 
 # Approximate number of rows of samples in a band on a CPU.
@@ -19,16 +20,11 @@ BAND_ROWS = 16
 # Samples in a row of a tile, if there are that many lanes.
 TILE_WIDTH = 4
 
-# The first planes of every tile: the depth of what is seen, and its place in the texture [texels]. Other planes follow
-# as the code needs them (`Code.layout`).
-DEPTH, TEXEL_X, TEXEL_Y = 0, 1, 2
-
 # Farther than anything that is drawn.
 INFINITY = 3e38
 
 
-@dataclass(frozen=True)
-class Code:
+class DrawingConfig(NamedTuple):
     """What kernel 2 is compiled for; all else it takes as arguments.
 
     Attributes:
@@ -90,25 +86,20 @@ class Code:
         """Whether instruments are shaded."""
         return self.picture and self.instruments
 
-    @cached_property
-    def layout(self) -> dict[str, int]:
-        """Map the names of the planes after the first three to the vector of a tile that each is."""
-        wanted = {
-            "light": self.headlit,  # share of the headlight that comes back
-            "wire": self.wires,  # share of the mesh's lines in the colour
-            **dict.fromkeys(("across", "down"), self.labels),  # the material point, fractions of the sheet
-            "instrument": self.instruments,  # 1 where an instrument is seen, else 0
-            **dict.fromkeys(("normal_x", "normal_y", "normal_z"), self.tissue or self.metal),  # in the camera's frame
-            **dict.fromkeys(("cell", "triangle"), self.unordered),  # their numbers
-            "footprint": self.tissue,  # square of the texels of a sample's longer side
-            **dict.fromkeys(("red", "green", "blue"), self.picture and self.supersample > 1),  # to be averaged
-        }
-        return {name: TEXEL_Y + 1 + n for n, name in enumerate(name for name, there in wanted.items() if there)}
+    @property
+    def plane(self) -> Any:
+        """The planes of a tile by name, and which of its vectors each is."""
+        return _planes(self)
 
     @property
     def planes(self) -> int:
         """Vectors stored per tile."""
-        return TEXEL_Y + 1 + len(self.layout)
+        return len(self.plane)
+
+    @property
+    def normal_planes(self) -> list[int]:
+        """The planes of the normal in the camera's frame, if what is seen is shaded by it."""
+        return [self.plane.normal_x + n for n in range(3)] if self.tissue or self.metal else []
 
     @property
     def band_rows(self) -> int:
@@ -126,27 +117,115 @@ class Code:
         return self.supersample == 1 and self.tile_width == TILE_WIDTH
 
     def tiles_across(self, width: int) -> int:
-        """Count the tiles in a row.
-
-        Args:
-            width: of the picture [px].
-        """
+        """Count the tiles in a row of a picture of this width [px]."""
         return -(-width * self.supersample // self.tile_width)
 
-    def band_vectors(self, width: int) -> int:
-        """Count the vectors that a worker stores.
-
-        Args:
-            width: of the picture [px].
-        """
-        return self.band_lines * self.tiles_across(width) * self.planes
-
-    @cached_property
+    @property
     def floats(self) -> Any:
         """Taichi's type of one floating-point number per lane."""
         return ti.types.vector(self.lanes, ti.f32)
 
-    @cached_property
+    @property
     def integers(self) -> Any:
         """Taichi's type of one whole number per lane."""
         return ti.types.vector(self.lanes, ti.i32)
+
+    @property
+    def columns(self) -> list[float]:
+        """How far the centre of every lane's sample is from the tile's left edge."""
+        return [lane % self.tile_width + 0.5 for lane in range(self.lanes)]
+
+    @property
+    def lines(self) -> list[float]:
+        """How far it is from the tile's upper edge."""
+        return [lane // self.tile_width + 0.5 for lane in range(self.lanes)]
+
+
+@cache
+def _planes(config: DrawingConfig) -> Any:
+    """Number the planes that a config needs."""
+    needed = {
+        **{name: config.labels for label in LABELS.values() for name in label.planes},
+        **dict.fromkeys(("depth", "texel_x", "texel_y"), True),  # of what is seen; its place in the texture [texels]
+        "light": config.headlit,  # share of the headlight that comes back
+        "wire": config.wires,  # share of the mesh's lines in the colour
+        "instrument": config.instruments,  # 255 where an instrument is seen, else 0
+        **dict.fromkeys(("normal_x", "normal_y", "normal_z"), config.tissue or config.metal),  # in the camera's frame
+        **dict.fromkeys(("cell", "triangle"), config.unordered),  # their numbers
+        "footprint": config.tissue,  # square of the texels of a sample's longer side
+        **dict.fromkeys(("red", "green", "blue"), config.picture and config.supersample > 1),  # to be averaged
+    }
+    names = [name for name, there in needed.items() if there]
+    return namedtuple("Planes", names)(*range(len(names)))
+
+
+class Band(NamedTuple):
+    """A band of the picture, or a part of one, and the view.
+
+    Attributes:
+        config: what the kernel is compiled for.
+        samples: the planes of all tiles that are kept.
+        first: entry of `samples` where the band begins, from the left edge of the picture.
+        across: tiles in a row.
+        left, right: first column of samples, and the column after the last.
+        top, bottom: first row of samples, and the row after the last.
+        width, height: of the picture [samples].
+        near: only what is farther than this is drawn.
+        numbers: as `view_numbers` makes them.
+    """
+
+    config: DrawingConfig
+    samples: Any
+    first: Any
+    across: Any
+    left: Any
+    right: Any
+    top: Any
+    bottom: Any
+    width: Any
+    height: Any
+    near: Any
+    numbers: Any
+
+
+@ti.func
+def clip(low_x, high_x, low_y, high_y, band: ti.template()):
+    """Clip a rectangle to a band: give its first and end column, its first and end row of samples."""
+    return (
+        ti.cast(ti.math.clamp(ti.floor(low_x), band.left, band.right), ti.i32),
+        ti.cast(ti.math.clamp(ti.ceil(high_x), band.left, band.right), ti.i32),
+        ti.cast(ti.math.clamp(ti.floor(low_y), band.top, band.bottom), ti.i32),
+        ti.cast(ti.math.clamp(ti.ceil(high_y), band.top, band.bottom), ti.i32),
+    )
+
+
+@ti.func
+def tiles_of(first_column, end_column, first_row, end_row, band: ti.template()):
+    """Give the tiles of a rectangle of samples: the first and end tile in a line of tiles, the first and end line."""
+    width, height = ti.static((band.config.tile_width, band.config.tile_height))
+    return (
+        first_column // width,
+        (end_column + (width - 1)) // width,
+        (first_row - band.top) // height,
+        (end_row - band.top + (height - 1)) // height,
+    )
+
+
+@ti.func
+def centres(left, top, config: ti.template()):
+    """Give x and y of the samples of a tile, whose upper left corner is at (left, top)."""
+    return config.floats(config.columns) + ti.cast(left, ti.f32), config.floats(config.lines) + ti.cast(top, ti.f32)
+
+
+@ti.func
+def clear(at, band: ti.template()):
+    """Empty a tile."""
+    band.samples[at + band.config.plane.depth] = band.config.floats(INFINITY)
+    if ti.static(band.config.instruments):
+        band.samples[at + band.config.plane.instrument] = band.config.floats(0)
+
+
+@ti.func
+def keep(at, visible, value, samples: ti.template()):
+    """Store a plane's value for the samples where it is visible."""
+    samples[at] = ti.select(visible, value, samples[at])
