@@ -5,10 +5,10 @@
 from typing import Any, NamedTuple
 
 from taichi_msm.render import style
+from taichi_msm.render import uniforms as uni
 from taichi_msm.render.camera_kernel import POINT_NUMBERS
 from taichi_msm.render.cell import on_triangle
 from taichi_msm.render.samples import keep
-from taichi_msm.render.view_numbers import AXES
 from taichi_msm.system.runtime import ti
 
 # The numbers of the unit normal at a mass point; normals are stored after the other numbers of all mass points.
@@ -19,48 +19,31 @@ LARGEST_FOOTPRINT = 1e12
 
 
 class DrawnSheet(NamedTuple):
-    """The mass points, and the size of what is between them.
+    """The mass points, and the size of what is between them."""
 
-    Attributes:
-        point: the numbers of every mass point, then the normals.
-        rows, cols: mass points.
-        parts: small quads along a side of a cell.
-        texture_width, texture_height: of the texture [texels].
-    """
-
-    point: Any
+    point: Any  # the numbers of every mass point, then the normals
     rows: Any
     cols: Any
-    parts: Any
-    texture_width: Any
+    parts: Any  # small quads along a side of a cell
+    texture_width: Any  # [texels]
     texture_height: Any
 
 
 class Cell(NamedTuple):
-    """A cell and its place on the sheet and on the texture.
-
-    Attributes:
-        patch: its surface.
-        i, j: its row and column.
-        down, across: cells of the sheet.
-        texel_x, texel_y: whole texels to its upper left mass point.
-        rest_x, rest_y: the fraction of a texel that remains.
-        step_x, step_y: texels of the cell.
-        normal: entry of the normal at its upper left mass point.
-    """
+    """A cell and its place on the sheet and on the texture."""
 
     patch: Any
-    i: Any
+    i: Any  # its row and column
     j: Any
-    down: Any
+    down: Any  # cells of the sheet
     across: Any
-    texel_x: Any
+    texel_x: Any  # whole texels to its upper left mass point
     texel_y: Any
-    rest_x: Any
+    rest_x: Any  # the fraction of a texel that remains
     rest_y: Any
-    step_x: Any
+    step_x: Any  # texels of the cell
     step_y: Any
-    normal: Any
+    normal: Any  # entry of the normal at its upper left mass point
 
 
 @ti.func
@@ -102,7 +85,7 @@ def store_normal(
         here = rows * cols * POINT_NUMBERS + (i * cols + j) * NORMAL_NUMBERS
         if ti.static(config.tissue):
             for n in ti.static(range(3)):
-                axis = AXES + 3 * n
+                axis = uni.AXES + 3 * n
                 point[here + n] = numbers[axis] * n_x + numbers[axis + 1] * n_y + numbers[axis + 2] * n_z
         else:
             point[here] = n_x
@@ -134,7 +117,7 @@ def absolute(values):
 def headlight(normal: ti.template(), numbers: ti.template()):
     """Share of the headlight that is reflected: the cosine between the normal and the direction to the light."""
     length = ti.sqrt(normal[0] * normal[0] + normal[1] * normal[1] + normal[2] * normal[2])
-    toward = AXES + 6
+    toward = uni.AXES + 6
     cosine = absolute(normal[0] * numbers[toward] + normal[1] * numbers[toward + 1] + normal[2] * numbers[toward + 2])
     cosine = cosine / ti.max(length, 1e-30)
     # Where a point is infinite or NaN, so is its normal.
@@ -169,10 +152,7 @@ def footprint(x, y, s, t, texels_x, texels_y, triangle: ti.template()):
 def distance_to_line(place, right, below):
     """Distance of samples from the nearest line of the mesh [samples], given their distance from its first [cells].
 
-    Args:
-        place: of the samples.
-        right: that of what their right neighbours show of the same triangle.
-        below: likewise the neighbours below.
+    `right` and `below` are the distances of what the neighbours show of the same triangle.
     """
     to_right, to_below = right - place, below - place
     slope = ti.sqrt(to_right * to_right + to_below * to_below)
@@ -186,19 +166,7 @@ def store(
 ):  # fmt: skip
     """Keep what the visible samples of a tile show.
 
-    Args:
-        at: entry where the tile begins.
-        visible: which samples show it.
-        x: column of the samples.
-        y: their row.
-        s: place on the triangle.
-        t: likewise.
-        column: of the small quad in the cell.
-        line: likewise.
-        triangle: the triangle that they show.
-        cell: its cell.
-        sheet: the sheet.
-        band: of the tile.
+    That is the point (s, t) of a triangle of the small quad in this column and line of a cell.
     """
     config, samples = ti.static((band.config, band.samples))
     plane = ti.static(config.plane)
@@ -221,7 +189,7 @@ def store(
         keep(at + plane.normal_y, visible, normal[1] * front, samples)
         keep(at + plane.normal_z, visible, normal[2] * front, samples)
         keep(at + plane.footprint, visible, size, samples)
-    if ti.static(config.wires):
+    if ti.static(config.wireframe):
         s_right, t_right = on_triangle(x + 1.0, y, triangle)
         s_below, t_below = on_triangle(x, y + 1.0, triangle)
         distance = ti.min(

@@ -7,6 +7,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from taichi_msm.render.samples import Integers
 from taichi_msm.system.launches import Launches, end_thread
 from taichi_msm.system.runtime import our_compilation, ti
 
@@ -129,13 +130,7 @@ def _reached(cell, size, bounds: ti.template()):
 
 
 @ti.kernel
-def _count(
-    cells: ti.i32,
-    size: ti.i32,
-    across: ti.i32,
-    bounds: ti.types.ndarray(dtype=ti.i32, ndim=1),
-    ends: ti.types.ndarray(dtype=ti.i32, ndim=1),
-):
+def _count(cells: ti.i32, size: ti.i32, across: ti.i32, bounds: Integers, ends: Integers):
     """Count the cells of every bin; the count of bin n is in entry n + 1."""
     ti.loop_config(serialize=True)
     for cell in range(cells):
@@ -146,14 +141,7 @@ def _count(
 
 
 @ti.kernel
-def _fill(
-    cells: ti.i32,
-    size: ti.i32,
-    across: ti.i32,
-    bounds: ti.types.ndarray(dtype=ti.i32, ndim=1),
-    ends: ti.types.ndarray(dtype=ti.i32, ndim=1),
-    entries: ti.types.ndarray(dtype=ti.i32, ndim=1),
-):
+def _fill(cells: ti.i32, size: ti.i32, across: ti.i32, bounds: Integers, ends: Integers, entries: Integers):
     """List the cells of every bin; `ends` holds where each list begins, and afterwards where it ends."""
     ti.loop_config(serialize=True)
     for cell in range(cells):
@@ -179,18 +167,9 @@ def owner(item, count, ends: ti.template()):
 
 @ti.kernel
 def _enter(
-    first: ti.i32,
-    end: ti.i32,
-    ended: ti.types.ndarray(dtype=ti.i32, ndim=1),
-    cells: ti.i32,
-    size: ti.i32,
-    across: ti.i32,
-    bounds: ti.types.ndarray(dtype=ti.i32, ndim=1),
-    ends: ti.types.ndarray(dtype=ti.i32, ndim=1),
-    counts: ti.types.ndarray(dtype=ti.i32, ndim=1),
-    squares: ti.types.ndarray(dtype=ti.i32, ndim=1),
-    places: ti.types.ndarray(dtype=ti.i32, ndim=1),
-):
+    first: ti.i32, end: ti.i32, ended: Integers, cells: ti.i32, size: ti.i32, across: ti.i32,
+    bounds: Integers, ends: Integers, counts: Integers, squares: Integers, places: Integers,
+):  # fmt: skip
     """Find the bin and the place in its list of every entry, and so the length of every list."""
     for entry in range(first, end):
         cell = owner(entry, cells, ends)
@@ -204,16 +183,9 @@ def _enter(
 
 @ti.kernel
 def _enlist(
-    first: ti.i32,
-    end: ti.i32,
-    ended: ti.types.ndarray(dtype=ti.i32, ndim=1),
-    cells: ti.i32,
-    ends: ti.types.ndarray(dtype=ti.i32, ndim=1),
-    squares: ti.types.ndarray(dtype=ti.i32, ndim=1),
-    places: ti.types.ndarray(dtype=ti.i32, ndim=1),
-    starts: ti.types.ndarray(dtype=ti.i32, ndim=1),
-    entries: ti.types.ndarray(dtype=ti.i32, ndim=1),
-):
+    first: ti.i32, end: ti.i32, ended: Integers, cells: ti.i32, ends: Integers, squares: Integers, places: Integers,
+    starts: Integers, entries: Integers,
+):  # fmt: skip
     """Put every entry into its place."""
     for entry in range(first, end):
         entries[starts[squares[entry]] + places[entry]] = owner(entry, cells, ends)

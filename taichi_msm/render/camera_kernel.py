@@ -2,7 +2,7 @@
 
 # No `from __future__ import annotations` here: Taichi reads the annotations of a kernel.
 
-from taichi_msm.render.view_numbers import CENTRE_X, CENTRE_Y, MATRIX, PINHOLE, SPREAD
+from taichi_msm.render import uniforms as uni
 from taichi_msm.system.runtime import ti
 
 # The numbers of a mass point: (X, Y, w, depth), its place in the picture [samples].
@@ -15,7 +15,7 @@ def project(position: ti.template(), i, j, cols, numbers: ti.template(), point: 
     here = (i * cols + j) * POINT_NUMBERS
     x, y, z = position[i, j, 0], position[i, j, 1], position[i, j, 2]
     for n in ti.static(range(4)):
-        row = MATRIX + 4 * n
+        row = uni.MATRIX + 4 * n
         if ti.static(double):
             point[here + n] = numbers[row + 3] + numbers[row] * x + numbers[row + 1] * y + numbers[row + 2] * z
         else:
@@ -27,10 +27,10 @@ def project(position: ti.template(), i, j, cols, numbers: ti.template(), point: 
 @ti.func
 def w_at(depth, numbers: ti.template()):
     """Give w of points at a depth."""
-    return depth * numbers[PINHOLE] + (1.0 - numbers[PINHOLE])
+    return depth * numbers[uni.PINHOLE] + (1.0 - numbers[uni.PINHOLE])
 
 
 @ti.func
 def line_of_sight(x, y, numbers: ti.template()):
     """Give how far points that are seen at (x, y) are to the right and above the axis of view, at w = 1 [m]."""
-    return (x - numbers[CENTRE_X]) * numbers[SPREAD], (numbers[CENTRE_Y] - y) * numbers[SPREAD]
+    return (x - numbers[uni.CENTRE_X]) * numbers[uni.SPREAD], (numbers[uni.CENTRE_Y] - y) * numbers[uni.SPREAD]

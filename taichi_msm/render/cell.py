@@ -28,55 +28,37 @@ FARTHEST = float(1 << 16)
 
 
 class Outline(NamedTuple):
-    """A cell in the picture.
+    """A cell in the picture."""
 
-    Attributes:
-        x, y: of its corners, lists.
-        left, right, top, bottom: its bounds.
-        side: 1 where its front is seen, -1 where its back is, 0 if it is folded.
-        in_front, behind: whether all of its corners are in front of the camera, or none is.
-    """
-
-    x: Any
+    x: Any  # of its corners, a list
     y: Any
-    left: Any
+    left: Any  # its bounds
     right: Any
     top: Any
     bottom: Any
-    side: Any
-    in_front: Any
-    behind: Any
+    side: Any  # 1 where its front is seen, -1 where its back is, 0 if it is folded
+    in_front: Any  # whether all of its corners are in front of the camera
+    behind: Any  # whether none is
 
 
 class Patch(NamedTuple):
-    """The surface between four mass points.
+    """The surface between four mass points."""
 
-    Attributes:
-        a, b, c, d: coefficients, each (X, Y, w, depth).
-        side: as in its `Outline`.
-        whole: whether it is drawn as a whole, and not triangle by triangle.
-    """
-
-    a: Any
+    a: Any  # coefficients, each (X, Y, w, depth)
     b: Any
     c: Any
     d: Any
-    side: Any
-    whole: Any
+    side: Any  # as in its `Outline`
+    whole: Any  # whether it is drawn as a whole, and not triangle by triangle
 
 
 class Triangle(NamedTuple):
-    """The triangle P + R s + D t of a small quad that a sample is on.
-
-    Attributes:
-        p, r, d: each a list of X, Y, w and depth.
-        below: whether it is the one below the diagonal, where t > s.
-    """
+    """The triangle P + R s + D t of a small quad that a sample is on; P, R and D are lists of X, Y, w and depth."""
 
     p: Any
     r: Any
     d: Any
-    below: Any
+    below: Any  # whether it is the one below the diagonal, where t > s
 
 
 @ti.func
@@ -167,12 +149,7 @@ def seen_side(x: ti.template(), y: ti.template()):
 def small_quad(x, y, inside, parts, patch: ti.template()):
     """Find column and line of the small quads of a patch that are seen at (x, y).
 
-    Args:
-        x: column of the samples.
-        y: their row.
-        inside: which of them the cell covers.
-        parts: small quads along a side of the cell.
-        patch: the cell, which is drawn as a whole.
+    `inside` are those that it covers; `parts` is the number of small quads along its side.
     """
     a, b, c, d = ti.static((patch.a, patch.b, patch.c, patch.d))
     a_1 = a[0] - x * a[2]
@@ -201,16 +178,9 @@ def small_quad(x, y, inside, parts, patch: ti.template()):
 
 @ti.func
 def triangle_at(x, y, column, line, part, lower, patch: ti.template()):
-    """Find the `Triangle` of a small quad that (x, y) is on.
+    """Find the `Triangle` of a small quad that (x, y) is on; in a patch that is not whole, the `lower` or upper one.
 
-    Args:
-        x: column of the samples.
-        y: their row.
-        column: of the small quad in the cell.
-        line: likewise.
-        part: side of a small quad, as a fraction of the cell's.
-        lower: for a patch that is not whole: whether to take the triangle below the diagonal.
-        patch: the cell.
+    The small quad is in this column and line of the cell, and `part` is its side as a fraction of the cell's.
     """
     a, b, c, d = ti.static((patch.a, patch.b, patch.c, patch.d))
     s0 = column * part
@@ -268,17 +238,7 @@ def depth_at(s, t, triangle: ti.template()):
 
 @ti.func
 def triangle_bounds(column, line, lower, part, near, width, height, patch: ti.template()):
-    """Find the bounds of a small triangle in the picture; arguments as for `triangle_at`.
-
-    Args:
-        column: of its small quad.
-        line: likewise.
-        lower: whether it is the one below the diagonal.
-        part: side of a small quad.
-        near: only what is farther than this is drawn.
-        width: of the picture [samples].
-        height: likewise.
-        patch: the cell.
+    """Find the bounds of a small triangle in a picture of this width and height; other arguments as for `triangle_at`.
 
     Returns:
         Least and largest x, least and largest y; and by what fraction of its side it is enlarged.

@@ -30,16 +30,11 @@ from taichi_msm.system.runtime import ti
 
 
 class Part(NamedTuple):
-    """A part of a cell, for a thread of a GPU.
+    """A part of a cell, for a thread of a GPU."""
 
-    Attributes:
-        whole: whether the cell is drawn as a whole; then the part is all of it.
-        first, end: else, its first triangle, and that after its last.
-    """
-
-    whole: Any
-    first: Any
-    end: Any
+    whole: Any  # whether the cell is drawn as a whole; then the part is all of it
+    first: Any  # else, its first triangle
+    end: Any  # and that after its last
 
 
 @ti.func
@@ -72,18 +67,8 @@ def cover_tile(
 ):  # fmt: skip
     """Cover a tile of samples with the small quads (column, line) of a cell.
 
-    Args:
-        at: entry where the tile begins.
-        x: column of the samples.
-        y: their row.
-        inside: which of them the cell covers.
-        column: of their small quads in the cell.
-        line: likewise.
-        lower: of a cell that is drawn triangle by triangle: whether the triangle is below the diagonal.
-        overstep: by what fraction of its side that is enlarged.
-        cell: the cell.
-        sheet: the sheet.
-        band: of the tile.
+    The cell covers those `inside`. If it is drawn triangle by triangle, this is the `lower` or upper one, enlarged by the
+    fraction `overstep` of its side.
     """
     config = ti.static(band.config)
     plane = ti.static(config.plane)
@@ -111,12 +96,7 @@ def cover_tile(
 def cover(i, j, drawn: ti.template(), sheet: ti.template(), band: ti.template()):
     """Cover the samples of a band with the cell to the right and below of mass point (i, j).
 
-    Args:
-        i: row of the mass point.
-        j: its column.
-        drawn: the part of the cell that is drawn, where cells are unordered.
-        sheet: the sheet.
-        band: the band.
+    Where cells are unordered, `drawn` is the part of it that is drawn.
     """
     config, floats = ti.static((band.config, band.config.floats))
     corner = (i * sheet.cols + j) * POINT_NUMBERS

@@ -8,21 +8,9 @@ beyond an end of the segment, the line of sight is intersected with the sphere a
 
 # No `from __future__ import annotations` here: Taichi reads the annotations of a kernel.
 
+from taichi_msm.render import uniforms as uni
 from taichi_msm.render.camera_kernel import line_of_sight, w_at
 from taichi_msm.render.samples import INFINITY, centres, clip, keep, tiles_of
-from taichi_msm.render.view_numbers import (
-    AXIS,
-    BOTTOM,
-    LEFT,
-    LENGTH,
-    PINHOLE,
-    RADIUS,
-    RIGHT,
-    ROD_NUMBERS,
-    RODS,
-    TIP,
-    TOP,
-)
 from taichi_msm.system.runtime import ti
 
 
@@ -36,23 +24,17 @@ def dot(a_x, a_y, a_z, b_x, b_y, b_z):
 def meet(x, y, n, numbers: ti.template()):
     """Find where lines of sight meet rod n first.
 
-    Args:
-        x: column of the samples.
-        y: their row.
-        n: number of the rod.
-        numbers: as `view_numbers` makes them.
-
     Returns:
         The depth, INFINITY where they miss the rod, and the normal times the radius.
     """
-    rod = RODS + n * ROD_NUMBERS
-    tip, axis = rod + TIP, rod + AXIS
+    rod = uni.RODS + n * uni.ROD_NUMBERS
+    tip, axis = rod + uni.TIP, rod + uni.AXIS
     u_x, u_y, u_z = numbers[axis], numbers[axis + 1], numbers[axis + 2]
-    length, radius = numbers[rod + LENGTH], numbers[rod + RADIUS]
+    length, radius = numbers[rod + uni.LENGTH], numbers[rod + uni.RADIUS]
     # The line of sight P = O + D t; here t is counted from the depth of the tip, and the tip is at 0.
     start = numbers[tip + 2] * (-1.0)
     across, up = line_of_sight(x, y, numbers)
-    d_x, d_y, d_z = across * numbers[PINHOLE], up * numbers[PINHOLE], -1.0
+    d_x, d_y, d_z = across * numbers[uni.PINHOLE], up * numbers[uni.PINHOLE], -1.0
     w = w_at(start, numbers)
     o_x, o_y, o_z = across * w - numbers[tip], up * w - numbers[tip + 1], 0.0
     # The side of the rod: a t^2 + 2 b t + c = 0.
@@ -104,12 +86,11 @@ def cover_with_rods(count, band: ti.template()):
     """Cover a band with its `count` instruments."""
     config, numbers = ti.static((band.config, band.numbers))
     for n in range(count):
-        rod = RODS + n * ROD_NUMBERS
-        if numbers[rod + TOP] < band.bottom and numbers[rod + BOTTOM] > band.top:
-            left, right, top, bottom = clip(
-                numbers[rod + LEFT], numbers[rod + RIGHT], numbers[rod + TOP], numbers[rod + BOTTOM], band
-            )
-            first_tile, end_tile, first_line, end_line = tiles_of(left, right, top, bottom, band)
+        rod = uni.RODS + n * uni.ROD_NUMBERS
+        top, bottom = numbers[rod + uni.TOP], numbers[rod + uni.BOTTOM]
+        if top < band.bottom and bottom > band.top:
+            left, right, upper, lower = clip(numbers[rod + uni.LEFT], numbers[rod + uni.RIGHT], top, bottom, band)
+            first_tile, end_tile, first_line, end_line = tiles_of(left, right, upper, lower, band)
             for line in range(first_line, end_line):
                 for tile in range(first_tile, end_tile):
                     x, y = centres(tile * config.tile_width, band.top + line * config.tile_height, config)

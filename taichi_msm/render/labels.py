@@ -30,69 +30,53 @@ class Labels(NamedTuple):
 
 
 class Label(NamedTuple):
-    """How kernel 2 writes a label: a number or several for every pixel, row by row.
+    """How kernel 2 writes a label: one number or several for every pixel, row by row."""
 
-    Attributes:
-        planes: where a tile of samples has the numbers (samples.py).
-        nothing: the number where nothing is seen.
-        of_sheet: whether it tells of the sheet alone; then it is `nothing` too where an instrument is seen.
-        dtype: of its values.
-    """
+    first: int  # numbers per pixel of the labels before it
+    planes: tuple[str, ...]  # where a tile of samples has the numbers (samples.py)
+    nothing: float  # the number where nothing is seen
+    of_sheet: bool  # whether it tells of the sheet alone; then it is `nothing` too where an instrument is seen
+    dtype: type[np.generic]  # of its values
 
-    planes: tuple[str, ...]
-    nothing: float
-    of_sheet: bool
-    dtype: type[np.generic]
+    @property
+    def numbers(self) -> int:
+        """Its numbers per pixel."""
+        return len(self.planes)
 
 
-# The fields of `Labels`. The kernel writes one after the other.
+# The fields of `Labels`, which the kernel writes one after the other, and the numbers that all of them take per pixel.
 LABELS = {
-    "coordinates": Label(("across", "down"), math.nan, of_sheet=True, dtype=np.float32),
-    "depth": Label(("depth",), 0.0, of_sheet=False, dtype=np.float32),
-    "instrument": Label(("instrument",), 0.0, of_sheet=False, dtype=np.uint8),
+    "coordinates": Label(0, ("across", "down"), math.nan, of_sheet=True, dtype=np.float32),
+    "depth": Label(2, ("depth",), 0.0, of_sheet=False, dtype=np.float32),
+    "instrument": Label(3, ("instrument",), 0.0, of_sheet=False, dtype=np.uint8),
 }
-LABEL_NUMBERS = sum(len(label.planes) for label in LABELS.values())
+LABEL_NUMBERS = 4
 
 
-class Channel(NamedTuple):
-    """One number of a label; that of a pixel is entry first * pixels + stride * pixel + offset."""
+def label_channels(plane: Any) -> list[tuple[int, int, Label]]:
+    """List the planes that labels are written from, each with which of its label's numbers it is, and the label.
 
-    plane: int
-    nothing: float
-    of_sheet: bool
-    first: int
-    stride: int
-    offset: int
-
-
-def label_channels(plane: Any) -> list[Channel]:
-    """List what is written of a tile that has these planes; a label whose plane it lacks stays 0."""
-    channels, first = [], 0
-    for label in LABELS.values():
-        channels += [
-            Channel(getattr(plane, name), label.nothing, label.of_sheet, first, len(label.planes), offset)
-            for offset, name in enumerate(label.planes)
-            if hasattr(plane, name)
-        ]
-        first += len(label.planes)
-    return channels
+    A label whose planes are missing stays 0.
+    """
+    return [
+        (getattr(plane, name), n, label)
+        for label in LABELS.values()
+        for n, name in enumerate(label.planes)
+        if hasattr(plane, name)
+    ]
 
 
 def labels_of(numbers: NDArray[np.float32], size: tuple[int, int]) -> Labels:
-    """Split what the kernel wrote into labels.
-
-    Args:
-        numbers: of all labels of all pixels.
-        size: width and height of the picture [px].
-    """
-    (width, height), first, values = size, 0, []
-    for label in LABELS.values():
-        count = len(label.planes)
-        value = numbers[first * width * height : (first + count) * width * height]
-        shape = (height, width, count) if count > 1 else (height, width)
-        values.append(value.reshape(shape).astype(label.dtype, copy=False))
-        first += count
-    return Labels(*values)
+    """Split the numbers that the kernel wrote of a picture of this width and height [px]."""
+    values, (width, height) = numbers.reshape(LABEL_NUMBERS, -1), size
+    return Labels(
+        *(
+            values[label.first : label.first + label.numbers]
+            .reshape((height, width, label.numbers)[: 2 + (label.numbers > 1)])
+            .astype(label.dtype, copy=False)
+            for label in LABELS.values()
+        )
+    )
 
 
 class Flow(NamedTuple):

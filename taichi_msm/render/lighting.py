@@ -18,29 +18,8 @@ Normals are lists, and may have any length.
 # No `from __future__ import annotations` here: Taichi reads the annotations of a kernel.
 
 from taichi_msm.render import style
+from taichi_msm.render import uniforms as uni
 from taichi_msm.render.camera_kernel import line_of_sight, w_at
-from taichi_msm.render.view_numbers import (
-    ACROSS,
-    AMBIENT,
-    AXIS,
-    CENTRE_X,
-    CENTRE_Y,
-    FARNESS,
-    GLOSS,
-    LENGTH,
-    LIGHT_X,
-    LIGHT_Y,
-    PINHOLE,
-    RADIUS,
-    ROD_NUMBERS,
-    RODS,
-    SLOPE_X,
-    SLOPE_Y,
-    TIP,
-    UNIT,
-    UP,
-    VIGNETTE,
-)
 from taichi_msm.system.runtime import ti
 
 
@@ -55,8 +34,8 @@ def illuminate(x, y, depth, normal: ti.template(), numbers: ti.template()):
     across, above = line_of_sight(x, y, numbers)
     w = w_at(depth, numbers)
     right, up = across * w, above * w
-    l_x, l_y = numbers[LIGHT_X] - right, numbers[LIGHT_Y] - up
-    v_x, v_y, v_z = right * (numbers[PINHOLE] * (-1.0)), up * (numbers[PINHOLE] * (-1.0)), w
+    l_x, l_y = numbers[uni.LIGHT_X] - right, numbers[uni.LIGHT_Y] - up
+    v_x, v_y, v_z = right * (numbers[uni.PINHOLE] * (-1.0)), up * (numbers[uni.PINHOLE] * (-1.0)), w
     # Scalar products of vectors that are not normalised yet.
     n_l = n_x * l_x + n_y * l_y + n_z * depth
     n_v = n_x * v_x + n_y * v_y + n_z * v_z
@@ -73,7 +52,7 @@ def illuminate(x, y, depth, normal: ti.template(), numbers: ti.template()):
     return (
         cosine,
         (2.0 * n_l * n_v * to_n - l_v) * to_both,
-        ti.min(numbers[FARNESS] * to_l, 4.0),
+        ti.min(numbers[uni.FARNESS] * to_l, 4.0),
         (2.0 * n_v * n_y * to_n - v_y) * to_v,
     )
 
@@ -95,13 +74,13 @@ def unshaded(x, y, depth, rod_count, numbers: ti.template(), config: ti.template
     right, up = across * w, above * w
     share = config.floats(1)
     for n in range(rod_count):
-        rod = RODS + n * ROD_NUMBERS
-        tip, axis = rod + TIP, rod + AXIS
+        rod = uni.RODS + n * uni.ROD_NUMBERS
+        tip, axis = rod + uni.TIP, rod + uni.AXIS
         p_x, p_y, p_z = right - numbers[tip], up - numbers[tip + 1], depth * (-1.0) - numbers[tip + 2]
         u_x, u_y, u_z = numbers[axis], numbers[axis + 1], numbers[axis + 2]
-        foot = ti.max(ti.min(p_x * u_x + p_y * u_y + p_z * u_z, numbers[rod + LENGTH]), 0.0)
+        foot = ti.max(ti.min(p_x * u_x + p_y * u_y + p_z * u_z, numbers[rod + uni.LENGTH]), 0.0)
         f_x, f_y, f_z = p_x - u_x * foot, p_y - u_y * foot, p_z - u_z * foot
-        square = numbers[rod + RADIUS] * numbers[rod + RADIUS]
+        square = numbers[rod + uni.RADIUS] * numbers[rod + uni.RADIUS]
         share *= 1.0 - style.SHADE * square / ti.max(f_x * f_x + f_y * f_y + f_z * f_z, square)
     return share
 
@@ -111,10 +90,10 @@ def tilt(normal: ti.template(), rise_x, rise_y, numbers: ti.template()):
     """Tilt normals by the relief, given the rise of the grey from texel to texel: where it rises, they tilt back."""
     n_x, n_y, n_z = ti.static((normal[0], normal[1], normal[2]))
     length = 1.0 / ti.max(ti.sqrt(n_x * n_x + n_y * n_y + n_z * n_z), 1e-30)
-    a = [numbers[ACROSS + k] for k in ti.static(range(3))]
-    b = [numbers[UP + k] for k in ti.static(range(3))]
+    a = [numbers[uni.ACROSS + k] for k in ti.static(range(3))]
+    b = [numbers[uni.UP + k] for k in ti.static(range(3))]
     n = [n_x * length, n_y * length, n_z * length]
-    slope_x, slope_y = rise_x * numbers[SLOPE_X], rise_y * numbers[SLOPE_Y]
+    slope_x, slope_y = rise_x * numbers[uni.SLOPE_X], rise_y * numbers[uni.SLOPE_Y]
     along = slope_x * (a[0] * n[0] + a[1] * n[1] + a[2] * n[2]) + slope_y * (b[0] * n[0] + b[1] * n[1] + b[2] * n[2])
     for k in ti.static(range(3)):
         normal[k] = n[k] * (along + 1.0) - slope_x * a[k] - slope_y * b[k]
@@ -132,17 +111,17 @@ def light_tissue(x, y, depth, normal: ti.template(), rise_x, rise_y, appearance:
     if ti.static(config.relief):
         tilt(tilted, rise_x, rise_y, numbers)
     cosine, mirror, nearness, _ = illuminate(x, y, depth, tilted, numbers)
-    diffuse = ti.max(cosine + style.WRAP, 0.0) * (1.0 / (1.0 + style.WRAP)) * nearness * numbers[UNIT]
-    share = numbers[AMBIENT] + (1.0 - numbers[AMBIENT]) * diffuse
-    gloss = highlight(mirror) * nearness * (255.0 * numbers[GLOSS])
+    diffuse = ti.max(cosine + style.WRAP, 0.0) * (1.0 / (1.0 + style.WRAP)) * nearness * numbers[uni.UNIT]
+    share = numbers[uni.AMBIENT] + (1.0 - numbers[uni.AMBIENT]) * diffuse
+    gloss = highlight(mirror) * nearness * (255.0 * numbers[uni.GLOSS])
     if ti.static(config.instruments):
         left = unshaded(x, y, depth, appearance.rod_count, numbers, config)
         share, gloss = share * left, gloss * left
     if ti.static(config.vignette):
         # The distance from the middle of the picture is in units of half its diagonal.
-        off_x, off_y = x - numbers[CENTRE_X], y - numbers[CENTRE_Y]
-        diagonal = numbers[CENTRE_X] * numbers[CENTRE_X] + numbers[CENTRE_Y] * numbers[CENTRE_Y]
-        rim = 1.0 - numbers[VIGNETTE] * (off_x * off_x + off_y * off_y) / diagonal
+        off_x, off_y = x - numbers[uni.CENTRE_X], y - numbers[uni.CENTRE_Y]
+        diagonal = numbers[uni.CENTRE_X] * numbers[uni.CENTRE_X] + numbers[uni.CENTRE_Y] * numbers[uni.CENTRE_Y]
+        rim = 1.0 - numbers[uni.VIGNETTE] * (off_x * off_x + off_y * off_y) / diagonal
         share, gloss = share * rim, gloss * rim
     # Where a point is infinite or NaN, so is its normal.
     return ti.max(ti.min(share, 8.0), 0.0), ti.max(ti.min(gloss, 8.0 * 255.0), 0.0)
@@ -152,7 +131,7 @@ def light_tissue(x, y, depth, normal: ti.template(), rise_x, rise_y, appearance:
 def light_metal(x, y, depth, normal: ti.template(), numbers: ti.template()):
     """Light metal, which reflects a room that is bright above and dark below: give red, green and blue."""
     # What reaches to the light or beyond it is lit as if it ended before.
-    below = ti.max(depth, style.METAL_NEAREST * numbers[FARNESS])
+    below = ti.max(depth, style.METAL_NEAREST * numbers[uni.FARNESS])
     cosine, mirror, _, upward = illuminate(x, y, below, normal, numbers)
     bright = ti.max(upward, 0.0)
     share = style.METAL_AMBIENT + style.METAL_DIFFUSE * ti.max(cosine, 0.0) + style.METAL_MIRROR * bright * bright

@@ -15,6 +15,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from taichi_msm.render import uniforms as uni
 from taichi_msm.render.camera import View, view
 from taichi_msm.render.instrument import Rod
 from taichi_msm.render.labels import Labels, labels_of
@@ -22,7 +23,7 @@ from taichi_msm.render.pyramid import pyramid
 from taichi_msm.render.rasterizer_cpu import Bands
 from taichi_msm.render.rasterizer_gpu import Threads
 from taichi_msm.render.samples import DrawingConfig
-from taichi_msm.render.view_numbers import ROD_COUNT, sizes_of, view_numbers
+from taichi_msm.render.uniforms import sizes_of, view_numbers
 from taichi_msm.scene import Scene
 from taichi_msm.system.runtime import lanes
 
@@ -54,7 +55,7 @@ def drawing_config(scene: Scene, *, picture: bool = True, labels: bool = False) 
         shading=render.shading,
         relief=render.shading == "tissue" and picture and render.light.relief != 0,
         vignette=render.shading == "tissue" and picture and render.light.vignette != 0,
-        wireframe=render.wireframe,
+        wireframe=render.wireframe and picture,
         instruments=scene.has_instruments,
         picture=picture,
         labels=labels,
@@ -99,7 +100,7 @@ class Drawing:
 
     def look(self, position: NDArray[Any], camera: View | None = None, rods: Sequence[Rod] = ()) -> Drawn:
         """Draw the picture, the labels or both, as the config says; arguments as for `draw`."""
-        self._sizes[ROD_COUNT] = len(rods)
+        self._sizes[uni.ROD_COUNT] = len(rods)
         numbers = self._numbers(camera or self._view, rods)
         picture, labels = self._form.draw(np.ascontiguousarray(position, np.float32), numbers, self._sizes)
         return Drawn(

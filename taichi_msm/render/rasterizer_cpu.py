@@ -12,27 +12,15 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from taichi_msm.render import uniforms as uni
 from taichi_msm.render.attributes import NORMAL_NUMBERS, DrawnSheet, store_normal
 from taichi_msm.render.camera_kernel import POINT_NUMBERS, SEEN, project
 from taichi_msm.render.coverage import cover
 from taichi_msm.render.instrument_coverage import cover_with_rods
 from taichi_msm.render.labels import LABEL_NUMBERS
-from taichi_msm.render.samples import INFINITY, Band, DrawingConfig, clear
+from taichi_msm.render.samples import INFINITY, Band, Bytes, DrawingConfig, Floats, Integers, clear
 from taichi_msm.render.shading import Output, resolve
 from taichi_msm.render.texture_filter import Appearance
-from taichi_msm.render.view_numbers import (
-    BANDS_TAKEN,
-    COLS,
-    HEIGHT,
-    LEVELS,
-    NEAR,
-    PARTS,
-    ROD_COUNT,
-    ROWS,
-    ROWS_PROJECTED,
-    ROWS_TAKEN,
-    WIDTH,
-)
 from taichi_msm.system.runtime import ITERATIONS_PER_THREAD, Memory, our_compilation, started, ti
 
 # The numbers that are stored of all mass points come first; then, for every row of them, its highest and its lowest
@@ -81,19 +69,12 @@ class Bands:
         picture = np.empty((height, stride, 3) if config.picture else (1, 4, 3), np.uint8)
         # Without labels nothing is written there; an array of Taichi's is passed in half the time of one of NumPy's.
         labels: Any = np.zeros(LABEL_NUMBERS * width * height, np.float32) if config.labels else self._point
-        sizes[[ROWS_TAKEN, ROWS_PROJECTED, BANDS_TAKEN]] = 0
+        sizes[[uni.ROWS_TAKEN, uni.ROWS_PROJECTED, uni.BANDS_TAKEN]] = 0
         with our_compilation(optimised=False):
             self._draw(
-                position,
-                self._texels,
-                numbers,
-                self._workers,
-                sizes,
-                self._point,
-                self._samples,
-                picture.ravel().view(np.int32) if config.in_words else picture.ravel(),
-                labels,
-            )
+                position, self._texels, numbers, self._workers, sizes, self._point, self._samples,
+                picture.ravel().view(np.int32) if config.in_words else picture.ravel(), labels,
+            )  # fmt: skip
         return picture[:, :width], labels
 
 
@@ -107,7 +88,7 @@ def project_row(
         project(position, i, j, cols, numbers, point, False)
         store_normal(position, i, j, rows, cols, config, numbers, point)
         here = (i * cols + j) * POINT_NUMBERS
-        if point[here + 2] > numbers[NEAR]:
+        if point[here + 2] > numbers[uni.NEAR]:
             low = ti.min(low, point[here + SEEN + 1])
             high = ti.max(high, point[here + SEEN + 1])
         else:
@@ -127,14 +108,14 @@ def project_all(
     """
     taking = True
     while taking:
-        i = ti.atomic_add(sizes[ROWS_TAKEN], 1)
+        i = ti.atomic_add(sizes[uni.ROWS_TAKEN], 1)
         taking = i < rows
         if taking:
             project_row(position, i, rows, cols, config, numbers, point)
-            ti.atomic_add(sizes[ROWS_PROJECTED], 1)
-    projected = ti.atomic_add(sizes[ROWS_PROJECTED], 0)
+            ti.atomic_add(sizes[uni.ROWS_PROJECTED], 1)
+    projected = ti.atomic_add(sizes[uni.ROWS_PROJECTED], 0)
     while projected < rows:
-        projected = ti.atomic_add(sizes[ROWS_PROJECTED], 0)
+        projected = ti.atomic_add(sizes[uni.ROWS_PROJECTED], 0)
 
 
 @ti.func
@@ -157,27 +138,22 @@ def cover_band(sheet: ti.template(), band: ti.template()):
 @cache
 def _kernel(config: DrawingConfig) -> Callable[..., None]:
     """Make the kernel of one config."""
-    factor, floats = config.supersample, config.floats
+    factor = config.supersample
 
     @ti.kernel
     def draw(
-        position: ti.types.ndarray(dtype=ti.f32, ndim=3),
-        texels: ti.types.ndarray(dtype=ti.f32, ndim=1),
-        numbers: ti.types.ndarray(dtype=ti.f32, ndim=1),
-        workers: ti.i32,
-        sizes: ti.types.ndarray(dtype=ti.i32, ndim=1),
-        point: ti.types.ndarray(dtype=ti.f32, ndim=1),
-        samples: ti.types.ndarray(dtype=floats, ndim=1),
-        colours: ti.types.ndarray(dtype=ti.i32 if config.in_words else ti.u8, ndim=1),
-        labels: ti.types.ndarray(dtype=ti.f32, ndim=1),
-    ):
+        position: ti.types.ndarray(dtype=ti.f32, ndim=3), texels: Floats, numbers: Floats, workers: ti.i32,
+        sizes: Integers, point: Floats, samples: ti.types.ndarray(dtype=config.floats, ndim=1),
+        colours: Integers if config.in_words else Bytes, labels: Floats,
+    ):  # fmt: skip
         for index in range(workers * ITERATIONS_PER_THREAD):
             if index % ITERATIONS_PER_THREAD == 0:
-                rows, cols, width, height = sizes[ROWS], sizes[COLS], sizes[WIDTH], sizes[HEIGHT]
+                rows, cols = sizes[uni.ROWS], sizes[uni.COLS]
+                width, height = sizes[uni.WIDTH], sizes[uni.HEIGHT]
                 # To start a loop for this alone takes longer than to project a sheet of usual size.
                 project_all(position, rows, cols, config, numbers, sizes, point)
-                texture_width, texture_height = sizes[LEVELS + 1], sizes[LEVELS + 2]
-                rod_count, parts, near = sizes[ROD_COUNT], numbers[PARTS], numbers[NEAR]
+                texture_width, texture_height = sizes[uni.LEVELS + 1], sizes[uni.LEVELS + 2]
+                rod_count, parts, near = sizes[uni.ROD_COUNT], numbers[uni.PARTS], numbers[uni.NEAR]
                 across = (width * factor + config.tile_width - 1) // config.tile_width
                 first = index // ITERATIONS_PER_THREAD * across * (config.band_lines * config.planes)
                 sheet = ti.static(DrawnSheet(point, rows, cols, parts, texture_width, texture_height))
@@ -190,7 +166,7 @@ def _kernel(config: DrawingConfig) -> Callable[..., None]:
                 # Bands are taken one by one: if another program delays a worker, the others take its bands.
                 taking = True
                 while taking:
-                    row = ti.atomic_add(sizes[BANDS_TAKEN], 1) * config.band_rows
+                    row = ti.atomic_add(sizes[uni.BANDS_TAKEN], 1) * config.band_rows
                     taking = row < height
                     if taking:
                         end_row = ti.min(row + config.band_rows, height)

@@ -3,6 +3,9 @@
 Samples are pixels, or parts of pixels where these are supersampled. A tile of samples is one vector: 4 x 4 samples for
 the 16 lanes of AVX-512, 4 x 2 for 8 lanes, 4 x 1 for 4, a single one on a GPU. A tile takes several vectors, its
 planes. On a CPU bands of rows of tiles are the unit of parallel work; a worker stores one band at a time.
+
+What functions of kernel 2 take: x and y are column and row of a tile's samples, a number for each; `at` the entry of
+`samples` where the tile begins; `numbers` and `sizes` the arrays of uniforms.py; `point` what `project` stores.
 """
 
 # No `from __future__ import annotations` here: Taichi reads the annotations of a kernel.
@@ -24,32 +27,26 @@ TILE_WIDTH = 4
 INFINITY = 3e38
 
 
+# Types of a kernel's arguments.
+Floats = ti.types.ndarray(dtype=ti.f32, ndim=1)
+Doubles = ti.types.ndarray(dtype=ti.f64, ndim=1)
+Integers = ti.types.ndarray(dtype=ti.i32, ndim=1)
+Bytes = ti.types.ndarray(dtype=ti.u8, ndim=1)
+
+
 class DrawingConfig(NamedTuple):
-    """What kernel 2 is compiled for; all else it takes as arguments.
+    """What kernel 2 is compiled for; all else it takes as arguments."""
 
-    Attributes:
-        refined: whether vertices are inserted between mass points.
-        supersample: samples per pixel along each axis.
-        shading: none, headlight or tissue.
-        relief: whether tissue is shaded with a relief.
-        vignette: whether tissue is shaded with a vignette.
-        wireframe: whether the mass-point mesh is drawn.
-        instruments: whether there are any.
-        picture: whether colours are written.
-        labels: whether labels are written; needs one sample per pixel.
-        lanes: samples in a tile.
-    """
-
-    refined: bool
-    supersample: int
-    shading: str
-    relief: bool
-    vignette: bool
-    wireframe: bool
-    instruments: bool
-    picture: bool
-    labels: bool
-    lanes: int
+    refined: bool  # whether vertices are inserted between mass points
+    supersample: int  # samples per pixel along each axis
+    shading: str  # none, headlight or tissue
+    relief: bool  # whether tissue is shaded with a relief
+    vignette: bool  # whether tissue is shaded with a vignette
+    wireframe: bool  # whether the mass-point mesh is drawn
+    instruments: bool  # whether there are any
+    picture: bool  # whether colours are written
+    labels: bool  # whether labels are written; needs one sample per pixel
+    lanes: int  # samples in a tile
 
     @property
     def tile_width(self) -> int:
@@ -75,11 +72,6 @@ class DrawingConfig(NamedTuple):
     def tissue(self) -> bool:
         """Whether the sheet is shaded as wet tissue."""
         return self.picture and self.shading == "tissue"
-
-    @property
-    def wires(self) -> bool:
-        """Whether the mesh is drawn over the sheet."""
-        return self.picture and self.wireframe
 
     @property
     def metal(self) -> bool:
@@ -130,16 +122,6 @@ class DrawingConfig(NamedTuple):
         """Taichi's type of one whole number per lane."""
         return ti.types.vector(self.lanes, ti.i32)
 
-    @property
-    def columns(self) -> list[float]:
-        """How far the centre of every lane's sample is from the tile's left edge."""
-        return [lane % self.tile_width + 0.5 for lane in range(self.lanes)]
-
-    @property
-    def lines(self) -> list[float]:
-        """How far it is from the tile's upper edge."""
-        return [lane // self.tile_width + 0.5 for lane in range(self.lanes)]
-
 
 @cache
 def _planes(config: DrawingConfig) -> Any:
@@ -148,7 +130,7 @@ def _planes(config: DrawingConfig) -> Any:
         **{name: config.labels for label in LABELS.values() for name in label.planes},
         **dict.fromkeys(("depth", "texel_x", "texel_y"), True),  # of what is seen; its place in the texture [texels]
         "light": config.headlit,  # share of the headlight that comes back
-        "wire": config.wires,  # share of the mesh's lines in the colour
+        "wire": config.wireframe,  # share of the mesh's lines in the colour
         "instrument": config.instruments,  # 255 where an instrument is seen, else 0
         **dict.fromkeys(("normal_x", "normal_y", "normal_z"), config.tissue or config.metal),  # in the camera's frame
         **dict.fromkeys(("cell", "triangle"), config.unordered),  # their numbers
@@ -160,31 +142,19 @@ def _planes(config: DrawingConfig) -> Any:
 
 
 class Band(NamedTuple):
-    """A band of the picture, or a part of one, and the view.
-
-    Attributes:
-        config: what the kernel is compiled for.
-        samples: the planes of all tiles that are kept.
-        first: entry of `samples` where the band begins, from the left edge of the picture.
-        across: tiles in a row.
-        left, right: first column of samples, and the column after the last.
-        top, bottom: first row of samples, and the row after the last.
-        width, height: of the picture [samples].
-        near: only what is farther than this is drawn.
-        numbers: as `view_numbers` makes them.
-    """
+    """A band of the picture, or a part of one, and the view; all in samples."""
 
     config: DrawingConfig
-    samples: Any
-    first: Any
-    across: Any
-    left: Any
-    right: Any
-    top: Any
-    bottom: Any
-    width: Any
+    samples: Any  # the planes of all tiles that are kept
+    first: Any  # entry of `samples` where the band begins, from the left edge of the picture
+    across: Any  # tiles in a row
+    left: Any  # first column
+    right: Any  # the column after the last
+    top: Any  # first row
+    bottom: Any  # the row after the last
+    width: Any  # of the picture
     height: Any
-    near: Any
+    near: Any  # only what is farther than this is drawn
     numbers: Any
 
 
@@ -214,7 +184,10 @@ def tiles_of(first_column, end_column, first_row, end_row, band: ti.template()):
 @ti.func
 def centres(left, top, config: ti.template()):
     """Give x and y of the samples of a tile, whose upper left corner is at (left, top)."""
-    return config.floats(config.columns) + ti.cast(left, ti.f32), config.floats(config.lines) + ti.cast(top, ti.f32)
+    width = ti.static(config.tile_width)
+    columns = config.floats([lane % width + 0.5 for lane in ti.static(range(config.lanes))])
+    lines = config.floats([lane // width + 0.5 for lane in ti.static(range(config.lanes))])
+    return columns + ti.cast(left, ti.f32), lines + ti.cast(top, ti.f32)
 
 
 @ti.func

@@ -5,26 +5,20 @@
 from typing import Any, NamedTuple
 
 from taichi_msm.render import style
+from taichi_msm.render import uniforms as uni
 from taichi_msm.render.labels import label_channels
 from taichi_msm.render.lighting import light_metal, light_tissue
 from taichi_msm.render.samples import INFINITY, centres
 from taichi_msm.render.texture_filter import filtered
-from taichi_msm.render.view_numbers import BACKGROUND
 from taichi_msm.system.runtime import ti
 
 
 class Output(NamedTuple):
-    """What the kernel writes.
+    """What the kernel writes."""
 
-    Attributes:
-        colours: of the pixels, as words or bytes.
-        labels: those of all pixels, one label after the other (labels.py).
-        pixels: how many there are.
-    """
-
-    colours: Any
-    labels: Any
-    pixels: Any
+    colours: Any  # of the pixels, as words or bytes
+    labels: Any  # those of all pixels, one label after the other (labels.py)
+    pixels: Any  # how many there are
 
 
 @ti.func
@@ -55,7 +49,7 @@ def shade(at, left, top, samples: ti.template(), appearance: ti.template()):
         share, gloss = light_tissue(x, y, depth, normal, rise_x, rise_y, appearance)
         for n in ti.static(range(3)):
             colour[n] = ti.min(colour[n] * share + gloss, 255.0)
-    if ti.static(config.wires):
+    if ti.static(config.wireframe):
         wire = samples[at + plane.wire]
         for n in ti.static(range(3)):
             colour[n] += (style.WIRE_COLOUR[n] - colour[n]) * wire
@@ -65,7 +59,7 @@ def shade(at, left, top, samples: ti.template(), appearance: ti.template()):
             metal = light_metal(x, y, depth, normal, numbers)
             for n in ti.static(range(3)):
                 colour[n] = ti.select(is_metal, metal[n], colour[n])
-    return [ti.select(seen, colour[n], config.floats(numbers[BACKGROUND + n])) for n in ti.static(range(3))]
+    return [ti.select(seen, colour[n], config.floats(numbers[uni.BACKGROUND + n])) for n in ti.static(range(3))]
 
 
 @ti.func
@@ -117,15 +111,16 @@ def write_labels(
     if ti.static(config.instruments):
         sheet = sheet & (samples[at + plane.instrument] <= 0.0)
     values = [
-        ti.select(sheet if ti.static(channel.of_sheet) else seen, samples[at + channel.plane], channel.nothing)
-        for channel in ti.static(channels)
+        ti.select(sheet if ti.static(label.of_sheet) else seen, samples[at + entry], label.nothing)
+        for entry, _, label in ti.static(channels)
     ]
     for line in ti.static(range(config.tile_height)):
         for n in ti.static(range(config.tile_width)):
             if row + line < end_row and left + n < width:
                 pixel = (row + line) * width + left + n
                 for channel, value in ti.static(zip(channels, values, strict=True)):
-                    place = channel.first * output.pixels + channel.stride * pixel + channel.offset
+                    _, k, label = ti.static(channel)
+                    place = label.first * output.pixels + label.numbers * pixel + k
                     output.labels[place] = value[line * config.tile_width + n]
 
 

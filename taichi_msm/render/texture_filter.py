@@ -4,27 +4,18 @@
 
 from typing import Any, NamedTuple
 
+from taichi_msm.render import uniforms as uni
 from taichi_msm.render.samples import DrawingConfig
-from taichi_msm.render.view_numbers import LEVEL_COUNT, LEVEL_SIZES, LEVELS
 from taichi_msm.system.runtime import ti
 
 
 class Appearance(NamedTuple):
-    """The picture on the sheet, and the light and the instruments that it is shaded with.
-
-    Attributes:
-        config: what the kernel is compiled for.
-        texels: as in a `Pyramid`.
-        sizes: of its levels, after other sizes (`view_numbers`).
-        width, height: of the first level.
-        numbers: as `view_numbers` makes them.
-        rod_count: how many instruments there are.
-    """
+    """The picture on the sheet, and the light and the instruments that it is shaded with."""
 
     config: DrawingConfig
-    texels: Any
+    texels: Any  # as in a `Pyramid`
     sizes: Any
-    width: Any
+    width: Any  # of the first level
     height: Any
     numbers: Any
     rod_count: Any
@@ -99,11 +90,12 @@ def filtered(at, seen, samples: ti.template(), appearance: ti.template()):
         if most > 1.0:
             # For every sample, the coarsest level whose texels are not larger than the sample is mixed with the next
             # coarser one.
-            last = sizes[LEVEL_COUNT] - 1
+            last = sizes[uni.LEVEL_COUNT] - 1
             level, bound = 0, 1.0
             while level <= last and most >= bound:
                 larger = footprint >= bound
-                here, far = LEVELS + LEVEL_SIZES * level, LEVELS + LEVEL_SIZES * ti.min(level + 1, last)
+                here = uni.LEVELS + uni.LEVEL_SIZES * level
+                far = uni.LEVELS + uni.LEVEL_SIZES * ti.min(level + 1, last)
                 if level > 0:
                     texel = ti.select(larger, texel * 2.0, texel)
                     first = ti.select(larger, sizes[here], first)

@@ -12,6 +12,7 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
+from taichi_msm.render import uniforms as uni
 from taichi_msm.render.bins import BOUNDS, binned, store_bounds
 from taichi_msm.render.camera import View
 from taichi_msm.render.camera_kernel import POINT_NUMBERS, project, w_at
@@ -29,27 +30,8 @@ from taichi_msm.render.cell import (
 from taichi_msm.render.instrument import Rod
 from taichi_msm.render.instrument_coverage import meet
 from taichi_msm.render.labels import NO_FLOW, Flow, Sight
-from taichi_msm.render.samples import INFINITY
-from taichi_msm.render.view_numbers import (
-    BIN_SIZE,
-    BINS_ACROSS,
-    BOTTOM,
-    COLS,
-    HEIGHT,
-    LEFT,
-    NEAR,
-    PARTS,
-    RIGHT,
-    ROD_COUNT,
-    ROD_NUMBERS,
-    RODS,
-    ROWS,
-    TOP,
-    TOUCHING,
-    WIDTH,
-    sizes_of,
-    view_numbers,
-)
+from taichi_msm.render.samples import INFINITY, Bytes, Doubles, Floats, Integers
+from taichi_msm.render.uniforms import sizes_of, view_numbers
 from taichi_msm.scene import Scene
 from taichi_msm.system.launches import Launches, end_thread
 from taichi_msm.system.runtime import lanes, our_compilation, ti
@@ -135,13 +117,13 @@ def _search(
     launches = Launches(bounded=lanes("f64") == 1)
     numbers = launches.give(view_numbers(view, scene.render, 1, scene.sheet.size, (1, 1), rods))
     sizes = sizes_of(scene, np.empty((0, 3), np.int32))
-    sizes[ROD_COUNT] = len(rods)
+    sizes[uni.ROD_COUNT] = len(rods)
     point, cell = (launches.array(np.float64, n) for n in (rows * cols * POINT_NUMBERS, cells * CELL_NUMBERS))
     bounds = launches.array(np.int32, cells * BOUNDS)
     with our_compilation(optimised=False):
         _outline(np.ascontiguousarray(position, np.float64), numbers, launches.give(sizes), point, cell, bounds)
     bins = binned(launches, bounds, cells, (width, height), bin_size)
-    sizes[[BIN_SIZE, BINS_ACROSS]] = bins.size, bins.across
+    sizes[[uni.BIN_SIZE, uni.BINS_ACROSS]] = bins.size, bins.across
     simple = launches.array(np.uint8, bins.lengths.size)
     launches.launch(_judge, bins.lengths.size, cell, cols, bins.starts, bins.entries, simple, rounds=3 * AROUND)
     pixels, hidden = launches.array(np.float32, 2 * total), launches.array(np.uint8, total)
@@ -159,22 +141,19 @@ def _search(
 
 @ti.kernel
 def _outline(
-    position: ti.types.ndarray(dtype=ti.f64, ndim=3),
-    numbers: ti.types.ndarray(dtype=ti.f64, ndim=1),
-    sizes: ti.types.ndarray(dtype=ti.i32, ndim=1),
-    point: ti.types.ndarray(dtype=ti.f64, ndim=1),
-    cell: ti.types.ndarray(dtype=ti.f64, ndim=1),
-    bounds: ti.types.ndarray(dtype=ti.i32, ndim=1),
-):
+    position: ti.types.ndarray(dtype=ti.f64, ndim=3), numbers: Doubles, sizes: Integers, point: Doubles, cell: Doubles,
+    bounds: Integers,
+):  # fmt: skip
     """Project the mass points, and find the outlines of the cells, and their bounds in whole pixels."""
-    for index in range(sizes[ROWS] * sizes[COLS]):
-        project(position, index // sizes[COLS], index % sizes[COLS], sizes[COLS], numbers, point, True)
+    for index in range(sizes[uni.ROWS] * sizes[uni.COLS]):
+        cols = sizes[uni.COLS]
+        project(position, index // cols, index % cols, cols, numbers, point, True)
 
-    for index in range((sizes[ROWS] - 1) * (sizes[COLS] - 1)):
-        cols, here = sizes[COLS], index * CELL_NUMBERS
+    for index in range((sizes[uni.ROWS] - 1) * (sizes[uni.COLS] - 1)):
+        cols, here = sizes[uni.COLS], index * CELL_NUMBERS
         corner = corner_of(index, cols)
         below = corner + cols * POINT_NUMBERS
-        outline = ti.static(outlined(corner, cols, numbers[NEAR], point))
+        outline = ti.static(outlined(corner, cols, numbers[uni.NEAR], point))
         left, right, top, bottom, side = outline.left, outline.right, outline.top, outline.bottom, outline.side
         if outline.behind:
             left, right, top, bottom = 1.0, -1.0, 1.0, -1.0
@@ -185,20 +164,14 @@ def _outline(
             point[corner + 3], point[corner + POINT_NUMBERS + 3], point[below + 3], point[below + POINT_NUMBERS + 3]
         )
         cell[here + SIDE] = side
-        store_bounds(index, left, right, top, bottom, sizes[WIDTH], sizes[HEIGHT], bounds)
+        store_bounds(index, left, right, top, bottom, sizes[uni.WIDTH], sizes[uni.HEIGHT], bounds)
 
 
 @ti.kernel
 def _judge(
-    first: ti.i32,
-    end: ti.i32,
-    ended: ti.types.ndarray(dtype=ti.i32, ndim=1),
-    cell: ti.types.ndarray(dtype=ti.f64, ndim=1),
-    cols: ti.i32,
-    starts: ti.types.ndarray(dtype=ti.i32, ndim=1),
-    entries: ti.types.ndarray(dtype=ti.i32, ndim=1),
-    simple: ti.types.ndarray(dtype=ti.u8, ndim=1),
-):
+    first: ti.i32, end: ti.i32, ended: Integers, cell: Doubles, cols: ti.i32, starts: Integers, entries: Integers,
+    simple: Bytes,
+):  # fmt: skip
     """Mark the bins in which no two cells can be seen at the same place.
 
     This is so if the cells of a bin are among the four around one mass point, and these four are all drawn as a whole
@@ -241,18 +214,7 @@ def _depth(x, y, column, line, part, lower, near, patch: ti.template()):
 def _hides(x, y, depth, index, own, own_triangle, cols, parts, near, point: ti.template(), cell: ti.template()):
     """Tell whether a cell is seen at (x, y) at a smaller depth than `depth`.
 
-    Args:
-        x: place in the picture, to the right [px].
-        y: likewise, down.
-        depth: of the point [m].
-        index: of the cell.
-        own: the cell that the point is on.
-        own_triangle: the small triangle of that cell that the point is on.
-        cols: columns of mass points.
-        parts: small quads along a side of a cell.
-        near: only what is farther than this is seen.
-        point: as `_outline` makes it.
-        cell: likewise.
+    `depth` is that of a point that is on the cell `own`, there on the small triangle `own_triangle`.
     """
     here, part = index * CELL_NUMBERS, 1.0 / parts
     side = cell[here + SIDE]
@@ -289,43 +251,30 @@ def _hides(x, y, depth, index, own, own_triangle, cols, parts, near, point: ti.t
 def _is_behind_rod(x, y, depth, numbers: ti.template(), sizes: ti.template()):
     """Tell whether an instrument is seen at (x, y) at a smaller depth than `depth`."""
     hides = False
-    for n in range(sizes[ROD_COUNT]):
-        rod = RODS + n * ROD_NUMBERS
-        across_it = x >= numbers[rod + LEFT] and x <= numbers[rod + RIGHT]
-        if across_it and y >= numbers[rod + TOP] and y <= numbers[rod + BOTTOM]:
+    for n in range(sizes[uni.ROD_COUNT]):
+        rod = uni.RODS + n * uni.ROD_NUMBERS
+        across_it = x >= numbers[rod + uni.LEFT] and x <= numbers[rod + uni.RIGHT]
+        if across_it and y >= numbers[rod + uni.TOP] and y <= numbers[rod + uni.BOTTOM]:
             met, _, _, _ = meet(x, y, n, numbers)
-            if met < depth and w_at(met, numbers) > numbers[NEAR]:
+            if met < depth and w_at(met, numbers) > numbers[uni.NEAR]:
                 hides = True
     return hides
 
 
 @ti.kernel
 def _find(
-    first: ti.i32,
-    end: ti.i32,
-    ended: ti.types.ndarray(dtype=ti.i32, ndim=1),
-    listed: ti.i32,
-    count: ti.i32,
-    coordinates: ti.types.ndarray(dtype=ti.f32, ndim=1),
-    moved: ti.i32,
-    numbers: ti.types.ndarray(dtype=ti.f64, ndim=1),
-    sizes: ti.types.ndarray(dtype=ti.i32, ndim=1),
-    point: ti.types.ndarray(dtype=ti.f64, ndim=1),
-    cell: ti.types.ndarray(dtype=ti.f64, ndim=1),
-    starts: ti.types.ndarray(dtype=ti.i32, ndim=1),
-    entries: ti.types.ndarray(dtype=ti.i32, ndim=1),
-    simple: ti.types.ndarray(dtype=ti.u8, ndim=1),
-    pixels: ti.types.ndarray(dtype=ti.f32, ndim=1),
-    hidden: ti.types.ndarray(dtype=ti.u8, ndim=1),
-):
+    first: ti.i32, end: ti.i32, ended: Integers, listed: ti.i32, count: ti.i32, coordinates: Floats, moved: ti.i32,
+    numbers: Doubles, sizes: Integers, point: Doubles, cell: Doubles, starts: Integers, entries: Integers,
+    simple: Bytes, pixels: Floats, hidden: Bytes,
+):  # fmt: skip
     """Find where material points are seen, and which are hidden by `count` cells of their lists from `listed` on.
 
     If `moved` is 0, `pixels` gets their places [px]. Otherwise they are what the pixels of another frame showed, and
     `pixels` gets how far each has moved from its pixel's centre [px].
     """
     for k in range(first, end):
-        rows, cols, width, height = sizes[ROWS], sizes[COLS], sizes[WIDTH], sizes[HEIGHT]
-        near, parts = numbers[NEAR], numbers[PARTS]
+        rows, cols, width, height = sizes[uni.ROWS], sizes[uni.COLS], sizes[uni.WIDTH], sizes[uni.HEIGHT]
+        near, parts = numbers[uni.NEAR], numbers[uni.PARTS]
         u, v = coordinates[2 * k], coordinates[2 * k + 1]
         x, y, out_of_sight = ti.cast(NOWHERE, ti.f64), ti.cast(NOWHERE, ti.f64), False
         if abs(u) < 2.0:  # False for NaN
@@ -346,9 +295,9 @@ def _find(
                 x, y = p[0] / p[2], p[1] / p[2]
                 if x >= 0.0 and y >= 0.0 and x < width and y < height:
                     out_of_sight = False
-                    depth = p[3] - numbers[TOUCHING]
-                    square = ti.cast(y, ti.i32) // sizes[BIN_SIZE] * sizes[BINS_ACROSS]
-                    square += ti.cast(x, ti.i32) // sizes[BIN_SIZE]
+                    depth = p[3] - numbers[uni.TOUCHING]
+                    square = ti.cast(y, ti.i32) // sizes[uni.BIN_SIZE] * sizes[uni.BINS_ACROSS]
+                    square += ti.cast(x, ti.i32) // sizes[uni.BIN_SIZE]
                     if simple[square] == 0:
                         begin = starts[square] + listed
                         for n in range(begin, ti.min(begin + count, starts[square + 1])):
