@@ -14,7 +14,7 @@ from benchmarks.parts import NARROW, PIXELS, READY, REFINE
 from benchmarks.process import ROOT
 from benchmarks.stepping.measure import TOLERANCE
 from taichi_msm import load_scene
-from taichi_msm.physics.timestep import time_grid
+from taichi_msm.physics.planning import make_plan
 from taichi_msm.study import measure
 from taichi_msm.study.result import Timing
 from taichi_msm.study.table import duration, markdown, number, timing
@@ -113,7 +113,7 @@ def page(results: Results) -> str:
         step_flops=f"{bounds.STEP_FLOPS:g}",
         step_roots=bounds.STEP_ROOTS,
         pixel_flops=bounds.PIXEL_FLOPS,
-        frame_steps=time_grid(load_scene(ROOT / whole_run.SCENE)).steps_per_frame,
+        frame_steps=make_plan(load_scene(ROOT / whole_run.SCENE)).grid.steps_per_frame,
         launch_share=launch_share(results),
         warm_shares=warm_shares(results),
     )
@@ -133,7 +133,7 @@ def launch_share(results: Results) -> str:
     found = results.get("bounds", {})
     if "one_step" not in found:
         return NOT_MEASURED
-    return duration(found["one_step"] / time_grid(load_scene(ROOT / whole_run.SCENE)).steps_per_frame)
+    return duration(found["one_step"] / make_plan(load_scene(ROOT / whole_run.SCENE)).grid.steps_per_frame)
 
 
 def table(head: list[str], rows: list[list[str]]) -> str:

@@ -7,7 +7,6 @@ The paper's sheet (scenes/figure-3.yaml) at 18,000 steps a second, in NumPy.
 
 from __future__ import annotations
 
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -15,12 +14,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from taichi_msm import load_scene
-from taichi_msm.physics.lattice import fixed_points, rest_positions, springs
+from taichi_msm.physics.lattice import rest_positions, springs
 from taichi_msm.physics.loads import Schedule, decay, schedule
-from taichi_msm.physics.material import material
-from taichi_msm.physics.timestep import time_grid
+from taichi_msm.physics.plan import Plan
+from taichi_msm.physics.planning import make_plan
 from taichi_msm.scene import Scene
-from taichi_msm.timegrid import TimeGrid
 
 SCENE = Path(__file__).parent.parent / "scenes" / "figure-3.yaml"
 STEPS_PER_SECOND = 18000
@@ -48,17 +46,17 @@ def elastic_force(scene: Scene, values: Array, form: str) -> Array:
     return force
 
 
-def displacements(scene: Scene, grid: TimeGrid, real: type[np.floating[Any]], form: str) -> Array:
+def displacements(plan: Plan, real: type[np.floating[Any]], form: str) -> Array:
     """Step the scene with its state stored in one form; gives the displacements of all frames."""
-    made = material(scene)
+    scene, grid, made = plan.scene, plan.grid, plan.material
     h, m = grid.step, made.mass
     g = scene.damping / m
     keep = real((1 - g * h / 2) / (1 + g * h / 2))
     rest64 = rest_positions(scene.sheet)
     rest = rest64.astype(real)
-    moves = ~fixed_points(scene.sheet)[..., None]
+    moves = ~plan.fixed[..., None]
     share = [decay(probe, scene.sheet).astype(real)[..., None] for probe in scene.probes]
-    loads: Schedule = schedule(scene, grid, 0, grid.steps)
+    loads: Schedule = schedule(plan, 0, grid.steps)
     now = rest.copy() if form == "positions" else np.zeros_like(rest)
     # The one before, or the difference from it.
     other = now.copy()
@@ -82,11 +80,11 @@ def displacements(scene: Scene, grid: TimeGrid, real: type[np.floating[Any]], fo
 def measure() -> dict[str, float]:
     """Give the rounding of every form as a fraction of the largest displacement."""
     scene = load_scene(SCENE, ["output=[]"])
-    grid = replace(time_grid(scene), steps_per_frame=round(STEPS_PER_SECOND / scene.time.frames_per_second))
-    exact = displacements(scene, grid, np.float64, "difference")
+    plan = make_plan(scene).with_grid(steps_per_frame=round(STEPS_PER_SECOND / scene.time.frames_per_second))
+    exact = displacements(plan, np.float64, "difference")
     largest = np.linalg.norm(exact, axis=-1).max()
     return {
-        name: float(np.linalg.norm(displacements(scene, grid, np.float32, form) - exact, axis=-1).max() / largest)
+        name: float(np.linalg.norm(displacements(plan, np.float32, form) - exact, axis=-1).max() / largest)
         for name, form in FORMS.items()
     }
 

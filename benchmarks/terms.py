@@ -12,9 +12,8 @@ from PIL import Image
 
 from benchmarks.process import call
 from benchmarks.race import Progress
-from taichi_msm.physics.material import material
+from taichi_msm.physics.planning import make_plan
 from taichi_msm.physics.solver import Dynamics
-from taichi_msm.physics.timestep import time_grid
 from taichi_msm.scene import Scene
 from taichi_msm.system import runtime
 from taichi_msm.system.resources import available_threads
@@ -45,7 +44,7 @@ def variants(points: int, precision: str, image: str) -> dict[str, Scene]:
             **others,
         )
 
-    plain = material(scene({}, tissue=TISSUE))
+    plain = make_plan(scene({}, tissue=TISSUE)).material
     springs = {"structural": plain.across, "shear": plain.shear, "virtual": plain.virtual}
     return {
         SPRINGS: scene({"mass": plain.mass}, springs=springs, damping=plain.drag * plain.mass),
@@ -66,8 +65,7 @@ def cost(points: int, precision: str, rounds: int) -> dict[str, list[float]]:
         image = Path(folder) / "map.png"
         Image.fromarray(np.random.default_rng(0).integers(0, 256, (64, 64), dtype=np.uint8)).save(image)
         sheets = {
-            name: Dynamics(scene, time_grid(scene), device)
-            for name, scene in variants(points, precision, str(image)).items()
+            name: Dynamics(make_plan(scene), device) for name, scene in variants(points, precision, str(image)).items()
         }
     samples: dict[str, list[float]] = {name: [] for name in sheets}
     for _ in range(1 + rounds):

@@ -8,7 +8,6 @@ It takes some minutes; nothing in it is timed.
 from __future__ import annotations
 
 import math
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -24,14 +23,14 @@ from taichi_msm import Scene, load_scene
 from taichi_msm.physics.error_control import estimate_error, longest
 from taichi_msm.physics.lattice import fixed_points, rest_positions, spacing
 from taichi_msm.physics.loads import decay, loads_at
-from taichi_msm.physics.material import material
+from taichi_msm.physics.plan import Plan
+from taichi_msm.physics.planning import make_plan
 from taichi_msm.physics.solver import Dynamics
 from taichi_msm.physics.state import State
-from taichi_msm.physics.timestep import stable_step, time_grid
 from taichi_msm.study.plot import BLUE, DPI, GREY, STYLE, VERMILION, WIDE
 from taichi_msm.study.table import markdown
 from taichi_msm.system import runtime
-from taichi_msm.timegrid import Precision, TimeGrid
+from taichi_msm.timegrid import Precision
 
 ROOT = Path(__file__).parent.parent
 PAGE, TEMPLATE = ROOT / "docs" / "numerics.md", ROOT / "docs" / "numerics.template"
@@ -55,16 +54,16 @@ def press(*overrides: str) -> Scene:
 
 def stiffer(times: int) -> Scene:
     """Make the springs of the press stiffer, but not the virtual ones."""
-    sheet = material(press())
+    sheet = make_plan(press()).material
     return press(f"springs.structural={times * sheet.across}", f"springs.shear={times * sheet.shear}")
 
 
-def motion(scene: Scene, grid: TimeGrid) -> Array:
+def motion(plan: Plan) -> Array:
     """Displacements of every frame but the first, as they are written."""
-    dynamics = Dynamics(scene, grid, runtime.started())
-    rest, frames = rest_positions(scene.sheet), []
-    for _ in range(grid.frames):
-        dynamics.advance(grid.steps_per_frame)
+    dynamics = Dynamics(plan, runtime.started())
+    rest, frames = rest_positions(plan.scene.sheet), []
+    for _ in range(plan.grid.frames):
+        dynamics.advance(plan.grid.steps_per_frame)
         u = dynamics.displacement()
         # In f32 the trajectory has positions.
         frames.append((rest + u).astype(u.dtype) - rest)
@@ -72,10 +71,10 @@ def motion(scene: Scene, grid: TimeGrid) -> Array:
     return np.array(frames)
 
 
-def truth(scene: Scene, grid: TimeGrid) -> Array:
+def truth(plan: Plan) -> Array:
     """Extrapolate in float64, from displacements."""
-    counts = (n * grid.steps_per_frame for n in (8, 16))
-    coarse, fine = (motion(scene, replace(grid, steps_per_frame=count, precision="f64")) for count in counts)
+    counts = (n * plan.grid.steps_per_frame for n in (8, 16))
+    coarse, fine = (motion(plan.with_grid(steps_per_frame=count, precision="f64")) for count in counts)
     return fine + (fine - coarse) / 3
 
 
@@ -86,13 +85,12 @@ def silent_table() -> str:
     cases |= {"`faint`, displacements of 10 nm": faint}
     rows = []
     for name, scene in cases.items():
-        grid = time_grid(scene)
-        exact = truth(scene, grid)
+        plan = make_plan(scene)
+        exact = truth(plan)
         largest = longest(exact)
-        grids = replace(grid, precision="f32"), grid
-        errors = [longest(motion(scene, one) - exact) / largest for one in grids]
-        told = estimate_error(scene, grid, runtime.started()).error
-        rows.append([name, *(f"{error:.2g}" for error in errors), f"{told:.2g}", grid.precision])
+        errors = [longest(motion(one) - exact) / largest for one in (plan.with_grid(precision="f32"), plan)]
+        told = estimate_error(plan, runtime.started()).error
+        rows.append([name, *(f"{error:.2g}" for error in errors), f"{told:.2g}", plan.grid.precision])
     return markdown(["run", "error in f32", "error with auto", "error told", "auto takes"], rows, left=(0, 4))
 
 
@@ -107,7 +105,7 @@ def stiffness(scene: Scene, displacement: Array, active: float) -> csc_matrix:
     number = np.arange(rows * cols).reshape(rows, cols)
     parts = []
     for down, right in HALF:
-        k = material(scene).shear if down and right else material(scene).across
+        k = make_plan(scene).material.shear if down and right else make_plan(scene).material.across
         here = np.s_[0 : rows - down, max(0, -right) : cols - max(0, right)]
         there = np.s_[down:rows, max(0, right) : cols + min(0, right)]
         along = x[there] - x[here]
@@ -123,7 +121,7 @@ def stiffness(scene: Scene, displacement: Array, active: float) -> csc_matrix:
     second = np.concatenate([np.tile(3 * j[:, None] + np.arange(3), (1, 3)).ravel() for _, j, _ in parts])
     values = np.concatenate([blocks.ravel() for _, _, blocks in parts])
     whole = coo_matrix((values, (first, second)), shape=(size, size)).tocsc()
-    whole = whole + active * material(scene).virtual * identity(size, format="csc")
+    whole = whole + active * make_plan(scene).material.virtual * identity(size, format="csc")
     moves = np.repeat(~fixed_points(scene.sheet).ravel(), 3)
     return whole[moves][:, moves]
 
@@ -134,7 +132,7 @@ def forces(scene: Scene, displacement: Array, t: float) -> Array:
     dx, dy = spacing(scene.sheet)
     x, total = rest_positions(scene.sheet) + displacement, np.zeros((rows, cols, 3))
     for down, right in HALF:
-        k = material(scene).shear if down and right else material(scene).across
+        k = make_plan(scene).material.shear if down and right else make_plan(scene).material.across
         here = np.s_[0 : rows - down, max(0, -right) : cols - max(0, right)]
         there = np.s_[down:rows, max(0, right) : cols + min(0, right)]
         along = x[there] - x[here]
@@ -142,8 +140,8 @@ def forces(scene: Scene, displacement: Array, t: float) -> Array:
         pull = k * (1 - math.hypot(right * dx, down * dy) / length) * along
         total[here] += pull
         total[there] -= pull
-    loads = loads_at(scene, np.array([t]))
-    total -= loads.active[0] * material(scene).virtual * displacement
+    loads = loads_at(make_plan(scene), np.array([t]))
+    total -= loads.active[0] * make_plan(scene).material.virtual * displacement
     for n, probe in enumerate(scene.probes):
         total += decay(probe, scene.sheet)[..., None] * loads.strength[0, n]
     return total[~fixed_points(scene.sheet)].ravel()
@@ -160,15 +158,15 @@ def lowest(matrix: csc_matrix, below: float, count: int = 1) -> tuple[Array, Arr
 def buckling() -> dict[str, Any]:
     """Follow the smallest eigenvalue through a stiffer press, and draw it and its mode."""
     scene = stiffer(BUCKLING)
-    grid = replace(time_grid(scene), precision="f64")
-    dynamics = Dynamics(scene, grid, runtime.started())
+    plan = make_plan(scene).with_grid(precision="f64")
+    grid, dynamics = plan.grid, Dynamics(plan, runtime.started())
     moves = ~fixed_points(scene.sheet)
     times, values, modes = [], [], []
     for frame in range(grid.frames + 1):
         if frame:
             dynamics.advance(grid.steps_per_frame)
         t = frame / scene.time.frames_per_second
-        active = float(loads_at(scene, np.array([t])).active[0])
+        active = float(loads_at(make_plan(scene), np.array([t])).active[0])
         value, vector = lowest(stiffness(scene, dynamics.displacement(), active), below=-6.0)
         mode = np.zeros((*scene.sheet.points, 3))
         mode[moves] = vector[:, 0].reshape(-1, 3)
@@ -215,7 +213,7 @@ def energy() -> dict[str, Any]:
     scene = load_scene(ROOT / "tests" / "hard" / "undamped.yaml", [f"time.duration={ENERGY_STEPS}"])
     assert scene.springs is not None
     base = scene.model_copy(update={"springs": scene.springs.model_copy(update={"virtual": 0.0})})
-    h = 0.1 * stable_step(base)
+    h = 0.1 * make_plan(base).stable_step
     probe = scene.probes[0].model_copy(update={"load": [[0, 0], [press_time, 100], [press_time, 0]]})
     rate = 1 / (every * h)
     made = base.model_copy(update={"probes": (probe,)})
@@ -227,7 +225,7 @@ def energy() -> dict[str, Any]:
         axes = figure.subplots()
         colours: dict[Precision, str] = {"f32": VERMILION, "f64": BLUE}
         for kind, colour in colours.items():
-            dynamics = Dynamics(made, replace(time_grid(made), precision=kind), runtime.started())
+            dynamics = Dynamics(make_plan(made).with_grid(precision=kind), runtime.started())
             found = []
             for _ in range(ENERGY_STEPS // every):
                 dynamics.advance(every)
@@ -251,7 +249,7 @@ def energy() -> dict[str, Any]:
         "energy_points": " × ".join(map(str, made.sheet.points)),
         "energy_press": press_time,
         "energy_steps": f"{ENERGY_STEPS:,}",
-        "energy_share": f"{h / stable_step(made):g}",
+        "energy_share": f"{h / make_plan(made).stable_step:g}",
         "energy_table": markdown(
             ["precision", "mean energy", "largest swing", "last tenth of the time, against the first"], rows, left=(0,)
         ),
@@ -264,9 +262,9 @@ def static() -> dict[str, Any]:
     scene = press(
         "probes.0.load=[[0, 0], [0.36, 100]]", f"time.duration={seconds}", "damping=0.04", "time.precision=f64"
     )
-    grid = time_grid(scene)
-    dynamics = Dynamics(scene, grid, runtime.started())
-    dynamics.advance(grid.steps)
+    plan = make_plan(scene)
+    dynamics = Dynamics(plan, runtime.started())
+    dynamics.advance(plan.grid.steps)
     stepped = dynamics.displacement()
     dynamics.close()
     moves = ~fixed_points(scene.sheet)
@@ -286,17 +284,18 @@ def static() -> dict[str, Any]:
 def frequencies() -> dict[str, Any]:
     """Compare the phase of small motions with that of the modes."""
     scene = press("springs.virtual_active=always", "damping=0", "time.precision=f64", "probes=[]", "time.duration=0.8")
-    moves, grid = ~fixed_points(scene.sheet), time_grid(scene)
+    plan = make_plan(scene)
+    moves, grid = ~plan.fixed, plan.grid
     values, vectors = lowest(stiffness(scene, np.zeros((*scene.sheet.points, 3)), 1.0), 0.0, MODES)
     rows = []
-    dynamics = Dynamics(scene, grid, runtime.started())
+    dynamics = Dynamics(plan, runtime.started())
     for value, vector in zip(values, vectors.T, strict=True):
-        w = math.sqrt(value / material(scene).mass)
+        w = math.sqrt(value / plan.material.mass)
         theta = 2 * math.asin(w * grid.step / 2)
         shape = np.zeros((*scene.sheet.points, 3))
         shape[moves] = 1e-6 * spacing(scene.sheet)[0] * vector.reshape(-1, 3) / np.abs(vector).max()
         # Of u_n = cos(n theta) that is u_0, and the difference from u_{-1}. A first step from rest would be another.
-        dynamics.restart(scene, grid, State(1, shape, shape * (1 - math.cos(theta))))
+        dynamics.restart(plan, State(1, shape, shape * (1 - math.cos(theta))))
         dynamics.advance(grid.steps)
         found = float((dynamics.displacement() * shape).sum() / (shape * shape).sum())
         expected = math.cos(grid.steps * theta)

@@ -26,7 +26,7 @@ from taichi_msm.system.streams import mute, tell
 
 if TYPE_CHECKING:
     from taichi_msm.console import Progress
-    from taichi_msm.scene import Scene
+    from taichi_msm.physics.plan import Plan
 
 DONE, BUG, WRONG_INPUT, DIVERGED, FILES = 0, 1, 2, 3, 4
 # What may be given together with --resume, and with --again.
@@ -130,13 +130,13 @@ def run(
     elif again is not None:
         require_alone(context, "--again repeats", REPEATABLE)
         directory = result_directory(again, option="--again") if out is None else result_directory(out)
-        loaded, typed = repeated(again)
+        plan, typed = repeated(again)
     elif scene is None:
         raise click.MissingParameter(param_hint="'SCENE'", param_type="argument")
     else:
-        from taichi_msm.scenefile.load import load_scene
+        from taichi_msm.scenefile.load import load_plan
 
-        loaded = load_scene(scene, overrides, image)
+        plan = load_plan(scene, overrides, image)
         directory = result_directory(out, Path(scene).stem)
 
     from taichi_msm import runner
@@ -151,7 +151,7 @@ def run(
                 record = runner.resume(directory, threads=threads, started=STARTED, progress=progress)
             else:
                 record = runner.run(
-                    loaded,
+                    plan,
                     directory,
                     arch=arch,
                     threads=threads,
@@ -164,7 +164,7 @@ def run(
         report("interrupted", [f"interrupted; nothing was written{going_on(directory)}"], as_json)
         return interruption.code
     if resume is None:
-        duration.learn(loaded, record)
+        duration.learn(plan, record)
     if as_json:
         print_json({"directory": str(directory), **record})
     if record["status"] != "complete":
@@ -183,17 +183,17 @@ def run(
 @json_option
 def check(scene: str, image: str | None, overrides: tuple[str, ...], as_json: bool) -> int:
     """Validate SCENE and print the steps, time, memory and disk space it needs; compute nothing."""
-    from taichi_msm.physics import probe_force, timestep
+    from taichi_msm.physics import probe_force
     from taichi_msm.physics.probe_force import in_words, probe_records
     from taichi_msm.render.drawing_notes import drawing_notes
     from taichi_msm.scenefile import budget, duration
-    from taichi_msm.scenefile.load import load_scene
+    from taichi_msm.scenefile.load import load_plan
 
-    loaded = load_scene(scene, overrides, image)
+    plan = load_plan(scene, overrides, image)
     with naming(scene):
-        budget.require_disk(loaded, Path("output"))
-    grid, limit = timestep.time_grid(loaded), timestep.stable_step(loaded)
-    need, takes = budget.estimate(loaded, grid), duration.estimate(loaded, grid)
+        budget.require_disk(plan, Path("output"))
+    loaded, grid, limit = plan.scene, plan.grid, plan.stable_step
+    need, takes = budget.estimate(plan), duration.estimate(plan)
     facts: dict[str, Any] = {
         "scene": loaded.model_dump(mode="json"),
         "step": grid.step,
@@ -207,7 +207,7 @@ def check(scene: str, image: str | None, overrides: tuple[str, ...], as_json: bo
         "disk": need.disk_bytes,
         "disk_while_running": need.disk_bytes + need.working_bytes,
         "probes": (records := probe_records(loaded)),
-        "notes": [*probe_force.notes(loaded, records), *drawing_notes(loaded)],
+        "notes": [*probe_force.force_notes(loaded, records), *drawing_notes(loaded)],
     }
     if as_json:
         print_json(facts)
@@ -291,7 +291,7 @@ def study(
     require_writable(directory)
     interruption = Interruption()
     with Progress(quiet=as_json) as bar, naming(scene):
-        found = measure(
+        results = measure(
             loaded,
             Path(scene).stem,
             tolerance=tolerance,
@@ -300,19 +300,19 @@ def study(
             threads=threads,
             progress=interruptible(bar, interruption),
         )
-    if not found.stepping:
+    if not results.stepping:
         report("interrupted", ["interrupted; nothing was written"], as_json)
         return interruption.code
-    if found.status == "interrupted" and (directory / RECORD).exists():
+    if results.status == "interrupted" and (directory / RECORD).exists():
         # An earlier study is not replaced by part of a new one.
         directory = without_link(directory / "interrupted", "--out")
-    outputs = write_report(found, directory)
+    outputs = write_report(results, directory)
     if as_json:
-        print_json({"directory": str(directory), **as_record(found), "outputs": outputs})
+        print_json({"directory": str(directory), **as_record(results), "outputs": outputs})
     else:
-        print_summary(found, Console())
+        print_summary(results, Console())
         click.echo(printable(f"{directory}: {', '.join(outputs)}"))
-    return EXIT_CODES.get(found.status, interruption.code)
+    return EXIT_CODES.get(results.status, interruption.code)
 
 
 @program.command()
@@ -395,7 +395,7 @@ def view(
         return interruption.code
     finally:
         tell(notices)
-        for path in captures.kept:
+        for path in captures.saved:
             click.echo(printable(str(path)))
     return DIVERGED if record is not None and session.fault else DONE
 
@@ -448,13 +448,14 @@ def require_alone(context: click.Context, does: str, allowed: Sequence[str]) -> 
             raise click.UsageError(f"{does} a run with its own settings; leave out {name}")
 
 
-def repeated(directory: str) -> tuple[Scene, list[str]]:
-    """Give the scene of an earlier run, with its pictures where they are, and the overrides that made it."""
+def repeated(directory: str) -> tuple[Plan, list[str]]:
+    """Plan the scene of an earlier run, with its pictures where they are, and the overrides that made it."""
     from taichi_msm.results.finished_run import read_run
+    from taichi_msm.scenefile.validation import checked
 
     earlier = read_run(result_directory(directory, option="--again"))
     earlier.require_pictures(drawn=earlier.scene.draws or "image" in earlier.sha256)
-    return earlier.scene, earlier.overrides
+    return checked(earlier.scene), earlier.overrides
 
 
 def unfinished(directory: str) -> Path:

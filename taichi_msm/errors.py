@@ -7,7 +7,8 @@ from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 
-Path = tuple[str | int, ...]
+# The way to a value of a scene: ("probes", 0, "load").
+Key = tuple[str | int, ...]
 
 # So many letters of a name are compared with those that are known.
 MAX_NAME = 60
@@ -22,7 +23,7 @@ class Problem:
         message: the value, what is wrong with it, and the remedy; without the key.
     """
 
-    path: Path
+    path: Key
     message: str
 
     @property

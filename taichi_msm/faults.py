@@ -11,7 +11,7 @@ from typing import Any, Literal, NamedTuple, Union, get_args, get_origin
 
 from pydantic import BaseModel, ValidationError
 
-from taichi_msm.errors import Path, Problem, did_you_mean
+from taichi_msm.errors import Key, Problem, did_you_mean
 
 # Beyond these limits, squares and quotients of two numbers overflow or underflow.
 LARGEST = 1e30
@@ -37,7 +37,7 @@ def cut(text: str) -> str:
     return text if len(text) <= MAX_SHOWN else text[:MAX_SHOWN] + "..."
 
 
-def problems(error: ValidationError, section: type[BaseModel], data: Any) -> list[Problem]:
+def key_problems(error: ValidationError, section: type[BaseModel], data: Any) -> list[Problem]:
     """Say what is wrong with plain data.
 
     Args:
@@ -64,18 +64,18 @@ class _Fault(NamedTuple):
         words: those that the value may be.
     """
 
-    path: Path
+    path: Key
     kind: str
     text: str
     context: dict[str, Any]
     section: type[BaseModel]
     expects: str
-    choice: Path | None
+    choice: Key | None
     branch: str
     words: tuple[str, ...]
 
 
-class _Key(NamedTuple):
+class _Field(NamedTuple):
     """What `_fault` needs to know of a key.
 
     Attributes:
@@ -93,7 +93,7 @@ class _Key(NamedTuple):
 
 def _fault(error: Any, section: type[BaseModel]) -> _Fault:
     """Follow an error's location through the models, skipping pydantic's names for the kinds of a value."""
-    path: Path = ()
+    path: Key = ()
     expects, choice, branch = "", None, ""
     words: tuple[tuple[str, ...], tuple[str, ...]] = (), ()
     parts = iter(error["loc"])
@@ -120,14 +120,14 @@ def _fault(error: Any, section: type[BaseModel]) -> _Fault:
 
 
 @cache
-def _describe(section: type[BaseModel], name: str) -> _Key:
+def _describe(section: type[BaseModel], name: str) -> _Field:
     field = section.model_fields[name]
     extra = field.json_schema_extra
     assert isinstance(extra, dict)
     kinds = [kind for kind in get_args(field.annotation) if kind is not type(None)]
     has_choice = get_origin(field.annotation) in (Union, UnionType) and len(kinds) > 1
     words = tuple(_words(field.annotation, 0)), tuple(_words(field.annotation, 1))
-    return _Key(next(_sections(field.annotation), section), str(extra["expects"]), has_choice, words)
+    return _Field(next(_sections(field.annotation), section), str(extra["expects"]), has_choice, words)
 
 
 def _words(annotation: Any, depth: int) -> Iterator[str]:
@@ -152,7 +152,7 @@ def _choose_kinds(faults: Sequence[_Fault]) -> Iterator[_Fault]:
 
     That is the kind whose check got furthest into the value; if two got equally far, the whole value is at fault.
     """
-    reached: dict[Path | None, dict[str, int]] = defaultdict(dict)
+    reached: dict[Key | None, dict[str, int]] = defaultdict(dict)
     for fault in faults:
         reached[fault.choice][fault.branch] = max(reached[fault.choice].get(fault.branch, 0), len(fault.path))
     for fault in faults:

@@ -147,10 +147,10 @@ def _of(path: str, file: BinaryIO, sha256: str | None) -> BinaryIO:
 
 
 def _sha256(file: BinaryIO) -> str:
-    found = hashlib.sha256()
+    digest = hashlib.sha256()
     while data := file.read(1 << 20):
-        found.update(data)
-    return found.hexdigest()
+        digest.update(data)
+    return digest.hexdigest()
 
 
 def _scans(file: BinaryIO) -> int:

@@ -11,9 +11,10 @@ from numpy.typing import NDArray
 
 from taichi_msm.errors import ArgumentError
 from taichi_msm.render.labels import Flow, Labels
+from taichi_msm.render.renderer import CameraLike
 from taichi_msm.results.finished_run import read_run
 from taichi_msm.scene import Scene
-from taichi_msm.simulation import CameraLike, Simulation
+from taichi_msm.simulation import Simulation
 
 
 class Playback:

@@ -6,13 +6,14 @@ import math
 import platform
 import sys
 import time
-from collections.abc import Mapping, Sequence
-from contextlib import ExitStack, closing, suppress
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import ExitStack, closing, contextmanager, suppress
 from dataclasses import replace
 from functools import partial
 from operator import attrgetter
 from pathlib import Path
-from typing import Any, cast
+from types import TracebackType
+from typing import Any, NamedTuple, cast
 
 import numpy as np
 import PIL
@@ -21,16 +22,15 @@ from numpy.typing import NDArray
 from taichi_msm import __version__
 from taichi_msm.arguments import require_path
 from taichi_msm.errors import DamagedError, DeviceError, DivergedError, FilesError, SceneError, writing
-from taichi_msm.physics import error_control
 from taichi_msm.physics.error_control import Estimate
 from taichi_msm.physics.lattice import rest_positions
-from taichi_msm.physics.mesh_error import MeshEstimate, choose_points
+from taichi_msm.physics.mesh_error import MeshEstimate
 from taichi_msm.physics.pilots import Pilots, choose_pilots, no_pilots
+from taichi_msm.physics.plan import Plan
 from taichi_msm.physics.probe_force import probe_records
 from taichi_msm.physics.run_error import Known, RunError
+from taichi_msm.physics.run_notes import run_notes
 from taichi_msm.physics.run_progress import RunProgress
-from taichi_msm.physics.timestep import stable_step, time_grid, with_grid
-from taichi_msm.physics.warnings import notes
 from taichi_msm.physics.workload import ENCODING
 from taichi_msm.progress import Progress
 from taichi_msm.render.drawing_notes import drawing_notes
@@ -41,30 +41,44 @@ from taichi_msm.results.record import RunRecord
 from taichi_msm.results.writer import ResultWriter
 from taichi_msm.scene import Scene
 from taichi_msm.scenefile import budget
+from taichi_msm.scenefile.resolve import resolve
 from taichi_msm.scenefile.validation import checked
 from taichi_msm.simulation import Simulation
 from taichi_msm.system import resources, runtime
 from taichi_msm.system.compiler import chosen
 from taichi_msm.system.runtime import Device
-from taichi_msm.timegrid import TimeGrid
 
 
 class Stopwatch:
-    """Adds up the time of every stage.
+    """Adds up the time of every stage of a run; a stage within another one interrupts it.
 
     Args:
-        started: `time.perf_counter()` when the first stage began; None: now.
+        started: `time.perf_counter()` when the first stage, startup, began; None: now.
+
+    Attributes:
+        seconds: time of every stage so far [s].
     """
 
     def __init__(self, started: float | None) -> None:
         self.seconds: dict[str, float] = {}
+        self._stage = "startup"
         self._started = self._last = time.perf_counter() if started is None else started
 
-    def lap(self, stage: str) -> None:
-        """Add the time since the last lap to a stage."""
-        now = time.perf_counter()
-        self.seconds[stage] = self.seconds.get(stage, 0.0) + now - self._last
-        self._last = now
+    @contextmanager
+    def stage(self, name: str) -> Iterator[None]:
+        """Count the time of a block as that of a stage."""
+        around = self._switch(name)
+        try:
+            yield
+        finally:
+            self._switch(around)
+
+    def _switch(self, stage: str) -> str:
+        """Begin a stage; returns the one that it interrupts."""
+        now, before = time.perf_counter(), self._stage
+        self.seconds[before] = self.seconds.get(before, 0.0) + now - self._last
+        self._last, self._stage = now, stage
+        return before
 
     def total(self) -> float:
         """Give the time since the beginning [s]."""
@@ -72,7 +86,7 @@ class Stopwatch:
 
 
 def run(
-    scene: Scene | Mapping[str, Any],
+    scene: Plan | Scene | Mapping[str, Any],
     directory: str | Path,
     *,
     arch: str = "cpu",
@@ -111,28 +125,24 @@ def run(
         KeyboardInterrupt: when interrupted before the first frame; nothing is written then.
     """
     watch = Stopwatch(started)
-    scene = checked(scene)
+    plan = checked(scene)
     require_path(directory)
-    budget.require_disk(scene, Path(directory))
+    folder = Path(directory)
+    budget.require_disk(plan, folder)
     device = runtime.start(arch, threads)
-    sha256 = digests(scene)
-    texture = load_texture(scene, sha256.get("image")) if scene.draws else None
-    watch.lap("startup")
-    given, estimate, mesh = scene, None, None
-    if scene.sheet.tolerance is not None:
-        scene, mesh = choose_points(scene, device, checked, partial(progress, "pilot"))
-        budget.require_disk(scene, Path(directory))
-        watch.lap("pilot")
-    grid = time_grid(scene, device.arch)
-    if scene.time.tolerance is not None:
-        grid, estimate = error_control.choose_step(scene, grid, device, partial(progress, "pilot"))
-        watch.lap("pilot")
-    scene = with_grid(scene, grid)
+    sha256 = digests(plan)
+    texture = load_texture(plan.scene, sha256.get("image")) if plan.scene.draws else None
+    given = plan.scene
+    seeks = given.sheet.tolerance is not None or given.time.tolerance is not None
+    with watch.stage("pilot" if seeks else "startup"):
+        plan, estimate, mesh = resolve(plan, device, partial(progress, "pilot"))
+    if mesh is not None:
+        budget.require_disk(plan, folder)
     with writing(directory):
         here = str(Path.cwd())
     manifest = Manifest(
         given,
-        scene,
+        plan.scene,
         tuple(overrides),
         estimate,
         mesh,
@@ -142,24 +152,11 @@ def run(
         sha256,
         versions(),
     )
-    if begun := _begun(manifest, Path(directory)):
+    task = _Task(manifest, plan, texture, device, folder)
+    if begun := _begun(manifest, folder):
         with suppress(DamagedError):
-            return _carry_out(_with_versions(begun), Path(directory), device, texture, watch, progress, resumes=True)
-    return _carry_out(manifest, Path(directory), device, texture, watch, progress, resumes=False)
-
-
-def _begun(manifest: Manifest, directory: Path) -> Manifest | None:
-    """Find the unfinished run in a directory whose results have the same bits as those of this one."""
-    try:
-        found = read_manifest(directory)
-    except (FilesError, SceneError):
-        return None
-    return replace(manifest, versions=found.versions) if manifest.gives_the_bits_of(found) else None
-
-
-def _with_versions(begun: Manifest) -> Manifest:
-    """Add the versions of this process, whose compiler may be another one, to those of the process that began a run."""
-    return replace(begun, versions={**begun.versions, **versions()})
+            return _carry_out(task._replace(manifest=_with_versions(begun)), watch, progress, resumes=True)
+    return _carry_out(task, watch, progress, resumes=False)
 
 
 def resume(
@@ -188,148 +185,235 @@ def resume(
     """
     watch = Stopwatch(started)
     require_path(directory)
-    manifest = read_manifest(Path(directory))
-    if too_large := [str(problem) for problem in budget.problems(manifest.scene)]:
+    manifest, plan = read_manifest(Path(directory))
+    if too_large := [str(problem) for problem in budget.size_problems(plan)]:
         raise SceneError(too_large)
-    manifest.require_same(versions())
-    texture = load_texture(manifest.scene, manifest.sha256.get("image")) if manifest.scene.draws else None
+    manifest.require_same(digests(plan), versions())
+    texture = load_texture(plan.scene, manifest.sha256.get("image")) if plan.scene.draws else None
     device = runtime.start(manifest.arch, threads)
-    watch.lap("startup")
-    return _carry_out(_with_versions(manifest), Path(directory), device, texture, watch, progress, resumes=True)
+    task = _Task(_with_versions(manifest), plan, texture, device, Path(directory))
+    return _carry_out(task, watch, progress, resumes=True)
 
 
-def _carry_out(
-    manifest: Manifest,
-    directory: Path,
-    device: Device,
-    texture: NDArray[np.uint8] | None,
-    watch: Stopwatch,
-    progress: Progress,
-    *,
-    resumes: bool,
-) -> RunRecord:
+def _begun(manifest: Manifest, directory: Path) -> Manifest | None:
+    """Find the unfinished run in a directory whose results have the same bits as those of this one."""
+    try:
+        unfinished, _ = read_manifest(directory)
+    except (FilesError, SceneError):
+        return None
+    return replace(manifest, versions=unfinished.versions) if manifest.gives_the_bits_of(unfinished) else None
+
+
+def _with_versions(begun: Manifest) -> Manifest:
+    """Add the versions of this process, whose compiler may be another one, to those of the process that began a run."""
+    return replace(begun, versions={**begun.versions, **versions()})
+
+
+class _Task(NamedTuple):
+    """What is to be run.
+
+    Attributes:
+        manifest: as it is written down.
+        plan: of its scene, in which nothing is left open.
+        texture: the picture on the sheet; None: nothing is drawn.
+        device: what `runtime.start` returned.
+        directory: where the results go.
+    """
+
+    manifest: Manifest
+    plan: Plan
+    texture: NDArray[np.uint8] | None
+    device: Device
+    directory: Path
+
+
+def _carry_out(task: _Task, watch: Stopwatch, progress: Progress, *, resumes: bool) -> RunRecord:
     """Simulate and draw all frames, or those that the unfinished run in the directory lacks."""
-    scene, grid = manifest.scene, time_grid(manifest.scene, device.arch)
-    frames = grid.frames + 1
-    ending: dict[str, Any] = {"status": "complete"}
-
-    def pause() -> None:
-        watch.lap("simulate")
-        progress("frames", writer.frames, frames)
-        if writer.due:
-            writer.save(simulation.save())
-        watch.lap("hand over")
-
-    progress("compile", 0, frames)
-    cores = free_cores(scene, grid)
-    # In this order, so that the encoder starts up while kernels are compiled.
-    with (
-        ResultWriter(directory, scene, grid, manifest.as_json(), resumes=resumes) as writer,
-        Simulation(scene, device.arch, device.threads, texture, cores) as simulation,
-        ExitStack() as opened,
-    ):
-        resumed = writer.stored
-        pilots = _pilots(manifest, grid, device, resumed=resumed > 0)
-        run_error: RunError | None = None
-        known = Known(manifest.estimate, pilots.reason, manifest.mesh)
-        if not pilots.reason:
+    with _Run(task, watch, progress, resumes=resumes) as run:
+        run.check_stored_frames()
+        with watch.stage("hand over"):
             try:
-                run_error = opened.enter_context(closing(RunError(scene, grid, pilots, known, device, cores)))
-            except DeviceError:
-                known = known._replace(reason=f"{device.arch} cannot run this scene in f64")
-        rest = rest_positions(scene.sheet)
-        for frame in range(resumed if scene.output else 0):
-            progress("check", frame, resumed)
-            writer.position(frame)  # finds damage before the positions are used
-        watch.lap("startup")
-        try:
-            simulation.compile(partial(progress, "compile", 0, frames))
-            if run_error:
-                run_error.compile()
-            watch.lap("compile")
-            if writer.saved:
-                simulation.restore(writer.saved)
-            if run_error:
-                for frame in range(1, writer.frames):
-                    run_error.follow(writer.position(frame) - rest, partial(progress, "pilot", frame, writer.frames))
-                    watch.lap("pilot")
-            observed = Observed()
-            # Frames that need no step are told apart, as they say nothing of the time that the others will take.
-            without_steps = max(resumed, 1)
-            for frame in range(writer.frames, frames):
-                stage, of = ("redraw", without_steps) if frame < without_steps else ("frames", frames)
-                told = partial(progress, stage, frame, of)
-                told()
-                watch.lap("hand over")
-                if frame > simulation.frame:
-                    simulation.advance(pause=pause)
-                watch.lap("simulate")
-                position = writer.position(frame) if frame < resumed else simulation.positions()
-                observed = simulation.observe(observed.labels, position, frame / scene.time.frames_per_second)
-                watch.lap("render")
-                writer.add(position, observed, told)
-                watch.lap("hand over")
-                if run_error and frame > 0:
-                    run_error.follow(position - rest, told)
-                    watch.lap("pilot")
-            try:
-                if run_error:
-                    kept = (writer.position(frame) - rest for frame in range(1, frames)) if scene.output else None
-                    run_error.finish(kept, partial(progress, "pilot"))
-                    watch.lap("pilot")
+                run.prepare()
+                run.go_through_frames()
+                ending: dict[str, Any] = {"status": "complete"}
             except KeyboardInterrupt:
-                # All frames are done, and what the coarse pilot tells stands.
-                writer.finish()
-            else:
-                writer.finish(partial(progress, "frames", frames, frames))
+                ending = run.keep_finished_frames()
+            except DivergedError as error:
+                ending = run.find_cause(error)
+            return run.conclude(ending)
+
+
+class _Run:
+    """A run under way: a simulation, the pilots beside it, and the results as they grow."""
+
+    def __init__(self, task: _Task, watch: Stopwatch, progress: Progress, *, resumes: bool) -> None:
+        self._task, self._watch, self._progress = task, watch, progress
+        self._frames = task.plan.grid.frames + 1
+        self._resumes = resumes
+        self._open = ExitStack()
+
+    def __enter__(self) -> _Run:
+        plan, device, manifest = self._task.plan, self._task.device, self._task.manifest
+        self._progress("compile", 0, self._frames)
+        cores = free_cores(plan)
+        with ExitStack() as opened:
+            # In this order, so that the encoder starts up while kernels are compiled.
+            self._writer = opened.enter_context(
+                ResultWriter(self._task.directory, plan.scene, plan.grid, manifest.as_json(), resumes=self._resumes)
+            )
+            self._simulation = opened.enter_context(
+                Simulation(plan, device.arch, device.threads, self._task.texture, cores)
+            )
+            self._resumed = self._writer.stored
+            pilots = _pilots(manifest, plan, device, resumed=self._resumed > 0)
+            self._error: RunError | None = None
+            self._known = Known(manifest.estimate, pilots.reason, manifest.mesh)
+            if not pilots.reason:
+                try:
+                    self._error = opened.enter_context(closing(RunError(plan, pilots, self._known, device, cores)))
+                except DeviceError:
+                    self._known = self._known._replace(reason=f"{device.arch} cannot run this scene in f64")
+            self._open = opened.pop_all()
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self._open.close()
+
+    def check_stored_frames(self) -> None:
+        """Find damage in the stored positions before they are used."""
+        for frame in range(self._resumed if self._task.plan.scene.output else 0):
+            self._progress("check", frame, self._resumed)
+            self._writer.position(frame)
+
+    def prepare(self) -> None:
+        """Compile, and bring the simulation and its pilots to where the unfinished run was left."""
+        writer, rest = self._writer, rest_positions(self._task.plan.scene.sheet)
+        with self._watch.stage("compile"):
+            self._simulation.compile(partial(self._progress, "compile", 0, self._frames))
+            if self._error:
+                self._error.compile()
+        if writer.saved:
+            self._simulation.restore(writer.saved)
+        if self._error:
+            with self._watch.stage("pilot"):
+                for frame in range(1, writer.frames):
+                    told = partial(self._progress, "pilot", frame, writer.frames)
+                    self._error.follow(writer.position(frame) - rest, told)
+
+    def go_through_frames(self) -> None:
+        """Simulate, draw and write every frame that is missing, and finish the results."""
+        writer, simulation, scene = self._writer, self._simulation, self._task.plan.scene
+        stage, rest = self._watch.stage, rest_positions(scene.sheet)
+        observed = Observed()
+        # Frames that need no step are told apart, as they say nothing of the time that the others will take.
+        without_steps = max(self._resumed, 1)
+        for frame in range(writer.frames, self._frames):
+            kind, of = ("redraw", without_steps) if frame < without_steps else ("frames", self._frames)
+            told = partial(self._progress, kind, frame, of)
+            told()
+            if frame > simulation.frame:
+                with stage("simulate"):
+                    simulation.advance(pause=self._pause)
+            position = writer.position(frame) if frame < self._resumed else simulation.positions()
+            with stage("render"):
+                observed = simulation.observe(observed.labels, position, frame / scene.time.frames_per_second)
+            writer.add(position, observed, told)
+            if self._error and frame > 0:
+                with stage("pilot"):
+                    self._error.follow(position - rest, told)
+        try:
+            if self._error:
+                kept = (writer.position(frame) - rest for frame in range(1, self._frames)) if scene.output else None
+                with stage("pilot"):
+                    self._error.finish(kept, partial(self._progress, "pilot"))
         except KeyboardInterrupt:
-            # An interruption outside `progress` may come before the last frame is stored.
-            if simulation.steps > 0 and simulation.frame < writer.stored and not simulation.torn:
-                # If the simulation diverges within this frame, the resumed run will find it.
-                with suppress(DivergedError):
-                    writer.save(simulation.save())
-            # Without a new frame there are no new results; to end soon, new frames may be given up too.
-            if writer.frames > resumed:
-                writer.finish(hurry=True)
-            if writer.frames <= resumed:
-                raise
-            ending = {"status": "interrupted"}
-        except DivergedError as error:
-            run_error, known = None, Known(reason="the run diverged")
-            ending = {"status": "diverged", "error": str(error), "dump": None}
-            with suppress(KeyboardInterrupt):
-                found = simulation.diagnose(writer.load(), partial(progress, "diagnosis", writer.frames, frames))
-                ending["error"] = found.message
-                if found.good:
-                    ending["dump"] = writer.save(found.good)
-        progress("write", writer.frames, frames)
+            # All frames are done, and what the coarse pilot tells stands.
+            writer.finish()
+        else:
+            writer.finish(partial(self._progress, "frames", self._frames, self._frames))
+
+    def keep_finished_frames(self) -> dict[str, Any]:
+        """Save what an interrupted run has.
+
+        Raises:
+            KeyboardInterrupt: when there is no new frame.
+        """
+        writer, simulation = self._writer, self._simulation
+        # An interruption outside `progress` may come before the last frame is stored.
+        if simulation.steps > 0 and simulation.frame < writer.stored and not simulation.torn:
+            # If the simulation diverges within this frame, the resumed run will find it.
+            with suppress(DivergedError):
+                writer.save(simulation.save())
+        # Without a new frame there are no new results; to end soon, new frames may be given up too.
+        if writer.frames > self._resumed:
+            writer.finish(hurry=True)
+        if writer.frames <= self._resumed:
+            raise KeyboardInterrupt
+        return {"status": "interrupted"}
+
+    def find_cause(self, error: DivergedError) -> dict[str, Any]:
+        """Say why the run diverged, and save its last sound state."""
+        writer = self._writer
+        self._error, self._known = None, Known(reason="the run diverged")
+        ending: dict[str, Any] = {"status": "diverged", "error": str(error), "dump": None}
+        with suppress(KeyboardInterrupt):
+            diagnosis = self._simulation.diagnose(
+                writer.load(), partial(self._progress, "diagnosis", writer.frames, self._frames)
+            )
+            ending["error"] = diagnosis.message
+            if diagnosis.good:
+                ending["dump"] = writer.save(diagnosis.good)
+        return ending
+
+    def conclude(self, ending: dict[str, Any]) -> RunRecord:
+        """Publish the results with their record."""
+        writer, simulation, device, watch = self._writer, self._simulation, self._task.device, self._watch
+        self._progress("write", writer.frames, self._frames)
         writer.finish()
-        if run_error:
-            known = run_error.known
-        record = {**ending, **_facts(manifest, grid, simulation.progress, known), "resumed": resumed}
+        known = self._error.known if self._error else self._known
         stages = ["startup", *(["pilot"] if "pilot" in watch.seconds else []), "compile", "simulate", "render"]
         seconds = {stage: watch.seconds.get(stage, 0.0) for stage in stages}
-        record["timings"] = {**seconds, "encode": writer.encode_seconds, "total": watch.total()}
-        record |= {"arch": device.arch, "device": device.name, "threads": device.threads, "lanes": simulation.lanes}
-        record |= {"workers": simulation.workers, "versions": manifest.versions}
+        record = {
+            **ending,
+            **_facts(self._task, simulation.progress, known),
+            "resumed": self._resumed,
+            "timings": {**seconds, "encode": writer.encode_seconds, "total": watch.total()},
+            "arch": device.arch,
+            "device": device.name,
+            "threads": device.threads,
+            "lanes": simulation.lanes,
+            "workers": simulation.workers,
+            "versions": self._task.manifest.versions,
+        }
         return cast(RunRecord, writer.publish(record))
 
+    def _pause(self) -> None:
+        """Show the progress within a frame, and save the state of the run from time to time."""
+        with self._watch.stage("hand over"):
+            self._progress("frames", self._writer.frames, self._frames)
+            if self._writer.due:
+                self._writer.save(self._simulation.save())
 
-def _pilots(manifest: Manifest, grid: TimeGrid, device: Device, *, resumed: bool) -> Pilots:
+
+def _pilots(manifest: Manifest, plan: Plan, device: Device, *, resumed: bool) -> Pilots:
     """Choose the pilots of a run, or say why there are none."""
-    scene, asked = manifest.scene, manifest.asks_estimate
+    asked = manifest.asks_estimate
     if asked is False:
         return no_pilots("not asked for")
     if asked is None and device.arch != "cpu":
         return no_pilots("on a GPU, this needs --estimate-error")
-    if resumed and not scene.output:
+    if resumed and not plan.scene.output:
         return no_pilots("the frames before the interruption were not kept")
-    return choose_pilots(scene, grid, asked=asked is True)
+    return choose_pilots(plan, asked=asked is True)
 
 
-def _facts(manifest: Manifest, grid: TimeGrid, progress: RunProgress, known: Known) -> dict[str, Any]:
+def _facts(task: _Task, progress: RunProgress, known: Known) -> dict[str, Any]:
     """Say what was run, and what is known of its last frame, for run.json."""
-    scene, limit = manifest.scene, stable_step(manifest.scene)
+    manifest, plan = task.manifest, task.plan
+    scene, grid, limit = plan.scene, plan.grid, plan.stable_step
+    probes = probe_records(scene)
     return {
         # With the paths of pictures as they were given; only these two sections hold anything that is chosen.
         "scene": manifest.given.model_copy(update={"sheet": scene.sheet, "time": scene.time}).model_dump(mode="json"),
@@ -346,19 +430,19 @@ def _facts(manifest: Manifest, grid: TimeGrid, progress: RunProgress, known: Kno
         "max_displacement": progress.max_displacement,
         "shortest_spring": progress.shortest_spring,
         "longest_spring": progress.longest_spring,
-        "probes": probe_records(scene),
-        "notes": [*notes(scene, grid, progress, *known), *drawing_notes(scene)],
+        "probes": probes,
+        "notes": [*run_notes(plan, probes, progress, *known), *drawing_notes(scene)],
         "error_estimate": None if known.estimate is None else error_record(known.estimate, known.mesh),
         **({"error_estimate_reason": known.reason} if known.estimate is None else {}),
     }
 
 
-def free_cores(scene: Scene, grid: TimeGrid) -> int:
+def free_cores(plan: Plan) -> int:
     """Count the cores that are free for stepping: all but one for the encoder, unless that mostly waits for frames."""
-    width, height = scene.render.size
-    rows, cols = scene.sheet.points
-    encoding = width * height * ENCODING if scene.draws else 0
-    busy = encoding > rows * cols * grid.steps_per_frame
+    width, height = plan.scene.render.size
+    rows, cols = plan.scene.sheet.points
+    encoding = width * height * ENCODING if plan.scene.draws else 0
+    busy = encoding > rows * cols * plan.grid.steps_per_frame
     return max(1, resources.available_threads() - busy)
 
 
@@ -371,12 +455,12 @@ def _asked(given: Scene, scene: Scene) -> dict[str, Any]:
 
 def error_record(estimate: Estimate, mesh: MeshEstimate | None = None) -> dict[str, Any]:
     """Write an estimate for run.json, where null stands for what is not known."""
-    found = {key: getattr(estimate, key) for key in ("error", "rounding", "in_f64", "order", "at_least")}
+    fields = {key: getattr(estimate, key) for key in ("error", "rounding", "in_f64", "order", "at_least")}
     if not estimate.parted:
-        found |= {"rounding": None, "in_f64": None}
+        fields |= {"rounding": None, "in_f64": None}
     if mesh is not None:
-        found |= {"mesh_error": mesh.error, "mesh_doubt": mesh.doubt}
-    return {key: None if value == math.inf else value for key, value in found.items()}
+        fields |= {"mesh_error": mesh.error, "mesh_doubt": mesh.doubt}
+    return {key: None if value == math.inf else value for key, value in fields.items()}
 
 
 def versions() -> dict[str, str]:

@@ -92,7 +92,7 @@ class _Checked(ModelMetaclass):
         try:
             return super().__call__(**keys)  # type: ignore[misc]
         except ValidationError as error:
-            raise SceneError([str(problem) for problem in faults.problems(error, cls, keys)]) from None
+            raise SceneError([str(problem) for problem in faults.key_problems(error, cls, keys)]) from None
 
 
 class Section(BaseModel, metaclass=_Checked):
@@ -528,15 +528,15 @@ class Scene(Section):
     def pictures(self) -> dict[str, str]:
         """The paths of the picture and the maps, by the keys that name them, such as image and tissue.map.image."""
         image = {} if self.image is None else {"image": self.image}
-        return image | {f"{self.kind}.{name}.image": found.image for name, found in self.maps.items()}
+        return image | {f"{self.kind}.{name}.image": each.image for name, each in self.maps.items()}
 
     def with_pictures(self, path: Callable[[str], str]) -> Scene:
         """Give the picture and the maps other paths, each by its present one."""
-        maps = {name: found.model_copy(update={"image": path(found.image)}) for name, found in self.maps.items()}
+        maps = {name: each.model_copy(update={"image": path(each.image)}) for name, each in self.maps.items()}
         image = None if self.image is None else path(self.image)
         sheet = self.tissue or self.springs
-        made = None if sheet is None else sheet.model_copy(update=maps)
-        return self.model_copy(update={"image": image, self.kind: made})
+        material = None if sheet is None else sheet.model_copy(update=maps)
+        return self.model_copy(update={"image": image, self.kind: material})
 
     @model_validator(mode="after")
     def _picture_given(self) -> Scene:

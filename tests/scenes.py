@@ -7,7 +7,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from taichi_msm.physics.timestep import time_grid, with_time
+from taichi_msm.physics.plan import Plan
+from taichi_msm.physics.planning import try_plan
+from taichi_msm.physics.timestep import with_time
 from taichi_msm.scene import Scene
 from taichi_msm.timegrid import TimeGrid
 
@@ -151,6 +153,13 @@ def with_steps(made: Scene, count: int) -> Scene:
     return with_time(made, step=1 / made.time.frames_per_second / count, tolerance=None)
 
 
+def plan_of(made: Scene) -> Plan:
+    """The plan of a scene, whose step may be unstable."""
+    plan, _ = try_plan(made)
+    assert plan is not None
+    return plan
+
+
 def scene_and_grid(made: Scene) -> tuple[Scene, TimeGrid]:
     """The scene and its steps."""
-    return made, time_grid(made)
+    return made, plan_of(made).grid

@@ -16,15 +16,16 @@ from taichi_msm.physics import error_control
 from taichi_msm.physics.error_control import Estimate, Trials, choose_step, estimate_error, longest, order
 from taichi_msm.physics.mesh_error import MeshEstimate
 from taichi_msm.physics.pilots import coarse_steps, fine_steps
+from taichi_msm.physics.plan import Plan
+from taichi_msm.physics.run_notes import run_notes
 from taichi_msm.physics.run_progress import RunProgress
-from taichi_msm.physics.timestep import stable_step, time_grid, with_time
-from taichi_msm.physics.warnings import notes
+from taichi_msm.physics.timestep import with_time
 from taichi_msm.scene import Scene
 from taichi_msm.simulation import Simulation
 from taichi_msm.system.runtime import Device
 from taichi_msm.timegrid import TimeGrid
 from tests.motion import frames, true_error
-from tests.scenes import PRESS, SHEET, SPRINGS, scene, with_steps
+from tests.scenes import PRESS, SHEET, SPRINGS, plan_of, scene, with_steps
 
 # Of a run in which something moved.
 MOVED = RunProgress(1, 1.0)
@@ -56,12 +57,12 @@ SCENES: dict[str, Any] = {
 
 def estimated(made: Scene, device: Device) -> Estimate:
     """What is known of the error of a scene's own steps."""
-    return estimate_error(made, time_grid(made), device)
+    return estimate_error(plan_of(made), device)
 
 
-def chosen(made: Scene, device: Device) -> tuple[TimeGrid, Estimate]:
-    """The steps for a scene's tolerance, and their error."""
-    return choose_step(made, time_grid(made), device)
+def chosen(made: Scene, device: Device) -> tuple[Plan, Estimate]:
+    """The plan for a scene's tolerance, and their error."""
+    return choose_step(plan_of(made), device)
 
 
 @pytest.mark.parametrize(("precision", "tolerance"), [("f32", 5e-4), pytest.param("f64", 5e-5, marks=pytest.mark.slow)])
@@ -69,14 +70,15 @@ def chosen(made: Scene, device: Device) -> tuple[TimeGrid, Estimate]:
 def test_the_step_chosen_is_right_and_the_largest(kind: str, precision: str, tolerance: float, device: Device) -> None:
     sections = SCENES[kind]
     made = scene(**sections | {"time": {"precision": precision, "tolerance": tolerance, **sections.get("time", {})}})
-    grid, estimate = chosen(made, device)
+    plan, estimate = chosen(made, device)
+    grid = plan.grid
     assert estimate.error <= tolerance
-    error = true_error(made, grid, device, fine=12)
+    error = true_error(plan, device, fine=12)
     assert error <= 1.5 * tolerance, estimate
-    assert estimate.steps_per_frame == grid.steps_per_frame >= time_grid(made).steps_per_frame
-    if grid.steps_per_frame > time_grid(made).steps_per_frame:
+    assert estimate.steps_per_frame == grid.steps_per_frame >= plan_of(made).grid.steps_per_frame
+    if grid.steps_per_frame > plan_of(made).grid.steps_per_frame:
         # Half as many steps would not have done.
-        with closing(Trials(made, grid, device)) as trials:
+        with closing(Trials(plan, device)) as trials:
             assert trials.estimate(grid.steps_per_frame // 2, lambda done, total: None).error > tolerance
 
 
@@ -87,7 +89,7 @@ def test_an_estimate_is_near_the_error(kind: str, difference: str, device: Devic
     made = scene(**sections | {"time": {"damping_difference": difference, **sections.get("time", {})}})
     estimate = estimated(made, device)
     exact = with_time(made, damping_difference="central")
-    reference = frames(exact, device, cut=64 * time_grid(made).steps_per_frame)
+    reference = frames(exact, device, cut=64 * plan_of(made).grid.steps_per_frame)
     error = longest(frames(made, device) - reference) / longest(reference)
     assert error / 1.5 < estimate.error < 1.5 * error
     if difference == "central":
@@ -128,16 +130,16 @@ def test_an_error_that_is_a_power_of_the_step_is_told_exactly(
 def test_how_many_steps_the_pilots_take() -> None:
     for kind in ("release", "between"):
         made = scene(**SCENES[kind])
-        grid = time_grid(made)
-        assert fine_steps(made, grid) == 2 * grid.steps_per_frame
-        assert coarse_steps(made, grid) == math.ceil(grid.steps_per_frame / 2)
+        plan = plan_of(made)
+        assert fine_steps(plan) == 2 * plan.grid.steps_per_frame
+        assert coarse_steps(plan) == math.ceil(plan.grid.steps_per_frame / 2)
     made = scene(damping=3.0, time={"step": 0.0025})
-    assert fine_steps(made, time_grid(made)) == 8 * 16, "g h is 7.5"
-    assert coarse_steps(made, time_grid(made)) == 9, "8 are not stable"
+    assert fine_steps(plan_of(made)) == 8 * 16, "g h is 7.5"
+    assert coarse_steps(plan_of(made)) == 9, "8 are not stable"
     # Twice this step is not stable.
-    limit = stable_step(scene(damping=0.01))
+    limit = plan_of(scene(damping=0.01)).stable_step
     made = with_steps(scene(damping=0.01), math.ceil(0.04 / (0.6 * limit)))
-    assert coarse_steps(made, time_grid(made)) == 0
+    assert coarse_steps(plan_of(made)) == 0
 
 
 def test_rounding_is_part_of_the_estimate(device: Device) -> None:
@@ -171,13 +173,13 @@ def test_a_motion_that_does_not_converge_is_refused(device: Device) -> None:
 
 def test_a_sheet_that_does_not_move_has_no_error(device: Device) -> None:
     made = scene(probes=[], time={"tolerance": 1e-6})
-    assert chosen(made, device)[1] == Estimate(time_grid(made).steps_per_frame, 0.0, 0.0, 0.0, 2)
+    assert chosen(made, device)[1] == Estimate(plan_of(made).grid.steps_per_frame, 0.0, 0.0, 0.0, 2)
 
 
 def test_a_simulation_meets_the_tolerance_by_itself(device: Device) -> None:
     made = scene(probes=[SOFT_PRESS], damping=0.02, time={"tolerance": 5e-5})
     with Simulation(made, threads=2) as simulation:
-        assert time_grid(simulation.scene).step < time_grid(made).step <= stable_step(made) / 2
+        assert plan_of(simulation.scene).grid.step < plan_of(made).grid.step <= plan_of(made).stable_step / 2
 
 
 def test_progress_may_interrupt(device: Device) -> None:
@@ -187,7 +189,7 @@ def test_progress_may_interrupt(device: Device) -> None:
             raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):
-        estimate_error(scene(), time_grid(scene()), device, stop)
+        estimate_error(plan_of(scene()), device, stop)
 
 
 # 25 frames a second in steps of 0.01 s.
@@ -204,7 +206,10 @@ BETWEEN = 0.105
     ],
 )
 def test_order(expected: int, sections: dict[str, Any]) -> None:
-    assert order(scene(sheet=SHEET, **sections | {"time": {"step": 0.01, **sections.get("time", {})}})) == expected
+    assert (
+        order(plan_of(scene(sheet=SHEET, **sections | {"time": {"step": 0.01, **sections.get("time", {})}})))
+        == expected
+    )
 
 
 @pytest.mark.parametrize(
@@ -232,16 +237,16 @@ def test_damping_within_a_step_is_known_or_not_told(damping: float, device: Devi
     # g h = 7 and 47. A load that is there at once makes velocities change their sign at every step, at h and at h / 2.
     made = scene(probes=[{**SOFT_PRESS, "load": [[0, 100]]}], damping=damping)
     estimate = estimated(made, device)
-    reference = frames(made, device, cut=128 * time_grid(made).steps_per_frame)
+    reference = frames(made, device, cut=128 * plan_of(made).grid.steps_per_frame)
     error = longest(frames(made, device) - reference) / longest(reference)
     assert error / 1.5 < estimate.error < 1.5 * error
-    assert "velocities change their sign" in "".join(notes(made, time_grid(made), MOVED, None))
+    assert "velocities change their sign" in "".join(run_notes(plan_of(made), (), MOVED, None))
 
 
 def test_damping_within_a_hundredth_of_a_step_has_no_estimate(device: Device) -> None:
     made = scene(probes=[{**SOFT_PRESS, "load": [[0, 100]]}], damping=100.0)
     assert estimated(made, device).error == np.inf
-    assert next(notes(made, time_grid(made), MOVED, estimated(made, device))).startswith("error not known")
+    assert next(run_notes(plan_of(made), (), MOVED, estimated(made, device))).startswith("error not known")
 
 
 @pytest.mark.parametrize("pulse", [[0.2005, 0.2006], [0.2, 0.2 + 1e-9], [0.2021, 0.2032]])
@@ -249,24 +254,24 @@ def test_the_error_of_a_load_shorter_than_a_step_is_known(pulse: list[float], de
     start, end = pulse
     made = scene(probes=[{**SOFT_PRESS, "load": [[start, 0], [start, 100], [end, 100], [end, 0]]}])
     estimate = estimated(made, device)
-    exact = frames(made, device, cut=64 * time_grid(made).steps_per_frame)
+    exact = frames(made, device, cut=64 * plan_of(made).grid.steps_per_frame)
     error = longest(frames(made, device) - exact) / longest(exact)
     assert error / 1.5 < estimate.error < 1.5 * error < 0.2
-    assert not list(notes(made, time_grid(made), MOVED, None))
+    assert not list(run_notes(plan_of(made), (), MOVED, None))
 
 
 def test_a_scene_that_is_all_right_has_no_notes() -> None:
-    assert not list(notes(scene(), time_grid(scene()), RunProgress(1, 1.0, 0.51), None))
-    assert next(notes(scene(), time_grid(scene()), RunProgress(1, 0.0, 0.49), Estimate(40, 1e-3, 1e-4, 1e-3, 2))) == (
+    assert not list(run_notes(plan_of(scene()), (), RunProgress(1, 1.0, 0.51), None))
+    assert next(run_notes(plan_of(scene()), (), RunProgress(1, 0.0, 0.49), Estimate(40, 1e-3, 1e-4, 1e-3, 2))) == (
         "error 0.001 of the largest displacement: 0.001 due to the time step, 0.0001 to rounding"
     )
-    assert len(list(notes(scene(), time_grid(scene()), RunProgress(1, 0.0, 0.49), None))) == 2
+    assert len(list(run_notes(plan_of(scene()), (), RunProgress(1, 0.0, 0.49), None))) == 2
 
 
 @pytest.mark.parametrize(("error", "advice"), [(0.04, "; try sheet.points: [24, 30]"), (2000.0, "")])
 def test_points_are_advised_where_they_can_help(error: float, advice: str) -> None:
     made = scene()
-    (note,) = notes(made, time_grid(made), MOVED, None, mesh=MeshEstimate(error))
+    (note,) = run_notes(plan_of(made), (), MOVED, None, mesh=MeshEstimate(error))
     assert note == f"so few points make the run up to {100 * error:g} % wrong{advice}"
 
 
@@ -304,9 +309,9 @@ def test_the_error_in_f64_is_that_of_the_step(device: Device) -> None:
     single, double = estimated(made, device), estimated(with_time(made, precision="f64"), device)
     assert single.in_f64 == pytest.approx(double.error, rel=1e-9)
     assert double.in_f64 == double.error
-    (said,) = notes(made, time_grid(made), MOVED, single)
+    (said,) = run_notes(plan_of(made), (), MOVED, single)
     assert f"{double.error:.1g} due to the time step, {single.rounding:.1g} to rounding" in said
-    (said,) = notes(made, time_grid(made), MOVED, double)
+    (said,) = run_notes(plan_of(made), (), MOVED, double)
     assert said.endswith(f": {single.in_f64:.1g} due to the time step")
 
 
@@ -323,7 +328,7 @@ def test_a_press_and_release_that_are_missed_alike_do_not_hide_each_other(
         time={"frames_per_second": 5},
     )
     for tolerance in (1e-2, 3e-3):
-        grid, estimate = chosen(with_time(made, tolerance=tolerance), device)
+        plan, estimate = chosen(with_time(made, tolerance=tolerance), device)
         truth = frames(made, device, cut=200_000)
-        error = longest(frames(made, device, cut=grid.steps_per_frame) - truth) / longest(truth)
+        error = longest(frames(made, device, cut=plan.grid.steps_per_frame) - truth) / longest(truth)
         assert error <= 1.5 * tolerance, estimate

@@ -22,7 +22,7 @@ from taichi_msm.scenefile.load import load_scene
 from taichi_msm.system.runtime import Device
 from tests.conftest import Program
 from tests.outputs import files, results
-from tests.scenes import speckle
+from tests.scenes import plan_of, speckle
 from tests.test_finished_run import change, change_scene
 from tests.test_resume import Stop
 
@@ -189,7 +189,7 @@ def test_a_picture_that_changes_while_a_run_starts_is_noticed(
     """The record tells of the file that was drawn."""
 
     def late(scene: Scene) -> dict[str, str]:
-        found = digests(scene)
+        found = digests(plan_of(scene))
         Image.fromarray(speckle(30, 40, 1)).save(small / "speckle.png")
         return found
 

@@ -10,15 +10,14 @@ import pytest
 from PIL import Image
 
 from taichi_msm.errors import SceneError
-from taichi_msm.physics.timestep import time_grid
 from taichi_msm.runner import run
 from taichi_msm.scene import OUTPUTS, Scene
 from taichi_msm.scenefile import budget
-from taichi_msm.scenefile.budget import Budget, problems, require_disk
+from taichi_msm.scenefile.budget import Budget, require_disk, size_problems
 from taichi_msm.system import resources
 from taichi_msm.system.resources import available_memory
 from taichi_msm.system.runtime import Device
-from tests.scenes import speckle
+from tests.scenes import plan_of, speckle
 
 TIME = {"duration": 2, "frames_per_second": 10, "step": 0.025, "precision": "f32"}
 PROBE = {"force": [0, 0, 1]}
@@ -42,11 +41,11 @@ def scene(**keys: Any) -> Scene:
 
 
 def estimate(scene: Scene) -> Budget:
-    return budget.estimate(scene, time_grid(scene))
+    return budget.estimate(plan_of(scene))
 
 
 def faults(scene: Scene) -> list[str]:
-    return [str(problem) for problem in problems(scene)]
+    return [str(problem) for problem in size_problems(plan_of(scene))]
 
 
 def test_counts() -> None:
@@ -242,7 +241,7 @@ def test_systems_without_proc(monkeypatch: pytest.MonkeyPatch) -> None:
 def test_a_file_system_without_a_size_may_have_room(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     disk_usage = shutil.disk_usage
     monkeypatch.setattr(shutil, "disk_usage", lambda path: disk_usage(path)._replace(total=0, used=0, free=0))
-    require_disk(scene(output=["png"]), tmp_path)
+    require_disk(plan_of(scene(output=["png"])), tmp_path)
 
 
 def test_results_that_do_not_fit_on_the_disk_are_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -258,10 +257,10 @@ def test_results_that_do_not_fit_on_the_disk_are_refused(tmp_path: Path, monkeyp
         monkeypatch.setattr(shutil, "disk_usage", lambda path: disk_usage(path)._replace(free=free))
 
     leave(needed)
-    require_disk(made, below)
+    require_disk(plan_of(made), below)
     leave(needed - 1)
     with pytest.raises(SceneError) as told:
-        require_disk(made, below)
+        require_disk(plan_of(made), below)
     assert str(told.value) == (
         "sheet.points: 21 frames may need 921 KiB on disk, 648 KiB of it for positions of 30 x 40 points, but "
         f"921 KiB is free for {below}; reduce it, time.frames_per_second or output, or choose another --out"
@@ -269,4 +268,4 @@ def test_results_that_do_not_fit_on_the_disk_are_refused(tmp_path: Path, monkeyp
     with pytest.raises(
         SceneError, match=r"^render.size: 21 frames may need .* of it for pictures of 500 x 600 pixels, but"
     ):
-        require_disk(scene(render={"size": [500, 600]}, output=["png"]), below)
+        require_disk(plan_of(scene(render={"size": [500, 600]}, output=["png"])), below)

@@ -78,7 +78,7 @@ def read(out: Path) -> list[Any]:
         finally:
             checkpoint.close()
     return [
-        read_manifest(out).as_json(),
+        read_manifest(out)[0].as_json(),
         positions,
         saved.state.steps,
         saved.state.displacement.tolist(),

@@ -197,7 +197,7 @@ def test_the_folder_of_compiled_kernels(named: bool, tmp_path: Path) -> None:
 
 
 def test_replacements_are_in_place_for_a_while(device: runtime.Device) -> None:
-    shortcuts = chosen().shortcuts()
+    shortcuts = chosen().shortcuts
 
     def parts() -> list[object]:
         return [getattr(owner, name) for owner, name, _ in shortcuts]
@@ -214,7 +214,7 @@ def test_replacements_are_in_place_for_a_while(device: runtime.Device) -> None:
 
 
 def test_nothing_is_replaced_in_a_version_that_was_not_tested() -> None:
-    assert replace(chosen(), tested="0.0.1").shortcuts() == []
+    assert replace(chosen(), tested="0.0.1").shortcuts == []
 
 
 @pytest.mark.parametrize(

@@ -8,10 +8,9 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from taichi_msm.physics.timestep import time_grid
 from taichi_msm.system.runtime import Device
 from tests.motion import dynamics_of
-from tests.scenes import scene
+from tests.scenes import plan_of, scene
 
 FRAME = 0.04
 # 50 (1 - cos) in pieces of 5 ms, which every step divides: its kinks fall on steps.
@@ -28,7 +27,7 @@ def final(device: Device, load: Any, cut: int, difference: str) -> NDArray[Any]:
         time={"duration": 0.4, "step": FRAME / cut, "damping_difference": difference},
     )
     dynamics = dynamics_of(made, device)
-    dynamics.advance(time_grid(made).steps)
+    dynamics.advance(plan_of(made).grid.steps)
     displacement = dynamics.displacement()
     dynamics.close()
     return displacement

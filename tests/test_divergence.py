@@ -14,10 +14,9 @@ from taichi_msm.physics.diagnosis import Diagnosis
 from taichi_msm.physics.divergence import farthest_displacement
 from taichi_msm.physics.run_progress import RunProgress, Saved
 from taichi_msm.physics.state import State
-from taichi_msm.physics.timestep import stable_step, time_grid
 from taichi_msm.scene import Scene
 from taichi_msm.system.runtime import Device
-from tests.scenes import SHEET, scene, with_steps
+from tests.scenes import SHEET, plan_of, scene, with_steps
 
 # Pressed for three frames.
 PRESS = {"force": [0, 300, -1000], "load": [[0, 100], [0.12, 100], [0.12, 0]], "falloff": 20}
@@ -82,7 +81,7 @@ def test_no_fault_is_found_where_there_is_none(precision: str, active: str, devi
         probes=[{**PRESS, "load": jumps}, {**PRESS, "at": [[0, -0.5, 0.5], [0.8, 1.5, 0.5]]}],
         time={"duration": 0.8, "precision": precision},
     )
-    for steps in (time_grid(made).steps_per_frame, math.ceil(1 / 25 / stable_step(made) / 0.995)):
+    for steps in (plan_of(made).grid.steps_per_frame, math.ceil(1 / 25 / plan_of(made).stable_step / 0.995)):
         with Simulation(with_steps(made, steps), threads=device.threads) as simulation:
             simulation.advance(20)
             assert simulation.progress.peak > 1e-3
@@ -225,9 +224,9 @@ def test_a_machine_that_makes_errors_is_told_of(device: Device) -> None:
 def test_how_far_a_point_may_be() -> None:
     # 0.05 N on 1 g is 50 m/s^2; the sheet is 0.4 m long.
     probes = [{"force": [0, 0, 0.05], "falloff": 0, "offset": 0}]
-    assert farthest_displacement(scene(probes=probes), 3.0) == pytest.approx(10 * 0.4)
+    assert farthest_displacement(plan_of(scene(probes=probes)), 3.0) == pytest.approx(10 * 0.4)
     loose = {"sheet": {**SHEET, "fixed": "none"}, "springs": {"structural": 20}}, {"springs": {"shear": 20}}
     for sections in loose:
-        flying = farthest_displacement(scene(probes=probes, **sections), 3.0)
+        flying = farthest_displacement(plan_of(scene(probes=probes, **sections)), 3.0)
         assert flying == pytest.approx(10 * 0.4 + 50 * 3.0**2 / 2)
-    assert farthest_displacement(scene(probes=probes, springs={"virtual": 1}), 3.0) == math.inf
+    assert farthest_displacement(plan_of(scene(probes=probes, springs={"virtual": 1})), 3.0) == math.inf

@@ -12,7 +12,6 @@ from typing import Any
 import pytest
 
 from taichi_msm.physics.pilots import choose_pilots
-from taichi_msm.physics.timestep import time_grid
 from taichi_msm.physics.workload import Work, work
 from taichi_msm.scene import Scene
 from taichi_msm.scenefile import duration
@@ -20,6 +19,7 @@ from taichi_msm.scenefile.duration import CALIBRATION, UNIT
 from taichi_msm.system import resources
 from taichi_msm.system.compiler import chosen
 from tests.conftest import Program
+from tests.scenes import plan_of
 from tests.scenes import scene as small_scene
 
 CORES = 3
@@ -44,7 +44,7 @@ def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 
 def estimate(made: Scene) -> Any:
-    return tuple(duration.estimate(made, time_grid(made)))
+    return tuple(duration.estimate(plan_of(made)))
 
 
 def record(**other: Any) -> dict[str, Any]:
@@ -62,8 +62,8 @@ def record(**other: Any) -> dict[str, Any]:
 
 
 def parts_of(made: Scene) -> Work:
-    grid = time_grid(made)
-    return work(made, grid, choose_pilots(made, grid).cost)
+    plan = plan_of(made)
+    return work(plan, choose_pilots(plan).cost)
 
 
 def guess(made: Scene) -> float:
@@ -84,7 +84,7 @@ def test_the_calibration_is_soon_done() -> None:
 def test_an_earlier_run_tells_how_long_the_next_one_takes(made: Scene, folder: Path) -> None:
     parts = parts_of(made)
     assert min(parts) > 0
-    duration.learn(made, record())
+    duration.learn(plan_of(made), record())
     assert estimate(made) == (pytest.approx(31), True)
     longer = made.model_copy(update={"time": made.time.model_copy(update={"duration": 10 * made.time.duration})})
     more = [later / now for later, now in zip(parts_of(longer), parts, strict=True)]
@@ -93,22 +93,24 @@ def test_an_earlier_run_tells_how_long_the_next_one_takes(made: Scene, folder: P
 
 
 def test_later_runs_count_more(made: Scene, folder: Path) -> None:
-    duration.learn(made, record())
+    duration.learn(plan_of(made), record())
     slow = {name: 2 * seconds for name, seconds in record()["timings"].items()}
-    duration.learn(made, record(timings=slow))
+    duration.learn(plan_of(made), record(timings=slow))
     # A quarter of the first run and the second one, over as much work.
     assert estimate(made)[0] == pytest.approx(31 * (0.25 + 2) / 1.25)
 
 
 def test_what_a_run_left_out_is_learnt_from_no_other(made: Scene, folder: Path) -> None:
-    duration.learn(made, record(timings={name: s for name, s in record()["timings"].items() if name != "pilot"}))
+    duration.learn(
+        plan_of(made), record(timings={name: s for name, s in record()["timings"].items() if name != "pilot"})
+    )
     kept = json.loads((folder / NAME).read_text())["parts"]
     assert set(kept) == {"start", "stepping", "pictures"}
     assert estimate(made)[1]
 
 
 def test_pilots_are_not_learnt_where_a_finer_one_may_have_followed(made: Scene, folder: Path) -> None:
-    duration.learn(made, record(error_estimate={"error": 2e-3}))
+    duration.learn(plan_of(made), record(error_estimate={"error": 2e-3}))
     assert set(json.loads((folder / NAME).read_text())["parts"]) == {"start", "stepping", "pictures"}
 
 
@@ -118,18 +120,18 @@ def test_pilots_are_not_learnt_where_a_finer_one_may_have_followed(made: Scene, 
     ids=str,
 )
 def test_other_runs_tell_nothing(other: dict[str, Any], made: Scene, folder: Path) -> None:
-    duration.learn(made, record(**other))
+    duration.learn(plan_of(made), record(**other))
     assert list(folder.iterdir()) == []
 
 
 def test_a_run_that_looked_for_its_step_tells_nothing(made: Scene, folder: Path) -> None:
     asking = made.model_copy(update={"time": made.time.model_copy(update={"step": "auto", "tolerance": 0.01})})
-    duration.learn(asking, record())
+    duration.learn(plan_of(asking), record())
     assert list(folder.iterdir()) == []
 
 
 def test_parts_of_a_moment_tell_nothing_of_longer_ones(made: Scene, folder: Path) -> None:
-    duration.learn(made, record(timings={**record()["timings"], "simulate": 0.04}))
+    duration.learn(plan_of(made), record(timings={**record()["timings"], "simulate": 0.04}))
     assert "stepping" not in json.loads((folder / NAME).read_text())["parts"]
 
 
@@ -168,7 +170,7 @@ def test_a_file_that_no_run_has_written_is_as_none(content: str, made: Scene, fo
     (folder / NAME).write_text(content)
     assert estimate(made) == (pytest.approx(guess(made)), False)
     (folder / NAME).write_text(content)
-    duration.learn(made, record())
+    duration.learn(plan_of(made), record())
     assert estimate(made) == (pytest.approx(31), True)
 
 
@@ -202,7 +204,7 @@ def test_where_nothing_can_be_kept_there_is_an_estimate_all_the_same(
     put(folder / NAME)
     before = sorted(folder.parent.rglob("*"))
     assert estimate(made) == (pytest.approx(guess(made)), False)
-    duration.learn(made, record())
+    duration.learn(plan_of(made), record())
     assert sorted(folder.parent.rglob("*")) == before, "nothing is left behind"
 
 
@@ -213,7 +215,7 @@ def test_without_a_home_there_is_an_estimate(made: Scene, folder: Path, monkeypa
     monkeypatch.delenv(chosen().folder_variable)
     monkeypatch.setattr(Path, "home", homeless)
     assert estimate(made)[0] == pytest.approx(guess(made))
-    duration.learn(made, record())
+    duration.learn(plan_of(made), record())
 
 
 def test_check_says_how_long_a_run_takes(

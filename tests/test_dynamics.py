@@ -18,23 +18,21 @@ from taichi_msm.errors import MsmError
 from taichi_msm.physics import kernel_cpu, kernel_gpu
 from taichi_msm.physics.kernel import Structure
 from taichi_msm.physics.lattice import rest_positions
-from taichi_msm.physics.material import material
 from taichi_msm.physics.solver import POINTS_PER_WORKER
-from taichi_msm.physics.timestep import stable_step, time_grid
 from taichi_msm.scene import MAX_POINTS, Scene
 from taichi_msm.system import resources
 from taichi_msm.system.launches import MOST_ROUNDS, THREADS
 from taichi_msm.system.resources import available_threads
 from taichi_msm.system.runtime import Device, lanes
 from tests.motion import dynamics_of, structure_of
-from tests.scenes import PRESS, SHEET, SPRINGS, random_scene, scene, with_steps
+from tests.scenes import PRESS, SHEET, SPRINGS, plan_of, random_scene, scene, with_steps
 
 ROUNDING = {"f32": 2.0**-24, "f64": 2.0**-53}
 
 
 def simulate(made: Scene, device: Device, layout: Structure | None = None) -> NDArray[Any]:
     """Displacements of every frame, shape (F + 1, rows, cols, 3)."""
-    grid, dynamics = time_grid(made), dynamics_of(made, device, layout)
+    grid, dynamics = plan_of(made).grid, dynamics_of(made, device, layout)
     frames = [dynamics.displacement()]
     for _ in range(grid.frames):
         dynamics.advance(grid.steps_per_frame)
@@ -48,7 +46,7 @@ def assert_like_twin(made: Scene, device: Device, layout: Structure | None = Non
     # A rounding of a step, of the size of a rest length, is amplified by at most the number of steps squared;
     # in practice by far less. Chaos is kept away by small displacements and few steps.
     largest = max(np.abs(twin).max(), 1e-3 * max(made.sheet.size))
-    steps = time_grid(made).steps
+    steps = plan_of(made).grid.steps
     tolerance = ROUNDING[made.time.precision] * steps**1.5 * largest
     np.testing.assert_allclose(simulate(made, device, layout), twin, rtol=0, atol=tolerance)
 
@@ -121,7 +119,7 @@ def short_launches(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
 def test_the_plain_layout_of_a_gpu_gives_the_same(device: Device) -> None:
     made = scene(probes=[PRESS], time={"duration": 0.08})
     layout = as_on_a_gpu(structure_of(made, device))
-    count = time_grid(made).steps_per_frame
+    count = plan_of(made).grid.steps_per_frame
     assert count % kernel_gpu.STEPS_PER_LAUNCH != 0, "a launch that is not full is part of the test"
     assert simulate(made, device, layout).tobytes() == simulate(made, device).tobytes()
 
@@ -134,7 +132,7 @@ def test_bands_and_passes_do_not_change_the_bits(fixed: Any, device: Device) -> 
     plain = simulate(made, device)
     # Also passes longer than a band has rows, and a last one that is not full.
     for workers, depth in ((1, 3), (2, 1), (2, 4), (2, 16)):
-        assert time_grid(made).steps_per_frame % depth != 0 or depth == 1
+        assert plan_of(made).grid.steps_per_frame % depth != 0 or depth == 1
         layout = replace(whole, workers=workers, depth=depth)
         assert simulate(made, device, layout).tobytes() == plain.tobytes(), (workers, depth)
 
@@ -145,7 +143,7 @@ def test_more_bands_than_threads_give_the_same_bits(workers: int, device: Device
     # at one time; but one step a launch, nobody waits.
     made = scene(sheet={**SHEET, "points": [21, 19], "fixed": ["top"]}, time={"precision": "f32", "duration": 0.08})
     dynamics = dynamics_of(made, device, replace(structure_of(made, device), workers=workers))
-    for _ in range(time_grid(made).steps):
+    for _ in range(plan_of(made).grid.steps):
         dynamics.advance(1)
     assert dynamics.displacement().tobytes() == simulate(made, device)[-1].tobytes()
     dynamics.close()
@@ -188,7 +186,7 @@ def test_a_launch_ends_soon(device: Device, monkeypatch: pytest.MonkeyPatch) -> 
     dynamics = dynamics_of(made, device)
     dynamics.advance(100)
     whole = dynamics.displacement()
-    dynamics.restart(made, time_grid(made))
+    dynamics.restart(plan_of(made))
     monkeypatch.setattr("taichi_msm.physics.solver.POINT_STEPS_PER_LAUNCH", 12 * math.prod(made.sheet.points))
 
     def stop() -> None:
@@ -206,8 +204,8 @@ def test_a_launch_ends_soon(device: Device, monkeypatch: pytest.MonkeyPatch) -> 
 def test_a_frame_of_a_small_sheet_is_one_launch(device: Device) -> None:
     made = scene(sheet={**SHEET, "points": [31, 31]})
     dynamics = dynamics_of(made, device)
-    dynamics.advance(time_grid(made).steps_per_frame)
-    assert time_grid(made).steps_per_frame > 1
+    dynamics.advance(plan_of(made).grid.steps_per_frame)
+    assert plan_of(made).grid.steps_per_frame > 1
     assert dynamics.launches == 1
     dynamics.close()
 
@@ -303,7 +301,7 @@ def test_energy_does_not_drift(device: Device) -> None:
         probes=[{"force": [0, 0, -300], "load": [[0, 0], [0.04, 100], [0.04, 0]], "falloff": 20}],
         time={"duration": 24.0},
     )
-    h, steps = time_grid(made).step, time_grid(made).steps_per_frame
+    h, steps = plan_of(made).grid.step, plan_of(made).grid.steps_per_frame
     assert made.time.frames * steps > 1e4
     dynamics = dynamics_of(made, device)
     energies = []
@@ -325,7 +323,7 @@ def energy(made: Scene, u: NDArray[Any], v: NDArray[Any]) -> float:
     """Kinetic and potential energy [J] at the middle of a step."""
     from taichi_msm.physics.lattice import springs
 
-    total = 0.5 * material(made).mass * (v**2).sum() + 0.5 * material(made).virtual * (u**2).sum()
+    total = 0.5 * plan_of(made).material.mass * (v**2).sum() + 0.5 * plan_of(made).material.virtual * (u**2).sum()
     x = u + rest_positions(made.sheet)
     for spring in springs(made):
         if (spring.down, spring.right) > (0, 0):
@@ -358,7 +356,7 @@ def test_a_state_is_gone_on_from_with_the_same_bits(change: dict[str, Any] | Non
     state, energy = dynamics.state(), dynamics.read().energy
     dynamics.advance(50)
     end = dynamics.state()
-    dynamics.restart(made, time_grid(made), state)
+    dynamics.restart(plan_of(made), state)
     again = dynamics.state()
     assert dynamics.read().energy == energy
     dynamics.advance(50)
@@ -380,7 +378,7 @@ def test_the_energy_is_that_of_motion_and_springs(seed: int, width: int, device:
     state = dynamics.state()
     assert made.springs is not None
     without_virtual = made.model_copy(update={"springs": made.springs.model_copy(update={"virtual": 0.0})})
-    expected = energy(without_virtual, state.displacement, state.difference / time_grid(made).step)
+    expected = energy(without_virtual, state.displacement, state.difference / plan_of(made).grid.step)
     assert dynamics.read().energy == pytest.approx(expected, rel=1e-12)
     assert dynamics.read().shortest_spring == pytest.approx(
         reference.shortest_spring(made, state.displacement), rel=1e-12
@@ -392,7 +390,7 @@ def test_the_energy_is_that_of_motion_and_springs(seed: int, width: int, device:
 def test_just_under_the_limit_stays_bounded(difference: str, device: Device) -> None:
     coarse = scene(time={"duration": 1, "damping_difference": difference})
     # The largest step below the limit that cuts a frame of its own rate into one.
-    rate = 1 / (0.99 * stable_step(coarse))
+    rate = 1 / (0.99 * plan_of(coarse).stable_step)
     frames = 100
     made = scene(
         probes=[{"force": [0, 0, -1000], "falloff": 20}],
@@ -440,10 +438,10 @@ def test_a_restart_is_a_new_start(device: Device) -> None:
     dynamics = dynamics_of(scene(), device, replace(structure_of(scene(), device), workers=2))
     dynamics.advance(77)
     for made in (other, with_steps(other, 50), scene()):
-        dynamics.restart(made, time_grid(made))
+        dynamics.restart(plan_of(made))
         frames = [dynamics.displacement()]
         for _ in range(made.time.frames):
-            dynamics.advance(time_grid(made).steps_per_frame)
+            dynamics.advance(plan_of(made).grid.steps_per_frame)
             frames.append(dynamics.displacement())
         np.testing.assert_array_equal(frames, simulate(made, device))
     dynamics.close()
@@ -458,7 +456,7 @@ def test_a_restart_may_be_that_of_any_scene(device: Device) -> None:
     ]
     for changes in other:
         made = scene(**changes)
-        dynamics.restart(made, time_grid(made))
+        dynamics.restart(plan_of(made))
         dynamics.advance(11)
         fresh = dynamics_of(made, device)
         fresh.advance(11)
@@ -576,7 +574,7 @@ def test_a_sheet_that_was_interrupted_while_stepping_is_not_used(
     for use in (dynamics.state, dynamics.read, lambda: dynamics.advance(1)):
         with pytest.raises(MsmError, match="restore what was saved before"):
             use()
-    dynamics.restart(made, dynamics.grid, saved)
+    dynamics.restart(dynamics.plan, saved)
     dynamics.advance(5)
     fresh = dynamics_of(made, device)
     fresh.advance(15)

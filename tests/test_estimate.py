@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -14,17 +13,18 @@ import pytest
 from taichi_msm import load_scene, resume, run
 from taichi_msm.physics import pilots, workload
 from taichi_msm.physics.pilots import ENOUGH, Pilots, choose_pilots
+from taichi_msm.physics.planning import on
+from taichi_msm.physics.run_notes import run_notes
 from taichi_msm.physics.run_progress import RunProgress
 from taichi_msm.physics.solver import Dynamics
-from taichi_msm.physics.timestep import time_grid, with_time
-from taichi_msm.physics.warnings import notes
+from taichi_msm.physics.timestep import with_time
 from taichi_msm.physics.workload import affords_pilots
 from taichi_msm.progress import Pause
 from taichi_msm.results.record import RunRecord
 from taichi_msm.scene import Scene
 from taichi_msm.system.runtime import Device
 from tests.motion import true_error
-from tests.scenes import PRESS, scene
+from tests.scenes import PRESS, plan_of, scene
 from tests.test_resume import Stop
 
 # A run of four frames that draws nothing.
@@ -58,7 +58,7 @@ def test_a_run_says_how_wrong_it_is(overrides: Sequence[str], small: Path, devic
     made = load_scene("small.yaml", [*SHORT, *overrides])
     record = run(made, "out", threads=device.threads)
     found = told(record)
-    error = true_error(made, time_grid(made), device, fine=32)
+    error = true_error(plan_of(made), device, fine=32)
     # Outside, 0.89 to 1.5 were found over 98 scenes.
     assert 0.8 * error < found < 1.5 * error
     assert record["notes"][0].startswith(f"error {found:.1g} of the largest displacement")
@@ -101,14 +101,14 @@ def test_a_run_that_is_wrong_says_what_helps() -> None:
     from taichi_msm.physics.error_control import Estimate
 
     def said(error: float, rounding: float, in_f64: float) -> list[str]:
-        return list(notes(scene(), time_grid(scene()), MOVED, Estimate(10, error, rounding, in_f64, 2)))
+        return list(run_notes(plan_of(scene()), (), MOVED, Estimate(10, error, rounding, in_f64, 2)))
 
     assert len(said(0.009, 0.0, 0.009)) == 1
     (_, step) = said(0.04, 0.0, 0.04)
     # 24 steps a frame make a quarter of the error, and a third as many again half of that.
     found = float(step.removeprefix("the run is about 4 % wrong; try time.step: "))
-    tried = time_grid(with_time(scene(), step=found))
-    assert tried.steps_per_frame == math.ceil(time_grid(scene()).steps_per_frame * 8**0.5)
+    tried = plan_of(with_time(scene(), step=found)).grid
+    assert tried.steps_per_frame == math.ceil(plan_of(scene()).grid.steps_per_frame * 8**0.5)
     (first, rounding) = said(0.03, 0.03, 1e-4)
     assert first == "error 0.03 of the largest displacement: 0.0001 due to the time step, 0.03 to rounding"
     assert rounding == (
@@ -122,7 +122,7 @@ def test_a_small_run_is_in_f64_and_a_large_one_in_f32() -> None:
         return scene(sheet={"points": [points, points], "size": [0.3, 0.3], "mass": 1e-3}, time=time, **keys)
 
     def precision(scene: Scene, arch: str = "cpu") -> str:
-        return time_grid(scene, arch).precision
+        return on(plan_of(scene), arch).grid.precision
 
     assert precision(made(61, 30)) == "f64"
     assert precision(made(61, 30), "cuda") == "f32"
@@ -134,23 +134,23 @@ def test_a_small_run_is_in_f64_and_a_large_one_in_f32() -> None:
     drawn = made(edge, 30, image="a.png", output=["png"])
     assert precision(drawn) == "f64"
     # The work is counted, and not timed.
-    steps = 30 * time_grid(made(edge, 30)).steps_per_frame * edge**2
+    steps = 30 * plan_of(made(edge, 30)).grid.steps_per_frame * edge**2
     assert workload.DOUBLE * steps > workload.SMALL * workload.START >= workload.DOUBLE * steps * (1 - 3 / edge)
 
 
 def test_pilots_are_taken_while_they_are_two_fifths_of_the_run() -> None:
     small = scene(probes=[PRESS], time={"precision": "auto"})
-    assert affords_pilots(small, time_grid(small), 2)
+    assert affords_pilots(plan_of(small), 2)
     time = {"precision": "auto", "duration": 40.0}
     large = scene(sheet={"points": [2000, 2000], "size": [0.3, 0.3], "mass": 1e-3}, time=time)
-    single, double = time_grid(large), replace(time_grid(large), precision="f64")
-    assert single.precision == "f32"
+    single, double = plan_of(large), plan_of(large).with_grid(precision="f64")
+    assert single.grid.precision == "f32"
     # Of a run that is nearly all stepping, two thirds of the run's own steps are two fifths of the whole.
-    assert [affords_pilots(large, double, steps) for steps in (0.66, 0.67)] == [True, False]
-    assert [affords_pilots(large, single, steps) for steps in (0.33, 0.34)] == [True, False]
-    steps = math.ceil(double.steps_per_frame / 2)
-    assert choose_pilots(large, double) == Pilots(steps, 0, False, steps / double.steps_per_frame)
-    assert choose_pilots(large, single).reason
+    assert [affords_pilots(double, steps) for steps in (0.66, 0.67)] == [True, False]
+    assert [affords_pilots(single, steps) for steps in (0.33, 0.34)] == [True, False]
+    steps = math.ceil(double.grid.steps_per_frame / 2)
+    assert choose_pilots(double) == Pilots(steps, 0, False, steps / double.grid.steps_per_frame)
+    assert choose_pilots(single).reason
 
 
 @pytest.fixture
@@ -160,7 +160,7 @@ def taken(monkeypatch: pytest.MonkeyPatch) -> list[int]:
     advance = Dynamics.advance
 
     def noted(self: Dynamics, steps: int, pause: Pause = lambda: None) -> None:
-        found.append(steps * math.prod(self.scene.sheet.points))
+        found.append(steps * math.prod(self.plan.scene.sheet.points))
         advance(self, steps, pause)
 
     monkeypatch.setattr(Dynamics, "advance", noted)
@@ -187,7 +187,7 @@ def test_a_finer_pilot_follows_an_error_that_matters(
 ) -> None:
     made = load_scene("small.yaml", [*WRONG, f"output={output}"])
     record = run(made, "out", threads=device.threads)
-    error = true_error(made, time_grid(made), device, fine=32)
+    error = true_error(plan_of(made), device, fine=32)
     # Twice the next power of h, as in tests/test_accuracy.py.
     assert told(record) == pytest.approx(error, rel=1 / 12)
     monkeypatch.setattr(pilots, "affords_pilots", lambda scene, grid, steps: steps < 1)
@@ -221,9 +221,9 @@ def test_beside_f32_a_coarse_pilot_of_order_1_tells_a_bound(small: Path, device:
     step = ["time.frames_per_second=50", "time.step=0.004", "time.damping_difference=backward", "time.precision=f32"]
     soft = ["springs.structural=8", "springs.shear=4", "output=[trajectory]"]
     made = load_scene("small.yaml", [*step, *soft, "probes.0.load=[[0, 0], [0.4, 100]]"])
-    assert choose_pilots(made, time_grid(made)).beside == 3
+    assert choose_pilots(plan_of(made)).beside == 3
     record = run(made, "out", threads=device.threads)
-    error = true_error(made, time_grid(made), device, fine=32)
+    error = true_error(plan_of(made), device, fine=32)
     assert error < told(record) < 4 * error
 
 
@@ -235,7 +235,7 @@ def test_beside_f32_a_coarse_pilot_tells_a_bound(
     record = run(made, "out", threads=device.threads)
     steps = math.prod(made.sheet.points) * record["steps"]
     assert sum(taken) <= 1.6 * steps
-    error = true_error(made, time_grid(made), device, fine=32)
+    error = true_error(plan_of(made), device, fine=32)
     # Three times the error of the step; and all of rounding, of which there is hardly any here.
     assert told(record) == pytest.approx(3 * error, rel=0.5)
     found = record["error_estimate"]
@@ -251,5 +251,5 @@ def test_a_tolerance_is_met_with_either_difference(difference: str, small: Path,
     assert told(record) <= 2e-3
     assert record["error_estimate"] is not None
     assert record["error_estimate"]["order"] == (2 if difference == "central" else 1)
-    grid = replace(time_grid(made), steps_per_frame=record["steps_per_frame"])
-    assert true_error(made, grid, device, fine=32) <= 3e-3
+    plan = plan_of(made).with_grid(steps_per_frame=record["steps_per_frame"])
+    assert true_error(plan, device, fine=32) <= 3e-3

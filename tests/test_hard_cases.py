@@ -17,14 +17,13 @@ from taichi_msm import reference
 from taichi_msm.physics import lattice
 from taichi_msm.physics.divergence import MOST_SHEET_SIZES
 from taichi_msm.physics.error_control import estimate_error
-from taichi_msm.physics.material import material
 from taichi_msm.physics.probe_force import probe_force
-from taichi_msm.physics.timestep import stable_step, time_grid
 from taichi_msm.scene import Scene
 from taichi_msm.scenefile.load import load_scene
 from taichi_msm.simulation import Simulation
 from taichi_msm.system.runtime import Device
 from tests.motion import dynamics_of, frames
+from tests.scenes import plan_of
 
 Array = NDArray[np.float64]
 
@@ -68,11 +67,11 @@ def truth(scene: Scene, cut: int, device: Device) -> tuple[Array, float]:
 
 
 def test_the_cases_are_as_hard_as_they_say(root: Path) -> None:
-    paper, stiff = material(load_scene(root / "scenes/figure-3.yaml")), material(hard("stiff"))
+    paper, stiff = plan_of(load_scene(root / "scenes/figure-3.yaml")).material, plan_of(hard("stiff")).material
     assert (stiff.across, stiff.shear) == pytest.approx((1e4 * paper.across, 1e4 * paper.shear))
     assert max(percent for _, percent in hard("overload").probes[0].load) == 1000
     damped = hard("overdamped")
-    assert material(damped).drag * time_grid(damped).step > 2
+    assert plan_of(damped).material.drag * plan_of(damped).grid.step > 2
     assert damped.time.damping_difference == "central"
     for path in FOLDER.glob("*.yaml"):
         scene = load_scene(path)
@@ -82,9 +81,9 @@ def test_the_cases_are_as_hard_as_they_say(root: Path) -> None:
 @pytest.mark.parametrize("name", SHORT)
 def test_the_error_is_small_and_known(name: str, device: Device) -> None:
     scene = hard(name)
-    exact, doubt = truth(scene, time_grid(scene).steps_per_frame, device)
+    exact, doubt = truth(scene, plan_of(scene).grid.steps_per_frame, device)
     error = longest(frames(scene, device) - exact) / longest(exact)
-    estimate = estimate_error(scene, time_grid(scene), device)
+    estimate = estimate_error(plan_of(scene), device)
     assert estimate.order == 2
     # At order 2 the runs at 8 and 16 times the steps differ by (1/64 - 1/256) of the error at once: 1/85.
     assert doubt < estimate.error / 16, "the reference has converged"
@@ -93,7 +92,7 @@ def test_the_error_is_small_and_known(name: str, device: Device) -> None:
     # Half a pixel where the sheet is 100 pixels wide and moves by a fifth of that: not to be seen.
     assert estimate.error < 0.025
     # A step in f32 rounds once the displacement, and the roundings of all steps to one side would be this.
-    assert estimate.rounding < F32 * time_grid(scene).steps
+    assert estimate.rounding < F32 * plan_of(scene).grid.steps
 
 
 @pytest.mark.parametrize("name", SHORT)
@@ -111,9 +110,9 @@ def test_only_the_pinch_is_noted(name: str, device: Device) -> None:
 @pytest.mark.parametrize("name", SHORT)
 def test_the_kernel_is_like_the_twin(name: str, device: Device) -> None:
     scene = in_double(hard(name))
-    grid = time_grid(scene)
+    grid = plan_of(scene).grid
     steps = min(grid.steps, TWIN_STEPS_OF_POINTS // math.prod(scene.sheet.points))
-    twin = next(u for n, u in enumerate(reference.displacements(scene, grid)) if n == steps)
+    twin = next(u for n, u in enumerate(reference.displacements(plan_of(scene))) if n == steps)
     dynamics = dynamics_of(scene, device)
     dynamics.advance(steps)
     difference = longest(dynamics.displacement() - twin)
@@ -139,7 +138,7 @@ def test_other_units_give_the_same_bits(name: str, metres: float, seconds: float
     height, width = scene.sheet.size
     other = changed(
         scene,
-        sheet={"size": (height * metres, width * metres), "mass": material(scene).mass * seconds**2},
+        sheet={"size": (height * metres, width * metres), "mass": plan_of(scene).material.mass * seconds**2},
         time={
             "duration": scene.time.duration * seconds,
             "frames_per_second": scene.time.frames_per_second / seconds,
@@ -160,7 +159,7 @@ def test_a_load_on_the_axes_keeps_the_sheet_symmetric(name: str, device: Device)
     scene = hard(name)
     u = frames(scene, device)
     # Forces are summed in another order on the other side: a rounding a step, at worst all to one side.
-    tolerance = F32 * time_grid(scene).steps * longest(u)
+    tolerance = F32 * plan_of(scene).grid.steps * longest(u)
     assert longest(u - u[:, :, ::-1] * [-1, 1, 1]) <= tolerance, "left and right"
     assert longest(u - u[:, ::-1] * [1, -1, 1]) <= tolerance, "top and bottom"
     assert longest(u + u.swapaxes(1, 2)[..., [1, 0, 2]] * [1, 1, -1]) <= tolerance, "rows and columns"
@@ -175,13 +174,13 @@ def test_adrift_moves_its_centre_of_mass_as_one_body(device: Device) -> None:
     (probe,) = scene.probes
     x, y = lattice.axes(scene.sheet)
     share = np.exp(-probe.falloff * np.hypot(x + scene.sheet.size[1] / 2, y) - probe.offset)
-    a = probe_force(probe, scene.sheet).force[0] * share.mean() / material(scene).mass
+    a = probe_force(probe, scene.sheet).force[0] * share.mean() / plan_of(scene).material.mass
     t = np.arange(1, scene.time.frames + 1) / scene.time.frames_per_second
     pushed = np.minimum(t, probe.load[-1][0])
     way = a * pushed**2 / 2 + a * pushed * (t - pushed)
     assert way[-1] > MOST_SHEET_SIZES * max(scene.sheet.size), "would be taken for diverged if something held it"
     centre = frames(scene, device).mean(axis=(1, 2))
-    rounding = F32 * time_grid(scene).steps * way[-1]
+    rounding = F32 * plan_of(scene).grid.steps * way[-1]
     np.testing.assert_allclose(centre[:, 0], way, rtol=0, atol=rounding)
     np.testing.assert_allclose(centre[:, 1:], 0, rtol=0, atol=rounding)
 
@@ -207,7 +206,7 @@ def shadow_energy(scene: Scene, before: Array, after: Array) -> float:
 
     m v^2 / 2 + V(x) + h^2 (|F(x)|^2 / (12 m) - v V''(x) v / 24)    Hairer, Lubich, Wanner 2003, Acta Numerica 12
     """
-    h, m = time_grid(scene).step, material(scene).mass
+    h, m = plan_of(scene).grid.step, plan_of(scene).material.mass
     v, middle = (after - before) / h, (before + after) / 2
 
     def force(u: Array) -> Array:
@@ -229,7 +228,7 @@ def shadow_energy(scene: Scene, before: Array, after: Array) -> float:
 @pytest.mark.parametrize("name", sorted(LONG))
 def test_a_million_steps_keep_the_energy(name: str, device: Device) -> None:
     scene = hard(name)
-    grid, limit = time_grid(scene), stable_step(scene)
+    grid, limit = plan_of(scene).grid, plan_of(scene).stable_step
     assert grid.steps == 10**6
     assert grid.step / limit == pytest.approx({"limit": 0.99, "undamped": 0.495}[name], rel=1e-4)
     dynamics = dynamics_of(scene, device)
@@ -253,4 +252,4 @@ def test_a_million_steps_keep_the_energy(name: str, device: Device) -> None:
         assert max(values[half:]) < 2 * max(values[:half])
     # Where single points are is not known after so long; and the estimate says so, already after a tenth.
     tenth = changed(scene, time={"duration": scene.time.duration / 10})
-    assert estimate_error(tenth, time_grid(tenth), device).error > 0.5
+    assert estimate_error(plan_of(tenth), device).error > 0.5

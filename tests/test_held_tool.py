@@ -6,10 +6,9 @@ import numpy as np
 import pytest
 
 from taichi_msm.physics.loads import Schedule, schedule
-from taichi_msm.physics.timestep import time_grid
 from taichi_msm.scene import Probe, Scene
 from taichi_msm.viewer.held_tool import RISE, HeldTool
-from tests.scenes import scene
+from tests.scenes import plan_of, scene
 
 RATE = 50.0
 
@@ -25,9 +24,9 @@ def with_probe(probe: Probe, frames: int) -> Scene:
 
 def loads(probe: Probe, frame: int) -> Schedule:
     """The loads at the steps of a frame."""
-    made = with_probe(probe, 1)
-    grid = time_grid(made)
-    return schedule(made, grid, frame * grid.steps_per_frame, grid.steps_per_frame)
+    plan = plan_of(with_probe(probe, 1))
+    count = plan.grid.steps_per_frame
+    return schedule(plan, frame * count, count)
 
 
 def percents(hand: HeldTool, first: int, count: int) -> list[float]:

@@ -12,6 +12,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from PIL import Image
 
 import taichi_msm
 from taichi_msm import (
@@ -31,11 +32,11 @@ from taichi_msm import (
     run,
 )
 from taichi_msm.physics.lattice import rest_positions
-from taichi_msm.physics.timestep import stable_step, time_grid, with_time
+from taichi_msm.physics.timestep import with_time
 from taichi_msm.render.camera import view
 from taichi_msm.system.resources import processor
 from taichi_msm.system.runtime import Device
-from tests.scenes import PRESS, SHEET, scene, speckle
+from tests.scenes import PRESS, SHEET, plan_of, scene, speckle
 
 HAND = {"at": [[0, 0.5, 0.5]], "force": [0, 0, -20], "falloff": 20, "offset": 0}
 
@@ -49,9 +50,11 @@ def simulation(device: Device) -> Iterator[Simulation]:
 
 def test_what_is_exported_is_there_and_nothing_else() -> None:
     for name in taichi_msm.__all__:
-        assert getattr(taichi_msm, name).__name__ == name
+        exported = getattr(taichi_msm, name)
+        assert exported.__name__ == name
+        assert exported.__doc__
     assert (Path(taichi_msm.__file__).parent / "py.typed").exists()
-    with pytest.raises(AttributeError):
+    with pytest.raises(AttributeError, match="no attribute 'nothing'"):
         taichi_msm.nothing  # noqa: B018
 
 
@@ -123,7 +126,7 @@ def test_scenes_made_in_python_are_checked(device: Device, tmp_path: Path) -> No
         Probe()
     broken = {"sheet": SHEET, "springs": {}, "time": {"duration": -1}, "output": []}
     unstable = with_time(good, step=0.04)
-    assert stable_step(good) < 0.04
+    assert plan_of(good).stable_step < 0.04
     for attempt in (lambda made: Simulation(made, threads=device.threads), lambda made: run(made, tmp_path / "out")):
         with pytest.raises(SceneError, match=r"time\.duration: -1 is not allowed"):
             attempt(broken)
@@ -178,12 +181,32 @@ def test_restarted_it_is_a_new_simulation(simulation: Simulation, device: Device
     assert simulation.scene == other
 
 
+def test_restarted_it_reads_its_picture_again_where_it_would_look_different(device: Device, tmp_path: Path) -> None:
+    # Nothing of the picture hides the background.
+    Image.new("RGBA", (8, 8)).save(tmp_path / "clear.png")
+    colours = [(0, 0, 0), (200, 0, 0)]
+    first, second = (
+        scene(image=str(tmp_path / "clear.png"), render={"size": [40, 30], "background": colour}) for colour in colours
+    )
+    with Simulation(first, threads=device.threads) as simulation:
+        assert (simulation.draw() == colours[0]).all()
+        simulation.restart(second)
+        assert (simulation.draw() == colours[1]).all()
+
+
+def test_a_tool_that_gets_an_instrument_is_drawn_with_it(simulation: Simulation) -> None:
+    bare = simulation.draw()
+    probe = simulation.scene.probes[0]
+    simulation.steer([probe.model_copy(update={"instrument": {"radius": 0.02, "shaft": [0, 0, 1], "length": 0.1}})])
+    assert (simulation.draw() != bare).any()
+
+
 def test_velocities_are_the_mean_of_the_last_step(simulation: Simulation) -> None:
     assert not simulation.velocities().any()
     simulation.advance(2)
-    h = time_grid(simulation.scene).step
+    h = plan_of(simulation.scene).grid.step
     made = with_time(simulation.scene, duration=2 * 0.04, frames_per_second=round(1 / h), step=h)
-    states = list(reference.displacements(made, time_grid(made)))
+    states = list(reference.displacements(plan_of(made)))
     np.testing.assert_allclose(simulation.velocities(), (states[-1] - states[-2]) / h, atol=1e-12)
 
 
@@ -239,7 +262,7 @@ def test_a_divergence_says_where_it_is(device: Device) -> None:
         simulation.advance(10)
     error = caught.value
     assert error.step > 0
-    assert error.time == pytest.approx(error.step * time_grid(made).step)
+    assert error.time == pytest.approx(error.step * plan_of(made).grid.step)
     assert f"point {error.point}" in str(error)
     again = pickle.loads(pickle.dumps(error))
     assert (str(again), again.step, again.time, again.point) == (str(error), error.step, error.time, error.point)
@@ -258,6 +281,7 @@ def test_all_errors_are_ours(simulation: Simulation) -> None:
     for call in (*calls, simulation.save):
         with pytest.raises(MsmError, match="this simulation is closed"):
             call()
+    assert np.isfinite(simulation.positions()).all()
 
 
 @pytest.mark.parametrize("threads", [0, -1, 10**6, True, 1.5, "2"])
@@ -271,7 +295,7 @@ def test_what_was_saved_elsewhere_is_not_gone_on_with(simulation: Simulation, de
     simulation.advance(3)
     before = simulation.positions()
     others = (
-        scene(time={"step": time_grid(simulation.scene).step / 4}),
+        scene(time={"step": plan_of(simulation.scene).grid.step / 4}),
         scene(sheet={**SHEET, "points": [5, 5]}),
         scene(time={"precision": "f32"}),
     )

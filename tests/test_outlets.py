@@ -4,10 +4,8 @@ from __future__ import annotations
 
 import os
 import shlex
-import signal
 import subprocess
 import sys
-import time
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -16,6 +14,7 @@ import pytest
 from taichi_msm.system import runtime
 from taichi_msm.system.compiler import chosen
 from tests.scenes import SMALL
+from tests.telling import Telling
 
 pytestmark = pytest.mark.skipif(not Path("/dev/full").exists(), reason="needs a shell and a device that is always full")
 
@@ -81,13 +80,13 @@ def test_results_that_nobody_can_read_are_4(command: str, here: Path) -> None:
         assert shell(f"msm {command} >&-").returncode == CODES[command]
 
 
-@pytest.mark.parametrize("delay", [0.1, 0.3, 0.6])
-def test_a_signal_is_heard_though_nobody_can_read_of_it(delay: float, here: Path) -> None:
-    command = [sys.executable, "-m", "taichi_msm", "run", "small.yaml", "--set", "render.size=[2048,2048]"]
-    with Path("/dev/full").open("w") as full, subprocess.Popen(command, stdout=full, stderr=full) as process:
-        time.sleep(delay)
+@pytest.mark.parametrize("stage", ["heard", "compile", "frames"])
+def test_a_signal_is_heard_though_nobody_can_read_of_it(stage: str, here: Path) -> None:
+    command = ["run", "small.yaml", "--set", "render.size=[2048,2048]"]
+    with Path("/dev/full").open("w") as full, Telling(*command, stdout=full, stderr=full) as process:
+        process.until(stage)
         process.terminate()
-        assert process.wait(timeout=30) == 143 or (delay < 0.2 and process.returncode == -signal.SIGTERM)
+        assert process.wait(timeout=60) == 143
 
 
 def test_results_into_a_pipe_that_nobody_reads(here: Path) -> None:

@@ -13,9 +13,8 @@ from scipy.integrate import solve_ivp
 from taichi_msm import reference
 from taichi_msm.physics.lattice import fixed_points, rest_positions
 from taichi_msm.physics.loads import loads_at
-from taichi_msm.physics.timestep import time_grid
 from taichi_msm.scene import Scene
-from tests.scenes import random_scene, random_tissue, scene, speckle
+from tests.scenes import plan_of, random_scene, random_tissue, scene, speckle
 
 # A 2 x 2 sheet without springs but virtual ones: four independent oscillators.
 ALONE = {
@@ -37,7 +36,7 @@ def discrete(n: NDArray[np.int_], h: float, w: float, g: float, rest: float) -> 
 @pytest.mark.parametrize("damping", [0.0, 4.0])
 def test_one_oscillator_follows_the_discrete_solution(damping: float) -> None:
     made = scene(**ALONE, damping=damping, time={"duration": 4.0, "step": 0.02})
-    z = np.array([u[0, 0, 2] for u in reference.displacements(made, time_grid(made))])
+    z = np.array([u[0, 0, 2] for u in reference.displacements(plan_of(made))])
     exact = discrete(np.arange(len(z)), 0.02, 5.0, damping / 2.0, 3.0 / 50.0)
     # 200 steps, each of which rounds numbers of at most 0.12.
     np.testing.assert_allclose(z, exact, rtol=0, atol=200**2 * 1.2e-17)
@@ -45,7 +44,7 @@ def test_one_oscillator_follows_the_discrete_solution(damping: float) -> None:
 
 def test_undamped_oscillator_has_the_frequency_of_the_scheme() -> None:
     made = scene(**ALONE, damping=0, time={"duration": 4.0, "step": 0.04})
-    z = np.array([u[0, 0, 2] for u in reference.displacements(made, time_grid(made))]) - 3.0 / 50.0
+    z = np.array([u[0, 0, 2] for u in reference.displacements(plan_of(made))]) - 3.0 / 50.0
     # sin(theta / 2) = w h / 2; and u_0 is an extremum, so the motion is a cosine.
     theta = 2 * np.arcsin(5.0 * 0.04 / 2)
     np.testing.assert_allclose(z, -3.0 / 50.0 * np.cos(theta * np.arange(len(z))), atol=1e-14)
@@ -56,14 +55,14 @@ def test_backward_damping_is_the_literal_recurrence() -> None:
     u = [0.0, 0.02**2 * 3.0 / 2.0 / 2]
     for _ in range(19):
         u.append(2 * u[-1] - u[-2] + 0.02**2 * (3.0 - 50.0 * u[-1]) / 2.0 - 2.0 * 0.02 * (u[-1] - u[-2]))
-    z = [v[0, 0, 2] for v in reference.displacements(made, time_grid(made))]
+    z = [v[0, 0, 2] for v in reference.displacements(plan_of(made))]
     np.testing.assert_allclose(z, u, atol=1e-16)
 
 
 def test_static_balance_of_virtual_springs_and_force() -> None:
     # Overdamped (g = 20 > 2 w = 10): the slow mode decays as exp(-1.34 t), to 1e-11 of itself after 20 s.
     made = scene(**ALONE, damping=40.0, time={"duration": 20.0})
-    *_, last = reference.displacements(made, time_grid(made))
+    *_, last = reference.displacements(plan_of(made))
     np.testing.assert_allclose(last[..., 2], 3.0 / 50.0, rtol=1e-10)
     assert np.abs(last[..., :2]).max() == 0
 
@@ -112,7 +111,7 @@ def without_bending(scene: Scene) -> Scene:
 def test_agrees_with_dop853() -> None:
     made = scene(probes=[{"force": [0, 300, -1000], "load": [[0, 0], [0.4, 100]], "falloff": 20}])
     rest, moves = rest_positions(made.sheet), ~fixed_points(made.sheet)[..., None]
-    full = loads_at(made, np.array([0.4]))
+    full = loads_at(plan_of(made), np.array([0.4]))
 
     def motion(t: float, y: NDArray[np.float64]) -> NDArray[np.float64]:
         u, v = y.reshape(2, *rest.shape)
@@ -125,9 +124,9 @@ def test_agrees_with_dop853() -> None:
     errors = []
     for halvings in (3, 4):
         fine = made.model_copy(
-            update={"time": made.time.model_copy(update={"step": time_grid(made).step / 2**halvings})}
+            update={"time": made.time.model_copy(update={"step": plan_of(made).grid.step / 2**halvings})}
         )
-        *_, last = reference.displacements(fine, time_grid(fine))
+        *_, last = reference.displacements(plan_of(fine))
         errors.append(np.abs(last - exact).max())
     # Of order 2, so the finer one is wrong by a third of the difference of both; the integrator by far less.
     assert 3.8 < errors[0] / errors[1] < 4.2

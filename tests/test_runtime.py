@@ -91,12 +91,14 @@ def test_a_process_may_have_many_sheets_and_gets_their_memory_back(device: runti
     assert not sizes or sizes[2] - sizes[1] < 4 * 2**20
 
 
-# Two of these at once on one core: each waits while the other works.
+# Two of these at once on one core, from a line on stdin on: each waits while the other works.
 BESIDE = """
 import os, time
 from taichi_msm.system.resources import waited_for_cores
 
 os.sched_setaffinity(0, {min(os.sched_getaffinity(0))})
+print("ready", flush=True)
+input()
 before, end = waited_for_cores(), time.perf_counter() + 1
 while time.perf_counter() < end:
     pass
@@ -108,9 +110,18 @@ print(waited_for_cores() - before)
 def test_waiting_for_a_core_is_noticed(root: Path) -> None:
     environment = {**os.environ, "PYTHONPATH": str(root)}
     both = [
-        subprocess.Popen([sys.executable, "-c", BESIDE], stdout=subprocess.PIPE, text=True, env=environment)
+        subprocess.Popen(
+            [sys.executable, "-c", BESIDE], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True, env=environment
+        )
         for _ in range(2)
     ]
+    for process in both:
+        assert process.stdout
+        assert process.stdout.readline() == "ready\n"
+    for process in both:
+        assert process.stdin
+        process.stdin.write("\n")
+        process.stdin.flush()
     waited = [float(process.communicate(timeout=60)[0]) for process in both]
     assert max(waited) > 0.1
 

@@ -5,7 +5,6 @@ from __future__ import annotations
 import os
 import re
 import subprocess
-import time
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack
 from pathlib import Path
@@ -19,15 +18,15 @@ from taichi_msm import load_scene, run
 from taichi_msm.errors import FilesError, SceneError
 from taichi_msm.physics.lattice import rest_positions
 from taichi_msm.physics.loads import schedule
-from taichi_msm.physics.timestep import time_grid
 from taichi_msm.system.runtime import Device
 from taichi_msm.viewer import captures
 from taichi_msm.viewer import session as live_session
 from taichi_msm.viewer.captures import Captures
-from taichi_msm.viewer.events import KEYS, Drag, Event, Harder, Key, Percent, Point, Press, Release, Turn
+from taichi_msm.viewer.events import KEYS, Drag, Event, Harder, Hover, Key, Percent, Press, Release, Turn
 from taichi_msm.viewer.recorder import record
 from taichi_msm.viewer.session import Session, with_live_frames
 from tests.outputs import duration
+from tests.scenes import plan_of
 
 # small.yaml with a force that dimples it as tissue, and a camera that sees it tilted.
 TILTED = {
@@ -195,8 +194,8 @@ def test_virtual_springs_vanish_when_the_tool_is_released(begin: Begin) -> None:
     session.handle(Release())
     advance(session, 1)
     recorded = session.recorded()
-    count = time_grid(recorded).steps_per_frame
-    active = schedule(recorded, time_grid(recorded), 0, 16 * count).active
+    count = plan_of(recorded).grid.steps_per_frame
+    active = schedule(plan_of(recorded), 0, 16 * count).active
     assert (active[: 15 * count] == 1).all()
     assert active[15 * count] == 0.5, "the mean at the instant of the release"
     assert (active[15 * count + 1 :] == 0).all()
@@ -353,7 +352,7 @@ def test_a_film_without_a_picture_is_none(begin: Begin) -> None:
     session = begin(TILTED)
     session.handle(Key("g"))
     session.handle(Key("g"))
-    assert session.notice == "the film had no picture yet"
+    assert session.notice == "no film was saved: it had no picture yet"
     assert list(Path("captures").iterdir()) == []
 
 
@@ -362,12 +361,9 @@ def test_a_film_that_cannot_go_on_ends_and_the_session_goes_on(begin: Begin) -> 
     session.handle(Key("g"))
     session.picture()
     subprocess.run(["pkill", "-KILL", "-P", str(os.getpid())], check=True)
-    for _ in range(20):
+    while not session.notice:
         session.advance()
         session.picture()
-        if session.notice:
-            break
-        time.sleep(0.05)
     assert session.notice.startswith("captures: cannot write: ")
     assert list(Path("captures").iterdir()) == []
     session.handle(Key("g"))
@@ -433,7 +429,7 @@ def test_two_albums_of_one_folder_keep_both_films(begin: Begin) -> None:
 
 def test_a_name_of_two_lines_is_one_in_the_comment(small: Path) -> None:
     keeper = Captures(Path("captures"), "a\nb: [.yaml")
-    assert load_scene(keeper.keep_scene(load_scene("small.yaml"))).sheet == load_scene("small.yaml").sheet
+    assert load_scene(keeper.save_scene(load_scene("small.yaml"))).sheet == load_scene("small.yaml").sheet
 
 
 def test_a_sheet_that_nothing_holds_may_fly_after_a_press(begin: Begin) -> None:
@@ -486,15 +482,15 @@ def test_a_session_that_diverged_says_so_and_can_be_reset(begin: Begin) -> None:
 )
 def test_a_session_has_as_many_frames_as_a_screen_shows(rate: float, step: Any, parts: int, small: Path) -> None:
     scene = load_scene("small.yaml", {"time.frames_per_second": rate, "time.duration": 1, "time.step": step})
-    live, found = with_live_frames(scene)
-    assert (live.time.frames_per_second, found) == (rate * parts, parts)
+    live, found = with_live_frames(plan_of(scene))
+    assert (live.scene.time.frames_per_second, found) == (rate * parts, parts)
 
 
 def test_a_given_step_stays(small: Path) -> None:
     scene = load_scene("small.yaml", {"time.frames_per_second": 20, "time.duration": 1, "time.step": 0.002})
-    live, parts = with_live_frames(scene)
+    live, parts = with_live_frames(plan_of(scene))
     assert parts == 1, "25 steps a frame cannot be cut into three frames, nor two"
-    assert time_grid(live).steps_per_frame == 25
+    assert live.grid.steps_per_frame == 25
 
 
 @pytest.mark.parametrize(
@@ -545,13 +541,13 @@ def rod_pixels(session: Session) -> set[tuple[int, int]]:
 def test_the_instrument_is_under_the_pointer(begin: Begin) -> None:
     session = begin({**TILTED, **ROD})
     for x, y in ((40, 60), (80, 50)):
-        session.handle(Point(x, y))
+        session.handle(Hover(x, y))
         pixels = rod_pixels(session)
         assert any(abs(column - x) <= 3 and abs(row - y) <= 3 for column, row in pixels), "the tip is there"
         assert 20 < len(pixels) < 3000
     session.handle(Press(60, 55))
     session.advance()
-    session.handle(Point(20, 20))
+    session.handle(Hover(20, 20))
     held = rod_pixels(session)
     assert any(abs(column - 60) <= 4 and abs(row - 55) <= 4 for column, row in held), "while it presses it stays"
 
@@ -559,7 +555,7 @@ def test_the_instrument_is_under_the_pointer(begin: Begin) -> None:
 def test_without_an_instrument_the_pointer_changes_nothing(begin: Begin) -> None:
     session = begin(TILTED)
     before = session.picture()
-    session.handle(Point(40, 60))
+    session.handle(Hover(40, 60))
     np.testing.assert_array_equal(session.picture(), before)
 
 

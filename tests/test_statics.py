@@ -12,11 +12,10 @@ from taichi_msm import reference
 from taichi_msm.physics.lattice import fixed_points
 from taichi_msm.physics.loads import loads_at
 from taichi_msm.physics.state import State
-from taichi_msm.physics.timestep import time_grid
 from taichi_msm.scene import Scene
 from taichi_msm.system.runtime import Device
 from tests.motion import dynamics_of
-from tests.scenes import SPRINGS, scene
+from tests.scenes import SPRINGS, plan_of, scene
 
 SHEET = {"points": [6, 7], "size": [0.3, 0.4], "mass": 1e-3}
 
@@ -26,14 +25,14 @@ def residual(made: Scene, moving: NDArray[np.float64]) -> NDArray[np.float64]:
     free = ~fixed_points(made.sheet)
     u = np.zeros((*made.sheet.points, 3))
     u[free] = moving.reshape(-1, 3)
-    return reference.force(made, u, loads_at(made, np.array([made.time.duration])), 0)[free].ravel()
+    return reference.force(made, u, loads_at(plan_of(made), np.array([made.time.duration])), 0)[free].ravel()
 
 
 def test_a_sheet_comes_to_rest_where_the_forces_balance(device: Device) -> None:
     probe = {"at": [0.4, 0.6], "force": [0.01, 0.02, -0.1], "load": [[0, 0], [0.1, 100]], "falloff": 20, "offset": 0}
     made = scene(sheet=SHEET, probes=[probe], damping=0.05, time={"duration": 12.0})
     dynamics = dynamics_of(made, device)
-    dynamics.advance(time_grid(made).steps)
+    dynamics.advance(plan_of(made).grid.steps)
     u = dynamics.displacement()
     dynamics.close()
     moving = u[~fixed_points(made.sheet)].ravel()
@@ -47,7 +46,7 @@ def test_a_sheet_comes_to_rest_where_the_forces_balance(device: Device) -> None:
 def test_small_motions_have_the_frequencies_of_the_stiffness(device: Device) -> None:
     springs = {**SPRINGS, "virtual_active": "always"}
     made = scene(sheet=SHEET, springs=springs, probes=[], damping=0, time={"duration": 0.4})
-    free, grid, m = ~fixed_points(made.sheet), time_grid(made), made.sheet.mass
+    free, grid, m = ~fixed_points(made.sheet), plan_of(made).grid, made.sheet.mass
     size, small = 3 * int(free.sum()), 1e-7
     rows = [(residual(made, small * one) - residual(made, -small * one)) / (2 * small) for one in np.eye(size)]
     stiffness = -np.array(rows)
@@ -58,7 +57,7 @@ def test_small_motions_have_the_frequencies_of_the_stiffness(device: Device) -> 
         shape = np.zeros((*made.sheet.points, 3))
         # So small that what is not linear in it is less than rounding, and far above that.
         shape[free] = 1e-9 * vectors[:, mode].reshape(-1, 3)
-        dynamics.restart(made, grid, State(1, shape, shape * (1 - math.cos(theta))))
+        dynamics.restart(plan_of(made), State(1, shape, shape * (1 - math.cos(theta))))
         dynamics.advance(grid.steps)
         found = float((dynamics.displacement() * shape).sum() / (shape * shape).sum())
         assert abs(found - math.cos(grid.steps * theta)) < 1e-5, mode

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from contextlib import closing
 from pathlib import Path
 from types import SimpleNamespace
@@ -14,8 +15,9 @@ from pydantic import BaseModel
 from taichi_msm import reference
 from taichi_msm.physics.lattice import rest_positions
 from taichi_msm.physics.mesh_error import with_points
+from taichi_msm.physics.plan import Plan
 from taichi_msm.physics.solver import Dynamics
-from taichi_msm.physics.timestep import stable_step, time_grid, with_time
+from taichi_msm.physics.timestep import with_time
 from taichi_msm.runner import run
 from taichi_msm.scene import Scene
 from taichi_msm.study import measure, pictures, terms
@@ -27,9 +29,8 @@ from taichi_msm.study.result import Drawn, Stepping, Study, Timing
 from taichi_msm.study.stepping import MARGIN, ROUNDS, SteppingStudy, observed_orders
 from taichi_msm.study.terms import TermStudy, variants
 from taichi_msm.system.runtime import Device
-from taichi_msm.timegrid import TimeGrid
 from tests.motion import frames_on, structure_of
-from tests.scenes import PRESS, SPRINGS, scene, speckle
+from tests.scenes import PRESS, SPRINGS, plan_of, scene, speckle
 
 SOFT_PRESS = {**PRESS, "force": [0, 300, -1000]}
 
@@ -42,7 +43,7 @@ def nothing(done: int, total: int) -> None:
 def stepping(device: Device) -> Any:
     """A study of a small scene with a release on a step."""
     made = scene(probes=[SOFT_PRESS], damping=0.02, time={"damping_difference": "backward"})
-    with closing(SteppingStudy(made, device, 0.05, nothing)) as measured:
+    with closing(SteppingStudy(plan_of(made), device, 0.05, nothing)) as measured:
         measured.run()
         yield measured
 
@@ -52,7 +53,7 @@ def test_stepping_starts_at_the_largest_stable_step_and_halves_it(stepping: Step
     assert {point.method for point in points} == {"f32 central", "f32 backward", "f64 central", "f64 backward"}
     for method in ("f32 central", "f64 backward"):
         steps = [point.step for point in points if point.method == method]
-        limit = stable_step(with_time(stepping.scene, damping_difference=method.split()[1]))
+        limit = plan_of(with_time(stepping.plan.scene, damping_difference=method.split()[1])).stable_step
         assert 0.5 * limit < steps[0] <= limit
         np.testing.assert_allclose(np.divide(steps[:-1], steps[1:]), 2)
         assert len(steps) >= 3
@@ -62,7 +63,7 @@ def test_stepping_starts_at_the_largest_stable_step_and_halves_it(stepping: Step
 
 def test_errors_of_stepping_are_those_of_the_twin(stepping: SteppingStudy) -> None:
     point = next(point for point in stepping.points() if point.method == "f64 backward")
-    made = with_time(stepping.scene, step=point.step, precision="f64")
+    made = with_time(stepping.plan.scene, step=point.step, precision="f64")
     exact = reference.simulate(with_time(made, step=point.step / 64, damping_difference="central"))
     wrong = reference.simulate(made) - exact
     largest = np.linalg.norm(exact - exact[0], axis=-1).max()
@@ -75,8 +76,8 @@ def test_errors_of_stepping_are_those_of_the_twin(stepping: SteppingStudy) -> No
 def test_the_reference_is_as_exact_as_it_says(stepping: SteppingStudy) -> None:
     assert stepping.frames is not None
     assert stepping.reference is not None
-    made = with_time(stepping.scene, damping_difference="central")
-    solved, _ = solve(made, 1e-12, 1e-14, float("inf"), lambda: None)
+    made = with_time(stepping.plan.scene, damping_difference="central")
+    solved, _ = solve(plan_of(made), 1e-12, 1e-14, float("inf"), lambda: None)
     error = np.linalg.norm(solved - stepping.frames, axis=-1).max() / stepping.reference.largest
     # The integrator keeps 1e-12 a step, of some thousand steps.
     assert error < stepping.reference.error + 1e-9
@@ -105,7 +106,7 @@ def test_orders_are_fitted_above_the_rounding_floor() -> None:
 def test_a_series_halves_its_steps_though_they_miss_a_jump(device: Device) -> None:
     # A release at 3.25 frames, which no ninth of a frame meets.
     made = scene(probes=[{**SOFT_PRESS, "load": [[0, 100], [0.13, 100], [0.13, 0]]}], time={"duration": 0.2})
-    with closing(SteppingStudy(made, device, 0.001, nothing)) as measured:
+    with closing(SteppingStudy(plan_of(made), device, 0.001, nothing)) as measured:
         measured.run()
         counts = [point.steps_per_frame for point in measured.points() if point.method == "f64 central"]
     assert counts == [9, 18, 36]
@@ -115,7 +116,7 @@ def test_dop853_solves_moving_and_jumping_probes() -> None:
     at = [[0, 0.2, 0.3], [0.2, 0.6, 0.5], [0.2, 0.4, 0.4], [0.3, 0.5, 0.7]]
     probe = {"at": at, "force": [200, 100, -500], "load": [[0.05, 50], [0.3, 100], [0.3, 0]], "falloff": 20}
     made = scene(probes=[probe], springs={**SPRINGS, "virtual": 5}, time={"step": 0.04 / 320})
-    solved, evaluations = solve(made, 1e-8, 1e-12, float("inf"), lambda: None)
+    solved, evaluations = solve(plan_of(made), 1e-8, 1e-12, float("inf"), lambda: None)
     coarse, fine = (
         (reference.simulate(with_time(made, step=0.04 / cut)) - rest_positions(made.sheet))[1:] for cut in (160, 320)
     )
@@ -140,14 +141,14 @@ def test_an_error_near_that_of_the_reference_is_not_known(stepping: SteppingStud
 
 def test_dop853_gives_up_in_time() -> None:
     with pytest.raises(TooSlowError):
-        solve(scene(), 1e-3, 1e-6, 0.0, lambda: None)
+        solve(plan_of(scene()), 1e-3, 1e-6, 0.0, lambda: None)
 
 
 def test_dop853_fails_where_no_step_is_small_enough(monkeypatch: pytest.MonkeyPatch) -> None:
     failed = SimpleNamespace(success=False, t=np.array([0.04, 0.08]))
     monkeypatch.setattr("scipy.integrate.solve_ivp", lambda *_, **__: failed)
     with pytest.raises(FailedError, match=r"^after 0.08 s$"):
-        solve(scene(), 1e-4, 1e-6, float("inf"), lambda: None)
+        solve(plan_of(scene()), 1e-4, 1e-6, float("inf"), lambda: None)
 
 
 @pytest.mark.parametrize(
@@ -170,7 +171,7 @@ def test_why_dop853_is_left_out_is_told(
 
     monkeypatch.setattr(measure, "solve", solve)
     found = Study("press", scene().model_dump(), "complete", 1e-3, {})
-    measure._measure_peer(scene(), stepping, measure.QUICK, found, lambda stage, done, total: None)
+    measure._measure_peer(plan_of(scene()), stepping, measure.QUICK, found, lambda stage, done, total: None)
     who = "DOP853, SciPy's general integrator, which the study compares its own steps with,"
     assert found.notes == [f"{who} {said}; no other figure depends on it"]
 
@@ -202,19 +203,19 @@ def test_all_terms_are_timed_on_the_grid_of_the_whole_scene(device: Device, monk
     grids = []
 
     class Recorded(Dynamics):
-        def __init__(self, scene: Scene, grid: TimeGrid, device: Device) -> None:
-            grids.append(grid)
-            super().__init__(scene, grid, device)
+        def __init__(self, plan: Plan, device: Device) -> None:
+            grids.append(plan.grid)
+            super().__init__(plan, device)
 
     monkeypatch.setattr(terms, "Dynamics", Recorded)
     made = scene(time={"precision": "auto"})
-    TermStudy(made, device, 0.0001, nothing).run()
+    TermStudy(plan_of(made), device, 0.0001, nothing).run()
     assert len(grids) == len(list(variants(made)))
-    assert set(grids) == {time_grid(made)} != {time_grid(variant) for _, variant in variants(made)}
+    assert set(grids) == {plan_of(made).grid} != {plan_of(variant).grid for _, variant in variants(made)}
 
 
 def test_terms_are_timed(device: Device) -> None:
-    measured = TermStudy(scene(damping=0, springs={"shear": 10}), device, 0.001, nothing)
+    measured = TermStudy(plan_of(scene(damping=0, springs={"shear": 10})), device, 0.001, nothing)
     measured.run()
     assert [term.without for term in measured.points()] == ["", "springs.shear", "probes.0"]
     assert all(1e-8 < term.seconds.median < 1e-2 and term.seconds.runs == 9 for term in measured.points())
@@ -240,7 +241,7 @@ def tissue(points: tuple[int, int] = (33, 33), **time: Any) -> Scene:
 
 @pytest.fixture(scope="module")
 def points(device: Device) -> PointStudy:
-    measured = PointStudy(tissue(), device, 2.0, nothing)
+    measured = PointStudy(plan_of(tissue()), device, 2.0, nothing)
     measured.run()
     return measured
 
@@ -261,10 +262,10 @@ def test_the_error_of_points_is_of_order_2(points: PointStudy) -> None:
 
 def test_the_error_of_points_is_that_against_many_more(points: PointStudy, device: Device) -> None:
     many = tissue((65, 65))
-    grid = time_grid(many)
+    steps = plan_of(many).grid.steps_per_frame
 
     def displacements(count: int) -> Any:
-        return frames_on(with_points(many, (count, count)), grid, device)
+        return frames_on(plan_of(with_points(many, (count, count))).with_grid(steps_per_frame=steps), device)
 
     exact = displacements(65)
     largest = np.linalg.norm(exact, axis=-1).max()
@@ -285,7 +286,7 @@ def test_the_estimate_beside_it_is_that_of_a_run(points: PointStudy, device: Dev
 
 
 def test_without_time_for_more_points_the_error_of_the_finest_is_a_bound(points: PointStudy, device: Device) -> None:
-    measured = PointStudy(tissue(), device, 1e-6, nothing)
+    measured = PointStudy(plan_of(tissue()), device, 1e-6, nothing)
     measured.run()
     found, better = measured.points(), points.points()
     assert measured.notes == ["65 x 65 points were not measured: time or memory"]
@@ -300,22 +301,26 @@ def test_where_the_finest_is_the_reference_its_error_is_never_known(device: Devi
     made = tissue((13, 13))
     assert made.tissue is not None
     slack = made.model_copy(update={"tissue": made.tissue.model_copy(update={"pretension": 0.0, "foundation": 2e6})})
-    measured = PointStudy(slack, device, 1e-6, nothing)
+    measured = PointStudy(plan_of(slack), device, 1e-6, nothing)
     measured.run()
     assert [one.known for one in measured.points()] == [True, False]
 
 
+def points_of(plans: Iterable[Plan]) -> list[tuple[int, int]]:
+    return [plan.scene.sheet.points for plan in plans]
+
+
 def test_points_are_quarters_and_halves_of_the_cells() -> None:
-    assert list(lattices(tissue((31, 31)))) == [(9, 9), (16, 16), (31, 31)]
-    assert list(lattices(tissue((41, 25)))) == [(11, 7), (21, 13), (41, 25)]
+    assert points_of(lattices(plan_of(tissue((31, 31))))) == [(9, 9), (16, 16), (31, 31)]
+    assert points_of(lattices(plan_of(tissue((41, 25))))) == [(11, 7), (21, 13), (41, 25)]
     # Too few to be compared with half as many; and cells that would be too long.
-    assert list(lattices(tissue((13, 15)))) == [(7, 8), (13, 15)]
-    assert list(lattices(tissue((6, 6)))) == []
-    assert list(lattices(tissue((46, 27)))) == [(23, 14), (46, 27)]
+    assert points_of(lattices(plan_of(tissue((13, 15))))) == [(7, 8), (13, 15)]
+    assert points_of(lattices(plan_of(tissue((6, 6))))) == []
+    assert points_of(lattices(plan_of(tissue((46, 27))))) == [(23, 14), (46, 27)]
 
 
 def test_a_sheet_of_too_few_points_is_left_out(device: Device) -> None:
-    measured = PointStudy(tissue((6, 6)), device, 1.0, nothing)
+    measured = PointStudy(plan_of(tissue((6, 6))), device, 1.0, nothing)
     measured.run()
     assert measured.points() == []
     assert measured.notes == ["points were not measured: with fewer than 7 a side they cannot be compared"]
@@ -323,7 +328,7 @@ def test_a_sheet_of_too_few_points_is_left_out(device: Device) -> None:
 
 def test_springs_have_no_part_of_points(device: Device) -> None:
     made = Study("press", scene().model_dump(), "complete", 1e-3, {})
-    measure._measure_points(scene(), device, measure.QUICK, made, lambda stage, done, total: None)
+    measure._measure_points(plan_of(scene()), device, measure.QUICK, made, lambda stage, done, total: None)
     assert (made.points, made.notes) == ([], [])
 
 
@@ -336,7 +341,7 @@ def test_an_interruption_leaves_the_points_that_were_timed(device: Device) -> No
             raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):
-        measure._measure_points(tissue((13, 13)), device, measure.QUICK, made, stop)
+        measure._measure_points(plan_of(tissue((13, 13))), device, measure.QUICK, made, stop)
     assert [(one.name, one.seconds.runs) for one in made.points] == [("7 x 7", 1)]
     assert made.points[0].error is not None
 
@@ -420,8 +425,8 @@ def test_the_step_recommended_is_one_that_a_scene_takes() -> None:
     made = Study("press", scene().model_dump(), "complete", 1e-3, {})
     made.stepping = [stepping_point(1e-4, 1.0, step=1 / 25 / 77, steps_per_frame=77)]
     text = made.recommendation()[1].split(": ")[1]
-    assert time_grid(with_time(scene(), step=float(text))).steps_per_frame == 77
-    assert time_grid(scene(time={"step": float(text)})).step == 1 / (25 * 77)
+    assert plan_of(with_time(scene(), step=float(text))).grid.steps_per_frame == 77
+    assert plan_of(scene(time={"step": float(text)})).grid.step == 1 / (25 * 77)
 
 
 def test_of_one_method_the_largest_step_is_recommended() -> None:
@@ -439,7 +444,7 @@ def test_an_interruption_leaves_what_is_done(device: Device) -> None:
         if calls > 90:
             raise KeyboardInterrupt
 
-    with closing(SteppingStudy(scene(probes=[SOFT_PRESS]), device, 0.01, stop)) as measured:
+    with closing(SteppingStudy(plan_of(scene(probes=[SOFT_PRESS])), device, 0.01, stop)) as measured:
         with pytest.raises(KeyboardInterrupt):
             measured.run()
         assert measured.reference is not None

@@ -12,10 +12,11 @@ import pytest
 from taichi_msm import Simulation
 from taichi_msm.physics.error_control import choose_step
 from taichi_msm.physics.loads import schedule
-from taichi_msm.physics.timestep import stable_step, time_grid, with_grid
+from taichi_msm.physics.planning import on
+from taichi_msm.physics.timestep import with_chosen_grid
 from taichi_msm.system.runtime import Device
 from taichi_msm.timegrid import TimeGrid
-from tests.scenes import PRESS, scene
+from tests.scenes import PRESS, plan_of, scene
 
 
 def test_a_grid_counts_whole_steps() -> None:
@@ -36,8 +37,8 @@ def test_a_time_is_rounded_once() -> None:
 
 def test_the_loads_are_those_of_the_grid() -> None:
     made = scene(springs={}, probes=[{"force": [100, 0, 0], "load": [[0, 0], [10, 1000]]}], time={"step": 0.04})
-    grid = replace(time_grid(made), steps_per_frame=13)
-    found = schedule(made, grid, 5, 100).strength[:, 0, 0]
+    plan = plan_of(made).with_grid(steps_per_frame=13)
+    found, grid = schedule(plan, 5, 100).strength[:, 0, 0], plan.grid
     np.testing.assert_allclose(found, [100 * grid.time(n) for n in range(5, 105)], rtol=1e-12)
 
 
@@ -54,45 +55,46 @@ def test_the_loads_are_those_of_the_grid() -> None:
 )
 def test_a_scene_into_which_its_grid_is_written_gives_it_again(time: dict[str, Any], arch: str) -> None:
     made = scene(time=time)
-    grid = time_grid(made, arch)
-    written = with_grid(made, grid)
+    plan = on(plan_of(made), arch)
+    written = with_chosen_grid(plan).scene
     for other in ("cpu", "cuda", "vulkan"):
-        assert time_grid(written, other) == grid
+        assert on(plan_of(written), other).grid == plan.grid
     assert written.time.step == made.time.step, "what follows from the scene is left to it"
-    assert with_grid(written, grid) == written
+    assert with_chosen_grid(plan_of(written)).scene == written
 
 
 @pytest.mark.parametrize("rate", [10.0, 24.0, 29.97, 1e-3, 1e5])
 @pytest.mark.parametrize("count", [1, 7, 49, 12_345, 10**7 + 1])
 def test_a_step_that_a_tolerance_chose_is_written_and_read_again(rate: float, count: int) -> None:
     made = scene(time={"frames_per_second": rate, "duration": 3 / rate, "tolerance": 1e-3})
-    grid = replace(time_grid(made), steps_per_frame=count)
-    written = with_grid(made, grid)
-    assert time_grid(written) == grid
+    plan = plan_of(made).with_grid(steps_per_frame=count)
+    written = with_chosen_grid(plan).scene
+    assert plan_of(written).grid == plan.grid
     assert written.time.tolerance is None
 
 
 def test_the_step_is_at_most_half_the_limit_unless_it_is_given() -> None:
     made = scene()
-    grid = time_grid(made)
-    assert grid.step <= stable_step(made) / 2 < replace(grid, steps_per_frame=grid.steps_per_frame - 1).step
-    assert time_grid(scene(time={"step": 0.004})).steps_per_frame == 10
+    grid = plan_of(made).grid
+    assert grid.step <= plan_of(made).stable_step / 2 < replace(grid, steps_per_frame=grid.steps_per_frame - 1).step
+    assert plan_of(scene(time={"step": 0.004})).grid.steps_per_frame == 10
 
 
 def test_a_tolerance_is_met_in_f64_on_a_cpu_whatever_the_work() -> None:
     large = {"points": [1024, 1024], "size": [0.3, 0.3], "mass": 1e-3}
     made = scene(sheet=large, time={"precision": "auto"})
     precise = scene(sheet=large, time={"precision": "auto", "tolerance": 1e-3})
-    assert (time_grid(made).precision, time_grid(precise).precision) == ("f32", "f64")
-    assert time_grid(precise, "cuda").precision == "f32"
+    assert (plan_of(made).grid.precision, plan_of(precise).grid.precision) == ("f32", "f64")
+    assert on(plan_of(precise), "cuda").grid.precision == "f32"
 
 
 def test_a_simulation_has_the_scene_that_gives_its_grid(device: Device) -> None:
     made = scene(probes=[{**PRESS, "force": [0, 0, -300]}], damping=0.02, time={"tolerance": 3e-4, "precision": "auto"})
-    grid, estimate = choose_step(made, time_grid(made), device)
-    assert grid == replace(time_grid(made), steps_per_frame=estimate.steps_per_frame)
+    plan, estimate = choose_step(plan_of(made), device)
+    grid = plan.grid
+    assert grid == replace(plan_of(made).grid, steps_per_frame=estimate.steps_per_frame)
     with Simulation(made, threads=device.threads) as simulation:
-        assert time_grid(simulation.scene) == grid
-        assert simulation.scene == with_grid(made, grid)
+        assert plan_of(simulation.scene).grid == grid
+        assert simulation.scene == with_chosen_grid(plan).scene
         simulation.advance()
         assert simulation.steps == grid.steps_per_frame

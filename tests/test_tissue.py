@@ -16,12 +16,13 @@ from PIL import Image
 from taichi_msm import reference
 from taichi_msm.console import summary
 from taichi_msm.errors import ArgumentError, FilesError, SceneError
-from taichi_msm.physics import kernel_gpu, probe_force, stiffness_map
+from taichi_msm.physics import kernel_gpu, probe_force
 from taichi_msm.physics.error_control import longest
 from taichi_msm.physics.lattice import rest_positions
-from taichi_msm.physics.material import factors, material, stiffness
+from taichi_msm.physics.material import stiffness
 from taichi_msm.physics.mesh_error import FEWEST, CubicSampling, MeshEstimate, MeshPilot, choose_points, coarser
-from taichi_msm.physics.timestep import stable_step, time_grid
+from taichi_msm.physics.plan import Plan
+from taichi_msm.physics.stiffness_map import MapImage
 from taichi_msm.runner import resume, run
 from taichi_msm.scene import Scene
 from taichi_msm.scenefile.load import load_scene
@@ -30,7 +31,7 @@ from taichi_msm.simulation import Simulation
 from taichi_msm.system.runtime import Device
 from tests.motion import dynamics_of, frames, structure_of
 from tests.outputs import results
-from tests.scenes import random_scene, random_tissue
+from tests.scenes import plan_of, random_scene, random_tissue
 from tests.test_dynamics import as_on_a_gpu, simulate
 
 SCENE = """\
@@ -79,7 +80,7 @@ SEEDS = [0, 1, 2, 7, 9, 10]
     "seed", [pytest.param(seed, marks=() if seed in SEEDS else pytest.mark.slow) for seed in range(24)]
 )
 def test_a_random_tissue_is_like_the_twin(seed: int, image: str, device: Device) -> None:
-    made = checked(random_tissue(seed, image))
+    made = checked(random_tissue(seed, image)).scene
     twin = reference.simulate(made) - rest_positions(made.sheet)
     np.testing.assert_allclose(simulate(made, device), twin, rtol=0, atol=1e-12 * np.abs(twin).max())
 
@@ -88,7 +89,7 @@ def test_a_random_tissue_is_like_the_twin(seed: int, image: str, device: Device)
     "seed", [0, 7, pytest.param(4, marks=pytest.mark.fuzz), pytest.param(9, marks=pytest.mark.fuzz)]
 )
 def test_in_f32_it_is_like_the_twin_but_for_rounding(seed: int, image: str, device: Device) -> None:
-    made = checked(random_tissue(seed, image, "f32"))
+    made = checked(random_tissue(seed, image, "f32")).scene
     twin = reference.simulate(made) - rest_positions(made.sheet)
     np.testing.assert_allclose(simulate(made, device), twin, rtol=0, atol=2e-4 * np.abs(twin).max())
 
@@ -111,7 +112,7 @@ def test_bands_do_not_change_the_bits(seed: int, image: str, device: Device) -> 
     plain = simulate(made, device)
     assert simulate(made, device, replace(layout, workers=2)).tobytes() == plain.tobytes()
     dynamics = dynamics_of(made, device, replace(layout, workers=3))
-    for _ in range(time_grid(made).steps):
+    for _ in range(plan_of(made).grid.steps):
         dynamics.advance(1)
     assert dynamics.displacement().tobytes() == plain[-1].tobytes()
     dynamics.close()
@@ -134,9 +135,9 @@ def test_the_form_of_a_gpu_gives_the_same_bits(
 def test_the_energy_is_that_of_the_twin(seed: int, image: str, device: Device) -> None:
     made = random_tissue(seed, image)
     dynamics = dynamics_of(made, device)
-    dynamics.advance(2 * time_grid(made).steps_per_frame)
+    dynamics.advance(2 * plan_of(made).grid.steps_per_frame)
     state, reading = dynamics.state(), dynamics.read()
-    v = state.difference / time_grid(made).step
+    v = state.difference / plan_of(made).grid.step
     mass = reference.sheet(made).mass[..., None]
     expected = float((mass * v * v).sum()) / 2 + reference.energy(made, state.displacement)
     assert reading.energy == pytest.approx(expected, rel=1e-9)
@@ -157,7 +158,10 @@ def test_a_map_of_springs_is_like_the_twin(load: Any, device: Device) -> None:
     twin = reference.simulate(made) - rest_positions(made.sheet)
     np.testing.assert_allclose(simulate(made, device), twin, rtol=0, atol=1e-12 * np.abs(twin).max())
     # A spring has the mean of its cells; at an edge it has one.
-    factor, (across, down, diagonal) = factors(made), stiffness(made)
+    material = plan_of(made).material
+    factor = material.factors
+    assert factor is not None
+    across, down, diagonal = stiffness(material, factor)
     np.testing.assert_allclose(across[[0, -1]], 20 * factor[[0, -1]], rtol=1e-15)
     np.testing.assert_allclose(across[1:-1], 10 * (factor[1:] + factor[:-1]), rtol=1e-15)
     np.testing.assert_allclose(down[:, 1:-1], 10 * (factor[:, 1:] + factor[:, :-1]), rtol=1e-15)
@@ -169,22 +173,26 @@ def test_a_map_of_one_grey_changes_nothing(load: Any, tmp_path: Path, device: De
     plain = load("tissue.young=6.0e4", "sheet.fixed=none")
     mapped = load("tissue.map={image: map.png, range: [1, 6]}", "sheet.fixed=none")
     np.testing.assert_allclose(
-        frames(mapped, device), frames(plain, device, time_grid(mapped).steps_per_frame), rtol=1e-9
+        frames(mapped, device), frames(plain, device, plan_of(mapped).grid.steps_per_frame), rtol=1e-9
     )
 
 
-def test_a_map_is_read_when_a_scene_is_loaded(load: Any, tmp_path: Path) -> None:
-    mapped = "tissue.map={image: map.png, range: [1, 2]}"
-    made = load(mapped)
-    before, limit = factors(made).copy(), stable_step(made)
+def test_a_map_is_read_once_for_a_run(load: Any, tmp_path: Path, device: Device) -> None:
+    """Also for the pilots with fewer points, whatever happens to its file meanwhile."""
+    made = load("tissue.map={image: map.png, range: [1, 2]}", "output=[trajectory]")
+    plan = plan_of(made)
+    before = run(plan, tmp_path / "before", threads=device.threads, estimate_error=True)
     Image.new("L", (3, 3), 51).save(tmp_path / "map.png")
-    assert (factors(made) == before).all()
-    assert stable_step(made) == limit
+    assert run(plan, tmp_path / "after", threads=device.threads, estimate_error=True)["sha256"] == before["sha256"]
     (tmp_path / "map.png").rename(tmp_path / "other.png")
-    assert (factors(made) == before).all(), "a run goes on"
+    gone = run(plan, tmp_path / "gone", threads=device.threads, estimate_error=True)
+    assert gone["max_displacement"] == before["max_displacement"]
+    assert gone["error_estimate"] == before["error_estimate"]
     (tmp_path / "other.png").rename(tmp_path / "map.png")
-    np.testing.assert_allclose(factors(load(mapped)), 1.2)
-    assert stable_step(load(mapped)) > limit
+    factors = plan_of(made).material.factors
+    assert factors is not None
+    np.testing.assert_allclose(factors, 1.2)
+    assert plan_of(made).stable_step > plan.stable_step
 
 
 def test_where_the_tool_lets_go_a_tense_sheet_comes_back(load: Any, device: Device) -> None:
@@ -310,7 +318,7 @@ def test_a_map_that_is_no_picture_is_named(load: Any, tmp_path: Path) -> None:
 
 
 def test_the_numbers_of_the_sheet(load: Any) -> None:
-    made = material(load("tissue.bending=plate", "tissue.pretension=9"))
+    made = plan_of(load("tissue.bending=plate", "tissue.pretension=9")).material
     dx, dy = 0.1 / 14, 0.1 / 12
     assert made.mass == pytest.approx(1050 * 2e-3 * dx * dy)
     assert made.across == pytest.approx(60 * (9 / 8 * dy / dx - 3 / 8 * dx / dy))
@@ -351,9 +359,9 @@ def test_the_mesh_error_is_that_of_the_points(count: int, load: Any, device: Dev
     tense = ("tissue.pretension=20", "tissue.foundation=0")
     smooth = (*tense, "probes.0.radius=0", "probes.0.at=[-0.3, 0.4]", "probes.0.falloff=10")
     made = load(f"sheet.points=[{count}, {count}]", *smooth)
-    coarse = coarser(made)
+    coarse = coarser(plan_of(made))
     assert coarse is not None
-    with closing(MeshPilot(made, time_grid(made), coarse, device)) as pilot:
+    with closing(MeshPilot(plan_of(made), coarse, device)) as pilot:
         for u in (found := frames(made, device)):
             pilot.follow(u, lambda: None)
     fine = frames(load(f"sheet.points=[{4 * count - 3}, {4 * count - 3}]", *smooth), device)[:, ::4, ::4]
@@ -373,9 +381,9 @@ def test_the_pilot_of_the_points_samples_cubics_exactly() -> None:
 
 
 def test_few_points_and_springs_have_no_mesh_error(load: Any, image: str) -> None:
-    assert coarser(load(f"sheet.points=[{FEWEST}, 9]", "sheet.size=[0.1, 0.13]")) is not None
-    assert coarser(load(f"sheet.points=[{FEWEST - 1}, 7]", "sheet.size=[0.1, 0.13]")) is None
-    assert coarser(random_scene(1)) is None
+    assert coarser(plan_of(load(f"sheet.points=[{FEWEST}, 9]", "sheet.size=[0.1, 0.13]"))) is not None
+    assert coarser(plan_of(load(f"sheet.points=[{FEWEST - 1}, 7]", "sheet.size=[0.1, 0.13]"))) is None
+    assert coarser(plan_of(random_scene(1))) is None
 
 
 def test_a_tolerance_of_the_points_chooses_them(load: Any, device: Device, tmp_path: Path) -> None:
@@ -387,7 +395,7 @@ def test_a_tolerance_of_the_points_chooses_them(load: Any, device: Device, tmp_p
     assert record["scene"]["sheet"]["points"] == record["points"]
     assert record["asked"]["sheet.tolerance"] == 0.02
     assert record["asked"]["sheet.points"] == made.sheet.points
-    assert record["points"] == list(choose_points(made, device, checked)[0].sheet.points)
+    assert record["points"] == list(choose_points(plan_of(made), device, checked)[0].scene.sheet.points)
     assert record["points"] > [13, 15]
     with Simulation(made, threads=device.threads) as simulation:
         assert simulation.positions().shape[:2] == tuple(record["points"])
@@ -396,13 +404,13 @@ def test_a_tolerance_of_the_points_chooses_them(load: Any, device: Device, tmp_p
 def test_a_tolerance_that_no_points_meet_is_refused(load: Any, device: Device, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("taichi_msm.physics.mesh_error.MAX_POINTS", 40)
     with pytest.raises(SceneError, match=r"sheet.tolerance: 0.0001 is out of reach: with \d+ x \d+ points the error"):
-        choose_points(load("sheet.tolerance=0.0001"), device, checked)
+        choose_points(plan_of(load("sheet.tolerance=0.0001")), device, checked)
 
 
 def test_a_tolerance_keeps_the_shape_of_the_cells(load: Any, device: Device) -> None:
     made = load("sheet.tolerance=0.2", *SMOOTH, "sheet.size=[0.1, 0.2]", "sheet.points=[3, 5]")
-    found, _ = choose_points(made, device, checked)
-    rows, cols = found.sheet.points
+    found, _ = choose_points(plan_of(made), device, checked)
+    rows, cols = found.scene.sheet.points
     assert (cols - 1) / (rows - 1) == pytest.approx(2, rel=0.1)
 
 
@@ -410,10 +418,15 @@ def test_a_tolerance_far_out_of_reach_is_refused_after_one_run(
     load: Any, device: Device, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     tried: list[tuple[int, int]] = []
+
+    def check(scene: Scene, image: MapImage | None) -> Plan:
+        tried.append(scene.sheet.points)
+        return checked(scene, image)
+
     with pytest.raises(
         SceneError, match=r"1e-10 is out of reach: with 13 x 15 points the error is 0\.\d+, and no sheet"
     ):
-        choose_points(load("sheet.tolerance=1e-10", *SMOOTH), device, lambda one: tried.append(one.sheet.points))
+        choose_points(plan_of(load("sheet.tolerance=1e-10", *SMOOTH)), device, check)
     assert tried == [(13, 15)]
 
 
@@ -428,9 +441,9 @@ def test_tissue_that_wrinkles_has_an_error_of_at_least_what_is_told(load: Any, d
 
     def known(*overrides: str) -> MeshEstimate:
         made = load(*pushed, *overrides)
-        coarse = coarser(made)
+        coarse = coarser(plan_of(made))
         assert coarse is not None
-        with closing(MeshPilot(made, time_grid(made), coarse, device)) as pilot:
+        with closing(MeshPilot(plan_of(made), coarse, device)) as pilot:
             for u in frames(made, device):
                 pilot.follow(u, lambda: None)
         return pilot.estimate
@@ -492,18 +505,18 @@ def test_a_run_does_not_go_on_with_another_map(load: Any, tmp_path: Path, device
 
 def test_the_cells_keep_their_shape_while_points_are_chosen(load: Any, device: Device) -> None:
     oblong = ("sheet.points=[5, 13]", "sheet.size=[0.04, 0.12]", "sheet.tolerance=0.05", *SMOOTH)
-    rows, cols = choose_points(load(*oblong), device, checked)[0].sheet.points
+    rows, cols = choose_points(plan_of(load(*oblong)), device, checked)[0].scene.sheet.points
     assert (cols - 1) / (rows - 1) == pytest.approx(3, rel=0.1)
     assert cols > 13
 
 
 def test_points_for_which_a_given_step_is_too_long_are_refused(load: Any, device: Device) -> None:
-    limit = stable_step(load())
+    limit = plan_of(load()).stable_step
     made = load("sheet.tolerance=0.001", f"time.step={0.1 / math.ceil(0.1 / limit)!r}")
     with pytest.raises(
         SceneError, match=r"time.step: .* above the stability limit .* points that sheet.tolerance: 0.001"
     ):
-        choose_points(made, device, checked)
+        choose_points(plan_of(made), device, checked)
 
 
 @pytest.mark.parametrize(
@@ -519,7 +532,7 @@ def test_points_for_which_a_given_step_is_too_long_are_refused(load: Any, device
 )
 def test_a_tool_that_does_not_act_as_a_whole_is_told_of(setting: str, told: str, load: Any) -> None:
     def notes(made: Scene) -> list[str]:
-        return list(probe_force.notes(made, probe_force.probe_records(made)))
+        return list(probe_force.force_notes(made, probe_force.probe_records(made)))
 
     assert not notes(load())
     (said,) = notes(load(setting))
@@ -538,7 +551,6 @@ def test_a_run_whose_map_is_gone_says_so(load: Any, tmp_path: Path, device: Devi
 
     run(made, tmp_path / "out", threads=device.threads, progress=stop_at_the_second_frame)
     (tmp_path / "map.png").rename(tmp_path / "away.png")
-    stiffness_map._kept.clear()
     with pytest.raises(SceneError, match=r"tissue.map.image: .*map.png: no such file"):
         resume(tmp_path / "out", threads=device.threads)
     (tmp_path / "away.png").rename(tmp_path / "map.png")

@@ -24,15 +24,14 @@ from skfem.models.elasticity import linear_elasticity, plane_stress
 from taichi_msm import reference
 from taichi_msm.physics.lattice import fixed_points, rest_positions, spacing
 from taichi_msm.physics.loads import loads_at
-from taichi_msm.physics.material import factors, highest_frequency
+from taichi_msm.physics.material import highest_frequency
 from taichi_msm.physics.probe_force import spread
 from taichi_msm.physics.state import State
-from taichi_msm.physics.timestep import stable_step, time_grid
 from taichi_msm.reference.sheet import sheet as assembled
 from taichi_msm.scene import Probe, Scene
 from taichi_msm.system.runtime import Device
 from tests.motion import dynamics_of
-from tests.scenes import random_tissue, speckle
+from tests.scenes import plan_of, random_tissue, speckle
 from tests.scenes import scene as scene_of_springs
 
 Array = NDArray[np.float64]
@@ -119,7 +118,7 @@ def moving(made: Scene, directions: tuple[int, ...] = (0, 1, 2)) -> NDArray[np.i
 
 
 def tool_forces(made: Scene, time: float = 0.01) -> Array:
-    return reference.surgical_force(made, loads_at(made, np.array([time])), 0)
+    return reference.surgical_force(made, loads_at(plan_of(made), np.array([time])), 0)
 
 
 def at_rest(made: Scene, directions: tuple[int, ...]) -> Array:
@@ -134,7 +133,7 @@ def assert_rests(made: Scene, displacement: Array, directions: tuple[int, ...], 
     dynamics = dynamics_of(made, device)
     dynamics.advance(1)
     thrown = np.abs(dynamics.state().difference).max()
-    dynamics.restart(made, time_grid(made), State(1, displacement, np.zeros_like(displacement)))
+    dynamics.restart(plan_of(made), State(1, displacement, np.zeros_like(displacement)))
     dynamics.advance(1)
     # What is not linear in strains of 1e-6 and less.
     assert np.abs(dynamics.state().difference[..., directions]).max() < 1e-5 * thrown
@@ -178,7 +177,7 @@ def test_the_linear_stiffness_is_that_of_the_forces(seed: int, tmp_path: Path) -
     rng, shape = np.random.default_rng(seed), (*made.sheet.points, 3)
     here, way, small = 1e-3 * rng.normal(size=shape), rng.normal(size=shape), 3e-8
     # At the end, when all tools press and so the foundation acts.
-    loads = loads_at(made, np.array([made.time.duration]))
+    loads = loads_at(plan_of(made), np.array([made.time.duration]))
     ends = [reference.force(made, here + sign * small * way, loads, 0) for sign in (1, -1)]
     found = (ends[1] - ends[0]).ravel() / (2 * small)
     expected = stiffness(made, here) @ way.ravel()
@@ -205,7 +204,7 @@ def test_uniform_strains_have_the_energy_of_plane_stress(ratio: float, device: D
         # Also at edges and corners, whose points have less of springs and of area.
         everywhere = np.full(made.sheet.points, density)
         np.testing.assert_allclose(reference.energy_density(made, strain * one), everywhere, rtol=10 * strain)
-        dynamics.restart(made, time_grid(made), State(1, strain * one, np.zeros_like(one)))
+        dynamics.restart(plan_of(made), State(1, strain * one, np.zeros_like(one)))
         assert dynamics.read().energy / area == pytest.approx(density, rel=10 * strain)
     dynamics.close()
 
@@ -320,7 +319,7 @@ def depth(points: int, device: Device) -> float:
     time = {"duration": 1.0, "frames_per_second": 25}
     made = tissue((points, points), foundation=2e6, damping=40, probes=[probe], time=time)
     dynamics = dynamics_of(made, device)
-    dynamics.advance(time_grid(made).steps)
+    dynamics.advance(plan_of(made).grid.steps)
     found = -dynamics.displacement()[..., 2].min()
     dynamics.close()
     return float(found)
@@ -338,7 +337,7 @@ def test_a_thrown_sheet_keeps_its_momenta(term: str, device: Device, tmp_path: P
     terms: dict[str, dict[str, Any]] = {"none": {}, "map": {"map": stiff}}
     thrown = {"at": [0.3, 0.2], "total": [0.2, -0.1, 0.4], "falloff": 40, "load": [[0, 100], [0.04, 100], [0.04, 0]]}
     made = tissue((9, 11), size=(0.08, 0.13), fixed="none", probes=[thrown], **terms[term])
-    mass, rest, h = assembled(made).mass[..., None], rest_positions(made.sheet), time_grid(made).step
+    mass, rest, h = assembled(made).mass[..., None], rest_positions(made.sheet), plan_of(made).grid.step
     dynamics = dynamics_of(made, device)
 
     def momenta() -> Array:
@@ -350,11 +349,11 @@ def test_a_thrown_sheet_keeps_its_momenta(term: str, device: Device, tmp_path: P
 
     found = []
     for _ in range(made.time.frames):
-        dynamics.advance(time_grid(made).steps_per_frame)
+        dynamics.advance(plan_of(made).grid.steps_per_frame)
         found.append(momenta())
     dynamics.close()
     # The tool lets go at the end of the first frame. From then on each step rounds once.
-    rounding = time_grid(made).steps * 2.0**-53
+    rounding = plan_of(made).grid.steps * 2.0**-53
     for one in found[2:]:
         for before, after in zip(found[1], one, strict=True):
             np.testing.assert_allclose(after, before, rtol=0, atol=rounding * np.abs(before).max())
@@ -397,7 +396,7 @@ def frequency(made: Scene, displacement: Array | None = None) -> float:
 @pytest.mark.parametrize("name", LIMITED)
 def test_the_bound_of_the_frequency_holds_and_is_near(name: str, tmp_path: Path) -> None:
     made = limited(name, tmp_path)
-    assert 1 <= highest_frequency(made) / frequency(made) < LIMITED[name][1]
+    assert 1 <= highest_frequency(plan_of(made).material, made.sheet) / frequency(made) < LIMITED[name][1]
 
 
 def test_the_bound_holds_where_a_corner_is_stiff(tmp_path: Path) -> None:
@@ -406,7 +405,7 @@ def test_the_bound_holds_where_a_corner_is_stiff(tmp_path: Path) -> None:
     grey[0, 0] = 255
     Image.fromarray(grey).save(tmp_path / "corner.png")
     made = tissue((9, 11), fixed="none", map={"image": str(tmp_path / "corner.png"), "range": [1, 30]})
-    assert 1 <= highest_frequency(made) / frequency(made) < 1.6
+    assert 1 <= highest_frequency(plan_of(made).material, made.sheet) / frequency(made) < 1.6
 
 
 @pytest.mark.parametrize("seed", range(16))
@@ -416,7 +415,7 @@ def test_the_bound_holds_for_any_tissue(seed: int, tmp_path: Path) -> None:
     crumpled = 0.15 * min(spacing(made.sheet)) * rng.uniform(-1, 1, (*made.sheet.points, 3))
     assert reference.shortest_spring(made, crumpled) > 0.5
     for displacement in (np.zeros_like(crumpled), crumpled):
-        assert frequency(made, displacement) <= highest_frequency(made)
+        assert frequency(made, displacement) <= highest_frequency(plan_of(made).material, made.sheet)
 
 
 @pytest.mark.parametrize(
@@ -424,7 +423,7 @@ def test_the_bound_holds_for_any_tissue(seed: int, tmp_path: Path) -> None:
 )
 def test_just_under_the_limit_tissue_stays_bounded(name: str, device: Device, tmp_path: Path) -> None:
     """Kicked at random places in the first step, and then left alone for 10^5."""
-    rng, h = np.random.default_rng(1), 0.99 * stable_step(limited(name, tmp_path))
+    rng, h = np.random.default_rng(1), 0.99 * plan_of(limited(name, tmp_path)).stable_step
     kicks = [
         {
             "at": list(rng.random(2)),
@@ -463,7 +462,7 @@ def test_a_wide_sheet_gets_the_whole_of_a_tool(fixed: str, device: Device) -> No
         dynamics = dynamics_of(made, device)
         dynamics.advance(1)
         # u_1 = h^2 F / m / 2.
-        force = 2 / time_grid(made).step ** 2 * assembled(made).mass[..., None] * dynamics.displacement()
+        force = 2 / plan_of(made).grid.step ** 2 * assembled(made).mass[..., None] * dynamics.displacement()
         dynamics.close()
         np.testing.assert_allclose(force.sum(axis=(0, 1)), total, rtol=1e-3)
 
@@ -502,4 +501,6 @@ def test_a_map_is_sampled_at_the_centres_of_cells(texels: tuple[int, int], kind:
     sheet = {"points": [9, 12], "size": [0.1, 0.1], "mass": 1e-3}
     of_springs = scene_of_springs(sheet=sheet, springs={"structural": 20, "map": stiff})
     for made in (tissue((9, 12), map=stiff), of_springs):
-        np.testing.assert_allclose(factors(made), sampled(grey, 8, 11, 6, 0.5), rtol=0, atol=1e-14 * 6)
+        factors = plan_of(made).material.factors
+        assert factors is not None
+        np.testing.assert_allclose(factors, sampled(grey, 8, 11, 6, 0.5), rtol=0, atol=1e-14 * 6)

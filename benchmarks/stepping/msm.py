@@ -13,6 +13,6 @@ from taichi_msm.system import runtime
 def prepare(problem: Problem, threads: int | None) -> Stepper:
     """Set up the sheet at rest."""
     device = runtime.start("cpu", threads)
-    layout = structure(problem.scene, problem.grid, device)
+    layout = structure(problem.plan, device)
     layout = replace(layout, code=replace(layout.code, lanes=vector_bits() // 32))
-    return Dynamics(problem.scene, problem.grid, device, layout)
+    return Dynamics(problem.plan, device, layout)

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 from benchmarks.stepping.problem import Problem, Stepper
 from taichi_msm.physics.solver import Dynamics
 from taichi_msm.system import runtime
@@ -11,4 +9,4 @@ from taichi_msm.system import runtime
 
 def prepare(problem: Problem, threads: int | None) -> Stepper:
     """Set up the sheet at rest."""
-    return Dynamics(problem.scene, replace(problem.grid, precision="f64"), runtime.start("cpu", threads))
+    return Dynamics(problem.plan.with_grid(precision="f64"), runtime.start("cpu", threads))

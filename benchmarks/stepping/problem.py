@@ -23,8 +23,9 @@ from numpy.typing import NDArray
 from taichi_msm import reference
 from taichi_msm.physics.lattice import Spring, springs
 from taichi_msm.physics.loads import decay
-from taichi_msm.physics.material import Material, material
-from taichi_msm.physics.timestep import time_grid
+from taichi_msm.physics.material import Material
+from taichi_msm.physics.plan import Plan
+from taichi_msm.physics.planning import make_plan
 from taichi_msm.scene import Scene
 from taichi_msm.timegrid import TimeGrid
 
@@ -73,14 +74,19 @@ class Problem:
         )
 
     @cached_property
+    def plan(self) -> Plan:
+        """The plan of the scene."""
+        return make_plan(self.scene)
+
+    @property
     def grid(self) -> TimeGrid:
         """The steps."""
-        return time_grid(self.scene)
+        return self.plan.grid
 
-    @cached_property
+    @property
     def material(self) -> Material:
         """The numbers of the sheet."""
-        return material(self.scene)
+        return self.plan.material
 
     @cached_property
     def springs(self) -> tuple[Spring, ...]:
@@ -115,4 +121,4 @@ class Problem:
 
     def answer(self, steps: int) -> NDArray[np.float64]:
         """Take the steps by the program's float64 twin; shape (n, n, 3)."""
-        return next(islice(reference.displacements(self.scene, self.grid), steps, None))
+        return next(islice(reference.displacements(self.plan), steps, None))

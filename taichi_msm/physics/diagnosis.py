@@ -4,19 +4,19 @@ from __future__ import annotations
 
 import math
 import time
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 
 from taichi_msm.physics import divergence
 from taichi_msm.physics.divergence import Watch, farthest
 from taichi_msm.physics.lattice import axes
+from taichi_msm.physics.plan import Plan
 from taichi_msm.physics.probe_force import control_points, probe_force
 from taichi_msm.physics.run_progress import RunProgress, Saved
 from taichi_msm.physics.solver import Dynamics
 from taichi_msm.progress import Pause
 from taichi_msm.scene import Scene
-from taichi_msm.timegrid import TimeGrid
 
 # How many times finer the steps are that are tried, and how long all trials together may take [s].
 CUTS = (2, 4, 8, 16, 32, 64)
@@ -44,10 +44,10 @@ def diagnose(dynamics: Dynamics, start: Saved | None, pause: Pause) -> Diagnosis
         start: a sound state of the run; None: at rest.
         pause: called often; an exception from it stops the search.
     """
-    scene, grid, bad = dynamics.scene, dynamics.grid, dynamics.steps_done
+    plan, grid, bad = dynamics.plan, dynamics.plan.grid, dynamics.steps_done
     state, progress = start or (None, RunProgress())
-    watch = Watch(scene, grid, progress)
-    dynamics.restart(scene, grid, state)
+    watch = Watch(plan, progress)
+    dynamics.restart(plan, state)
     low, wrong = dynamics.state(), ""
     while low.steps < bad:
         dynamics.advance(min(bad, (watch.progress.frame + 1) * grid.steps_per_frame) - low.steps, pause)
@@ -60,24 +60,25 @@ def diagnose(dynamics: Dynamics, start: Saved | None, pause: Pause) -> Diagnosis
         return Diagnosis(divergence.message(grid.time(bad), bad, said, exact=False), start)
     high = dynamics.steps_done
     while high - low.steps > 1:
-        dynamics.restart(scene, grid, low)
+        dynamics.restart(plan, low)
         dynamics.advance((high - low.steps) // 2, pause)
         if watch.judge(dynamics.read()):
             high = dynamics.steps_done
         else:
             low = dynamics.state()
-    dynamics.restart(scene, grid, low)
+    dynamics.restart(plan, low)
     dynamics.advance(1)
     reading = dynamics.read()
     wrong = watch.judge(reading)
     cause = _cause(dynamics, high, farthest(reading.displacement)[:2], pause)
-    found = divergence.message(grid.time(high), high, f"{wrong}; {cause}", exact=True)
-    return Diagnosis(found, Saved(low, watch.progress))
+    message = divergence.message(grid.time(high), high, f"{wrong}; {cause}", exact=True)
+    return Diagnosis(message, Saved(low, watch.progress))
 
 
 def _cause(dynamics: Dynamics, bad: int, point: tuple[int, int], pause: Pause) -> str:
     """Name the key that is the most likely cause: the step, if a finer one does not diverge, or else a force."""
-    scene, grid = dynamics.scene, dynamics.grid
+    plan, grid = dynamics.plan, dynamics.plan.grid
+    scene = plan.scene
     frames = -(-bad // grid.steps_per_frame)
     tried, end = math.inf, time.monotonic() + MOST_SECONDS
 
@@ -87,14 +88,14 @@ def _cause(dynamics: Dynamics, bad: int, point: tuple[int, int], pause: Pause) -
             raise TimeoutError
 
     for cut in CUTS:
-        finer = replace(grid, steps_per_frame=cut * grid.steps_per_frame)
+        finer = plan.with_grid(steps_per_frame=cut * grid.steps_per_frame)
         try:
-            went_well = _goes_well(dynamics, scene, finer, frames, pause_or_stop)
+            went_well = _goes_well(dynamics, finer, frames, pause_or_stop)
         except TimeoutError:
             break
         if went_well:
-            return f"likely cause: time.step, {grid.step:.6g} s; with {finer.step:.9g} s it does not diverge here"
-        tried = finer.step
+            return f"likely cause: time.step, {grid.step:.6g} s; with {finer.grid.step:.9g} s it does not diverge here"
+        tried = finer.grid.step
     index, force = _strongest_probe(scene, point)
     name = "force" if scene.probes[index].total is None else "total"
     said = f"likely cause: probes.{index}.{name}, which reaches {force:.3g} N at this point"
@@ -103,12 +104,12 @@ def _cause(dynamics: Dynamics, bad: int, point: tuple[int, int], pause: Pause) -
     return f"{said}; take less, or a time.step below {grid.step:.6g} s; finer steps would take too long to try here"
 
 
-def _goes_well(dynamics: Dynamics, scene: Scene, grid: TimeGrid, frames: int, pause: Pause) -> bool:
+def _goes_well(dynamics: Dynamics, plan: Plan, frames: int, pause: Pause) -> bool:
     """Tell whether a number of frames from rest are sound."""
-    dynamics.restart(scene, grid)
-    watch = Watch(scene, grid)
+    dynamics.restart(plan)
+    watch = Watch(plan)
     for _ in range(frames):
-        dynamics.advance(grid.steps_per_frame, pause)
+        dynamics.advance(plan.grid.steps_per_frame, pause)
         if watch.follow(dynamics.read()):
             return False
     return True

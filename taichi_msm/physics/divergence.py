@@ -9,14 +9,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from taichi_msm.physics.lattice import axes, spacing
-from taichi_msm.physics.loads import Envelope, ProbeSlot, decay, probe_slots
-from taichi_msm.physics.material import material
+from taichi_msm.physics.loads import Envelope, decay
+from taichi_msm.physics.plan import Plan
 from taichi_msm.physics.probe_force import probe_force
 from taichi_msm.physics.run_progress import RunProgress
+from taichi_msm.physics.slots import ProbeSlot
 from taichi_msm.physics.state import Reading
-from taichi_msm.physics.timestep import stable_step
 from taichi_msm.scene import Scene
-from taichi_msm.timegrid import TimeGrid
 
 # No deformation displaces a point by more than this many sheet sizes; a sheet that nothing holds may also fly away.
 MOST_SHEET_SIZES = 10.0
@@ -29,37 +28,35 @@ SWING = 4.0
 ROUNDING = 1e-9
 
 
-def _is_held(scene: Scene) -> bool:
+def _is_held(plan: Plan) -> bool:
     """Tell whether springs connect every point to a fixed one; shear springs alone may skip every other point."""
-    made = material(scene)
-    return scene.sheet.fixed not in ("none", ()) and min(made.across, made.down) > 0
+    return plan.scene.sheet.fixed not in ("none", ()) and min(plan.material.across, plan.material.down) > 0
 
 
-def _free_acceleration(scene: Scene) -> float:
+def _free_acceleration(plan: Plan) -> float:
     """Bound the acceleration that the probes give to a free point [m/s^2]."""
     forces = (
-        probe_force(probe, scene.sheet).size * max(abs(percent) for _, percent in probe.load) / 100
-        for probe in scene.probes
+        probe_force(probe, plan.scene.sheet).size * max(abs(percent) for _, percent in probe.load) / 100
+        for probe in plan.scene.probes
     )
-    return sum(forces) / material(scene).mass
+    return sum(forces) / plan.material.mass
 
 
-def farthest_displacement(scene: Scene, time: float, acceleration: float | None = None) -> float:
+def farthest_displacement(plan: Plan, time: float, acceleration: float | None = None) -> float:
     """Bound the displacement of a point [m]; if one is larger, the simulation has diverged.
 
     Args:
-        scene: what is run.
+        plan: of the run.
         time: since the beginning [s].
         acceleration: most that the probes have given to a free point so far [m/s^2]; None: most that the scene's can.
     """
-    most = MOST_SHEET_SIZES * max(scene.sheet.size)
-    if _is_held(scene):
+    most = MOST_SHEET_SIZES * max(plan.scene.sheet.size)
+    if _is_held(plan):
         return most
-    made = material(scene)
-    if made.virtual > 0 and not made.always:
+    if plan.material.virtual > 0 and not plan.material.always:
         # The virtual springs may accelerate a point from far away, and let go of it when it is fast.
         return math.inf
-    return most + (_free_acceleration(scene) if acceleration is None else acceleration) * time * time / 2
+    return most + (_free_acceleration(plan) if acceleration is None else acceleration) * time * time / 2
 
 
 class Watch:
@@ -73,30 +70,27 @@ class Watch:
     The virtual springs hold another K / 2 |u|^2; when they begin to act, it is added for the displacements then.
 
     Args:
-        scene: what is run.
-        grid: its steps.
+        plan: of the run.
         progress: of the frame where the watch begins.
 
     Attributes:
         progress: of the last frame that was found sound.
     """
 
-    def __init__(self, scene: Scene, grid: TimeGrid, progress: RunProgress | None = None) -> None:
+    def __init__(self, plan: Plan, progress: RunProgress | None = None) -> None:
         self.progress = progress or RunProgress()
-        self._scene, self._grid, self._material = scene, grid, material(scene)
-        self._loads = Envelope(scene, grid.step)
-        self._acceleration = _free_acceleration(scene)
-        slots = probe_slots(scene.probes, scene.sheet, grid.step)
-        self._shares = np.array([_share(slot, scene) for slot in slots])
-        limit = stable_step(scene)
-        self._swing = SWING / max(1e-9, 1 - (grid.step / limit) ** 2)
-        self._least = _underflow(scene, grid)
+        self._plan, self._grid = plan, plan.grid
+        self._loads = Envelope(plan)
+        self._acceleration = _free_acceleration(plan)
+        self._shares = np.array([_share(slot, plan.scene) for slot in plan.slots])
+        self._swing = SWING / max(1e-9, 1 - (plan.grid.step / plan.stable_step) ** 2)
+        self._least = _underflow(plan)
 
-    def steer(self, scene: Scene) -> None:
+    def steer(self, plan: Plan) -> None:
         """Expect other loads from now on; control points move if they did before."""
-        self._scene = scene
-        self._loads = Envelope(scene, self._grid.step)
-        self._acceleration = max(self._acceleration, _free_acceleration(scene))
+        self._plan = plan
+        self._loads = Envelope(plan)
+        self._acceleration = max(self._acceleration, _free_acceleration(plan))
 
     def follow(self, reading: Reading) -> str:
         """Judge the next frame, as `judge` does, and record its progress if it is sound."""
@@ -122,8 +116,8 @@ class Watch:
         begin, end = self.progress.frame / self._grid.frames_per_second, self._grid.time(reading.steps)
         point, distance, energy = f"point ({where.row}, {where.column})", where.distance, reading.energy
         # Written so that NaN is found too: no comparison with it is true.
-        if not distance <= farthest_displacement(self._scene, end, self._acceleration):
-            size = max(self._scene.sheet.size)
+        if not distance <= farthest_displacement(self._plan, end, self._acceleration):
+            size = max(self._plan.scene.sheet.size)
             return f"{point} is {distance:g} m from its rest position, and the sheet is {size:g} m long"
         most = self._most_energy(begin, end)
         if not energy < math.inf or energy > most:
@@ -135,7 +129,7 @@ class Watch:
 
     def _most_energy(self, begin: float, end: float) -> float:
         """Bound the energy at the end of an interval that begins at the last recorded frame [J]."""
-        progress, mass, virtual = self.progress, self._material.mass, self._material.virtual / 2
+        progress, mass, virtual = self.progress, self._plan.material.mass, self._plan.material.virtual / 2
         forces, active, activations = self._loads.between(begin, end)
         push = float((forces * self._shares).sum())
         # Products instead of powers: these raise OverflowError where a product is infinite.
@@ -186,13 +180,13 @@ def farthest(displacement: NDArray[np.floating]) -> Farthest:
         )
 
 
-def _underflow(scene: Scene, grid: TimeGrid) -> float:
+def _underflow(plan: Plan) -> float:
     """Give the energy below which the squares that it is summed from underflow [J]."""
-    tiny = float(np.finfo(np.float32 if grid.precision == "f32" else np.float64).tiny)
-    dx, dy = spacing(scene.sheet)
-    made = material(scene)
-    stiffness = max(made.across, made.down) + made.shear
-    return math.prod(scene.sheet.points) * tiny * (made.mass / grid.step**2 + stiffness * (dx**2 + dy**2))
+    tiny = float(np.finfo(np.float32 if plan.grid.precision == "f32" else np.float64).tiny)
+    (dx, dy), material = spacing(plan.scene.sheet), plan.material
+    stiffness = max(material.across, material.down) + material.shear
+    inertia = material.mass / plan.grid.step**2
+    return math.prod(plan.scene.sheet.points) * tiny * (inertia + stiffness * (dx**2 + dy**2))
 
 
 def _share(slot: ProbeSlot, scene: Scene) -> float:

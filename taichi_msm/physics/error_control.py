@@ -12,7 +12,7 @@ from __future__ import annotations
 
 import math
 from contextlib import ExitStack, closing
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import partial
 from itertools import pairwise
 from typing import Any
@@ -23,13 +23,12 @@ from numpy.typing import NDArray
 from taichi_msm.errors import SceneError
 from taichi_msm.physics.divergence import farthest_displacement
 from taichi_msm.physics.lattice import rest_positions
-from taichi_msm.physics.material import material
 from taichi_msm.physics.pilots import fine_steps
+from taichi_msm.physics.plan import Plan
 from taichi_msm.physics.solver import Dynamics
 from taichi_msm.progress import Count, Pause
-from taichi_msm.scene import LARGEST_TOLERANCE, Scene
+from taichi_msm.scene import LARGEST_TOLERANCE
 from taichi_msm.system.runtime import Device
-from taichi_msm.timegrid import TimeGrid
 
 # The search ends when the error is at least this share of the tolerance: the step is then within about 10 % of the
 # largest possible one.
@@ -69,47 +68,42 @@ class Estimate:
     at_least: bool = False
 
 
-def order(scene: Scene) -> int:
+def order(plan: Plan) -> int:
     """Give the order of the method: 1 with a damping by backward differences, else 2."""
-    return 2 if scene.time.damping_difference == "central" or material(scene).drag == 0 else 1
+    return 2 if plan.scene.time.damping_difference == "central" or plan.material.drag == 0 else 1
 
 
-def estimate_error(
-    scene: Scene, grid: TimeGrid, device: Device, progress: Count = lambda done, total: None
-) -> Estimate:
+def estimate_error(plan: Plan, device: Device, progress: Count = lambda done, total: None) -> Estimate:
     """Estimate the error of a run.
 
     Args:
-        scene: a checked scene.
-        grid: its steps.
+        plan: of the run.
         device: what `runtime.start` returned.
         progress: called with the frames done and the frames in all.
     """
-    with closing(Trials(scene, grid, device)) as trials:
-        return trials.estimate(grid.steps_per_frame, progress)
+    with closing(Trials(plan, device)) as trials:
+        return trials.estimate(plan.grid.steps_per_frame, progress)
 
 
-def choose_step(
-    scene: Scene, grid: TimeGrid, device: Device, progress: Count = lambda done, total: None
-) -> tuple[TimeGrid, Estimate]:
+def choose_step(plan: Plan, device: Device, progress: Count = lambda done, total: None) -> tuple[Plan, Estimate]:
     """Find the largest stable step whose estimated error is within the scene's tolerance.
 
     Args:
-        scene: a checked scene with a tolerance.
-        grid: the scene's steps without the tolerance; no fewer are tried.
+        plan: of a scene with a tolerance, whose steps do without it; no fewer are tried.
         device: what `runtime.start` returned.
         progress: called with the frames done and the frames in all of each pilot run.
 
     Returns:
-        The grid with that step, and its error.
+        The plan with that step, and its error.
 
     Raises:
         SceneError: when no step meets the tolerance; names a precision or a tolerance that would do.
     """
-    assert scene.time.tolerance is not None
-    with closing(Trials(scene, grid, device)) as trials:
-        found = _search(scene.time.tolerance, grid.steps_per_frame, trials, progress)
-    return replace(grid, steps_per_frame=found.steps_per_frame), found
+    tolerance = plan.scene.time.tolerance
+    assert tolerance is not None
+    with closing(Trials(plan, device)) as trials:
+        estimate = _search(tolerance, plan.grid.steps_per_frame, trials, progress)
+    return plan.with_grid(steps_per_frame=estimate.steps_per_frame), estimate
 
 
 class Pilot:
@@ -120,8 +114,7 @@ class Pilot:
     r^-p - 1 times the error of the step; where that is less than MARGIN times, the difference is enlarged accordingly.
 
     Args:
-        scene: what is run.
-        grid: its steps.
+        plan: of the run.
         steps: steps per frame of the pilot, as in `Pilots`; 0: the error is not known.
         device: what `runtime.start` returned.
         cores: number of cores that stepping may use; None: all. With as many as the run has, its kernels are reused.
@@ -133,35 +126,35 @@ class Pilot:
         DeviceError: when the device cannot run it in f64.
     """
 
-    def __init__(self, scene: Scene, grid: TimeGrid, steps: int, device: Device, cores: int | None = None) -> None:
-        self._scene, self._order = scene, order(scene)
-        coarse = 0 < steps < grid.steps_per_frame
+    def __init__(self, plan: Plan, steps: int, device: Device, cores: int | None = None) -> None:
+        self._order, exact = order(plan), plan.with_grid(precision="f64")
+        coarse = 0 < steps < plan.grid.steps_per_frame
         with ExitStack() as opened:
 
             def dynamics() -> Dynamics:
-                made = Dynamics(scene, replace(grid, precision="f64"), device, cores=cores)
-                opened.callback(made.close)
-                return made
+                sheet = Dynamics(exact, device, cores=cores)
+                opened.callback(sheet.close)
+                return sheet
 
             self._other = dynamics()
             # A run in f64 is itself the one with its own steps.
-            self._same = None if grid.precision == "f64" or coarse else dynamics()
+            self._same = None if plan.grid.precision == "f64" or coarse else dynamics()
             self._open = opened.pop_all()
-        self._parted = grid.precision == "f64" or not coarse
+        self._parted = plan.grid.precision == "f64" or not coarse
         self._margin = 1.0
         if coarse:
-            shown = (grid.steps_per_frame / steps) ** self._order - 1
+            shown = (plan.grid.steps_per_frame / steps) ** self._order - 1
             self._margin = MARGIN if self._parted else max(1.0, MARGIN / shown)
-        self.restart(grid, steps)
+        self.restart(plan, steps)
 
-    def restart(self, grid: TimeGrid, steps: int) -> None:
+    def restart(self, plan: Plan, steps: int) -> None:
         """Begin again beside another run of the same scene, with its steps and the pilot's; fine ones stay fine."""
-        self._own_steps, self._steps = grid.steps_per_frame, steps
-        exact = replace(grid, precision="f64")
+        self._plan, self._steps = plan, steps
+        exact = plan.with_grid(precision="f64")
         if steps:
-            self._other.restart(self._scene, replace(exact, steps_per_frame=steps))
+            self._other.restart(exact.with_grid(steps_per_frame=steps))
             if self._same:
-                self._same.restart(self._scene, exact)
+                self._same.restart(exact)
         self._error = self._rounding = self._in_f64 = self._largest = 0.0
 
     def compile(self) -> None:
@@ -179,11 +172,11 @@ class Pilot:
             return
         self._other.advance(self._steps, pause)
         if self._same:
-            self._same.advance(self._own_steps, pause)
+            self._same.advance(self._plan.grid.steps_per_frame, pause)
         other = self.displacement = self._other.displacement()
         same = self._same.displacement() if self._same else displacement
         with np.errstate(all="ignore"):
-            ratio = self._steps / self._own_steps
+            ratio = self._steps / self._plan.grid.steps_per_frame
             exact = other + (other - same) / (ratio**self._order - 1) if self._parted else other
             self._error = max(self._error, longest(displacement - exact))
             self._largest = max(self._largest, longest(exact))
@@ -195,8 +188,8 @@ class Pilot:
     def estimate(self) -> Estimate:
         """What the frames so far show."""
         if not self._steps:
-            return Estimate(self._own_steps, math.inf, 0.0, math.inf, self._order)
-        farthest = farthest_displacement(self._scene, self._scene.time.duration)
+            return Estimate(self._plan.grid.steps_per_frame, math.inf, 0.0, math.inf, self._order)
+        farthest = farthest_displacement(self._plan, self._plan.scene.time.duration)
 
         def share(part: float) -> float:
             # If nothing moves, there is no error; an error that is not finite is not known.
@@ -206,7 +199,7 @@ class Pilot:
         error, rounding, in_f64 = (share(part) for part in (self._error, self._rounding, self._in_f64))
         if not self._same:
             rounding, in_f64 = 0.0 if self._parted else error, error
-        return Estimate(self._own_steps, error, rounding, in_f64, self._order, self._parted)
+        return Estimate(self._plan.grid.steps_per_frame, error, rounding, in_f64, self._order, self._parted)
 
     def close(self) -> None:
         """Free the memory."""
@@ -216,12 +209,12 @@ class Pilot:
 class Trials:
     """Runs of a scene with different steps, one after the other, each with a pilot beside it."""
 
-    def __init__(self, scene: Scene, grid: TimeGrid, device: Device) -> None:
-        self._scene, self._grid = scene, grid
+    def __init__(self, plan: Plan, device: Device) -> None:
+        self._plan = plan
         with ExitStack() as opened:
-            self._pilot = Pilot(scene, grid, fine_steps(scene, grid), device)
+            self._pilot = Pilot(plan, fine_steps(plan), device)
             opened.callback(self._pilot.close)
-            self._own = Dynamics(scene, grid, device)
+            self._own = Dynamics(plan, device)
             opened.callback(self._own.close)
             self._open = opened.pop_all()
 
@@ -232,12 +225,12 @@ class Trials:
             steps: steps per frame.
             progress: called with the frames done and the frames in all.
         """
-        grid = replace(self._grid, steps_per_frame=steps)
-        fine = fine_steps(self._scene, grid)
-        self._pilot.restart(grid, fine)
-        self._own.restart(self._scene, grid)
-        for frame in range(grid.frames if fine else 0):
-            pause = partial(progress, frame, grid.frames)
+        plan = self._plan.with_grid(steps_per_frame=steps)
+        fine, frames = fine_steps(plan), plan.grid.frames
+        self._pilot.restart(plan, fine)
+        self._own.restart(plan)
+        for frame in range(frames if fine else 0):
+            pause = partial(progress, frame, frames)
             pause()
             self._own.advance(steps, pause)
             self._pilot.follow(self._as_written(self._own.displacement()), pause)
@@ -245,9 +238,9 @@ class Trials:
 
     def _as_written(self, displacement: NDArray[Any]) -> NDArray[Any]:
         """Round as positions in the trajectory are rounded: in f32, relative to the size of the sheet."""
-        if "trajectory" not in self._scene.output or self._grid.precision == "f64":
+        if "trajectory" not in self._plan.scene.output or self._plan.grid.precision == "f64":
             return displacement
-        rest = rest_positions(self._scene.sheet)
+        rest = rest_positions(self._plan.scene.sheet)
         return (rest + displacement).astype(np.float32) - rest
 
     def close(self) -> None:
@@ -273,17 +266,17 @@ def _search(tolerance: float, least: int, trials: Trials, progress: Count) -> Es
     too_few, enough, failures = least - 1, None, []
     steps = least
     for _ in range(MOST_PILOTS):
-        found = trials.estimate(steps, progress)
-        if found.error <= tolerance:
-            enough = found
+        tried = trials.estimate(steps, progress)
+        if tried.error <= tolerance:
+            enough = tried
         else:
             too_few = steps
-            failures.append(found)
-            if found.rounding > CLOSE * tolerance or _stuck(failures):
+            failures.append(tried)
+            if tried.rounding > CLOSE * tolerance or _stuck(failures):
                 break
         if enough and (enough.error >= CLOSE * tolerance or enough.steps_per_frame - too_few <= 1):
             return enough
-        steps = max(_next(found, tolerance), too_few + 1)
+        steps = max(_next(tried, tolerance), too_few + 1)
         if enough and steps >= enough.steps_per_frame:
             return enough
     if enough:
@@ -291,16 +284,16 @@ def _search(tolerance: float, least: int, trials: Trials, progress: Count) -> Es
     raise SceneError([_out_of_reach(tolerance, failures)])
 
 
-def _next(found: Estimate, tolerance: float) -> int:
+def _next(tried: Estimate, tolerance: float) -> int:
     """Extrapolate the fewest steps per frame that are enough: the error falls with the order of the method."""
-    if found.error == math.inf:
+    if tried.error == math.inf:
         cut = LARGEST_CUT
     else:
         # The error that the step may make, apart from rounding, and the error that it makes.
-        allowed = max((1 + CLOSE) / 2 * tolerance - found.rounding, tolerance / 16)
-        made = max(found.error - found.rounding, 0.0)
-        cut = min((made / allowed) ** (1 / found.order), LARGEST_CUT)
-    return max(1, math.ceil(found.steps_per_frame * cut))
+        allowed = max((1 + CLOSE) / 2 * tolerance - tried.rounding, tolerance / 16)
+        error = max(tried.error - tried.rounding, 0.0)
+        cut = min((error / allowed) ** (1 / tried.order), LARGEST_CUT)
+    return max(1, math.ceil(tried.steps_per_frame * cut))
 
 
 def _stuck(failures: list[Estimate]) -> bool:

@@ -12,70 +12,22 @@ averaged in the same way.
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
-from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from taichi_msm.physics.lattice import axes
-from taichi_msm.physics.material import area_shares, material
+from taichi_msm.physics.material import area_shares
+from taichi_msm.physics.plan import Plan
 from taichi_msm.physics.probe_force import control_points, probe_force
+from taichi_msm.physics.slots import EDGE, ProbeSegment, ProbeSlot, probe_slots
 from taichi_msm.scene import Probe, Scene, Sheet
-from taichi_msm.timegrid import TimeGrid
-
-# A key closer than this to an end of the hat, as a fraction of its half-width, counts as outside: it would contribute
-# less than rounding does.
-EDGE = 1e-9
 
 # A time before all others [s].
 LONG_AGO = -1e300
 
 Array = NDArray[np.float64]
-
-
-class ProbeSegment(NamedTuple):
-    """A control point between two jumps.
-
-    Attributes:
-        times: of the keys [s], shape (n,).
-        points: control point at those times, x and y at rest [m], shape (n, 2); constant before and after them.
-    """
-
-    times: Array
-    points: Array
-
-
-@dataclass(frozen=True)
-class ProbeSlot:
-    """A place where a probe acts; a probe whose control point jumps has several slots and uses them by turns.
-
-    If a jump falls within the hat, the probe acts in that step at the places before and after the jump. So the segments
-    of the control point are dealt out to two slots: the first, third, ... to one, the second, fourth, ... to the other.
-    If several jumps can fall within one hat, there are as many slots as it takes.
-
-    Attributes:
-        probe: index of the probe in the scene.
-        segments: all segments of the control point, also those of the other slots.
-        turn: index of the slot's first segment.
-        turns: number of slots that the probe has; every `turns`-th segment from `turn` on is the slot's.
-    """
-
-    probe: int
-    segments: tuple[ProbeSegment, ...]
-    turn: int
-    turns: int
-
-    @property
-    def moves(self) -> bool:
-        """Whether the control point moves."""
-        return len(self.segments) > 1 or len(self.segments[0].times) > 1
-
-    @property
-    def jumps(self) -> Array:
-        """Times at which the control point jumps [s]: the first key of every segment but the first."""
-        return np.array([segment.times[0] for segment in self.segments[1:]])
 
 
 class Schedule(NamedTuple):
@@ -94,28 +46,6 @@ class Schedule(NamedTuple):
     active: Array
 
 
-def probe_slots(probes: Sequence[Probe], sheet: Sheet, h: float) -> tuple[ProbeSlot, ...]:
-    """List the slots of all probes.
-
-    Args:
-        probes: of the scene, in its order.
-        sheet: on which they act.
-        h: half-width of the hat, which is the step [s]; 0 if loads are not averaged: every probe then has one slot.
-    """
-    found = []
-    for index, probe in enumerate(probes):
-        times, points = control_points(probe, sheet)
-        jumps = np.flatnonzero((times[1:] == times[:-1]) & (points[1:] != points[:-1]).any(axis=1)) + 1
-        parts = zip(np.split(times, jumps), np.split(points, jumps), strict=True)
-        segments = tuple(ProbeSegment(*part) for part in parts)
-        # One more than the largest number of jumps in any hat.
-        jumped = times[jumps]
-        within = np.searchsorted(jumped, jumped + 2 * h * (1 - EDGE), "left") - np.arange(len(jumped))
-        turns = 1 + int(within.max(initial=0))
-        found += [ProbeSlot(index, segments, turn, turns) for turn in range(turns)]
-    return tuple(found)
-
-
 def decay(probe: Probe, sheet: Sheet) -> Array:
     """Evaluate the decay of a probe around its control point, which stands; of one that moves, around its first place.
 
@@ -128,10 +58,10 @@ def decay(probe: Probe, sheet: Sheet) -> Array:
     return shares * area_shares(sheet) if acts.by_area else shares
 
 
-def schedule(scene: Scene, grid: TimeGrid, first: int, count: int) -> Schedule:
-    """Average the loads over the steps first, ..., first + count - 1 of a grid."""
-    t, h = np.arange(first, first + count) / grid.steps_per_second, grid.step
-    parts = probe_slots(scene.probes, scene.sheet, h)
+def schedule(plan: Plan, first: int, count: int) -> Schedule:
+    """Average the loads over the steps first, ..., first + count - 1 of a plan."""
+    scene, parts = plan.scene, plan.slots
+    t, h = np.arange(first, first + count) / plan.grid.steps_per_second, plan.grid.step
     strength, point = np.zeros((count, len(parts), 3)), np.zeros((count, len(parts), 2))
     for index, probe in enumerate(scene.probes):
         own = [n for n, part in enumerate(parts) if part.probe == index]
@@ -147,19 +77,19 @@ def schedule(scene: Scene, grid: TimeGrid, first: int, count: int) -> Schedule:
             for number in np.unique(place):
                 chosen = place == number
                 point[chosen, n] = _held(segments[number], t[chosen])
-    return Schedule(parts, strength, point, _activity(scene).averages(t, h))
+    return Schedule(parts, strength, point, _activity(plan).averages(t, h))
 
 
-def loads_at(scene: Scene, t: Array) -> Schedule:
-    """Evaluate the loads themselves, not their averages, at times that are no keys [s], shape (times,)."""
-    parts = probe_slots(scene.probes, scene.sheet, 0.0)
+def loads_at(plan: Plan, t: Array) -> Schedule:
+    """Evaluate the loads themselves, not their averages, with one slot a probe, at times that are no keys [s]."""
+    scene, parts = plan.scene, probe_slots(plan.scene.probes, plan.scene.sheet, 0.0)
     strength, point = np.zeros((len(t), len(parts), 3)), np.zeros((len(t), len(parts), 2))
     for n, (part, probe) in enumerate(zip(parts, scene.probes, strict=True)):
         strength[:, n] = np.multiply.outer(_load(probe).values(t) / 100, probe_force(probe, scene.sheet).force)
         number = part.jumps.searchsorted(t, "right")
         for segment in np.unique(number):
             point[number == segment, n] = _held(part.segments[segment], t[number == segment])
-    return Schedule(parts, strength, point, _activity(scene).values(t))
+    return Schedule(parts, strength, point, _activity(plan).values(t))
 
 
 def key_times(scene: Scene) -> Array:
@@ -169,19 +99,14 @@ def key_times(scene: Scene) -> Array:
 
 
 class Envelope:
-    """Bounds of the loads from one time to another.
+    """Bounds of the loads from one time to another."""
 
-    Args:
-        scene: a checked scene.
-        h: the step [s].
-    """
-
-    def __init__(self, scene: Scene, h: float) -> None:
-        self._h = h
+    def __init__(self, plan: Plan) -> None:
+        scene, self._h = plan.scene, plan.grid.step
         self._lines = [_load(probe) for probe in scene.probes]
         self._forces = [math.hypot(*probe_force(probe, scene.sheet).force) / 100 for probe in scene.probes]
-        self._probes = [slot.probe for slot in probe_slots(scene.probes, scene.sheet, h)]
-        self._activity = _activity(scene)
+        self._probes = [slot.probe for slot in plan.slots]
+        self._activity = _activity(plan)
         self._begins = self._activity.times[self._activity.before < self._activity.after]
 
     def between(self, begin: float, end: float) -> tuple[Array, bool, int]:
@@ -227,15 +152,15 @@ class _Line:
         If neither a key nor begin nor end lies within the hat, the average is the value itself.
         """
         edges = [edge for edge in (begin, end) if math.isfinite(edge)]
-        found = self.values(t) * ((begin <= t) & (t < end))
+        averages = self.values(t) * ((begin <= t) & (t < end))
         bounds = np.union1d(self.times, edges)
         # At t = 0 there is only half a hat, so that even the average of a line is not its value at t.
         uneven = (t <= 0) | (
             bounds.searchsorted(t + h * (1 - EDGE), "left") > bounds.searchsorted(t - h * (1 - EDGE), "right")
         )
         for n in np.flatnonzero(uneven):
-            found[n] = self._average(float(t[n]), h, begin, end)
-        return found
+            averages[n] = self._average(float(t[n]), h, begin, end)
+        return averages
 
     def largest(self, begin: float, end: float) -> float:
         """Find the largest absolute value from one time to another."""
@@ -297,9 +222,10 @@ def _load(probe: Probe) -> _Line:
     return _Line(*np.array(probe.load, dtype=float).T)
 
 
-def _activity(scene: Scene) -> _Line:
+def _activity(plan: Plan) -> _Line:
     """Tell when the virtual springs act: 1 always or while the percent of any probe is not 0, else 0."""
-    if material(scene).always:
+    scene = plan.scene
+    if plan.material.always:
         return _Line(np.array([LONG_AGO]), np.array([1.0]))
     times = np.unique([time for probe in scene.probes for time, _ in probe.load])
     if not times.size:

@@ -20,18 +20,17 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator
-from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from taichi_msm.errors import Problem, SceneError
+from taichi_msm.errors import Problem
 from taichi_msm.physics import stiffness_map
-from taichi_msm.physics.lattice import fixed_points, spacing
-from taichi_msm.picture import PictureError
-from taichi_msm.scene import MAX_POINTS, Scene, Sheet, StiffnessMap
+from taichi_msm.physics.lattice import spacing
+from taichi_msm.physics.stiffness_map import MapImage
+from taichi_msm.scene import MAX_POINTS, Scene, Sheet, Tissue
 
 # Poisson's ratio of a lattice of springs between nearest and diagonal neighbours.
 POISSON = 1 / 3
@@ -42,7 +41,7 @@ LONGEST_CELL = math.sqrt(3)
 Array = NDArray[np.float64]
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Material:
     """The numbers of a sheet; with a map, those for a factor of 1.
 
@@ -55,7 +54,7 @@ class Material:
         always: whether the virtual springs always act; else only under a load.
         bending: D dx dy [N m3].
         by_area: whether points and springs at an edge get less than others, as in tissue.
-        map: factors of the stiffness from place to place.
+        factors: of the stiffness at the centre of every cell, shape (rows - 1, cols - 1); None without a map.
     """
 
     mass: float
@@ -68,7 +67,7 @@ class Material:
     always: bool
     bending: float
     by_area: bool
-    map: StiffnessMap | None
+    factors: Array | None
 
     @property
     def stiffness(self) -> tuple[float, float, float]:
@@ -103,10 +102,20 @@ class Stiffness(NamedTuple):
     shear: Array
 
 
-def material(scene: Scene) -> Material:
-    """Find the numbers of a scene's sheet."""
+def material(scene: Scene, image: MapImage | None) -> Material:
+    """Find the numbers of a scene's sheet.
+
+    Args:
+        scene: in which `kind_problems` finds nothing.
+        image: of its map; None: it has none.
+    """
+    rows, cols = scene.sheet.points
+    factors = None
+    if image is not None:
+        assert scene.stiffness_map is not None
+        factors = stiffness_map.factors(scene.stiffness_map, image, rows - 1, cols - 1)
     if scene.tissue is not None:
-        return _of_tissue(scene)
+        return _of_tissue(scene, scene.tissue, factors)
     springs, mass = scene.springs, scene.sheet.mass
     assert springs is not None
     assert mass is not None
@@ -121,13 +130,12 @@ def material(scene: Scene) -> Material:
         always=springs.virtual_active == "always",
         bending=0.0,
         by_area=False,
-        map=springs.map,
+        factors=factors,
     )
 
 
-def _of_tissue(scene: Scene) -> Material:
-    tissue, (dx, dy) = scene.tissue, spacing(scene.sheet)
-    assert tissue is not None
+def _of_tissue(scene: Scene, tissue: Tissue, factors: Array | None) -> Material:
+    dx, dy = spacing(scene.sheet)
     membrane, area = tissue.young * tissue.thickness, dx * dy
     plate = tissue.young * tissue.thickness**3 / (12 * (1 - POISSON**2))
     return Material(
@@ -141,47 +149,25 @@ def _of_tissue(scene: Scene) -> Material:
         always=tissue.foundation_active == "always",
         bending=(plate if tissue.bending == "plate" else tissue.bending) * area,
         by_area=True,
-        map=tissue.map,
+        factors=factors,
     )
 
 
-def factors(scene: Scene) -> Array:
-    """Give the factor of the stiffness at the centre of every cell, shape (rows - 1, cols - 1); ones without a map.
-
-    Raises:
-        SceneError: when the map cannot be read.
-    """
-    rows, cols = scene.sheet.points
-    if scene.stiffness_map is None:
-        return np.ones((rows - 1, cols - 1))
-    with _naming_the_map(scene):
-        return stiffness_map.factors(scene.stiffness_map, rows - 1, cols - 1)
-
-
-@contextmanager
-def _naming_the_map(scene: Scene) -> Iterator[None]:
-    """Add the key of the map to an error about its file."""
-    try:
-        yield
-    except PictureError as error:
-        raise SceneError([f"{scene.kind}.map.image: {error}"]) from None
-
-
-def stiffness(scene: Scene) -> Stiffness:
+def stiffness(material: Material, factors: Array) -> Stiffness:
     """Assemble the stiffness of every spring from its cells.
 
-    Raises:
-        SceneError: when the map cannot be read.
+    Args:
+        material: of the sheet.
+        factors: of every cell, shape (rows - 1, cols - 1).
     """
-    made, factor = material(scene), factors(scene)
-    above_and_below, beside = np.pad(factor, ((1, 1), (0, 0))), np.pad(factor, ((0, 0), (1, 1)))
-    across = made.across / 2 * (above_and_below[:-1] + above_and_below[1:])
-    down = made.down / 2 * (beside[:, :-1] + beside[:, 1:])
-    if not made.by_area:
+    above_and_below, beside = np.pad(factors, ((1, 1), (0, 0))), np.pad(factors, ((0, 0), (1, 1)))
+    across = material.across / 2 * (above_and_below[:-1] + above_and_below[1:])
+    down = material.down / 2 * (beside[:, :-1] + beside[:, 1:])
+    if not material.by_area:
         # A spring at an edge is as stiff as any other: with the factor of its only cell, not with half of it.
         across[[0, -1]] *= 2
         down[:, [0, -1]] *= 2
-    return Stiffness(across, down, made.shear * factor)
+    return Stiffness(across, down, material.shear * factors)
 
 
 def area_shares(sheet: Sheet) -> Array:
@@ -191,7 +177,7 @@ def area_shares(sheet: Sheet) -> Array:
     return np.outer(rows, cols)
 
 
-def highest_frequency(scene: Scene) -> float:
+def highest_frequency(material: Material, sheet: Sheet) -> float:
     """Bound the highest angular frequency of the sheet [rad/s] in any shape without springs below half their length.
 
     The energy is a sum over cells. The springs of a cell have at most the energy k / 2 |q|^2, so that no mode of a cell
@@ -203,11 +189,10 @@ def highest_frequency(scene: Scene) -> float:
     point's stiffness; the maximum is then multiplied by the largest mean of the factors around a point. Bending adds
     the square of the largest Laplacian, (4 / dx^2 + 4 / dy^2)^2 D dx dy / m.
     """
-    made, (dx, dy) = material(scene), spacing(scene.sheet)
-    pairs = (made.across + made.down, made.across + 2 * made.shear, made.down + 2 * made.shear)
-    springs = 4 * max(pairs) * _largest_factor(scene)
-    bending = made.bending * (4 / dx**2 + 4 / dy**2) ** 2
-    return math.sqrt((springs + made.virtual + bending) / made.mass)
+    (dx, dy), across, down, shear = spacing(sheet), material.across, material.down, material.shear
+    springs = 4 * max(across + down, across + 2 * shear, down + 2 * shear) * _largest_factor(material)
+    bending = material.bending * (4 / dx**2 + 4 / dy**2) ** 2
+    return math.sqrt((springs + material.virtual + bending) / material.mass)
 
 
 def cell_ratio(sheet: Sheet) -> float:
@@ -216,34 +201,20 @@ def cell_ratio(sheet: Sheet) -> float:
     return max(dx, dy) / min(dx, dy)
 
 
-def has_fixed_border(sheet: Sheet) -> bool:
+def has_fixed_border(fixed: NDArray[np.bool_]) -> bool:
     """Tell whether every point at an edge is fixed."""
-    fixed = fixed_points(sheet)
     return bool(fixed[[0, -1]].all() and fixed[:, [0, -1]].all())
 
 
-def _largest_factor(scene: Scene) -> float:
+def _largest_factor(material: Material) -> float:
     """Find the largest mean of the factors of the cells around a point; with springs, the largest factor."""
-    if scene.stiffness_map is None:
+    if material.factors is None:
         return 1.0
-    rows, cols = scene.sheet.points
-    largest = stiffness_map.largest_mean if material(scene).by_area else stiffness_map.largest
-    with _naming_the_map(scene):
-        return largest(scene.stiffness_map, rows - 1, cols - 1)
+    return stiffness_map.largest_mean(material.factors) if material.by_area else float(material.factors.max())
 
 
-def problems(scene: Scene) -> Iterator[Problem]:
-    """Find missing and superfluous keys of springs and of tissue, and tissue that is impossible."""
-    kinds = list(_kind_problems(scene))
-    yield from kinds
-    if not kinds:
-        unreadable = list(_map_problems(scene))
-        yield from unreadable
-        yield from _tissue_problems(scene, has_map=scene.stiffness_map is not None and not unreadable)
-
-
-def _kind_problems(scene: Scene) -> Iterator[Problem]:
-    """Find keys that belong to the other kind of sheet."""
+def kind_problems(scene: Scene) -> Iterator[Problem]:
+    """Find missing and superfluous keys of springs and of tissue."""
     sheet = scene.sheet
     if scene.tissue is None:
         if scene.springs is None:
@@ -267,16 +238,14 @@ def _kind_problems(scene: Scene) -> Iterator[Problem]:
             yield Problem(("probes", index, "force"), said)
 
 
-def _map_problems(scene: Scene) -> Iterator[Problem]:
-    if scene.stiffness_map is None:
-        return
-    try:
-        stiffness_map.read(scene.stiffness_map)
-    except PictureError as error:
-        yield Problem((scene.kind, "map", "image"), str(error))
+def tissue_problems(scene: Scene, fixed: NDArray[np.bool_], factors: Array | None) -> Iterator[Problem]:
+    """Find tissue that is impossible.
 
-
-def _tissue_problems(scene: Scene, *, has_map: bool) -> Iterator[Problem]:
+    Args:
+        scene: in which `kind_problems` finds nothing.
+        fixed: which points of its sheet are fixed, shape (rows, cols).
+        factors: of the stiffness of its cells; None: not known, or there is no map.
+    """
     tissue, sheet = scene.tissue, scene.sheet
     if tissue is None:
         return
@@ -291,14 +260,14 @@ def _tissue_problems(scene: Scene, *, has_map: bool) -> Iterator[Problem]:
             f"{list(sheet.points)} make cells {longest:.3g} times as long as wide, and tissue allows "
             f"{LONGEST_CELL:.3g} times; {remedy}",
         )
-    if not has_fixed_border(sheet):
+    if not has_fixed_border(fixed):
         bending = "plate" if tissue.bending == "plate" else f"{tissue.bending:g} N m"
         for name, value in (("pretension", f"{tissue.pretension:g} N/m"), ("bending", bending)):
             if getattr(tissue, name) != 0:
                 said = f"{value} needs every side fixed; set sheet.fixed: border, or {name}: 0"
                 yield Problem(("tissue", name), said)
     if tissue.pretension > 0:
-        softest = float(factors(scene).min()) if has_map else 1.0
+        softest = 1.0 if factors is None else float(factors.min())
         most = 1.5 * tissue.young * tissue.thickness * softest
         if tissue.pretension >= most:
             yield Problem(

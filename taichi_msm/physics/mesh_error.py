@@ -25,7 +25,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from contextlib import ExitStack, closing
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import partial
 from itertools import pairwise, product
 from typing import Any
@@ -35,14 +35,16 @@ from numpy.typing import NDArray
 
 from taichi_msm.errors import SceneError
 from taichi_msm.physics.error_control import longest
-from taichi_msm.physics.material import LONGEST_CELL, cell_ratio, material
+from taichi_msm.physics.material import LONGEST_CELL, cell_ratio
+from taichi_msm.physics.plan import Plan
+from taichi_msm.physics.planning import on, try_plan
 from taichi_msm.physics.probe_force import sums
 from taichi_msm.physics.solver import Dynamics
-from taichi_msm.physics.timestep import stable_steps, time_grid
+from taichi_msm.physics.stiffness_map import MapImage
+from taichi_msm.physics.timestep import stable_steps
 from taichi_msm.progress import Count, Pause
 from taichi_msm.scene import MAX_POINTS, Probe, Scene, Sheet
 from taichi_msm.system.runtime import Device
-from taichi_msm.timegrid import TimeGrid
 
 # Orders between which the three runs are taken to converge.
 LOWEST_ORDER, HIGHEST_ORDER = 1.0, 3.0
@@ -81,12 +83,13 @@ class MeshEstimate:
     doubt: str = ""
 
 
-def coarser(scene: Scene) -> Scene | None:
-    """Give the scene half as many cells a side, and tools whose total force stays the same.
+def coarser(plan: Plan) -> Plan | None:
+    """Plan the scene with half as many cells a side, and tools whose total force stays the same.
 
     Returns:
         None if there are too few points, or no tissue.
     """
+    scene = plan.scene
     if scene.tissue is None or min(scene.sheet.points) < FEWEST:
         return None
     # Halves are rounded up or down, so that cells do not get too long.
@@ -96,7 +99,7 @@ def coarser(scene: Scene) -> Scene | None:
     if cell_ratio(coarse.sheet) > LONGEST_CELL:
         return None
     probes = tuple(_pressing_alike(probe, scene.sheet, coarse.sheet) for probe in scene.probes)
-    return coarse.model_copy(update={"probes": probes})
+    return try_plan(coarse.model_copy(update={"probes": probes}), plan.image)[0]
 
 
 def _pressing_alike(probe: Probe, sheet: Sheet, other: Sheet) -> Probe:
@@ -121,9 +124,8 @@ class MeshPilot:
     """Runs in f64 beside another run, with half the cells a side and, if there are enough points, with a quarter.
 
     Args:
-        scene: what is run.
-        grid: the steps of the run that it is compared with.
-        coarse: what `coarser` returned for the scene.
+        plan: of the run that it is compared with.
+        coarse: what `coarser` returned for it.
         device: what `runtime.start` returned.
         cores: number of cores that stepping may use; None: all.
 
@@ -131,21 +133,21 @@ class MeshPilot:
         DeviceError: when the device cannot run it in f64.
     """
 
-    def __init__(self, scene: Scene, grid: TimeGrid, coarse: Scene, device: Device, cores: int | None = None) -> None:
-        self._scene, coarsest, steps = scene, coarser(coarse), grid.steps_per_frame
-        scenes = [coarse] if coarsest is None else [coarse, coarsest]
+    def __init__(self, plan: Plan, coarse: Plan, device: Device, cores: int | None = None) -> None:
+        self._material, coarsest, steps = plan.material, coarser(coarse), plan.grid.steps_per_frame
+        plans = [coarse] if coarsest is None else [coarse, coarsest]
         self._sheets = []
         with ExitStack() as opened:
-            for one in scenes:
-                steps = max(math.ceil(steps / 2), stable_steps(one))
-                exact = replace(grid, precision="f64", steps_per_frame=steps)
-                self._sheets.append(opened.enter_context(closing(Dynamics(one, exact, device, cores=cores))))
+            for sheet in plans:
+                steps = max(math.ceil(steps / 2), stable_steps(sheet))
+                exact = sheet.with_grid(precision="f64", steps_per_frame=steps)
+                self._sheets.append(opened.enter_context(closing(Dynamics(exact, device, cores=cores))))
             self._open = opened.pop_all()
-        points = [one.sheet.points for one in (scene, *scenes)]
+        points = [sheet.scene.sheet.points for sheet in (plan, *plans)]
         self._samplings = [CubicSampling(after, before) for before, after in pairwise(points)]
         self._ratio = min((own - 1) / (other - 1) for own, other in zip(*points[:2], strict=True))
-        self._differences = [0.0 for _ in scenes]
-        self._missing = missing_force(scene)
+        self._differences = [0.0 for _ in plans]
+        self._missing = missing_force(plan.scene)
         self._largest, self._shortest = 0.0, 1.0
 
     def compile(self) -> None:
@@ -162,11 +164,11 @@ class MeshPilot:
         self._largest = max(self._largest, longest(displacement))
         finer = displacement
         for n, (sheet, sampling) in enumerate(zip(self._sheets, self._samplings, strict=True)):
-            sheet.advance(sheet.grid.steps_per_frame, pause)
-            found = sheet.read()
+            sheet.advance(sheet.plan.grid.steps_per_frame, pause)
+            reading = sheet.read()
             with np.errstate(all="ignore"):
-                self._differences[n] = max(self._differences[n], longest(finer - sampling.at(found.displacement)))
-            finer, self._shortest = found.displacement, min(self._shortest, found.shortest_spring)
+                self._differences[n] = max(self._differences[n], longest(finer - sampling.at(reading.displacement)))
+            finer, self._shortest = reading.displacement, min(self._shortest, reading.shortest_spring)
 
     @property
     def estimate(self) -> MeshEstimate:
@@ -175,12 +177,12 @@ class MeshPilot:
             return MeshEstimate(0.0)
         if not self._differences[0] / self._largest < math.inf:
             return MeshEstimate(math.inf)
-        made, order, doubt = material(self._scene), self.order, ""
+        order, doubt = self.order, ""
         assumed = 1.0 if order is None else max(1.0, min(order, 2 - ABOVE * (order - 2)))
         relative = self._differences[0] / (self._ratio**assumed - 1) / self._largest
         if order is not None and not LOWEST_ORDER <= order <= HIGHEST_ORDER:
             doubt = "runs with fewer points do not converge"
-        elif made.bending == 0 and self._shortest < 1 - made.tension - SLACK:
+        elif self._material.bending == 0 and self._shortest < 1 - self._material.tension - SLACK:
             doubt = "tissue without bending is pressed together, and with more points wrinkles more"
         return MeshEstimate((2 if doubt else 1) * relative + self._missing, doubt)
 
@@ -203,59 +205,58 @@ def with_points(scene: Scene, points: tuple[int, int]) -> Scene:
 
 
 def choose_points(
-    scene: Scene,
+    plan: Plan,
     device: Device,
-    check: Callable[[Scene], object],
+    check: Callable[[Scene, MapImage | None], Plan],
     progress: Count = lambda done, total: None,
-) -> tuple[Scene, MeshEstimate]:
+) -> tuple[Plan, MeshEstimate]:
     """Find the fewest points, approximately, whose error is within the sheet's tolerance.
 
     Args:
-        scene: a checked scene with such a tolerance. No fewer points than its own are tried; cells keep their shape.
+        plan: of a scene with such a tolerance. No fewer points than its own are tried; cells keep their shape.
         device: what `runtime.start` returned.
-        check: raises SceneError if a scene with other points cannot be run.
+        check: plans a scene with other points and the same map; raises SceneError if it cannot be run.
         progress: called with the frames done and the frames in all of each pilot run.
 
     Returns:
-        The scene with these points, and its error.
+        The plan with these points, and its error.
 
     Raises:
         SceneError: when even the largest possible number of points is too small, or cannot be run.
     """
-    tolerance, given = scene.sheet.tolerance, scene.sheet.points
+    tolerance, given = plan.scene.sheet.tolerance, plan.scene.sheet.points
     assert tolerance is not None
     times, most = max(1.0, (FEWEST - 1) / (min(given) - 1)), (MAX_POINTS - 1) / (max(given) - 1)
     for _ in range(MOST_TRIALS):
         rows, cols = (round((count - 1) * times) + 1 for count in given)
-        tried = with_points(scene, (rows, cols))
         try:
-            check(tried)
+            tried = on(check(with_points(plan.scene, (rows, cols)), plan.image), device.arch)
         except SceneError as error:
             asked = f"with the {rows} x {cols} points that sheet.tolerance: {tolerance:g} asks for"
             raise SceneError([f"{line} ({asked})" for line in error.lines]) from None
-        found = _estimate(tried, device, progress)
-        if found.error <= tolerance:
-            return tried, found
+        estimate = _estimate(tried, device, progress)
+        if estimate.error <= tolerance:
+            return tried, estimate
         # The error falls with the square of the length of the cells, or more slowly.
-        needed = times * math.sqrt(found.error / (CLOSE * tolerance))
+        needed = times * math.sqrt(estimate.error / (CLOSE * tolerance))
         if needed > most:
             break
         times *= min(LARGEST_CUT, max(LEAST_CUT, needed / times))
     raise SceneError(
         [
             f"sheet.tolerance: {tolerance:g} is out of reach: with {rows} x {cols} points the error is "
-            f"{found.error:.2g}, and no sheet has more than {MAX_POINTS} points a side; take a wider tool "
+            f"{estimate.error:.2g}, and no sheet has more than {MAX_POINTS} points a side; take a wider tool "
             "(probes.N.radius, a smaller falloff), tissue.pretension or bending where it wrinkles and every side is "
             "fixed, or a larger tolerance"
         ]
     )
 
 
-def _estimate(scene: Scene, device: Device, progress: Count) -> MeshEstimate:
+def _estimate(plan: Plan, device: Device, progress: Count) -> MeshEstimate:
     """Run a scene and its pilot in f64, and give the error that the pilot shows."""
-    grid, coarse = replace(time_grid(scene, device.arch), precision="f64"), coarser(scene)
+    exact, coarse, grid = plan.with_grid(precision="f64"), coarser(plan), plan.grid
     assert coarse is not None
-    with closing(Dynamics(scene, grid, device)) as own, closing(MeshPilot(scene, grid, coarse, device)) as pilot:
+    with closing(Dynamics(exact, device)) as own, closing(MeshPilot(exact, coarse, device)) as pilot:
         for frame in range(grid.frames):
             pause = partial(progress, frame, grid.frames)
             pause()

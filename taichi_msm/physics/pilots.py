@@ -9,11 +9,9 @@ from __future__ import annotations
 import math
 from typing import NamedTuple
 
-from taichi_msm.physics.material import material
+from taichi_msm.physics.plan import Plan
 from taichi_msm.physics.timestep import stable_steps
 from taichi_msm.physics.workload import affords_pilots
-from taichi_msm.scene import Scene
-from taichi_msm.timegrid import TimeGrid
 
 # An error below this needs no finer pilot: nobody sees it, and twice as much or half of it would mean the same.
 ENOUGH = 1e-3
@@ -47,27 +45,26 @@ class Pilots(NamedTuple):
     reason: str = ""
 
 
-def choose_pilots(scene: Scene, grid: TimeGrid, *, asked: bool = False) -> Pilots:
+def choose_pilots(plan: Plan, *, asked: bool = False) -> Pilots:
     """Choose the pilots of a run.
 
     Args:
-        scene: a checked scene.
-        grid: its steps.
+        plan: of the run.
         asked: whether they are wanted whatever they cost.
     """
-    own = grid.steps_per_frame
-    coarse, fine = coarse_steps(scene, grid), fine_steps(scene, grid)
+    scene, own = plan.scene, plan.grid.steps_per_frame
+    coarse, fine = coarse_steps(plan), fine_steps(plan)
     points = POINTS if scene.tissue is not None else 0.0
     # Beside a run in f32 a fine pilot has another one with the run's own steps.
-    fine_cost = fine / own + (grid.precision == "f32")
+    fine_cost = fine / own + (plan.grid.precision == "f32")
     first = (1 + points) * coarse / own if coarse else fine_cost + points
-    if not asked and not affords_pilots(scene, grid, first):
+    if not asked and not affords_pilots(plan, first):
         return no_pilots("it would take more than two fifths of the run; to have it anyway, pass --estimate-error")
     if not coarse:
         return Pilots(fine, 0, points > 0, first)
     # Where no positions are kept, the run is repeated beside the pilot that follows.
     again = 0.0 if scene.output else 1.0
-    follows = asked or affords_pilots(scene, grid, first + fine_cost + again)
+    follows = asked or affords_pilots(plan, first + fine_cost + again)
     return Pilots(coarse, fine if follows else 0, points > 0, first)
 
 
@@ -76,17 +73,18 @@ def no_pilots(reason: str) -> Pilots:
     return Pilots(0, 0, False, 0.0, reason)
 
 
-def coarse_steps(scene: Scene, grid: TimeGrid) -> int:
+def coarse_steps(plan: Plan) -> int:
     """Count the steps per frame of the coarse pilot: half of the run's; 0: no such run is stable, or cheap enough."""
-    steps = max(math.ceil(grid.steps_per_frame / 2), stable_steps(scene))
-    return steps if steps <= COARSEST * grid.steps_per_frame else 0
+    own = plan.grid.steps_per_frame
+    steps = max(math.ceil(own / 2), stable_steps(plan))
+    return steps if steps <= COARSEST * own else 0
 
 
-def fine_steps(scene: Scene, grid: TimeGrid) -> int:
+def fine_steps(plan: Plan) -> int:
     """Count the steps per frame of the fine pilot: twice the run's, or as many as resolve the damping; 0: too many.
 
     If g h / r > 1, with g = C / m, central differences make velocities change their sign at every step, and the
     difference between runs with steps h and h / r does not show all of it. A coarse pilot shows 2 to 4 times as much.
     """
-    refinement = max(2, math.ceil(material(scene).drag * grid.step))
-    return refinement * grid.steps_per_frame if refinement <= FINEST else 0
+    refinement = max(2, math.ceil(plan.material.drag * plan.grid.step))
+    return refinement * plan.grid.steps_per_frame if refinement <= FINEST else 0

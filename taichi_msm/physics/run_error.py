@@ -14,11 +14,10 @@ from numpy.typing import NDArray
 from taichi_msm.physics.error_control import Estimate, Pilot
 from taichi_msm.physics.mesh_error import MeshEstimate, MeshPilot, coarser
 from taichi_msm.physics.pilots import ENOUGH, Pilots
+from taichi_msm.physics.plan import Plan
 from taichi_msm.physics.solver import Dynamics
 from taichi_msm.progress import Count, Pause
-from taichi_msm.scene import Scene
 from taichi_msm.system.runtime import Device
-from taichi_msm.timegrid import TimeGrid
 
 
 class Known(NamedTuple):
@@ -39,8 +38,7 @@ class RunError:
     """The pilots of a run.
 
     Args:
-        scene: what is run.
-        grid: its steps.
+        plan: of the run.
         pilots: what `choose_pilots` returned.
         known: what was found before the run, and is not estimated again.
         device: what `runtime.start` returned.
@@ -50,18 +48,18 @@ class RunError:
         DeviceError: when the device cannot run the scene in f64.
     """
 
-    def __init__(self, scene: Scene, grid: TimeGrid, pilots: Pilots, known: Known, device: Device, cores: int) -> None:
-        self._scene, self._grid, self._pilots, self._known = scene, grid, pilots, known
+    def __init__(self, plan: Plan, pilots: Pilots, known: Known, device: Device, cores: int) -> None:
+        self._plan, self._pilots, self._known = plan, pilots, known
         self._device, self._cores = device, cores
-        self._coarse = known.estimate is None and 0 < pilots.beside < grid.steps_per_frame
+        self._coarse = known.estimate is None and 0 < pilots.beside < plan.grid.steps_per_frame
         with ExitStack() as opened:
             self._time = self._mesh = None
             if known.estimate is None:
-                self._time = opened.enter_context(closing(Pilot(scene, grid, pilots.beside, device, cores)))
-            coarse = coarser(scene) if pilots.points and known.mesh is None else None
+                self._time = opened.enter_context(closing(Pilot(plan, pilots.beside, device, cores)))
+            coarse = coarser(plan) if pilots.points and known.mesh is None else None
             if coarse is not None:
-                steps = replace(grid, steps_per_frame=pilots.beside) if self._coarse else grid
-                self._mesh = opened.enter_context(closing(MeshPilot(scene, steps, coarse, device, cores)))
+                beside = plan.with_grid(steps_per_frame=pilots.beside) if self._coarse else plan
+                self._mesh = opened.enter_context(closing(MeshPilot(beside, coarse, device, cores)))
             self._open = opened.pop_all()
 
     def compile(self) -> None:
@@ -91,31 +89,31 @@ class RunError:
         """
         if self._time is None or not self._pilots.after or self._time.estimate.error < ENOUGH:
             return
-        frames = self._grid.frames
-        with closing(Pilot(self._scene, self._grid, self._pilots.after, self._device, self._cores)) as fine:
+        frames = self._plan.grid.frames
+        with closing(Pilot(self._plan, self._pilots.after, self._device, self._cores)) as fine:
             for frame, displacement in enumerate(displacements or self._repeated(), 1):
                 fine.follow(displacement, partial(progress, frame, frames))
             self._known = self._known._replace(estimate=fine.estimate)
 
     def _repeated(self) -> Iterator[NDArray[Any]]:
         """Run the scene again; give the displacements of its frames."""
-        with closing(Dynamics(self._scene, self._grid, self._device, cores=self._cores)) as own:
-            for _ in range(self._grid.frames):
-                own.advance(self._grid.steps_per_frame)
+        with closing(Dynamics(self._plan, self._device, cores=self._cores)) as own:
+            for _ in range(self._plan.grid.frames):
+                own.advance(self._plan.grid.steps_per_frame)
                 yield own.displacement()
 
     @property
     def known(self) -> Known:
         """What the frames so far show."""
-        found = self._known
-        if found.estimate is None and self._time is not None:
+        known = self._known
+        if known.estimate is None and self._time is not None:
             estimate = self._time.estimate
             # What a coarse pilot tells of a run in f32 is an upper bound.
             at_least = self._coarse and estimate.parted and ENOUGH <= estimate.error < math.inf
-            found = found._replace(estimate=replace(estimate, at_least=at_least))
+            known = known._replace(estimate=replace(estimate, at_least=at_least))
         if self._mesh is not None:
-            found = found._replace(mesh=self._mesh.estimate)
-        return found
+            known = known._replace(mesh=self._mesh.estimate)
+        return known
 
     def close(self) -> None:
         """Free the memory."""

@@ -16,7 +16,6 @@ sheet.
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -47,17 +46,16 @@ from taichi_msm.physics.kernel import (
 )
 from taichi_msm.physics.kernel_cpu import Sweep
 from taichi_msm.physics.kernel_gpu import STEPS_PER_LAUNCH, Gather
-from taichi_msm.physics.lattice import axes, fixed_points, spacing
-from taichi_msm.physics.loads import ProbeSlot, decay, probe_slots, schedule
-from taichi_msm.physics.material import area_shares, has_fixed_border, material, stiffness
+from taichi_msm.physics.lattice import axes, spacing
+from taichi_msm.physics.loads import decay, schedule
+from taichi_msm.physics.material import area_shares, has_fixed_border, stiffness
+from taichi_msm.physics.plan import Plan
 from taichi_msm.physics.probe_force import probe_force
 from taichi_msm.physics.state import Reading, State
 from taichi_msm.physics.verlet import coefficients
 from taichi_msm.progress import Pause
-from taichi_msm.scene import Scene
 from taichi_msm.system.resources import available_threads
 from taichi_msm.system.runtime import Device, lanes
-from taichi_msm.timegrid import TimeGrid
 
 # With fewer points per worker, one worker more costs more time in waiting than it saves in work.
 POINTS_PER_WORKER = 450
@@ -78,21 +76,20 @@ MAX_STEPS_PER_LAUNCH = 8192
 STEPS_PER_TABLE = 4096
 
 
-def structure(scene: Scene, grid: TimeGrid, device: Device, cores: int | None = None) -> Structure:
+def structure(plan: Plan, device: Device, cores: int | None = None) -> Structure:
     """Choose how a sheet is laid out and shared out, and what is compiled for it: only the terms that the scene has.
 
     Args:
-        scene: a checked scene.
-        grid: its steps.
+        plan: of the scene.
         device: what `runtime.start` returned.
         cores: number of cores that stepping may use; None: all.
 
     Raises:
         DeviceError: when the device cannot do what the scene needs.
     """
-    rows, cols = scene.sheet.points
-    fixed, made, slots = fixed_points(scene.sheet), material(scene), _slots(scene, grid)
-    precision, open_edges = grid.precision, not has_fixed_border(scene.sheet)
+    rows, cols = plan.scene.sheet.points
+    fixed, material, precision = plan.fixed, plan.material, plan.grid.precision
+    open_edges = not has_fixed_border(fixed)
     fixed_rows = bool(fixed[0].all()), bool(fixed[-1].all())
     if device.arch == "cpu":
         # Workers wait by spinning, so more workers than cores would only hold each other up.
@@ -103,17 +100,17 @@ def structure(scene: Scene, grid: TimeGrid, device: Device, cores: int | None = 
     code = Code(
         precision=precision,
         lanes=lanes(precision),
-        structural=max(made.across, made.down) > 0,
-        shear=made.shear > 0,
+        structural=max(material.across, material.down) > 0,
+        shear=material.shear > 0,
         open_edges=open_edges,
-        by_area=open_edges and made.by_area,
-        mapped=made.map is not None,
-        tense=made.tension > 0,
-        bending=made.bending > 0,
-        virtual=made.virtual > 0,
-        damped=made.drag > 0,
-        slots_move=tuple(slot.moves for slot in slots),
-        slots_by_area=_slots_by_area(scene, slots),
+        by_area=open_edges and material.by_area,
+        mapped=material.factors is not None,
+        tense=material.tension > 0,
+        bending=material.bending > 0,
+        virtual=material.virtual > 0,
+        damped=material.drag > 0,
+        slots_move=_moves(plan),
+        slots_by_area=_slots_by_area(plan),
     )
     if device.arch == "vulkan" and precision == "f64" and any(code.slots_move):
         raise DeviceError(
@@ -129,15 +126,13 @@ class Dynamics:
     """The sheet in motion.
 
     Args:
-        scene: a checked scene.
-        grid: its steps.
+        plan: of the scene.
         device: what `runtime.start` returned.
         layout: a structure in the place of the scene's own; for tests.
         cores: number of cores that stepping may use; None: all.
 
     Attributes:
-        scene: what is stepped.
-        grid: its steps.
+        plan: of what is stepped.
         structure: what the kernels are compiled for.
         steps_done: number of steps taken.
         launches: number of times that a series of steps was taken, each followed by a call of `pause`.
@@ -147,8 +142,7 @@ class Dynamics:
 
     def __init__(
         self,
-        scene: Scene,
-        grid: TimeGrid,
+        plan: Plan,
         device: Device,
         layout: Structure | None = None,
         cores: int | None = None,
@@ -158,44 +152,42 @@ class Dynamics:
         self._layout = layout
         self.launches = 0
         self._sheet: Sweep | Gather | None = None
-        self.restart(scene, grid)
+        self.restart(plan)
 
-    def restart(self, scene: Scene, grid: TimeGrid, state: State | None = None) -> None:
+    def restart(self, plan: Plan, state: State | None = None) -> None:
         """Begin again with the same scene or another; nothing is compiled if only numbers differ.
 
         Args:
-            scene: a checked scene.
-            grid: its steps.
+            plan: of the scene.
             state: what `state` returned for the same points and steps, to continue from; None: at rest.
         """
-        self.scene, self.grid = scene, grid
-        self.structure = self._layout or structure(scene, grid, self._device, self._cores)
+        self.plan = plan
+        self.structure = self._layout or structure(plan, self._device, self._cores)
         self._begin(state)
 
-    def steer(self, scene: Scene) -> None:
+    def steer(self, plan: Plan) -> None:
         """Continue with other loads and the same steps.
 
         Args:
-            scene: the scene with other probes, each of which moves, jumps or stands as its predecessor did.
+            plan: with other probes, each of which moves, jumps or stands as its predecessor did.
 
         Raises:
             ArgumentError: when the new probes need another kernel.
         """
-        slots = _slots(scene, self.grid)
-        moves = tuple(slot.moves for slot in slots)
+        moves = _moves(plan)
         if moves != self.structure.code.slots_move:
             before = _in_words(self.structure.code.slots_move)
             raise ArgumentError(
                 f"probes: which control points move or jump cannot change (before: {before}; now: {_in_words(moves)}); "
                 "restart with the new scene"
             )
-        if _slots_by_area(scene, slots) != self.structure.code.slots_by_area:
+        if _slots_by_area(plan) != self.structure.code.slots_by_area:
             raise ArgumentError("probes: one has total instead of force, or the reverse; restart with the new scene")
-        if _standing(scene, slots) != _standing(self.scene, _slots(self.scene, self.grid)):
-            self._moving.set_decay(_standing_decays(scene, slots))
-        self.scene = scene
+        if _standing(plan) != _standing(self.plan):
+            self._moving.set_decay(_standing_decays(plan))
+        self.plan = plan
         # A caller that steers will steer again in a frame, so no more loads than those of a frame are tabulated.
-        self._first_tabled, self._loads = self.steps_done, self._table(self.steps_done, self.grid.steps_per_frame)
+        self._first_tabled, self._loads = self.steps_done, self._table(self.steps_done, plan.grid.steps_per_frame)
 
     def advance(self, steps: int, pause: Pause = lambda: None) -> None:
         """Take a number of steps.
@@ -250,20 +242,24 @@ class Dynamics:
             math.sqrt(max(0.0, 1.0 + float(one))) for one in (measures[:, LEAST].min(), measures[:, MOST].max())
         )
         sums = measures.sum(axis=0, dtype=np.float64)
-        made, (dx, dy) = self._material, spacing(self.scene.sheet)
+        material, (dx, dy) = self.plan.material, spacing(self.plan.scene.sheet)
         squares = np.array([dx**2, dy**2, dx**2 + dy**2])
-        stiffness = np.ones(3) if made.map else np.array(made.stiffness)
-        springs = (stiffness * sums[STRETCHED : STRETCHED + 3] + made.tensions * sums[TENSE : TENSE + 3]) @ squares
-        motion = made.mass * sums[MOTION] / self.grid.step**2
+        stiffness = np.ones(3) if self.structure.code.mapped else np.array(material.stiffness)
+        springs = (stiffness * sums[STRETCHED : STRETCHED + 3] + material.tensions * sums[TENSE : TENSE + 3]) @ squares
+        motion = material.mass * sums[MOTION] / self.plan.grid.step**2
         return Reading(
-            self.steps_done, displacement, shortest, longest, float(springs + motion + made.bending * sums[BENT]) / 2
+            self.steps_done,
+            displacement,
+            shortest,
+            longest,
+            float(springs + motion + material.bending * sums[BENT]) / 2,
         )
 
     def _copy(self, *, differences: bool) -> tuple[NDArray[Any], NDArray[Any]]:
         """Copy the displacements or the differences, and the measures of every row."""
         s = self.structure
         out, measures = np.empty((s.rows, s.cols, 3), self._real), np.empty((s.rows, MEASURES), self._real)
-        self._moving.read(spacing(self.scene.sheet), ReadArguments(differences, out, measures))
+        self._moving.read(spacing(self.plan.scene.sheet), ReadArguments(differences, out, measures))
         return out, measures
 
     def _require_whole(self) -> None:
@@ -283,8 +279,8 @@ class Dynamics:
         """Prepare the sheet at rest or in a given state."""
         self._real = np.dtype(np.float32 if self.structure.code.precision == "f32" else np.float64)
         self.steps_done, self.torn = 0 if state is None else state.steps, True
-        self._material = material(self.scene)
-        self._verlet = coefficients(self._material, self.grid.step, self.scene.time.damping_difference)
+        plan = self.plan
+        self._verlet = coefficients(plan.material, plan.grid.step, plan.scene.time.damping_difference)
         self._arguments = self._numbers()
         self._first_tabled, self._loads = self.steps_done, self._table(self.steps_done, STEPS_PER_TABLE)
         self._place(state)
@@ -292,8 +288,9 @@ class Dynamics:
 
     def _numbers(self) -> tuple[float, ...]:
         """List the scene's numbers in the order of the kernel's arguments."""
-        made, sheet = self._material, self.scene.sheet
-        return self._verlet.keep, *spacing(sheet), *made.stiffness, *made.tensions, made.bending, sheet.size[0] / 2
+        material, sheet = self.plan.material, self.plan.scene.sheet
+        numbers = *material.stiffness, *material.tensions, material.bending
+        return self._verlet.keep, *spacing(sheet), *numbers, sheet.size[0] / 2
 
     def _next_loads(self, count: int) -> NDArray[Any]:
         """Give the table of the loads of the next steps, shape (count, columns)."""
@@ -306,17 +303,17 @@ class Dynamics:
 
     def _table(self, first: int, count: int) -> NDArray[Any]:
         """Tabulate the loads of steps first, ..., first + count - 1, shape (count, columns)."""
-        scene, loads = self.scene, schedule(self.scene, self.grid, first, count)
+        plan, loads = self.plan, schedule(self.plan, first, count)
         table = np.empty((count, self.structure.code.load_columns))
         table[:, 0] = self._verlet.gain
         if first == 0:
             table[0, 0] = self._verlet.first_gain
-        table[:, 1] = self._material.virtual * loads.active
-        slot = table[:, SLOT_COLUMN:].reshape(count, len(loads.slots), SLOT_COLUMNS)
+        table[:, 1] = plan.material.virtual * loads.active
+        slot = table[:, SLOT_COLUMN:].reshape(count, len(plan.slots), SLOT_COLUMNS)
         slot[..., :3] = loads.strength
         slot[..., 3:5] = loads.point
-        for n, part in enumerate(loads.slots):
-            acts = probe_force(scene.probes[part.probe], scene.sheet)
+        for n, part in enumerate(plan.slots):
+            acts = probe_force(plan.scene.probes[part.probe], plan.scene.sheet)
             slot[:, n, 5:] = acts.falloff, acts.shift, acts.offset
         # Loads too large for f32 become infinite; the next reading of the sheet shows it.
         with np.errstate(over="ignore"):
@@ -324,40 +321,40 @@ class Dynamics:
 
     def _place(self, state: State | None) -> None:
         """Fill the arrays of the sheet."""
-        s, scene = self.structure, self.scene
-        moves, column = ~fixed_points(scene.sheet), np.arange(s.cols)
+        s, plan, sheet = self.structure, self.plan, self.plan.scene.sheet
+        moves, column, areas = ~plan.fixed, np.arange(s.cols), area_shares(sheet)
         # Rows are of three kinds: the first, any in between, the last.
         kinds = [0, s.rows // 2, -1]
-        shares = area_shares(scene.sheet)[kinds] if s.code.by_area else np.ones((3, s.cols))
+        shares = areas[kinds] if s.code.by_area else np.ones((3, s.cols))
         by_column = np.empty((COLUMN_ROWS, s.cols))
         by_column[MOVES : MOVES + 3] = moves[kinds] / shares
-        by_column[AREA : AREA + 3] = area_shares(scene.sheet)[kinds]
-        by_column[ACROSS] = axes(scene.sheet)[0]
+        by_column[AREA : AREA + 3] = areas[kinds]
+        by_column[ACROSS] = axes(sheet)[0]
         by_column[HAS_LEFT] = column > 0
         by_column[HAS_RIGHT] = column < s.cols - 1
         self._sheet = None  # Frees its memory before another sheet takes some.
         kind = Sweep if s.workers else Gather
         begun = None if state is None else (state.displacement, state.difference)
-        decays = _standing_decays(scene, _slots(scene, self.grid))
-        self._sheet = kind(s, Start(by_column, decays, _mapped_stiffness(scene), begun))
+        self._sheet = kind(s, Start(by_column, _standing_decays(plan), _mapped_stiffness(plan), begun))
 
 
-def _slots(scene: Scene, grid: TimeGrid) -> tuple[ProbeSlot, ...]:
-    return probe_slots(scene.probes, scene.sheet, grid.step)
+def _moves(plan: Plan) -> tuple[bool, ...]:
+    """Tell for every slot whether its control point moves."""
+    return tuple(slot.moves for slot in plan.slots)
 
 
-def _slots_by_area(scene: Scene, slots: Sequence[ProbeSlot]) -> tuple[bool, ...]:
+def _slots_by_area(plan: Plan) -> tuple[bool, ...]:
     """Tell for every slot whether there are points at a free edge, and these get less of its force than others."""
-    open_edges = not has_fixed_border(scene.sheet)
-    return tuple(open_edges and scene.probes[slot.probe].total is not None for slot in slots)
+    open_edges = not has_fixed_border(plan.fixed)
+    return tuple(open_edges and plan.scene.probes[slot.probe].total is not None for slot in plan.slots)
 
 
-def _mapped_stiffness(scene: Scene) -> tuple[NDArray[Any], NDArray[Any], NDArray[Any]] | None:
+def _mapped_stiffness(plan: Plan) -> tuple[NDArray[Any], NDArray[Any], NDArray[Any]] | None:
     """Give the stiffness k - tau of every spring in the form of `Start`; None without a map."""
-    made = material(scene)
-    if made.map is None:
+    material = plan.material
+    if material.factors is None:
         return None
-    parts = zip(stiffness(scene), made.tensions, strict=True)
+    parts = zip(stiffness(material, material.factors), material.tensions, strict=True)
     along_rows, along_columns, diagonals = (np.maximum(k - tension, 0) for k, tension in parts)
     return (
         np.pad(along_rows, ((0, 0), (0, 1))),
@@ -366,15 +363,16 @@ def _mapped_stiffness(scene: Scene) -> tuple[NDArray[Any], NDArray[Any], NDArray
     )
 
 
-def _standing(scene: Scene, slots: Sequence[ProbeSlot]) -> list[tuple[object, ...]]:
+def _standing(plan: Plan) -> list[tuple[object, ...]]:
     """List everything that the decays of the standing slots depend on."""
-    probes = [scene.probes[slot.probe] for slot in slots if not slot.moves]
-    return [(probe.at, probe_force(probe, scene.sheet)[1:]) for probe in probes]
+    probes = [plan.scene.probes[slot.probe] for slot in plan.slots if not slot.moves]
+    return [(probe.at, probe_force(probe, plan.scene.sheet)[1:]) for probe in probes]
 
 
-def _standing_decays(scene: Scene, slots: Sequence[ProbeSlot]) -> NDArray[np.float64]:
+def _standing_decays(plan: Plan) -> NDArray[np.float64]:
     """Evaluate the decays of all standing slots, shape (slots, rows, cols)."""
-    return np.array([decay(scene.probes[slot.probe], scene.sheet) for slot in slots if not slot.moves])
+    scene = plan.scene
+    return np.array([decay(scene.probes[slot.probe], scene.sheet) for slot in plan.slots if not slot.moves])
 
 
 def _in_words(moves: tuple[bool, ...]) -> str:

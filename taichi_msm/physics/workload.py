@@ -9,10 +9,8 @@ from __future__ import annotations
 import math
 from typing import NamedTuple
 
-from taichi_msm.physics.loads import probe_slots
-from taichi_msm.physics.material import material
+from taichi_msm.physics.plan import Plan
 from taichi_msm.scene import Scene
-from taichi_msm.timegrid import TimeGrid
 
 # Work of starting Python and Taichi and of compiling the kernels.
 START = 4e8
@@ -49,40 +47,34 @@ class Work(NamedTuple):
     pictures: float
 
 
-def work(scene: Scene, grid: TimeGrid, pilots: float) -> Work:
+def work(plan: Plan, pilots: float) -> Work:
     """Count the work of a run.
 
     Args:
-        scene: a checked scene.
-        grid: its steps.
+        plan: of the run.
         pilots: their steps in f64 for each step of the run, counted in steps of the whole sheet.
     """
-    steps = _steps(scene, grid)
-    stepping = DOUBLE * steps if grid.precision == "f64" else steps
-    return Work(START, stepping, DOUBLE * pilots * steps, _other(scene) - START)
+    steps = _steps(plan)
+    stepping = DOUBLE * steps if plan.grid.precision == "f64" else steps
+    return Work(START, stepping, DOUBLE * pilots * steps, _other(plan.scene) - START)
 
 
-def is_small_in_f64(scene: Scene, grid: TimeGrid) -> bool:
-    """Tell whether stepping in f64 is a small part of a run, so that `auto` chooses it.
-
-    Args:
-        scene: a checked scene.
-        grid: its steps; their precision does not matter.
-    """
-    return DOUBLE * _steps(scene, grid) <= SMALL * _other(scene)
+def is_small_in_f64(plan: Plan) -> bool:
+    """Tell whether stepping in f64 is a small part of a run, so that `auto` chooses it."""
+    return DOUBLE * _steps(plan) <= SMALL * _other(plan.scene)
 
 
-def affords_pilots(scene: Scene, grid: TimeGrid, pilots: float) -> bool:
+def affords_pilots(plan: Plan, pilots: float) -> bool:
     """Tell whether pilots take at most two fifths of a run; arguments as for `work`."""
-    found = work(scene, grid, pilots)
-    return found.pilots <= MOST_FOR_PILOTS * sum(found)
+    parts = work(plan, pilots)
+    return parts.pilots <= MOST_FOR_PILOTS * sum(parts)
 
 
-def _steps(scene: Scene, grid: TimeGrid) -> float:
+def _steps(plan: Plan) -> float:
     """Count the work of stepping in f32."""
-    moving = sum(slot.moves for slot in probe_slots(scene.probes, scene.sheet, grid.step))
-    cost = 1 + MOVING * moving + BENDING * (material(scene).bending > 0)
-    return cost * grid.steps * math.prod(scene.sheet.points)
+    moving = sum(slot.moves for slot in plan.slots)
+    cost = 1 + MOVING * moving + BENDING * (plan.material.bending > 0)
+    return cost * plan.grid.steps * math.prod(plan.scene.sheet.points)
 
 
 def _other(scene: Scene) -> float:

@@ -7,13 +7,13 @@ from collections.abc import Iterator
 import numpy as np
 from numpy.typing import NDArray
 
-from taichi_msm.physics.lattice import fixed_points, rest_positions, spacing
+from taichi_msm.physics.lattice import rest_positions, spacing
 from taichi_msm.physics.loads import Schedule, schedule
 from taichi_msm.physics.material import area_shares
-from taichi_msm.physics.timestep import time_grid
+from taichi_msm.physics.plan import Plan
+from taichi_msm.physics.planning import make_plan
 from taichi_msm.reference.sheet import Springs, sheet
 from taichi_msm.scene import Scene
-from taichi_msm.timegrid import TimeGrid
 
 Array = NDArray[np.float64]
 
@@ -177,12 +177,13 @@ def force(scene: Scene, displacement: Array, loads: Schedule, n: int) -> Array:
     )
 
 
-def displacements(scene: Scene, grid: TimeGrid) -> Iterator[Array]:
-    """Step the scene by Stoermer-Verlet (eq. 6 to 9) and yield u_0, u_1, ... [m], each of shape (rows, cols, 3)."""
-    h, made = grid.step, sheet(scene)
+def displacements(plan: Plan) -> Iterator[Array]:
+    """Step a scene by Stoermer-Verlet (eq. 6 to 9) and yield u_0, u_1, ... [m], each of shape (rows, cols, 3)."""
+    scene = plan.scene
+    h, made = plan.grid.step, sheet(scene)
     m, g = made.mass[..., None], (made.drag / made.mass)[..., None]
-    moves = ~fixed_points(scene.sheet)[..., None]
-    loads = schedule(scene, grid, 0, grid.steps)
+    moves = ~plan.fixed[..., None]
+    loads = schedule(plan, 0, plan.grid.steps)
 
     previous = np.zeros((*scene.sheet.points, 3))
     yield previous
@@ -204,6 +205,6 @@ def simulate(scene: Scene) -> Array:
     Returns:
         Positions of every frame [m], shape (F + 1, rows, cols, 3).
     """
-    grid = time_grid(scene)
-    frames = [u for n, u in enumerate(displacements(scene, grid)) if n % grid.steps_per_frame == 0]
+    plan = make_plan(scene)
+    frames = [u for n, u in enumerate(displacements(plan)) if n % plan.grid.steps_per_frame == 0]
     return rest_positions(scene.sheet) + np.array(frames)

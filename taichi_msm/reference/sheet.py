@@ -3,14 +3,17 @@
 from __future__ import annotations
 
 import math
+from functools import lru_cache
+from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
+from taichi_msm.physics import stiffness_map
 from taichi_msm.physics.lattice import spacing
-from taichi_msm.physics.material import factors
-from taichi_msm.scene import Scene, Tissue
+from taichi_msm.physics.stiffness_map import MapImage
+from taichi_msm.scene import Scene, StiffnessMap, Tissue
 
 Array = NDArray[np.float64]
 Window = tuple[slice, slice]
@@ -55,6 +58,20 @@ class Sheet(NamedTuple):
 
 # Points from one end of a spring to the other, down and right.
 ALONG_ROW, ALONG_COLUMN, TO_RIGHT, TO_LEFT = (0, 1), (1, 0), (1, 1), (1, -1)
+
+
+def factors(scene: Scene) -> Array:
+    """Give the factor of the stiffness at the centre of every cell, shape (rows - 1, cols - 1); ones without a map."""
+    rows, cols = scene.sheet.points
+    if scene.stiffness_map is None:
+        return np.ones((rows - 1, cols - 1))
+    changed = Path(scene.stiffness_map.image).stat().st_mtime_ns
+    return stiffness_map.factors(scene.stiffness_map, _read(scene.stiffness_map, changed), rows - 1, cols - 1)
+
+
+@lru_cache(maxsize=8)
+def _read(of: StiffnessMap, _changed: int) -> MapImage:
+    return stiffness_map.read(of)
 
 
 def sheet(scene: Scene) -> Sheet:

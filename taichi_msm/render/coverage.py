@@ -67,8 +67,8 @@ def cover_tile(
 ):  # fmt: skip
     """Cover a tile of samples with the small quads (column, line) of a cell.
 
-    The cell covers those `inside`. If it is drawn triangle by triangle, this is the `lower` or upper one, enlarged by the
-    fraction `overstep` of its side.
+    The cell covers those `inside`. If it is drawn triangle by triangle, this is the `lower` or upper one, enlarged by
+    the fraction `overstep` of its side.
     """
     config = ti.static(band.config)
     plane = ti.static(config.plane)

@@ -17,8 +17,8 @@ from typing_extensions import TypedDict
 
 from taichi_msm.arguments import require_path
 from taichi_msm.errors import FilesError, MsmError, SceneError
-from taichi_msm.physics import material
 from taichi_msm.physics.lattice import rest_positions
+from taichi_msm.physics.planning import try_plan
 from taichi_msm.picture import PictureError, file_sha256
 from taichi_msm.render import camera
 from taichi_msm.results.npz import map_array
@@ -217,8 +217,8 @@ def _as_run(record: Mapping[str, Any]) -> Scene:
     scene, folder = Scene(**record["scene"]), Path(record["working_directory"])
     if folder != Path.cwd():
         scene = scene.with_pictures(lambda path: str(folder / path))
-    found = [problem for check in (material.problems, camera.problems) for problem in check(scene)]
+    problems = [*try_plan(scene)[1], *camera.problems(scene)]
     # A picture that is missing, or has changed, is reported by the code that needs it.
-    if any(problem.path[-1:] != ("image",) for problem in found):
-        raise SceneError([str(problem) for problem in found])
+    if any(problem.path[-1:] != ("image",) for problem in problems):
+        raise SceneError([str(problem) for problem in problems])
     return scene

@@ -12,11 +12,11 @@ from typing import Any
 
 from pydantic import TypeAdapter
 
-from taichi_msm.errors import DamagedError, FilesError
-from taichi_msm.physics import material, stiffness_map, timestep
+from taichi_msm.errors import DamagedError, FilesError, SceneError
 from taichi_msm.physics.error_control import Estimate
-from taichi_msm.physics.material import factors
 from taichi_msm.physics.mesh_error import MeshEstimate
+from taichi_msm.physics.plan import Plan
+from taichi_msm.physics.planning import try_plan
 from taichi_msm.picture import PictureError, file_sha256
 from taichi_msm.render import camera
 from taichi_msm.results.publication import CHECKPOINT, MANIFEST, STAGING, open_checkpoint
@@ -63,13 +63,16 @@ class Manifest:
         scenes = {"given": self.given.model_dump(mode="json"), "scene": self.scene.model_dump(mode="json")}
         return {**vars(self), **scenes, **known}
 
-    def require_same(self, versions: Mapping[str, str]) -> None:
+    def require_same(self, sha256: Mapping[str, str], versions: Mapping[str, str]) -> None:
         """Make sure that the rest of the run would have the same bits as if it had not been interrupted.
+
+        Args:
+            sha256: of its picture and map now, by `digests`.
+            versions: of this process.
 
         Raises:
             FilesError: when the picture, a map or a version has changed.
         """
-        sha256 = digests(self.scene)
         for key, path in self.scene.pictures.items():
             if sha256.get(key) != self.sha256.get(key):
                 raise FilesError(f"{path} has changed since the run began; put it back, or run the scene again")
@@ -94,11 +97,11 @@ class Manifest:
         return mine == its
 
 
-_PLAN = TypeAdapter(Manifest)
+_MANIFEST = TypeAdapter(Manifest)
 
 
-def read_manifest(directory: Path) -> Manifest:
-    """Read the manifest of the unfinished run into a directory.
+def read_manifest(directory: Path) -> tuple[Manifest, Plan]:
+    """Read the manifest of the unfinished run into a directory, and plan its scene.
 
     Raises:
         FilesError: when there is no such run.
@@ -109,7 +112,7 @@ def read_manifest(directory: Path) -> Manifest:
     try:
         with open_checkpoint(directory) as folder, folder.open(MANIFEST) as file:
             data = file.read(MAX_BYTES + 1)
-        manifest = _PLAN.validate_python(unseal(data))
+        manifest = _MANIFEST.validate_python(unseal(data))
         # The current directory may be another one now.
         manifest = replace(manifest, scene=manifest.scene.with_pictures(partial(os.path.join, manifest.folder)))
     except (FileNotFoundError, NotADirectoryError):
@@ -118,22 +121,25 @@ def read_manifest(directory: Path) -> Manifest:
         raise FilesError(f"{path}: {(error.strerror or str(error)).lower()}") from None
     except ValueError:  # pydantic's too
         raise DamagedError(f"{path} is damaged; run the scene again") from None
-    factors(manifest.scene)
+    plan, problems = try_plan(manifest.scene)
+    if unreadable := [str(problem) for problem in problems if problem.path[-1:] == ("image",)]:
+        raise SceneError(unreadable)
     # Not trusted: anybody may have written it.
     numbers = () if manifest.estimate is None else asdict(manifest.estimate).values()
     possible = manifest.arch in ARCHS and all(number >= 0 for number in numbers)
-    checks = (material.problems, timestep.problems, camera.problems)
-    if not possible or any(list(check(manifest.scene)) for check in checks):
+    if plan is None or problems or not possible or list(camera.problems(manifest.scene)):
         raise DamagedError(f"{path} is of a scene that cannot be run; run the scene again")
-    return manifest
+    return manifest, plan
 
 
-def digests(scene: Scene) -> dict[str, str]:
-    """Compute the SHA-256 of the files of a checked scene's picture and maps, by the keys that name them.
+def digests(plan: Plan) -> dict[str, str]:
+    """Compute the SHA-256 of the files of a scene's picture and map, by the keys that name them.
 
-    There is none of a picture that cannot be read. That of a map is of the file as it was read for the check.
+    There is none of a picture that cannot be read. That of the map is of the file as it was read for the plan.
     """
-    found = {f"{scene.kind}.{name}.image": stiffness_map.sha256(one) for name, one in scene.maps.items()}
+    scene, sha256 = plan.scene, {}
+    if plan.image is not None:
+        sha256[f"{scene.kind}.map.image"] = plan.image.sha256
     with suppress(PictureError):
-        found |= {} if scene.image is None else {"image": file_sha256(scene.image)}
-    return found
+        sha256 |= {} if scene.image is None else {"image": file_sha256(scene.image)}
+    return sha256

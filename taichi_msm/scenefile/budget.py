@@ -11,10 +11,9 @@ from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 
-from taichi_msm.errors import Path as Key
-from taichi_msm.errors import Problem, SceneError
+from taichi_msm.errors import Key, Problem, SceneError
 from taichi_msm.physics.pilots import choose_pilots
-from taichi_msm.physics.timestep import time_grid
+from taichi_msm.physics.plan import Plan
 from taichi_msm.render import texture
 from taichi_msm.scene import Scene
 from taichi_msm.system.resources import available_memory
@@ -95,8 +94,9 @@ class Budget:
         return self.picture_bytes + self.track_bytes + self.trajectory_bytes + self.record_bytes
 
 
-def estimate(scene: Scene, grid: TimeGrid) -> Budget:
-    """Estimate what a scene needs with the steps of a grid."""
+def estimate(plan: Plan) -> Budget:
+    """Estimate what a run needs."""
+    scene, grid = plan.scene, plan.grid
     rows, cols = scene.sheet.points
     points, number_bytes = rows * cols, 4 if grid.precision == "f32" else 8
     frames, (width, height) = grid.frames + 1, scene.render.size
@@ -106,7 +106,7 @@ def estimate(scene: Scene, grid: TimeGrid) -> Budget:
     tracks = scene.render.tracks**2 * (frames * TRACK_BYTES + 16) + FILE_BYTES if "tracks" in scene.output else 0
     numbers = STATE_NUMBERS + OUTPUT_NUMBERS + len(scene.probes) + (MAP_NUMBERS if scene.stiffness_map else 0)
     # Pilots are up to two more sheets in f64; with tissue also two smaller ones.
-    pilot = scene.time.tolerance is not None or not choose_pilots(scene, grid).reason
+    pilot = scene.time.tolerance is not None or not choose_pilots(plan).reason
     sheets = number_bytes + (8 * (2 + (scene.tissue is not None) * 5 / 16) if pilot else 0)
     return Budget(
         points=points,
@@ -123,24 +123,23 @@ def estimate(scene: Scene, grid: TimeGrid) -> Budget:
     )
 
 
-def problems(scene: Scene) -> Iterator[Problem]:
+def size_problems(plan: Plan) -> Iterator[Problem]:
     """Find what makes a scene too large, with the numbers and the key to change."""
-    grid = time_grid(scene)
-    yield from _step_problems(scene, grid)
-    yield from _memory_problems(scene, estimate(scene, grid))
+    yield from _step_problems(plan.scene, plan.grid)
+    yield from _memory_problems(plan.scene, estimate(plan))
 
 
-def require_disk(scene: Scene, directory: Path) -> None:
+def require_disk(plan: Plan, directory: Path) -> None:
     """Make sure that the disk has room for the results.
 
     Args:
-        scene: a checked scene.
+        plan: of the run.
         directory: of the results; it need not exist yet.
 
     Raises:
         SceneError: when there is too little room; has the numbers and the key to change.
     """
-    budget, free = estimate(scene, time_grid(scene)), _free_disk(directory)
+    scene, budget, free = plan.scene, estimate(plan), _free_disk(directory)
     needed = budget.disk_bytes + budget.working_bytes
     if needed <= free:
         return

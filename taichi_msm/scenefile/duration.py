@@ -20,12 +20,10 @@ import numpy as np
 
 from taichi_msm.errors import MsmError
 from taichi_msm.physics.pilots import ENOUGH, choose_pilots
-from taichi_msm.physics.timestep import time_grid
+from taichi_msm.physics.plan import Plan
 from taichi_msm.physics.workload import work
-from taichi_msm.scene import Scene
 from taichi_msm.system import resources
 from taichi_msm.system.compiler import chosen
-from taichi_msm.timegrid import TimeGrid
 
 # Time of a unit of work [s], and of the calibration, on two cores of an AMD EPYC of 2024.
 UNIT, CALIBRATION = 1.5e-9, 1e-4
@@ -57,15 +55,10 @@ class Duration(NamedTuple):
     measured: bool
 
 
-def estimate(scene: Scene, grid: TimeGrid) -> Duration:
-    """Estimate how long a run of a scene takes on a CPU, with every core; computing it takes milliseconds.
-
-    Args:
-        scene: a checked scene.
-        grid: its steps.
-    """
+def estimate(plan: Plan) -> Duration:
+    """Estimate how long a run takes on a CPU, with every core; computing it takes milliseconds."""
     kept = _read()
-    parts = work(scene, grid, choose_pilots(scene, grid).cost)._asdict()
+    parts = work(plan, choose_pilots(plan).cost)._asdict()
     if missing := [name for name in parts if name not in kept]:
         if "calibration" not in kept:
             kept["calibration"] = _calibrate(), CALIBRATION / UNIT
@@ -75,14 +68,14 @@ def estimate(scene: Scene, grid: TimeGrid) -> Duration:
     return Duration(seconds, "start" not in missing)
 
 
-def learn(scene: Scene, record: Mapping[str, Any]) -> None:
+def learn(plan: Plan, record: Mapping[str, Any]) -> None:
     """Keep what a run took for its work, if it was one that `estimate` means: complete, on a CPU with every core.
 
     Args:
-        scene: what was run.
+        plan: of the run.
         record: its run.json.
     """
-    tolerances = scene.sheet.tolerance, scene.time.tolerance
+    tolerances = plan.scene.sheet.tolerance, plan.scene.time.tolerance
     plain = record["arch"] == "cpu" and record["threads"] == resources.available_threads() and not record["resumed"]
     if record["status"] != "complete" or not plain or any(one is not None for one in tolerances):
         return
@@ -95,8 +88,7 @@ def learn(scene: Scene, record: Mapping[str, Any]) -> None:
     took["pictures"] = times["total"] - sum(took.values())
     if ((record["error_estimate"] or {}).get("error") or 0.0) >= ENOUGH:
         took["pilots"] = 0.0  # A finer one may have followed.
-    grid = time_grid(scene)
-    for name, amount in work(scene, grid, choose_pilots(scene, grid).cost)._asdict().items():
+    for name, amount in work(plan, choose_pilots(plan).cost)._asdict().items():
         if amount > 0 and took[name] > SHORTEST:
             seconds, before = kept.get(name, (0.0, 0.0))
             kept[name] = KEPT * seconds + took[name], KEPT * before + amount
@@ -131,8 +123,8 @@ def _read() -> Kept:
         if not file.is_file():
             return {}
         with file.open("rb") as opened:
-            found = json.loads(opened.read(MAX_BYTES))
-        parts = found["parts"] if found["machine"] == _machine() else {}
+            content = json.loads(opened.read(MAX_BYTES))
+        parts = content["parts"] if content["machine"] == _machine() else {}
         pairs = {str(name): (float(seconds), float(amount)) for name, (seconds, amount) in parts.items()}
     except (OSError, ValueError, TypeError, LookupError, AttributeError, ArithmeticError, RuntimeError, MsmError):
         return {}

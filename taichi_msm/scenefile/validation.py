@@ -1,28 +1,22 @@
-"""Plain data -> Scene, or everything that is wrong with it: a list of problems, each with its key."""
+"""Plain data -> Scene and its plan, or everything that is wrong with it: a list of problems, each with its key."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Mapping
 from typing import Any, TypeVar
 
 from pydantic import ValidationError
 
 from taichi_msm import faults
 from taichi_msm.errors import ArgumentError, Problem, SceneError
-from taichi_msm.physics import material, timestep
+from taichi_msm.physics.plan import Plan
+from taichi_msm.physics.planning import try_plan
+from taichi_msm.physics.stiffness_map import MapImage
 from taichi_msm.render import camera, texture
 from taichi_msm.scene import Scene, Section
 from taichi_msm.scenefile import budget
 
 Model = TypeVar("Model", bound=Section)
-
-# Checks of keys in several sections. They require a scene in which `material.problems` finds nothing.
-CHECKS: tuple[Callable[[Scene], Iterable[Problem]], ...] = (
-    timestep.problems,
-    camera.problems,
-    texture.problems,
-    budget.problems,
-)
 
 # Valid sections that replace faulty ones; no check finds anything in them.
 _STAND_INS: dict[str, Any] = {
@@ -35,61 +29,71 @@ _STAND_INS: dict[str, Any] = {
 }
 
 
-def validate(data: dict[str, Any]) -> tuple[Scene | None, list[Problem]]:
+def validate(data: dict[str, Any]) -> tuple[Plan | None, list[Problem]]:
     """Check a scene: first each key by itself, then several keys together.
 
     If some sections are faulty, the checks of several keys still run on the others, so that all problems are reported
     at once.
 
     Returns:
-        The scene, or None if there is any problem; and the problems.
+        The scene's plan, or None if there is any problem; and the problems.
     """
     problems: list[Problem] = []
-    # Pydantic checks the scene as a whole once its sections are valid, and CHECKS run once that finds nothing either.
+    plan = None
+    # Pydantic checks the scene as a whole once its sections are valid, and several keys are checked once that finds
+    # nothing either.
     for _ in range(3):
-        scene, found = parse(Scene, data)
-        problems += found
+        scene, wrong = parse(Scene, data)
+        problems += wrong
         if scene is not None:
-            problems += joint_problems(scene)
+            plan, wrong = _joint_check(scene)
+            problems += wrong
             break
-        data = _spare(data, found)
-    return (None if problems else scene), problems
+        data = _spare(data, wrong)
+    return (None if problems else plan), problems
 
 
-def joint_problems(scene: Scene, *, picture: bool = True) -> list[Problem]:
-    """Find what is wrong with several keys together.
+def _joint_check(
+    scene: Scene, image: MapImage | None = None, *, picture: bool = True
+) -> tuple[Plan | None, list[Problem]]:
+    """Plan a scene whose keys are valid each by itself, and find what is wrong with several keys together.
 
     Args:
-        scene: whose keys are valid each by itself.
+        scene: the scene.
+        image: of its map, as for `try_plan`.
         picture: whether to check its picture too.
     """
-    checks = [check for check in CHECKS if picture or check is not texture.problems]
-    found = list(material.problems(scene))
-    if found:
-        # Steps and memory depend on what the sheet is made of, so they cannot be checked.
-        checks = [check for check in checks if check in (camera.problems, texture.problems)]
-    return found + [problem for check in checks for problem in check(scene)]
+    plan, problems = try_plan(scene, image)
+    problems += camera.problems(scene)
+    if picture:
+        problems += texture.problems(scene)
+    if plan is not None:
+        problems += budget.size_problems(plan)
+    return plan, problems
 
 
-def checked(scene: Scene | Mapping[str, Any]) -> Scene:
-    """Check a scene, except for its picture, and return it.
+def checked(scene: Plan | Scene | Mapping[str, Any], image: MapImage | None = None) -> Plan:
+    """Check a scene, except for its picture, and plan it for a CPU.
 
     Args:
-        scene: a scene, which may have been made in Python, or a mapping of its keys.
+        scene: a scene, which may have been made in Python, or a mapping of its keys; a plan was checked before.
+        image: of its map, as for `try_plan`.
 
     Raises:
+        ArgumentError: when it is none of these.
         SceneError: with everything that is wrong with it.
     """
+    if isinstance(scene, Plan):
+        return scene
     if isinstance(scene, Scene):
-        problems = joint_problems(scene, picture=False)
-        made: Scene | None = scene
+        plan, problems = _joint_check(scene, image, picture=False)
     elif isinstance(scene, Mapping):
-        made, problems = validate(dict(scene))
+        plan, problems = validate(dict(scene))
     else:
         raise ArgumentError(f"{type(scene).__name__} is no scene; take what load_scene returns, or a mapping")
-    if made is None or problems:
+    if plan is None or problems:
         raise SceneError([str(problem) for problem in problems])
-    return made
+    return plan
 
 
 def _spare(data: dict[str, Any], problems: list[Problem]) -> dict[str, Any]:
@@ -114,4 +118,4 @@ def parse(model: type[Model], data: dict[str, Any]) -> tuple[Model | None, list[
     try:
         return model.model_validate(data), []
     except ValidationError as error:
-        return None, faults.problems(error, model, data)
+        return None, faults.key_problems(error, model, data)

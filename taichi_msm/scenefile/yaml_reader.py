@@ -13,7 +13,7 @@ from typing import Any, NamedTuple
 
 import yaml
 
-from taichi_msm.errors import Path
+from taichi_msm.errors import Key
 from taichi_msm.faults import cut
 
 MAX_DEPTH = 20
@@ -59,7 +59,7 @@ class Fault(NamedTuple):
     """A fault of one node that does not keep the rest of the text from being read."""
 
     mark: Mark
-    path: Path
+    path: Key
     message: str
 
 
@@ -73,7 +73,7 @@ class Document(NamedTuple):
     """
 
     data: Any
-    marks: dict[Path, Mark]
+    marks: dict[Key, Mark]
     faults: list[Fault]
 
 
@@ -143,7 +143,7 @@ class _Reader:
     """Builds data from a stream of events."""
 
     def __init__(self, events: Iterator[Any]) -> None:
-        self.marks: dict[Path, Mark] = {(): Mark(1, 1)}
+        self.marks: dict[Key, Mark] = {(): Mark(1, 1)}
         self.faults: list[Fault] = []
         self._events = events
         self._nodes = 0
@@ -160,7 +160,7 @@ class _Reader:
             self._refuse(after, (), "a second document begins here; keep one")
         return data
 
-    def _node(self, event: Any, path: Path) -> Any:
+    def _node(self, event: Any, path: Key) -> Any:
         self._admit(event, path)
         if isinstance(event, yaml.AliasEvent):
             return None
@@ -170,7 +170,7 @@ class _Reader:
             return self._items(path)
         return self._mapping(path)
 
-    def _admit(self, event: Any, path: Path) -> None:
+    def _admit(self, event: Any, path: Key) -> None:
         """Refuse what a scene does not need."""
         self._nodes += 1
         if self._nodes > MAX_NODES:
@@ -189,11 +189,11 @@ class _Reader:
             tag = event.tag.replace("tag:yaml.org,2002:", "!!")
             self._refuse(event, path, f"tag {tag} is not allowed; remove it")
 
-    def _refuse(self, event: Any, path: Path, message: str) -> None:
+    def _refuse(self, event: Any, path: Key, message: str) -> None:
         if len(self.faults) < MAX_FAULTS:
             self.faults.append(Fault(_mark(event.start_mark), path, message))
 
-    def _items(self, path: Path) -> list[Any]:
+    def _items(self, path: Key) -> list[Any]:
         items: list[Any] = []
         while not isinstance(event := next(self._events), yaml.SequenceEndEvent):
             here = (*path, len(items))
@@ -201,7 +201,7 @@ class _Reader:
             items.append(self._node(event, here))
         return items
 
-    def _mapping(self, path: Path) -> dict[str, Any]:
+    def _mapping(self, path: Key) -> dict[str, Any]:
         mapping: dict[str, Any] = {}
         while not isinstance(event := next(self._events), yaml.MappingEndEvent):
             if not isinstance(event, yaml.ScalarEvent):

@@ -11,11 +11,14 @@ from typing import Any
 
 from taichi_msm.errors import SceneError
 from taichi_msm.physics.lattice import rest_positions
+from taichi_msm.physics.plan import Plan
+from taichi_msm.physics.planning import make_plan, on
 from taichi_msm.physics.timestep import with_time
 from taichi_msm.progress import Progress
 from taichi_msm.render.texture import load_texture
 from taichi_msm.runner import versions
 from taichi_msm.scene import Scene
+from taichi_msm.scenefile.validation import checked
 from taichi_msm.study.peer import FailedError, TooSlowError, solve
 from taichi_msm.study.pictures import PictureStudy
 from taichi_msm.study.points import PointStudy
@@ -59,7 +62,7 @@ FULL = Effort(False, longest_run=2.0, peer=30.0, peer_rtols=(1e-3, 1e-5, 1e-7), 
 
 
 def study(
-    scene: Scene,
+    scene: Plan | Scene,
     name: str,
     *,
     tolerance: float | None = None,
@@ -84,7 +87,8 @@ def study(
         SceneError: when the picture cannot be decoded, or the trajectories do not fit in memory.
         DeviceError: when the arch is not there.
     """
-    device = runtime.start(arch, threads)
+    given, device = checked(scene), runtime.start(arch, threads)
+    scene = given.scene
     _require_memory(scene)
     texture = load_texture(scene) if scene.image is not None else None
     found = Study(
@@ -96,18 +100,19 @@ def study(
     )
     effort = QUICK if quick else FULL
     # The study itself varies the step.
-    scene = with_time(scene, tolerance=None)
+    plan = on(make_plan(with_time(scene, tolerance=None), given.image), device.arch)
+    scene = plan.scene
     try:
-        with closing(SteppingStudy(scene, device, effort.longest_run, partial(progress, "stepping"))) as stepping:
+        with closing(SteppingStudy(plan, device, effort.longest_run, partial(progress, "stepping"))) as stepping:
             try:
                 stepping.run()
             finally:
                 found.reference, found.stepping = stepping.reference, stepping.points()
                 found.orders = observed_orders(found.stepping)
-        _measure_peer(scene, stepping, effort, found, progress)
+        _measure_peer(plan, stepping, effort, found, progress)
         _measure_pictures(scene, stepping, texture, effort, found, progress)
-        _measure_points(scene, device, effort, found, progress)
-        terms = TermStudy(scene, device, effort.sample, partial(progress, "terms"))
+        _measure_points(plan, device, effort, found, progress)
+        terms = TermStudy(plan, device, effort.sample, partial(progress, "terms"))
         try:
             terms.run()
         finally:
@@ -143,7 +148,7 @@ def _require_memory(scene: Scene) -> None:
         )
 
 
-def _measure_peer(scene: Scene, stepping: SteppingStudy, effort: Effort, found: Study, progress: Progress) -> None:
+def _measure_peer(plan: Plan, stepping: SteppingStudy, effort: Effort, found: Study, progress: Progress) -> None:
     """Solve by DOP853 at several tolerances, each as many times as time allows, up to 5."""
     assert stepping.reference is not None
     rtols = effort.peer_rtols
@@ -155,7 +160,7 @@ def _measure_peer(scene: Scene, stepping: SteppingStudy, effort: Effort, found: 
         try:
             while len(samples) < 5:
                 start = time.perf_counter()
-                frames, evaluations = solve(scene, rtol, atol, deadline, tick)
+                frames, evaluations = solve(plan, rtol, atol, deadline, tick)
                 samples.append(time.perf_counter() - start)
         except TooSlowError:
             if not samples:
@@ -191,11 +196,11 @@ def _measure_pictures(
         found.notes += pictures.notes
 
 
-def _measure_points(scene: Scene, device: Device, effort: Effort, found: Study, progress: Progress) -> None:
+def _measure_points(plan: Plan, device: Device, effort: Effort, found: Study, progress: Progress) -> None:
     """Vary the number of points of tissue; with springs, other points would make another sheet."""
-    if scene.tissue is None:
+    if plan.scene.tissue is None:
         return
-    points = PointStudy(scene, device, effort.longest_run, partial(progress, "points"))
+    points = PointStudy(plan, device, effort.longest_run, partial(progress, "points"))
     try:
         points.run()
     finally:

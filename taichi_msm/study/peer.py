@@ -10,8 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from taichi_msm import reference
-from taichi_msm.physics.lattice import fixed_points
 from taichi_msm.physics.loads import Schedule, key_times, loads_at
+from taichi_msm.physics.plan import Plan
 from taichi_msm.reference.sheet import sheet
 from taichi_msm.scene import Scene
 
@@ -29,11 +29,11 @@ class FailedError(Exception):
     """The solver finds no step that is small enough; the message says when."""
 
 
-def solve(scene: Scene, rtol: float, atol: float, deadline: float, tick: Callable[[], None]) -> tuple[Array, int]:
+def solve(plan: Plan, rtol: float, atol: float, deadline: float, tick: Callable[[], None]) -> tuple[Array, int]:
     """Integrate from key to key of the loads, between which they are smooth.
 
     Args:
-        scene: a checked scene.
+        plan: of the scene.
         rtol: relative tolerance.
         atol: absolute tolerance of displacements [m] and velocities [m/s].
         deadline: `time.perf_counter()` at which to give up.
@@ -48,14 +48,15 @@ def solve(scene: Scene, rtol: float, atol: float, deadline: float, tick: Callabl
     """
     from scipy.integrate import solve_ivp
 
+    scene = plan.scene
     shape = (*scene.sheet.points, 3)
-    made, moves = sheet(scene), ~fixed_points(scene.sheet)[..., None]
+    made, moves = sheet(scene), ~plan.fixed[..., None]
     state = np.zeros(2 * int(np.prod(shape)))
     evaluations = 0
     found = []
     for start, end, frames in _pieces(scene):
         margin = INSIDE * (end - start)
-        first = loads_at(scene, np.array([start + margin, end - margin]))
+        first = loads_at(plan, np.array([start + margin, end - margin]))
 
         def motion(t: float, y: Array, start: float = start, end: float = end, ends: Schedule = first) -> Array:
             if time.perf_counter() > deadline:

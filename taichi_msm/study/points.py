@@ -12,18 +12,18 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from taichi_msm.physics import material
 from taichi_msm.physics.divergence import farthest_displacement
 from taichi_msm.physics.error_control import longest
 from taichi_msm.physics.mesh_error import FEWEST, CubicSampling, MeshPilot, coarser, with_points
+from taichi_msm.physics.plan import Plan
+from taichi_msm.physics.planning import make_plan, try_plan
 from taichi_msm.physics.solver import Dynamics
-from taichi_msm.physics.timestep import time_grid, with_time
+from taichi_msm.physics.timestep import with_time
 from taichi_msm.progress import Count
-from taichi_msm.scene import MAX_POINTS, Scene
+from taichi_msm.scene import MAX_POINTS
 from taichi_msm.scenefile import budget
 from taichi_msm.study.result import Points, Timing
 from taichi_msm.system.runtime import Device
-from taichi_msm.timegrid import TimeGrid
 
 # Cells a side, relative to those of the scene.
 COARSER = (1 / 4, 1 / 2)
@@ -43,8 +43,7 @@ Lattice = tuple[int, int]
 class _Trial:
     """A sheet with some number of points, and what is known about it so far."""
 
-    scene: Scene
-    grid: TimeGrid
+    plan: Plan
     dynamics: Dynamics
     estimate: float = math.inf
     error: float = math.inf
@@ -54,7 +53,7 @@ class _Trial:
     @property
     def points(self) -> Lattice:
         """Give the rows and columns."""
-        return self.scene.sheet.points
+        return self.plan.scene.sheet.points
 
 
 class PointStudy:
@@ -67,7 +66,7 @@ class PointStudy:
     of those listed, whose own error is then known only as a bound.
 
     Args:
-        scene: a checked scene with tissue.
+        plan: of a scene with tissue.
         device: what `runtime.start` returned.
         longest_run: approximate time that a run may take [s]. The reference is run only once, and may take as long as
             all the runs together by which another sheet is timed.
@@ -77,9 +76,10 @@ class PointStudy:
         notes: what was left out.
     """
 
-    def __init__(self, scene: Scene, device: Device, longest_run: float, progress: Count) -> None:
+    def __init__(self, plan: Plan, device: Device, longest_run: float, progress: Count) -> None:
         self.notes: list[str] = []
-        self._scene = with_points(with_time(scene, step="auto", tolerance=None, precision="f64"), scene.sheet.points)
+        scene = with_time(plan.scene, step="auto", tolerance=None, precision="f64")
+        self._plan = make_plan(with_points(scene, scene.sheet.points), plan.image)
         self._device = device
         self._longest_run = longest_run
         self._progress = progress
@@ -90,17 +90,17 @@ class PointStudy:
         """Compute the estimates, then the errors, then measure the times."""
         with ExitStack() as opened:
             seconds = 0.0
-            for points in lattices(self._scene):
-                seconds = self._try(points, opened)
+            for plan in lattices(self._plan):
+                seconds = self._try(plan, opened)
             if not self._trials:
                 self.notes.append(f"points were not measured: with fewer than {FEWEST} a side they cannot be compared")
                 return
-            finer = self._finer(self._scene, seconds, self._longest_run)
+            finer = self._finer(self._plan, seconds, self._longest_run)
             if finer is None:
-                rows, cols = _scaled(self._scene, FINER)
+                rows, cols = _scaled(self._plan, FINER)
                 self.notes.append(f"{rows} x {cols} points were not measured: time or memory")
             else:
-                seconds = self._try(finer.sheet.points, opened)
+                seconds = self._try(finer, opened)
                 finer = self._finer(finer, seconds, ROUNDS * self._longest_run)
             if len(self._trials) < 2:
                 return
@@ -113,54 +113,52 @@ class PointStudy:
         """Give the results so far, the fewest points first."""
         return [self._point(trial) for trial in self._trials if trial.samples]
 
-    def _try(self, points: Lattice, opened: ExitStack) -> float:
+    def _try(self, plan: Plan, opened: ExitStack) -> float:
         """Run a sheet with its own step beside the pilot that `run` would have; returns the time of stepping [s]."""
-        scene = with_points(self._scene, points)
-        grid = time_grid(scene)
-        trial = _Trial(scene, grid, Dynamics(scene, grid, self._device))
+        trial = _Trial(plan, Dynamics(plan, self._device))
         opened.callback(trial.dynamics.close)
-        coarse = coarser(scene)
+        coarse = coarser(plan)
         assert coarse is not None
         self._trials.append(trial)
         self._tick()
         trial.dynamics.compile()
-        with closing(MeshPilot(scene, grid, coarse, self._device)) as pilot:
+        with closing(MeshPilot(plan, coarse, self._device)) as pilot:
             pilot.compile()
             first = self._step_through(trial, pilot)
             trial.estimate = pilot.estimate.error
         # The faster of two runs: what disturbs one may not disturb the other.
         return min(first, self._step_through(trial))
 
-    def _finer(self, scene: Scene, seconds: float, longest_run: float) -> Scene | None:
-        """Give a scene more points; None if a run would take too long or too much memory.
+    def _finer(self, plan: Plan, seconds: float, longest_run: float) -> Plan | None:
+        """Plan more points; None if a run would take too long or too much memory.
 
         Args:
-            scene: what is to be refined.
+            plan: what is to be refined.
             seconds: time that stepping through it took [s].
             longest_run: time that stepping through the finer one may take [s].
         """
-        points = _scaled(scene, FINER)
+        points = _scaled(plan, FINER)
         if max(points) > MAX_POINTS:
             return None
-        finer = with_points(scene, points)
-        work = [math.prod(one.sheet.points) * time_grid(one).steps_per_frame for one in (scene, finer)]
-        return None if seconds * work[1] / work[0] > longest_run or any(budget.problems(finer)) else finer
+        finer = make_plan(with_points(plan.scene, points), plan.image)
+        work = [math.prod(one.scene.sheet.points) * one.grid.steps_per_frame for one in (plan, finer)]
+        return None if seconds * work[1] / work[0] > longest_run or any(budget.size_problems(finer)) else finer
 
-    def _measure_errors(self, finer: Scene | None) -> None:
+    def _measure_errors(self, finer: Plan | None) -> None:
         """Step through the scene with all sheets side by side, and compare them frame by frame.
 
         Args:
-            finer: the scene with even more points, for the reference; None: there is no time for it.
+            finer: with even more points, for the reference; None: there is no time for it.
         """
-        finest = self._trials[-1].scene if finer is None else finer
-        grid = time_grid(finest)
+        finest = self._trials[-1].plan if finer is None else finer
+        grid = finest.grid
         with ExitStack() as opened:
             sheets = [trial.dynamics for trial in self._trials]
             if finer is not None:
-                sheets.append(opened.enter_context(closing(Dynamics(finer, grid, self._device))))
+                sheets.append(opened.enter_context(closing(Dynamics(finer, self._device))))
                 sheets[-1].compile()
             for sheet in sheets:
-                sheet.restart(sheet.scene, grid)
+                sheet.restart(sheet.plan.with_grid(steps_per_frame=grid.steps_per_frame))
             errors, own_error, largest = [0.0] * len(sheets), 0.0, 0.0
             for _ in range(grid.frames):
                 for sheet in sheets:
@@ -176,23 +174,23 @@ class PointStudy:
                 errors = [max(pair) for pair in zip(errors, apart, strict=True)]
                 own_error, largest = max(own_error, bound), max(largest, longest(exact))
             self._done += 1
-        farthest = farthest_displacement(finest, finest.time.duration)
+        farthest = farthest_displacement(finest, finest.scene.time.duration)
         for trial, error in zip(self._trials, errors, strict=False):
             if largest > farthest:
                 continue
-            if trial.scene is not finest:
+            if trial.plan is not finest:
                 trial.known = error >= MARGIN * own_error
                 error += 0.0 if trial.known else own_error
             trial.error = error / largest if largest > 0 else 0.0
 
     def _step_through(self, trial: _Trial, pilot: MeshPilot | None = None) -> float:
         """Step through the scene with the sheet's own step; returns the time of stepping alone [s]."""
-        trial.dynamics.restart(trial.scene, trial.grid)
+        trial.dynamics.restart(trial.plan)
         seconds = 0.0
-        for _ in range(trial.grid.frames):
+        for _ in range(trial.plan.grid.frames):
             self._tick()
             start = time.perf_counter()
-            trial.dynamics.advance(trial.grid.steps_per_frame)
+            trial.dynamics.advance(trial.plan.grid.steps_per_frame)
             seconds += time.perf_counter() - start
             displacement = trial.dynamics.displacement()
             if pilot is not None:
@@ -209,7 +207,7 @@ class PointStudy:
         return Points(
             rows=rows,
             cols=cols,
-            steps_per_frame=trial.grid.steps_per_frame,
+            steps_per_frame=trial.plan.grid.steps_per_frame,
             error=trial.error if trial.error < math.inf else None,
             known=trial.known,
             estimate=trial.estimate if trial.estimate < math.inf else None,
@@ -217,16 +215,20 @@ class PointStudy:
         )
 
 
-def lattices(scene: Scene) -> Iterator[Lattice]:
-    """List the numbers of points to compare, as far as the scene allows them; its own come last."""
-    for points in (*(_scaled(scene, share) for share in COARSER), scene.sheet.points):
-        if min(points) >= FEWEST and not any(material.problems(with_points(scene, points))):
-            yield points
+def lattices(plan: Plan) -> Iterator[Plan]:
+    """Plan the numbers of points to compare, as far as the scene allows them; its own come last."""
+    for share in COARSER:
+        points = _scaled(plan, share)
+        coarse, _ = try_plan(with_points(plan.scene, points), plan.image) if min(points) >= FEWEST else (None, [])
+        if coarse is not None:
+            yield coarse
+    if min(plan.scene.sheet.points) >= FEWEST:
+        yield plan
 
 
-def _scaled(scene: Scene, factor: float) -> Lattice:
+def _scaled(plan: Plan, factor: float) -> Lattice:
     """Give the rows and columns of points for `factor` times the cells a side."""
-    rows, cols = (round((count - 1) * factor) + 1 for count in scene.sheet.points)
+    rows, cols = (round((count - 1) * factor) + 1 for count in plan.scene.sheet.points)
     return rows, cols
 
 

@@ -14,10 +14,11 @@ from numpy.typing import NDArray
 
 from taichi_msm.physics.divergence import farthest_displacement
 from taichi_msm.physics.error_control import longest
+from taichi_msm.physics.plan import Plan
+from taichi_msm.physics.planning import make_plan
 from taichi_msm.physics.solver import Dynamics
-from taichi_msm.physics.timestep import stable_step, time_grid, with_time
+from taichi_msm.physics.timestep import stable_steps, with_time
 from taichi_msm.progress import Count
-from taichi_msm.scene import Scene
 from taichi_msm.study.result import Reference, Stepping, Timing
 from taichi_msm.system.runtime import Device
 from taichi_msm.timegrid import Precision
@@ -63,9 +64,13 @@ class SteppingStudy:
         reference: the facts about it.
     """
 
-    def __init__(self, scene: Scene, device: Device, longest_run: float, progress: Count) -> None:
-        self.scene = scene
-        self._grid = time_grid(scene, device.arch)
+    def __init__(self, plan: Plan, device: Device, longest_run: float, progress: Count) -> None:
+        self.plan = plan
+        self._grid = plan.grid
+        self._plans = {
+            difference: make_plan(with_time(plan.scene, damping_difference=difference, step="auto"), plan.image)
+            for difference in DIFFERENCES
+        }
         self.frames: Frames | None = None
         self.reference: Reference | None = None
         self._longest_run = longest_run
@@ -76,7 +81,7 @@ class SteppingStudy:
         with ExitStack() as opened:
             self._dynamics: dict[Precision, Dynamics] = {}
             for precision in PRECISIONS:
-                dynamics = self._dynamics[precision] = Dynamics(scene, replace(self._grid, precision=precision), device)
+                dynamics = self._dynamics[precision] = Dynamics(plan.with_grid(precision=precision), device)
                 opened.callback(dynamics.close)
             self._open = opened.pop_all()
 
@@ -118,8 +123,7 @@ class SteppingStudy:
 
     def _series(self, difference: str) -> Iterator[int]:
         """Give the steps per frame of a series: of the largest stable step, doubled until a run would take too long."""
-        limit = stable_step(with_time(self.scene, damping_difference=difference))
-        steps = max(1, math.ceil(1 / self.scene.time.frames_per_second / limit * (1 - 1e-12)))
+        steps = stable_steps(self._plans[difference])
         samples: list[float] = []
         self._run("f64", difference, steps, samples)
         yield steps
@@ -152,7 +156,7 @@ class SteppingStudy:
                 trial = _Trial(precision, difference, steps)
                 frames = self._run(precision, difference, steps, trial.samples)
                 trial.error = self.relative(frames)
-                if longest(frames) > farthest_displacement(self.scene, self.scene.time.duration):
+                if longest(frames) > farthest_displacement(self.plan, self.plan.scene.time.duration):
                     trial.error = math.inf
                 self._trials.append(trial)
                 if precision == "f64":
@@ -166,9 +170,9 @@ class SteppingStudy:
     def _run(self, precision: Precision, difference: str, steps: int, samples: list[float]) -> Frames:
         """Step through the scene, and append the time of stepping alone [s] to the samples."""
         dynamics = self._dynamics[precision]
-        grid = replace(self._grid, precision=precision, steps_per_frame=steps)
-        dynamics.restart(with_time(self.scene, damping_difference=difference), grid)
-        frames = np.empty((grid.frames, *self.scene.sheet.points, 3), precision.replace("f", "float"))
+        plan = self._plans[difference].with_grid(precision=precision, steps_per_frame=steps)
+        dynamics.restart(plan)
+        frames = np.empty((plan.grid.frames, *plan.scene.sheet.points, 3), precision.replace("f", "float"))
         seconds = 0.0
         for frame in frames:
             self._progress(self._done, self._to_do)

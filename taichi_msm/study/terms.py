@@ -6,8 +6,9 @@ import time
 from collections.abc import Iterator
 from contextlib import ExitStack
 
+from taichi_msm.physics.plan import Plan
+from taichi_msm.physics.planning import make_plan
 from taichi_msm.physics.solver import Dynamics
-from taichi_msm.physics.timestep import time_grid
 from taichi_msm.progress import Count
 from taichi_msm.scene import Scene
 from taichi_msm.study.result import Term, Timing
@@ -26,11 +27,12 @@ class TermStudy:
         progress: called with the measurements done and all of them; may raise KeyboardInterrupt.
     """
 
-    def __init__(self, scene: Scene, device: Device, sample: float, progress: Count) -> None:
+    def __init__(self, plan: Plan, device: Device, sample: float, progress: Count) -> None:
         self._device = device
         # All variants have the steps of the whole scene: without a spring the automatic step would be another.
-        self._grid = time_grid(scene, device.arch)
-        self._variants = dict(variants(scene))
+        self._grid = plan.grid
+        grid = {"steps_per_frame": plan.grid.steps_per_frame, "precision": plan.grid.precision}
+        self._variants = {name: make_plan(scene, plan.image).with_grid(**grid) for name, scene in variants(plan.scene)}
         self._samples: dict[str, list[float]] = {name: [] for name in self._variants}
         self._sample = sample
         self._progress = progress
@@ -39,17 +41,17 @@ class TermStudy:
         """Compile every variant, and then let them step in turn."""
         with ExitStack() as opened:
             sheets: dict[str, Dynamics] = {}
-            for name, scene in self._variants.items():
+            for name, plan in self._variants.items():
                 self._progress(0, len(self._variants))
-                sheets[name] = Dynamics(scene, self._grid, self._device)
+                sheets[name] = Dynamics(plan, self._device)
                 opened.callback(sheets[name].close)
                 sheets[name].compile()
             frames = self._frames(sheets[""])
             for round_ in range(ROUNDS):
-                for number, (name, scene) in enumerate(self._variants.items()):
+                for number, (name, plan) in enumerate(self._variants.items()):
                     self._progress(round_ * len(sheets) + number, ROUNDS * len(sheets))
                     # From rest, so that all variants step through the same part of the scene.
-                    sheets[name].restart(scene, self._grid)
+                    sheets[name].restart(plan)
                     self._samples[name].append(_step_seconds(sheets[name], frames))
 
     def points(self) -> list[Term]:
@@ -90,7 +92,7 @@ def variants(scene: Scene) -> Iterator[tuple[str, Scene]]:
 
 def _step_seconds(dynamics: Dynamics, frames: int) -> float:
     """Measure the time of one step [s]."""
-    steps = frames * dynamics.grid.steps_per_frame
+    steps = frames * dynamics.plan.grid.steps_per_frame
     start = time.perf_counter()
     dynamics.advance(steps)
     return (time.perf_counter() - start) / steps

@@ -7,7 +7,7 @@ import os
 import tempfile
 from collections.abc import Mapping
 from dataclasses import dataclass
-from functools import cache
+from functools import cache, cached_property
 from importlib import import_module
 from pathlib import Path
 from typing import Any
@@ -100,8 +100,9 @@ class Compiler:
             if silent:
                 del os.environ[level]
 
+    @cached_property
     def shortcuts(self) -> Parts:
-        """List what to replace while a kernel of ours is read; nothing in a version that was not tested.
+        """What to replace while a kernel of ours is read; nothing in a version that was not tested.
 
         A compiler reads every kernel in every process, as the key of its cache is made from what it reads. Meanwhile it
         prepares, for every node, the source lines that an error would show: useful only to those who change a kernel.

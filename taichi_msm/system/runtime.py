@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import ctypes
 import errno
 import io
 import os
@@ -15,7 +14,6 @@ import weakref
 from collections import defaultdict
 from collections.abc import Iterator
 from dataclasses import dataclass, field, replace
-from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -122,16 +120,7 @@ def write(array: Any, values: NDArray[Any]) -> None:
         values: shape (entries, lanes).
     """
     real = np.float32 if array.dtype == ti.f32 else np.float64
-    if started().arch == "cpu":
-        # A kernel that copies takes longer to read and to load than a short run takes to step.
-        address = ti.lang.impl.get_runtime().prog.get_ndarray_data_ptr_as_int(array.arr)
-        entries = array.shape[0]
-        memory = (ctypes.c_char * (entries * array.n * np.dtype(real).itemsize)).from_address(address)
-        target = np.frombuffer(memory, real).reshape(entries, array.n)
-        target[: len(values)] = values
-        target[len(values) :] = 0
-    else:
-        array.from_numpy(np.pad(values.astype(real), ((0, array.shape[0] - len(values)), (0, 0))))
+    array.from_numpy(np.pad(values.astype(real), ((0, array.shape[0] - len(values)), (0, 0))))
 
 
 _free: dict[tuple[str, int], list[Any]] = defaultdict(list)
@@ -244,22 +233,19 @@ def our_compilation(*, optimised: bool = True) -> contextlib.AbstractContextMana
         (config, "advanced_optimization", optimised),
         (config, "real_matrix_scalarize", started().arch != "cpu"),
     ]
-    return _replaced(options + _shortcuts())
-
-
-_shortcuts = cache(chosen().shortcuts)
+    return _replaced(options + chosen().shortcuts)
 
 
 @contextlib.contextmanager
 def _replaced(parts: Parts) -> Iterator[None]:
     """Give attributes of objects other values for a while."""
-    found = [(owner, name, getattr(owner, name)) for owner, name, _ in parts]
+    originals = [(owner, name, getattr(owner, name)) for owner, name, _ in parts]
     for owner, name, value in parts:
         setattr(owner, name, value)
     try:
         yield
     finally:
-        for owner, name, value in found:
+        for owner, name, value in originals:
             setattr(owner, name, value)
 
 

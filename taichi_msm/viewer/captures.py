@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import filecmp
 import os
+import re
 import secrets
 import shutil
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
@@ -15,17 +16,83 @@ import yaml
 from PIL import Image
 
 from taichi_msm.errors import FilesError, printable, writing
+from taichi_msm.progress import Pause
+from taichi_msm.results.encoder import Encoder, Job
+from taichi_msm.results.folder import FOLDER, INHERITS, Folder, Tree
 from taichi_msm.results.gif import Picture
-from taichi_msm.scene import Scene
+from taichi_msm.results.publication import ANIMATION
+from taichi_msm.scene import Render, Scene
 from taichi_msm.scenefile.load import MAX_BYTES
 from taichi_msm.scenefile.yaml_reader import MAX_NODES
-from taichi_msm.viewer.film import Film
 
 # The C emitter is ten times faster; a PyYAML that was built without it writes the same text.
 _DUMPER: Any = getattr(yaml, "CSafeDumper", yaml.SafeDumper)
 
 # A scene has at most this many values besides the keys of its probes.
-VALUES_BESIDES = 1000
+OTHER_VALUES = 1000
+
+# A film is encoded in a hidden folder, which is locked until the film is closed.
+HIDDEN, LOCK = r"\.film-[0-9a-f]{16}", "lock"
+TREE: Tree = {LOCK: None, re.escape(ANIMATION): None}
+
+
+class Film:
+    """A GIF of a session, encoded in a hidden folder while the session runs. On closing, it is removed unless moved.
+
+    Args:
+        folder: in which the hidden one is made; made if it does not exist.
+        render: gives the size of the pictures, and the background, a colour that is kept exactly.
+        rate: pictures per second.
+        parts: frames of the session per picture.
+        begin: frame of the session with which it begins.
+        option: what the error says to choose another folder by.
+
+    Raises:
+        FilesError: here and in the methods, when it cannot be written.
+
+    Attributes:
+        pictures: how many it has.
+    """
+
+    def __init__(
+        self, folder: Path, render: Render, rate: float, parts: int, begin: int = 0, option: str = "--out"
+    ) -> None:
+        self.pictures = 0
+        self._parts, self._begin, self._place = parts, begin, (folder, option)
+        with writing(*self._place), ExitStack() as opened:
+            near = opened.enter_context(Folder.at(folder, create=True))
+            _clear_abandoned(near)
+            name = f".film-{secrets.token_hex(8)}"
+            self._hidden = opened.enter_context(near.folder(name, create=True))
+            opened.callback(_remove, near, name)
+            lock = [opened.enter_context(self._hidden.lock(LOCK)).fileno()] if INHERITS else []
+            job = Job(self._hidden, render.size, rate, png=False, gif=True, background=render.background)
+            self._encoder = Encoder(job, inherit=tuple(lock))
+            opened.callback(self._encoder.abort)
+            self._opened = opened.pop_all()
+
+    def show(self, picture: Picture, frame: int, pause: Pause = lambda: None) -> None:
+        """Film a picture of a frame of the session; one that comes late is taken several times. `pause`: as Encoder."""
+        with writing(*self._place):
+            while self.pictures * self._parts <= frame - self._begin:
+                self._encoder.add(picture, pause)
+                self.pictures += 1
+
+    def encoded(self, pause: Pause = lambda: None) -> Path:
+        """Wait until the last picture is encoded; there must be one. Returns the file, which is to be moved away."""
+        with writing(*self._place):
+            self._encoder.finish(pause)
+        return self._hidden.path / ANIMATION
+
+    def close(self) -> None:
+        """End it."""
+        self._opened.close()
+
+    def __enter__(self) -> Film:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
 
 
 class Captures:
@@ -35,26 +102,26 @@ class Captures:
         folder: the folder.
         name: what the session is of; written into its scenes.
 
+    Raises:
+        FilesError: in the methods, when the folder cannot be written.
+
     Attributes:
-        kept: the saved files, in order.
+        folder: the folder.
+        saved: the saved files, in order.
     """
 
     def __init__(self, folder: Path, name: str) -> None:
         self.folder = folder
-        self.kept: list[Path] = []
+        self.saved: list[Path] = []
         self._name = name
 
-    def keep_picture(self, picture: Picture) -> Path:
-        """Save a picture as PNG; returns its file.
-
-        Raises:
-            FilesError: here and below, when the folder cannot be written.
-        """
+    def save_picture(self, picture: Picture) -> Path:
+        """Save a picture as PNG; returns its file."""
         with _draft(self.folder) as draft:
             Image.fromarray(picture).save(draft, "PNG")
             return self._place(draft, "picture", ".png")
 
-    def keep_scene(self, scene: Scene) -> Path:
+    def save_scene(self, scene: Scene) -> Path:
         """Save a scene, and beside it copies of its pictures, where a scene file must have them; returns its file."""
         with _draft(self.folder) as draft:
             scene = scene.with_pictures(lambda path: self._copied(Path(path)).name)
@@ -63,16 +130,12 @@ class Captures:
                 data, Dumper=_DUMPER, sort_keys=False, default_flow_style=None, width=120, allow_unicode=True
             )
             text = f"# What was done in a live session of {printable(self._name)}; `run` repeats it.\n{text}"
-            if len(text.encode()) > MAX_BYTES or values(scene) + VALUES_BESIDES > MAX_NODES:
+            if len(text.encode()) > MAX_BYTES or probe_values(scene) + OTHER_VALUES > MAX_NODES:
                 raise FilesError("this session is too long for a scene file; reset it, and do less")
             draft.write_text(text, "utf-8")
             return self._place(draft, "session", ".yaml")
 
-    def film(self, size: tuple[int, int], rate: float, background: tuple[int, int, int]) -> Film:
-        """Begin a film."""
-        return Film(self.folder, size, rate, background)
-
-    def keep_film(self, film: Film) -> Path:
+    def save_film(self, film: Film) -> Path:
         """End a film that has a picture, and save it; returns its file."""
         with film, writing(self.folder):
             return self._place(film.encoded(), "film", ".gif")
@@ -82,7 +145,7 @@ class Captures:
         number = 1
         while not _named(draft, path := self.folder / f"{stem}-{number}{suffix}"):
             number += 1
-        self.kept.append(path)
+        self.saved.append(path)
         return path
 
     def _copied(self, image: Path) -> Path:
@@ -100,6 +163,11 @@ class Captures:
         return copy
 
 
+def probe_values(scene: Scene) -> int:
+    """Count the values that the keys of a scene's probes add to its file, which may have `MAX_NODES` in all."""
+    return sum(4 * len(probe.at) + 3 * len(probe.load) for probe in scene.probes)
+
+
 @contextmanager
 def _draft(folder: Path) -> Iterator[Path]:
     """Give a hidden name to write a file under; the name is removed in the end."""
@@ -111,11 +179,6 @@ def _draft(folder: Path) -> Iterator[Path]:
             yield draft
         finally:
             draft.unlink(missing_ok=True)
-
-
-def values(scene: Scene) -> int:
-    """Count the values that the keys of a scene's probes add to its file, which may have `MAX_NODES` in all."""
-    return sum(4 * len(probe.at) + 3 * len(probe.load) for probe in scene.probes)
 
 
 def _named(draft: Path, path: Path) -> bool:
@@ -131,3 +194,22 @@ def _named(draft: Path, path: Path) -> bool:
             return False
         draft.replace(path)
     return True
+
+
+def _clear_abandoned(folder: Folder) -> None:
+    """Remove what films of killed processes have left."""
+    for name, kind in folder.entries() if INHERITS else ():
+        if kind == FOLDER and re.fullmatch(HIDDEN, name):
+            # A film of another user, or one still being made, stays.
+            with suppress(OSError, FilesError), folder.folder(name) as hidden:
+                hidden.require_only(TREE)
+                if hidden.kind(LOCK) is not None:
+                    hidden.lock(LOCK).close()
+                    _remove(folder, name)
+
+
+def _remove(folder: Folder, name: str) -> None:
+    """Remove a film's hidden folder, as far as possible."""
+    with suppress(OSError, FilesError), folder.folder(name) as hidden:
+        hidden.clear(TREE)
+        folder.remove_folder(name)

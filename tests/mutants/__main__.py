@@ -53,7 +53,7 @@ def first_failure(files: Iterable[str], mutant: Mutant | None = None) -> str | N
             else:
                 shutil.copy(original, copy)
         if mutant:
-            mutant.path(copy).write_text(mutant.source(), encoding="utf-8")
+            (copy / mutant.definition().file).write_text(mutant.source(), encoding="utf-8")
         try:
             done = subprocess.run(
                 [*PYTEST, "-p", "tests.mutants.own_package", *(f"tests/{file}" for file in files)],

@@ -3,16 +3,17 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 
 from taichi_msm.physics import probe_force
 from taichi_msm.physics.error_control import Estimate
-from taichi_msm.physics.material import has_fixed_border, material
+from taichi_msm.physics.material import has_fixed_border
 from taichi_msm.physics.mesh_error import MeshEstimate
+from taichi_msm.physics.plan import Plan
+from taichi_msm.physics.probe_force import ProbeRecord
 from taichi_msm.physics.run_progress import RunProgress
-from taichi_msm.scene import MAX_POINTS, Scene
-from taichi_msm.timegrid import TimeGrid
+from taichi_msm.scene import MAX_POINTS
 
 # The stability limit holds while no spring is compressed below this share of its rest length (see
 # `material.highest_frequency`).
@@ -25,9 +26,9 @@ LONGEST = 2.0
 WRONG = 0.01
 
 
-def notes(
-    scene: Scene,
-    grid: TimeGrid,
+def run_notes(
+    plan: Plan,
+    probes: Sequence[ProbeRecord],
     progress: RunProgress,
     estimate: Estimate | None,
     reason: str = "",
@@ -36,25 +37,26 @@ def notes(
     """Say what is remarkable about a run, each in a line.
 
     Args:
-        scene: what was run.
-        grid: the steps that were taken.
+        plan: of the run.
+        probes: the forces of its probes.
         progress: of the last frame.
         estimate: of the error; None: there is none.
         reason: why there is no estimate.
         mesh: the error that the number of points makes; None: not estimated.
     """
+    scene, grid = plan.scene, plan.grid
     if estimate is not None:
         yield error(estimate, mesh)
         if WRONG < estimate.error < math.inf:
             wrong = float(f"{100 * estimate.error:.2g}")
             bound = "about" if estimate.parted else "up to"
-            yield f"the run is {bound} {wrong:g} % wrong; {_remedy(scene, grid, estimate)}"
+            yield f"the run is {bound} {wrong:g} % wrong; {_remedy(plan, estimate)}"
     elif reason:
         if mesh is None:
             yield f"error not estimated: {reason}"
         else:
             yield f"error {_size(mesh)} due to the number of points; due to the time step not estimated: {reason}"
-    yield from probe_force.notes(scene, probe_force.probe_records(scene))
+    yield from probe_force.force_notes(scene, probes)
     if mesh is not None and mesh.doubt:
         yield f"the error due to the number of points may be larger: {mesh.doubt}"
     if mesh is not None and WRONG < mesh.error < math.inf:
@@ -74,7 +76,7 @@ def notes(
             f"a spring was pressed to {progress.shortest_spring:.2g} of its rest length: below {SHORTEST} the sheet "
             "folds over itself and small errors grow; press less"
         )
-    quick = material(scene).drag * grid.step
+    quick = plan.material.drag * grid.step
     if quick > 2 and scene.time.damping_difference == "central":
         yield (
             f"the damping stops a point within 1/{quick:.3g} of a step: velocities change their sign at every step; "
@@ -104,19 +106,19 @@ def _size(mesh: MeshEstimate) -> str:
     return f"{'at least ' if mesh.doubt else ''}{mesh.error:.2g}" if mesh.error < math.inf else "an unknown part"
 
 
-def _remedy(scene: Scene, grid: TimeGrid, estimate: Estimate) -> str:
+def _remedy(plan: Plan, estimate: Estimate) -> str:
     """Say what would reduce the error."""
     if not estimate.parted:
         return "pass --estimate-error to learn whether the step or rounding makes it"
     said = []
     if estimate.rounding > WRONG / 2:
         said.append("time.precision: f64")
-        if material(scene).has_springs:
-            held = "tissue.pretension or bending" if has_fixed_border(scene.sheet) else "tissue.foundation"
-            support = "springs.virtual" if scene.tissue is None else held
+        if plan.material.has_springs:
+            held = "tissue.pretension or bending" if has_fixed_border(plan.fixed) else "tissue.foundation"
+            support = "springs.virtual" if plan.scene.tissue is None else held
             said.append(f"more {support}, where the sheet buckles")
     if estimate.in_f64 > WRONG / 2:
-        needed = grid.steps_per_frame * (estimate.in_f64 / (WRONG / 2)) ** (1 / estimate.order)
-        finer = replace(grid, steps_per_frame=math.ceil(needed))
+        needed = plan.grid.steps_per_frame * (estimate.in_f64 / (WRONG / 2)) ** (1 / estimate.order)
+        finer = replace(plan.grid, steps_per_frame=math.ceil(needed))
         said.insert(0, f"time.step: {finer.step:.9g}")
     return f"try {', or '.join(said)}"

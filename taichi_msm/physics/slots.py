@@ -1,0 +1,84 @@
+"""The places where probes act: a control point that jumps is dealt out to several slots."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from taichi_msm.physics.probe_force import control_points
+from taichi_msm.scene import Probe, Sheet
+
+# A key closer than this to an end of the hat, as a fraction of its half-width, counts as outside: it would contribute
+# less than rounding does.
+EDGE = 1e-9
+
+Array = NDArray[np.float64]
+
+
+class ProbeSegment(NamedTuple):
+    """A control point between two jumps.
+
+    Attributes:
+        times: of the keys [s], shape (n,).
+        points: control point at those times, x and y at rest [m], shape (n, 2); constant before and after them.
+    """
+
+    times: Array
+    points: Array
+
+
+@dataclass(frozen=True)
+class ProbeSlot:
+    """A place where a probe acts; a probe whose control point jumps has several slots and uses them by turns.
+
+    If a jump falls within the hat, the probe acts in that step at the places before and after the jump. So the segments
+    of the control point are dealt out to two slots: the first, third, ... to one, the second, fourth, ... to the other.
+    If several jumps can fall within one hat, there are as many slots as it takes.
+
+    Attributes:
+        probe: index of the probe in the scene.
+        segments: all segments of the control point, also those of the other slots.
+        turn: index of the slot's first segment.
+        turns: number of slots that the probe has; every `turns`-th segment from `turn` on is the slot's.
+    """
+
+    probe: int
+    segments: tuple[ProbeSegment, ...]
+    turn: int
+    turns: int
+
+    @property
+    def moves(self) -> bool:
+        """Whether the control point moves."""
+        return len(self.segments) > 1 or len(self.segments[0].times) > 1
+
+    @property
+    def jumps(self) -> Array:
+        """Times at which the control point jumps [s]: the first key of every segment but the first."""
+        return np.array([segment.times[0] for segment in self.segments[1:]])
+
+
+def probe_slots(probes: Sequence[Probe], sheet: Sheet, h: float) -> tuple[ProbeSlot, ...]:
+    """List the slots of all probes.
+
+    Args:
+        probes: of the scene, in its order.
+        sheet: on which they act.
+        h: half-width of the hat, which is the step [s]; 0 if loads are not averaged: every probe then has one slot.
+    """
+    slots = []
+    for index, probe in enumerate(probes):
+        times, points = control_points(probe, sheet)
+        jumps = np.flatnonzero((times[1:] == times[:-1]) & (points[1:] != points[:-1]).any(axis=1)) + 1
+        parts = zip(np.split(times, jumps), np.split(points, jumps), strict=True)
+        segments = tuple(ProbeSegment(*part) for part in parts)
+        # One more than the largest number of jumps in any hat.
+        jumped = times[jumps]
+        within = np.searchsorted(jumped, jumped + 2 * h * (1 - EDGE), "left") - np.arange(len(jumped))
+        turns = 1 + int(within.max(initial=0))
+        slots += [ProbeSlot(index, segments, turn, turns) for turn in range(turns)]
+    return tuple(slots)

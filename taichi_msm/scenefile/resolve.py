@@ -1,0 +1,48 @@
+"""Choose what a scene leaves open: the points and the step for its tolerances, and the precision."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+from taichi_msm.physics import planning
+from taichi_msm.physics.error_control import Estimate, choose_step
+from taichi_msm.physics.mesh_error import MeshEstimate, choose_points
+from taichi_msm.physics.plan import Plan
+from taichi_msm.physics.timestep import with_chosen_grid
+from taichi_msm.progress import Count
+from taichi_msm.scenefile.validation import checked
+from taichi_msm.system.runtime import Device
+
+
+class Resolved(NamedTuple):
+    """A plan in which nothing is left open.
+
+    Attributes:
+        plan: its scene has the points, the step and the precision that were chosen.
+        estimate: of the error, if a tolerance of the time required it; else None.
+        mesh: the error of the points, if a tolerance of the sheet required it; else None.
+    """
+
+    plan: Plan
+    estimate: Estimate | None
+    mesh: MeshEstimate | None
+
+
+def resolve(plan: Plan, device: Device, progress: Count = lambda done, total: None) -> Resolved:
+    """Choose what a checked scene leaves open, by pilot runs where it has tolerances.
+
+    Args:
+        plan: what `checked` returned.
+        device: what `runtime.start` returned.
+        progress: called with the frames done and the frames in all of each pilot run.
+
+    Raises:
+        SceneError: when no points or no step meet a tolerance.
+    """
+    estimate = mesh = None
+    plan = planning.on(plan, device.arch)
+    if plan.scene.sheet.tolerance is not None:
+        plan, mesh = choose_points(plan, device, checked, progress)
+    if plan.scene.time.tolerance is not None:
+        plan, estimate = choose_step(plan, device, progress)
+    return Resolved(with_chosen_grid(plan), estimate, mesh)

@@ -1,0 +1,106 @@
+"""The definitions of the package by name, and text in them, however it is indented and broken into lines."""
+
+from __future__ import annotations
+
+import ast
+import re
+from collections.abc import Iterator
+from functools import cache
+from pathlib import Path
+from textwrap import dedent, indent
+from typing import NamedTuple
+
+TOKEN = re.compile(r"\w+|[^\w\s]")
+CLOSING = (")", "]", "}")
+
+
+class Definition(NamedTuple):
+    """A function, a method, a class, or a constant of a module or a class.
+
+    Attributes:
+        name: qualified, with the names of package and modules.
+        file: relative to the root of the project.
+        start: where its source begins in the file [characters].
+        source: its text, decorators included.
+    """
+
+    name: str
+    file: Path
+    start: int
+    source: str
+
+    def spans(self, text: str) -> list[tuple[int, int]]:
+        """Find text in the source, whatever the white space and the commas before closing brackets.
+
+        Returns:
+            Where it begins and ends in the file [characters].
+        """
+        matches = _pattern(text).finditer(self.source)
+        return [(self.start + match.start(), self.start + match.end()) for match in matches]
+
+
+def definitions(root: Path, package: str) -> tuple[Definition, ...]:
+    """Read all definitions of a package."""
+    return tuple(
+        definition
+        for path in sorted((root / package).rglob("*.py"))
+        for definition in _definitions(root, path.relative_to(root), path.stat().st_mtime_ns)
+    )
+
+
+def named(name: str, known: tuple[Definition, ...]) -> list[Definition]:
+    """Choose the definitions whose qualified name is this or ends with it."""
+    return [definition for definition in known if f".{definition.name}".endswith(f".{name}")]
+
+
+def replaced(source: str, span: tuple[int, int], text: str) -> str:
+    """Put text in the place of a span; further lines are indented like the line in which the span begins."""
+    begin, end = span
+    line = source[source.rfind("\n", 0, begin) + 1 : begin]
+    margin = line[: len(line) - len(line.lstrip())]
+    return source[:begin] + indent(dedent(text).strip(), margin).removeprefix(margin) + source[end:]
+
+
+@cache
+def _definitions(root: Path, file: Path, _changed: int) -> tuple[Definition, ...]:
+    source = (root / file).read_text(encoding="utf-8")
+    starts = [0]
+    for line in source.splitlines(keepends=True):
+        starts.append(starts[-1] + len(line))
+
+    def within(body: ast.AST, prefix: str, *, in_function: bool) -> Iterator[Definition]:
+        for node in ast.iter_child_nodes(body):
+            inner, is_function = prefix, isinstance(node, ast.FunctionDef)
+            for name, lines in _names(node, constants=not in_function):
+                inner = f"{prefix}.{name}"
+                begin, end = starts[lines.start], starts[lines.stop]
+                yield Definition(inner, file, begin, source[begin:end])
+            yield from within(node, inner, in_function=in_function or is_function)
+
+    module = ".".join(file.with_suffix("").parts).removesuffix(".__init__")
+    return tuple(within(ast.parse(source), module, in_function=False))
+
+
+def _names(node: ast.AST, *, constants: bool) -> Iterator[tuple[str, slice]]:
+    """Give the names that a node defines, and its lines, counted from 0."""
+    if isinstance(node, ast.FunctionDef | ast.ClassDef):
+        first = min((decorator.lineno for decorator in node.decorator_list), default=node.lineno)
+        yield node.name, slice(first - 1, node.end_lineno)
+    elif constants and isinstance(node, ast.Assign | ast.AnnAssign):
+        targets = node.targets if isinstance(node, ast.Assign) else [node.target]
+        names = [part.id for target in targets for part in ast.walk(target) if isinstance(part, ast.Name)]
+        yield from ((name, slice(node.lineno - 1, node.end_lineno)) for name in names)
+
+
+def _pattern(text: str) -> re.Pattern[str]:
+    tokens = TOKEN.findall(text)
+    tokens = [t for t, after in zip(tokens, [*tokens[1:], ""], strict=True) if not (t == "," and after in CLOSING)]
+    parts = [r"\b" if tokens[0][0].isalnum() else ""]
+    for token, after in zip(tokens, [*tokens[1:], ""], strict=True):
+        parts.append(re.escape(token))
+        if after in CLOSING:
+            parts.append(r"\s*,?\s*")
+        elif after:
+            parts.append(r"\s+" if re.match(r"\w", token) and re.match(r"\w", after) else r"\s*")
+    parts.append(r"\b" if re.match(r"\w", tokens[-1]) else "")
+    return re.compile("".join(parts))

@@ -1,0 +1,67 @@
+"""A scene is resolved once, into a plan that everything after takes."""
+
+from __future__ import annotations
+
+import sys
+from collections import Counter
+from pathlib import Path
+from types import ModuleType
+from typing import Any
+
+import pytest
+
+import taichi_msm
+import taichi_msm.runner
+from taichi_msm.cli import main
+from taichi_msm.physics import lattice, material, slots, stiffness_map, timestep
+
+DERIVED = [
+    (material, "material"),
+    (material, "highest_frequency"),
+    (slots, "probe_slots"),
+    (lattice, "fixed_points"),
+    (stiffness_map, "read"),
+    (stiffness_map, "factors"),
+    (timestep, "stable_step"),
+    (timestep, "steps_per_frame"),
+]
+
+
+@pytest.fixture
+def calls(monkeypatch: pytest.MonkeyPatch) -> Counter[str]:
+    """How many times each of these functions is called, wherever it was imported."""
+    counted: Counter[str] = Counter()
+
+    def counting(module: ModuleType, name: str) -> None:
+        function = getattr(module, name)
+
+        def counted_function(*arguments: Any) -> Any:
+            counted[name] += 1
+            return function(*arguments)
+
+        for other in [one for key, one in sys.modules.items() if key.startswith(taichi_msm.__name__)]:
+            if getattr(other, name, None) is function:
+                monkeypatch.setattr(other, name, counted_function)
+
+    for module, name in DERIVED:
+        counting(module, name)
+    return counted
+
+
+def test_a_run_derives_everything_once(root: Path, tmp_path: Path, calls: Counter[str]) -> None:
+    short = ["--set", "time.duration=0.08", "--set", "output=[trajectory]", "--no-estimate", "--quiet"]
+    assert main(["run", str(root / "scenes/tumour.yaml"), "--out", str(tmp_path / "out"), *short]) == 0
+    assert calls == dict.fromkeys((name for _, name in DERIVED), 1)
+
+
+def test_pilots_with_fewer_points_derive_their_own_sheets_once(root: Path, tmp_path: Path, calls: Counter[str]) -> None:
+    short = ["--set", "time.duration=0.08", "--set", "output=[]", "--estimate-error", "--quiet"]
+    assert main(["run", str(root / "scenes/tumour.yaml"), "--out", str(tmp_path / "out"), *short]) == 0
+    assert {calls[name] for name in ("material", "fixed_points", "factors", "stable_step")} == {3}
+    assert calls["read"] == 1, "the map's file"
+
+
+def test_a_check_derives_everything_once(root: Path, calls: Counter[str], capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["check", str(root / "scenes/tumour.yaml")]) == 0
+    assert calls == dict.fromkeys((name for _, name in DERIVED), 1)
+    assert "limit" in capsys.readouterr().out
