@@ -289,7 +289,8 @@ def _find(
             own_triangle = 2 * ti.cast(line * parts + column, ti.i32) + ti.cast(t1 > s1, ti.i32)
             patch = ti.static(patch_of(corner_of(own, cols), cols, 0.0, True, point, True))
             # In the small quad, D s t is replaced by a function that is linear on either side of the diagonal.
-            p = patch.a + patch.b * s + patch.c * t + patch.d * (s0 * t0 + s1 * t0 + s0 * t1 + ti.min(s1, t1) * part)
+            twist = s0 * t0 + s1 * t0 + s0 * t1 + ti.min(s1, t1) * part
+            p = patch.a + patch.b * s + patch.c * t + patch.d * twist
             out_of_sight = True
             if p[2] > near:
                 x, y = p[0] / p[2], p[1] / p[2]
