@@ -21,6 +21,7 @@ import click
 
 from taichi_msm import __version__
 from taichi_msm.errors import DeviceError, FilesError, NotInstalledError, SceneError, did_you_mean, printable
+from taichi_msm.export.formats import FORMATS
 from taichi_msm.system.signals import Interruption
 from taichi_msm.system.streams import mute, tell
 
@@ -32,9 +33,6 @@ DONE, BUG, WRONG_INPUT, DIVERGED, FILES = 0, 1, 2, 3, 4
 # What may be given together with --resume, and with --again.
 RESUMABLE = ("resume", "threads", "quiet", "as_json")
 REPEATABLE = ("again", "out", "arch", "threads", "estimate_error", "quiet", "as_json")
-
-# What results can be converted to.
-FORMATS = ("kitti", "tapvid", "vtk", "gltf", "obj")
 
 EXIT_CODES = {"complete": DONE, "diverged": DIVERGED}
 
@@ -281,12 +279,10 @@ def study(
         expected = f"expected a number, {SMALLEST_TOLERANCE:g} to {LARGEST_TOLERANCE:g}"
         raise click.BadParameter(f"{tolerance:g} is not allowed; {expected}", param_hint="--tolerance")
 
-    from rich.console import Console
-
     from taichi_msm.console import Progress
     from taichi_msm.study.measure import study as measure
+    from taichi_msm.study.page import summary
     from taichi_msm.study.report import RECORD, as_record, require_writable, write_report
-    from taichi_msm.study.table import print_summary
 
     require_writable(directory)
     interruption = Interruption()
@@ -310,7 +306,7 @@ def study(
     if as_json:
         print_json({"directory": str(directory), **as_record(results), "outputs": outputs})
     else:
-        print_summary(results, Console())
+        click.echo(summary(results))
         click.echo(printable(f"{directory}: {', '.join(outputs)}"))
     return EXIT_CODES.get(results.status, interruption.code)
 
@@ -408,8 +404,7 @@ def view(
     type=Choice(FORMATS),
     metavar="FORMAT",
     required=True,
-    help="kitti: optical flow; tapvid: tracks of points; vtk: for ParaView; gltf: for Blender and browsers; "
-    "obj: for other programs with surfaces.",
+    help="; ".join(f"{name}: {row.means}" for name, row in FORMATS.items()) + ".",
 )
 @click.option("--out", metavar="DIR2", help="Directory for the files.  [default: DIR/export-FORMAT]")
 @click.option("--quiet", is_flag=True, help="Print no progress and no summary.")
@@ -489,7 +484,7 @@ def without_link(folder: Path, option: str) -> Path:
 
 def going_on(directory: Path) -> str:
     """Say how to continue the unfinished run in a directory; empty if there is none."""
-    from taichi_msm.results.publication import is_unfinished
+    from taichi_msm.results.checkpoint import is_unfinished
 
     if not is_unfinished(directory):
         return ""

@@ -10,8 +10,9 @@ import pytest
 from PIL import Image
 
 from taichi_msm.errors import SceneError
+from taichi_msm.outputs.table import OUTPUTS
 from taichi_msm.runner import run
-from taichi_msm.scene import OUTPUTS, Scene
+from taichi_msm.scene import Scene
 from taichi_msm.scenefile import budget
 from taichi_msm.scenefile.budget import Budget, require_disk, size_problems
 from taichi_msm.system import resources

@@ -14,6 +14,7 @@ Source: VTK's own writer; for the .pvd file, ParaView's guide.
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import Any
 from xml.etree import ElementTree
 
@@ -23,14 +24,14 @@ from numpy.typing import NDArray
 from taichi_msm.errors import NotInstalledError
 from taichi_msm.export.mesh import PICTURE, REFINE, picture_png
 from taichi_msm.physics.lattice import rest_positions
+from taichi_msm.physics.planning import make_plan
+from taichi_msm.physics.springs import energy_density
 from taichi_msm.progress import Count
-from taichi_msm.reference import energy_density
 from taichi_msm.render.surface import surface
 from taichi_msm.results.finished_run import FinishedRun
-from taichi_msm.results.folder import Folder, Tree
+from taichi_msm.results.whole import add
 
 COLLECTION = "surface.pvd"
-FILES: Tree = dict.fromkeys((r"[0-9]{4,}\.vtu", r"surface\.pvd", r"picture\.png"))
 
 DISPLACEMENT, SPEED, ENERGY = "displacement", "speed", "energy_density"
 UNITS = {DISPLACEMENT: "m", SPEED: "m/s", ENERGY: "J/m2"}
@@ -38,7 +39,7 @@ UNITS = {DISPLACEMENT: "m", SPEED: "m/s", ENERGY: "J/m2"}
 Array = NDArray[np.floating]
 
 
-def write_vtk(run: FinishedRun, folder: Folder, progress: Count) -> list[str]:
+def write(run: FinishedRun, folder: Path, progress: Count) -> list[str]:
     """Write the surface of every frame, their times and the picture.
 
     Raises:
@@ -53,19 +54,19 @@ def write_vtk(run: FinishedRun, folder: Folder, progress: Count) -> list[str]:
         raise NotInstalledError(said) from None
     positions, picture = run.positions(), picture_png(run)
     run.require_pictures(drawn=False)
-    rest = rest_positions(run.scene.sheet)
+    plan, rest = make_plan(run.scene), rest_positions(run.scene.sheet)
     for frame in range(run.frames):
         progress(frame, run.frames)
         displacement = positions[frame] - rest
         values = {
             DISPLACEMENT: displacement.reshape(-1, 3),
             SPEED: speed(positions, run.time, frame).ravel(),
-            ENERGY: energy_density(run.scene, displacement).ravel(),
+            ENERGY: energy_density(plan, displacement).ravel(),
         }
-        folder.add(_name(frame), _grid(positions[frame], values))
+        add(folder / _name(frame), _grid(positions[frame], values))
     if picture is not None:
-        folder.add(PICTURE, picture)
-    folder.add(COLLECTION, _collection(run.time))
+        add(folder / PICTURE, picture)
+    add(folder / COLLECTION, _collection(run.time))
     return []
 
 

@@ -14,7 +14,7 @@ from taichi_msm.render.camera import View, view
 from taichi_msm.render.instrument import Rod
 from taichi_msm.render.labels import Flow, Labels, Observed, Sight, track_grid
 from taichi_msm.render.texture import load_texture
-from taichi_msm.scene import UNTIL_NEXT, Camera, Render, Scene
+from taichi_msm.scene import Camera, Render, Scene
 
 if TYPE_CHECKING:
     from taichi_msm.render.rasterizer import Drawing
@@ -121,9 +121,9 @@ class Renderer:
             picture, labels = self._drawing(picture=True, labels=scene.labels_pixels and together).look(*shot)
         if scene.labels_pixels and labels is None:
             labels = self.labels(shot)
-        if before is not None and any(kind in UNTIL_NEXT for kind in scene.output):
+        if before is not None and scene.asks_for("flow"):
             flow = self.flow(before, shot)
-        if "tracks" in scene.output:
+        if scene.asks_for("tracks"):
             tracks = self.locate(track_grid(scene.render.tracks), shot)
         return Observed(picture, labels, flow, tracks)
 

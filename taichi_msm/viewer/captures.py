@@ -4,11 +4,8 @@ from __future__ import annotations
 
 import filecmp
 import os
-import re
-import secrets
 import shutil
-from collections.abc import Iterator
-from contextlib import ExitStack, contextmanager, suppress
+from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
 
@@ -16,11 +13,11 @@ import yaml
 from PIL import Image
 
 from taichi_msm.errors import FilesError, printable, writing
+from taichi_msm.outputs.gif import Picture
+from taichi_msm.outputs.table import OUTPUTS
 from taichi_msm.progress import Pause
 from taichi_msm.results.encoder import Encoder, Job
-from taichi_msm.results.folder import FOLDER, INHERITS, Folder, Tree
-from taichi_msm.results.gif import Picture
-from taichi_msm.results.publication import ANIMATION
+from taichi_msm.results.whole import place, staged
 from taichi_msm.scene import Render, Scene
 from taichi_msm.scenefile.load import MAX_BYTES
 from taichi_msm.scenefile.yaml_reader import MAX_NODES
@@ -30,10 +27,6 @@ _DUMPER: Any = getattr(yaml, "CSafeDumper", yaml.SafeDumper)
 
 # A scene has at most this many values besides the keys of its probes.
 OTHER_VALUES = 1000
-
-# A film is encoded in a hidden folder, which is locked until the film is closed.
-HIDDEN, LOCK = r"\.film-[0-9a-f]{16}", "lock"
-TREE: Tree = {LOCK: None, re.escape(ANIMATION): None}
 
 
 class Film:
@@ -60,14 +53,9 @@ class Film:
         self.pictures = 0
         self._parts, self._begin, self._place = parts, begin, (folder, option)
         with writing(*self._place), ExitStack() as opened:
-            near = opened.enter_context(Folder.at(folder, create=True))
-            _clear_abandoned(near)
-            name = f".film-{secrets.token_hex(8)}"
-            self._hidden = opened.enter_context(near.folder(name, create=True))
-            opened.callback(_remove, near, name)
-            lock = [opened.enter_context(self._hidden.lock(LOCK)).fileno()] if INHERITS else []
+            self._hidden = opened.enter_context(staged(folder))
             job = Job(self._hidden, render.size, rate, png=False, gif=True, background=render.background)
-            self._encoder = Encoder(job, inherit=tuple(lock))
+            self._encoder = Encoder(job)
             opened.callback(self._encoder.abort)
             self._opened = opened.pop_all()
 
@@ -82,7 +70,7 @@ class Film:
         """Wait until the last picture is encoded; there must be one. Returns the file, which is to be moved away."""
         with writing(*self._place):
             self._encoder.finish(pause)
-        return self._hidden.path / ANIMATION
+        return self._hidden / OUTPUTS["gif"].path()
 
     def close(self) -> None:
         """End it."""
@@ -117,13 +105,13 @@ class Captures:
 
     def save_picture(self, picture: Picture) -> Path:
         """Save a picture as PNG; returns its file."""
-        with _draft(self.folder) as draft:
-            Image.fromarray(picture).save(draft, "PNG")
-            return self._place(draft, "picture", ".png")
+        with writing(self.folder), staged(self.folder) as hidden:
+            Image.fromarray(picture).save(hidden / "picture", "PNG")
+            return self._place(hidden / "picture", "picture", ".png")
 
     def save_scene(self, scene: Scene) -> Path:
         """Save a scene, and beside it copies of its pictures, where a scene file must have them; returns its file."""
-        with _draft(self.folder) as draft:
+        with writing(self.folder), staged(self.folder) as hidden:
             scene = scene.with_pictures(lambda path: self._copied(Path(path)).name)
             data = scene.model_dump(mode="json", exclude_none=True)
             text = yaml.dump(
@@ -132,8 +120,8 @@ class Captures:
             text = f"# What was done in a live session of {printable(self._name)}; `run` repeats it.\n{text}"
             if len(text.encode()) > MAX_BYTES or probe_values(scene) + OTHER_VALUES > MAX_NODES:
                 raise FilesError("this session is too long for a scene file; reset it, and do less")
-            draft.write_text(text, "utf-8")
-            return self._place(draft, "session", ".yaml")
+            (hidden / "session").write_text(text, "utf-8")
+            return self._place(hidden / "session", "session", ".yaml")
 
     def save_film(self, film: Film) -> Path:
         """End a film that has a picture, and save it; returns its file."""
@@ -142,11 +130,8 @@ class Captures:
 
     def _place(self, draft: Path, stem: str, suffix: str) -> Path:
         """Give a file the next free name."""
-        number = 1
-        while not _named(draft, path := self.folder / f"{stem}-{number}{suffix}"):
-            number += 1
-        self.saved.append(path)
-        return path
+        self.saved.append(place(draft, self.folder, stem, suffix))
+        return self.saved[-1]
 
     def _copied(self, image: Path) -> Path:
         """Make sure that the folder has a copy of a picture, under the picture's own name if that is free."""
@@ -157,59 +142,11 @@ class Captures:
             number += 1
             copy = self.folder / f"{image.stem}-{number}{image.suffix}"
         if not os.path.lexists(copy):
-            with _draft(self.folder) as draft:
-                shutil.copyfile(image, draft)
-                draft.replace(copy)
+            with staged(self.folder) as hidden:
+                shutil.copyfile(image, hidden / "copy").replace(copy)
         return copy
 
 
 def probe_values(scene: Scene) -> int:
     """Count the values that the keys of a scene's probes add to its file, which may have `MAX_NODES` in all."""
     return sum(4 * len(probe.at) + 3 * len(probe.load) for probe in scene.probes)
-
-
-@contextmanager
-def _draft(folder: Path) -> Iterator[Path]:
-    """Give a hidden name to write a file under; the name is removed in the end."""
-    # The name is random, as a killed process may have left its draft, which can be a hard link to a file that it saved.
-    draft = folder / f".draft-{secrets.token_hex(8)}"
-    with writing(folder):
-        folder.mkdir(parents=True, exist_ok=True)
-        try:
-            yield draft
-        finally:
-            draft.unlink(missing_ok=True)
-
-
-def _named(draft: Path, path: Path) -> bool:
-    """Give a file a name, unless another has it."""
-    try:
-        # Unlike a rename, a link does not replace another file.
-        os.link(draft, path)
-    except FileExistsError:
-        return False
-    except OSError:
-        # The file system has no links.
-        if path.exists():
-            return False
-        draft.replace(path)
-    return True
-
-
-def _clear_abandoned(folder: Folder) -> None:
-    """Remove what films of killed processes have left."""
-    for name, kind in folder.entries() if INHERITS else ():
-        if kind == FOLDER and re.fullmatch(HIDDEN, name):
-            # A film of another user, or one still being made, stays.
-            with suppress(OSError, FilesError), folder.folder(name) as hidden:
-                hidden.require_only(TREE)
-                if hidden.kind(LOCK) is not None:
-                    hidden.lock(LOCK).close()
-                    _remove(folder, name)
-
-
-def _remove(folder: Folder, name: str) -> None:
-    """Remove a film's hidden folder, as far as possible."""
-    with suppress(OSError, FilesError), folder.folder(name) as hidden:
-        hidden.clear(TREE)
-        folder.remove_folder(name)

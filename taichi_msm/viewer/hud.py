@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image, ImageDraw, ImageFont
 
-from taichi_msm.results.gif import Picture
+from taichi_msm.outputs.gif import Picture
 
 # Height of letters: this share of the picture's height, within limits [px].
 LETTER = 1 / 36

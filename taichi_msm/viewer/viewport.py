@@ -9,10 +9,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from taichi_msm.outputs.gif import Picture
 from taichi_msm.render.camera import View, pinhole, turned
 from taichi_msm.render.instrument import Rod
 from taichi_msm.render.renderer import Renderer, Shot
-from taichi_msm.results.gif import Picture
 from taichi_msm.scene import Camera, Render
 
 
