@@ -87,13 +87,13 @@ def calibration(camera: View) -> dict[str, list[list[float]]]:
         pinhole also, in OpenCV's convention (x right, y down, z forward): intrinsics, 3 x 3; pose, 3 x 4, from the
         world to the camera.
     """
-    found = {"projection": camera.matrix[:3].tolist()}
+    matrices = {"projection": camera.matrix[:3].tolist()}
     if camera.pinhole:
         turn = camera.axes * np.array([[1.0], [-1.0], [-1.0]])
         x, y = camera.centre.tolist()
-        found["intrinsics"] = [[camera.scale, 0.0, x], [0.0, camera.scale, y], [0.0, 0.0, 1.0]]
-        found["pose"] = np.concatenate([turn, -turn @ camera.eye[:, None]], axis=1).tolist()
-    return found
+        matrices["intrinsics"] = [[camera.scale, 0.0, x], [0.0, camera.scale, y], [0.0, 0.0, 1.0]]
+        matrices["pose"] = np.concatenate([turn, -turn @ camera.eye[:, None]], axis=1).tolist()
+    return matrices
 
 
 def view(scene: Scene) -> View:
@@ -102,7 +102,7 @@ def view(scene: Scene) -> View:
     Raises:
         SceneError: when it sees nothing.
     """
-    if blind := [str(problem) for problem in problems(scene)]:
+    if blind := [str(problem) for problem in camera_problems(scene)]:
         raise SceneError(blind)
     camera = scene.render.camera
     if camera == "top":
@@ -112,7 +112,7 @@ def view(scene: Scene) -> View:
     return _pinhole(_oblique(scene), scene)
 
 
-def problems(scene: Scene) -> Iterator[Problem]:
+def camera_problems(scene: Scene) -> Iterator[Problem]:
     """Say why a pinhole camera sees nothing, or cannot be computed, if so."""
     camera = scene.render.camera
     if not isinstance(camera, Camera):
