@@ -71,26 +71,19 @@ def store_normal(
     if ti.static(config.headlit or config.tissue):
         i0, i1 = ti.max(i - 1, 0), ti.min(i + 1, rows - 1)
         j0, j1 = ti.max(j - 1, 0), ti.min(j + 1, cols - 1)
-        r_x = position[i, j1, 0] - position[i, j0, 0]
-        r_y = position[i, j1, 1] - position[i, j0, 1]
-        r_z = position[i, j1, 2] - position[i, j0, 2]
-        u_x = position[i0, j, 0] - position[i1, j, 0]
-        u_y = position[i0, j, 1] - position[i1, j, 1]
-        u_z = position[i0, j, 2] - position[i1, j, 2]
-        n_x = r_y * u_z - r_z * u_y
-        n_y = r_z * u_x - r_x * u_z
-        n_z = r_x * u_y - r_y * u_x
-        length = ti.max(ti.sqrt(n_x * n_x + n_y * n_y + n_z * n_z), 1e-30)
-        n_x, n_y, n_z = n_x / length, n_y / length, n_z / length
+        r = [position[i, j1, n] - position[i, j0, n] for n in ti.static(range(3))]
+        u = [position[i0, j, n] - position[i1, j, n] for n in ti.static(range(3))]
+        across = [r[1] * u[2] - r[2] * u[1], r[2] * u[0] - r[0] * u[2], r[0] * u[1] - r[1] * u[0]]
+        length = ti.sqrt(across[0] * across[0] + across[1] * across[1] + across[2] * across[2])
+        normal = [across[n] / ti.max(length, 1e-30) for n in ti.static(range(3))]
         here = rows * cols * POINT_NUMBERS + (i * cols + j) * NORMAL_NUMBERS
-        if ti.static(config.tissue):
-            for n in ti.static(range(3)):
-                axis = uni.AXES + 3 * n
-                point[here + n] = numbers[axis] * n_x + numbers[axis + 1] * n_y + numbers[axis + 2] * n_z
-        else:
-            point[here] = n_x
-            point[here + 1] = n_y
-            point[here + 2] = n_z
+        for n in ti.static(range(3)):
+            axis = uni.AXES + 3 * n
+            point[here + n] = (
+                numbers[axis] * normal[0] + numbers[axis + 1] * normal[1] + numbers[axis + 2] * normal[2]
+                if ti.static(config.tissue)
+                else normal[n]
+            )
 
 
 @ti.func

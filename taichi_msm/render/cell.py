@@ -151,15 +151,9 @@ def small_quad(x, y, inside, parts, patch: ti.template()):
 
     `inside` are those that it covers; `parts` is the number of small quads along its side.
     """
-    a, b, c, d = ti.static((patch.a, patch.b, patch.c, patch.d))
-    a_1 = a[0] - x * a[2]
-    b_1 = b[0] - x * b[2]
-    c_1 = c[0] - x * c[2]
-    d_1 = d[0] - x * d[2]
-    a_2 = a[1] - y * a[2]
-    b_2 = b[1] - y * b[2]
-    c_2 = c[1] - y * c[2]
-    d_2 = d[1] - y * d[2]
+    coefficients = ti.static((patch.a, patch.b, patch.c, patch.d))
+    a_1, b_1, c_1, d_1 = [k[0] - x * k[2] for k in coefficients]
+    a_2, b_2, c_2, d_2 = [k[1] - y * k[2] for k in coefficients]
     # Eliminating t gives bd s^2 + (ad + bc) s + ac = 0; eliminating s gives an equation with the same discriminant.
     ad = a_1 * d_2 - d_1 * a_2
     bc = b_1 * c_2 - c_1 * b_2
@@ -206,13 +200,9 @@ def triangle_at(x, y, column, line, part, lower, patch: ti.template()):
 @ti.func
 def on_triangle(x, y, triangle: ti.template()):
     """Find (s, t) where the triangle is seen at (x, y)."""
-    p, r, d = ti.static((triangle.p, triangle.r, triangle.d))
-    p_1 = p[0] - x * p[2]
-    r_1 = r[0] - x * r[2]
-    d_1 = d[0] - x * d[2]
-    p_2 = p[1] - y * p[2]
-    r_2 = r[1] - y * r[2]
-    d_2 = d[1] - y * d[2]
+    coefficients = ti.static((triangle.p, triangle.r, triangle.d))
+    p_1, r_1, d_1 = [k[0] - x * k[2] for k in coefficients]
+    p_2, r_2, d_2 = [k[1] - y * k[2] for k in coefficients]
     share = 1.0 / (r_1 * d_2 - r_2 * d_1)
     return (p_2 * d_1 - p_1 * d_2) * share, (p_1 * r_2 - p_2 * r_1) * share
 

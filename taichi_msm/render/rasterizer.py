@@ -29,15 +29,10 @@ from taichi_msm.system.runtime import lanes
 
 
 class Drawn(NamedTuple):
-    """What was drawn of one frame.
+    """What was drawn of one frame."""
 
-    Attributes:
-        picture: colours, shape (height, width, 3); None where only labels are drawn.
-        labels: what each pixel shows; None where only the picture is drawn.
-    """
-
-    picture: NDArray[np.uint8] | None
-    labels: Labels | None
+    picture: NDArray[np.uint8] | None  # colours, shape (height, width, 3); None where only labels are drawn
+    labels: Labels | None  # what each pixel shows; None where only the picture is drawn
 
 
 def drawing_config(scene: Scene, *, picture: bool = True, labels: bool = False) -> DrawingConfig:
