@@ -14,11 +14,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from taichi_msm import load_scene
-from taichi_msm.physics.lattice import rest_positions, springs
+from taichi_msm.physics.lattice import rest_positions
 from taichi_msm.physics.loads import Schedule, decay, schedule
 from taichi_msm.physics.plan import Plan
 from taichi_msm.physics.planning import make_plan
 from taichi_msm.scene import Scene
+from tests.reference.neighbours import springs
 
 SCENE = Path(__file__).parent.parent / "scenes" / "figure-3.yaml"
 STEPS_PER_SECOND = 18000

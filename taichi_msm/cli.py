@@ -279,12 +279,10 @@ def study(
         expected = f"expected a number, {SMALLEST_TOLERANCE:g} to {LARGEST_TOLERANCE:g}"
         raise click.BadParameter(f"{tolerance:g} is not allowed; {expected}", param_hint="--tolerance")
 
-    from rich.console import Console
-
     from taichi_msm.console import Progress
     from taichi_msm.study.measure import study as measure
+    from taichi_msm.study.page import summary
     from taichi_msm.study.report import RECORD, as_record, require_writable, write_report
-    from taichi_msm.study.table import print_summary
 
     require_writable(directory)
     interruption = Interruption()
@@ -308,7 +306,7 @@ def study(
     if as_json:
         print_json({"directory": str(directory), **as_record(results), "outputs": outputs})
     else:
-        print_summary(results, Console())
+        click.echo(summary(results))
         click.echo(printable(f"{directory}: {', '.join(outputs)}"))
     return EXIT_CODES.get(results.status, interruption.code)
 

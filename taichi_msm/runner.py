@@ -123,6 +123,13 @@ def run(
         DeviceError: when the arch is not available.
         FilesError: when the results cannot be written.
         KeyboardInterrupt: when interrupted before the first frame; nothing is written then.
+
+    Example:
+        >>> from taichi_msm import load_scene, run
+        >>> scene = load_scene("scenes/press.yaml", {"sheet.points": [41, 41]})
+        >>> record = run(scene, "output/press")
+        >>> record["status"], record["frames"], record["precision"]
+        ('complete', 31, 'f64')
     """
     watch = Stopwatch(started)
     plan = checked(scene)

@@ -442,7 +442,16 @@ class Render(Section):
 
 
 class Scene(Section):
-    """Everything a run needs; what the YAML file says, checked and with its defaults filled in."""
+    """Everything a run needs; what the YAML file says, checked and with its defaults filled in.
+
+    Example:
+        >>> from taichi_msm import Scene
+        >>> tissue = {"young": 3e4, "thickness": 3e-3, "density": 1050}
+        >>> sheet = {"points": [31, 31], "size": [0.1, 0.1]}
+        >>> scene = Scene(sheet=sheet, tissue=tissue, time={"duration": 1}, output=["trajectory"])
+        >>> scene.time.frames, scene.render.size
+        (25, (512, 512))
+    """
 
     model_config = ConfigDict(json_schema_extra={"oneOf": [{"required": ["tissue"]}, {"required": ["springs"]}]})
 

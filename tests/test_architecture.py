@@ -19,7 +19,7 @@ LAYERS = [
     {"scene"},
     {"physics"},
     {"render"},
-    {"scenefile", "reference"},
+    {"scenefile"},
     {"simulation", "results"},
     {"runner", "playback", "console"},
     {"export", "study", "viewer"},

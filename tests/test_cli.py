@@ -17,10 +17,11 @@ import pytest
 import yaml
 from PIL import Image
 
-from taichi_msm import console, reference
+from taichi_msm import console
 from taichi_msm.cli import main
 from taichi_msm.scenefile.load import load_scene
 from taichi_msm.system.compiler import chosen
+from tests import reference
 from tests.conftest import Program
 from tests.outputs import files
 from tests.scenes import SMALL, speckle
@@ -626,7 +627,7 @@ def test_a_bug_is_one_line(small: Path, capsys: pytest.CaptureFixture[str], monk
         raise ZeroDivisionError("by zero\nin two lines")
 
     monkeypatch.delenv("TAICHI_MSM_TRACEBACK", raising=False)
-    monkeypatch.setattr("taichi_msm.scenefile.load.load_scene", broken)
+    monkeypatch.setattr("taichi_msm.scenefile.load.load_plan", broken)
     code, _, err = call(capsys, "check", "small.yaml")
     assert code == 1
     assert err == (

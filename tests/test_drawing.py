@@ -10,7 +10,6 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from taichi_msm import reference
 from taichi_msm.physics.lattice import rest_positions
 from taichi_msm.render import bins, rasterizer_gpu
 from taichi_msm.render.camera import view
@@ -20,6 +19,7 @@ from taichi_msm.render.rasterizer_cpu import Bands
 from taichi_msm.scene import Scene
 from taichi_msm.system import launches
 from taichi_msm.system.runtime import Device
+from tests import reference
 from tests.scenes import SHEET, scene, speckle
 
 NEAR = {"eye": [0, -0.1, 0.1], "target": [0, 0.1, 0], "fov": 80}

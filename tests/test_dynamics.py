@@ -13,7 +13,6 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from taichi_msm import reference
 from taichi_msm.errors import MsmError
 from taichi_msm.physics import kernel_cpu, kernel_gpu
 from taichi_msm.physics.kernel import Structure
@@ -24,6 +23,7 @@ from taichi_msm.system import resources
 from taichi_msm.system.launches import MOST_ROUNDS, THREADS
 from taichi_msm.system.resources import available_threads
 from taichi_msm.system.runtime import Device, lanes
+from tests import reference
 from tests.motion import dynamics_of, structure_of
 from tests.scenes import PRESS, SHEET, SPRINGS, plan_of, random_scene, scene, with_steps
 
@@ -321,7 +321,7 @@ def test_energy_does_not_drift(device: Device) -> None:
 
 def energy(made: Scene, u: NDArray[Any], v: NDArray[Any]) -> float:
     """Kinetic and potential energy [J] at the middle of a step."""
-    from taichi_msm.physics.lattice import springs
+    from tests.reference.neighbours import springs
 
     total = 0.5 * plan_of(made).material.mass * (v**2).sum() + 0.5 * plan_of(made).material.virtual * (u**2).sum()
     x = u + rest_positions(made.sheet)

@@ -13,7 +13,6 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from taichi_msm import reference
 from taichi_msm.physics import lattice
 from taichi_msm.physics.divergence import MOST_SHEET_SIZES
 from taichi_msm.physics.error_control import estimate_error
@@ -22,7 +21,9 @@ from taichi_msm.scene import Scene
 from taichi_msm.scenefile.load import load_scene
 from taichi_msm.simulation import Simulation
 from taichi_msm.system.runtime import Device
+from tests import reference
 from tests.motion import dynamics_of, frames
+from tests.reference.neighbours import springs
 from tests.scenes import plan_of
 
 Array = NDArray[np.float64]
@@ -214,7 +215,7 @@ def shadow_energy(scene: Scene, before: Array, after: Array) -> float:
 
     potential = 0.0
     x = middle + lattice.rest_positions(scene.sheet)
-    for spring in lattice.springs(scene):
+    for spring in springs(scene):
         if spring.down >= 0 and (spring.down, spring.right) != (0, -1):
             here, there = spring.ends(scene.sheet.points)
             stretch = np.linalg.norm(x[there] - x[here], axis=-1) - spring.length

@@ -12,12 +12,12 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from taichi_msm import ArgumentError, FilesError, Playback, Simulation, resume, run
-from taichi_msm.reference import labels as twin
 from taichi_msm.render.instrument import rods
 from taichi_msm.scene import Scene
 from taichi_msm.scenefile.load import load_scene
 from taichi_msm.system.runtime import Device
 from tests.outputs import files, results
+from tests.reference import labels as twin
 from tests.test_resume import interrupted, published
 
 ALL = "output=[png, coordinates, depth, flow, occlusion, instrument, tracks, trajectory]"

@@ -9,7 +9,6 @@ import pytest
 from numpy.typing import NDArray
 
 from taichi_msm.physics.lattice import rest_positions
-from taichi_msm.reference import labels as twin
 from taichi_msm.render import tracking
 from taichi_msm.render.camera import view
 from taichi_msm.render.instrument import rods
@@ -19,6 +18,7 @@ from taichi_msm.render.tracking import find, find_flow
 from taichi_msm.scene import Scene
 from taichi_msm.system import launches
 from taichi_msm.system.runtime import Device
+from tests.reference import labels as twin
 from tests.test_drawing import NEAR, dented, drawable, with_instruments
 
 Array = NDArray[np.float64]

@@ -5,7 +5,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from taichi_msm.physics.lattice import fixed_points, rest_positions, springs
+from taichi_msm.physics.lattice import fixed_points, rest_positions
+from tests.reference.neighbours import springs
 from tests.scenes import SHEET, scene
 
 

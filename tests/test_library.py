@@ -27,7 +27,6 @@ from taichi_msm import (
     Sheet,
     Simulation,
     load_scene,
-    reference,
     resume,
     run,
 )
@@ -36,6 +35,7 @@ from taichi_msm.physics.timestep import with_time
 from taichi_msm.render.camera import view
 from taichi_msm.system.resources import processor
 from taichi_msm.system.runtime import Device
+from tests import reference
 from tests.scenes import PRESS, SHEET, plan_of, scene, speckle
 
 HAND = {"at": [[0, 0.5, 0.5]], "force": [0, 0, -20], "falloff": 20, "offset": 0}

@@ -6,10 +6,11 @@ import numpy as np
 import pytest
 
 import taichi_msm
-from taichi_msm import DivergedError, Simulation, reference, runner
+from taichi_msm import DivergedError, Simulation, runner
 from taichi_msm.system import resources
 from taichi_msm.system.compiler import chosen
 from taichi_msm.system.runtime import Device
+from tests import reference
 from tests.scenes import plan_of, scene, speckle
 
 

@@ -6,10 +6,10 @@ from typing import Any
 import numpy as np
 import pytest
 
-from taichi_msm import reference
 from taichi_msm.physics.lattice import rest_positions
 from taichi_msm.physics.material import highest_frequency
 from taichi_msm.physics.planning import try_plan
+from tests import reference
 from tests.scenes import SHEET, plan_of, scene
 
 

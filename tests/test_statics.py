@@ -8,12 +8,12 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import root
 
-from taichi_msm import reference
 from taichi_msm.physics.lattice import fixed_points
 from taichi_msm.physics.loads import loads_at
 from taichi_msm.physics.state import State
 from taichi_msm.scene import Scene
 from taichi_msm.system.runtime import Device
+from tests import reference
 from tests.motion import dynamics_of
 from tests.scenes import SPRINGS, plan_of, scene
 

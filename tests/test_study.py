@@ -12,7 +12,6 @@ import numpy as np
 import pytest
 from pydantic import BaseModel
 
-from taichi_msm import reference
 from taichi_msm.physics.lattice import rest_positions
 from taichi_msm.physics.mesh_error import with_points
 from taichi_msm.physics.plan import Plan
@@ -29,6 +28,7 @@ from taichi_msm.study.result import Drawn, Stepping, Study, Timing
 from taichi_msm.study.stepping import MARGIN, ROUNDS, SteppingStudy, observed_orders
 from taichi_msm.study.terms import TermStudy, variants
 from taichi_msm.system.runtime import Device
+from tests import reference
 from tests.motion import frames_on, structure_of
 from tests.scenes import PRESS, SPRINGS, plan_of, scene, speckle
 

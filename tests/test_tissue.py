@@ -13,7 +13,6 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from taichi_msm import reference
 from taichi_msm.console import summary
 from taichi_msm.errors import ArgumentError, FilesError, SceneError
 from taichi_msm.physics import kernel_gpu, probe_force
@@ -29,6 +28,7 @@ from taichi_msm.scenefile.load import load_scene
 from taichi_msm.scenefile.validation import checked
 from taichi_msm.simulation import Simulation
 from taichi_msm.system.runtime import Device
+from tests import reference
 from tests.motion import dynamics_of, frames, structure_of
 from tests.outputs import results
 from tests.scenes import plan_of, random_scene, random_tissue

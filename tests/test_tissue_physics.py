@@ -21,16 +21,17 @@ from skfem import Basis, BilinearForm, ElementQuad2, ElementVector, LinearForm, 
 from skfem.helpers import dot
 from skfem.models.elasticity import linear_elasticity, plane_stress
 
-from taichi_msm import reference
 from taichi_msm.physics.lattice import fixed_points, rest_positions, spacing
 from taichi_msm.physics.loads import loads_at
 from taichi_msm.physics.material import highest_frequency
 from taichi_msm.physics.probe_force import spread
+from taichi_msm.physics.springs import energy_density
 from taichi_msm.physics.state import State
-from taichi_msm.reference.sheet import sheet as assembled
 from taichi_msm.scene import Probe, Scene
 from taichi_msm.system.runtime import Device
+from tests import reference
 from tests.motion import dynamics_of
+from tests.reference.sheet import sheet as assembled
 from tests.scenes import plan_of, random_tissue, speckle
 from tests.scenes import scene as scene_of_springs
 
@@ -203,7 +204,7 @@ def test_uniform_strains_have_the_energy_of_plane_stress(ratio: float, device: D
         assert reference.energy(made, strain * one) / area == pytest.approx(density, rel=10 * strain)
         # Also at edges and corners, whose points have less of springs and of area.
         everywhere = np.full(made.sheet.points, density)
-        np.testing.assert_allclose(reference.energy_density(made, strain * one), everywhere, rtol=10 * strain)
+        np.testing.assert_allclose(energy_density(plan_of(made), strain * one), everywhere, rtol=10 * strain)
         dynamics.restart(plan_of(made), State(1, strain * one, np.zeros_like(one)))
         assert dynamics.read().energy / area == pytest.approx(density, rel=10 * strain)
     dynamics.close()

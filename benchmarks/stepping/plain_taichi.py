@@ -5,7 +5,7 @@
 import taichi as ti
 
 from benchmarks.stepping.problem import Array, Problem, Stepper
-from taichi_msm.physics.lattice import springs
+from tests.reference.neighbours import springs
 
 
 class PlainTaichi:

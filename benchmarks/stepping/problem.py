@@ -20,14 +20,14 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from taichi_msm import reference
-from taichi_msm.physics.lattice import Spring, springs
 from taichi_msm.physics.loads import decay
 from taichi_msm.physics.material import Material
 from taichi_msm.physics.plan import Plan
 from taichi_msm.physics.planning import make_plan
 from taichi_msm.scene import Scene
 from taichi_msm.timegrid import TimeGrid
+from tests import reference
+from tests.reference.neighbours import Spring, springs
 
 CELL = 0.01
 FORCE = (0.02, 0.01, -0.08)

@@ -8,7 +8,6 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
 
-from taichi_msm.reference.shading import normals
 from taichi_msm.render.texture import load_texture
 from taichi_msm.results.finished_run import FinishedRun
 
@@ -35,12 +34,15 @@ def picture_png(run: FinishedRun) -> bytes | None:
 def unit_normals(position: NDArray[np.floating]) -> NDArray[np.float64]:
     """Give unit normals of the points, the same as for the light in pictures; along z where a fold leaves none.
 
+    They come from central differences, at edges from one-sided ones.
+
     Args:
         position: positions [m], shape (rows, cols, 3).
 
     Returns:
         Normals, toward the viewer at rest, shape (rows cols, 3).
     """
-    found = normals(position.astype(np.float64)).reshape(-1, 3)
-    found[~found.any(axis=-1)] = 0, 0, 1
-    return found
+    place = position.astype(np.float64)
+    normal = np.cross(np.gradient(place, axis=1), -np.gradient(place, axis=0)).reshape(-1, 3)
+    length = np.linalg.norm(normal, axis=-1, keepdims=True)
+    return np.divide(normal, length, out=np.tile([0.0, 0.0, 1.0], (len(normal), 1)), where=length > 0)

@@ -24,8 +24,9 @@ from numpy.typing import NDArray
 from taichi_msm.errors import NotInstalledError
 from taichi_msm.export.mesh import PICTURE, REFINE, picture_png
 from taichi_msm.physics.lattice import rest_positions
+from taichi_msm.physics.planning import make_plan
+from taichi_msm.physics.springs import energy_density
 from taichi_msm.progress import Count
-from taichi_msm.reference import energy_density
 from taichi_msm.render.surface import surface
 from taichi_msm.results.finished_run import FinishedRun
 from taichi_msm.results.whole import add
@@ -53,14 +54,14 @@ def write(run: FinishedRun, folder: Path, progress: Count) -> list[str]:
         raise NotInstalledError(said) from None
     positions, picture = run.positions(), picture_png(run)
     run.require_pictures(drawn=False)
-    rest = rest_positions(run.scene.sheet)
+    plan, rest = make_plan(run.scene), rest_positions(run.scene.sheet)
     for frame in range(run.frames):
         progress(frame, run.frames)
         displacement = positions[frame] - rest
         values = {
             DISPLACEMENT: displacement.reshape(-1, 3),
             SPEED: speed(positions, run.time, frame).ravel(),
-            ENERGY: energy_density(run.scene, displacement).ravel(),
+            ENERGY: energy_density(plan, displacement).ravel(),
         }
         add(folder / _name(frame), _grid(positions[frame], values))
     if picture is not None:

@@ -68,6 +68,12 @@ def load_scene(
     Raises:
         ArgumentError: when the overrides are neither a sequence of texts nor a mapping from texts.
         SceneError: with all problems of the scene, one line each, in the order of their places in the file.
+
+    Example:
+        >>> from taichi_msm import load_scene
+        >>> scene = load_scene("scenes/press.yaml", {"sheet.points": [41, 41]}, image="photo.jpg")
+        >>> scene.sheet.points, scene.image
+        ((41, 41), 'photo.jpg')
     """
     return load_plan(path, overrides, image).scene
 

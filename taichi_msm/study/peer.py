@@ -9,10 +9,12 @@ from itertools import pairwise
 import numpy as np
 from numpy.typing import NDArray
 
-from taichi_msm import reference
+from taichi_msm.physics.lattice import axes, spacing
 from taichi_msm.physics.loads import Schedule, key_times, loads_at
+from taichi_msm.physics.material import area_shares
 from taichi_msm.physics.plan import Plan
-from taichi_msm.reference.sheet import sheet
+from taichi_msm.physics.probe_force import probe_force
+from taichi_msm.physics.springs import elastic_force, springs
 from taichi_msm.scene import Scene
 
 # Loads are evaluated this far inside an interval between two keys, as a fraction of it: at its ends they may jump.
@@ -50,7 +52,7 @@ def solve(plan: Plan, rtol: float, atol: float, deadline: float, tick: Callable[
 
     scene = plan.scene
     shape = (*scene.sheet.points, 3)
-    made, moves = sheet(scene), ~plan.fixed[..., None]
+    accelerate, moves = acceleration(plan), ~plan.fixed[..., None]
     state = np.zeros(2 * int(np.prod(shape)))
     evaluations = 0
     found = []
@@ -66,8 +68,7 @@ def solve(plan: Plan, rtol: float, atol: float, deadline: float, tick: Callable[
             between = (each[:1] + share * (each[1:] - each[:1]) for each in ends[1:])
             loads = Schedule(ends.slots, *between)
             u, v = y.reshape(2, *shape)
-            force = reference.force(scene, u, loads, 0) - made.drag[..., None] * v
-            return np.concatenate([v.ravel(), (force / made.mass[..., None] * moves).ravel()])
+            return np.concatenate([v.ravel(), (accelerate(u, v, loads) * moves).ravel()])
 
         times = np.union1d(frames, end)
         solved = solve_ivp(motion, (start, end), state, "DOP853", t_eval=times, rtol=rtol, atol=atol)
@@ -77,6 +78,39 @@ def solve(plan: Plan, rtol: float, atol: float, deadline: float, tick: Callable[
         evaluations += solved.nfev
         found += [column[: state.size // 2].reshape(shape) for column in solved.y.T[: len(frames)]]
     return np.array(found), evaluations
+
+
+def acceleration(plan: Plan) -> Callable[[Array, Array, Schedule], Array]:
+    """Prepare the right side of eq. 1 over the mass.
+
+    Returns:
+        A function of displacements [m], velocities [m/s], and a schedule of one step, that gives accelerations
+        [m/s2]; its arrays have the shape (rows, cols, 3).
+    """
+    scene, sheet, every = plan.scene, plan.material, tuple(springs(plan))
+    (dx, dy), (x, y) = spacing(scene.sheet), axes(scene.sheet)
+    shares = area_shares(scene.sheet)
+    area = shares if sheet.by_area else np.ones_like(shares)
+    probes = [probe_force(probe, scene.sheet) for probe in scene.probes]
+
+    def laplacian(u: Array) -> Array:
+        inner = u[1:-1, 1:-1]
+        return (u[1:-1, 2:] - 2 * inner + u[1:-1, :-2]) / dx**2 + (u[2:, 1:-1] - 2 * inner + u[:-2, 1:-1]) / dy**2
+
+    def accelerate(u: Array, v: Array, loads: Schedule) -> Array:
+        force = elastic_force(every, u) - (loads.active[0] * sheet.virtual * area)[..., None] * u
+        for slot, strength, (at_x, at_y) in zip(loads.slots, loads.strength[0], loads.point[0], strict=True):
+            probe = probes[slot.probe]
+            decay = probe.decay(np.hypot(x - at_x, y - at_y)) * (shares if probe.by_area else 1)
+            force += decay[..., None] * strength
+        if sheet.bending:
+            # Points with four neighbours have a moment; those at the edges, which are fixed, need no force.
+            moment = np.zeros_like(u)
+            moment[1:-1, 1:-1] = sheet.bending * laplacian(u)
+            force[1:-1, 1:-1] -= laplacian(moment)
+        return np.asarray(force / (sheet.mass * area)[..., None] - sheet.drag * v)
+
+    return accelerate
 
 
 def _pieces(scene: Scene) -> Iterator[tuple[float, float, Array]]:

@@ -23,9 +23,9 @@ class Mutant(NamedTuple):
     Attributes:
         name: what to call it.
         wrong: what is wrong with it.
-        function: where it is made: a function, method, class or constant of the package, of nested functions the
-            innermost; qualified where others of that name have the same text (`step`, `Solver.step`,
-            `solver.Solver.step`).
+        function: where it is made: a function, method, class or constant of the package or of the twin in
+            tests/reference, of nested functions the innermost; qualified where others of that name have the same text
+            (`step`, `Solver.step`, `solver.Solver.step`).
         find: the text there that is right, which stands there once; line breaks and indentation do not count.
         replace: what takes its place.
         tests: files of tests that are to notice it, in tests/; those first that are likely to, or quick.
@@ -45,7 +45,7 @@ class Mutant(NamedTuple):
             ValueError: when no definition or more than one has the name, or the text is not in it once; it says what
                 to write in mutants.yaml instead.
         """
-        known = definitions(ROOT, "taichi_msm")
+        known = definitions(ROOT, "taichi_msm") + definitions(ROOT, "tests/reference")
         same_name = named(self.function, known)
         places = [place for place in same_name if place.spans(self.find)]
         if len(places) == 1 and len(places[0].spans(self.find)) == 1:
@@ -60,7 +60,7 @@ class Mutant(NamedTuple):
             innermost = [p for p in elsewhere if not any(q.name.startswith(f"{p.name}.") for q in elsewhere)]
             raise ValueError(f"{self.name}: {reason}; if it moved to {_names(innermost)}, name that in `function`")
         raise ValueError(
-            f"{self.name}: {reason}, nor does any other function: find the code that can have this mistake now "
+            f"{self.name}: {reason}, nor does any other function; find the code that can have this mistake now "
             f"({self.wrong}), write it in `function`, `find` and `replace`, "
             f"and see that python -m tests.mutants {self.name} still kills it"
         )

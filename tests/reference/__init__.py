@@ -3,20 +3,19 @@
 This is no independent check of the model; it is itself tested against closed forms and SciPy's integrators.
 """
 
-from taichi_msm.reference.drawing import draw, refine
-from taichi_msm.reference.dynamics import (
+from tests.reference.drawing import draw, refine
+from tests.reference.dynamics import (
     bending_force,
     displacements,
     elastic_force,
     energy,
-    energy_density,
     force,
     longest_spring,
     shortest_spring,
     simulate,
     surgical_force,
 )
-from taichi_msm.reference.sheet import sheet
+from tests.reference.sheet import sheet
 
 __all__ = [
     "bending_force",
@@ -24,7 +23,6 @@ __all__ = [
     "draw",
     "elastic_force",
     "energy",
-    "energy_density",
     "force",
     "longest_spring",
     "refine",

@@ -7,11 +7,11 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from taichi_msm.reference.drawing import look, refine, triangles, weights
-from taichi_msm.reference.shading import meet
 from taichi_msm.render.camera import view
 from taichi_msm.render.instrument import Rod
 from taichi_msm.scene import Scene
+from tests.reference.drawing import look, refine, triangles, weights
+from tests.reference.shading import meet
 
 Array = NDArray[np.float64]
 

@@ -8,11 +8,11 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from taichi_msm.reference.shading import headlight, meet, metal, normals, normals_at, sample, tissue
 from taichi_msm.render import style
 from taichi_msm.render.camera import view
 from taichi_msm.render.instrument import Rod
 from taichi_msm.scene import Scene
+from tests.reference.shading import headlight, meet, metal, normals, normals_at, sample, tissue
 
 Array = NDArray[np.float64]
 

@@ -9,11 +9,10 @@ from numpy.typing import NDArray
 
 from taichi_msm.physics.lattice import rest_positions, spacing
 from taichi_msm.physics.loads import Schedule, schedule
-from taichi_msm.physics.material import area_shares
 from taichi_msm.physics.plan import Plan
 from taichi_msm.physics.planning import make_plan
-from taichi_msm.reference.sheet import Springs, sheet
 from taichi_msm.scene import Scene
+from tests.reference.sheet import Springs, sheet
 
 Array = NDArray[np.float64]
 
@@ -99,26 +98,6 @@ def energy(scene: Scene, displacement: Array) -> float:
     """Give the elastic energy of springs and bending above that at rest [J], without the virtual springs."""
     held = sum(float(held.sum()) for _, held in _held(scene, displacement))
     return held + sheet(scene).bending / 2 * float((_laplacian(scene, displacement) ** 2).sum())
-
-
-def energy_density(scene: Scene, displacement: Array) -> Array:
-    """Give the elastic energy of springs above that at rest, per area, without bending and the virtual springs.
-
-    Each end of a spring gets half of its energy, and a point has the share of the sheet's area at rest that
-    `area_shares` gives it, so that the sum of density times area is the energy of all springs.
-
-    Args:
-        scene: the scene.
-        displacement: x - X [m], shape (rows, cols, 3).
-
-    Returns:
-        Energy per area at rest [J/m2], shape (rows, cols).
-    """
-    at_points, (dx, dy) = np.zeros(displacement.shape[:2]), spacing(scene.sheet)
-    for springs, held in _held(scene, displacement):
-        at_points[springs.here] += held / 2
-        at_points[springs.there] += held / 2
-    return at_points / (dx * dy * area_shares(scene.sheet))
 
 
 def _held(scene: Scene, displacement: Array) -> Iterator[tuple[Springs, Array]]:
