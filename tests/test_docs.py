@@ -60,7 +60,7 @@ def blocks(path: Path, language: str) -> list[str]:
 
 def table(path: Path, name: str) -> dict[str, list[str]]:
     """Give the other cells of a marked table by its first."""
-    lines = read(path).split(f"<!-- {name}: checked by tests/test_docs.py -->\n")[1].split("\n\n")[0].splitlines()[2:]
+    lines = [line for line in read(path).split(f"<!-- {name}: ")[1].split("\n\n")[0].splitlines()[3:] if line[0] == "|"]
     rows = [[cell.strip() for cell in line.strip("|").split(" | ")] for line in lines]
     return {row[0]: row[1:] for row in rows}
 
