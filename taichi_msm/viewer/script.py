@@ -56,10 +56,9 @@ class Entry(Section):
     def _complete(self) -> Entry:
         for name in ("at", "by", "to", "name"):
             given, needed = getattr(self, name) is not None, NEEDS[self.do] == name
-            if given and not needed:
-                raise _refused(name, "{do} takes none; remove it", do=self.do)
-            if needed and not given:
-                raise _refused(name, "missing; {do} needs it", do=self.do)
+            if given != needed:
+                message = "missing; {do} needs it" if needed else "{do} takes none; remove it"
+                raise _refused(name, message, do=self.do)
         if self.name is not None and self.name not in PRESSABLE:
             message = "there is no key '{name}' here; expected one of: {keys}"
             raise _refused("name", message, name=self.name, keys=", ".join(PRESSABLE))
