@@ -247,7 +247,7 @@ def test_the_python_shown_runs(tmp_path: Path) -> None:
 
 
 # Those whose examples stand in their docstrings. The example of Playback reads what that of run writes.
-WITH_EXAMPLES = ["run", "Playback", "load_scene", "Scene"]
+WITH_EXAMPLES = ["run", "Playback", "Simulation", "load_scene", "Scene"]
 
 
 @pytest.mark.parametrize("name", WITH_EXAMPLES)
