@@ -8,23 +8,37 @@ from typing import TypeVar
 
 from taichi_msm.scene import MAX_POINTS
 from taichi_msm.study.result import Drawn, Peer, Points, Stepping, Study
-from taichi_msm.study.table import (
-    DRAWINGS,
-    METHODS,
-    PEERS,
-    SHEETS,
-    Columns,
-    duration,
-    number,
-    shown,
-    size,
-    table,
-    timing,
-    where,
-    wrong,
-)
+from taichi_msm.study.table import Columns, duration, number, shown, size, table, timing, where, wrong
 from taichi_msm.system.compiler import named
 
+METHODS: Columns = {
+    "method": lambda point: point.method,
+    "step": lambda point: duration(point.step),
+    "steps/frame": lambda point: str(point.steps_per_frame),
+    "error": wrong,
+    "of it rounding": lambda point: "" if point.rounding is None else number(point.rounding),
+    "time of the scene": lambda point: timing(point.seconds),
+}
+PEERS: Columns = {
+    "rtol": lambda peer: f"{peer.rtol:g}",
+    "error": wrong,
+    "evaluations": lambda peer: str(peer.evaluations),
+    "time of the scene": lambda peer: timing(peer.seconds),
+}
+DRAWINGS: Columns = {
+    "refine": lambda drawn: str(drawn.refine),
+    "supersample": lambda drawn: str(drawn.supersample),
+    "PSNR": lambda drawn: "equal" if drawn.psnr is None else f"{drawn.psnr:.1f} dB",
+    "largest error": lambda drawn: str(drawn.largest_error),
+    "time of a frame": lambda drawn: timing(drawn.seconds),
+}
+SHEETS: Columns = {
+    "points": lambda points: points.name,
+    "steps/frame": lambda points: str(points.steps_per_frame),
+    "error": wrong,
+    "estimate": lambda points: "not known" if points.estimate is None else number(points.estimate),
+    "time of the scene": lambda points: timing(points.seconds),
+}
 # The columns of stepping that the terminal shows.
 BRIEF = ("method", "step", "error", "time of the scene")
 
