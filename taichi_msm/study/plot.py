@@ -19,8 +19,9 @@ from matplotlib.lines import Line2D
 from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
 from matplotlib.transforms import offset_copy
 
+from taichi_msm.errors import printable
 from taichi_msm.study.result import Drawn, Peer, Points, Stepping, Study
-from taichi_msm.study.table import mostly_rounding, number, shown, unit, where
+from taichi_msm.study.table import mostly_rounding, number, unit, where
 from taichi_msm.system.compiler import named
 
 # The colours of Okabe and Ito, which the colour-blind can tell apart too.
@@ -121,7 +122,7 @@ def _figure(study: Study) -> Figure:
     FigureCanvasAgg(figure)
     versions = study.machine["versions"]
     state = " (interrupted)" if study.status == "interrupted" else ""
-    figure.suptitle(f"{shown(study.scene)}: speed against error{state}", x=0.01, ha="left", parse_math=False)
+    figure.suptitle(f"{printable(study.scene)}: speed against error{state}", x=0.01, ha="left", parse_math=False)
     machine = f"{where(study)}; taichi-msm {versions['taichi-msm']}, {named(versions)}"
     figure.supxlabel(f"{_advice(study)}\n{machine}", x=0.01, ha="left", size=8, parse_math=False, wrap=True)
     axes = figure.subplot_mosaic(layout)

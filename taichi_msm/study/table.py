@@ -51,11 +51,6 @@ def mostly_rounding(point: Stepping | Peer | Points) -> bool:
     return isinstance(point, Stepping) and (point.rounding or 0) > (point.error or 0) / 2
 
 
-def shown(text: str) -> str:
-    """Make a file name printable even if it is not UTF-8."""
-    return text.encode("utf-8", "backslashreplace").decode("utf-8")
-
-
 def where(study: Study) -> str:
     """Name the machine."""
     threads = study.machine["threads"]
