@@ -1,4 +1,4 @@
-"""Measure a live session: how long from an event to its picture, and how many pictures a second; into the README.
+"""Measure a live session: how long from an event to its picture, and how many pictures a second; into docs/view.md.
 
     xvfb-run -a python -m benchmarks.live
 
@@ -25,7 +25,7 @@ POINTS = (31, 101)
 ROUNDS = 9
 PICTURES = 40
 
-README = ROOT / "README.md"
+PAGE = ROOT / "docs" / "view.md"
 START, END = "<!-- live: made by benchmarks/live.py -->\n", "<!-- end of live -->\n"
 
 
@@ -87,9 +87,9 @@ def main() -> None:
             case.measure()
     head = "| picture | points | from event to picture | pictures a second, at most | simulation, against real time |\n"
     table = head + "|---|---|---:|---:|---:|\n" + "".join(f"{case.row()}\n" for case in cases)
-    text = README.read_text(encoding="utf-8")
+    text = PAGE.read_text(encoding="utf-8")
     before, rest = text.split(START)
-    README.write_text(before + START + table + END + rest.split(END)[1], encoding="utf-8")
+    PAGE.write_text(before + START + table + END + rest.split(END)[1], encoding="utf-8")
     print(table)
 
 

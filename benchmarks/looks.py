@@ -16,13 +16,16 @@ from benchmarks.drawing.problem import Problem
 from benchmarks.process import call
 from benchmarks.race import Progress
 from benchmarks.whole_run import SCENE, command
+from taichi_msm.outputs import table
 from taichi_msm.render.camera import view
 from taichi_msm.render.instrument import rods
 from taichi_msm.render.rasterizer import Drawing, structure
 from taichi_msm.render.tracking import find_flow
-from taichi_msm.scene import PIXEL_LABELS, Scene
+from taichi_msm.scene import Scene
 from taichi_msm.system import runtime
 from taichi_msm.system.resources import available_threads
+
+ALL_LABELS = tuple(name for name, output in table.OUTPUTS.items() if output.source in ("labels", "flow", "tracks"))
 
 PIXELS = (512, 1024)
 REFINE = 10
@@ -40,8 +43,8 @@ INSTRUMENT = {"radius": 0.012, "shaft": [0.5, -0.6, 0.9], "length": 0.3}
 # What is written of a run, and the scene's keys for it; its own steps are of no interest here.
 OUTPUTS = {
     "frames": ("png",),
-    "labels": (*PIXEL_LABELS, "tracks"),
-    "frames and labels": ("png", *PIXEL_LABELS, "tracks"),
+    "labels": ALL_LABELS,
+    "frames and labels": ("png", *ALL_LABELS),
 }
 SETTINGS = ("sheet.points=[31,31]", "time.duration=6")
 

@@ -106,19 +106,22 @@ def scene_table(studies: dict[str, Record]) -> str:
     return table(head, rows)
 
 
+def error_at(found: Record, method: str, step: float) -> float | None:
+    """Interpolate the error of a method at a step, on logarithmic axes; None: outside what was measured."""
+    for coarse, fine in pairwise(points(found, method)):
+        if fine["step"] <= step <= coarse["step"]:
+            share = math.log(coarse["step"] / step) / math.log(coarse["step"] / fine["step"])
+            return float(coarse["error"] * (fine["error"] / coarse["error"]) ** share)
+    return None
+
+
 def difference_table(found: Record) -> str:
     """Show central beside backward differences at the same steps."""
-    backward = {one["steps_per_frame"]: one for one in points(found, "f64 backward")}
-    rows = [
-        [
-            f"{1000 * one['step']:.4g} ms",
-            significant(one["error"]),
-            significant(backward[one["steps_per_frame"]]["error"]),
-            significant(backward[one["steps_per_frame"]]["error"] / one["error"]),
-        ]
-        for one in points(found, "f64 central")
-        if one["steps_per_frame"] in backward
-    ]
+    rows = []
+    for one in points(found, "f64 central"):
+        if (backward := error_at(found, "f64 backward", one["step"])) is not None:
+            ratio = backward / one["error"]
+            rows.append([f"{1000 * one['step']:.4g} ms", *map(significant, (one["error"], backward, ratio))])
     return table(["step", "central", "backward", "ratio"], rows)
 
 

@@ -1,4 +1,4 @@
-"""Make the pictures of the README: run the shipped scenes and keep what the page shows.
+"""Make the pictures of the README and of the pages on scenes and live sessions, from the shipped scenes.
 
     python docs/make_figures.py
 

@@ -1,4 +1,4 @@
-"""Make the README's picture of labels and its line on flow, which is checked by what it is for: to warp a frame.
+"""Make the picture of labels.md and its line on flow, which is checked by what it is for: to warp a frame.
 
     PYTHONPATH=. python docs/make_labels.py
 
@@ -19,8 +19,8 @@ from taichi_msm import Flow, Labels, Simulation, load_scene
 
 ROOT = Path(__file__).parent.parent
 PICTURE = ROOT / "docs" / "images" / "labels.jpg"
-README = ROOT / "README.md"
-START, END = "<!-- labels: made by docs/make_labels.py -->\n", "<!-- end of labels -->\n"
+PAGE = ROOT / "docs" / "labels.md"
+START, END = "<!-- warping: made by docs/make_labels.py -->\n", "<!-- end of warping -->\n"
 
 # The frame before the fold of grasp.yaml drops, when everything moves.
 SCENE, FRAME = "grasp", 21
@@ -102,7 +102,7 @@ def page(panels: dict[str, Image8]) -> Image.Image:
 
 
 def main() -> None:
-    """Write the picture, and to the README what is left after warping."""
+    """Write the picture, and to the page what is left after warping."""
     settings = [f"render.size=[{SIZE},{SIZE}]", f"render.supersample={SAMPLES}"]
     lit = load_scene(ROOT / "scenes" / f"{SCENE}.yaml", settings)
     plain = load_scene(ROOT / "scenes" / f"{SCENE}.yaml", [*settings, "render.shading=none"])
@@ -125,14 +125,14 @@ def main() -> None:
     }
     page(panels).save(PICTURE, quality=92)
     said = (
-        f"The panels show it: frame {FRAME} of `{SCENE}.yaml` and the next, drawn without light at {SIZE} × {SIZE}\n"
-        f"pixels of {SAMPLES} × {SAMPLES} samples, differ by {before:.2f} grey levels on average where the next one\n"
-        f"shows the same; fetched from where flow leads, by {after:.2f}, due to filtering. In lit\n"
+        f"The top picture shows it: frame {FRAME} of `{SCENE}.yaml` and the next, drawn without light at\n"
+        f"{SIZE} × {SIZE} pixels of {SAMPLES} × {SAMPLES} samples, differ by {before:.2f} grey levels on average\n"
+        f"where the next one shows the same; fetched from where flow leads, by {after:.2f}, due to filtering. In lit\n"
         "frames more is left, as highlights do not move with the tissue. (`docs/make_labels.py` makes the picture\n"
         "and these lines.)\n"
     )
-    begin, rest = README.read_text(encoding="utf-8").split(START)
-    README.write_text(begin + START + said + END + rest.split(END)[1], encoding="utf-8")
+    begin, rest = PAGE.read_text(encoding="utf-8").split(START)
+    PAGE.write_text(begin + START + said + END + rest.split(END)[1], encoding="utf-8")
     print(said, end="")
 
 

@@ -21,7 +21,19 @@ if TYPE_CHECKING:
     from taichi_msm.render.labels import Flow, Labels, Sight
     from taichi_msm.render.surface import Surface
     from taichi_msm.runner import resume, run
-    from taichi_msm.scene import Camera, Instrument, Light, Probe, Render, Scene, Sheet, Springs, Time
+    from taichi_msm.scene import (
+        Camera,
+        Instrument,
+        Light,
+        Probe,
+        Render,
+        Scene,
+        Sheet,
+        Springs,
+        StiffnessMap,
+        Time,
+        Tissue,
+    )
     from taichi_msm.scenefile.load import load_scene
     from taichi_msm.simulation import Simulation
 
@@ -32,7 +44,22 @@ _HOMES = {
         ("ArgumentError", "DeviceError", "DivergedError", "FilesError", "MsmError", "NotInstalledError", "SceneError"),
         "errors",
     ),
-    **dict.fromkeys(("Camera", "Instrument", "Light", "Probe", "Render", "Scene", "Sheet", "Springs", "Time"), "scene"),
+    **dict.fromkeys(
+        (
+            "Camera",
+            "Instrument",
+            "Light",
+            "Probe",
+            "Render",
+            "Scene",
+            "Sheet",
+            "Springs",
+            "StiffnessMap",
+            "Time",
+            "Tissue",
+        ),
+        "scene",
+    ),
     **dict.fromkeys(("Flow", "Labels", "Sight"), "render.labels"),
     "Playback": "playback",
     "Simulation": "simulation",
@@ -62,8 +89,10 @@ __all__ = [
     "Sight",
     "Simulation",
     "Springs",
+    "StiffnessMap",
     "Surface",
     "Time",
+    "Tissue",
     "load_scene",
     "resume",
     "run",

@@ -27,6 +27,11 @@ def as_array(values: Any, name: str) -> NDArray[Any]:
         raise ArgumentError(f"{name}: {error}; take an array") from None
 
 
+def are_numbers(array: NDArray[Any], shape: tuple[int, ...]) -> bool:
+    """Tell whether an array holds real numbers and has a shape."""
+    return array.dtype.kind in "fiu" and array.shape == shape
+
+
 def require_frame_count(frames: int) -> None:
     """Make sure that a number of frames is a whole number, 0 or more.
 

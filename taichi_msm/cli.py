@@ -21,6 +21,7 @@ import click
 
 from taichi_msm import __version__
 from taichi_msm.errors import DeviceError, FilesError, NotInstalledError, SceneError, did_you_mean, printable
+from taichi_msm.export.formats import FORMATS
 from taichi_msm.system.signals import Interruption
 from taichi_msm.system.streams import mute, tell
 
@@ -32,9 +33,6 @@ DONE, BUG, WRONG_INPUT, DIVERGED, FILES = 0, 1, 2, 3, 4
 # What may be given together with --resume, and with --again.
 RESUMABLE = ("resume", "threads", "quiet", "as_json")
 REPEATABLE = ("again", "out", "arch", "threads", "estimate_error", "quiet", "as_json")
-
-# What results can be converted to.
-FORMATS = ("kitti", "tapvid", "vtk", "gltf", "obj")
 
 EXIT_CODES = {"complete": DONE, "diverged": DIVERGED}
 
@@ -207,7 +205,7 @@ def check(scene: str, image: str | None, overrides: tuple[str, ...], as_json: bo
         "disk": need.disk_bytes,
         "disk_while_running": need.disk_bytes + need.working_bytes,
         "probes": (records := probe_records(loaded)),
-        "notes": [*probe_force.notes(loaded, records), *drawing_notes(loaded)],
+        "notes": [*probe_force.force_notes(loaded, records), *drawing_notes(loaded)],
     }
     if as_json:
         print_json(facts)
@@ -289,7 +287,7 @@ def study(
     require_writable(directory)
     interruption = Interruption()
     with Progress(quiet=as_json) as bar, naming(scene):
-        found = measure(
+        results = measure(
             loaded,
             Path(scene).stem,
             tolerance=tolerance,
@@ -298,19 +296,19 @@ def study(
             threads=threads,
             progress=interruptible(bar, interruption),
         )
-    if not found.stepping:
+    if not results.stepping:
         report("interrupted", ["interrupted; nothing was written"], as_json)
         return interruption.code
-    if found.status == "interrupted" and (directory / RECORD).exists():
+    if results.status == "interrupted" and (directory / RECORD).exists():
         # An earlier study is not replaced by part of a new one.
         directory = without_link(directory / "interrupted", "--out")
-    outputs = write_report(found, directory)
+    outputs = write_report(results, directory)
     if as_json:
-        print_json({"directory": str(directory), **as_record(found), "outputs": outputs})
+        print_json({"directory": str(directory), **as_record(results), "outputs": outputs})
     else:
-        click.echo(summary(found))
+        click.echo(summary(results))
         click.echo(printable(f"{directory}: {', '.join(outputs)}"))
-    return EXIT_CODES.get(found.status, interruption.code)
+    return EXIT_CODES.get(results.status, interruption.code)
 
 
 @program.command()
@@ -393,7 +391,7 @@ def view(
         return interruption.code
     finally:
         tell(notices)
-        for path in captures.kept:
+        for path in captures.saved:
             click.echo(printable(str(path)))
     return DIVERGED if record is not None and session.fault else DONE
 
@@ -406,8 +404,7 @@ def view(
     type=Choice(FORMATS),
     metavar="FORMAT",
     required=True,
-    help="kitti: optical flow; tapvid: tracks of points; vtk: for ParaView; gltf: for Blender and browsers; "
-    "obj: for other programs with surfaces.",
+    help="; ".join(f"{name}: {row.means}" for name, row in FORMATS.items()) + ".",
 )
 @click.option("--out", metavar="DIR2", help="Directory for the files.  [default: DIR/export-FORMAT]")
 @click.option("--quiet", is_flag=True, help="Print no progress and no summary.")
@@ -487,7 +484,7 @@ def without_link(folder: Path, option: str) -> Path:
 
 def going_on(directory: Path) -> str:
     """Say how to continue the unfinished run in a directory; empty if there is none."""
-    from taichi_msm.results.publication import is_unfinished
+    from taichi_msm.results.checkpoint import is_unfinished
 
     if not is_unfinished(directory):
         return ""

@@ -37,7 +37,7 @@ def cut(text: str) -> str:
     return text if len(text) <= MAX_SHOWN else text[:MAX_SHOWN] + "..."
 
 
-def problems(error: ValidationError, section: type[BaseModel], data: Any) -> list[Problem]:
+def key_problems(error: ValidationError, section: type[BaseModel], data: Any) -> list[Problem]:
     """Say what is wrong with plain data.
 
     Args:

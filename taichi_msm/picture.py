@@ -16,7 +16,7 @@ from taichi_msm.system.silence import silenced
 if TYPE_CHECKING:
     from PIL import Image
 
-FORMATS = ("PNG", "JPEG", "WEBP", "BMP", "TIFF")
+PICTURE_FORMATS = ("PNG", "JPEG", "WEBP", "BMP", "TIFF")
 SUFFIXES = (".png", ".jpg", ".jpeg", ".webp", ".bmp", ".tif", ".tiff")
 
 # The kinds of pixels, by Pillow's names, whose colours are defined; 32-bit and floating-point greys can have any range.
@@ -112,7 +112,7 @@ def _open(path: str, sha256: str | None = None) -> Iterator[Image.Image]:
         warnings.simplefilter("ignore")
         warnings.simplefilter("error", Image.DecompressionBombWarning)
         try:
-            with Path(path).open("rb") as file, Image.open(_of(path, file, sha256), formats=FORMATS) as image:
+            with Path(path).open("rb") as file, Image.open(_of(path, file, sha256), formats=PICTURE_FORMATS) as image:
                 if max(image.size) > MAX_SIDE:
                     said = f"has {image.width} x {image.height} pixels; a side may have at most {MAX_SIDE}, cut it"
                     raise PictureError(f"{path} {said}")
@@ -147,10 +147,10 @@ def _of(path: str, file: BinaryIO, sha256: str | None) -> BinaryIO:
 
 
 def _sha256(file: BinaryIO) -> str:
-    found = hashlib.sha256()
+    digest = hashlib.sha256()
     while data := file.read(1 << 20):
-        found.update(data)
-    return found.hexdigest()
+        digest.update(data)
+    return digest.hexdigest()
 
 
 def _scans(file: BinaryIO) -> int:

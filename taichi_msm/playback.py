@@ -11,9 +11,10 @@ from numpy.typing import NDArray
 
 from taichi_msm.errors import ArgumentError
 from taichi_msm.render.labels import Flow, Labels
+from taichi_msm.render.renderer import CameraLike
 from taichi_msm.results.finished_run import read_run
 from taichi_msm.scene import Scene
-from taichi_msm.simulation import CameraLike, Simulation
+from taichi_msm.simulation import Simulation
 
 
 class Playback:
@@ -33,6 +34,14 @@ class Playback:
         scene: the scene as it was run, with the points, the step and the precision that were chosen.
         time: of every frame [s], shape (frames,).
         positions: of the points in every frame [m], shape (frames, rows, cols, 3); not to be written to.
+
+    Example:
+        >>> from taichi_msm import Playback
+        >>> with Playback("output/press") as run:
+        ...     picture = run.draw(9, camera="top")
+        ...     flow, occlusion = run.flow(9, 15)
+        >>> picture.shape, flow.shape
+        ((512, 512, 3), (512, 512, 2))
     """
 
     scene: Scene

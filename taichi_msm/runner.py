@@ -29,8 +29,8 @@ from taichi_msm.physics.pilots import Pilots, choose_pilots, no_pilots
 from taichi_msm.physics.plan import Plan
 from taichi_msm.physics.probe_force import probe_records
 from taichi_msm.physics.run_error import Known, RunError
+from taichi_msm.physics.run_notes import run_notes
 from taichi_msm.physics.run_progress import RunProgress
-from taichi_msm.physics.warnings import notes
 from taichi_msm.physics.workload import ENCODING
 from taichi_msm.progress import Progress
 from taichi_msm.render.labels import Observed
@@ -123,6 +123,13 @@ def run(
         DeviceError: when the arch is not available.
         FilesError: when the results cannot be written.
         KeyboardInterrupt: when interrupted before the first frame; nothing is written then.
+
+    Example:
+        >>> from taichi_msm import load_scene, run
+        >>> scene = load_scene("scenes/press.yaml", {"sheet.points": [41, 41]})
+        >>> record = run(scene, "output/press")
+        >>> record["status"], record["frames"], record["precision"]
+        ('complete', 31, 'f64')
     """
     watch = Stopwatch(started)
     plan = checked(scene)
@@ -186,7 +193,7 @@ def resume(
     watch = Stopwatch(started)
     require_path(directory)
     manifest, plan = read_manifest(Path(directory))
-    if too_large := [str(problem) for problem in budget.problems(plan)]:
+    if too_large := [str(problem) for problem in budget.size_problems(plan)]:
         raise SceneError(too_large)
     manifest.require_same(digests(plan), versions())
     texture = load_texture(plan.scene, manifest.sha256.get("image")) if plan.scene.draws else None
@@ -431,7 +438,7 @@ def _facts(task: _Task, progress: RunProgress, known: Known) -> dict[str, Any]:
         "shortest_spring": progress.shortest_spring,
         "longest_spring": progress.longest_spring,
         "probes": probes,
-        "notes": [*notes(plan, probes, progress, *known), *drawing_notes(scene)],
+        "notes": [*run_notes(plan, probes, progress, *known), *drawing_notes(scene)],
         "error_estimate": None if known.estimate is None else error_record(known.estimate, known.mesh),
         **({"error_estimate_reason": known.reason} if known.estimate is None else {}),
     }
@@ -455,12 +462,12 @@ def _asked(given: Scene, scene: Scene) -> dict[str, Any]:
 
 def error_record(estimate: Estimate, mesh: MeshEstimate | None = None) -> dict[str, Any]:
     """Write an estimate for run.json, where null stands for what is not known."""
-    found = {key: getattr(estimate, key) for key in ("error", "rounding", "in_f64", "order", "at_least")}
+    fields = {key: getattr(estimate, key) for key in ("error", "rounding", "in_f64", "order", "at_least")}
     if not estimate.parted:
-        found |= {"rounding": None, "in_f64": None}
+        fields |= {"rounding": None, "in_f64": None}
     if mesh is not None:
-        found |= {"mesh_error": mesh.error, "mesh_doubt": mesh.doubt}
-    return {key: None if value == math.inf else value for key, value in found.items()}
+        fields |= {"mesh_error": mesh.error, "mesh_doubt": mesh.doubt}
+    return {key: None if value == math.inf else value for key, value in fields.items()}
 
 
 def versions() -> dict[str, str]:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from typing import TYPE_CHECKING, Annotated, Any, Literal, get_args
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 from pydantic import (
     BaseModel,
@@ -21,6 +21,7 @@ from typing_extensions import Self
 from taichi_msm import faults
 from taichi_msm.errors import ArgumentError, SceneError
 from taichi_msm.faults import LARGEST, REFUSED, SMALLEST
+from taichi_msm.outputs.table import OUTPUTS
 
 MAX_POINTS = 4096
 MAX_PROBES = 16
@@ -57,19 +58,10 @@ Pixels = Annotated[Whole, Field(ge=1, le=MAX_PIXELS)]
 Byte = Annotated[Whole, Field(ge=0, le=255)]
 FilePath = Annotated[str, Field(strict=True, min_length=1, max_length=MAX_PATH)]
 Share = Annotated[Number, Field(ge=0, le=1)]
-Output = Literal["png", "gif", "trajectory", "coordinates", "depth", "flow", "occlusion", "instrument", "tracks"]
 Side = Literal["top", "bottom", "left", "right"]
 Vector = tuple[Number, Number, Number]
 # A tool may come from beyond the edge; larger numbers are taken for pixels given by mistake, and refused.
 Fraction = Annotated[Number, Field(ge=-1, le=2)]
-
-OUTPUTS: tuple[str, ...] = get_args(Output)
-
-# The outputs with a value for every pixel.
-PIXEL_LABELS = ("coordinates", "depth", "flow", "occlusion", "instrument")
-# Those of them that describe what happens until the next frame.
-UNTIL_NEXT = ("flow", "occlusion")
-NEED_CAMERA = ("coordinates", "depth", "flow", "tracks")
 
 
 def key(default: Any = ..., *, means: str, expects: str) -> Any:
@@ -79,8 +71,11 @@ def key(default: Any = ..., *, means: str, expects: str) -> Any:
 
 if TYPE_CHECKING:
     from pydantic._internal._model_construction import ModelMetaclass
+
+    OutputName = str
 else:
     ModelMetaclass = type(BaseModel)
+    OutputName = Literal[tuple(OUTPUTS)]
 
 
 class _Checked(ModelMetaclass):
@@ -92,7 +87,7 @@ class _Checked(ModelMetaclass):
         try:
             return super().__call__(**keys)  # type: ignore[misc]
         except ValidationError as error:
-            raise SceneError([str(problem) for problem in faults.problems(error, cls, keys)]) from None
+            raise SceneError([str(problem) for problem in faults.key_problems(error, cls, keys)]) from None
 
 
 class Section(BaseModel, metaclass=_Checked):
@@ -447,7 +442,16 @@ class Render(Section):
 
 
 class Scene(Section):
-    """Everything a run needs; what the YAML file says, checked and with its defaults filled in."""
+    """Everything a run needs; what the YAML file says, checked and with its defaults filled in.
+
+    Example:
+        >>> from taichi_msm import Scene
+        >>> tissue = {"young": 3e4, "thickness": 3e-3, "density": 1050}
+        >>> sheet = {"points": [31, 31], "size": [0.1, 0.1]}
+        >>> scene = Scene(sheet=sheet, tissue=tissue, time={"duration": 1}, output=["trajectory"])
+        >>> scene.time.frames, scene.render.size
+        (25, (512, 512))
+    """
 
     model_config = ConfigDict(json_schema_extra={"oneOf": [{"required": ["tissue"]}, {"required": ["springs"]}]})
 
@@ -477,31 +481,30 @@ class Scene(Section):
     )
     time: Time = key(means="time span, frames and steps", expects="a mapping with at least duration")
     render: Render = key(Render(), means="how a frame is drawn", expects="a mapping")
-    output: tuple[Output, ...] = key(
+    output: tuple[OutputName, ...] = key(
         ("png", "gif", "trajectory"),
         means="what is written besides run.json; [] simulates only",
         expects=f"a list of {', '.join(OUTPUTS)}",
     )
 
+    def asks_for(self, *sources: str) -> bool:
+        """Tell whether the values of any output are in one of these fields of `Observed`."""
+        return any(OUTPUTS[name].source in sources for name in self.output)
+
     @property
     def draws(self) -> bool:
         """Whether any output is a picture."""
-        return "png" in self.output or "gif" in self.output
+        return self.asks_for("picture")
 
     @property
     def labels_pixels(self) -> bool:
         """Whether any output is a label of every pixel."""
-        return any(kind in PIXEL_LABELS for kind in self.output)
+        return self.asks_for("labels", "flow")
 
     @property
     def renders(self) -> bool:
         """Whether any output depends on what the camera sees."""
-        return self.draws or self.labels_pixels or "tracks" in self.output
-
-    @property
-    def output_camera(self) -> bool:
-        """Whether any output can be used only with the camera's matrices."""
-        return any(kind in NEED_CAMERA for kind in self.output)
+        return self.asks_for("picture", "labels", "flow", "tracks")
 
     @property
     def has_instruments(self) -> bool:
@@ -528,15 +531,15 @@ class Scene(Section):
     def pictures(self) -> dict[str, str]:
         """The paths of the picture and the maps, by the keys that name them, such as image and tissue.map.image."""
         image = {} if self.image is None else {"image": self.image}
-        return image | {f"{self.kind}.{name}.image": found.image for name, found in self.maps.items()}
+        return image | {f"{self.kind}.{name}.image": each.image for name, each in self.maps.items()}
 
     def with_pictures(self, path: Callable[[str], str]) -> Scene:
         """Give the picture and the maps other paths, each by its present one."""
-        maps = {name: found.model_copy(update={"image": path(found.image)}) for name, found in self.maps.items()}
+        maps = {name: each.model_copy(update={"image": path(each.image)}) for name, each in self.maps.items()}
         image = None if self.image is None else path(self.image)
         sheet = self.tissue or self.springs
-        made = None if sheet is None else sheet.model_copy(update=maps)
-        return self.model_copy(update={"image": image, self.kind: made})
+        material = None if sheet is None else sheet.model_copy(update=maps)
+        return self.model_copy(update={"image": image, self.kind: material})
 
     @model_validator(mode="after")
     def _picture_given(self) -> Scene:

@@ -4,13 +4,12 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from types import TracebackType
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from taichi_msm.arguments import as_array, require_frame_count
+from taichi_msm.arguments import are_numbers, as_array, require_frame_count
 from taichi_msm.errors import ArgumentError, DivergedError, MsmError
 from taichi_msm.physics import divergence
 from taichi_msm.physics.diagnosis import Diagnosis, diagnose
@@ -21,23 +20,19 @@ from taichi_msm.physics.run_progress import RunProgress, Saved
 from taichi_msm.physics.solver import Dynamics
 from taichi_msm.physics.state import Reading
 from taichi_msm.progress import Pause
-from taichi_msm.render.camera import View, view
-from taichi_msm.render.instrument import Rod, rods
-from taichi_msm.render.labels import Flow, Labels, Observed, Sight, track_grid
+from taichi_msm.render.instrument import rods
+from taichi_msm.render.labels import Flow, Labels, Observed, Sight
 from taichi_msm.render.picking import pick
+from taichi_msm.render.renderer import Array, CameraLike, Renderer, Shot
 from taichi_msm.render.surface import Surface, surface
-from taichi_msm.render.texture import load_texture, require_texture
-from taichi_msm.scene import UNTIL_NEXT, Camera, Probe, Scene
+from taichi_msm.render.texture import require_texture
+from taichi_msm.scene import Probe, Scene
 from taichi_msm.scenefile.resolve import resolve
 from taichi_msm.scenefile.validation import checked
 from taichi_msm.system import runtime
 
 if TYPE_CHECKING:
     from taichi_msm.notebook import Player
-    from taichi_msm.render.rasterizer import Drawing, Drawn
-
-# A camera in one of the forms that a scene may have; or a `View`, which was set up already; None: the scene's own.
-CameraLike = str | Mapping[str, Any] | Camera | View | None
 
 
 class Simulation:
@@ -54,11 +49,21 @@ class Simulation:
 
     Raises:
         MsmError: here and in all methods, in any thread but that of the first simulation, or in a process that was
-            forked after it.
+            forked after it; in most methods also when it is closed.
         ArgumentError: here and in all methods, when an argument is not what it must be.
         DeviceError: when the arch is not available, or the compiler already runs on another one in this process.
         SceneError: when the scene cannot be run, or no step meets its tolerance.
 
+    Attributes:
+        renderer: what draws and labels it.
+
+    Example:
+        >>> from taichi_msm import Simulation, load_scene
+        >>> with Simulation(load_scene("scenes/press.yaml")) as simulation:
+        ...     simulation.advance(10)
+        ...     picture = simulation.draw("oblique")
+        >>> simulation.positions().shape, picture.shape
+        ((61, 61, 3), (512, 512, 3))
     """
 
     def __init__(
@@ -77,10 +82,7 @@ class Simulation:
         self._closed = self._diverged = False
         self._dynamics = Dynamics(self._plan, self.device, cores=cores)
         self._position = self._place(self._dynamics.displacement())
-        self._texture = texture
-        self._own_texture = texture is None
-        # The keys tell whether a drawing gives a picture, and whether it gives labels.
-        self._drawings: dict[tuple[bool, bool], Drawing] = {}
+        self.renderer = Renderer(self.scene, texture)
 
     @property
     def scene(self) -> Scene:
@@ -131,7 +133,6 @@ class Simulation:
                 call goes on from there.
 
         Raises:
-            MsmError: when the simulation is closed.
             DivergedError: when the simulation diverges: a position is no longer finite, or exceeds every bound.
                 `positions` and `draw` then give the last good frame.
         """
@@ -140,7 +141,9 @@ class Simulation:
         for _ in range(frames):
             end = (self.frame + 1) * self._plan.grid.steps_per_frame
             self._dynamics.advance(end - self.steps, pause)
-            self._position = self._read()
+            reading = self._dynamics.read()
+            self._require_good(reading, self._watch.follow(reading))
+            self._position = self._place(reading.displacement)
 
     def steer(self, probes: Sequence[Probe | Mapping[str, Any]]) -> None:
         """Replace the loads from here on.
@@ -150,7 +153,6 @@ class Simulation:
                 tool that is to move later, give `at` as keys from the start, be it a single one.
 
         Raises:
-            MsmError: when the simulation is closed.
             ArgumentError: when the kernel was not compiled for such probes.
             SceneError: when one of them is not a probe.
         """
@@ -160,7 +162,7 @@ class Simulation:
         plan = self._plan.with_probes(probes)
         self._dynamics.steer(plan)
         self._watch.steer(plan)
-        self._plan = plan
+        self._plan, self.renderer.scene = plan, plan.scene
 
     def restart(self, scene: Scene | Mapping[str, Any] | None = None) -> None:
         """Begin again at rest. Nothing is compiled if the terms of the model and the precision stay the same.
@@ -169,26 +171,21 @@ class Simulation:
             scene: another one; None: the same.
 
         Raises:
-            MsmError: when the simulation is closed.
             SceneError: as for `Simulation`.
         """
         self._require_open()
         if scene is not None:
-            plan = resolve(checked(scene), self.device).plan
-            if self._own_texture and (plan.scene.image, plan.scene.region) != (self.scene.image, self.scene.region):
-                self._texture = None
-            self._plan = plan
+            self._plan = resolve(checked(scene), self.device).plan
+            self.renderer.restart(self.scene)
         self._watch = Watch(self._plan)
         self._diverged = False
         self._dynamics.restart(self._plan)
-        self._drawings.clear()
         self._position = self._place(self._dynamics.displacement())
 
     def save(self) -> Saved:
         """Save all that another simulation needs to continue from here.
 
         Raises:
-            MsmError: when the simulation is closed.
             DivergedError: as for `advance`.
         """
         self._require_open()
@@ -200,7 +197,6 @@ class Simulation:
         """Continue from where a simulation of the same scene was saved, also between two frames; to the same bits.
 
         Raises:
-            MsmError: when the simulation is closed.
             ArgumentError: when it was saved with other points, another precision or another step.
         """
         self._require_open()
@@ -219,7 +215,7 @@ class Simulation:
         self._position = self._place(self._dynamics.displacement())
         self._watch.progress = saved.progress
 
-    def positions(self) -> NDArray[Any]:
+    def positions(self) -> Array:
         """Give where the points are.
 
         Returns:
@@ -227,7 +223,7 @@ class Simulation:
         """
         return self._position
 
-    def velocities(self) -> NDArray[Any]:
+    def velocities(self) -> Array:
         """Give the velocities of the points: the mean over the last step, so those half a step before `time`.
 
         Returns:
@@ -240,27 +236,6 @@ class Simulation:
         """Give the refined surface as textured triangles: vertices, triangles, texture coordinates."""
         return surface(self._position, self.scene.render.refine)
 
-    def pick(self, pixel: tuple[float, float], camera: CameraLike = None) -> tuple[float, float] | None:
-        """Find the material point that is seen at the centre of a pixel.
-
-        Args:
-            pixel: x to the right and y down from the picture's top-left pixel, which is (0, 0).
-            camera: as for `draw`.
-
-        Returns:
-            Fractions of the sheet's width from its left and of its height from its top, as in a probe's `at`;
-            None if no surface is there.
-
-        Raises:
-            ArgumentError: when the pixel is not two numbers.
-            SceneError: as for `draw`.
-        """
-        seen = as_array(pixel, "pixel")
-        if seen.shape != (2,) or seen.dtype.kind not in "fiu" or not np.isfinite(seen).all():
-            raise ArgumentError(f"pixel: {pixel!r}; take two numbers, x to the right and y down")
-        x, y = (float(number) for number in seen)
-        return pick(self._position, self.scene.render.refine, self._view(camera), (x, y))
-
     def diagnose(self, start: Saved | None = None, pause: Pause = lambda: None) -> Diagnosis:
         """Find out why the simulation diverged in `advance`. Afterwards it can advance only after `restore`.
 
@@ -269,7 +244,7 @@ class Simulation:
             pause: called some times a second; what it raises stops the search.
 
         Raises:
-            MsmError: when the simulation is closed, or has not diverged.
+            MsmError: when the simulation has not diverged.
         """
         self._require_open()
         if not self._diverged:
@@ -277,7 +252,7 @@ class Simulation:
         return diagnose(self._dynamics, start, pause)
 
     def draw(
-        self, camera: CameraLike = None, positions: NDArray[Any] | None = None, time: float | None = None
+        self, camera: CameraLike = None, positions: Array | None = None, time: float | None = None
     ) -> NDArray[np.uint8]:
         """Draw the sheet as it is now, and the probes' instruments.
 
@@ -290,126 +265,57 @@ class Simulation:
             Colours, shape (height, width, 3).
 
         Raises:
-            ArgumentError: when the positions are of another shape.
             SceneError: when the scene's picture cannot be read, or the camera is not valid.
             DeviceError: when the driver of a GPU ended part of the work early.
         """
-        picture = self._look(camera, positions, time, picture=True, labels=False).picture
-        assert picture is not None
-        return picture
+        return self.renderer.draw(self._shot(camera, positions, time))
 
-    def labels(
-        self, camera: CameraLike = None, positions: NDArray[Any] | None = None, time: float | None = None
-    ) -> Labels:
+    def labels(self, camera: CameraLike = None, positions: Array | None = None, time: float | None = None) -> Labels:
         """Give what each pixel shows at its centre: the material point, the depth, whether it is an instrument.
 
-        Args:
-            camera: as for `draw`.
-            positions: as for `draw`.
-            time: as for `draw`.
-
-        Raises:
-            ArgumentError, DeviceError: as for `draw`.
-            SceneError: when the camera is not valid.
+        `camera`, `positions` and `time` are as for `draw`, here and in the methods below, and so are the errors.
         """
-        labels = self._look(camera, positions, time, picture=False, labels=True).labels
-        assert labels is not None
-        return labels
+        return self.renderer.labels(self._shot(camera, positions, time))
 
     def flow(
-        self,
-        before: Labels,
-        camera: CameraLike = None,
-        positions: NDArray[Any] | None = None,
-        time: float | None = None,
+        self, before: Labels, camera: CameraLike = None, positions: Array | None = None, time: float | None = None
     ) -> Flow:
         """Give the optical flow from an earlier or later frame to this one, and which of its material is now hidden.
 
-        Args:
-            before: what `labels` returned for the other frame, with the same size of the picture.
-            camera: as for `draw`.
-            positions: as for `draw`.
-            time: as for `draw`.
-
-        Raises:
-            ArgumentError: as for `draw`, and when `before` is of another size.
-            SceneError: when the camera is not valid.
-            DeviceError: as for `draw`.
+        `before` is what `labels` returned for the other frame, with the same size of the picture.
         """
-        width, height = self.scene.render.size
-        points = as_array(before.coordinates, "before") if isinstance(before, Labels) else np.empty(0)
-        on_sheet = points.dtype.kind == "f" and not ((points < 0) | (points > 1)).any()
-        if points.shape != (height, width, 2) or not on_sheet:
-            raise ArgumentError(f"before: take what `labels` gave for a picture of {width} x {height} pixels")
-        from taichi_msm.render.tracking import find_flow
-
-        positions, rods = self._placed(positions, time)
-        return find_flow(self.scene, points, positions, self._view(camera), rods)
+        return self.renderer.flow(before, self._shot(camera, positions, time))
 
     def locate(
-        self,
-        coordinates: NDArray[Any],
-        camera: CameraLike = None,
-        positions: NDArray[Any] | None = None,
-        time: float | None = None,
+        self, coordinates: Array, camera: CameraLike = None, positions: Array | None = None, time: float | None = None
     ) -> Sight:
         """Find where material points are seen, and whether anything hides them; the inverse of `pick`.
 
-        Args:
-            coordinates: fractions of the sheet's width from its left and of its height from its top, 0 to 1, shape
-                (n, 2).
-            camera: as for `draw`.
-            positions: as for `draw`.
-            time: as for `draw`.
-
-        Raises:
-            ArgumentError: as for `draw`, and when the coordinates are not numbers of that shape from 0 to 1.
-            SceneError: when the camera is not valid.
-            DeviceError: as for `draw`.
+        `coordinates` are fractions of the sheet's width from its left and of its height from its top, shape (n, 2).
         """
-        found = as_array(coordinates, "coordinates")
-        numbers = found.dtype.kind in "fiu" and found.ndim == 2 and found.shape[1] == 2
-        if not numbers or not ((found >= 0) & (found <= 1)).all():
-            raise ArgumentError(
-                f"coordinates: {found.dtype} of shape {found.shape}; take numbers from 0 to 1 of shape (n, 2)"
-            )
-        from taichi_msm.render.tracking import find
+        return self.renderer.locate(coordinates, self._shot(camera, positions, time))
 
-        positions, rods = self._placed(positions, time)
-        return find(self.scene, found, positions, self._view(camera), rods)
+    def pick(self, pixel: tuple[float, float], camera: CameraLike = None) -> tuple[float, float] | None:
+        """Find the material point that is seen at the centre of a pixel.
 
-    def observe(self, before: Labels | None, positions: NDArray[Any], time: float) -> Observed:
-        """Give everything that the scene's output asks for of one frame.
+        `pixel` is x to the right and y down from the picture's top-left pixel, which is (0, 0).
 
-        Args:
-            before: the labels of the frame before; None: there was none.
-            positions: of the points [m], shape (rows, cols, 3).
-            time: of the frame [s].
+        Returns:
+            Fractions of the sheet's width from its left and of its height from its top, as in a probe's `at`;
+            None if no surface is there.
         """
-        scene = self.scene
-        # Labels need one sample, at the pixel's centre; with several samples per pixel, none is there.
-        together = scene.render.supersample == 1
-        picture = labels = flow = tracks = None
-        if scene.draws:
-            picture, labels = self._look(None, positions, time, picture=True, labels=scene.labels_pixels and together)
-        if scene.labels_pixels and labels is None:
-            labels = self.labels(None, positions, time)
-        if before is not None and any(kind in UNTIL_NEXT for kind in scene.output):
-            flow = self.flow(before, None, positions, time)
-        if "tracks" in scene.output:
-            tracks = self.locate(track_grid(scene.render.tracks), None, positions, time)
-        return Observed(picture, labels, flow, tracks)
+        point = as_array(pixel, "pixel")
+        if not (are_numbers(point, (2,)) and np.isfinite(point).all()):
+            raise ArgumentError(f"pixel: {pixel!r}; take two numbers, x to the right and y down")
+        x, y = point.tolist()
+        return pick(self._position, self.scene.render.refine, self.renderer.set_up(camera), (x, y))
+
+    def observe(self, before: Labels | None, positions: Array, time: float) -> Observed:
+        """Give all that the scene's output asks for of a frame; `before`: the labels of the frame before, if any."""
+        return self.renderer.observe(before, self._shot(None, positions, time))
 
     def play(self, frames: int, camera: CameraLike = None) -> Player:
-        """Draw the present frame, simulate and draw more of them, and show them in a notebook.
-
-        Args:
-            frames: how many, 0 or more.
-            camera: as for `draw`.
-
-        Raises:
-            MsmError: as for `advance` and `draw`.
-        """
+        """Draw the present frame, simulate and draw that many more, and show them in a notebook."""
         from taichi_msm.notebook import Player
 
         require_frame_count(frames)
@@ -433,11 +339,7 @@ class Simulation:
     def compile(self, pause: Pause = lambda: None) -> None:
         """Compile the kernels now that would otherwise be compiled at the first frame.
 
-        Args:
-            pause: called between kernels; what it raises stops here.
-
-        Raises:
-            MsmError: when the simulation is closed.
+        `pause` is called between kernels; what it raises stops here.
         """
         self._require_open()
         self._dynamics.compile()
@@ -451,14 +353,12 @@ class Simulation:
         runtime.require_here()
         self._closed = True
         self._dynamics.close()
-        self._drawings.clear()
+        self.renderer.close()
 
     def __enter__(self) -> Simulation:
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         self.close()
 
     def __reduce__(self) -> Any:
@@ -471,63 +371,32 @@ class Simulation:
             raise MsmError("this simulation is closed; make another")
         runtime.require_here()
 
-    def _view(self, camera: CameraLike) -> View:
-        if isinstance(camera, View):
-            return camera
-        if camera is None:
-            return view(self.scene)
-        # The scene is checked as a whole, so that an error names the key as a scene has it.
-        render = {**dict(self.scene.render), "camera": camera}
-        return view(self.scene.model_copy(update={"render": render}))
-
-    def _look(
-        self, camera: CameraLike, positions: NDArray[Any] | None, time: float | None, *, picture: bool, labels: bool
-    ) -> Drawn:
-        from taichi_msm.render.rasterizer import Drawing, structure
-
-        positions, rods = self._placed(positions, time)
-        view = None if camera is None else self._view(camera)
-        if (picture, labels) not in self._drawings:
-            code = structure(self.scene, picture=picture, labels=labels)
-            self._drawings[picture, labels] = Drawing(self.scene, self._require_texture(picture=picture), code)
-        return self._drawings[picture, labels].look(positions, view, rods)
-
-    def _placed(self, positions: NDArray[Any] | None, time: float | None) -> tuple[NDArray[Any], list[Rod]]:
-        """Check positions, and place the instruments on the sheet."""
+    def _shot(self, camera: CameraLike, positions: Array | None, time: float | None) -> Shot:
+        """Check positions and a time, place the instruments on the sheet, and set up the camera."""
         self._require_open()
         if positions is None:
             positions = self._position
         else:
-            positions = as_array(positions, "positions")
-            found, expected = positions.shape, self._position.shape
-            if found != expected or positions.dtype.kind not in "fiu":
-                raise ArgumentError(f"positions: {positions.dtype} of shape {found}; take numbers of shape {expected}")
-        if time is not None and not _is_finite(time):
+            positions, shape = as_array(positions, "positions"), self._position.shape
+            if not are_numbers(positions, shape):
+                raise ArgumentError(
+                    f"positions: {positions.dtype} of shape {positions.shape}; take numbers of shape {shape}"
+                )
+        if time is None:
+            time = self.time
+        elif not (are_numbers(as_array(time, "time"), ()) and math.isfinite(time)):
             raise ArgumentError(f"time: {time!r}; take a number, in seconds, or None for now")
-        return positions, rods(self.scene, positions, self.time if time is None else time)
+        return Shot(positions, self.renderer.set_up(camera), rods(self.scene, positions, time))
 
-    def _require_texture(self, *, picture: bool) -> NDArray[np.uint8]:
-        """Give the picture on the sheet; a single texel if it is not seen."""
-        if not picture:
-            return np.zeros((1, 1, 3), np.uint8)
-        if self._texture is None:
-            self._texture = load_texture(self.scene)
-        return self._texture
-
-    def _read(self) -> NDArray[Any]:
-        """Read where the points are, after checking that the simulation has not diverged since the last frame."""
-        reading = self._dynamics.read()
-        self._require_good(reading, self._watch.follow(reading))
-        return self._place(reading.displacement)
-
-    def _require_good(self, reading: Reading, wrong: str) -> None:
-        if wrong:
+    def _require_good(self, reading: Reading, fault: str) -> None:
+        """Raise the error of a divergence, if there is a fault."""
+        if fault:
             self._diverged = True
             steps, time = reading.steps, self._plan.grid.time(reading.steps)
             point = farthest(reading.displacement)[:2]
-            raise DivergedError(divergence.message(time, steps, wrong, exact=False), steps, time, point)
+            raise DivergedError(divergence.message(time, steps, fault, exact=False), steps, time, point)
 
-    def _place(self, displacement: NDArray[Any]) -> NDArray[Any]:
+    def _place(self, displacement: Array) -> Array:
         """Turn displacements into positions."""
         position, (x, y) = displacement, axes(self.scene.sheet)
         # The sum is computed in float64 and rounded once, without a float64 copy of the sheet.
@@ -535,13 +404,3 @@ class Simulation:
         np.add(position[..., 1], y, out=position[..., 1], casting="same_kind")
         position.flags.writeable = False
         return position
-
-
-def _is_finite(number: Any) -> bool:
-    """Tell whether a value is a number that a float can hold."""
-    if isinstance(number, bool) or not isinstance(number, int | float | np.integer | np.floating):
-        return False
-    try:
-        return math.isfinite(number)
-    except OverflowError:
-        return False

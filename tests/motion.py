@@ -2,12 +2,17 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 from numpy.typing import NDArray
 
-from taichi_msm.physics.error_control import longest
+from taichi_msm.physics.error_control import Estimate, longest
 from taichi_msm.physics.kernel import Structure
 from taichi_msm.physics.plan import Plan
+from taichi_msm.physics.probe_force import probe_records
+from taichi_msm.physics.run_notes import run_notes
+from taichi_msm.physics.run_progress import RunProgress
 from taichi_msm.physics.solver import Dynamics, structure
 from taichi_msm.scene import Scene
 from taichi_msm.system.runtime import Device
@@ -49,3 +54,8 @@ def true_error(plan: Plan, device: Device, fine: int) -> float:
     finer = plan.with_grid(precision="f64", steps_per_frame=fine * plan.grid.steps_per_frame)
     reference = frames_on(finer, device)
     return longest(frames_on(plan, device) - reference) / longest(reference)
+
+
+def notes_of(made: Scene, progress: RunProgress, estimate: Estimate | None, **more: Any) -> list[str]:
+    """What is noted of a run of a scene."""
+    return list(run_notes(plan_of(made), probe_records(made), progress, estimate, **more))

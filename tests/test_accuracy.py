@@ -19,12 +19,10 @@ from taichi_msm.physics.pilots import coarse_steps, fine_steps
 from taichi_msm.physics.plan import Plan
 from taichi_msm.physics.run_progress import RunProgress
 from taichi_msm.physics.timestep import with_time
-from taichi_msm.physics.warnings import notes
 from taichi_msm.scene import Scene
 from taichi_msm.simulation import Simulation
 from taichi_msm.system.runtime import Device
-from taichi_msm.timegrid import TimeGrid
-from tests.motion import frames, true_error
+from tests.motion import frames, notes_of, true_error
 from tests.scenes import PRESS, SHEET, SPRINGS, plan_of, scene, with_steps
 
 # Of a run in which something moved.
@@ -100,12 +98,12 @@ def test_an_estimate_is_near_the_error(kind: str, difference: str, device: Devic
 class Falling:
     """A stand-in for Dynamics, of every displacement of which h^p is wrong and no more."""
 
-    def __init__(self, p: int, made: Scene, grid: TimeGrid, device: Device, cores: int | None = None) -> None:
+    def __init__(self, p: int, plan: Plan, device: Device, cores: int | None = None) -> None:
         self.p = p
-        self.restart(made, grid)
+        self.restart(plan)
 
-    def restart(self, made: Scene, grid: TimeGrid) -> None:
-        self.h = grid.step
+    def restart(self, plan: Plan) -> None:
+        self.h = plan.grid.step
 
     def advance(self, steps: int, pause: object) -> None:
         pass
@@ -240,13 +238,13 @@ def test_damping_within_a_step_is_known_or_not_told(damping: float, device: Devi
     reference = frames(made, device, cut=128 * plan_of(made).grid.steps_per_frame)
     error = longest(frames(made, device) - reference) / longest(reference)
     assert error / 1.5 < estimate.error < 1.5 * error
-    assert "velocities change their sign" in "".join(notes(plan_of(made), (), MOVED, None))
+    assert "velocities change their sign" in "".join(notes_of(made, MOVED, None))
 
 
 def test_damping_within_a_hundredth_of_a_step_has_no_estimate(device: Device) -> None:
     made = scene(probes=[{**SOFT_PRESS, "load": [[0, 100]]}], damping=100.0)
     assert estimated(made, device).error == np.inf
-    assert next(notes(plan_of(made), (), MOVED, estimated(made, device))).startswith("error not known")
+    assert notes_of(made, MOVED, estimated(made, device))[0].startswith("error not known")
 
 
 @pytest.mark.parametrize("pulse", [[0.2005, 0.2006], [0.2, 0.2 + 1e-9], [0.2021, 0.2032]])
@@ -257,21 +255,21 @@ def test_the_error_of_a_load_shorter_than_a_step_is_known(pulse: list[float], de
     exact = frames(made, device, cut=64 * plan_of(made).grid.steps_per_frame)
     error = longest(frames(made, device) - exact) / longest(exact)
     assert error / 1.5 < estimate.error < 1.5 * error < 0.2
-    assert not list(notes(plan_of(made), (), MOVED, None))
+    assert not notes_of(made, MOVED, None)
 
 
 def test_a_scene_that_is_all_right_has_no_notes() -> None:
-    assert not list(notes(plan_of(scene()), (), RunProgress(1, 1.0, 0.51), None))
-    assert next(notes(plan_of(scene()), (), RunProgress(1, 0.0, 0.49), Estimate(40, 1e-3, 1e-4, 1e-3, 2))) == (
+    assert not notes_of(scene(), RunProgress(1, 1.0, 0.51), None)
+    assert notes_of(scene(), RunProgress(1, 0.0, 0.49), Estimate(40, 1e-3, 1e-4, 1e-3, 2))[0] == (
         "error 0.001 of the largest displacement: 0.001 due to the time step, 0.0001 to rounding"
     )
-    assert len(list(notes(plan_of(scene()), (), RunProgress(1, 0.0, 0.49), None))) == 2
+    assert len(notes_of(scene(), RunProgress(1, 0.0, 0.49), None)) == 2
 
 
 @pytest.mark.parametrize(("error", "advice"), [(0.04, "; try sheet.points: [24, 30]"), (2000.0, "")])
 def test_points_are_advised_where_they_can_help(error: float, advice: str) -> None:
     made = scene()
-    (note,) = notes(plan_of(made), (), MOVED, None, mesh=MeshEstimate(error))
+    (note,) = notes_of(made, MOVED, None, mesh=MeshEstimate(error))
     assert note == f"so few points make the run up to {100 * error:g} % wrong{advice}"
 
 
@@ -309,9 +307,9 @@ def test_the_error_in_f64_is_that_of_the_step(device: Device) -> None:
     single, double = estimated(made, device), estimated(with_time(made, precision="f64"), device)
     assert single.in_f64 == pytest.approx(double.error, rel=1e-9)
     assert double.in_f64 == double.error
-    (said,) = notes(plan_of(made), (), MOVED, single)
+    (said,) = notes_of(made, MOVED, single)
     assert f"{double.error:.1g} due to the time step, {single.rounding:.1g} to rounding" in said
-    (said,) = notes(plan_of(made), (), MOVED, double)
+    (said,) = notes_of(made, MOVED, double)
     assert said.endswith(f": {single.in_f64:.1g} due to the time step")
 
 

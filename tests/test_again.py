@@ -12,17 +12,17 @@ import pytest
 from PIL import Image
 
 from taichi_msm.errors import FilesError, SceneError
+from taichi_msm.physics.plan import Plan
 from taichi_msm.playback import Playback
 from taichi_msm.results.finished_run import PUT_BACK, read_run
 from taichi_msm.results.manifest import digests
 from taichi_msm.results.record import RunRecord
 from taichi_msm.runner import resume, run
-from taichi_msm.scene import Scene
 from taichi_msm.scenefile.load import load_scene
 from taichi_msm.system.runtime import Device
 from tests.conftest import Program
 from tests.outputs import files, results
-from tests.scenes import plan_of, speckle
+from tests.scenes import speckle
 from tests.test_finished_run import change, change_scene
 from tests.test_resume import Stop
 
@@ -188,8 +188,8 @@ def test_a_picture_that_changes_while_a_run_starts_is_noticed(
 ) -> None:
     """The record tells of the file that was drawn."""
 
-    def late(scene: Scene) -> dict[str, str]:
-        found = digests(plan_of(scene))
+    def late(plan: Plan) -> dict[str, str]:
+        found = digests(plan)
         Image.fromarray(speckle(30, 40, 1)).save(small / "speckle.png")
         return found
 

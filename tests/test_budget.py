@@ -10,10 +10,11 @@ import pytest
 from PIL import Image
 
 from taichi_msm.errors import SceneError
+from taichi_msm.outputs.table import OUTPUTS
 from taichi_msm.runner import run
-from taichi_msm.scene import OUTPUTS, Scene
+from taichi_msm.scene import Scene
 from taichi_msm.scenefile import budget
-from taichi_msm.scenefile.budget import Budget, problems, require_disk
+from taichi_msm.scenefile.budget import Budget, require_disk, size_problems
 from taichi_msm.system import resources
 from taichi_msm.system.resources import available_memory
 from taichi_msm.system.runtime import Device
@@ -45,7 +46,7 @@ def estimate(scene: Scene) -> Budget:
 
 
 def faults(scene: Scene) -> list[str]:
-    return [str(problem) for problem in problems(plan_of(scene))]
+    return [str(problem) for problem in size_problems(plan_of(scene))]
 
 
 def test_counts() -> None:

@@ -15,11 +15,8 @@ import pytest
 from taichi_msm.errors import DamagedError
 from taichi_msm.physics.run_progress import RunProgress, Saved
 from taichi_msm.physics.state import State
-from taichi_msm.results.checkpoint import Checkpoint
-from taichi_msm.results.folder import Folder
+from taichi_msm.results.checkpoint import MANIFEST, POSITIONS, STATE, Checkpoint, seal, unseal
 from taichi_msm.results.manifest import Manifest, read_manifest
-from taichi_msm.results.publication import MANIFEST, POSITIONS, STATE
-from taichi_msm.results.sealed import seal, unseal
 from taichi_msm.scene import Scene
 from tests.scenes import scene, scene_and_grid
 
@@ -31,9 +28,9 @@ def small_scene() -> Scene:
     return scene(sheet={"points": [2, 3], "size": [0.3, 0.4], "mass": 1e-3}, output=["trajectory"])
 
 
-def checkpoint_in(staging: Folder) -> Checkpoint:
+def checkpoint_in(directory: Path) -> Checkpoint:
     made, grid = scene_and_grid(small_scene())
-    return Checkpoint(staging, grid, made.sheet.points, keeps_positions=True)
+    return Checkpoint(directory / ".partial" / "checkpoint", grid, made.sheet.points, keeps_positions=True)
 
 
 def position(frame: int) -> Any:
@@ -57,26 +54,24 @@ def state(**changes: Any) -> Saved:
 def out(tmp_path: Path) -> Path:
     """A directory with a checkpoint."""
     (tmp_path / ".partial").mkdir()
-    with Folder.at(tmp_path / ".partial") as staging:
-        checkpoint = checkpoint_in(staging)
-        checkpoint.begin(manifest().as_json())
-        for frame in range(FRAMES):
-            checkpoint.add(position(frame))
-        checkpoint.save(state())
-        checkpoint.close()
+    checkpoint = checkpoint_in(tmp_path)
+    checkpoint.begin(manifest().as_json())
+    for frame in range(FRAMES):
+        checkpoint.add(position(frame))
+    checkpoint.save(state())
+    checkpoint.close()
     return tmp_path
 
 
 def read(out: Path) -> list[Any]:
     """All that is used of a checkpoint when a run goes on."""
-    with Folder.at(out / ".partial") as staging:
-        checkpoint = checkpoint_in(staging)
-        try:
-            saved = checkpoint.reopen()
-            assert saved is not None
-            positions = [checkpoint.position(frame).tolist() for frame in range(checkpoint.frames)]
-        finally:
-            checkpoint.close()
+    checkpoint = checkpoint_in(out)
+    try:
+        saved = checkpoint.reopen()
+        assert saved is not None
+        positions = [checkpoint.position(frame).tolist() for frame in range(checkpoint.frames)]
+    finally:
+        checkpoint.close()
     return [
         read_manifest(out)[0].as_json(),
         positions,
@@ -188,14 +183,13 @@ def test_a_compressed_array_takes_no_memory(out: Path) -> None:
 @pytest.mark.parametrize("name", [POSITIONS, STATE])
 def test_parts_of_another_run_are_refused(name: str, out: Path, tmp_path: Path) -> None:
     """Of the same sheet, and whole."""
-    with Folder.at(tmp_path / ".partial") as staging:
-        other = checkpoint_in(staging)
-        part = (out / ".partial" / "checkpoint" / name).read_bytes()
-        other.begin({**manifest().as_json(), "folder": "/elsewhere"})
-        for frame in range(FRAMES):
-            other.add(position(frame))
-        other.save(state())
-        other.close()
+    other = checkpoint_in(tmp_path)
+    part = (out / ".partial" / "checkpoint" / name).read_bytes()
+    other.begin({**manifest().as_json(), "folder": "/elsewhere"})
+    for frame in range(FRAMES):
+        other.add(position(frame))
+    other.save(state())
+    other.close()
     (out / ".partial" / "checkpoint" / name).write_bytes(part)
     with pytest.raises(DamagedError):
         read(out)
@@ -203,12 +197,11 @@ def test_parts_of_another_run_are_refused(name: str, out: Path, tmp_path: Path) 
 
 def test_positions_that_are_no_numbers_are_refused(out: Path) -> None:
     """With a checksum that is right."""
-    with Folder.at(out / ".partial") as staging:
-        checkpoint = checkpoint_in(staging)
-        checkpoint.reopen()
-        checkpoint.frames = 1
-        checkpoint.add(np.full((2, 3, 3), math.nan))
-        checkpoint.close()
+    checkpoint = checkpoint_in(out)
+    checkpoint.reopen()
+    checkpoint.frames = 1
+    checkpoint.add(np.full((2, 3, 3), math.nan))
+    checkpoint.close()
     with pytest.raises(DamagedError):
         read(out)
 

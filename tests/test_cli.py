@@ -627,7 +627,7 @@ def test_a_bug_is_one_line(small: Path, capsys: pytest.CaptureFixture[str], monk
         raise ZeroDivisionError("by zero\nin two lines")
 
     monkeypatch.delenv("TAICHI_MSM_TRACEBACK", raising=False)
-    monkeypatch.setattr("taichi_msm.scenefile.load.load_scene", broken)
+    monkeypatch.setattr("taichi_msm.scenefile.load.load_plan", broken)
     code, _, err = call(capsys, "check", "small.yaml")
     assert code == 1
     assert err == (

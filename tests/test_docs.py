@@ -1,53 +1,238 @@
-"""What the README says is what the program does."""
+"""What the README and the pages say is what the program does."""
 
 from __future__ import annotations
 
 import ast
+import doctest
+import importlib.util
 import json
 import re
+import shlex
+import shutil
 import subprocess
 import sys
+from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
+from typing import Any, get_type_hints
 
 import pytest
+import yaml
+from PIL import Image
 
-from taichi_msm.scenefile.load import load_scene
+import taichi_msm
+from taichi_msm import cli, scene
+from taichi_msm.export.formats import FORMATS
+from taichi_msm.outputs.table import OUTPUTS
+from taichi_msm.results.record import ErrorRecord, RunRecord
+from taichi_msm.runner import run
+from taichi_msm.scenefile.load import load_scene, schema
 from taichi_msm.system import resources
 from taichi_msm.system.runtime import Device
 from taichi_msm.viewer.script import load_script
+from tests.conftest import Program
+from tests.scenes import speckle
 
-SCENES = ["press", "figure-3", "drag", "grasp", "two-tools", "tumour"]
+ROOT = Path(__file__).parent.parent
+README = ROOT / "README.md"
+DOCS = ROOT / "docs"
+PAGES = [README, ROOT / "CONTRIBUTING.md", ROOT / "CHANGELOG.md", *sorted(DOCS.glob("**/*.md"))]
+# Those with commands, in an order in which each finds the results that it reads.
+WITH_COMMANDS = [README, *(DOCS / f"{name}.md" for name in ("scene", "labels", "export", "error", "view", "study"))]
+SCENES = sorted(path.stem for path in (ROOT / "scenes").glob("*.yaml"))
+
+README_LINES = 200
+
+# How the shipped scenes are made smaller, to run every command of the pages in little time.
+SMALLER = {
+    r"points: \[\d+, \d+\]": "points: [13, 13]",
+    r"size: \[\d+, \d+\]": "size: [48, 48]",
+    r"duration: \S+": "duration: 0.2",
+}
 
 
-def blocks(root: Path, language: str) -> list[str]:
-    text = (root / "README.md").read_text(encoding="utf-8")
-    return re.findall(rf"```{language}\n(.*?)```", text, flags=re.DOTALL)
+def read(path: Path) -> str:
+    return path.read_text(encoding="utf-8")
 
 
-def test_what_is_shown_is_what_is_shipped(root: Path) -> None:
-    shipped = [root / "scenes" / "scripts" / "press.yaml", root / "scenes" / "press.yaml"]
-    assert blocks(root, "yaml") == [path.read_text(encoding="utf-8") for path in shipped]
+def blocks(path: Path, language: str) -> list[str]:
+    return re.findall(rf"```{language}\n(.*?)```", read(path), flags=re.DOTALL)
 
 
-def test_the_tables_of_keys_are_made_from_the_program(root: Path) -> None:
-    sys.path.insert(0, str(root / "docs"))
+def table(path: Path, name: str) -> dict[str, list[str]]:
+    """Give the other cells of a marked table by its first."""
+    lines = [line for line in read(path).split(f"<!-- {name}: ")[1].split("\n\n")[0].splitlines()[3:] if line[0] == "|"]
+    rows = [[cell.strip() for cell in line.strip("|").split(" | ")] for line in lines]
+    return {row[0]: row[1:] for row in rows}
+
+
+def words(cells: dict[str, list[str]]) -> list[str]:
+    """Give what is set as code in the first cells of a table."""
+    return [word for cell in cells for word in re.findall(r"`(\w+)`", cell)]
+
+
+def commands(path: Path) -> list[list[str]]:
+    """Give the arguments of every command of the program that a page has, in blocks and within its text."""
+    lines = [line for block in blocks(path, "sh") for line in block.replace("\\\n", " ").splitlines()]
+    lines += re.findall(r"`(taichi-msm [^`]+)`", read(path))
+    typed = [shlex.split(line.split(" > ")[0], comments=True) for line in lines]
+    return [
+        words[1:] for words in typed if words and words[0].endswith("taichi-msm") and (words[2:] or "schema" in words)
+    ]
+
+
+def anchors(path: Path) -> set[str]:
+    """Give the anchors of a page's titles, as GitHub makes them."""
+    titles = re.findall(r"^#+ (.*)$", read(path), flags=re.MULTILINE)
+    return {re.sub(r"[^\w\- ]", "", title.lower()).replace(" ", "-") for title in titles}
+
+
+@pytest.fixture(scope="module")
+def examples_folder(device: Device, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
+    """The current directory, with the shipped scenes and a picture, photo.jpg; as many threads as `device` has."""
+    folder = tmp_path_factory.mktemp("examples")
+    (folder / "scenes").symlink_to(ROOT / "scenes")
+    Image.fromarray(speckle(90, 120)).save(folder / "photo.jpg")
+    with pytest.MonkeyPatch.context() as patch:
+        patch.chdir(folder)
+        patch.setattr(resources, "available_threads", lambda: device.threads)
+        yield folder
+
+
+@pytest.fixture
+def small_scenes(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """The current directory, with the shipped scenes made smaller and a picture, photo.jpg."""
+    folder = tmp_path / "scenes"
+    folder.mkdir()
+    for name in ("textures", "scripts"):
+        shutil.copytree(ROOT / "scenes" / name, folder / name)
+    for name in SCENES:
+        text = read(ROOT / "scenes" / f"{name}.yaml")
+        for pattern, smaller in SMALLER.items():
+            text = re.sub(pattern, smaller, text)
+        (folder / f"{name}.yaml").write_text(text, encoding="utf-8")
+    Image.fromarray(speckle(90, 120)).save(tmp_path / "photo.jpg")
+    monkeypatch.chdir(tmp_path)
+    return tmp_path
+
+
+def test_the_readme_is_short() -> None:
+    assert read(README).count("\n") <= README_LINES
+
+
+def test_every_page_is_reached_from_the_index() -> None:
+    linked = set(re.findall(r"\]\(([^)#]+)\)", read(DOCS / "index.md")))
+    assert {page.name for page in DOCS.glob("*.md")} - linked == {"index.md"}
+    assert "(docs/index.md)" in read(README)
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.stem)
+def test_every_link_leads_somewhere(page: Path) -> None:
+    links = [link for link in re.findall(r"\]\(([^)\s]+)\)", read(page)) if "://" not in link]
+    for link in links:
+        name, _, anchor = link.partition("#")
+        target = page.parent / name if name else page
+        assert target.exists(), link
+        assert not anchor or anchor in anchors(target), link
+
+
+def test_what_is_shown_is_what_is_shipped() -> None:
+    assert blocks(DOCS / "scene.md", "yaml") == [read(ROOT / "scenes" / "press.yaml")]
+    assert blocks(DOCS / "view.md", "yaml") == [read(ROOT / "scenes" / "scripts" / "press.yaml")]
+
+
+def test_tables_are_made_from_the_program() -> None:
+    sys.path.insert(0, str(DOCS))
     try:
-        from make_key_table import tables  # type: ignore[import-not-found,unused-ignore]
+        import make_tables  # type: ignore[import-not-found,unused-ignore]
     finally:
         sys.path.pop(0)
-    for table in tables().values():
-        assert table in (root / "README.md").read_text(encoding="utf-8"), "run docs/make_key_table.py"
+    for (page, name), make in make_tables.TABLES.items():
+        text = read(DOCS / f"{page}.md")
+        assert make_tables.with_table(text, name, make()) == text, "run docs/make_tables.py"
 
 
-def test_the_shipped_script_is_valid(root: Path) -> None:
-    assert len(load_script(root / "scenes" / "scripts" / "press.yaml", (512, 512)).events) > 3
+def test_the_table_of_keys_has_their_limits() -> None:
+    whole = schema()
+    sections = [whole, *whole["$defs"].values()]
+    keys = [key for section in sections for key in section.get("properties", {}).values()]
+    for key in keys:
+        if key.get("type") in ("number", "integer"):
+            low, high = (key.get(bound) for bound in ("minimum", "maximum"))
+            if low is not None and 0 < low < 1e-20:
+                assert "above 0" in key["expects"], key
+            elif low == 0 and high > 1e20:
+                assert "0 or more" in key["expects"], key
+            else:
+                below = key.get("exclusiveMaximum")
+                limits = f"{low:g} to {high:g}" if below is None else f"from {low:g} to below {below:g}"
+                assert limits in key["expects"], key
 
 
-def test_the_python_shown_runs(root: Path, tmp_path: Path) -> None:
-    labels, first, second = blocks(root, "python")
+def test_all_parts_of_a_scene_are_exported() -> None:
+    sections = {
+        name for name, value in vars(scene).items() if isinstance(value, type) and issubclass(value, scene.Section)
+    }
+    assert sections - {"Section"} <= set(taichi_msm.__all__)
+
+
+def test_every_output_has_its_row() -> None:
+    results, labels = table(DOCS / "command-line.md", "outputs"), table(DOCS / "labels.md", "labels")
+    assert words(results) + words(labels) == list(OUTPUTS)
+
+
+def test_every_key_of_the_record_has_its_row() -> None:
+    assert sorted(words(table(DOCS / "command-line.md", "record"))) == sorted(get_type_hints(RunRecord))
+    assert words(table(DOCS / "error.md", "estimate")) == list(get_type_hints(ErrorRecord))
+
+
+def test_every_exit_code_has_its_row() -> None:
+    codes = {cli.DONE, cli.BUG, cli.WRONG_INPUT, cli.DIVERGED, cli.FILES, 130, 143}
+    assert [int(code) for cell in table(DOCS / "command-line.md", "exit codes") for code in cell.split(", ")] == sorted(
+        codes
+    )
+
+
+def test_every_format_has_its_row() -> None:
+    assert sorted(words(table(DOCS / "export.md", "formats"))) == sorted(FORMATS)
+
+
+def test_every_option_of_the_command_line_is_shown() -> None:
+    shown: dict[str, set[str]] = {}
+    for usage in re.split(r"\n(?=taichi-msm)", blocks(DOCS / "command-line.md", "text")[0]):
+        shown.setdefault(usage.split()[1], set()).update(re.findall(r"--[a-z-]+", usage))
+    for name, command in cli.program.commands.items():
+        options = {
+            option for param in command.params for option in (*param.opts, *param.secondary_opts) if option[0] == "-"
+        }
+        assert shown.get(name, set()) == options, name
+
+
+@pytest.mark.parametrize("page", [*WITH_COMMANDS, DOCS / "command-line.md"], ids=lambda page: page.stem)
+def test_every_command_is_understood(page: Path) -> None:
+    for name, *arguments in commands(page):
+        cli.program.commands[name].make_context(name, arguments)
+
+
+def test_the_commands_work(small_scenes: Path, program: Program) -> None:
+    for arguments in (arguments for page in WITH_COMMANDS for arguments in commands(page)):
+        opens_a_window = arguments[0] == "view" and "--record" not in arguments
+        needs_a_session = any("session-1" in word for word in arguments)
+        needs_vtk = "vtk" in arguments and importlib.util.find_spec("vtk") is None
+        if opens_a_window or needs_a_session or needs_vtk or arguments[0] == "study" or "--resume" in arguments:
+            continue
+        done = program(*arguments)
+        assert done.returncode == 0, (arguments, done.stderr)
+
+
+def test_the_shipped_script_is_valid() -> None:
+    assert len(load_script(ROOT / "scenes" / "scripts" / "press.yaml", (512, 512)).events) > 3
+
+
+def test_the_python_shown_runs(tmp_path: Path) -> None:
+    first, second = blocks(DOCS / "python.md", "python")
+    (labels,) = blocks(DOCS / "labels.md", "python")
     shown = "print(position.shape, picture.shape, record['status'])\n"
-    (tmp_path / "scenes").symlink_to(root / "scenes")
+    (tmp_path / "scenes").symlink_to(ROOT / "scenes")
     (tmp_path / "example.py").write_text(first + shown + second)
     done = subprocess.run([sys.executable, "example.py"], cwd=tmp_path, check=True, capture_output=True, text=True)
     shapes, result = done.stdout.splitlines()
@@ -61,12 +246,57 @@ def test_the_python_shown_runs(root: Path, tmp_path: Path) -> None:
     assert (tmp_path / "output" / "from-python" / "animation.gif").exists()
 
 
-def test_the_notebook_runs(
-    root: Path, device: Device, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    monkeypatch.chdir(root)
+# Those whose examples stand in their docstrings. The example of Playback reads what that of run writes.
+WITH_EXAMPLES = ["run", "Playback", "load_scene", "Scene"]
+
+
+@pytest.mark.parametrize("name", WITH_EXAMPLES)
+def test_the_example_of_a_docstring_gives_what_it_shows(name: str, examples_folder: Path) -> None:
+    tests = doctest.DocTestFinder(recurse=False).find(getattr(taichi_msm, name), name, globs={})
+    assert sum(len(test.examples) for test in tests) >= 3, f"{name} has no example"
+    for test in tests:
+        outcome = doctest.DocTestRunner().run(test)
+        assert outcome.failed == 0, f"the example of {name} fails; see above"
+
+
+def test_the_error_in_the_readme_is_that_of_the_run(device: Device, tmp_path: Path) -> None:
+    (line,) = read(README).split("<!-- error: checked by tests/test_docs.py -->\n```text\n")[1].splitlines()[:1]
+    press = load_scene(ROOT / "scenes" / "press.yaml", {"output": []})
+    record = run(press, tmp_path / "press", threads=device.threads, estimate_error=True)
+    assert line in record["notes"]
+    rows, cols = record["points"]
+    assert f"{record['steps']:,} steps of {rows} × {cols} points and {press.time.frames + 1} pictures" in read(README)
+
+
+def test_the_speed_in_the_readme_is_that_of_the_page() -> None:
+    def measured(section: str, name: str, column: int) -> str:
+        part = read(DOCS / "performance.md").split(f"\n## {section}\n")[1]
+        row = next(line for line in part.splitlines() if line.startswith(f"| {name} "))
+        value, unit = re.match(r" *([\d.]+) ?(\w*)", row.split("|")[column + 1]).groups()  # type: ignore[union-attr]
+        return f"{float(value):.{max(2, len(value.split('.')[0]))}g} {unit.replace('us', 'µs') or 's'}"
+
+    warm, cold = (measured("The whole run", name, 1) for name in ("warm", "cold"))
+    ours, cpp, numba, numpy = (
+        measured("Stepping", name, 2) for name in ("taichi_msm", "C++, OpenMP", "Numba", "NumPy")
+    )
+    lit, opengl = (measured("Drawing", name, 1) for name in ("taichi_msm", "moderngl"))
+    said = " ".join(read(README).split())
+    assert f"takes {warm}, and {cold} the first time" in said
+    assert f"takes {ours}, the same in C++ with OpenMP {cpp}, in Numba {numba} and in NumPy {numpy}." in said
+    assert f"512 × 512 pixels takes {lit}, by OpenGL on the same cores {opengl}." in said
+
+
+def test_the_citation_is_of_this_version() -> None:
+    citation = yaml.safe_load(read(ROOT / "CITATION.cff"))
+    assert citation["cff-version"] == "1.2.0"
+    assert citation["version"] == taichi_msm.__version__
+    assert citation["references"][0]["title"] in read(README)
+
+
+def test_the_notebook_runs(device: Device, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+    monkeypatch.chdir(ROOT)
     monkeypatch.setattr(resources, "available_threads", lambda: device.threads)
-    notebook = json.loads((root / "docs" / "notebooks" / "closed-loop.ipynb").read_text(encoding="utf-8"))
+    notebook = json.loads(read(DOCS / "notebooks" / "closed-loop.ipynb"))
     cells = ["".join(cell["source"]) for cell in notebook["cells"] if cell["cell_type"] == "code"]
     names: dict[str, Any] = {}
     pages = []
@@ -87,27 +317,13 @@ def test_the_notebook_runs(
 
 
 @pytest.mark.parametrize("name", SCENES)
-def test_shipped_scenes_are_valid(name: str, root: Path) -> None:
-    scene = load_scene(root / "scenes" / f"{name}.yaml")
-    assert scene.time.frames >= 25
+def test_shipped_scenes_are_valid(name: str) -> None:
+    shipped = load_scene(ROOT / "scenes" / f"{name}.yaml")
+    assert shipped.time.frames >= 25
 
 
-def test_every_link_of_the_readme_leads_somewhere(root: Path) -> None:
-    def anchors(path: Path) -> set[str]:
-        titles = re.findall(r"^#+ (.*)$", path.read_text(encoding="utf-8"), flags=re.MULTILINE)
-        return {title.lower().replace(" ", "-") for title in titles}
-
-    readme = root / "README.md"
-    links = [link for link in re.findall(r"\]\(([^)]+)\)", readme.read_text(encoding="utf-8")) if "://" not in link]
-    assert links
-    for link in links:
-        name, _, anchor = link.partition("#")
-        assert (root / name).exists(), link
-        assert not anchor or anchor in anchors(root / (name or "README.md")), link
-
-
-def test_every_promise_has_its_test(root: Path) -> None:
-    named = re.findall(r"`(tests/\w+\.py)::(\w+)`", (root / "docs" / "trust.md").read_text(encoding="utf-8"))
+def test_every_promise_has_its_test() -> None:
+    named = re.findall(r"`(tests/\w+\.py)::(\w+)`", read(DOCS / "trust.md"))
     assert named
     for file, test in named:
-        assert f"\ndef {test}(" in (root / file).read_text(encoding="utf-8"), test
+        assert f"\ndef {test}(" in read(ROOT / file), test

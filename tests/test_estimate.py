@@ -17,13 +17,12 @@ from taichi_msm.physics.planning import on
 from taichi_msm.physics.run_progress import RunProgress
 from taichi_msm.physics.solver import Dynamics
 from taichi_msm.physics.timestep import with_time
-from taichi_msm.physics.warnings import notes
 from taichi_msm.physics.workload import affords_pilots
 from taichi_msm.progress import Pause
 from taichi_msm.results.record import RunRecord
 from taichi_msm.scene import Scene
 from taichi_msm.system.runtime import Device
-from tests.motion import true_error
+from tests.motion import notes_of, true_error
 from tests.scenes import PRESS, plan_of, scene
 from tests.test_resume import Stop
 
@@ -70,7 +69,7 @@ def test_an_estimate_can_be_left_out_or_asked_for(small: Path, device: Device, m
     record = run(made, "out", threads=device.threads, estimate_error=False)
     assert (record["error_estimate"], record["error_estimate_reason"]) == (None, "not asked for")
     assert "pilot" not in record["timings"]
-    monkeypatch.setattr(pilots, "affords_pilots", lambda scene, grid, steps: False)
+    monkeypatch.setattr(pilots, "affords_pilots", lambda plan, steps: False)
     record = run(made, "out", threads=device.threads)
     assert record["error_estimate"] is None
     assert record["error_estimate_reason"].startswith("it would take more than two fifths of the run")
@@ -101,7 +100,7 @@ def test_a_run_that_is_wrong_says_what_helps() -> None:
     from taichi_msm.physics.error_control import Estimate
 
     def said(error: float, rounding: float, in_f64: float) -> list[str]:
-        return list(notes(plan_of(scene()), (), MOVED, Estimate(10, error, rounding, in_f64, 2)))
+        return notes_of(scene(), MOVED, Estimate(10, error, rounding, in_f64, 2))
 
     assert len(said(0.009, 0.0, 0.009)) == 1
     (_, step) = said(0.04, 0.0, 0.04)
@@ -190,7 +189,7 @@ def test_a_finer_pilot_follows_an_error_that_matters(
     error = true_error(plan_of(made), device, fine=32)
     # Twice the next power of h, as in tests/test_accuracy.py.
     assert told(record) == pytest.approx(error, rel=1 / 12)
-    monkeypatch.setattr(pilots, "affords_pilots", lambda scene, grid, steps: steps < 1)
+    monkeypatch.setattr(pilots, "affords_pilots", lambda plan, steps: steps < 1)
     record = run(made, "out", threads=device.threads)
     found = record["error_estimate"]
     assert found is not None
@@ -230,7 +229,7 @@ def test_beside_f32_a_coarse_pilot_of_order_1_tells_a_bound(small: Path, device:
 def test_beside_f32_a_coarse_pilot_tells_a_bound(
     small: Path, device: Device, monkeypatch: pytest.MonkeyPatch, taken: list[int]
 ) -> None:
-    monkeypatch.setattr(pilots, "affords_pilots", lambda scene, grid, steps: steps < 1)
+    monkeypatch.setattr(pilots, "affords_pilots", lambda plan, steps: steps < 1)
     made = load_scene("small.yaml", [*WRONG, "time.precision=f32"])
     record = run(made, "out", threads=device.threads)
     steps = math.prod(made.sheet.points) * record["steps"]

@@ -19,7 +19,8 @@ from taichi_msm.errors import FilesError
 from taichi_msm.export.convert import convert
 from taichi_msm.export.kitti import encode
 from taichi_msm.export.png16 import png16
-from taichi_msm.results.flo import read_flo
+from taichi_msm.outputs.flo import read_flo
+from taichi_msm.results.finished_run import reading
 from tests.outputs import files
 
 WIDTH, HEIGHT, PAIRS = 40, 30, 4
@@ -170,7 +171,7 @@ def test_damaged_flow_is_one_line(data: bytes, tmp_path: Path) -> None:
     path.write_bytes(whole_flow())
     assert read_flo(path, (WIDTH, HEIGHT)).shape == (HEIGHT, WIDTH, 2)
     path.write_bytes(data)
-    with pytest.raises(FilesError) as caught:
+    with pytest.raises(FilesError) as caught, reading(path):
         read_flo(path, (WIDTH, HEIGHT))
     assert str(caught.value) == f"{path}: damaged, or not of this run; run the scene again"
 

@@ -22,7 +22,6 @@ from PIL import Image
 from taichi_msm.errors import FilesError
 from taichi_msm.render.labels import Observed
 from taichi_msm.results.encoder import Encoder, Job, encode
-from taichi_msm.results.folder import Folder
 from taichi_msm.results.writer import ResultWriter
 from taichi_msm.scene import Scene
 from tests.outputs import files
@@ -207,9 +206,8 @@ def test_an_encoder_in_a_hurry_takes_no_more_pictures(tmp_path: Path) -> None:
                 hurry.set()
             return data
 
-    with Folder.at(tmp_path) as folder:
-        job = Job(folder, (30, 20), 25.0, png=True, gif=True, background=(0, 0, 0))
-        frames = encode(job, Pictures(b"".join(one.tobytes() for one in shown)), hurry).frames
+    job = Job(tmp_path, (30, 20), 25.0, png=True, gif=True, background=(0, 0, 0))
+    frames = encode(job, Pictures(b"".join(one.tobytes() for one in shown)), hurry).frames
     assert frames <= 4
     assert sorted(path.name for path in (tmp_path / "frames").glob("*")) == [f"000{n}.png" for n in range(frames)]
 
@@ -296,14 +294,14 @@ def full_disk(*_: object, **__: object) -> None:
     raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
 
 
-@pytest.mark.parametrize("target", ["create", "write"])
+@pytest.mark.parametrize("target", ["checkpoint.create", "checkpoint.replacing", "writer.add"])
 def test_a_full_disk_is_one_line_and_changes_nothing(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, target: str
 ) -> None:
-    """When the positions are written, or the marker."""
+    """When the positions are written, the manifest or the record."""
     write(tmp_path, 3, small_scene())
     before = files(tmp_path)
-    monkeypatch.setattr(Folder, target, full_disk)
+    monkeypatch.setattr(f"taichi_msm.results.{target}", full_disk)
     with pytest.raises(FilesError) as told:
         write(tmp_path, 2, small_scene())
     assert str(told.value) == (
@@ -371,9 +369,7 @@ def test_what_stops_the_encoder_is_told(tmp_path: Path) -> None:
     def block(_: ResultWriter) -> None:
         (tmp_path / ".partial" / "new" / "frames").write_text("in the way")
 
-    assert refused(tmp_path, block) == (
-        f"{tmp_path}/.partial/new/frames: a file that no run has put there; move it away or choose another folder"
-    )
+    assert refused(tmp_path, block) == f"{tmp_path}: cannot write: File exists; choose another --out"
     assert (tmp_path / ".partial" / "new" / "frames").read_text() == "in the way"
 
 

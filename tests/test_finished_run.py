@@ -48,7 +48,7 @@ def test_a_run_is_read_as_it_was(ran: Path) -> None:
     np.testing.assert_array_equal(positions, written["position"])
     np.testing.assert_array_equal(run.time, written["time"])
     assert run.scene.time.precision == "f64"
-    assert run.result("frames/0004.png", "png") == ran / "frames" / "0004.png"
+    assert run.result("png", 4) == ran / "frames" / "0004.png"
 
 
 def test_pictures_are_found_from_where_the_run_was(results: Path) -> None:
@@ -80,12 +80,12 @@ def test_what_is_missing_is_named_with_the_remedy(results: Path) -> None:
         run.positions()
     assert str(caught.value) == f'trajectory.npz: {missing}; {again}]"'
     with pytest.raises(FilesError) as caught:
-        run.result("flow/0000.flo", "flow")
+        run.result("flow")
     assert str(caught.value) == f'flow: {missing}; {again},flow]"'
     with pytest.raises(FilesError) as caught:
-        run.result("frames/0003.png", "png")
+        run.result("png", 3)
     assert str(caught.value) == f'{results / "frames" / "0003.png"}: no such file; {again}]"'
-    assert run.has("frames")
+    assert run.has("png")
     assert not run.has("flow")
 
 

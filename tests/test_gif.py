@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+from contextlib import closing
 from pathlib import Path
 from typing import NamedTuple
 
@@ -9,7 +10,7 @@ from numpy.typing import NDArray
 from PIL import Image
 from scipy.spatial import cKDTree
 
-from taichi_msm.results.gif import LONGEST, SHORTEST, TRANSPARENT, GifWriter, Palette
+from taichi_msm.outputs.gif import LONGEST, SHORTEST, TRANSPARENT, GifWriter, Palette
 from tests.scenes import speckle
 
 Picture = NDArray[np.uint8]
@@ -31,7 +32,7 @@ def grey(number: int) -> Picture:
 
 def write(path: Path, pictures: list[Picture], rate: float, palette: Palette) -> None:
     height, width, _ = pictures[0].shape if pictures else (HEIGHT, WIDTH, 3)
-    with GifWriter(path.open("wb"), (width, height), rate, palette) as gif:
+    with closing(GifWriter(path.open("wb"), (width, height), rate, palette)) as gif:
         for picture in pictures:
             gif.add(picture)
 

@@ -13,14 +13,14 @@ from PIL import Image
 
 from taichi_msm import ArgumentError, FilesError, Playback, Simulation, resume, run
 from taichi_msm.render.instrument import rods
-from taichi_msm.scene import PIXEL_LABELS, Scene
+from taichi_msm.scene import Scene
 from taichi_msm.scenefile.load import load_scene
 from taichi_msm.system.runtime import Device
 from tests.outputs import files, results
 from tests.reference import labels as twin
 from tests.test_resume import interrupted, published
 
-ALL = f"output=[png, {', '.join(PIXEL_LABELS)}, tracks, trajectory]"
+ALL = "output=[png, coordinates, depth, flow, occlusion, instrument, tracks, trajectory]"
 OBLIQUE = "render.camera=oblique"
 ROD = "probes.0.instrument={radius: 0.01, shaft: [1, -0.5, 0.6], length: 0.2}"
 

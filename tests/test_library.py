@@ -12,6 +12,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from PIL import Image
 
 import taichi_msm
 from taichi_msm import (
@@ -49,9 +50,11 @@ def simulation(device: Device) -> Iterator[Simulation]:
 
 def test_what_is_exported_is_there_and_nothing_else() -> None:
     for name in taichi_msm.__all__:
-        assert getattr(taichi_msm, name).__name__ == name
+        exported = getattr(taichi_msm, name)
+        assert exported.__name__ == name
+        assert exported.__doc__
     assert (Path(taichi_msm.__file__).parent / "py.typed").exists()
-    with pytest.raises(AttributeError):
+    with pytest.raises(AttributeError, match="no attribute 'nothing'"):
         taichi_msm.nothing  # noqa: B018
 
 
@@ -178,6 +181,26 @@ def test_restarted_it_is_a_new_simulation(simulation: Simulation, device: Device
     assert simulation.scene == other
 
 
+def test_restarted_it_reads_its_picture_again_where_it_would_look_different(device: Device, tmp_path: Path) -> None:
+    # Nothing of the picture hides the background.
+    Image.new("RGBA", (8, 8)).save(tmp_path / "clear.png")
+    colours = [(0, 0, 0), (200, 0, 0)]
+    first, second = (
+        scene(image=str(tmp_path / "clear.png"), render={"size": [40, 30], "background": colour}) for colour in colours
+    )
+    with Simulation(first, threads=device.threads) as simulation:
+        assert (simulation.draw() == colours[0]).all()
+        simulation.restart(second)
+        assert (simulation.draw() == colours[1]).all()
+
+
+def test_a_tool_that_gets_an_instrument_is_drawn_with_it(simulation: Simulation) -> None:
+    bare = simulation.draw()
+    probe = simulation.scene.probes[0]
+    simulation.steer([probe.model_copy(update={"instrument": {"radius": 0.02, "shaft": [0, 0, 1], "length": 0.1}})])
+    assert (simulation.draw() != bare).any()
+
+
 def test_velocities_are_the_mean_of_the_last_step(simulation: Simulation) -> None:
     assert not simulation.velocities().any()
     simulation.advance(2)
@@ -258,6 +281,7 @@ def test_all_errors_are_ours(simulation: Simulation) -> None:
     for call in (*calls, simulation.save):
         with pytest.raises(MsmError, match="this simulation is closed"):
             call()
+    assert np.isfinite(simulation.positions()).all()
 
 
 @pytest.mark.parametrize("threads", [0, -1, 10**6, True, 1.5, "2"])

@@ -14,8 +14,8 @@ import pytest
 
 from taichi_msm.errors import FilesError
 from taichi_msm.render.labels import Observed
+from taichi_msm.results.checkpoint import MANIFEST, is_unfinished
 from taichi_msm.results.manifest import read_manifest
-from taichi_msm.results.publication import MANIFEST, is_unfinished
 from taichi_msm.results.writer import ResultWriter
 from taichi_msm.scene import Scene
 from tests.scenes import scene, scene_and_grid, speckle
@@ -111,11 +111,15 @@ PLANTED = {
     "the lock never ends": (link(".partial/lock", "/dev/zero"), ".partial/lock: a symbolic link"),
     "the lock is a pipe": (pipe(".partial/lock"), ".partial/lock: a pipe or a device"),
     "the lock is a device": (device(".partial/lock"), ".partial/lock: a pipe or a device"),
-    "the marker is a pipe": (pipe(".partial/complete"), ".partial/complete: a pipe or a device"),
-    "the marker leads elsewhere": (link(".partial/complete", "notes.txt"), ".partial/complete: a symbolic link"),
-    "the marker names what is elsewhere": (
-        file(".partial/complete", "../../treasure/notes.txt\nrun.json"),
-        ".partial/complete is damaged",
+    "the whole results lead elsewhere": (link(".partial/whole"), ".partial/whole: a symbolic link"),
+    "the record of whole results is a pipe": (pipe(".partial/whole/run.json"), "whole/run.json: a pipe or a device"),
+    "the record of whole results names what is elsewhere": (
+        file(".partial/whole/run.json", '{"outputs": "../../treasure/notes.txt"}'),
+        "whole/run.json is damaged",
+    ),
+    "the earlier record leads elsewhere": (
+        link(".partial/earlier.json", "notes.txt"),
+        ".partial/earlier.json: a symbolic link",
     ),
     "the new results lead elsewhere": (link(".partial/new"), ".partial/new: a symbolic link"),
     "the new frames lead elsewhere": (link(".partial/new/frames"), ".partial/new/frames: a symbolic link"),
@@ -202,22 +206,6 @@ def test_a_checkpoint_whose_file_has_another_name(name: str, treasure: Path) -> 
         write(treasure.parent / "out", resumes=True)
     assert snapshot(treasure) == precious
     write(treasure.parent / "out")
-    assert snapshot(treasure) == precious
-
-
-def test_a_folder_exchanged_for_a_link_meanwhile(treasure: Path) -> None:
-    """What is open stays where it is: nothing that follows goes elsewhere."""
-    out, aside = treasure.parent / "out", treasure.parent / "aside"
-    precious, made = snapshot(treasure), small_scene()
-    with ResultWriter(out, *scene_and_grid(made), {}) as writer:
-        writer.add(np.zeros((3, 4, 3)), Observed(speckle(6, 8, 0)))
-        shutil.move(out / ".partial", aside)
-        (out / ".partial").symlink_to(treasure)
-        (out / "frames").symlink_to(treasure)
-        for frame in range(1, made.time.frames + 1):
-            writer.add(np.zeros((3, 4, 3)), Observed(speckle(6, 8, frame)))
-        with pytest.raises(FilesError, match="frames: a symbolic link"):
-            writer.publish({"status": "complete"})
     assert snapshot(treasure) == precious
 
 

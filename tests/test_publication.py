@@ -2,22 +2,32 @@ from __future__ import annotations
 
 import json
 import os
+import re
 import shutil
 import subprocess
 import sys
 from collections.abc import Collection
 from pathlib import Path
+from typing import BinaryIO
 
 import pytest
 
 from taichi_msm.errors import FilesError, ForeignError
-from taichi_msm.results.folder import Folder, Tree
-from taichi_msm.results.publication import Publication, is_result
-from taichi_msm.results.sealed import seal
+from taichi_msm.outputs.table import PATTERNS
+from taichi_msm.results.publication import Publication
+from taichi_msm.results.whole import lock
+from taichi_msm.results.writer import RUN
 
-OLD = ["frames/0000.png", "frames/0001.png", "frames/0002.png", "animation.gif", "run.json"]
-NEW = ["frames/0000.png", "frames/0001.png", "frames/0003.png", "trajectory.npz", "run.json"]
-FOREIGN = ["notes.txt", "frames/notes.txt", "frames/0000 copy.png", "frames/12.png", "a/frames/0000.png"]
+OLD = ["frames/0000.png", "frames/0001.png", "frames/0002.png", "flow/0000.flo", "animation.gif", "run.json"]
+NEW = ["frames/0000.png", "frames/0001.png", "trajectory.npz", "run.json"]
+FOREIGN = [
+    "notes.txt",
+    "frames/notes.txt",
+    "frames/0000 copy.png",
+    "frames/12.png",
+    "frames/00001.png",
+    "a/frames/0000.png",
+]
 
 # For every number n that it reads it forks a process that publishes files and dies before the n-th operation on a path,
 # or ends well where there are fewer, and tells how it ended.
@@ -39,7 +49,7 @@ for line in sys.stdin:
     left = int(line)
     process = os.fork()
     if not process:
-        for name in ("open", "mkdir", "replace", "unlink", "rmdir"):
+        for name in ("open", "mkdir", "rename", "replace", "unlink", "rmdir"):
             setattr(os, name, mortal(getattr(os, name)))
         publish(Path(sys.argv[1]), sys.argv[2:])
         os._exit(0)
@@ -49,24 +59,24 @@ for line in sys.stdin:
 
 def write(directory: Path, names: Collection[str], text: str) -> None:
     """Write files, and in the record what there is."""
-    outputs = sorted({"frames" if "/" in name else name for name in names})
+    outputs = sorted({name.partition("/")[0] for name in names})
+    record = {"outputs": outputs, "frames": sum(name.startswith("frames/") for name in names), "text": text}
     for name in names:
         (directory / name).parent.mkdir(parents=True, exist_ok=True)
-        record = {"outputs": outputs, "frames": 100, "text": text}
         (directory / name).write_text(json.dumps(record) if name == "run.json" else text)
 
 
 def publish(directory: Path, names: Collection[str]) -> None:
-    with Publication(directory, names) as publication:
-        write(publication.staged.path, names, "new")
+    with Publication(directory, RUN, names) as publication:
+        write(publication.staged, names, "new")
         publication.publish(names)
 
 
 def contents(directory: Path) -> dict[str, str]:
     """The results, the record by its text."""
     paths = {str(path.relative_to(directory)): path for path in sorted(directory.rglob("*"))}
-    found = {name: path.read_text() for name, path in paths.items() if is_result(name)}
-    return {name: json.loads(text)["text"] if name == "run.json" else text for name, text in found.items()}
+    texts = {name: path.read_text() for name, path in paths.items() if re.fullmatch("|".join(PATTERNS), name)}
+    return {name: json.loads(text)["text"] if name == "run.json" else text for name, text in texts.items()}
 
 
 def expected(names: list[str], text: str) -> dict[str, str]:
@@ -88,8 +98,8 @@ def assert_tidy(directory: Path) -> None:
 
 
 def test_new_results_take_the_place_of_all_old_ones(directory: Path) -> None:
-    with Publication(directory) as publication:
-        write(publication.staged.path, NEW, "new")
+    with Publication(directory, RUN) as publication:
+        write(publication.staged, NEW, "new")
         assert contents(directory) == expected(OLD, "old")
         publication.publish(NEW)
         assert contents(directory) == expected(NEW, "new")
@@ -98,29 +108,29 @@ def test_new_results_take_the_place_of_all_old_ones(directory: Path) -> None:
 
 
 def test_leaving_without_publishing_changes_nothing(directory: Path) -> None:
-    with Publication(directory) as publication:
-        write(publication.staged.path, NEW, "new")
+    with Publication(directory, RUN) as publication:
+        write(publication.staged, NEW, "new")
     assert contents(directory) == expected(OLD, "old")
     assert_tidy(directory)
 
 
 def test_a_directory_made_for_nothing_goes(tmp_path: Path) -> None:
-    with Publication(tmp_path / "out" / "press"):
+    with Publication(tmp_path / "out" / "press", RUN):
         assert (tmp_path / "out" / "press").is_dir()
     assert not (tmp_path / "out" / "press").exists()
     assert tmp_path.exists()
 
 
 def test_an_empty_directory_of_the_user_stays(tmp_path: Path) -> None:
-    with Publication(tmp_path):
+    with Publication(tmp_path, RUN):
         pass
     assert list(tmp_path.iterdir()) == []
 
 
 def test_frames_that_are_not_wanted_go_with_their_directory(tmp_path: Path) -> None:
     write(tmp_path, OLD, "old")
-    with Publication(tmp_path, ["run.json"]) as publication:
-        write(publication.staged.path, ["run.json"], "new")
+    with Publication(tmp_path, RUN, ["run.json"]) as publication:
+        write(publication.staged, ["run.json"], "new")
         publication.publish(["run.json"])
     assert [path.name for path in tmp_path.iterdir()] == ["run.json"]
 
@@ -135,7 +145,6 @@ def test_killed_at_any_moment_the_results_are_all_old_or_all_new(directory: Path
         for moment in range(100):
             write(directory, OLD, "old")
             (directory / "trajectory.npz").unlink(missing_ok=True)
-            (directory / "frames/0003.png").unlink(missing_ok=True)
             print(moment, file=parent.stdin, flush=True)
             status = int(parent.stdout.readline())
             if status == 0:
@@ -145,30 +154,30 @@ def test_killed_at_any_moment_the_results_are_all_old_or_all_new(directory: Path
                 # Where there is a record, results are whole without the help of a next run.
                 assert contents(directory) in (expected(OLD, "old"), expected(NEW, "new"))
             else:
-                assert (directory / ".partial" / "complete").exists()
-            with Publication(directory):
+                assert (directory / ".partial" / "whole" / "run.json").exists()
+            with Publication(directory, RUN):
                 pass
             found = contents(directory)
             assert found in (expected(OLD, "old"), expected(NEW, "new")), f"killed before operation {moment}"
             outcomes.append(found["run.json"])
             assert_tidy(directory)
     assert status == 0
-    # Once new, always new: all operations but those before the marker roll forward.
+    # Once new, always new: all operations but those before the new files are renamed roll forward.
     assert outcomes == sorted(outcomes, reverse=True)
-    assert outcomes.count("old") > 10
+    assert outcomes.count("old") > 5
     assert outcomes.count("new") > 10
 
 
 @pytest.mark.skipif(sys.platform == "win32", reason="no lock")
 def test_a_second_run_is_refused_until_the_first_ends(directory: Path) -> None:
-    with Publication(directory) as first:
-        write(first.staged.path, NEW, "new")
-        with pytest.raises(FilesError) as refused, Publication(directory):
+    with Publication(directory, RUN) as first:
+        write(first.staged, NEW, "new")
+        with pytest.raises(FilesError) as refused, Publication(directory, RUN):
             pass
         assert str(refused.value) == f"{directory}: another run is writing there; choose another --out"
         first.publish(NEW)
     assert contents(directory) == expected(NEW, "new")
-    with Publication(directory):
+    with Publication(directory, RUN):
         pass
     assert_tidy(directory)
 
@@ -188,79 +197,63 @@ def test_the_lock_of_a_directory_that_was_removed_is_no_lock(directory: Path, mo
         flock(file, operation)
 
     monkeypatch.setattr(fcntl, "flock", late)
-    with Publication(directory):
+    with Publication(directory, RUN):
         assert len(opened) == 2
         monkeypatch.undo()
-        with pytest.raises(FilesError), Publication(directory):
+        with pytest.raises(FilesError), Publication(directory, RUN):
             pass
 
 
 def test_what_a_killed_run_left_is_cleared(directory: Path) -> None:
-    write(directory / ".partial", ["lock", "draft", "new/frames/0000.png"], "stale")
-    with Publication(directory) as publication:
-        assert list(publication.staged.entries()) == []
+    write(directory / ".partial", ["lock", "earlier.json", "new/frames/0000.png", "whole/frames/0000.png"], "stale")
+    with Publication(directory, RUN) as publication:
+        assert list(publication.staged.iterdir()) == []
     assert contents(directory) == expected(OLD, "old")
     assert_tidy(directory)
 
 
 def test_a_staged_file_that_is_taken_away_is_missed(directory: Path) -> None:
-    with Publication(directory, NEW) as publication:
-        write(publication.staged.path, NEW, "new")
-        (publication.staged.path / "frames" / "0001.png").unlink()
+    with Publication(directory, RUN, NEW) as publication:
+        write(publication.staged, NEW, "new")
+        (publication.staged / "frames" / "0001.png").unlink()
         with pytest.raises(FilesError, match=r"new/frames/0001\.png was removed during the run; run it again"):
             publication.publish(NEW)
     assert contents(directory) == expected(OLD, "old")
     assert_tidy(directory)
 
 
-def test_a_damaged_marker_publishes_nothing(directory: Path) -> None:
-    """Neither does one whose names lead elsewhere."""
-    (directory.parent / "payload").write_text("mine")
-    write(directory / ".partial" / "new", NEW, "new")
-    whole = seal({"names": NEW, "earlier": {}})
-    for damaged in (whole.replace(b"0001", b"0002"), whole + b" ", b"", b"../payload"):
-        (directory / ".partial" / "complete").write_bytes(damaged)
+def test_new_files_with_a_damaged_record_are_not_published(directory: Path) -> None:
+    write(directory / ".partial" / "whole", NEW, "new")
+    for damaged in ("", "[]", '{"outputs": 3, "frames": 2}', '{"outputs": ["frames"], "frames": 1e999}'):
+        (directory / ".partial" / "whole" / "run.json").write_text(damaged)
         with (
-            pytest.raises(FilesError, match=r"/complete is damaged; remove .*/\.partial and run"),
-            Publication(directory),
+            pytest.raises(FilesError, match=r"/whole/run\.json is damaged; remove .*/\.partial and run"),
+            Publication(directory, RUN),
         ):
             pass
         assert contents(directory) == expected(OLD, "old")
-    (directory / ".partial" / "complete").write_bytes(seal({"names": ["../payload"], "earlier": {"../payload": [1]}}))
-    with Publication(directory):
-        pass
-    assert contents(directory) == expected(OLD, "old")
-    assert (directory.parent / "payload").read_text() == "mine"
 
 
-def test_a_marker_that_was_made_up_takes_no_file_of_the_user(tmp_path: Path) -> None:
-    """It may name them, but it cannot know them."""
-    mine = ["animation.gif", "trajectory.npz", "frames/0000.png"]
-    write(tmp_path, mine, "mine")
-    write(tmp_path / ".partial" / "new", ["run.json"], "new")
-    known = {name: [1, 4, 0] for name in mine}
-    (tmp_path / ".partial" / "complete").write_bytes(seal({"names": ["run.json"], "earlier": known}))
-    with Publication(tmp_path):
+def test_new_files_that_were_made_up_take_no_file_of_the_user(tmp_path: Path) -> None:
+    write(tmp_path, ["animation.gif", "trajectory.npz", "frames/0000.png"], "mine")
+    write(tmp_path / ".partial" / "whole", ["animation.gif", "run.json"], "new")
+    with (
+        pytest.raises(ForeignError, match=r"/animation\.gif: a file that no run has put there"),
+        Publication(tmp_path, RUN),
+    ):
         pass
-    assert contents(tmp_path) == {**expected(mine, "mine"), "run.json": "new"}
-    write(tmp_path / ".partial" / "new", ["animation.gif", "run.json"], "newer")
-    (tmp_path / ".partial" / "complete").write_bytes(seal({"names": ["animation.gif", "run.json"], "earlier": known}))
-    with pytest.raises(ForeignError, match=r"/animation\.gif: a file that no run has put there"), Publication(tmp_path):
-        pass
-    assert contents(tmp_path) == {**expected(mine, "mine"), "run.json": "new"}
+    assert contents(tmp_path) == expected(["animation.gif", "trajectory.npz", "frames/0000.png"], "mine")
 
 
 def test_a_directory_that_is_removed_when_it_was_opened_is_no_endless_loop(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    require_only = Folder.require_only
-
-    def remove(folder: Folder, tree: Tree) -> None:
-        require_only(folder, tree)
+    def remove(path: Path) -> BinaryIO:
         shutil.rmtree(tmp_path / "out", ignore_errors=True)
+        return lock(path)
 
-    monkeypatch.setattr(Folder, "require_only", remove)
-    with pytest.raises(FileNotFoundError), Publication(tmp_path / "out"):
+    monkeypatch.setattr("taichi_msm.results.publication.lock", remove)
+    with pytest.raises(FileNotFoundError), Publication(tmp_path / "out", RUN):
         pass
 
 

@@ -21,8 +21,7 @@ from PIL import Image
 
 from taichi_msm import FilesError, resume, run, runner
 from taichi_msm.physics import solver
-from taichi_msm.results.checkpoint import Checkpoint
-from taichi_msm.results.publication import MANIFEST, POSITIONS, STATE
+from taichi_msm.results.checkpoint import MANIFEST, POSITIONS, STATE, Checkpoint
 from taichi_msm.results.record import RunRecord
 from taichi_msm.scene import Scene
 from taichi_msm.scenefile.load import load_scene

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import taichi_msm
-from taichi_msm import DivergedError, MsmError, Simulation, runner
+from taichi_msm import DivergedError, Simulation, runner
 from taichi_msm.system import resources
 from taichi_msm.system.compiler import chosen
 from taichi_msm.system.runtime import Device
@@ -66,35 +66,9 @@ def test_a_sheet_that_nothing_holds_may_fly_away(device: Device) -> None:
         np.testing.assert_allclose(simulation.positions()[..., 2], 16.0, rtol=1e-12)
 
 
-def test_a_closed_simulation_says_so(device: Device) -> None:
-    with Simulation(scene(), threads=device.threads) as simulation:
-        simulation.advance()
-    assert np.isfinite(simulation.positions()).all()
-    with pytest.raises(MsmError, match="closed"):
-        simulation.advance()
-    with pytest.raises(MsmError, match="closed"):
-        simulation.draw()
-
-
-@pytest.mark.parametrize("frames", [-1, 1.5])
-def test_frames_are_counted(frames: int, device: Device) -> None:
-    with (
-        Simulation(scene(), threads=device.threads) as simulation,
-        pytest.raises(ValueError, match="take a whole number, 0 or more"),
-    ):
-        simulation.advance(frames)
-
-
 def test_one_device_a_process(device: Device) -> None:
     with pytest.raises(taichi_msm.DeviceError, match=f"{chosen().title} already runs on cpu with 2 threads"):
         Simulation(scene(), threads=device.threads + 1)
-
-
-def test_the_names_of_the_api() -> None:
-    for name in taichi_msm.__all__:
-        assert getattr(taichi_msm, name).__doc__
-    with pytest.raises(AttributeError, match="no attribute 'simulate'"):
-        taichi_msm.simulate  # noqa: B018
 
 
 def test_the_encoder_has_a_core_of_its_own_while_it_works(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -398,7 +398,7 @@ def test_a_file_in_the_place_of_the_directory_is_told(tmp_path: Path) -> None:
     out.write_text("a file")
     with pytest.raises(FilesError) as caught:
         write_report(realistic(), out)
-    assert str(caught.value) == f"{out}: cannot write: File exists; choose another --out"
+    assert str(caught.value) == f"{out}: cannot write: Not a directory; choose another --out"
     assert out.read_text() == "a file"
 
 

@@ -532,7 +532,7 @@ def test_points_for_which_a_given_step_is_too_long_are_refused(load: Any, device
 )
 def test_a_tool_that_does_not_act_as_a_whole_is_told_of(setting: str, told: str, load: Any) -> None:
     def notes(made: Scene) -> list[str]:
-        return list(probe_force.notes(made, probe_force.probe_records(made)))
+        return list(probe_force.force_notes(made, probe_force.probe_records(made)))
 
     assert not notes(load())
     (said,) = notes(load(setting))

@@ -1,59 +1,36 @@
-"""The export formats by name: the files of each, and the function that writes them; and how they are published."""
+"""The formats of `export`. A new one is a row of this table, and a module of its name with a function `write`."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from typing import Any, NamedTuple
-
-from taichi_msm.export import gltf, kitti, obj, tapvid, vtk
-from taichi_msm.progress import Count
-from taichi_msm.results.finished_run import FinishedRun
-from taichi_msm.results.folder import Folder, Tree, allows
-from taichi_msm.results.publication import Kind
+from typing import NamedTuple
 
 
 class Format(NamedTuple):
-    """An export format.
+    """An export format."""
 
-    Attributes:
-        needs: the entries of a scene's `output` that it is made from.
-        uses: further entries of which it would have more.
-        files: the files in its folder, as patterns of names.
-        write: writes the files of a run into an empty folder, reports its progress, and returns what the user should
-            know about the files.
-    """
-
-    needs: tuple[str, ...]
-    uses: tuple[str, ...]
-    files: Tree
-    write: Callable[[FinishedRun, Folder, Count], list[str]]
+    means: str  # what it is for, in few words
+    needs: tuple[str, ...]  # the entries of a scene's `output` that it is made from
+    files: tuple[str, ...]  # their names as regular expressions, for `entries.files`
+    uses: tuple[str, ...] = ()  # further entries of `output`, of which it would have more
 
 
 FORMATS = {
-    "kitti": Format(("flow",), ("occlusion", "png"), kitti.FILES, kitti.write_kitti),
-    "tapvid": Format(("tracks", "png"), (), tapvid.FILES, tapvid.write_tapvid),
-    "vtk": Format(("trajectory",), (), vtk.FILES, vtk.write_vtk),
-    "gltf": Format(("trajectory",), (), gltf.FILES, gltf.write_gltf),
-    "obj": Format(("trajectory",), (), obj.FILES, obj.write_obj),
+    "kitti": Format(
+        "optical flow",
+        needs=("flow",),
+        uses=("occlusion", "png"),
+        files=(
+            r"training/image_2/[0-9]{6,}_1[01]\.png",
+            r"training/flow_occ/[0-9]{6,}_10\.png",
+            r"training/flow_noc/[0-9]{6,}_10\.png",
+        ),
+    ),
+    "tapvid": Format("tracks of points", needs=("tracks", "png"), files=(r"tapvid\.pkl",)),
+    "vtk": Format("for ParaView", needs=("trajectory",), files=(r"[0-9]{4,}\.vtu", r"surface\.pvd", r"picture\.png")),
+    "gltf": Format("for Blender and browsers", needs=("trajectory",), files=(r"surface\.glb",)),
+    "obj": Format(
+        "for other programs with surfaces",
+        needs=("trajectory",),
+        files=(r"[0-9]{4,}\.obj", r"surface\.mtl", r"picture\.png"),
+    ),
 }
-
-# The file that lists the others.
-RECORD = "export.json"
-
-# The files of all formats: any of them may have been exported to a folder before, or been about to be.
-FILES: Tree = {
-    r"export\.json": None,
-    **{name: below for one in FORMATS.values() for name, below in one.files.items()},
-}
-
-
-def _is_ours(name: object) -> bool:
-    return isinstance(name, str) and allows(FILES, name)
-
-
-def _listed(record: Any) -> Callable[[str], bool]:
-    return {RECORD, *record["files"]}.__contains__
-
-
-# A folder with anything else in it is refused, as nobody would find it again among so many files.
-EXPORT = Kind("export", RECORD, FILES, _is_ours, _listed, alone=True, beside={})

@@ -14,6 +14,7 @@ Source: the glTF 2.0 specification of Khronos, sections 3.7.2.2 (morph targets) 
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -26,10 +27,9 @@ from taichi_msm.export.mesh import REFINE, picture_png, unit_normals
 from taichi_msm.progress import Count
 from taichi_msm.render.surface import surface
 from taichi_msm.results.finished_run import FinishedRun
-from taichi_msm.results.folder import Folder, Tree
+from taichi_msm.results.whole import create
 
 FILE = "surface.glb"
-FILES: Tree = {r"surface\.glb": None}
 
 # Limits of morph targets: by number, MAX_ARRAY_TEXTURE_LAYERS of every WebGL 2; by bytes, what still loads well.
 MOST_TARGETS = 256
@@ -41,7 +41,7 @@ VERTEX_BYTES = 2 * 3 * 4
 LINEAR, MIPMAPS, CLAMPED = 9729, 9987, 33071
 
 
-def write_gltf(run: FinishedRun, folder: Folder, progress: Count) -> list[str]:
+def write(run: FinishedRun, folder: Path, progress: Count) -> list[str]:
     """Write the surface of a run, with its picture.
 
     Raises:
@@ -71,7 +71,7 @@ def write_gltf(run: FinishedRun, folder: Folder, progress: Count) -> list[str]:
         mesh["weights"] = [0.0] * len(targets)
         mesh["extras"] = {"targetNames": [f"{time:g} s" for time in times[1:]], "error": keys.error}
         document["animations"] = [_animation(times.astype(np.float32), binary)]
-    with folder.create(FILE) as file:
+    with create(folder / FILE) as file:
         file.writelines(binary.container({**document, "meshes": [mesh]}))
     if len(keys.frames) == run.frames:
         return []

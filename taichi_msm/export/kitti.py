@@ -15,55 +15,50 @@ Source: the development kit of KITTI's scene flow benchmark 2015, readme.txt and
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import numpy as np
 from numpy.typing import NDArray
 
 from taichi_msm.errors import FilesError
-from taichi_msm.export.frames import frame_path, read_picture
 from taichi_msm.export.png16 import png16
+from taichi_msm.outputs.flo import read_flo
+from taichi_msm.outputs.table import OUTPUTS
 from taichi_msm.progress import Count
 from taichi_msm.results.finished_run import FinishedRun, reading
-from taichi_msm.results.flo import read_flo
-from taichi_msm.results.folder import Folder, Tree
-from taichi_msm.results.publication import FLOW, FRAMES, OCCLUSION, series_file
-
-ROOT, PICTURES, ALL, SEEN = "training", "image_2", "flow_occ", "flow_noc"
-FIRST = {r"[0-9]{6,}_10\.png": None}
-FILES: Tree = {ROOT: {PICTURES: {r"[0-9]{6,}_1[01]\.png": None}, ALL: FIRST, SEEN: FIRST}}
+from taichi_msm.results.whole import add
 
 SCALE, ZERO, LARGEST = 64.0, 32768.0, 65535.0
 
 
-def write_kitti(run: FinishedRun, folder: Folder, progress: Count) -> list[str]:
+def write(run: FinishedRun, folder: Path, progress: Count) -> list[str]:
     """Write the flow of a run, and its frames and occlusion if it has them.
 
     Raises:
         FilesError: when the run has no flow, or when a file is missing or damaged.
     """
-    size, pairs = run.scene.render.size, run.frames - 1
+    pairs = run.frames - 1
     if pairs == 0:
         raise FilesError(f"{run.directory}: has only one frame, and flow needs two; run the scene to its end")
-    has = {output: run.has(output) for output in (OCCLUSION, FRAMES)}
-    with (
-        folder.folder(ROOT, create=True) as root,
-        root.folder(ALL, create=True) as flows,
-        root.folder(SEEN, create=True) as seen,
-        root.folder(PICTURES, create=True) as pictures,
-    ):
-        for pair in range(pairs):
-            progress(pair, pairs)
-            flow, name = read_flo(run.result(f"{FLOW}/{series_file(FLOW, pair)}", FLOW), size), f"{pair:06}_10.png"
-            flows.add(name, png16(encode(flow)))
-            if has[OCCLUSION]:
-                path = run.result(f"{OCCLUSION}/{series_file(OCCLUSION, pair)}", OCCLUSION)
-                seen.add(name, png16(encode(flow, ~(read_picture(path, size)[..., 0] > 0))))
-            for number in (0, 1) if has[FRAMES] else ():
-                _copy(run, pair + number, pictures, f"{pair:06}_1{number}.png")
-    left_out = [(OCCLUSION, SEEN), (FRAMES, PICTURES)]
+    made_from = {"flow_occ": "flow", "flow_noc": "occlusion", "image_2": "png"}
+    flow_occ, flow_noc, image_2 = (folder / "training" / name for name in made_from)
+    for path in (flow_occ, flow_noc, image_2):
+        path.mkdir(parents=True)
+    for pair in range(pairs):
+        progress(pair, pairs)
+        source, name = run.result("flow", pair), f"{pair:06}_10.png"
+        with reading(source):
+            flow = read_flo(source, run.scene.render.size)
+        add(flow_occ / name, png16(encode(flow)))
+        if run.has("occlusion"):
+            add(flow_noc / name, png16(encode(flow, ~(run.picture("occlusion", pair)[..., 0] > 0))))
+        for number in (0, 1) if run.has("png") else ():
+            _copy(run, pair + number, image_2 / f"{pair:06}_1{number}.png")
+    remedy = run.remedy("occlusion", "png")
     return [
-        f"{name} is left out: {output} is not among the results; {run.remedy(OCCLUSION, 'png')}"
-        for output, name in left_out
-        if not has[output]
+        f"{name} is left out: {OUTPUTS[key].result} is not among the results; {remedy}"
+        for name, key in made_from.items()
+        if not run.has(key)
     ]
 
 
@@ -88,10 +83,10 @@ def encode(flow: NDArray[np.float32], seen: NDArray[np.bool_] | None = None) -> 
     return colours
 
 
-def _copy(run: FinishedRun, number: int, folder: Folder, name: str) -> None:
+def _copy(run: FinishedRun, number: int, path: Path) -> None:
     """Copy a frame, after checking that it is a whole picture of the right size."""
-    source = frame_path(run, number)
-    read_picture(source, run.scene.render.size)
+    run.picture("png", number)
+    source = run.result("png", number)
     with reading(source):
         data = source.read_bytes()
-    folder.add(name, data)
+    add(path, data)

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import io
 from collections.abc import Iterable
+from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,16 +19,15 @@ from taichi_msm.export.mesh import PICTURE, REFINE, picture_png, unit_normals
 from taichi_msm.progress import Count
 from taichi_msm.render.surface import surface
 from taichi_msm.results.finished_run import FinishedRun
-from taichi_msm.results.folder import Folder, Tree
+from taichi_msm.results.whole import add, create
 
 MATERIAL = "surface.mtl"
-FILES: Tree = dict.fromkeys((r"[0-9]{4,}\.obj", r"surface\.mtl", r"picture\.png"))
 
 # As many digits as distinguish any two numbers of single precision.
 EXACT = "%.9g"
 
 
-def write_obj(run: FinishedRun, folder: Folder, progress: Count) -> list[str]:
+def write(run: FinishedRun, folder: Path, progress: Count) -> list[str]:
     """Write the surface of every frame, its material and the picture.
 
     Raises:
@@ -36,8 +36,8 @@ def write_obj(run: FinishedRun, folder: Folder, progress: Count) -> list[str]:
     """
     positions, picture = run.positions(), picture_png(run)
     if picture is not None:
-        folder.add(PICTURE, picture)
-    folder.add(MATERIAL, "".join(f"{line}\n" for line in _material(picture is not None)).encode())
+        add(folder / PICTURE, picture)
+    add(folder / MATERIAL, "".join(f"{line}\n" for line in _material(picture is not None)).encode())
     first = surface(positions[0], REFINE)
     from_below = first.texture_coordinates * (1, -1) + (0, 1)
     coordinates = _lines("vt", from_below)
@@ -45,7 +45,7 @@ def write_obj(run: FinishedRun, folder: Folder, progress: Count) -> list[str]:
     faces = ("f %d/%d/%d %d/%d/%d %d/%d/%d\n" * len(corners)) % tuple(corners.ravel().tolist())
     for frame, position in enumerate(positions):
         progress(frame, run.frames)
-        with io.TextIOWrapper(folder.create(f"{frame:04}.obj"), "ascii", newline="") as file:
+        with io.TextIOWrapper(create(folder / f"{frame:04}.obj"), "ascii", newline="") as file:
             file.write(f"# {run.time[frame]:g} s, in metres\nmtllib {MATERIAL}\n")
             file.write(_lines("v", position.reshape(-1, 3)))
             file.write(coordinates)

@@ -16,22 +16,18 @@ from __future__ import annotations
 
 import pickle
 import zipfile
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from taichi_msm.errors import FilesError
-from taichi_msm.export.frames import frame_path, read_picture
+from taichi_msm.outputs.npz import read_rows
 from taichi_msm.progress import Count
 from taichi_msm.results.finished_run import FinishedRun, damaged, reading
-from taichi_msm.results.folder import Folder, Tree
-from taichi_msm.results.npz import read_rows
-from taichi_msm.results.publication import TRACKS
+from taichi_msm.results.whole import create
 from taichi_msm.system.resources import available_memory
-
-FILE = "tapvid.pkl"
-FILES: Tree = {r"tapvid\.pkl": None}
 
 # The pickle protocol that every Python from 3.4 on reads.
 PROTOCOL = 4
@@ -46,7 +42,7 @@ class _Pickler(pickle.Pickler):
         return NotImplemented
 
 
-def write_tapvid(run: FinishedRun, folder: Folder, progress: Count) -> list[str]:
+def write(run: FinishedRun, folder: Path, progress: Count) -> list[str]:
     """Write the tracks of a run and its frames.
 
     Raises:
@@ -64,9 +60,9 @@ def write_tapvid(run: FinishedRun, folder: Folder, progress: Count) -> list[str]
     video = np.empty((run.frames, height, width, 3), np.uint8)
     for frame in range(run.frames):
         progress(frame, run.frames)
-        video[frame] = read_picture(frame_path(run, frame), (width, height))
+        video[frame] = run.picture("png", frame)
     scaled = (points / (width, height)).astype(np.float32)
-    with folder.create(FILE) as file:
+    with create(folder / "tapvid.pkl") as file:
         name = run.directory.resolve().name
         _Pickler(file, PROTOCOL).dump({name: {"video": video, "points": scaled, "occluded": occluded}})
     return []
@@ -82,7 +78,7 @@ def read_tracks(run: FinishedRun) -> tuple[NDArray[np.float32], NDArray[np.bool_
     Raises:
         FilesError: when there are none, or they are damaged.
     """
-    path = run.result(TRACKS, "tracks")
+    path = run.result("tracks")
     with reading(path), zipfile.ZipFile(path) as archive:
         points = read_rows(archive, "points", np.float32, (run.frames, 2))
         occluded = read_rows(archive, "occluded", np.bool_, (run.frames,))

@@ -14,6 +14,7 @@ Source: VTK's own writer; for the .pvd file, ParaView's guide.
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import Any
 from xml.etree import ElementTree
 
@@ -28,10 +29,9 @@ from taichi_msm.physics.springs import energy_density
 from taichi_msm.progress import Count
 from taichi_msm.render.surface import surface
 from taichi_msm.results.finished_run import FinishedRun
-from taichi_msm.results.folder import Folder, Tree
+from taichi_msm.results.whole import add
 
 COLLECTION = "surface.pvd"
-FILES: Tree = dict.fromkeys((r"[0-9]{4,}\.vtu", r"surface\.pvd", r"picture\.png"))
 
 DISPLACEMENT, SPEED, ENERGY = "displacement", "speed", "energy_density"
 UNITS = {DISPLACEMENT: "m", SPEED: "m/s", ENERGY: "J/m2"}
@@ -39,7 +39,7 @@ UNITS = {DISPLACEMENT: "m", SPEED: "m/s", ENERGY: "J/m2"}
 Array = NDArray[np.floating]
 
 
-def write_vtk(run: FinishedRun, folder: Folder, progress: Count) -> list[str]:
+def write(run: FinishedRun, folder: Path, progress: Count) -> list[str]:
     """Write the surface of every frame, their times and the picture.
 
     Raises:
@@ -63,10 +63,10 @@ def write_vtk(run: FinishedRun, folder: Folder, progress: Count) -> list[str]:
             SPEED: speed(positions, run.time, frame).ravel(),
             ENERGY: energy_density(plan, displacement).ravel(),
         }
-        folder.add(_name(frame), _grid(positions[frame], values))
+        add(folder / _name(frame), _grid(positions[frame], values))
     if picture is not None:
-        folder.add(PICTURE, picture)
-    folder.add(COLLECTION, _collection(run.time))
+        add(folder / PICTURE, picture)
+    add(folder / COLLECTION, _collection(run.time))
     return []
 
 

@@ -71,8 +71,8 @@ def diagnose(dynamics: Dynamics, start: Saved | None, pause: Pause) -> Diagnosis
     reading = dynamics.read()
     wrong = watch.judge(reading)
     cause = _cause(dynamics, high, farthest(reading.displacement)[:2], pause)
-    found = divergence.message(grid.time(high), high, f"{wrong}; {cause}", exact=True)
-    return Diagnosis(found, Saved(low, watch.progress))
+    message = divergence.message(grid.time(high), high, f"{wrong}; {cause}", exact=True)
+    return Diagnosis(message, Saved(low, watch.progress))
 
 
 def _cause(dynamics: Dynamics, bad: int, point: tuple[int, int], pause: Pause) -> str:

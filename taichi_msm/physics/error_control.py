@@ -266,17 +266,17 @@ def _search(tolerance: float, least: int, trials: Trials, progress: Count) -> Es
     too_few, enough, failures = least - 1, None, []
     steps = least
     for _ in range(MOST_PILOTS):
-        found = trials.estimate(steps, progress)
-        if found.error <= tolerance:
-            enough = found
+        tried = trials.estimate(steps, progress)
+        if tried.error <= tolerance:
+            enough = tried
         else:
             too_few = steps
-            failures.append(found)
-            if found.rounding > CLOSE * tolerance or _stuck(failures):
+            failures.append(tried)
+            if tried.rounding > CLOSE * tolerance or _stuck(failures):
                 break
         if enough and (enough.error >= CLOSE * tolerance or enough.steps_per_frame - too_few <= 1):
             return enough
-        steps = max(_next(found, tolerance), too_few + 1)
+        steps = max(_next(tried, tolerance), too_few + 1)
         if enough and steps >= enough.steps_per_frame:
             return enough
     if enough:
@@ -284,16 +284,16 @@ def _search(tolerance: float, least: int, trials: Trials, progress: Count) -> Es
     raise SceneError([_out_of_reach(tolerance, failures)])
 
 
-def _next(found: Estimate, tolerance: float) -> int:
+def _next(tried: Estimate, tolerance: float) -> int:
     """Extrapolate the fewest steps per frame that are enough: the error falls with the order of the method."""
-    if found.error == math.inf:
+    if tried.error == math.inf:
         cut = LARGEST_CUT
     else:
         # The error that the step may make, apart from rounding, and the error that it makes.
-        allowed = max((1 + CLOSE) / 2 * tolerance - found.rounding, tolerance / 16)
-        made = max(found.error - found.rounding, 0.0)
-        cut = min((made / allowed) ** (1 / found.order), LARGEST_CUT)
-    return max(1, math.ceil(found.steps_per_frame * cut))
+        allowed = max((1 + CLOSE) / 2 * tolerance - tried.rounding, tolerance / 16)
+        error = max(tried.error - tried.rounding, 0.0)
+        cut = min((error / allowed) ** (1 / tried.order), LARGEST_CUT)
+    return max(1, math.ceil(tried.steps_per_frame * cut))
 
 
 def _stuck(failures: list[Estimate]) -> bool:

@@ -152,15 +152,15 @@ class _Line:
         If neither a key nor begin nor end lies within the hat, the average is the value itself.
         """
         edges = [edge for edge in (begin, end) if math.isfinite(edge)]
-        found = self.values(t) * ((begin <= t) & (t < end))
+        averages = self.values(t) * ((begin <= t) & (t < end))
         bounds = np.union1d(self.times, edges)
         # At t = 0 there is only half a hat, so that even the average of a line is not its value at t.
         uneven = (t <= 0) | (
             bounds.searchsorted(t + h * (1 - EDGE), "left") > bounds.searchsorted(t - h * (1 - EDGE), "right")
         )
         for n in np.flatnonzero(uneven):
-            found[n] = self._average(float(t[n]), h, begin, end)
-        return found
+            averages[n] = self._average(float(t[n]), h, begin, end)
+        return averages
 
     def largest(self, begin: float, end: float) -> float:
         """Find the largest absolute value from one time to another."""

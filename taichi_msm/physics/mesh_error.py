@@ -165,10 +165,10 @@ class MeshPilot:
         finer = displacement
         for n, (sheet, sampling) in enumerate(zip(self._sheets, self._samplings, strict=True)):
             sheet.advance(sheet.plan.grid.steps_per_frame, pause)
-            found = sheet.read()
+            reading = sheet.read()
             with np.errstate(all="ignore"):
-                self._differences[n] = max(self._differences[n], longest(finer - sampling.at(found.displacement)))
-            finer, self._shortest = found.displacement, min(self._shortest, found.shortest_spring)
+                self._differences[n] = max(self._differences[n], longest(finer - sampling.at(reading.displacement)))
+            finer, self._shortest = reading.displacement, min(self._shortest, reading.shortest_spring)
 
     @property
     def estimate(self) -> MeshEstimate:

@@ -48,15 +48,15 @@ def try_plan(scene: Scene, image: MapImage | None = None) -> tuple[Plan | None, 
             image = stiffness_map.read(scene.stiffness_map)
         except PictureError as error:
             problems.append(Problem((scene.kind, "map", "image"), str(error)))
-    made = material(scene, image)
-    problems += tissue_problems(scene, fixed, made.factors)
+    sheet = material(scene, image)
+    problems += tissue_problems(scene, fixed, sheet.factors)
     if problems:
         return None, problems
-    limit = timestep.stable_step(made, scene.sheet, scene.time.damping_difference)
+    limit = timestep.stable_step(sheet, scene.sheet, scene.time.damping_difference)
     steps = timestep.steps_per_frame(scene.time, limit)
     grid = TimeGrid(scene.time.frames_per_second, scene.time.frames, steps, "f64")
-    plan = on(Plan(scene, image, fixed, made, limit, grid, probe_slots(scene.probes, scene.sheet, grid.step)), "cpu")
-    return plan, list(timestep.problems(plan))
+    plan = on(Plan(scene, image, fixed, sheet, limit, grid, probe_slots(scene.probes, scene.sheet, grid.step)), "cpu")
+    return plan, list(timestep.step_problems(plan))
 
 
 def on(plan: Plan, arch: str) -> Plan:

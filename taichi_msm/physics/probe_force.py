@@ -158,13 +158,13 @@ class ProbeRecord(TypedDict):
 
 def probe_records(scene: Scene) -> list[ProbeRecord]:
     """Sum the forces of every probe of a scene."""
-    found = []
+    records = []
     for probe in scene.probes:
         flat, (total, pressure) = 0.0, sums(probe, scene.sheet)
         if probe.total is not None:
             flat = math.hypot(*probe.total) * math.pi * probe.radius * probe.radius / spread(probe)
-        found.append(ProbeRecord(total_force=total, flat_end_force=flat, largest_pressure=pressure))
-    return found
+        records.append(ProbeRecord(total_force=total, flat_end_force=flat, largest_pressure=pressure))
+    return records
 
 
 def in_words(record: ProbeRecord) -> str:
@@ -173,7 +173,7 @@ def in_words(record: ProbeRecord) -> str:
     return f"{record['total_force']:.3g} N in all{flat}, at most {record['largest_pressure'] / 1000:.3g} kPa"
 
 
-def notes(scene: Scene, records: Sequence[ProbeRecord]) -> Iterator[str]:
+def force_notes(scene: Scene, records: Sequence[ProbeRecord]) -> Iterator[str]:
     """Note the probes whose forces do not add up to their total on this sheet.
 
     Args:
@@ -183,11 +183,11 @@ def notes(scene: Scene, records: Sequence[ProbeRecord]) -> Iterator[str]:
     across, down = spacing(scene.sheet)
     cell = f"a cell of {across:.3g} x {down:.3g} m"
     for index, (probe, record) in enumerate(zip(scene.probes, records, strict=True)):
-        asked, found = math.hypot(*probe.total) if probe.total is not None else 0.0, record["total_force"]
-        if asked > 0 and found <= LEAST_REACHING * asked:
+        asked, reaching = math.hypot(*probe.total) if probe.total is not None else 0.0, record["total_force"]
+        if asked > 0 and reaching <= LEAST_REACHING * asked:
             yield (
-                f"probes.{index}: {found:.3g} N of its {asked:.3g} N reach the sheet; is the tool beside the sheet, "
+                f"probes.{index}: {reaching:.3g} N of its {asked:.3g} N reach the sheet; is the tool beside the sheet, "
                 f"wider than the sheet, or narrower than {cell}?"
             )
-        elif asked > 0 and found * LEAST_REACHING >= asked:
-            yield f"probes.{index}: {found:.3g} N instead of its {asked:.3g} N, as the tool is narrower than {cell}"
+        elif asked > 0 and reaching * LEAST_REACHING >= asked:
+            yield f"probes.{index}: {reaching:.3g} N instead of its {asked:.3g} N, as the tool is narrower than {cell}"

@@ -105,15 +105,15 @@ class RunError:
     @property
     def known(self) -> Known:
         """What the frames so far show."""
-        found = self._known
-        if found.estimate is None and self._time is not None:
+        known = self._known
+        if known.estimate is None and self._time is not None:
             estimate = self._time.estimate
             # What a coarse pilot tells of a run in f32 is an upper bound.
             at_least = self._coarse and estimate.parted and ENOUGH <= estimate.error < math.inf
-            found = found._replace(estimate=replace(estimate, at_least=at_least))
+            known = known._replace(estimate=replace(estimate, at_least=at_least))
         if self._mesh is not None:
-            found = found._replace(mesh=self._mesh.estimate)
-        return found
+            known = known._replace(mesh=self._mesh.estimate)
+        return known
 
     def close(self) -> None:
         """Free the memory."""

@@ -68,14 +68,14 @@ def with_chosen_grid(plan: Plan) -> Plan:
     return replace(plan, scene=with_time(plan.scene, **changes))
 
 
-def problems(plan: Plan) -> Iterator[Problem]:
+def step_problems(plan: Plan) -> Iterator[Problem]:
     """Find a given step that cannot be taken, and what f32 cannot hold."""
-    yield from _step_problems(plan.scene.time, plan.stable_step)
+    yield from _given_step_problems(plan.scene.time, plan.stable_step)
     if plan.grid.precision == "f32":
         yield from _range_problems(plan)
 
 
-def _step_problems(time: Time, limit: float) -> Iterator[Problem]:
+def _given_step_problems(time: Time, limit: float) -> Iterator[Problem]:
     """Find a given step that is unstable or does not divide a frame."""
     given = time.step
     if given == "auto":

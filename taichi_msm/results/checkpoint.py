@@ -1,32 +1,40 @@
 """The files from which another process can continue an unfinished run: its manifest, its frames and its last state.
 
 Every part has a checksum, which is verified before the part is used: a SHA-256 for the manifest, one for the positions
-of every frame, and the CRC-32 of the archive for the arrays of the state.
+of every frame, and the CRC-32 of the archive for the arrays of the state. What
+they say is not trusted, as anybody may have written them.
 """
 
 from __future__ import annotations
 
 import hashlib
+import json
 import math
 import os
+import re
 import time
 import zipfile
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from contextlib import ExitStack
 from dataclasses import asdict, fields
+from pathlib import Path
 from typing import Any, BinaryIO
 
 import numpy as np
 from numpy.typing import NDArray
 
-from taichi_msm.errors import DamagedError
+from taichi_msm.errors import DamagedError, FilesError, ForeignError
+from taichi_msm.outputs.npz import read_array, write_arrays
 from taichi_msm.physics.run_progress import RunProgress, Saved
 from taichi_msm.physics.state import State
-from taichi_msm.results.folder import Folder, write_all
-from taichi_msm.results.npz import read_array, write_array
-from taichi_msm.results.publication import CHECKPOINT, CHECKPOINT_TREE, DRAFT, MANIFEST, POSITIONS, STATE
-from taichi_msm.results.sealed import seal
+from taichi_msm.results.entries import FILE, FOLDER, clear, require
+from taichi_msm.results.publication import STAGING
+from taichi_msm.results.whole import DRAFT, create, replacing
 from taichi_msm.timegrid import TimeGrid
+
+# A folder is a checkpoint if it has a run's manifest. Beside it are the positions of the frames and the last state.
+CHECKPOINT, MANIFEST, POSITIONS, STATE = "checkpoint", "manifest.json", "positions", "state.npz"
+PATTERNS = tuple(re.escape(name) for name in (MANIFEST, POSITIONS, STATE, DRAFT))
 
 # The share of the time that saving states may take.
 SHARE = 0.02
@@ -38,7 +46,7 @@ class Checkpoint:
     """A folder from which a run can continue, no matter when its process is killed.
 
     Args:
-        staging: the folder that contains it.
+        folder: for its files; made by `begin`.
         grid: the steps of the run.
         points: rows and columns of the sheet.
         keeps_positions: whether the positions of the frames are kept.
@@ -48,9 +56,9 @@ class Checkpoint:
         precision: type of the positions.
     """
 
-    def __init__(self, staging: Folder, grid: TimeGrid, points: tuple[int, int], *, keeps_positions: bool) -> None:
+    def __init__(self, folder: Path, grid: TimeGrid, points: tuple[int, int], *, keeps_positions: bool) -> None:
         self.frames = 0
-        self._staging = staging
+        self._folder = folder
         self._grid = grid
         self._shape = (*points, 3)
         self.precision = np.dtype(np.float32 if grid.precision == "f32" else np.float64)
@@ -60,7 +68,6 @@ class Checkpoint:
         self._open = ExitStack()
         # The digest of the manifest, to which all parts of a checkpoint are tied.
         self._key = b""
-        self._folder: Folder | None = None
         self._positions: BinaryIO | None = None
 
     @property
@@ -69,21 +76,21 @@ class Checkpoint:
         return time.perf_counter() >= self._due
 
     def begin(self, manifest: Mapping[str, Any]) -> None:
-        """Begin without frames, replacing the checkpoint of any other run.
-
-        Args:
-            manifest: what another process must know to continue the run, in JSON.
-        """
-        with self._staging.folder(CHECKPOINT, create=True) as folder:
-            # Removed first: without a manifest, what is left of a checkpoint does not count as one.
-            folder.remove(MANIFEST)
-            folder.clear(CHECKPOINT_TREE)
-        folder = self._enter()
+        """Begin a run with this manifest, without frames, replacing the checkpoint of any other run."""
+        self.close()
+        self._folder.mkdir(exist_ok=True)
+        self.forget()
+        clear(self._folder, PATTERNS)
         # Unbuffered, so that what was written is not lost when the process is killed.
-        self._positions = self._open.enter_context(folder.create(POSITIONS, buffering=0))
+        self._positions = self._open.enter_context(create(self._folder / POSITIONS, buffering=0))
         sealed = seal(manifest)
         self._key = _digest(sealed)
-        folder.write(MANIFEST, sealed, DRAFT)
+        with replacing(self._folder / MANIFEST) as file:
+            file.write(sealed)
+
+    def forget(self) -> None:
+        """Remove the manifest: without it, what is left, even if it is only half removed, is no checkpoint."""
+        (self._folder / MANIFEST).unlink(missing_ok=True)
 
     def reopen(self) -> Saved | None:
         """Continue an earlier run; returns the state that it saved last, or None to continue from rest.
@@ -92,16 +99,19 @@ class Checkpoint:
             DamagedError: when the files do not belong together.
             OSError: when they cannot be read.
         """
-        folder = self._enter()
+        self.close()
+        path = self._folder / POSITIONS
         try:
-            with folder.open(MANIFEST) as file:
-                self._key = _digest(file.read())
-            self._positions = self._open.enter_context(folder.open(POSITIONS, write=True))
+            self._key = _digest((self._folder / MANIFEST).read_bytes())
+            self._positions = self._open.enter_context(path.open("r+b", buffering=0))
         except FileNotFoundError as error:
-            raise self._damaged(str(error.filename)) from None
+            raise self._damaged(Path(error.filename).name) from None
+        status = os.fstat(self._positions.fileno())
+        if status.st_nlink > 1:
+            raise ForeignError.at(path, "a file that has other names")
         saved = self.load()
         frames = 0 if saved is None else saved.progress.frame + 1
-        if os.fstat(self._positions.fileno()).st_size < frames * self._record_bytes:
+        if status.st_size < frames * self._record_bytes:
             raise self._damaged(POSITIONS)
         self.frames = frames
         return saved
@@ -112,18 +122,16 @@ class Checkpoint:
             assert self._positions is not None, "begin or reopen comes first"
             data = np.ascontiguousarray(position, self.precision).data.cast("B")
             self._positions.seek(self.frames * self._record_bytes)
-            write_all(self._positions, self._digest(self.frames, data))
-            write_all(self._positions, data)
+            for rest in (memoryview(self._digest(self.frames, data)), data):
+                while rest:  # A write to an unbuffered file may take only some of the bytes.
+                    rest = rest[self._positions.write(rest) :]
         self.frames += 1
 
     def position(self, frame: int) -> NDArray[Any]:
-        """Read the positions of a frame.
-
-        Returns:
-            Positions [m], shape (rows, cols, 3).
+        """Read the positions of a frame [m], shape (rows, cols, 3).
 
         Raises:
-            DamagedError: when the positions are not as they were written.
+            DamagedError: when they are not as they were written.
         """
         assert self._positions is not None, "begin or reopen comes first"
         record = np.empty(self._record_bytes, np.uint8)
@@ -132,16 +140,10 @@ class Checkpoint:
         while rest and (count := self._positions.readinto(rest)):  # type: ignore[attr-defined]
             rest = rest[count:]
         data = record[DIGEST_BYTES:]
-        found = data.view(self.precision).reshape(self._shape)
-        # Not trusted: anybody may have written it.
-        if rest or record[:DIGEST_BYTES].tobytes() != self._digest(frame, data.data) or not np.isfinite(found).all():
+        position = data.view(self.precision).reshape(self._shape)
+        if rest or record[:DIGEST_BYTES].tobytes() != self._digest(frame, data.data) or not np.isfinite(position).all():
             raise self._damaged(POSITIONS)
-        return found
-
-    def positions(self, frames: int) -> Iterator[memoryview]:
-        """Read the bytes of the positions of the first frames, frame by frame; raises what `position` does."""
-        for frame in range(frames):
-            yield self.position(frame).data.cast("B")
+        return position
 
     def save(self, saved: Saved) -> str:
         """Save a state of the run, replacing the one saved before; the frames up to it must have been added.
@@ -150,19 +152,12 @@ class Checkpoint:
             The path of the file, which has the arrays of `State` and the numbers of `RunProgress` by name.
         """
         start = time.perf_counter()
-        folder = self._entered
-        folder.remove(DRAFT)
-        try:
-            with folder.create(DRAFT) as file, zipfile.ZipFile(file, "w", zipfile.ZIP_STORED) as archive:
-                for name, array in self._arrays(saved).items():
-                    write_array(archive, name, array.dtype, array.shape, [np.ascontiguousarray(array).data.cast("B")])
-            folder.replace(DRAFT, folder, STATE)
-        except OSError:
-            folder.remove(DRAFT)
-            raise
+        path = self._folder / STATE
+        with replacing(path) as file:
+            write_arrays(file, self._arrays(saved))
         now = time.perf_counter()
         self._due = now + (now - start) / SHARE
-        return str(folder.path / STATE)
+        return str(path)
 
     def load(self) -> Saved | None:
         """Read the state that was saved last; None: none was.
@@ -174,23 +169,22 @@ class Checkpoint:
         sheet = self.precision, self._shape
         kinds = {name: sheet if array.size == 0 else (array.dtype, array.shape) for name, array in like.items()}
         try:
-            with self._entered.open(STATE) as file, zipfile.ZipFile(file) as archive:
-                found = {name: read_array(archive, name, *kind) for name, kind in kinds.items()}
+            with (self._folder / STATE).open("rb") as file, zipfile.ZipFile(file) as archive:
+                arrays = {name: read_array(archive, name, *kind) for name, kind in kinds.items()}
         except FileNotFoundError:
             return None
         # A forged archive can make zipfile raise almost anything.
         except Exception:
             raise self._damaged(STATE) from None
-        progress = RunProgress(**{field.name: found[field.name].item() for field in fields(RunProgress)})
-        saved = Saved(State(int(found["steps"]), found["displacement"], found["difference"]), progress)
+        progress = RunProgress(**{field.name: arrays[field.name].item() for field in fields(RunProgress)})
+        saved = Saved(State(int(arrays["steps"]), arrays["displacement"], arrays["difference"]), progress)
         every = self._grid.steps_per_frame
-        # Not trusted: anybody may have written it.
         if not (
             progress.frame <= self._grid.frames
             and progress.frame * every <= saved.state.steps <= (progress.frame + 1) * every
-            and all(np.isfinite(array).all() for array in found.values())
+            and all(np.isfinite(array).all() for array in arrays.values())
             and all(value >= 0 for value in asdict(progress).values())
-            and found["manifest"].tobytes() == self._key
+            and arrays["manifest"].tobytes() == self._key
         ):
             raise self._damaged(STATE)
         return saved
@@ -198,16 +192,6 @@ class Checkpoint:
     def close(self) -> None:
         """Close its files."""
         self._open.close()
-
-    @property
-    def _entered(self) -> Folder:
-        assert self._folder is not None, "begin or reopen comes first"
-        return self._folder
-
-    def _enter(self) -> Folder:
-        self.close()
-        self._folder = self._open.enter_context(self._staging.folder(CHECKPOINT))
-        return self._folder
 
     def _arrays(self, saved: Saved) -> dict[str, NDArray[Any]]:
         """Give the arrays of a state, the numbers of its progress and the digest of the manifest, all by name."""
@@ -219,7 +203,43 @@ class Checkpoint:
         return _digest(self._key, frame.to_bytes(8, "little"), data)
 
     def _damaged(self, name: str) -> DamagedError:
-        return DamagedError(f"{self._staging.path / CHECKPOINT / name} is damaged; run the scene again")
+        return DamagedError(f"{self._folder / name} is damaged; run the scene again")
+
+
+def open_manifest(directory: Path) -> BinaryIO:
+    """Open the manifest of the unfinished run in a directory.
+
+    Raises:
+        OSError: when there is none.
+        ForeignError: when there is a link or a device in its place.
+    """
+    checkpoint = require(require(directory / STAGING, FOLDER) / CHECKPOINT, FOLDER)
+    return require(checkpoint / MANIFEST, FILE).open("rb")
+
+
+def is_unfinished(directory: Path) -> bool:
+    """Tell whether a directory has an unfinished run that can be continued."""
+    try:
+        open_manifest(directory).close()
+    except (OSError, FilesError):
+        return False
+    return True
+
+
+def seal(content: Any) -> bytes:
+    """Write a value as JSON together with its SHA-256."""
+    return json.dumps({"sha256": _digest(json.dumps(content).encode()).hex(), "content": content}).encode()
+
+
+def unseal(data: bytes) -> Any:
+    """Read what `seal` wrote; raises ValueError when any bit of it, even of white space, is not as it was written."""
+    try:
+        content = json.loads(data)["content"]
+        if seal(content) == data:
+            return content
+    except (KeyError, TypeError, RecursionError):
+        pass
+    raise ValueError("damaged")
 
 
 def _digest(*parts: bytes | memoryview) -> bytes:

@@ -19,18 +19,18 @@ from collections import deque
 from collections.abc import Callable, Iterator
 from concurrent.futures import CancelledError, Future, ThreadPoolExecutor
 from contextlib import contextmanager, suppress
-from dataclasses import dataclass
+from pathlib import Path
 from threading import Event
-from typing import BinaryIO
+from typing import BinaryIO, NamedTuple
 
 import numpy as np
 from PIL import Image
 
 from taichi_msm.errors import FilesError
+from taichi_msm.outputs.gif import GifWriter, Palette, Picture, shades
+from taichi_msm.outputs.table import OUTPUTS
 from taichi_msm.progress import Pause
-from taichi_msm.results.folder import Folder
-from taichi_msm.results.gif import GifWriter, Palette, Picture, shades
-from taichi_msm.results.publication import ANIMATION, FRAMES, series_file
+from taichi_msm.results.whole import create
 
 # Of 512 x 512 pixels of shaded tissue Pillow's default takes 93 ms, its level 1 takes 17 ms and 348 kB. With a search
 # for runs of equal bytes alone it takes 16 ms and 314 kB: tissue has no other repetitions, and a background has these.
@@ -48,35 +48,23 @@ PATIENCE = 0.1
 _CHILD = "import sys; sys.path[:] = {path!r}; from taichi_msm.results.encoder import main; main()"
 
 
-@dataclass(frozen=True)
-class Job:
-    """What to encode.
+class Job(NamedTuple):
+    """What to encode: as `frames/0000.png` and so on, as `animation.gif`, or as both."""
 
-    Attributes:
-        folder: where frames/ and animation.gif go.
-        size: width, height of the pictures [px].
-        rate: frames per second.
-        png: whether each picture is written.
-        gif: whether the animation is written.
-        background: a colour that the animation keeps exactly.
-    """
-
-    folder: Folder
-    size: tuple[int, int]
-    rate: float
+    folder: Path  # where the files go
+    size: tuple[int, int]  # width, height of the pictures [px]
+    rate: float  # frames per second
     png: bool
     gif: bool
-    background: tuple[int, int, int]
+    background: tuple[int, int, int]  # a colour that the animation keeps exactly
+
+    def still(self, number: int) -> Path:
+        """Name the PNG of a frame."""
+        return self.folder / OUTPUTS["png"].path(number)
 
 
-@dataclass(frozen=True)
-class Report:
-    """What was encoded.
-
-    Attributes:
-        frames: number of pictures that were encoded completely.
-        seconds: processor time spent encoding [s].
-    """
+class Report(NamedTuple):
+    """How many pictures were encoded completely, and the processor time that was spent [s]."""
 
     frames: int
     seconds: float
@@ -100,8 +88,7 @@ class Encoder:
                 bufsize=0,
                 stdin=subprocess.PIPE,
                 stdout=subprocess.PIPE,
-                # The folder keeps its descriptor in the child.
-                pass_fds=(*inherit, *([] if job.folder.descriptor is None else [job.folder.descriptor])),
+                pass_fds=inherit,
                 # Ctrl-C must reach only us: the child still finishes the pictures so far, as it does after a SIGTERM.
                 start_new_session=True,
                 creationflags=getattr(subprocess, "CREATE_NEW_PROCESS_GROUP", 0),
@@ -117,11 +104,9 @@ class Encoder:
             os.set_blocking(self._pictures.fileno(), False)
 
     def add(self, picture: Picture, pause: Pause = lambda: None) -> None:
-        """Hand over the next picture; waits while too many are not encoded yet.
+        """Hand over the next picture, shape (height, width, 3); waits while too many are not encoded yet.
 
-        Args:
-            picture: colours, shape (height, width, 3).
-            pause: called some times a second while it waits; if it raises, the picture is given up.
+        `pause` is called some times a second while it waits; if it raises, the picture is given up.
         """
         rest = np.ascontiguousarray(picture).reshape(-1).data
         try:
@@ -136,12 +121,9 @@ class Encoder:
             raise
 
     def finish(self, pause: Pause = lambda: None, *, hurry: bool = False) -> Report:
-        """Wait until all pictures are encoded.
+        """Wait until all pictures are encoded; in a hurry those that are not being encoded yet are given up.
 
-        Args:
-            pause: called some times a second while it waits; what it raises stops the waiting, and this can be called
-                again.
-            hurry: give up those that are not being encoded yet.
+        `pause` is called some times a second while it waits; if it raises, this can be called again.
         """
         if self._report is None:
             if hurry:
@@ -230,18 +212,25 @@ def encode(job: Job, source: BinaryIO, hurry: Event) -> Report:
     frames = begun = 0
     seconds = 0.0
     pending: deque[Future[float]] = deque()
-    film = _Film(job)
+    gif: GifWriter | None = None
+
+    def film(picture: Picture) -> None:
+        nonlocal gif
+        if gif is None:  # The first frame shows the colours that the animation needs.
+            file, palette = create(job.folder / OUTPUTS["gif"].path()), Palette(shades(picture), job.background)
+            gif = GifWriter(file, job.size, job.rate, palette)
+        gif.add(picture)
 
     def shoot(picture: Picture, still: Future[float] | None) -> float:
         """Complete a frame: first its still, then its place in the film, which so has no frame without a still."""
         spent = still.result() if still else 0.0
-        return spent + (_seconds(film.add, picture) if job.gif else 0.0)
+        return spent + (_seconds(film, picture) if job.gif else 0.0)
 
     with ThreadPoolExecutor(min(depth, os.cpu_count() or 1)) as stills, ThreadPoolExecutor(1) as reel:
         for picture in _pictures(source, job.size):
             if job.png and begun == 0:
-                folder = job.folder.folder(FRAMES, create=True)
-            still = stills.submit(_seconds, _write_png, picture, folder, begun) if job.png else None
+                job.still(0).parent.mkdir()
+            still = stills.submit(_seconds, _write_png, picture, job.still(begun)) if job.png else None
             begun += 1
             pending.append(reel.submit(shoot, picture, still))
             while len(pending) > depth and not hurry.is_set():
@@ -259,8 +248,9 @@ def encode(job: Job, source: BinaryIO, hurry: Event) -> Report:
                 seconds += task.result()
                 frames += 1
     for number in range(frames, begun) if job.png else ():
-        folder.remove(series_file(FRAMES, number))
-    seconds += _seconds(film.close)
+        job.still(number).unlink(missing_ok=True)
+    if gif is not None:
+        seconds += _seconds(gif.close)
     return Report(frames, seconds)
 
 
@@ -268,24 +258,6 @@ def _leave_orphaned(parent: int) -> None:
     """End this process if its parent was killed, so that the directory is free for another run."""
     if os.getppid() != parent:
         os._exit(1)
-
-
-class _Film:
-    """The animation; it is begun at its first frame, which shows the colours that it needs."""
-
-    def __init__(self, job: Job) -> None:
-        self._job = job
-        self._gif: GifWriter | None = None
-
-    def add(self, picture: Picture) -> None:
-        if self._gif is None:
-            palette = Palette(shades(picture), self._job.background)
-            self._gif = GifWriter(self._job.folder.create(ANIMATION), self._job.size, self._job.rate, palette)
-        self._gif.add(picture)
-
-    def close(self) -> None:
-        if self._gif is not None:
-            self._gif.close()
 
 
 def _pictures(source: BinaryIO, size: tuple[int, int]) -> Iterator[Picture]:
@@ -298,13 +270,13 @@ def _pictures(source: BinaryIO, size: tuple[int, int]) -> Iterator[Picture]:
         yield np.frombuffer(data, np.uint8).reshape(height, width, 3)
 
 
-def _write_png(picture: Picture, folder: Folder, number: int) -> None:
-    with folder.create(series_file(FRAMES, number)) as file:
+def _write_png(picture: Picture, path: Path) -> None:
+    with create(path) as file:
         Image.fromarray(picture).save(file, "PNG", **COMPRESSION)
 
 
 def _seconds(work: Callable[..., None], *args: object) -> float:
-    """Do some work and return its processor time [s], which does not grow while the simulation occupies the cores."""
+    """Do some work; returns its processor time [s], which does not grow while the simulation occupies the cores."""
     start = time.thread_time()
     work(*args)
     return time.thread_time() - start

@@ -13,20 +13,22 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 from pydantic import TypeAdapter
-from typing_extensions import TypedDict
 
 from taichi_msm.arguments import require_path
 from taichi_msm.errors import FilesError, MsmError, SceneError
+from taichi_msm.outputs.npz import map_array
+from taichi_msm.outputs.table import OUTPUTS, RECORD
 from taichi_msm.physics.lattice import rest_positions
 from taichi_msm.physics.planning import try_plan
-from taichi_msm.picture import PictureError, file_sha256
+from taichi_msm.picture import PictureError, file_sha256, read_rgb
 from taichi_msm.render import camera
-from taichi_msm.results.npz import map_array
-from taichi_msm.results.publication import MAX_RECORD, RECORD, TRAJECTORY
+from taichi_msm.results.publication import MAX_RECORD
 from taichi_msm.scene import Scene
 
 # The largest number of f32.
 MOST = float(np.finfo(np.float32).max)
+
+_DIGESTS, _OVERRIDES = TypeAdapter(dict[str, str]), TypeAdapter(list[str])
 
 PUT_BACK = "put back the picture that it was run with, or run the scene again"
 
@@ -35,23 +37,16 @@ PUT_BACK = "put back the picture that it was run with, or run the scene again"
 class FinishedRun:
     """A run that has ended, complete or not.
 
-    Attributes:
-        directory: where its results are.
-        record: the content of run.json.
-        scene: the scene as it was run: with the points, the step and the precision that were chosen, without a
-            tolerance, and with paths of pictures that are relative to the current directory.
-        frames: how many were simulated.
-        sha256: of the files of its pictures, by the keys that name them.
-        overrides: that made the scene from its file.
+    Its scene is that which was run: with the points, the step and the precision that were chosen, without a tolerance,
+    and with paths of pictures that are relative to the current directory.
     """
 
-    directory: Path
-    record: Mapping[str, Any]
+    directory: Path  # where its results are
     scene: Scene
-    frames: int
-    sha256: Mapping[str, str]
-    overrides: list[str]
-    _data: bytes = field(repr=False)
+    frames: int  # how many were simulated
+    sha256: Mapping[str, str]  # of the files of its pictures, by the keys that name them
+    overrides: list[str]  # that made the scene from its file
+    _record: bytes = field(repr=False)
 
     @property
     def time(self) -> NDArray[np.float64]:
@@ -67,16 +62,32 @@ class FinishedRun:
         Raises:
             FilesError: when there is none, or it is damaged or belongs to another run.
         """
-        path = self.result(TRAJECTORY, "trajectory")
+        path = self.result("trajectory")
         dtype = np.dtype(np.float32 if self.scene.time.precision == "f32" else np.float64)
         rest = rest_positions(self.scene.sheet)
         with reading(path):
-            found = map_array(path, "position", dtype, (self.frames, *rest.shape))
+            positions = map_array(path, "position", dtype, (self.frames, *rest.shape))
         # Every run begins at rest; this is checked, as anybody may have written the file. Kernels and other programs
         # take numbers in f32. Written so that NaN is found too.
-        if not np.array_equal(found[0], rest.astype(dtype)) or not all(np.abs(frame).max() <= MOST for frame in found):
+        begins_at_rest = np.array_equal(positions[0], rest.astype(dtype))
+        if not begins_at_rest or not all(np.abs(position).max() <= MOST for position in positions):
             raise damaged(path)
-        return found
+        return positions
+
+    def picture(self, key: str, frame: int) -> NDArray[np.uint8]:
+        """Read a picture that was written for an entry of `output`; colours, shape (height, width, 3).
+
+        Raises:
+            FilesError: when it is missing or cannot be read, or has another size than the scene's.
+        """
+        path = self.result(key, frame)
+        try:
+            image = read_rgb(str(path), (0, 0, 0))
+        except PictureError as error:
+            raise FilesError(f"{error}, or run the scene again") from None
+        if image.size != self.scene.render.size:
+            raise damaged(path)
+        return np.asarray(image)
 
     @contextmanager
     def unchanged(self) -> Iterator[None]:
@@ -97,14 +108,11 @@ class FinishedRun:
         data = b""
         with suppress(OSError):
             data = (self.directory / RECORD).read_bytes()
-        if data != self._data:
+        if data != self._record:
             raise FilesError(f"{self.directory}: another run replaced these results while they were read; try again")
 
     def require_pictures(self, *, drawn: bool) -> None:
-        """Make sure that the maps are those that were run, by their SHA-256.
-
-        Args:
-            drawn: whether the picture is used too.
+        """Make sure that the maps, and if it is `drawn` the picture, are those that were run, by their SHA-256.
 
         Raises:
             FilesError: when one of them is missing or has changed.
@@ -120,33 +128,30 @@ class FinishedRun:
                 fault = str(error).partition(";")[0]
             raise FilesError(f"{self.directory}: {key}: {fault}; {PUT_BACK}")
 
-    def has(self, output: str) -> bool:
-        """Tell whether a file or folder is among the results."""
-        with reading(self.directory / output):
-            return (self.directory / output).exists()
+    def has(self, key: str) -> bool:
+        """Tell whether the results have what an entry of `output` asks for."""
+        path = self.directory / OUTPUTS[key].result
+        with reading(path):
+            return path.exists()
 
     def remedy(self, *keys: str) -> str:
         """Say how to get the results of further entries of a scene's `output`."""
         outputs = ",".join(dict.fromkeys([*self.scene.output, *keys]))
         return f'run the scene again with --set "output=[{outputs}]"'
 
-    def result(self, name: str, key: str) -> Path:
-        """Find a file of the results.
-
-        Args:
-            name: of the file, with its folder.
-            key: the entry of a scene's `output` that makes a run write it.
+    def result(self, key: str, frame: int = 0) -> Path:
+        """Find a file that was written for an entry of `output`, of a frame if there is one for each.
 
         Raises:
             FilesError: when it is not there.
         """
-        output, path = name.partition("/")[0], self.directory / name
-        if not self.has(output):
-            raise FilesError(f"{output}: not among the results of {self.directory}; {self.remedy(key)}")
+        result, path = OUTPUTS[key].result, self.directory / OUTPUTS[key].path(frame)
+        if not self.has(key):
+            raise FilesError(f"{result}: not among the results of {self.directory}; {self.remedy(key)}")
         if not path.is_file():
             raise FilesError(f"{path}: no such file; {self.remedy(key)}")
         # The results may come from anybody, and what is read here may be given to others.
-        if (self.directory / output).is_symlink() or path.is_symlink():
+        if (self.directory / result).is_symlink() or path.is_symlink():
             raise FilesError(f"{path}: a symbolic link, which no run writes; {self.remedy(key)}")
         return path
 
@@ -170,11 +175,11 @@ def read_run(directory: str | Path) -> FinishedRun:
             data = file.read(MAX_RECORD)
         record = json.loads(data)
         scene, frames = _as_run(record), record["frames"]
-        facts = _FACTS.validate_python(record)
+        sha256, overrides = _DIGESTS.validate_python(record["sha256"]), _OVERRIDES.validate_python(record["overrides"])
         chosen = scene.time.precision != "auto" and scene.sheet.tolerance is scene.time.tolerance is None
         if not isinstance(frames, int) or not 1 <= frames <= scene.time.frames + 1 or not chosen:
             raise damaged(path)
-    return FinishedRun(path.parent, record, scene, frames, facts["sha256"], facts["overrides"], data)
+    return FinishedRun(path.parent, scene, frames, sha256, overrides, data)
 
 
 @contextmanager
@@ -198,14 +203,6 @@ def reading(path: Path) -> Iterator[None]:
 def damaged(path: Path) -> FilesError:
     """Make the error for a result that is not what the run has written."""
     return FilesError(f"{path}: damaged, or not of this run; run the scene again")
-
-
-class _Facts(TypedDict):
-    sha256: dict[str, str]
-    overrides: list[str]
-
-
-_FACTS = TypeAdapter(_Facts)
 
 
 def _as_run(record: Mapping[str, Any]) -> Scene:

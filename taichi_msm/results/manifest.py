@@ -8,7 +8,7 @@ from contextlib import suppress
 from dataclasses import asdict, dataclass, replace
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 from pydantic import TypeAdapter
 
@@ -19,8 +19,8 @@ from taichi_msm.physics.plan import Plan
 from taichi_msm.physics.planning import try_plan
 from taichi_msm.picture import PictureError, file_sha256
 from taichi_msm.render import camera
-from taichi_msm.results.publication import CHECKPOINT, MANIFEST, STAGING, open_checkpoint
-from taichi_msm.results.sealed import unseal
+from taichi_msm.results.checkpoint import CHECKPOINT, MANIFEST, open_manifest, unseal
+from taichi_msm.results.publication import STAGING
 from taichi_msm.scene import Scene
 from taichi_msm.system.compiler import what_decides_bits
 from taichi_msm.system.runtime import ARCHS
@@ -31,37 +31,22 @@ MAX_BYTES = 1 << 26
 
 @dataclass(frozen=True)
 class Manifest:
-    """Everything that the bits of a result depend on, and facts for its record.
+    """Everything that the bits of a result depend on, and facts for its record."""
 
-    Attributes:
-        given: the scene as it was loaded.
-        scene: the scene with the points, the step and the precision that were chosen.
-        overrides: of the scene file.
-        estimate: of the error, if a tolerance required it before the run; else None.
-        mesh: error of the points, if a tolerance of the sheet required it before the run; else None.
-        asks_estimate: whether to estimate the error beside the run; None: if it is cheap.
-        folder: the current directory, from which the paths of the scene's pictures start.
-        arch: cpu, cuda or vulkan.
-        sha256: of the files of the picture and the maps, by the keys that name them.
-        versions: of all that the results depend on.
-    """
-
-    given: Scene
-    scene: Scene
-    overrides: tuple[str, ...]
-    estimate: Estimate | None
-    mesh: MeshEstimate | None
-    asks_estimate: bool | None
-    folder: str
-    arch: str
-    sha256: Mapping[str, str]
-    versions: Mapping[str, str]
+    given: Scene  # as it was loaded
+    scene: Scene  # with the points, the step and the precision that were chosen
+    overrides: tuple[str, ...]  # of the scene file
+    estimate: Estimate | None  # of the error, if a tolerance required it before the run
+    mesh: MeshEstimate | None  # error of the points, if a tolerance of the sheet required it before the run
+    asks_estimate: bool | None  # whether to estimate the error beside the run; None: if it is cheap
+    folder: str  # the current directory, from which the paths of the scene's pictures start
+    arch: str  # cpu, cuda or vulkan
+    sha256: Mapping[str, str]  # of the files of the picture and the maps, by the keys that name them
+    versions: Mapping[str, str]  # of all that the results depend on
 
     def as_json(self) -> dict[str, Any]:
         """Convert the manifest to data for JSON."""
-        known = {key: one and asdict(one) for key, one in (("estimate", self.estimate), ("mesh", self.mesh))}
-        scenes = {"given": self.given.model_dump(mode="json"), "scene": self.scene.model_dump(mode="json")}
-        return {**vars(self), **scenes, **known}
+        return cast(dict[str, Any], _MANIFEST.dump_python(self, mode="json"))
 
     def require_same(self, sha256: Mapping[str, str], versions: Mapping[str, str]) -> None:
         """Make sure that the rest of the run would have the same bits as if it had not been interrupted.
@@ -76,25 +61,21 @@ class Manifest:
         for key, path in self.scene.pictures.items():
             if sha256.get(key) != self.sha256.get(key):
                 raise FilesError(f"{path} has changed since the run began; put it back, or run the scene again")
-        began, here = (what_decides_bits(one, self.arch) for one in (self.versions, versions))
+        began, here = what_decides_bits(self.versions, self.arch), what_decides_bits(versions, self.arch)
         if began != here:
             # Where a tested compiler began the run, only the one that is here decides bits.
-            told = began if any(found != here.get(name) for name, found in began.items()) else self.versions
-            others = [f"{name} {found}" for name, found in told.items() if found != versions.get(name)]
+            named = began if any(version != here.get(name) for name, version in began.items()) else self.versions
+            others = [f"{name} {version}" for name, version in named.items() if version != versions.get(name)]
             raise FilesError(f"the run began with {', '.join(others)}; use these versions, or run the scene again")
 
     def gives_the_bits_of(self, other: Manifest) -> bool:
         """Tell whether the results of both runs have the same bits, so that one can continue the other."""
-        mine, its = (
-            (
-                one.scene.with_pictures(lambda path: "any"),
-                one.arch,
-                one.sha256,
-                what_decides_bits(one.versions, one.arch),
-            )
-            for one in (self, other)
-        )
-        return mine == its
+        return self._deciding() == other._deciding()
+
+    def _deciding(self) -> tuple[Any, ...]:
+        """Give all that decides bits. Pictures count by what is in them, wherever they are."""
+        scene = self.scene.with_pictures(lambda path: "any")
+        return scene, self.arch, self.sha256, what_decides_bits(self.versions, self.arch)
 
 
 _MANIFEST = TypeAdapter(Manifest)
@@ -110,7 +91,7 @@ def read_manifest(directory: Path) -> tuple[Manifest, Plan]:
     """
     path = directory / STAGING / CHECKPOINT / MANIFEST
     try:
-        with open_checkpoint(directory) as folder, folder.open(MANIFEST) as file:
+        with open_manifest(directory) as file:
             data = file.read(MAX_BYTES + 1)
         manifest = _MANIFEST.validate_python(unseal(data))
         # The current directory may be another one now.
@@ -140,6 +121,7 @@ def digests(plan: Plan) -> dict[str, str]:
     scene, sha256 = plan.scene, {}
     if plan.image is not None:
         sha256[f"{scene.kind}.map.image"] = plan.image.sha256
-    with suppress(PictureError):
-        sha256 |= {} if scene.image is None else {"image": file_sha256(scene.image)}
+    if scene.image is not None:
+        with suppress(PictureError):
+            sha256["image"] = file_sha256(scene.image)
     return sha256

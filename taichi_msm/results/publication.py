@@ -1,13 +1,13 @@
 """Replace the results in a directory, whole or not at all, and only what a run, or an export, has written.
 
-New files are staged below the directory, so that every move is a rename within one file system. When all are there, a
-marker with their names is written. Then the record of the earlier results is removed, the other files are moved, and
-the new record is moved last: where there is a record, the results are whole and belong together. If the process is
-killed before the marker is written, the directory stays as it was; if later, the next publication first completes the
-moves.
+New files are written in `.partial/new`, in the directory itself. When all are there, this folder is renamed to
+`.partial/whole`, and from then on the new results count: the record of the earlier ones is moved aside, the new files
+are moved into place, those of the earlier ones that are left are removed, and the new record is moved last. So where
+there is a record, the results are whole and belong together. If the process is killed before the folder is renamed, the
+directory stays as it was; if later, the next publication completes the moves.
 
-The record lists what was written, and only that is ever replaced or removed. If anything else is in the way, that
-is an error before anything is touched.
+A record lists what was written, and only that is ever replaced or removed. Whatever else is in the way, a link or a
+device among it, is an error before anything is touched. Who may write to the directory while a run does is trusted.
 """
 
 from __future__ import annotations
@@ -16,44 +16,16 @@ import errno
 import json
 import os
 import re
-from collections.abc import Callable, Collection, Iterable, Mapping
+from collections.abc import Callable, Collection, Mapping
 from contextlib import ExitStack, suppress
 from pathlib import Path
 from typing import Any, BinaryIO, NamedTuple
 
 from taichi_msm.errors import DamagedError, FilesError, ForeignError
-from taichi_msm.results.folder import FILE, FOLDER, HAS_DESCRIPTORS, INHERITS, Folder, Tree
-from taichi_msm.results.sealed import seal, unseal
-from taichi_msm.scene import UNTIL_NEXT
+from taichi_msm.results.entries import FILE, FOLDER, clear, files, kind, parents, require
+from taichi_msm.results.whole import LOCK, ensured, lock
 
-FRAMES, COORDINATES, DEPTH, FLOW, OCCLUSION, INSTRUMENT = SERIES_NAMES = (
-    "frames",
-    "coordinates",
-    "depth",
-    "flow",
-    "occlusion",
-    "instrument",
-)
-ANIMATION, TRAJECTORY, TRACKS, CAMERA = FILE_NAMES = "animation.gif", "trajectory.npz", "tracks.npz", "camera.json"
-RECORD = "run.json"
-
-# Folders with a file for every frame, and the extension of these files.
-# The result of an entry of a scene's `output`, where it has another name.
-RESULTS = {"png": FRAMES, "gif": ANIMATION, "trajectory": TRAJECTORY, "tracks": TRACKS}
-SERIES = dict(zip(SERIES_NAMES, ("png", "npy", "tiff", "flo", "png", "png"), strict=True))
-
-# A folder is a checkpoint if it has a run's manifest. Beside it are the positions of the frames and the last state.
-MANIFEST, POSITIONS, STATE = "manifest.json", "positions", "state.npz"
-
-STAGING, NEW, CHECKPOINT = ".partial", "new", "checkpoint"
-LOCK, MARKER, DRAFT = "lock", "complete", "draft"
-
-# All files that a run may have below a directory before it publishes its results.
-CHECKPOINT_TREE: Tree = dict.fromkeys((MANIFEST, POSITIONS, re.escape(STATE), DRAFT))
-NEW_TREE: Tree = {
-    **{folder: {rf"[0-9]{{4,}}\.{kind}": None} for folder, kind in SERIES.items()},
-    **{re.escape(name): None for name in (*FILE_NAMES, RECORD)},
-}
+STAGING, NEW, WHOLE, EARLIER = ".partial", "new", "whole", "earlier.json"
 
 # How often the staging directory is tried again while ending runs remove it; then it counts as missing.
 ATTEMPTS = 100
@@ -61,68 +33,19 @@ ATTEMPTS = 100
 # Size limit of a record [bytes]; even with more frames than any disk holds, it is smaller.
 MAX_RECORD = 1 << 28
 
-
-def open_checkpoint(directory: Path) -> Folder:
-    """Open the checkpoint of the unfinished run in a directory; raises OSError if there is none."""
-    with Folder.at(directory) as here, here.folder(STAGING) as staging:
-        return staging.folder(CHECKPOINT)
+# Tells of the name of a file whether it is listed in a record.
+Listed = Callable[[str], bool]
 
 
-def is_unfinished(directory: Path) -> bool:
-    """Tell whether a directory has an unfinished run that can be continued."""
-    try:
-        with open_checkpoint(directory) as checkpoint:
-            return checkpoint.kind(MANIFEST) == FILE
-    except (OSError, FilesError):
-        return False
+class Contents(NamedTuple):
+    """What is published in a directory: the results of a run, or an export. Patterns are those of `entries.files`."""
 
-
-def series_file(folder: str, number: int) -> str:
-    """Name the file of a frame within its folder."""
-    return f"{number:04}.{SERIES[folder]}"
-
-
-def series_length(folder: str, frames: int) -> int:
-    """Count the files in a folder of results with this many frames."""
-    return max(0, frames - 1) if folder in UNTIL_NEXT else frames
-
-
-def result_names(outputs: Iterable[str], frames: int) -> list[str]:
-    """List the files of results, with their folder.
-
-    Args:
-        outputs: names of files and of folders with a file for every frame.
-        frames: how many frames.
-    """
-    names = []
-    for output in outputs:
-        if output in SERIES:
-            names += [f"{output}/{series_file(output, n)}" for n in range(series_length(output, frames))]
-        else:
-            names.append(output)
-    return names
-
-
-class Kind(NamedTuple):
-    """What is published.
-
-    Attributes:
-        name: what writes it, in messages.
-        record: the file that lists what was written; it is moved last.
-        files: all that may be written, the record among it.
-        is_result: tells whether this may be the name of a file.
-        listed: turns the content of a record into what tells whether it lists a file.
-        alone: whether nothing else may be in the directory.
-        beside: what else may be in the staging directory.
-    """
-
-    name: str
-    record: str
-    files: Tree
-    is_result: Callable[[object], bool]
-    listed: Callable[[Any], Callable[[str], bool]]
-    alone: bool
-    beside: Tree
+    name: str  # what writes it, in messages
+    record: str  # the file that lists what was written
+    patterns: Collection[str]  # of all files that may be written, the record among them
+    listed: Callable[[Mapping[str, Any]], Listed]  # turns the content of a record into what tells of the files
+    alone: bool = False  # whether nothing else may be in the directory
+    beside: tuple[str, Collection[str]] | None = None  # a folder, and patterns of its files, that `keep` is about
 
 
 class Publication:
@@ -130,8 +53,8 @@ class Publication:
 
     Args:
         directory: where the results go; made if it does not exist.
+        contents: what they are.
         names: all that may be published; it is an error if anything but earlier results has one of these names.
-        kind: what is published; None: the results of a run.
 
     Raises:
         FilesError: on entering, when another process publishes there, or something is in the way that no run has put
@@ -139,33 +62,32 @@ class Publication:
         OSError: when the directory cannot be written.
 
     Attributes:
-        staging: the folder for all that is not published yet; known after entering.
-        staged: the folder to write the new files in, under their final names; likewise.
-        keep: whether the checkpoint of an unfinished run, this one or an earlier, stays when the with statement is
-            left.
+        staging: the folder for all that is not published yet.
+        staged: the folder to write the new files in, under their final names; made on entering.
+        keep: whether the folder beside the new files stays when the with statement is left.
     """
 
-    staging: Folder
-    staged: Folder
-
-    def __init__(self, directory: Path, names: Collection[str] = (), kind: Kind | None = None) -> None:
+    def __init__(self, directory: Path, contents: Contents, names: Collection[str] = ()) -> None:
+        self.staging = directory / STAGING
+        self.staged = self.staging / NEW
         self.keep = True
-        self._kind = kind or RUN
-        self._tree: Tree = {
-            **dict.fromkeys((LOCK, MARKER, DRAFT)),
-            NEW: self._kind.files,
-            **self._kind.beside,
-        }
-        self._path = directory
+        self._directory = directory
+        self._contents = contents
         self._names = names
+        self._record = directory / contents.record
+        self._beside, inner = contents.beside or ("", ())
+        self._patterns = [
+            *(rf"{folder}/{pattern}" for folder in (NEW, WHOLE) for pattern in contents.patterns),
+            *(rf"{self._beside}/{pattern}" for pattern in inner),
+            *(LOCK, re.escape(EARLIER)),
+        ]
+        self._lock: BinaryIO
         self._open = ExitStack()
-        self._lock: BinaryIO | None = None
-        self._created = False
 
     @property
     def lock_descriptors(self) -> tuple[int, ...]:
         """File descriptors that a child process inherits to keep the directory locked while it lives."""
-        return (self._lock.fileno(),) if self._lock and INHERITS else ()
+        return (self._lock.fileno(),) if os.name == "posix" else ()
 
     def publish(self, names: Collection[str]) -> None:
         """Replace earlier results by the staged files.
@@ -176,38 +98,30 @@ class Publication:
         Raises:
             FilesError: when a staged file was removed, or something that no run has written is in its place.
         """
-        with ExitStack() as opened:
-            staged = _Files(self.staged, opened)
-            for name in names:
-                if staged.kind(name) != FILE:
-                    said = f"was removed during the {self._kind.name}; run it again"
-                    raise FilesError(f"{self.staged.path / name} {said}")
-        earlier = self._earlier()
-        self._require_free(names, earlier)
-        with ExitStack() as opened:
-            here = _Files(self._here, opened)
-            # The marker names the exact files, so that a forged marker cannot make us remove the user's files.
-            known = {name: here.identity(name) for name in sorted(earlier)}
-        self.staging.write(MARKER, seal({"names": sorted(names), "earlier": known}), DRAFT)
+        for name in names:
+            if kind(self.staged / name) != FILE:
+                raise FilesError(f"{self.staged / name} was removed during the {self._contents.name}; run it again")
+        self._require_free(names, self._earlier(self._record))
+        self.staged.replace(self.staging / WHOLE)
         self._complete()
 
     def __enter__(self) -> Publication:
-        self._created = not self._path.exists()
         with ExitStack() as opened:
-            self._here = opened.enter_context(Folder.at(self._path, create=True))
-            opened.callback(self._remove_if_created)
+            opened.enter_context(ensured(self._directory))
             try:
-                self._acquire(opened)
+                opened.enter_context(self._acquire())
             except BlockingIOError:
-                said = f"another {self._kind.name} is writing there; choose another --out"
-                raise FilesError(f"{self._path}: {said}") from None
+                said = f"another {self._contents.name} is writing there; choose another --out"
+                raise FilesError(f"{self._directory}: {said}") from None
             self._complete()
             self._clear()
-            earlier = self._earlier()
-            if self._kind.alone:
-                _require_only(self._here, earlier)
+            earlier = self._earlier(self._record)
+            if self._contents.alone:
+                for name in files(self._directory, self._contents.patterns, strict=True, besides=(STAGING,)):
+                    if name not in earlier:
+                        raise ForeignError.at(self._directory / name, FILE)
             self._require_free(self._names, earlier)
-            self.staged = opened.enter_context(self.staging.folder(NEW, create=True))
+            self.staged.mkdir()
             self._open = opened.pop_all()
         return self
 
@@ -218,212 +132,87 @@ class Publication:
             self._clear()
         self._open.close()
 
-    def _earlier(self) -> set[str]:
-        """List the earlier results, according to their record."""
-        record = self._kind.record
-        if self._here.kind(record) is None:
+    def _earlier(self, record: Path) -> set[str]:
+        """List the results that are there, according to their record."""
+        if kind(record) is None:
             return set()
         try:
-            with self._here.open(record) as file:
-                listed = self._kind.listed(json.loads(file.read(MAX_RECORD)))
-        except (ValueError, KeyError, TypeError, RecursionError, OverflowError):
-            raise ForeignError.at(self._path / record, "a file") from None
-        return {name for name in self._here.files(self._kind.files) if self._kind.is_result(name) and listed(name)}
+            listed = self._listed(record)
+        except ValueError:
+            raise ForeignError.at(record, FILE) from None
+        return {name for name in files(self._directory, self._contents.patterns, strict=False) if listed(name)}
+
+    def _listed(self, record: Path) -> Listed:
+        """Read a record; raises ValueError if it is none, and ForeignError if it is no file."""
+        try:
+            with require(record, FILE).open("rb") as file:
+                return self._contents.listed(json.loads(file.read(MAX_RECORD)))
+        except (KeyError, TypeError, RecursionError, OverflowError) as error:
+            raise ValueError("no record") from error
 
     def _require_free(self, names: Collection[str], earlier: set[str]) -> None:
         """Make sure that results can be put in place, and that only earlier results are in their places."""
-        with ExitStack() as opened:
-            here = _Files(self._here, opened)
+        for folder in sorted(parents(names)):
             # Checked here, so that it fails before the run, and not halfway through the moves.
-            for folder in _folders(names):
-                if here.has_folder(folder) and not here.is_writable(folder):
-                    raise PermissionError(errno.EACCES, f"{folder} is not a writable directory")
-            for name in names:
-                kind = here.kind(name)
-                if kind is not None and (kind != FILE or name not in earlier):
-                    raise ForeignError.at(self._path / name, kind)
+            path = require(self._directory / folder, FOLDER)
+            if kind(path) is None:
+                continue
+            if not os.access(path, os.W_OK):
+                raise PermissionError(errno.EACCES, f"{folder} is not a writable directory")
+        for name in names:
+            actual = kind(self._directory / name)
+            if actual is not None and (actual != FILE or name not in earlier):
+                raise ForeignError.at(self._directory / name, actual)
 
     def _complete(self) -> None:
-        """Move the staged files into place, if the marker says that all are there; after an interruption, go on."""
+        """Move the new files into place, if all are there; after an interruption, go on."""
+        whole, aside = self.staging / WHOLE, self.staging / EARLIER
+        record = whole / self._contents.record
+        if kind(record) is None:
+            return  # The record is moved last, so all is done, or nothing is to be done.
         try:
-            with self.staging.open(MARKER) as file:
-                marker = unseal(file.read(MAX_RECORD))
-            # The marker is not trusted, as anybody may have written it.
-            is_result = self._kind.is_result
-            names = [name for name in marker["names"] if is_result(name)]
-            known = {name: identity for name, identity in marker["earlier"].items() if is_result(name)}
-        except FileNotFoundError:
-            return
-        except (ValueError, KeyError, TypeError, AttributeError):
-            message = f"{self.staging.path / MARKER} is damaged; remove {self.staging.path} and run the scene again"
-            raise DamagedError(message) from None
-        if self.staging.kind(NEW) is None:
-            return
-        with ExitStack() as opened:
-            new = opened.enter_context(self.staging.folder(NEW))
-            here, staged = _Files(self._here, opened), _Files(new, opened)
-            left = [name for name in names if staged.kind(name) is not None]
-            record = self._kind.record
-            if record not in left:
-                return  # The record is moved last, so all is done.
-            earlier = {name for name, identity in known.items() if here.identity(name) == identity}
-            self._require_free(left, earlier)
-            here.remove(record)
-            for name in left:
-                if name != record:
-                    staged.replace(name, here)
-            gone = [name for name in earlier.difference(names) if here.kind(name) == FILE]
-            for name in gone:
-                here.remove(name)
-            for folder in sorted(_folders(gone), reverse=True):
-                with suppress(OSError):  # not empty
-                    here.remove_folder(folder)
-            staged.replace(record, here)
+            is_new = self._listed(record)
+        except ValueError:
+            raise DamagedError(f"{record} is damaged; remove {self.staging} and run the scene again") from None
+        begun = kind(aside) is not None
+        earlier = self._earlier(aside if begun else self._record)
+        left = list(files(whole, self._contents.patterns, strict=True))
+        self._require_free(left, earlier)
+        if not begun and kind(self._record) is not None:
+            self._record.replace(aside)
+        for name in left:
+            if name != record.name:
+                (self._directory / name).parent.mkdir(parents=True, exist_ok=True)
+                (whole / name).replace(self._directory / name)
+        gone = [name for name in earlier if not is_new(name)]
+        for name in gone:
+            (self._directory / name).unlink(missing_ok=True)
+        for folder in sorted(parents(gone), reverse=True):
+            with suppress(OSError):  # not empty
+                (self._directory / folder).rmdir()
+        record.replace(self._record)
 
     def _clear(self) -> None:
         """Empty the staging directory, except for the lock and what is to be kept."""
-        if not self.keep and self.staging.kind(CHECKPOINT) is not None:
-            with self.staging.folder(CHECKPOINT) as checkpoint:
-                # The manifest is removed first, so that a half-removed checkpoint does not count as one.
-                checkpoint.remove(MANIFEST)
-        self.staging.clear(self._tree, keep=(LOCK, CHECKPOINT) if self.keep else (LOCK,))
+        clear(self.staging, self._patterns, keep=(LOCK, self._beside) if self.keep else (LOCK,))
 
-    def _acquire(self, opened: ExitStack) -> None:
-        """Make the staging directory and lock it. The lock is released when the processes that hold it have ended."""
+    def _acquire(self) -> ExitStack:
+        """Make the staging directory and lock it; released when all processes that hold the lock have ended."""
         for _ in range(ATTEMPTS):
-            # A run that is ending may remove the directory before we open it, or before we have its lock.
-            with suppress(FileNotFoundError), ExitStack() as tried:
-                self.staging = tried.enter_context(self._here.folder(STAGING, create=True))
+            # A run that is ending may remove the directory before we open the lock, or before we have it.
+            with suppress(FileNotFoundError), ExitStack() as opened:
+                with suppress(FileExistsError):
+                    self.staging.mkdir()
                 # Checked before anything is written there.
-                self.staging.require_only(self._tree)
-                tried.callback(self._remove_staging)
-                lock = tried.enter_context(self.staging.lock(LOCK))
-                if HAS_DESCRIPTORS:
-                    status = os.stat(LOCK, dir_fd=self.staging.descriptor, follow_symlinks=False)
-                    if not os.path.samestat(os.fstat(lock.fileno()), status):
-                        continue
-                self._lock = lock
-                tried.callback(self._remove_lock)
-                opened.push(tried.pop_all())
-                return
+                list(files(require(self.staging, FOLDER), self._patterns, strict=True))
+                opened.callback(_try, self.staging.rmdir)
+                self._lock = opened.enter_context(lock(self.staging / LOCK))
+                if os.path.samestat(os.fstat(self._lock.fileno()), (self.staging / LOCK).lstat()):
+                    opened.callback(_try, (self.staging / LOCK).unlink)
+                    return opened.pop_all()
         raise FileNotFoundError(errno.ENOENT, os.strerror(errno.ENOENT))
 
-    def _remove_lock(self) -> None:
-        with suppress(OSError, FilesError):
-            self.staging.remove(LOCK)
 
-    def _remove_staging(self) -> None:
-        with suppress(OSError):  # not empty
-            self._here.remove_folder(STAGING)
-
-    def _remove_if_created(self) -> None:
-        if self._created:
-            with suppress(OSError):  # not empty
-                self._path.rmdir()
-
-
-class _Files:
-    """Files by their names, which may begin with folders; each folder is opened once.
-
-    Args:
-        top: the folder of names that begin with none.
-        opened: closes what is opened.
-    """
-
-    def __init__(self, top: Folder, opened: ExitStack) -> None:
-        self._opened = opened
-        self._folders = {"": top}
-
-    def has_folder(self, name: str, *, create: bool = False) -> bool:
-        """Tell whether a folder is there; raises ForeignError if something else has its name; `create`: make it."""
-        if name not in self._folders:
-            folder, _, last = name.rpartition("/")
-            if self.has_folder(folder, create=create) and (create or self._folders[folder].kind(last) is not None):
-                self._folders[name] = self._opened.enter_context(self._folders[folder].folder(last, create=create))
-        return name in self._folders
-
-    def is_writable(self, name: str) -> bool:
-        """Tell whether this process may write to a folder, which is there."""
-        folder, _, last = name.rpartition("/")
-        return self._folders[folder].is_writable(last)
-
-    def remove_folder(self, name: str) -> None:
-        """Remove an empty folder, whose files were removed here."""
-        folder, _, last = name.rpartition("/")
-        self._folders[folder].remove_folder(last)
-
-    def kind(self, name: str) -> str | None:
-        """Say what has this name."""
-        folder, _, file = name.rpartition("/")
-        return self._folders[folder].kind(file) if self.has_folder(folder) else None
-
-    def identity(self, name: str) -> list[int] | None:
-        """Give what distinguishes a file from any other that may take its place."""
-        folder, _, file = name.rpartition("/")
-        return self._folders[folder].identity(file) if self.has_folder(folder) else None
-
-    def remove(self, name: str) -> None:
-        """Remove a file, if there is one."""
-        folder, _, file = name.rpartition("/")
-        if self.has_folder(folder):
-            self._folders[folder].remove(file)
-
-    def replace(self, name: str, other: _Files) -> None:
-        """Move a file to the same name among other files."""
-        folder, _, file = name.rpartition("/")
-        other.has_folder(folder, create=True)
-        self._folders[folder].replace(file, other._folders[folder], file)
-
-
-def _folders(names: Iterable[str]) -> set[str]:
-    """List the folders that files are in, and those around them."""
-    found = {name.rpartition("/")[0] for name in names if "/" in name}
-    return found | _folders(found) if found else found
-
-
-def _require_only(directory: Folder, names: set[str]) -> None:
-    """Make sure that a directory contains only these files, and its staging directory; raises ForeignError."""
-    folders = _folders(names)
-
-    def look(folder: Folder, prefix: str) -> None:
-        for last, kind in folder.entries():
-            name = prefix + last
-            if kind == FOLDER and name in folders:
-                with folder.folder(last) as inner:
-                    look(inner, f"{name}/")
-            elif name != STAGING and not (kind == FILE and name in names):
-                raise ForeignError.at(directory.path / name, kind)
-
-    look(directory, "")
-
-
-def _listed(record: Mapping[str, Any]) -> Callable[[str], bool]:
-    """Tell of a result whether it is one of the run with this record."""
-    outputs, frames = set(record["outputs"]), int(record["frames"])
-    return lambda name: _belongs(name, outputs, frames)
-
-
-def is_result(name: object) -> bool:
-    """Tell whether this is the name of a result."""
-    return isinstance(name, str) and (name in (*FILE_NAMES, RECORD) or _frame(name) is not None)
-
-
-def _belongs(name: str, outputs: Collection[str], frames: int) -> bool:
-    """Tell whether a result is one of a run with these outputs and this many frames."""
-    frame = _frame(name)
-    if frame is None:
-        return name in outputs
-    folder, number = frame
-    return folder in outputs and number < series_length(folder, frames)
-
-
-def _frame(name: str) -> tuple[str, int] | None:
-    """Give the folder of a frame's file, and its number; None for another name."""
-    found = re.fullmatch(r"([a-z]+)/([0-9]{4,15})\.[a-z]+", name)
-    if not found or found[1] not in SERIES or name != f"{found[1]}/{series_file(found[1], int(found[2]))}":
-        return None
-    return found[1], int(found[2])
-
-
-# The results of a run, and beside them the checkpoint from which it can go on.
-RUN = Kind("run", RECORD, NEW_TREE, is_result, _listed, alone=False, beside={CHECKPOINT: CHECKPOINT_TREE})
+def _try(remove: Callable[[], None]) -> None:
+    with suppress(OSError):
+        remove()

@@ -6,32 +6,40 @@ import json
 from collections.abc import Mapping
 from contextlib import ExitStack
 from pathlib import Path
-from types import TracebackType
 from typing import Any
 
+import numpy as np
 from numpy.typing import NDArray
 
 from taichi_msm.errors import writing
+from taichi_msm.outputs import table
+from taichi_msm.outputs.npz import Pieces, write_arrays
 from taichi_msm.physics.run_progress import Saved
 from taichi_msm.progress import Pause
 from taichi_msm.render.labels import Observed
-from taichi_msm.results.checkpoint import Checkpoint
+from taichi_msm.results.checkpoint import CHECKPOINT, PATTERNS, Checkpoint
 from taichi_msm.results.encoder import Encoder, Job
 from taichi_msm.results.labels import LabelWriter
-from taichi_msm.results.publication import (
-    ANIMATION,
-    CAMERA,
-    RECORD,
-    RESULTS,
-    SERIES,
-    TRACKS,
-    TRAJECTORY,
-    Publication,
-    result_names,
-)
-from taichi_msm.results.trajectory import write_trajectory
+from taichi_msm.results.publication import Contents, Listed, Publication
+from taichi_msm.results.whole import add, create
 from taichi_msm.scene import Scene
 from taichi_msm.timegrid import TimeGrid
+
+
+def _listed(record: Mapping[str, Any]) -> Listed:
+    """Tell of a file whether it is one of the run with this record."""
+    results, frames = set(record["outputs"]), int(record["frames"])
+    counts = {output.result: output.count(frames) for output in table.OUTPUTS.values() if output.is_series}
+
+    def is_listed(name: str) -> bool:
+        result, _, file = name.partition("/")
+        return result in results and (not file or int(Path(file).stem) < counts[result])
+
+    return is_listed
+
+
+# The results of a run, and beside them the checkpoint from which it can go on.
+RUN = Contents("run", table.RECORD, table.PATTERNS, _listed, beside=(CHECKPOINT, PATTERNS))
 
 
 class ResultWriter:
@@ -54,6 +62,9 @@ class ResultWriter:
 
     Attributes:
         saved: the state from which the run continues; None: from rest.
+        frames: in the results; after an interruption their number is known only after `finish`.
+        encode_seconds: processor time spent encoding pictures, in parallel with the simulation [s]; known after
+            `finish`.
     """
 
     def __init__(
@@ -66,29 +77,20 @@ class ResultWriter:
         resumes: bool = False,
     ) -> None:
         self.saved: Saved | None = None
+        self.frames = 0
+        self.encode_seconds = 0.0
         self._directory = directory
         self._scene = scene
-        self._grid = grid
         self._manifest = manifest
         self._resumes = resumes
-        self._publication = Publication(directory, self._names(scene.time.frames + 1))
-        self._checkpoint: Checkpoint
-        self._labels: LabelWriter
+        names = table.file_names(table.results(scene.output), scene.time.frames + 1)
+        self._publication = Publication(directory, RUN, names)
+        folder = self._publication.staging / CHECKPOINT
+        self._checkpoint = Checkpoint(folder, grid, scene.sheet.points, keeps_positions=bool(scene.output))
+        self._labels = LabelWriter(self._publication.staged, scene)
         self._encoder: Encoder | None = None
         self._open = ExitStack()
-        self._frames = 0
         self._finished = False
-        self._encode_seconds = 0.0
-
-    @property
-    def frames(self) -> int:
-        """Number of frames in the results. After an interruption it is known only after `finish`."""
-        return self._frames
-
-    @property
-    def encode_seconds(self) -> float:
-        """Processor time spent encoding pictures, in parallel with the simulation [s]; known after `finish`."""
-        return self._encode_seconds
 
     @property
     def stored(self) -> int:
@@ -101,25 +103,22 @@ class ResultWriter:
             return self._checkpoint.position(frame)
 
     def add(self, position: NDArray[Any], observed: Observed, pause: Pause = lambda: None) -> None:
-        """Add the next frame.
+        """Add the next frame: positions [m], shape (rows, cols, 3), and what else is wanted of it.
 
-        Args:
-            position: positions [m], shape (rows, cols, 3).
-            observed: the outputs of the frame that are wanted.
-            pause: called some times a second while the encoder takes no more; if it raises, the picture is given up.
+        `pause` is called some times a second while the encoder takes no more; if it raises, the picture is given up.
         """
         with writing(self._directory):
             # Positions come first: whenever the run is interrupted, there are at least as many of them as pictures.
             if self.stored == 0:
                 self._publication.keep = False
                 self._checkpoint.begin(self._manifest or {})
-            if self._frames == self.stored:
+            if self.frames == self.stored:
                 self._checkpoint.add(position)
                 self._publication.keep = self._manifest is not None
-            self._labels.add(self._frames, observed)
+            self._labels.add(self.frames, observed)
             if self._encoder and observed.picture is not None:
                 self._encoder.add(observed.picture, pause)
-            self._frames += 1
+            self.frames += 1
 
     @property
     def due(self) -> bool:
@@ -137,75 +136,52 @@ class ResultWriter:
             return self._checkpoint.load()
 
     def finish(self, pause: Pause = lambda: None, *, hurry: bool = False) -> None:
-        """Wait until every frame is encoded and close the files.
-
-        Args:
-            pause: called some times a second while it waits; what it raises stops the waiting, and this can be called
-                again.
-            hurry: give up frames that are not being encoded yet.
-        """
+        """Wait until every frame is encoded, and write what belongs to them all; arguments as for `Encoder.finish`."""
         if self._finished:
             return
         with writing(self._directory):
             if self._encoder:
-                report = self._encoder.finish(pause, hurry=hurry)
-                self._frames, self._encode_seconds = report.frames, report.seconds
-            self._labels.finish(self._frames)
-            if TRAJECTORY in self._outputs(self._frames):
-                scene = self._scene
-                with self._publication.staged.create(TRAJECTORY) as file:
-                    write_trajectory(
-                        file,
-                        self._checkpoint.positions(self._frames),
-                        self._frames,
-                        scene.sheet.points,
-                        self._checkpoint.precision,
-                        scene.time.frames_per_second,
-                    )
+                self.frames, self.encode_seconds = self._encoder.finish(pause, hurry=hurry)
+            self._labels.finish(self.frames)
+            if self.frames and "trajectory" in self._scene.output:
+                self._write_trajectory()
         self._finished = True
 
     def publish(self, record: Mapping[str, Any]) -> dict[str, Any]:
         """Write run.json, and replace earlier results by the new ones.
 
-        Args:
-            record: the content of run.json without "frames", their number, and "outputs", the names of all results,
-                with run.json as the last.
-
         Returns:
-            The whole content of run.json.
+            The content of run.json: the record, and "frames", their number, and "outputs", the names of all results.
         """
         self.finish()
         with writing(self._directory):
+            results = table.results(self._scene.output if self.frames else ())
             # By these names the next run into the directory recognises our files.
-            facts = {**record, "frames": self._frames, "outputs": self._outputs(self._frames)}
-            text = json.dumps(facts, indent=2, ensure_ascii=False, allow_nan=False)
-            with self._publication.staged.create(RECORD) as file:
-                # A file name that is not UTF-8 has surrogates; escaped with a backslash they are valid JSON.
-                file.write((text + "\n").encode("utf-8", "backslashreplace"))
-            self._publication.publish(self._names(self._frames))
-            self._publication.keep &= record.get("status") != "complete"
+            facts = {**record, "frames": self.frames, "outputs": results}
+            text = json.dumps(facts, indent=2, ensure_ascii=False, allow_nan=False) + "\n"
+            # A file name that is not UTF-8 has surrogates; escaped with a backslash they are valid JSON.
+            add(self._publication.staged / table.RECORD, text.encode("utf-8", "backslashreplace"))
+            self._publication.publish(table.file_names(results, self.frames))
+            if record.get("status") == "complete":
+                self._checkpoint.forget()
+                self._publication.keep = False
         return facts
 
-    def _outputs(self, frames: int) -> list[str]:
-        """List the outputs of a run with this many frames, the record last."""
-        wanted = [RESULTS.get(kind, kind) for kind in self._scene.output] if frames else []
-        if frames and self._scene.output_camera:
-            wanted.append(CAMERA)
-        order = (*SERIES, ANIMATION, TRAJECTORY, TRACKS, CAMERA)
-        return [*(name for name in order if name in wanted), RECORD]
-
-    def _names(self, frames: int) -> list[str]:
-        """List the files of a run with this many frames."""
-        return result_names(self._outputs(frames), frames)
+    def _write_trajectory(self) -> None:
+        """Write the time [s] and the positions [m] of all frames, which may be larger than memory."""
+        checkpoint, frames = self._checkpoint, self.frames
+        shape = (frames, *self._scene.sheet.points, 3)
+        arrays: dict[str, NDArray[Any] | Pieces] = {
+            "time": np.arange(frames) / self._scene.time.frames_per_second,
+            "position": Pieces(checkpoint.precision, shape, map(checkpoint.position, range(frames))),
+        }
+        with create(self._publication.staged / table.OUTPUTS["trajectory"].path()) as file:
+            write_arrays(file, arrays)
 
     def __enter__(self) -> ResultWriter:
         scene = self._scene
         with writing(self._directory), ExitStack() as opened:
             opened.enter_context(self._publication)
-            self._checkpoint = Checkpoint(
-                self._publication.staging, self._grid, scene.sheet.points, keeps_positions=bool(scene.output)
-            )
-            self._labels = LabelWriter(self._publication.staged, scene)
             if scene.draws:
                 job = Job(
                     folder=self._publication.staged,
@@ -220,11 +196,9 @@ class ResultWriter:
             opened.callback(self._checkpoint.close)
             if self._resumes:
                 self.saved = self._checkpoint.reopen()
-            self._frames = 0 if scene.renders else self.stored
+            self.frames = 0 if scene.renders else self.stored
             self._open = opened.pop_all()
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         self._open.close()

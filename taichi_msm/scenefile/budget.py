@@ -12,6 +12,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from taichi_msm.errors import Key, Problem, SceneError
+from taichi_msm.outputs.table import OUTPUTS
 from taichi_msm.physics.pilots import choose_pilots
 from taichi_msm.physics.plan import Plan
 from taichi_msm.render import texture
@@ -27,18 +28,6 @@ SAMPLE_BYTES = 48  # per sample, at most
 BAND_ROWS = 16  # rows of samples that a thread holds at a time
 PIXEL_BYTES = 3 * 12  # per pixel of the frame: its colours, from sums to bytes
 PICTURE_PIXEL_BYTES = 20  # per pixel of the picture's file, while it is decoded and converted; its texture takes less
-
-# The most that a pixel takes in a file [bytes], as one of noise: PNGs store it, codes of a GIF have 12 bits, and masks
-# have two values. Most pictures take a half or a third of it.
-PIXEL_FILE_BYTES = {
-    "png": 3.01,
-    "gif": 1.51,
-    "coordinates": 8,
-    "depth": 4,
-    "flow": 8,
-    "occlusion": 0.5,
-    "instrument": 0.5,
-}
 
 # The most that a file takes besides [bytes], but for a byte for every row of a PNG; and run.json besides its scene.
 FILE_BYTES = 1024
@@ -100,8 +89,8 @@ def estimate(plan: Plan) -> Budget:
     rows, cols = scene.sheet.points
     points, number_bytes = rows * cols, 4 if grid.precision == "f32" else 8
     frames, (width, height) = grid.frames + 1, scene.render.size
-    drawn = [PIXEL_FILE_BYTES[kind] for kind in set(scene.output) if kind in PIXEL_FILE_BYTES]
-    picture = sum(width * height * each + height + FILE_BYTES for each in drawn)
+    pixel_bytes = [output.pixel_bytes for name, output in OUTPUTS.items() if name in scene.output]
+    picture = sum(width * height * each + height + FILE_BYTES for each in pixel_bytes if each)
     positions = frames * points * 3 * number_bytes
     tracks = scene.render.tracks**2 * (frames * TRACK_BYTES + 16) + FILE_BYTES if "tracks" in scene.output else 0
     numbers = STATE_NUMBERS + OUTPUT_NUMBERS + len(scene.probes) + (MAP_NUMBERS if scene.stiffness_map else 0)
@@ -123,7 +112,7 @@ def estimate(plan: Plan) -> Budget:
     )
 
 
-def problems(plan: Plan) -> Iterator[Problem]:
+def size_problems(plan: Plan) -> Iterator[Problem]:
     """Find what makes a scene too large, with the numbers and the key to change."""
     yield from _step_problems(plan.scene, plan.grid)
     yield from _memory_problems(plan.scene, estimate(plan))

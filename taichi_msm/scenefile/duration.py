@@ -123,8 +123,8 @@ def _read() -> Kept:
         if not file.is_file():
             return {}
         with file.open("rb") as opened:
-            found = json.loads(opened.read(MAX_BYTES))
-        parts = found["parts"] if found["machine"] == _machine() else {}
+            content = json.loads(opened.read(MAX_BYTES))
+        parts = content["parts"] if content["machine"] == _machine() else {}
         pairs = {str(name): (float(seconds), float(amount)) for name, (seconds, amount) in parts.items()}
     except (OSError, ValueError, TypeError, LookupError, AttributeError, ArithmeticError, RuntimeError, MsmError):
         return {}

@@ -68,6 +68,12 @@ def load_scene(
     Raises:
         ArgumentError: when the overrides are neither a sequence of texts nor a mapping from texts.
         SceneError: with all problems of the scene, one line each, in the order of their places in the file.
+
+    Example:
+        >>> from taichi_msm import load_scene
+        >>> scene = load_scene("scenes/press.yaml", {"sheet.points": [41, 41]}, image="photo.jpg")
+        >>> scene.sheet.points, scene.image
+        ((41, 41), 'photo.jpg')
     """
     return load_plan(path, overrides, image).scene
 
@@ -88,7 +94,7 @@ def load_plan(
         draft.override(_Override(f"--image {cut(str(image))}", IMAGE, str(image)))
     plan, problems = validate(draft.data)
     draft.report(problems)
-    if plan is None or draft.found:
+    if plan is None or draft.problems:
         raise SceneError(draft.lines())
     return plan
 
@@ -175,7 +181,7 @@ class Draft:
 
     Attributes:
         data: its content, with the overrides applied so far.
-        found: the problems found so far, each with its place.
+        problems: found so far, each with its place.
     """
 
     def __init__(self, name: str, document: Document) -> None:
@@ -184,16 +190,16 @@ class Draft:
         self._overrides = 0
         self._overridden: dict[Key, _Place] = {}
         self.data: dict[str, Any] = document.data
-        self.found = [(self._in_file(mark), Problem(key, message)) for mark, key, message in document.faults]
+        self.problems = [(self._in_file(mark), Problem(key, message)) for mark, key, message in document.faults]
 
     def override(self, override: _Override) -> None:
         """Apply an override."""
         self._overrides += 1
         place = _Place(self._overrides, Mark(1, 1), override.name)
         if override.problems:
-            self.found += [(place, problem) for problem in override.problems]
+            self.problems += [(place, problem) for problem in override.problems]
         elif problem := self._put(override.path, override.value, place):
-            self.found.append((place, problem))
+            self.problems.append((place, problem))
 
     def find_pictures(self, folder: Path, keys: Sequence[Key]) -> None:
         """Change the paths of pictures, given relative to a folder, to paths from the current directory."""
@@ -213,22 +219,22 @@ class Draft:
         if not given and not _is_below(folder / image, folder):
             remedy = ", or name it with --image" if key == IMAGE else ""
             said = f"{image} is not below the scene's folder; put the picture there{remedy}"
-            self.found.append((self._place(key), Problem(key, said)))
+            self.problems.append((self._place(key), Problem(key, said)))
             del holder[key[-1]]
 
     def report(self, problems: Iterable[Problem]) -> None:
         """Add problems with their places, except those of keys that already have a problem."""
-        keys = {problem.path for _, problem in self.found}
+        keys = {problem.path for _, problem in self.problems}
         for problem in problems:
             if problem.path not in keys:
                 keys.add(problem.path)
-                self.found.append((self._place(problem.path), problem))
+                self.problems.append((self._place(problem.path), problem))
 
     def lines(self) -> list[str]:
         """Format the problems in the order of their places."""
-        found = sorted(self.found, key=lambda item: item[0][:2])
-        lines = [_line(place.name, problem) for place, problem in found[:MAX_LINES]]
-        return lines if len(lines) == len(found) else [*lines, "and more"]
+        ordered = sorted(self.problems, key=lambda item: item[0][:2])
+        lines = [_line(place.name, problem) for place, problem in ordered[:MAX_LINES]]
+        return lines if len(lines) == len(ordered) else [*lines, "and more"]
 
     def _in_file(self, mark: Mark) -> _Place:
         return _Place(0, mark, f"{self._name}:{mark.line}:{mark.column}")
@@ -298,8 +304,8 @@ def _read_text(name: str, kind: Kind) -> str:
         mode = path.stat().st_mode
         if not stat.S_ISREG(mode):
             # Opening a pipe would block until its other end is opened.
-            found = "a directory" if stat.S_ISDIR(mode) else "not a regular file"
-            raise _error(name, f"{found}; name a {kind.name} file")
+            what = "a directory" if stat.S_ISDIR(mode) else "not a regular file"
+            raise _error(name, f"{what}; name a {kind.name} file")
         with path.open("rb") as file:
             raw = file.read(MAX_BYTES + 1).removeprefix(codecs.BOM_UTF8)
     except ValueError:

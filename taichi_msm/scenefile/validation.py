@@ -68,7 +68,7 @@ def _joint_check(
     if picture:
         problems += texture.problems(scene)
     if plan is not None:
-        problems += budget.problems(plan)
+        problems += budget.size_problems(plan)
     return plan, problems
 
 
@@ -118,4 +118,4 @@ def parse(model: type[Model], data: dict[str, Any]) -> tuple[Model | None, list[
     try:
         return model.model_validate(data), []
     except ValidationError as error:
-        return None, faults.problems(error, model, data)
+        return None, faults.key_problems(error, model, data)

@@ -132,7 +132,7 @@ class PointStudy:
             return None
         finer = make_plan(with_points(plan.scene, points), plan.image)
         work = [math.prod(one.scene.sheet.points) * one.grid.steps_per_frame for one in (plan, finer)]
-        return None if seconds * work[1] / work[0] > longest_run or any(budget.problems(finer)) else finer
+        return None if seconds * work[1] / work[0] > longest_run or any(budget.size_problems(finer)) else finer
 
     def _measure_errors(self, finer: Plan | None) -> None:
         """Step through the scene with all sheets side by side, and compare them frame by frame.

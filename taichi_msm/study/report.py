@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import json
 import math
-import tempfile
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
 from taichi_msm.errors import writing
+from taichi_msm.results.whole import staged
 from taichi_msm.study.page import page
 from taichi_msm.study.result import Measured, Reference, Stepping, Study
 
@@ -24,13 +24,8 @@ def require_writable(directory: Path) -> None:
     Raises:
         FilesError: when it cannot.
     """
-    with writing(directory):
-        existed = directory.exists()
-        directory.mkdir(parents=True, exist_ok=True)
-        with tempfile.TemporaryDirectory(prefix=".partial-", dir=directory):
-            pass
-        if not existed:
-            directory.rmdir()
+    with writing(directory), staged(directory):
+        pass
 
 
 def write_report(study: Study, directory: Path) -> list[str]:
@@ -48,19 +43,16 @@ def write_report(study: Study, directory: Path) -> list[str]:
     Raises:
         FilesError: when the directory cannot be written.
     """
-    with writing(directory):
-        directory.mkdir(parents=True, exist_ok=True)
-        with tempfile.TemporaryDirectory(prefix=".partial-", dir=directory) as name:
-            staged = Path(name)
-            outputs = [*([PICTURE] if _draw(study, staged / PICTURE) else []), PAGE, RECORD]
-            record = json.dumps({**as_record(study), "outputs": outputs}, indent=2, ensure_ascii=False, allow_nan=False)
-            for file, text in ((PAGE, page(study)), (RECORD, record + "\n")):
-                # A file name that is not UTF-8 has surrogates; written with backslashes they are valid in JSON too.
-                (staged / file).write_text(text, encoding="utf-8", errors="backslashreplace", newline="")
-            if PICTURE not in outputs:
-                (directory / PICTURE).unlink(missing_ok=True)
-            for output in outputs:
-                (staged / output).replace(directory / output)
+    with writing(directory), staged(directory) as hidden:
+        outputs = [*([PICTURE] if _draw(study, hidden / PICTURE) else []), PAGE, RECORD]
+        record = json.dumps({**as_record(study), "outputs": outputs}, indent=2, ensure_ascii=False, allow_nan=False)
+        for file, text in ((PAGE, page(study)), (RECORD, record + "\n")):
+            # A file name that is not UTF-8 has surrogates; written with backslashes they are valid in JSON too.
+            (hidden / file).write_text(text, encoding="utf-8", errors="backslashreplace", newline="")
+        if PICTURE not in outputs:
+            (directory / PICTURE).unlink(missing_ok=True)
+        for output in outputs:
+            (hidden / output).replace(directory / output)
     return outputs
 
 

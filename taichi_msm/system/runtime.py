@@ -239,13 +239,13 @@ def our_compilation(*, optimised: bool = True) -> contextlib.AbstractContextMana
 @contextlib.contextmanager
 def _replaced(parts: Parts) -> Iterator[None]:
     """Give attributes of objects other values for a while."""
-    found = [(owner, name, getattr(owner, name)) for owner, name, _ in parts]
+    originals = [(owner, name, getattr(owner, name)) for owner, name, _ in parts]
     for owner, name, value in parts:
         setattr(owner, name, value)
     try:
         yield
     finally:
-        for owner, name, value in found:
+        for owner, name, value in originals:
             setattr(owner, name, value)
 
 

@@ -4,10 +4,8 @@ from __future__ import annotations
 
 import filecmp
 import os
-import secrets
 import shutil
-from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
 
@@ -15,17 +13,74 @@ import yaml
 from PIL import Image
 
 from taichi_msm.errors import FilesError, printable, writing
-from taichi_msm.results.gif import Picture
-from taichi_msm.scene import Scene
+from taichi_msm.outputs.gif import Picture
+from taichi_msm.outputs.table import OUTPUTS
+from taichi_msm.progress import Pause
+from taichi_msm.results.encoder import Encoder, Job
+from taichi_msm.results.whole import place, staged
+from taichi_msm.scene import Render, Scene
 from taichi_msm.scenefile.load import MAX_BYTES
 from taichi_msm.scenefile.yaml_reader import MAX_NODES
-from taichi_msm.viewer.film import Film
 
 # The C emitter is ten times faster; a PyYAML that was built without it writes the same text.
 _DUMPER: Any = getattr(yaml, "CSafeDumper", yaml.SafeDumper)
 
 # A scene has at most this many values besides the keys of its probes.
-VALUES_BESIDES = 1000
+OTHER_VALUES = 1000
+
+
+class Film:
+    """A GIF of a session, encoded in a hidden folder while the session runs. On closing, it is removed unless moved.
+
+    Args:
+        folder: in which the hidden one is made; made if it does not exist.
+        render: gives the size of the pictures, and the background, a colour that is kept exactly.
+        rate: pictures per second.
+        parts: frames of the session per picture.
+        begin: frame of the session with which it begins.
+        option: what the error says to choose another folder by.
+
+    Raises:
+        FilesError: here and in the methods, when it cannot be written.
+
+    Attributes:
+        pictures: how many it has.
+    """
+
+    def __init__(
+        self, folder: Path, render: Render, rate: float, parts: int, begin: int = 0, option: str = "--out"
+    ) -> None:
+        self.pictures = 0
+        self._parts, self._begin, self._place = parts, begin, (folder, option)
+        with writing(*self._place), ExitStack() as opened:
+            self._hidden = opened.enter_context(staged(folder))
+            job = Job(self._hidden, render.size, rate, png=False, gif=True, background=render.background)
+            self._encoder = Encoder(job)
+            opened.callback(self._encoder.abort)
+            self._opened = opened.pop_all()
+
+    def show(self, picture: Picture, frame: int, pause: Pause = lambda: None) -> None:
+        """Film a picture of a frame of the session; one that comes late is taken several times. `pause`: as Encoder."""
+        with writing(*self._place):
+            while self.pictures * self._parts <= frame - self._begin:
+                self._encoder.add(picture, pause)
+                self.pictures += 1
+
+    def encoded(self, pause: Pause = lambda: None) -> Path:
+        """Wait until the last picture is encoded; there must be one. Returns the file, which is to be moved away."""
+        with writing(*self._place):
+            self._encoder.finish(pause)
+        return self._hidden / OUTPUTS["gif"].path()
+
+    def close(self) -> None:
+        """End it."""
+        self._opened.close()
+
+    def __enter__(self) -> Film:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
 
 
 class Captures:
@@ -35,55 +90,48 @@ class Captures:
         folder: the folder.
         name: what the session is of; written into its scenes.
 
+    Raises:
+        FilesError: in the methods, when the folder cannot be written.
+
     Attributes:
-        kept: the saved files, in order.
+        folder: the folder.
+        saved: the saved files, in order.
     """
 
     def __init__(self, folder: Path, name: str) -> None:
         self.folder = folder
-        self.kept: list[Path] = []
+        self.saved: list[Path] = []
         self._name = name
 
-    def keep_picture(self, picture: Picture) -> Path:
-        """Save a picture as PNG; returns its file.
+    def save_picture(self, picture: Picture) -> Path:
+        """Save a picture as PNG; returns its file."""
+        with writing(self.folder), staged(self.folder) as hidden:
+            Image.fromarray(picture).save(hidden / "picture", "PNG")
+            return self._place(hidden / "picture", "picture", ".png")
 
-        Raises:
-            FilesError: here and below, when the folder cannot be written.
-        """
-        with _draft(self.folder) as draft:
-            Image.fromarray(picture).save(draft, "PNG")
-            return self._place(draft, "picture", ".png")
-
-    def keep_scene(self, scene: Scene) -> Path:
+    def save_scene(self, scene: Scene) -> Path:
         """Save a scene, and beside it copies of its pictures, where a scene file must have them; returns its file."""
-        with _draft(self.folder) as draft:
+        with writing(self.folder), staged(self.folder) as hidden:
             scene = scene.with_pictures(lambda path: self._copied(Path(path)).name)
             data = scene.model_dump(mode="json", exclude_none=True)
             text = yaml.dump(
                 data, Dumper=_DUMPER, sort_keys=False, default_flow_style=None, width=120, allow_unicode=True
             )
             text = f"# What was done in a live session of {printable(self._name)}; `run` repeats it.\n{text}"
-            if len(text.encode()) > MAX_BYTES or values(scene) + VALUES_BESIDES > MAX_NODES:
+            if len(text.encode()) > MAX_BYTES or probe_values(scene) + OTHER_VALUES > MAX_NODES:
                 raise FilesError("this session is too long for a scene file; reset it, and do less")
-            draft.write_text(text, "utf-8")
-            return self._place(draft, "session", ".yaml")
+            (hidden / "session").write_text(text, "utf-8")
+            return self._place(hidden / "session", "session", ".yaml")
 
-    def film(self, size: tuple[int, int], rate: float, background: tuple[int, int, int]) -> Film:
-        """Begin a film."""
-        return Film(self.folder, size, rate, background)
-
-    def keep_film(self, film: Film) -> Path:
+    def save_film(self, film: Film) -> Path:
         """End a film that has a picture, and save it; returns its file."""
         with film, writing(self.folder):
             return self._place(film.encoded(), "film", ".gif")
 
     def _place(self, draft: Path, stem: str, suffix: str) -> Path:
         """Give a file the next free name."""
-        number = 1
-        while not _named(draft, path := self.folder / f"{stem}-{number}{suffix}"):
-            number += 1
-        self.kept.append(path)
-        return path
+        self.saved.append(place(draft, self.folder, stem, suffix))
+        return self.saved[-1]
 
     def _copied(self, image: Path) -> Path:
         """Make sure that the folder has a copy of a picture, under the picture's own name if that is free."""
@@ -94,40 +142,11 @@ class Captures:
             number += 1
             copy = self.folder / f"{image.stem}-{number}{image.suffix}"
         if not os.path.lexists(copy):
-            with _draft(self.folder) as draft:
-                shutil.copyfile(image, draft)
-                draft.replace(copy)
+            with staged(self.folder) as hidden:
+                shutil.copyfile(image, hidden / "copy").replace(copy)
         return copy
 
 
-@contextmanager
-def _draft(folder: Path) -> Iterator[Path]:
-    """Give a hidden name to write a file under; the name is removed in the end."""
-    # The name is random, as a killed process may have left its draft, which can be a hard link to a file that it saved.
-    draft = folder / f".draft-{secrets.token_hex(8)}"
-    with writing(folder):
-        folder.mkdir(parents=True, exist_ok=True)
-        try:
-            yield draft
-        finally:
-            draft.unlink(missing_ok=True)
-
-
-def values(scene: Scene) -> int:
+def probe_values(scene: Scene) -> int:
     """Count the values that the keys of a scene's probes add to its file, which may have `MAX_NODES` in all."""
     return sum(4 * len(probe.at) + 3 * len(probe.load) for probe in scene.probes)
-
-
-def _named(draft: Path, path: Path) -> bool:
-    """Give a file a name, unless another has it."""
-    try:
-        # Unlike a rename, a link does not replace another file.
-        os.link(draft, path)
-    except FileExistsError:
-        return False
-    except OSError:
-        # The file system has no links.
-        if path.exists():
-            return False
-        draft.replace(path)
-    return True

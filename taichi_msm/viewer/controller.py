@@ -5,47 +5,41 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from taichi_msm.render.picking import on_rest_plane, pick
-from taichi_msm.scene import Scene
+from taichi_msm.render.picking import on_rest_plane
+from taichi_msm.simulation import Simulation
 from taichi_msm.viewer.held_tool import HeldTool, Place
 from taichi_msm.viewer.viewport import Viewport
 
 
 class Controller:
-    """Moves a tool with a pointer over a picture.
+    """Moves a tool with a pointer over the picture of a simulation."""
 
-    Args:
-        tool: the tool.
-        viewport: how the tissue is shown.
-        scene: the scene that is shown.
-    """
-
-    def __init__(self, tool: HeldTool, viewport: Viewport, scene: Scene) -> None:
+    def __init__(self, tool: HeldTool, viewport: Viewport, simulation: Simulation) -> None:
         self._tool = tool
         self._viewport = viewport
-        self._refine, self._size = scene.render.refine, scene.sheet.size
+        self._simulation = simulation
         # Where a drag begins: the place of the tool, and the point of the rest plane that was then under the pointer.
         self._held: tuple[Place, NDArray[np.floating] | None] | None = None
         self._pointer = (0.0, 0.0)
         self._hovering: tuple[float, float] | None = None
 
-    def press(self, position: NDArray[np.floating], x: float, y: float, direction: int) -> bool:
+    def press(self, x: float, y: float, direction: int) -> bool:
         """Press (1) or pull (-1) what is seen at a pixel; returns whether there is anything."""
-        place = pick(position, self._refine, self._viewport.view, (x, y))
+        place = self._simulation.pick((x, y), self._viewport.view)
         if place is None:
             return False
         self._tool.press(place, direction)
         self._pointer = x, y
-        self._held = place, on_rest_plane(self._viewport.view, (x, y))
+        self._held = place, on_rest_plane(self._viewport.view, self._pointer)
         return True
 
-    def over(self, position: NDArray[np.floating]) -> Place | None:
+    def over(self) -> Place | None:
         """Find the place on the sheet under a pointer that presses nothing; None if there is none."""
         if self._tool.held or self._tool.percent != 0 or self._hovering is None:
             return None
-        return pick(position, self._refine, self._viewport.view, self._hovering)
+        return self._simulation.pick(self._hovering, self._viewport.view)
 
-    def point(self, x: float, y: float) -> None:
+    def hover(self, x: float, y: float) -> None:
         """Note where a pointer is that presses nothing."""
         self._hovering = x, y
 
@@ -57,10 +51,10 @@ class Controller:
         if self._held is None:
             return
         self._pointer = x, y
-        ((across, down), begun), here = self._held, on_rest_plane(self._viewport.view, (x, y))
+        ((across, down), begun), here = self._held, on_rest_plane(self._viewport.view, self._pointer)
         if begun is None or here is None:
             return
-        (right, up), (height, width) = here - begun, self._size
+        (right, up), (height, width) = here - begun, self._simulation.scene.sheet.size
         self._tool.move((across + right / width, down - up / height))
 
     def release(self) -> None:

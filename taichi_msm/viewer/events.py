@@ -5,8 +5,8 @@ from __future__ import annotations
 from typing import NamedTuple
 
 
-class Point(NamedTuple):
-    """The pointer is over a pixel, and nothing is pressed."""
+class Hover(NamedTuple):
+    """The pointer is over a pixel, and no button is pressed."""
 
     x: float
     y: float
@@ -56,7 +56,7 @@ class Key(NamedTuple):
     name: str
 
 
-Event = Point | Press | Drag | Release | Turn | Percent | Harder | Key
+Event = Hover | Press | Drag | Release | Turn | Percent | Harder | Key
 
 # How much a notch of the wheel, or the up or down key, changes the strength [percent of the full force].
 NOTCH = 5.0

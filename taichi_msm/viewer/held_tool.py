@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+import math
 from collections import deque
 from collections.abc import Sequence
-from typing import TypeVar
+from typing import Any
 
-from taichi_msm.scene import Instrument, Probe
+from taichi_msm.scene import Probe
 
 # How long a hand takes from no force to the full force [s]. It lets go at once.
 RISE = 0.2
@@ -18,7 +19,6 @@ DIGITS = 6
 LATEST = 4
 
 Place = tuple[float, float]
-Key = TypeVar("Key", bound=tuple[float, ...])
 
 
 class HeldTool:
@@ -57,15 +57,9 @@ class HeldTool:
         self._at: list[tuple[float, float, float]] = [(0.0, *self.place)]
 
     @property
-    def instrument(self) -> Instrument | None:
-        """The rod that is drawn as the tool, if there is one."""
-        return self._probe.instrument
-
-    @property
     def goal(self) -> Place:
         """The place of the tool once all that was asked for is done."""
-        press = next((asked for asked in reversed(self._asked) if asked is not None), None)
-        return self._goal if press is None else press[0]
+        return next((press[0] for press in reversed(self._asked) if press is not None), self._goal)
 
     @property
     def held(self) -> bool:
@@ -102,20 +96,17 @@ class HeldTool:
         """
         begin, end = frame / self._rate, (frame + 1) / self._rate
         if self._asked:
-            asked = self._asked.popleft()
-            if asked is None:
+            if (press := self._asked.popleft()) is None:
                 self._pressing = 0
             else:
-                self._goal, self._pressing = asked
-                self.place = self._goal
-                self._put_at(begin)
+                self._goal, self._pressing = press
+                self._put(begin)
         if self._pressing == 0 and self.percent != 0:
             self.percent = 0.0
             self._load.append((begin, 0.0))
         if self._pressing != 0:
             self.percent = self._nearer(self._pressing * self.strength)
-            self.place = self._goal
-            self._put_at(end)
+            self._put(end)
         _extend(self._load, (end, self.percent))
         if self._given == (self.percent, self.place):
             return None
@@ -129,13 +120,14 @@ class HeldTool:
     def _nearer(self, goal: float) -> float:
         """Come as near to a percentage as a hand can within a frame."""
         most = 100 / (RISE * self._rate)
-        return goal if abs(goal - self.percent) <= most else self.percent + (most if goal > self.percent else -most)
+        return goal if abs(goal - self.percent) <= most else self.percent + math.copysign(most, goal - self.percent)
 
-    def _put_at(self, time: float) -> None:
-        key = (time, *self.place)
+    def _put(self, time: float) -> None:
+        """Come to the goal at a time."""
+        self.place = self._goal
         if self._at[-1][0] == time:
             self._at.pop()
-        _extend(self._at, key)
+        _extend(self._at, (time, *self.place))
 
     def _as_probe(
         self, load: Sequence[tuple[float, float]], at: Sequence[tuple[float, float, float]], end: float
@@ -146,7 +138,7 @@ class HeldTool:
         return self._probe.model_copy(update={"load": tuple(load), "at": tuple(at)})
 
 
-def _extend(keys: list[Key], key: Key) -> None:
+def _extend(keys: list[Any], key: tuple[float, ...]) -> None:
     """Add a key; if it and the two before differ only in time, the middle one is dropped, which changes no bit."""
     if len(keys) > 1 and keys[-1][1:] == keys[-2][1:] == key[1:]:
         keys.pop()

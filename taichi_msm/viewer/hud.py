@@ -10,13 +10,13 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image, ImageDraw, ImageFont
 
-from taichi_msm.results.gif import Picture
+from taichi_msm.outputs.gif import Picture
 
 # Height of letters: this share of the picture's height, within limits [px].
 LETTER = 1 / 36
 SMALLEST, LARGEST = 11, 22
 
-# Width of a letter as a share of its height; in most texts letters are narrower on average.
+# Width of a letter as a share of its height, at most on average.
 LETTER_WIDTH = 0.56
 
 # How many times darker the picture is behind text.
@@ -31,40 +31,32 @@ RING = 1 / 50
 
 
 def write(picture: Picture, above: Sequence[str], below: str = "", table: Mapping[str, str] | None = None) -> None:
-    """Write text over a picture, as large as its height asks for, on darker panels.
+    """Write text over a picture, which is changed, as large as its height asks for, on darker panels.
 
     Args:
-        picture: colours, shape (height, width, 3); changed.
+        picture: colours, shape (height, width, 3).
         above: lines for its top left corner.
         below: a text for its bottom left corner, wrapped as needed.
         table: two columns, below the lines at the top.
     """
     height, width = picture.shape[:2]
-    size = _size(picture)
-    edge = size // 2
-    top = edge
-    for panel in (_lines(tuple(above), size), _columns(tuple((table or {}).items()), size)):
+    size = _letter_size(picture)
+    top = edge = size // 2
+    for panel in (_panel(size, *above), _columns(tuple((table or {}).items()), size)):
         _lay(picture, panel, edge, top)
         top += len(panel) + edge if len(panel) else 0
-    lines = textwrap.wrap(below, max(1, int((width - 4 * edge) / (LETTER_WIDTH * size))))
-    panel = _lines(tuple(lines), size)
+    panel = _panel(size, *textwrap.wrap(below, max(1, int((width - 4 * edge) / (LETTER_WIDTH * size)))))
     _lay(picture, panel, edge, height - len(panel) - edge)
 
 
 def announce(picture: Picture, text: str) -> None:
     """Write a text over the middle of a picture, shape (height, width, 3), which is changed."""
-    panel = _lines((text,), _size(picture))
+    panel = _panel(_letter_size(picture), text)
     _lay(picture, panel, (picture.shape[1] - panel.shape[1]) // 2, (len(picture) - len(panel)) // 2)
 
 
 def mark(picture: Picture, tool: tuple[float, float], *, pulls: bool) -> None:
-    """Draw a ring around the place of the tool.
-
-    Args:
-        picture: colours, shape (height, width, 3); changed.
-        tool: the pixel at which the tool is seen.
-        pulls: whether it pulls.
-    """
+    """Draw a ring around the pixel at which the tool is seen; changes the picture, shape (height, width, 3)."""
     radius = picture.shape[0] * RING
     reach = int(radius) + 4
     left, top = max(0, int(tool[0]) - reach), max(0, int(tool[1]) - reach)
@@ -86,8 +78,7 @@ def _lay(picture: Picture, panel: NDArray[np.uint8], left: int, top: int) -> Non
     part[:] = np.maximum(part // DARKER, panel[: part.shape[0], : part.shape[1], None])
 
 
-@lru_cache(maxsize=64)
-def _lines(lines: tuple[str, ...], size: int) -> NDArray[np.uint8]:
+def _panel(size: int, *lines: str) -> NDArray[np.uint8]:
     """Make the panel of some lines."""
     return _columns(tuple((line, "") for line in lines), size)
 
@@ -108,5 +99,5 @@ def _columns(rows: tuple[tuple[str, str], ...], size: int) -> NDArray[np.uint8]:
     return np.asarray(image)
 
 
-def _size(picture: Picture) -> int:
+def _letter_size(picture: Picture) -> int:
     return int(min(LARGEST, max(SMALLEST, picture.shape[0] * LETTER)))

@@ -7,8 +7,8 @@ from functools import partial
 from pathlib import Path
 
 from taichi_msm.errors import FilesError, writing
+from taichi_msm.viewer.captures import Film
 from taichi_msm.viewer.events import Event
-from taichi_msm.viewer.film import Film
 from taichi_msm.viewer.session import Session
 
 OPTION = "--record"
@@ -39,12 +39,12 @@ def record(
     if path.is_dir():
         raise FilesError(f"{path}: a directory; choose another {OPTION}")
     frames = round(seconds * session.rate)
-    left = iter(events)
-    upcoming = next(left, None)
+    events = iter(events)
+    upcoming = next(events, None)
     failures: list[FilesError] = []
     notice = ""
-    render = session.scene.render
-    with Film(path.parent, render.size, session.rate / session.parts, render.background, OPTION) as reel:
+    rate, parts = session.rate / session.parts, session.parts
+    with Film(path.parent, session.scene.render, rate, parts, option=OPTION) as film:
         for frame in range(frames + 1):
             progress(frame, frames)
             while upcoming is not None and upcoming[0] <= frame:
@@ -55,9 +55,9 @@ def record(
                 if session.notice not in ("", notice):
                     say(f"{frame / session.rate:g} s: {session.notice}")
                 notice = session.notice
-                upcoming = next(left, None)
-            if frame % session.parts == 0:
-                reel.add(session.picture(), partial(progress, frame, frames))
+                upcoming = next(events, None)
+            if frame % parts == 0:
+                film.show(session.picture(), frame, partial(progress, frame, frames))
             if frame < frames:
                 session.advance()
             if session.fault:
@@ -66,6 +66,6 @@ def record(
         if upcoming is not None:
             say(f"the film ends at {frame / session.rate:g} s, before some of the script's events")
         with writing(path, OPTION):
-            reel.encoded(partial(progress, frames, frames)).replace(path)
+            film.encoded(partial(progress, frames, frames)).replace(path)
     if failures:
         raise failures[0]

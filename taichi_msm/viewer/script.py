@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from itertools import pairwise
 from pathlib import Path
 from typing import Annotated, Literal
 
@@ -57,14 +56,14 @@ class Entry(Section):
         for name in ("at", "by", "to", "name"):
             given, needed = getattr(self, name) is not None, NEEDS[self.do] == name
             if given and not needed:
-                raise PydanticCustomError(REFUSED, "{do} takes none; remove it", {"key": name, "do": self.do})
+                raise _refused(name, "{do} takes none; remove it", do=self.do)
             if needed and not given:
-                raise PydanticCustomError(REFUSED, "missing; {do} needs it", {"key": name, "do": self.do})
+                raise _refused(name, "missing; {do} needs it", do=self.do)
         if self.name is not None and self.name not in PRESSABLE:
-            said = "there is no key '{name}' here; expected one of: {keys}"
-            raise PydanticCustomError(REFUSED, said, {"key": "name", "name": self.name, "keys": ", ".join(PRESSABLE)})
+            message = "there is no key '{name}' here; expected one of: {keys}"
+            raise _refused("name", message, name=self.name, keys=", ".join(PRESSABLE))
         if self.seconds > 0 and self.do not in LASTING:
-            raise PydanticCustomError(REFUSED, "{do} takes no time; remove it", {"key": "seconds", "do": self.do})
+            raise _refused("seconds", "{do} takes no time; remove it", do=self.do)
         return self
 
 
@@ -80,34 +79,25 @@ class Script(Section):
 
     @field_validator("events", mode="after")
     @classmethod
-    def _on_something(cls, events: tuple[Entry, ...]) -> tuple[Entry, ...]:
-        presses = False
+    def _in_order(cls, events: tuple[Entry, ...]) -> tuple[Entry, ...]:
+        presses, end = False, 0.0
         for n, entry in enumerate(events):
             if entry.do in ("drag", "release") and not presses:
-                said = "{do} when nothing is pressed; put a press or a pull before it"
-                raise PydanticCustomError(REFUSED, said, {"key": n, "do": entry.do})
-            presses = entry.do in ("press", "pull") or (presses and entry.do != "release")
+                raise _refused(n, "{do} when nothing is pressed; put a press or a pull before it", do=entry.do)
+            if entry.t < end:
+                message = "begins at {t} s, before the one above ends at {end} s; let them follow each other"
+                raise _refused(n, message, t=f"{entry.t:g}", end=f"{end:g}")
+            presses, end = entry.do in ("press", "pull") or (presses and entry.do != "release"), entry.t + entry.seconds
         return events
 
-    @field_validator("events", mode="after")
-    @classmethod
-    def _in_order(cls, events: tuple[Entry, ...]) -> tuple[Entry, ...]:
-        for n, (before, entry) in enumerate(pairwise(events), 1):
-            if entry.t < before.t + before.seconds:
-                raise PydanticCustomError(
-                    REFUSED,
-                    "begins at {t} s, before the one above ends at {end} s; let them follow each other",
-                    {"key": n, "t": f"{entry.t:g}", "end": f"{before.t + before.seconds:g}"},
-                )
-        return events
+
+def _refused(key: str | int, message: str, **values: str) -> PydanticCustomError:
+    """Make the error of a key."""
+    return PydanticCustomError(REFUSED, message, {"key": key, **values})
 
 
 def load_script(path: str | Path, size: tuple[int, int]) -> Script:
-    """Read a script.
-
-    Args:
-        path: the file.
-        size: width, height of the picture that is shown [px].
+    """Read a script for a picture of a width and height [px].
 
     Raises:
         SceneError: with all faults, one line each, in the order of the file.
@@ -115,21 +105,21 @@ def load_script(path: str | Path, size: tuple[int, int]) -> Script:
     draft = Draft(str(path), read_file(str(path), _SCRIPT))
     script, problems = parse(Script, draft.data)
     draft.report(problems)
-    draft.report(_outside(script, size) if script is not None else ())
-    if script is None or draft.found:
+    draft.report(_outside(script, script.size or size) if script is not None else ())
+    if script is None or draft.problems:
         raise SceneError(draft.lines())
     return script
 
 
 def _outside(script: Script, size: tuple[int, int]) -> Iterator[Problem]:
     """Find the entries that point outside the picture."""
-    width, height = script.size or size
+    width, height = size
     for n, entry in enumerate(script.events):
         if entry.do in ("press", "pull") and entry.at is not None:
             x, y = entry.at
             if not (-0.5 <= x < width - 0.5 and -0.5 <= y < height - 0.5):
-                said = f"[{x:g}, {y:g}] is outside of the picture, which has {width} x {height} pixels"
-                yield Problem(("events", n, "at"), said)
+                message = f"[{x:g}, {y:g}] is outside of the picture, which has {width} x {height} pixels"
+                yield Problem(("events", n, "at"), message)
 
 
 def timed(script: Script, rate: float, size: tuple[int, int]) -> Iterator[tuple[int, Event]]:
@@ -138,7 +128,7 @@ def timed(script: Script, rate: float, size: tuple[int, int]) -> Iterator[tuple[
     Args:
         script: the script.
         rate: frames per second.
-        size: width, height of the picture that is shown [px].
+        size: width and height of the picture that is shown [px].
     """
     scale = [shown / meant for shown, meant in zip(size, script.size or size, strict=True)]
     x = y = 0.0

@@ -4,45 +4,30 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable
-from types import TracebackType
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
 
-from taichi_msm.errors import DivergedError, SceneError
-from taichi_msm.physics.lattice import rest_positions
+from taichi_msm.errors import DivergedError, FilesError, SceneError
+from taichi_msm.outputs.gif import Picture
 from taichi_msm.physics.plan import Plan
 from taichi_msm.physics.planning import make_plan
-from taichi_msm.physics.probe_force import control_point, probe_force
+from taichi_msm.physics.probe_force import probe_force
 from taichi_msm.physics.timestep import with_time
-from taichi_msm.render.instrument import rod
+from taichi_msm.render.instrument import rod, rods
+from taichi_msm.render.surface import touched
 from taichi_msm.render.texture import load_texture
-from taichi_msm.results.gif import Picture
-from taichi_msm.scene import MAX_PROBES, Camera, Scene
+from taichi_msm.scene import MAX_PROBES, Scene
 from taichi_msm.scenefile.resolve import resolve
 from taichi_msm.scenefile.validation import checked
 from taichi_msm.scenefile.yaml_reader import MAX_NODES
 from taichi_msm.simulation import Simulation
 from taichi_msm.system import runtime
-from taichi_msm.viewer import hud
-from taichi_msm.viewer.captures import Captures, values
+from taichi_msm.viewer import events, hud
+from taichi_msm.viewer.captures import Captures, Film, probe_values
 from taichi_msm.viewer.controller import Controller
-from taichi_msm.viewer.events import (
-    KEYS,
-    NOTCH,
-    POINTER,
-    Drag,
-    Event,
-    Harder,
-    Key,
-    Percent,
-    Point,
-    Press,
-    Release,
-    Turn,
-)
-from taichi_msm.viewer.held_tool import HeldTool
-from taichi_msm.viewer.recording import Recording
+from taichi_msm.viewer.held_tool import HeldTool, Place
 from taichi_msm.viewer.viewport import Viewport
 
 # A session has at most this many frames per second, what a screen shows; each is a whole part of a frame of the scene.
@@ -120,31 +105,33 @@ class Session:
         _require_usable(scene, play=play)
         progress("start")
         device = runtime.start(arch, threads)
-        given, texture = scene, load_texture(scene)
+        texture = load_texture(scene)
         live, self.parts = with_live_frames(checked(scene))
-        scene = resolve(live, device, lambda done, total: progress("pilot")).plan.scene
-        rate = scene.time.frames_per_second
+        plan = resolve(live, device, lambda done, total: progress("pilot")).plan
+        scene = plan.scene
         self._captures = captures
-        self._recording = Recording(captures, scene, given.time.frames_per_second, self.parts)
+        self._film: Film | None = None
         self._others = scene.probes if play else ()
-        self.tool = HeldTool(scene.probes[0], rate)
-        self.scene = scene.model_copy(update={"probes": (*self._others, self.tool.recorded(0))})
-        self._rest = rest_positions(scene.sheet)
-        self.viewport = Viewport(scene, texture)
-        self._controller = Controller(self.tool, self.viewport, scene)
+        self._instrument = scene.probes[0].instrument
+        self._lift = probe_force(scene.probes[0], scene.sheet).force[2]
+        self.tool = HeldTool(scene.probes[0], scene.time.frames_per_second)
+        plan = plan.with_probes((*self._others, self.tool.recorded(0)))
+        self.scene = plan.scene
         self._figures, self._keys = True, False
-        self._once = False
-        self._beats = 0
+        self._once = self._warned = self.paused = False
+        # Frames whose time went by, those while it was paused too.
+        self._elapsed = 0
         self._notice, self._notice_until = "", 0
-        self._warned = False
         self.fault = ""
-        self.paused = False
         self.seconds_a_frame = 0.0
         progress("compile")
-        # The pictures are drawn here.
-        self._simulation = Simulation(self.scene.model_copy(update={"output": ()}), arch, threads)
+        # Without outputs nothing is compiled for them.
+        plan = replace(plan, scene=plan.scene.model_copy(update={"output": ()}))
+        self._simulation = Simulation(plan, arch, threads, texture)
         self._simulation.compile(lambda: progress("compile"))
         self._beginning = self._simulation.save()
+        self.viewport = Viewport(self._simulation.renderer)
+        self._controller = Controller(self.tool, self.viewport, self._simulation)
         self._draw()
 
     @property
@@ -163,9 +150,7 @@ class Session:
 
     def displacement(self) -> float:
         """Tell how far the tissue at the tool is from rest [m]."""
-        across, down = self.tool.place
-        moved = _between(self.positions(), across, down) - _between(self._rest, across, down)
-        return float(np.linalg.norm(moved))
+        return float(np.linalg.norm(self._touched() - [*self._rest_point(self.tool.place), 0.0]))
 
     def recorded(self) -> Scene:
         """Give what was done as a scene; a run of it has the same bits."""
@@ -175,41 +160,43 @@ class Session:
         probes = (*self._others, self.tool.recorded(frames))
         return self.scene.model_copy(update={"probes": probes, "time": time, "render": self.viewport.render})
 
-    def handle(self, event: Event) -> None:
+    def handle(self, event: events.Event) -> None:
         """Do what an event asks for; its effect on the tissue is seen in the next frame.
 
         Raises:
             FilesError: when a file cannot be saved.
         """
         match event:
-            case Point(x, y):
-                self._controller.point(x, y)
-            case Press(x, y, pull):
-                if self._controller.press(self.positions(), x, y, -1 if pull else 1):
+            case events.Hover(x, y):
+                self._controller.hover(x, y)
+            case events.Press(x, y, pull):
+                if self._controller.press(x, y, -1 if pull else 1):
                     self._notice_until = 0
                 else:
                     self.say(f"no tissue at pixel {x:g}, {y:g}")
-            case Drag(x, y):
+            case events.Drag(x, y):
                 self._controller.drag(x, y)
-            case Release():
+            case events.Release():
                 self._controller.release()
-            case Turn(right, down):
+            case events.Turn(right, down):
                 self.viewport.turn(right, down)
                 self._controller.hold_on()
-            case Percent(percent):
+            case events.Percent(percent):
                 self.tool.strength = min(100.0, max(0.0, percent))
-            case Harder(percent):
-                self.handle(Percent(self.tool.strength + percent))
-            case Key(name):
+            case events.Harder(percent):
+                self.handle(events.Percent(self.tool.strength + percent))
+            case events.Key(name):
                 self._do(name)
 
     def advance(self) -> None:
         """Let a frame's time pass: the tissue moves, unless it is paused."""
-        self._beats += 1
+        self._elapsed += 1
         if (self.paused and not self._once) or self.fault:
             return
         self._once = False
-        self._warn_of_length()
+        if self.frame % CHECKED == 0 and not self._warned and probe_values(self.recorded()) > NEARLY * MAX_NODES:
+            self._warned = True
+            self.say("this session will soon be too long for a scene: save it now (w), then reset it (r)")
         begun = time.perf_counter()
         try:
             if probe := self.tool.follow(self.frame):
@@ -222,86 +209,71 @@ class Session:
         self.seconds_a_frame += share * (spent - self.seconds_a_frame)
 
     def picture(self, pacing: str = "") -> Picture:
-        """Draw the tissue, and write the texts over it.
+        """Draw the tissue, and write the texts over it, `pacing` among them: how fast pictures come.
 
         A film that is on takes the picture without texts; if it cannot, the film ends.
-
-        Args:
-            pacing: a text about the speed of the pictures.
-
-        Returns:
-            Colours, shape (height, width, 3).
         """
         picture = self._draw()
-        if self.tool.percent != 0 and self.tool.instrument is None:
-            seen = self.viewport.pixel(_between(self.positions(), *self.tool.place))
-            if seen is not None:
-                hud.mark(picture, seen, pulls=self._pulls)
-        self._tell(self._recording.expose(picture, self._beats))
+        if self.tool.percent != 0 and self._instrument is None and (pixel := self.viewport.pixel(self._touched())):
+            hud.mark(picture, pixel, pulls=self._pulls)
+        if self._film is not None:
+            try:
+                self._film.show(picture, self._elapsed)
+            except FilesError as error:
+                self._film.close()
+                self._film = None
+                self.say(str(error))
         above = self._figure_lines(pacing) if self._figures else ["paused"] if self.paused else []
-        hud.write(picture, above, self.notice, POINTER | KEYS if self._keys else None)
+        hud.write(picture, above, self.notice, events.POINTER | events.KEYS if self._keys else None)
         return picture
 
     def say(self, notice: str) -> None:
         """Show a notice for a few seconds."""
-        self._notice, self._notice_until = notice, self._beats + round(NOTICE * self.rate)
+        self._notice, self._notice_until = notice, self._elapsed + round(NOTICE * self.rate)
 
     @property
     def notice(self) -> str:
         """The notice that is shown now."""
-        return self._notice if self._beats < self._notice_until else self.fault
+        return self._notice if self._elapsed < self._notice_until else self.fault
 
     def close(self) -> None:
         """Save the film that is on, and free the memory."""
         self._simulation.close()
-        self.viewport.close()
-        self._tell(self._recording.end())
+        self._end_film()
 
     def __enter__(self) -> Session:
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         self.close()
-
-    def _warn_of_length(self) -> None:
-        """Warn once before the session becomes too long for a scene file."""
-        if self.frame % CHECKED == 0 and not self._warned and values(self.recorded()) > NEARLY * MAX_NODES:
-            self._warned = True
-            self.say("this session will soon be too long for a scene: save it now (w), then reset it (r)")
 
     def _draw(self) -> Picture:
         """Draw the tissue and the instruments; the tool's is where the tool acts, or would if it were pressed."""
-        positions, rate = self.positions(), self.rate
-        placed = [
-            rod(probe.instrument, self.scene, positions, control_point(probe, self.scene.sheet, self.frame / rate))
-            for probe in self._others
-            if probe.instrument is not None
-        ]
-        if (instrument := self.tool.instrument) is not None:
-            across, down = self._controller.over(positions) or self.tool.place
-            height, width = self.scene.sheet.size
-            rest = np.array([(across - 0.5) * width, (0.5 - down) * height])
-            placed.append(rod(instrument, self.scene, positions, rest))
-        return self.viewport.draw(positions, placed)
+        positions, scene = self.positions(), self._simulation.scene
+        instruments = rods(scene, positions, self._simulation.time)
+        if self._instrument is not None and (place := self._controller.over()):
+            instruments[-1] = rod(self._instrument, scene, positions, self._rest_point(place))
+        return self.viewport.draw(positions, instruments)
 
-    def _look(self, camera: str | Camera) -> None:
-        self.viewport.look(camera)
-        self._controller.hold_on()
+    def _rest_point(self, place: Place) -> NDArray[np.float64]:
+        """Give x and y of a place on the sheet at rest [m]."""
+        (across, down), (height, width) = place, self.scene.sheet.size
+        return np.array([(across - 0.5) * width, (0.5 - down) * height])
+
+    def _touched(self) -> NDArray[np.float64]:
+        """Find the point of the sheet at which the tool acts [m]."""
+        rest = self._rest_point(self.tool.place)
+        return touched(self.positions(), self.scene.render.refine, self.scene.sheet, rest)[0]
 
     def _do(self, key: str) -> None:
         match key:
             case "up":
-                self.handle(Harder(NOTCH))
+                self.handle(events.Harder(events.NOTCH))
             case "down":
-                self.handle(Harder(-NOTCH))
-            case "c":
-                self._look(self.scene.render.camera)
-            case "t":
-                self._look("top")
-            case "o":
-                self._look("oblique")
+                self.handle(events.Harder(-events.NOTCH))
+            case "c" | "t" | "o":
+                self.viewport.look({"c": self.scene.render.camera, "t": "top", "o": "oblique"}[key])
+                self._controller.hold_on()
             case "m":
                 self.viewport.mesh()
             case "l":
@@ -311,40 +283,47 @@ class Session:
             case ".":
                 self._once = self.paused
             case "r":
-                self._once = False
+                self._once = self._warned = False
                 self._simulation.restore(self._beginning)
                 self._controller.forget()
-                self._warned = False
+                self._simulation.steer((*self._others, self.tool.recorded(0)))
                 self.fault = ""
             case "p":
-                self.say(f"saved {self._captures.keep_picture(self._draw())}")
+                self.say(f"saved {self._captures.save_picture(self._draw())}")
             case "g":
-                if self._recording.on:
-                    self._tell(self._recording.end())
+                if self._film is None:
+                    rate = self.rate / self.parts
+                    self._film = Film(self._captures.folder, self.scene.render, rate, self.parts, self._elapsed)
                 else:
-                    self._recording.start(self._beats)
+                    self._end_film()
             case "w":
-                self.say(f"saved {self._captures.keep_scene(self.recorded())}")
+                self.say(f"saved {self._captures.save_scene(self.recorded())}")
             case "i":
                 self._figures = not self._figures
             case "h":
                 self._keys = not self._keys
 
-    def _tell(self, notice: str) -> None:
-        """Show a notice, if there is one."""
-        if notice:
-            self.say(notice)
+    def _end_film(self) -> None:
+        """End the film that is on, and save it if it has a picture."""
+        film, self._film = self._film, None
+        if film is None:
+            return
+        if film.pictures > 0:
+            self.say(f"saved {self._captures.save_film(film)}")
+        else:
+            film.close()
+            self.say("no film was saved: it had no picture yet")
 
     @property
     def _pulls(self) -> bool:
         """Whether the force of the tool points away from the sheet; a scene's force may do so by itself."""
-        return self.tool.percent * probe_force(self.scene.probes[-1], self.scene.sheet).force[2] > 0
+        return self.tool.percent * self._lift > 0
 
     def _figure_lines(self, pacing: str) -> list[str]:
         tool, speed = self.tool, ""
         if self.seconds_a_frame > 0:
             speed = f"steps {1 / self.rate / self.seconds_a_frame:.2g} x real time"
-        state = [word for word, on in (("paused", self.paused), ("film", self._recording.on)) if on]
+        state = [word for word, on in (("paused", self.paused), ("film", self._film is not None)) if on]
         does = "pull" if self._pulls else "push"
         percent = f"{does} {abs(tool.percent):.0f} %" if tool.percent else f"tool {tool.strength:.0f} %"
         moved = self.displacement()
@@ -355,26 +334,14 @@ class Session:
 
 
 def _require_usable(scene: Scene, *, play: bool) -> None:
-    problems = []
-    if scene.image is None:
-        problems.append("image: missing; a session needs one, name it here or with --image")
-    if not scene.probes:
-        problems.append("probes: empty; the tool takes its force from the first probe, add one")
-    if play and len(scene.probes) == MAX_PROBES:
-        problems.append(f"probes: {MAX_PROBES} leave no room for the tool; remove one, or leave out --play")
-    if problems:
-        raise SceneError(problems)
-
-
-def _between(values: NDArray[np.floating], across: float, down: float) -> NDArray[np.float64]:
-    """Interpolate values of the mass points, shape (rows, cols, 3), bilinearly at a place on the sheet."""
-    rows, cols = values.shape[:2]
-    y, x = down * (rows - 1), across * (cols - 1)
-    i, j = min(int(y), rows - 2), min(int(x), cols - 2)
-    t, s = y - i, x - j
-    corners = values[i : i + 2, j : j + 2].astype(np.float64)
-    rows_between: NDArray[np.float64] = corners[0] + t * (corners[1] - corners[0])
-    return rows_between[0] + s * (rows_between[1] - rows_between[0])
+    faults = {
+        "image: missing; a session needs one, name it here or with --image": scene.image is None,
+        "probes: empty; the tool takes its force from the first probe, add one": not scene.probes,
+        f"probes: {MAX_PROBES} leave no room for the tool; remove one, or leave out --play": play
+        and len(scene.probes) == MAX_PROBES,
+    }
+    if any(faults.values()):
+        raise SceneError([message for message, is_so in faults.items() if is_so])
 
 
 def length(metres: float) -> str:

@@ -6,16 +6,15 @@ import os
 import sys
 import time
 from collections.abc import Iterable, Iterator
-from types import TracebackType
 
 import numpy as np
 
 from taichi_msm.errors import DeviceError, FilesError
+from taichi_msm.outputs.gif import Picture
 from taichi_msm.progress import Pause
-from taichi_msm.results.gif import Picture
 from taichi_msm.system.silence import silenced
 from taichi_msm.viewer import hud
-from taichi_msm.viewer.events import KEYS, NOTCH, Drag, Event, Harder, Key, Point, Press, Release, Turn
+from taichi_msm.viewer.events import KEYS, NOTCH, Drag, Event, Harder, Hover, Key, Press, Release, Turn
 from taichi_msm.viewer.pacing import Pacing
 from taichi_msm.viewer.session import Session
 
@@ -101,27 +100,20 @@ class Window:
 
     def events(self) -> Iterator[Event]:
         """Give the events since the last call."""
-        told = pygame.event.get()
-        yield from self._hand.events(told, placed(self._size, self._window.get_surface().get_size()))
+        yield from self._hand.events(pygame.event.get(), placed(self._size, self._window.get_surface().get_size()))
 
     def __enter__(self) -> Window:
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         self._window.destroy()
 
 
 def opening(picture: tuple[int, int], screen: tuple[int, int]) -> tuple[int, int]:
-    """Choose the size of a new window.
+    """Choose the size of a new window; all sizes are width, height [px].
 
     It is the largest whole multiple of the picture's that takes at most half of the screen each way, or the picture's
     own, or less if the screen is smaller.
-
-    Args:
-        picture: width, height [px].
-        screen: width, height [px].
     """
     times = max(1, min(screen[0] // (2 * picture[0]), screen[1] // (2 * picture[1])))
     return placed(picture, (min(times * picture[0], screen[0]), min(times * picture[1], screen[1]))).size
@@ -135,11 +127,7 @@ def placed(picture: tuple[int, int], window: tuple[int, int]) -> pygame.Rect:
 
 
 class Hand:
-    """Turns a window's reports of the pointer and the keyboard into events.
-
-    Args:
-        size: width, height of the picture [px].
-    """
+    """Turns a window's reports of the pointer and the keyboard into events; `size`: of the picture [px]."""
 
     def __init__(self, size: tuple[int, int]) -> None:
         self._size = size
@@ -147,20 +135,14 @@ class Hand:
         self._turning: tuple[float, float] | None = None
         self._down: set[int] = set()
 
-    def events(self, told: Iterable[pygame.Event], area: pygame.Rect) -> Iterator[Event]:
-        """Turn reports into our events.
-
-        Args:
-            told: events of pygame, in their order.
-            area: where the picture is in the window.
-        """
-        for event in told:
+    def events(self, reports: Iterable[pygame.Event], area: pygame.Rect) -> Iterator[Event]:
+        """Turn pygame's events, in their order, into ours; `area`: where the picture is in the window."""
+        for event in reports:
             if event.type == pygame.QUIT:
                 yield QUIT
             elif event.type == pygame.KEYDOWN:
-                name = named(event)
                 # A key that is held down is reported again and again.
-                if name is not None and (event.key not in self._down or name in REPEATED):
+                if (name := key_name(event)) and (event.key not in self._down or name in REPEATED):
                     yield Key(name)
                 self._down.add(event.key)
             elif event.type == pygame.KEYUP:
@@ -199,7 +181,7 @@ class Hand:
         if self._pressing:
             yield Drag(x, y)
         elif self._turning is None:
-            yield Point(x, y)
+            yield Hover(x, y)
         if self._turning is not None:
             yield Turn(x - self._turning[0], y - self._turning[1])
             self._turning = (x, y)
@@ -210,7 +192,7 @@ class Hand:
             yield Release()
 
 
-def named(event: pygame.Event) -> str | None:
+def key_name(event: pygame.Event) -> str | None:
     """Name the key that was pressed, as in `KEYS`; None if it is none of them.
 
     A key is what it types, on every layout; where that is no Latin letter, it is the letter of a US keyboard there.
@@ -223,13 +205,7 @@ def named(event: pygame.Event) -> str | None:
 
 
 def show(session: Session, window: Window, pause: Pause) -> None:
-    """Show a session until the person quits.
-
-    Args:
-        session: the session.
-        window: the window.
-        pause: called before every picture; what it raises ends the session.
-    """
+    """Show a session in a window until the person quits; `pause` is called before every picture."""
     pacing = Pacing(session.rate, time.perf_counter)
     session.say("h: the keys")
     while True:

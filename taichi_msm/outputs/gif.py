@@ -10,7 +10,6 @@ from __future__ import annotations
 import math
 import struct
 from collections import deque
-from types import TracebackType
 from typing import BinaryIO, NamedTuple
 
 import numpy as np
@@ -38,14 +37,7 @@ HALF_CELL = 2
 
 
 def shades(picture: Picture) -> Picture:
-    """Predict the colours of an animation from its first frame.
-
-    Args:
-        picture: colours, shape (height, width, 3).
-
-    Returns:
-        Colours, shape (height, width, 3).
-    """
+    """Predict the colours of an animation, shape (height, width, 3), from its first frame, likewise."""
     stride = -(-max(picture.shape) // SAMPLES)
     samples = picture[::stride, ::stride].astype(np.float32)
     return np.concatenate([np.clip(samples * light, 0, 255) for light in LIGHT]).astype(np.uint8)
@@ -70,14 +62,7 @@ class Palette:
         self._lookup.putpalette((np.maximum(colours, HALF_CELL) - HALF_CELL).tobytes())
 
     def indices(self, picture: Picture) -> Picture:
-        """Find the nearest colour of every pixel.
-
-        Args:
-            picture: colours, shape (height, width, 3).
-
-        Returns:
-            Rows of `table`, shape (height, width).
-        """
+        """Find the nearest colour of every pixel: rows of `table`, shape (height, width)."""
         image = Image.fromarray(picture)
         indices = np.array(image.quantize(palette=self._lookup, dither=Image.Dither.NONE))
         red, green, blue = self._background
@@ -118,11 +103,7 @@ class GifWriter:
         self._file.write(b"\x21\xff\x0bNETSCAPE2.0\x03\x01\x00\x00\x00")
 
     def add(self, picture: Picture) -> None:
-        """Add the next frame.
-
-        Args:
-            picture: colours, shape (height, width, 3).
-        """
+        """Add the next frame, shape (height, width, 3)."""
         start = self._hundredths(self._frames)
         self._frames += 1
         self._latest = picture
@@ -142,17 +123,6 @@ class GifWriter:
             if self._latest is not None:
                 self._write_last(self._palette.indices(self._latest))
             self._file.write(b";")
-
-    def __enter__(self) -> GifWriter:
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        if kind is None:
-            self.close()
-        else:
-            self._file.close()
 
     def _hundredths(self, frame: int) -> int:
         return round(100 * frame / self._rate)

@@ -7,9 +7,9 @@ import math
 import struct
 import zipfile
 import zlib
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from pathlib import Path
-from typing import Any
+from typing import Any, BinaryIO, NamedTuple
 
 import numpy as np
 from numpy.lib import format as npy
@@ -21,32 +21,32 @@ EPOCH = (1980, 1, 1, 0, 0, 0)
 Shape = tuple[int, ...]
 
 
-def write_array(
-    archive: zipfile.ZipFile, name: str, dtype: DTypeLike, shape: Shape, parts: Iterable[bytes | memoryview]
-) -> None:
-    """Add an array to an archive.
+class Pieces(NamedTuple):
+    """An array that need not be in memory as a whole."""
 
-    Args:
-        archive: open for writing.
-        name: of the array.
-        dtype: of the numbers.
-        shape: of the array.
-        parts: the bytes of the array in C order, in any number of pieces.
-    """
-    with archive.open(zipfile.ZipInfo(f"{name}.npy", EPOCH), "w", force_zip64=True) as entry:
-        entry.write(_header(dtype, shape))
-        for part in parts:
-            entry.write(part)
+    dtype: DTypeLike
+    shape: Shape
+    parts: Iterable[NDArray[Any]]  # its numbers in C order, in any number of pieces
+
+
+def write_arrays(file: BinaryIO, arrays: Mapping[str, NDArray[Any] | Pieces]) -> None:
+    """Write arrays to an uncompressed archive, by name; equal arrays give equal files."""
+    with zipfile.ZipFile(file, "w", zipfile.ZIP_STORED) as archive:
+        for name, array in arrays.items():
+            pieces = array if isinstance(array, Pieces) else Pieces(array.dtype, array.shape, _parts(array))
+            with archive.open(zipfile.ZipInfo(f"{name}.npy", EPOCH), "w", force_zip64=True) as entry:
+                entry.write(_header(pieces.dtype, pieces.shape))
+                for part in pieces.parts:
+                    entry.write(part.data)
+
+
+def _parts(array: NDArray[Any]) -> Iterable[NDArray[Any]]:
+    """Give an array without a second copy of all of it."""
+    return [array] if array.flags.c_contiguous else (np.ascontiguousarray(row) for row in array)
 
 
 def read_array(archive: zipfile.ZipFile, name: str, dtype: DTypeLike, shape: Shape) -> NDArray[Any]:
-    """Read an array that `write_array` wrote.
-
-    Args:
-        archive: open for reading.
-        name: of the array.
-        dtype: that the numbers must have.
-        shape: that the array must have.
+    """Read an array that `write_arrays` wrote; it must have this dtype and shape.
 
     Raises:
         ValueError: when dtype or shape differ; raised before memory is allocated for the array.
@@ -68,20 +68,10 @@ def read_rows(archive: zipfile.ZipFile, name: str, dtype: DTypeLike, row: Shape)
 
 
 def map_array(path: Path, name: str, dtype: DTypeLike, shape: Shape) -> NDArray[Any]:
-    """Map an array that `write_array` wrote, which may be larger than memory, after its checksum was verified.
+    """Map an array that `write_arrays` wrote, after its checksum was verified.
 
-    Args:
-        path: of the archive.
-        name: of the array.
-        dtype: that the numbers must have.
-        shape: that the array must have; not empty.
-
-    Returns:
-        The array, read-only; the system reads it when it is accessed.
-
-    Raises:
-        ValueError: when dtype or shape differ, or the array is damaged.
-        Exception: whatever `zipfile` raises for a damaged archive.
+    It may be larger than memory, but not empty. It is read-only, and the system reads it when it is accessed. Raises
+    what `read_array` does.
     """
     header = _header(dtype, shape)
     with path.open("rb") as file, zipfile.ZipFile(file) as archive:

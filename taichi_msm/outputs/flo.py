@@ -9,17 +9,14 @@ from typing import BinaryIO
 import numpy as np
 from numpy.typing import NDArray
 
-from taichi_msm.results.finished_run import damaged, reading
-from taichi_msm.results.folder import write_all
-
 MAGIC = b"PIEH"
 
 
 def write_flo(file: BinaryIO, flow: NDArray[np.float32]) -> None:
     """Write flow to the right and down [px], shape (height, width, 2)."""
     height, width, _ = flow.shape
-    write_all(file, _header(width, height))
-    write_all(file, np.ascontiguousarray(flow, "<f4").data.cast("B"))
+    file.write(_header(width, height))
+    file.write(np.ascontiguousarray(flow, "<f4").data)
 
 
 def read_flo(path: Path, size: tuple[int, int]) -> NDArray[np.float32]:
@@ -33,15 +30,16 @@ def read_flo(path: Path, size: tuple[int, int]) -> NDArray[np.float32]:
         Flow to the right and down [px], shape (height, width, 2).
 
     Raises:
-        FilesError: when it cannot be read, or is not a flow of that size.
+        OSError: when it cannot be read.
+        ValueError: when it is not a flow of that size.
     """
     width, height = size
     header, length = _header(width, height), 8 * width * height
-    with reading(path), path.open("rb") as file:
+    with path.open("rb") as file:
         # Only the expected size is read, so that a wrong one in the file takes no more memory.
-        found, data, rest = file.read(len(header)), file.read(length), file.read(1)
-    if found != header or len(data) != length or rest:
-        raise damaged(path)
+        start, data, rest = file.read(len(header)), file.read(length), file.read(1)
+    if start != header or len(data) != length or rest:
+        raise ValueError(f"not a flow of {width} x {height} pixels")
     return np.frombuffer(data, "<f4").reshape(height, width, 2)
 
 

@@ -26,7 +26,7 @@ LONGEST = 2.0
 WRONG = 0.01
 
 
-def notes(
+def run_notes(
     plan: Plan,
     probes: Sequence[ProbeRecord],
     progress: RunProgress,
@@ -56,7 +56,7 @@ def notes(
             yield f"error not estimated: {reason}"
         else:
             yield f"error {_size(mesh)} due to the number of points; due to the time step not estimated: {reason}"
-    yield from probe_force.notes(scene, probes)
+    yield from probe_force.force_notes(scene, probes)
     if mesh is not None and mesh.doubt:
         yield f"the error due to the number of points may be larger: {mesh.doubt}"
     if mesh is not None and WRONG < mesh.error < math.inf:

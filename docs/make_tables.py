@@ -1,0 +1,98 @@
+"""Write the tables that come from the program's own words into the pages: keys, outputs and names.
+
+python docs/make_tables.py
+"""
+
+from __future__ import annotations
+
+import inspect
+import json
+from collections.abc import Callable, Iterator
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import taichi_msm
+from taichi_msm.outputs.table import OUTPUTS
+from taichi_msm.scenefile.load import schema
+from taichi_msm.viewer.events import KEYS, POINTER
+
+DOCS = Path(__file__).parent
+MARKS = "<!-- {}: made by docs/make_tables.py -->\n", "<!-- end of {} -->\n"
+
+
+def rows(section: dict[str, Any], definitions: dict[str, Any], prefix: str = "") -> Iterator[str]:
+    """Give a line for every key of a section and of the sections below it."""
+    for name, key in section["properties"].items():
+        below = list(_references(key))
+        default = f"`{json.dumps(key['default'])}`" if key.get("default") is not None else ""
+        if name in section.get("required", ()):
+            default = "**required**"
+        elif below and name != "camera" and {"type": "null"} not in key.get("anyOf", ()):
+            default = "none" if "items" in key else "those below"
+        yield f"| `{prefix}{name}` | {key['description']} | {key['expects']} | {default} |"
+        for reference in below:
+            yield from rows(definitions[reference], definitions, f"{prefix}{name}.{'N.' if 'items' in key else ''}")
+
+
+def _references(key: dict[str, Any]) -> Iterator[str]:
+    for place in (key, key.get("items", {}), *key.get("anyOf", ())):
+        if "$ref" in place:
+            yield place["$ref"].rsplit("/", 1)[-1]
+
+
+def scene_keys() -> str:
+    """Give the table of a scene's keys, from its JSON Schema."""
+    whole = schema()
+    return "| key | meaning | value | default |\n|---|---|---|---|\n" + "\n".join(rows(whole, whole["$defs"])) + "\n"
+
+
+def window_keys() -> str:
+    """Give the table of what the pointer and the keys do in the window."""
+    lines = [f"| {name} | {does} |" for name, does in POINTER.items()]
+    lines += [f"| `{name}` | {does} |" for name, does in KEYS.items()]
+    return "| | |\n|---|---|\n" + "\n".join(lines) + "\n"
+
+
+def outputs(*sources: str) -> str:
+    """Give the table of the outputs with these sources."""
+    chosen = [output for output in OUTPUTS.values() if output.source in sources]
+    lines = [f"| `{output.name}` | `{output.file}` | {output.means} |" for output in chosen]
+    return "| `output` | file (that of frame 0) | what it holds |\n|---|---|---|\n" + "\n".join(lines) + "\n"
+
+
+def names() -> str:
+    """Give the table of what the package exports, with the first line of each docstring."""
+    lines = []
+    for name in taichi_msm.__all__:
+        first = (inspect.getdoc(getattr(taichi_msm, name)) or "").split("\n")[0]
+        lines.append(f"| `{name}` | {first} |")
+    return "| name | what it is |\n|---|---|\n" + "\n".join(lines) + "\n"
+
+
+# What makes each table, by its page and its name there.
+TABLES: dict[tuple[str, str], Callable[[], str]] = {
+    ("scene", "keys"): scene_keys,
+    ("view", "hands"): window_keys,
+    ("python", "names"): names,
+    ("command-line", "outputs"): partial(outputs, "picture", "positions"),
+    ("labels", "labels"): partial(outputs, "labels", "flow", "tracks"),
+}
+
+
+def with_table(text: str, name: str, table: str) -> str:
+    """Replace what is between the marks of a table."""
+    start, end = (mark.format(name) for mark in MARKS)
+    before, rest = text.split(start)
+    return before + start + table + end + rest.split(end)[1]
+
+
+def main() -> None:
+    """Write every table."""
+    for (page, name), make in TABLES.items():
+        path = DOCS / f"{page}.md"
+        path.write_text(with_table(path.read_text(encoding="utf-8"), name, make()), encoding="utf-8")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,115 @@
+"""The outputs of a run. A new output is a row of this table, and what computes its values."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Collection, Iterable, Iterator
+from typing import Literal, NamedTuple
+
+# Of a run's files these two belong to no entry of `output`: the record, and the matrices of the camera.
+RECORD, CAMERA = "run.json", "camera.json"
+
+# The number in the name of a frame's file.
+FIRST, NUMBER = "0000", r"(?:[0-9]{4}|[1-9][0-9]{4,14})"
+
+
+class Output(NamedTuple):
+    """An entry of a scene's `output`.
+
+    Of labels and flow, the field of `Labels` or `Flow` with the output's name is written, in the format of the suffix.
+    """
+
+    name: str
+    file: str  # with a folder, that of the first frame of a series
+    source: Literal["picture", "labels", "flow", "tracks", "positions"]  # field of `Observed`; positions: none
+    means: str  # what the file holds, for users
+    pixel_bytes: float = 0  # the most that a pixel takes in a file, as one of noise; 0: the size is not by pixels
+    needs_camera: bool = False  # whether it can be used only with the camera's matrices
+
+    @property
+    def result(self) -> str:
+        """The file, or the folder with a file for every frame; so `outputs` in run.json names it."""
+        return self.file.partition("/")[0]
+
+    @property
+    def is_series(self) -> bool:
+        """Whether there is a file for every frame."""
+        return "/" in self.file
+
+    @property
+    def until_next(self) -> bool:
+        """Whether it tells of a frame what happens until the next one; then there is none of the last frame."""
+        return self.source == "flow"
+
+    @property
+    def pattern(self) -> str:
+        """A regular expression for the names of its files."""
+        return re.escape(self.file).replace(FIRST, NUMBER) if self.is_series else re.escape(self.file)
+
+    def path(self, frame: int = 0) -> str:
+        """Name the file, of a frame if there is one for each."""
+        return self.file.replace(FIRST, f"{frame:04}")
+
+    def count(self, frames: int) -> int:
+        """Count the files of a series in a run with this many frames."""
+        return max(0, frames - self.until_next)
+
+
+def _rows() -> Iterator[Output]:
+    """Give the table, in the order in which errors and help name the outputs.
+
+    PNGs store pixels of noise, codes of a GIF have 12 bits, and masks have two values; most pictures take a half or a
+    third of that.
+    """
+    yield Output("png", "frames/0000.png", "picture", "the picture", pixel_bytes=3.01)
+    yield Output("gif", "animation.gif", "picture", "the pictures as an animation", pixel_bytes=1.51)
+    means = "`time` [s], shape (frames,), and `position` of the mass points [m], shape (frames, rows, cols, 3)"
+    yield Output("trajectory", "trajectory.npz", "positions", means)
+    means = (
+        "float32 (height, width, 2): the material point at the pixel's centre, as fractions of the sheet's width from "
+        "its left and of its height from its top; NaN where no sheet is seen"
+    )
+    yield Output("coordinates", "coordinates/0000.npy", "labels", means, pixel_bytes=8, needs_camera=True)
+    means = (
+        "float32 [m] along the direction of view, from the eye; with `camera: top` from as far above the sheet at rest "
+        "as its larger side is long; 0: background"
+    )
+    yield Output("depth", "depth/0000.tiff", "labels", means, pixel_bytes=4, needs_camera=True)
+    means = (
+        "Middlebury's format: how far what is seen moves until the next frame, right and down [px], hidden there or "
+        "not; 1e10: no sheet, or it goes behind the eye"
+    )
+    yield Output("flow", "flow/0000.flo", "flow", means, pixel_bytes=8, needs_camera=True)
+    means = "255 where what is seen is hidden or outside the picture in the next frame, else 0"
+    yield Output("occlusion", "occlusion/0000.png", "flow", means, pixel_bytes=0.5)
+    means = "255 where an instrument is seen, else 0"
+    yield Output("instrument", "instrument/0000.png", "labels", means, pixel_bytes=0.5)
+    means = (
+        "of `render.tracks` × `render.tracks` points in the middle of equal fields of the sheet: `coordinates` (N, 2), "
+        "`points` (N, frames, 2) [px] from the picture's upper left corner, NaN behind the eye, `occluded` (N, frames)"
+    )
+    yield Output("tracks", "tracks.npz", "tracks", means, needs_camera=True)
+
+
+OUTPUTS = {output.name: output for output in _rows()}
+
+# The names of all files that a run writes, as regular expressions.
+PATTERNS = (*(output.pattern for output in OUTPUTS.values()), re.escape(CAMERA), re.escape(RECORD))
+
+
+def results(names: Collection[str]) -> list[str]:
+    """Name the results of a run with these outputs as run.json does: folders, files, the camera, the record."""
+    chosen = [output for name, output in OUTPUTS.items() if name in names]
+    chosen.sort(key=lambda output: not output.is_series)
+    camera = [CAMERA] if any(output.needs_camera for output in chosen) else []
+    return [*(output.result for output in chosen), *camera, RECORD]
+
+
+def file_names(results: Iterable[str], frames: int) -> list[str]:
+    """List the files of a run with this many frames, by the names of its results."""
+    outputs = {output.result: output for output in OUTPUTS.values() if output.is_series}
+    names: list[str] = []
+    for result in results:
+        output = outputs.get(result)
+        names += [output.path(n) for n in range(output.count(frames))] if output else [result]
+    return names

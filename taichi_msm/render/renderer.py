@@ -1,0 +1,155 @@
+"""Pictures and labels of a scene's sheet, from any camera: what a simulation and a live session draw with."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from taichi_msm.arguments import are_numbers, as_array
+from taichi_msm.errors import ArgumentError
+from taichi_msm.render.camera import View, view
+from taichi_msm.render.instrument import Rod
+from taichi_msm.render.labels import Flow, Labels, Observed, Sight, track_grid
+from taichi_msm.render.texture import load_texture
+from taichi_msm.scene import Camera, Render, Scene
+
+if TYPE_CHECKING:
+    from taichi_msm.render.rasterizer import Drawing
+
+# A camera in one of the forms that a scene may have; or a `View`, which was set up already; None: the scene's own.
+CameraLike = str | Mapping[str, Any] | Camera | View | None
+
+Array = NDArray[Any]
+
+
+class Shot(NamedTuple):
+    """What is in front of which camera at one time.
+
+    Attributes:
+        positions: of the mass points [m], shape (rows, cols, 3).
+        view: the camera.
+        rods: the instruments.
+    """
+
+    positions: Array
+    view: View
+    rods: Sequence[Rod] = ()
+
+
+class Renderer:
+    """Draws and labels the sheet of a scene; call `runtime.start` first. Results are those of `Simulation`'s methods.
+
+    Args:
+        scene: a checked scene.
+        texture: the picture on the sheet, shape (height, width, 3); None: the scene's own, read when it is drawn.
+
+    Raises:
+        ArgumentError: in the methods, when coordinates or labels are not what they must be.
+
+    Attributes:
+        scene: the scene; may be replaced by one that differs in its probes alone.
+        view: the scene's own camera.
+    """
+
+    def __init__(self, scene: Scene, texture: NDArray[np.uint8] | None = None) -> None:
+        self._given = texture
+        self._loaded: tuple[object, NDArray[np.uint8]] | None = None
+        self._drawings: dict[tuple[object, ...], Drawing] = {}
+        self.restart(scene)
+
+    def restart(self, scene: Scene) -> None:
+        """Draw another scene from here on."""
+        self._drawings.clear()
+        self.scene, self.view = scene, view(scene)
+
+    def set_up(self, camera: CameraLike) -> View:
+        """Set up a camera; raises a SceneError if it is not valid, or sees nothing."""
+        if isinstance(camera, View):
+            return camera
+        if camera is None:
+            return self.view
+        # The scene is checked as a whole, so that an error names the key as a scene has it.
+        render = {**dict(self.scene.render), "camera": camera}
+        return view(self.scene.model_copy(update={"render": render}))
+
+    def draw(self, shot: Shot, style: Render | None = None) -> NDArray[np.uint8]:
+        """Draw a picture; `style`: the scene's `render` with another shading, or with the mesh shown or hidden."""
+        return self._drawing(style, picture=True, labels=False).draw(*shot)
+
+    def is_compiled(self, style: Render) -> bool:
+        """Tell whether a picture in a style, as for `draw`, has been drawn before."""
+        return self._key(style, picture=True, labels=False) in self._drawings
+
+    def labels(self, shot: Shot) -> Labels:
+        """Give what each pixel shows at its centre."""
+        labels = self._drawing(picture=False, labels=True).look(*shot).labels
+        assert labels is not None
+        return labels
+
+    def flow(self, before: Labels, shot: Shot) -> Flow:
+        """Give the optical flow to a shot from another one, whose labels are given."""
+        width, height = self.scene.render.size
+        points = as_array(before.coordinates, "before") if isinstance(before, Labels) else np.empty(0)
+        on_sheet = points.dtype.kind == "f" and not ((points < 0) | (points > 1)).any()
+        if points.shape != (height, width, 2) or not on_sheet:
+            raise ArgumentError(f"before: take what `labels` gave for a picture of {width} x {height} pixels")
+        from taichi_msm.render.tracking import find_flow
+
+        return find_flow(self.scene, points, *shot)
+
+    def locate(self, coordinates: Array, shot: Shot) -> Sight:
+        """Find where material points are seen, and whether anything hides them."""
+        points = as_array(coordinates, "coordinates")
+        if not (are_numbers(points, (*points.shape[:1], 2)) and ((points >= 0) & (points <= 1)).all()):
+            raise ArgumentError(
+                f"coordinates: {points.dtype} of shape {points.shape}; take numbers from 0 to 1 of shape (n, 2)"
+            )
+        from taichi_msm.render.tracking import find
+
+        return find(self.scene, points, *shot)
+
+    def observe(self, before: Labels | None, shot: Shot) -> Observed:
+        """Give everything that the scene's output asks for; `before`: the labels of the frame before, if any."""
+        scene = self.scene
+        # Labels need one sample, at the pixel's centre; with several samples per pixel, none is there.
+        together = scene.render.supersample == 1
+        picture = labels = flow = tracks = None
+        if scene.draws:
+            picture, labels = self._drawing(picture=True, labels=scene.labels_pixels and together).look(*shot)
+        if scene.labels_pixels and labels is None:
+            labels = self.labels(shot)
+        if before is not None and scene.asks_for("flow"):
+            flow = self.flow(before, shot)
+        if scene.asks_for("tracks"):
+            tracks = self.locate(track_grid(scene.render.tracks), shot)
+        return Observed(picture, labels, flow, tracks)
+
+    def close(self) -> None:
+        """Free the memory."""
+        self._drawings.clear()
+
+    def _drawing(self, style: Render | None = None, *, picture: bool, labels: bool) -> Drawing:
+        key = self._key(style or self.scene.render, picture=picture, labels=labels)
+        if key not in self._drawings:
+            from taichi_msm.render.rasterizer import Drawing, structure
+
+            scene = self.scene if style is None else self.scene.model_copy(update={"render": style})
+            texture = self._texture() if picture else np.zeros((1, 1, 3), np.uint8)
+            self._drawings[key] = Drawing(scene, texture, structure(scene, picture=picture, labels=labels))
+        return self._drawings[key]
+
+    def _key(self, style: Render, *, picture: bool, labels: bool) -> tuple[object, ...]:
+        """Give all that tells the drawings of this scene apart."""
+        return picture, labels, style.shading, style.wireframe, self.scene.has_instruments
+
+    def _texture(self) -> NDArray[np.uint8]:
+        """Give the picture on the sheet, which is read again only if the scene names another one."""
+        if self._given is not None:
+            return self._given
+        source = self.scene.image, self.scene.region, self.scene.render.background
+        if self._loaded is None or self._loaded[0] != source:
+            self._loaded = source, load_texture(self.scene)
+        return self._loaded[1]
