@@ -37,21 +37,16 @@ PUT_BACK = "put back the picture that it was run with, or run the scene again"
 class FinishedRun:
     """A run that has ended, complete or not.
 
-    Attributes:
-        directory: where its results are.
-        scene: the scene as it was run: with the points, the step and the precision that were chosen, without a
-            tolerance, and with paths of pictures that are relative to the current directory.
-        frames: how many were simulated.
-        sha256: of the files of its pictures, by the keys that name them.
-        overrides: that made the scene from its file.
+    Its scene is that which was run: with the points, the step and the precision that were chosen, without a tolerance,
+    and with paths of pictures that are relative to the current directory.
     """
 
-    directory: Path
+    directory: Path  # where its results are
     scene: Scene
-    frames: int
-    sha256: Mapping[str, str]
-    overrides: list[str]
-    _data: bytes = field(repr=False)
+    frames: int  # how many were simulated
+    sha256: Mapping[str, str]  # of the files of its pictures, by the keys that name them
+    overrides: list[str]  # that made the scene from its file
+    _record: bytes = field(repr=False)
 
     @property
     def time(self) -> NDArray[np.float64]:
@@ -113,7 +108,7 @@ class FinishedRun:
         data = b""
         with suppress(OSError):
             data = (self.directory / RECORD).read_bytes()
-        if data != self._data:
+        if data != self._record:
             raise FilesError(f"{self.directory}: another run replaced these results while they were read; try again")
 
     def require_pictures(self, *, drawn: bool) -> None:

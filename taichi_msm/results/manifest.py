@@ -31,31 +31,18 @@ MAX_BYTES = 1 << 26
 
 @dataclass(frozen=True)
 class Manifest:
-    """Everything that the bits of a result depend on, and facts for its record.
+    """Everything that the bits of a result depend on, and facts for its record."""
 
-    Attributes:
-        given: the scene as it was loaded.
-        scene: the scene with the points, the step and the precision that were chosen.
-        overrides: of the scene file.
-        estimate: of the error, if a tolerance required it before the run; else None.
-        mesh: error of the points, if a tolerance of the sheet required it before the run; else None.
-        asks_estimate: whether to estimate the error beside the run; None: if it is cheap.
-        folder: the current directory, from which the paths of the scene's pictures start.
-        arch: cpu, cuda or vulkan.
-        sha256: of the files of the picture and the maps, by the keys that name them.
-        versions: of all that the results depend on.
-    """
-
-    given: Scene
-    scene: Scene
-    overrides: tuple[str, ...]
-    estimate: Estimate | None
-    mesh: MeshEstimate | None
-    asks_estimate: bool | None
-    folder: str
-    arch: str
-    sha256: Mapping[str, str]
-    versions: Mapping[str, str]
+    given: Scene  # as it was loaded
+    scene: Scene  # with the points, the step and the precision that were chosen
+    overrides: tuple[str, ...]  # of the scene file
+    estimate: Estimate | None  # of the error, if a tolerance required it before the run
+    mesh: MeshEstimate | None  # error of the points, if a tolerance of the sheet required it before the run
+    asks_estimate: bool | None  # whether to estimate the error beside the run; None: if it is cheap
+    folder: str  # the current directory, from which the paths of the scene's pictures start
+    arch: str  # cpu, cuda or vulkan
+    sha256: Mapping[str, str]  # of the files of the picture and the maps, by the keys that name them
+    versions: Mapping[str, str]  # of all that the results depend on
 
     def as_json(self) -> dict[str, Any]:
         """Convert the manifest to data for JSON."""
