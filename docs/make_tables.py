@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import inspect
 import json
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -71,7 +71,7 @@ def names() -> str:
 
 
 # What makes each table, by its page and its name there.
-TABLES = {
+TABLES: dict[tuple[str, str], Callable[[], str]] = {
     ("scene", "keys"): scene_keys,
     ("view", "hands"): window_keys,
     ("python", "names"): names,
