@@ -18,8 +18,8 @@ from benchmarks.race import Progress
 from benchmarks.whole_run import SCENE, command
 from taichi_msm.outputs import table
 from taichi_msm.render.camera import view
-from taichi_msm.render.instrument import rods
 from taichi_msm.render.rasterizer import Drawing, drawing_config
+from taichi_msm.render.surface import rods
 from taichi_msm.render.tracking import find_flow
 from taichi_msm.scene import Scene
 from taichi_msm.system import runtime

@@ -17,8 +17,7 @@ from PIL import Image
 
 from taichi_msm import Simulation, load_scene, run
 from taichi_msm.viewer.captures import Captures
-from taichi_msm.viewer.recorder import record
-from taichi_msm.viewer.script import load_script, timed
+from taichi_msm.viewer.script import film, load_script, timed
 from taichi_msm.viewer.session import Session
 
 ROOT = Path(__file__).parent.parent
@@ -62,7 +61,7 @@ def live(name: str, size: int, rate: float, seconds: float) -> None:
     scene = load_scene(SCENES / "press.yaml", settings)
     script = load_script(SCENES / "scripts" / "press.yaml", scene.render.size)
     with tempfile.TemporaryDirectory() as directory, Session(scene, Captures(Path(directory), "press.yaml")) as session:
-        record(session, IMAGES / f"{name}.gif", seconds, timed(script, session.rate, scene.render.size))
+        film(session, IMAGES / f"{name}.gif", seconds, timed(script, session.rate, scene.render.size))
 
 
 def grid(pictures: list[Image.Image], columns: int, gap: int = 6) -> Image.Image:

@@ -353,12 +353,11 @@ def view(
     directory = result_directory(out, f"{Path(scene).stem}-live")
 
     from taichi_msm.render.drawing_notes import drawing_notes
-    from taichi_msm.viewer.script import load_script, timed
+    from taichi_msm.viewer.script import film, load_script, timed
 
     done = load_script(script, loaded.render.size) if script is not None else None
 
     from taichi_msm.console import Progress
-    from taichi_msm.viewer import recorder
     from taichi_msm.viewer.captures import Captures
     from taichi_msm.viewer.session import Session
 
@@ -384,7 +383,7 @@ def view(
                 with begin() as session, Progress(quiet=False) as bar:
                     events = timed(done, session.rate, loaded.render.size) if done else ()
                     progress = partial(interruptible(bar, interruption), "film")
-                    recorder.record(session, Path(record), seconds, events, progress, notices.append)
+                    film(session, Path(record), seconds, events, progress, notices.append)
                 click.echo(printable(record))
     except KeyboardInterrupt:
         report("interrupted", ["interrupted" if record is None else "interrupted; no film was written"], as_json=False)

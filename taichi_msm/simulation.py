@@ -20,11 +20,10 @@ from taichi_msm.physics.run_progress import RunProgress, Saved
 from taichi_msm.physics.solver import Dynamics
 from taichi_msm.physics.state import Reading
 from taichi_msm.progress import Pause
-from taichi_msm.render.instrument import rods
 from taichi_msm.render.labels import Flow, Labels, Observed, Sight
 from taichi_msm.render.picking import pick
 from taichi_msm.render.renderer import Array, CameraLike, Renderer, Shot
-from taichi_msm.render.surface import Surface, surface
+from taichi_msm.render.surface import Surface, rods, surface
 from taichi_msm.render.texture import require_texture
 from taichi_msm.scene import Probe, Scene
 from taichi_msm.scenefile.resolve import resolve

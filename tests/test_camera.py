@@ -35,7 +35,7 @@ def test_pinhole_looks_at_its_target_with_its_angle() -> None:
     made = with_camera({"eye": [0.2, -0.5, 0.7], "target": [0.05, 0.1, 0], "fov": 50})
     np.testing.assert_allclose(pixel(made, [0.05, 0.1, 0])[0], [50, 30], atol=1e-12)
     # A point at the target's depth, half the picture's height up.
-    toward = view(made).toward
+    toward = view(made).axes[2]
     right = np.cross([0, 1, 0], toward)
     right /= np.linalg.norm(right)
     up = np.cross(toward, right)

@@ -12,9 +12,9 @@ from numpy.typing import NDArray
 from taichi_msm.physics.lattice import rest_positions
 from taichi_msm.render import bins, rasterizer_gpu
 from taichi_msm.render.camera import view
-from taichi_msm.render.instrument import rods
 from taichi_msm.render.rasterizer import Drawing, drawing_config
 from taichi_msm.render.rasterizer_cpu import Bands
+from taichi_msm.render.surface import rods
 from taichi_msm.scene import Scene
 from taichi_msm.system import launches
 from taichi_msm.system.runtime import Device

@@ -23,7 +23,7 @@ from taichi_msm.viewer import captures
 from taichi_msm.viewer import session as live_session
 from taichi_msm.viewer.captures import Captures
 from taichi_msm.viewer.events import KEYS, Drag, Event, Harder, Hover, Key, Percent, Press, Release, Turn
-from taichi_msm.viewer.recorder import record
+from taichi_msm.viewer.script import film
 from taichi_msm.viewer.session import Session, with_live_frames
 from tests.outputs import duration
 from tests.scenes import plan_of
@@ -273,9 +273,9 @@ def test_turning_follows_the_pointer(begin: Begin) -> None:
     near = pixel_of(session, 20, 12)
     session.handle(Turn(10, 0))
     assert pixel_of(session, 20, 12)[0] > near[0] + 2
-    before = session.viewport.view.toward[2]
+    before = session.viewport.view.axes[2, 2]
     session.handle(Turn(0, 10))
-    assert session.viewport.view.toward[2] > before, "pushed down, the sheet shows more of its face"
+    assert session.viewport.view.axes[2, 2] > before, "pushed down, the sheet shows more of its face"
 
 
 def test_a_press_beside_the_sheet_says_so(begin: Begin) -> None:
@@ -411,7 +411,7 @@ def test_a_session_too_long_for_a_file_says_so_before(begin: Begin, monkeypatch:
 def test_a_film_ends_where_the_session_diverges(begin: Begin) -> None:
     session = begin({**TILTED, "probes.0.force": [0, 0, -1e12]})
     said: list[str] = []
-    record(session, Path("a.gif"), 2.0, [(2, Press(60, 50)), (90, Key("w"))], say=said.append)
+    film(session, Path("a.gif"), 2.0, [(2, Press(60, 50)), (90, Key("w"))], say=said.append)
     assert said[0] == session.fault
     assert re.fullmatch(r"the film ends at 0\.\d+ s, before some of the script's events", said[1])
     assert duration("a.gif") < 500

@@ -24,9 +24,8 @@ from taichi_msm.cli import main
 from taichi_msm.errors import SceneError
 from taichi_msm.scene import Scene
 from taichi_msm.viewer.events import Drag, Harder, Hover, Key, Percent, Press, Release, Turn
-from taichi_msm.viewer.pacing import LONGEST, Pacing
 from taichi_msm.viewer.script import load_script, timed
-from taichi_msm.viewer.window import QUIT, Hand, opening, placed
+from taichi_msm.viewer.window import LONGEST, QUIT, Hand, Pacing, opening, placed
 from tests.conftest import Program
 from tests.outputs import duration
 from tests.telling import Telling

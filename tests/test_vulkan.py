@@ -18,9 +18,9 @@ from taichi_msm import run
 from taichi_msm.outputs.flo import read_flo
 from taichi_msm.physics.lattice import rest_positions
 from taichi_msm.render.camera import view
-from taichi_msm.render.instrument import rods
 from taichi_msm.render.labels import track_grid
 from taichi_msm.render.rasterizer import Drawing, drawing_config
+from taichi_msm.render.surface import rods
 from taichi_msm.render.tracking import find, find_flow
 from taichi_msm.scene import Scene
 from taichi_msm.scenefile.load import load_scene

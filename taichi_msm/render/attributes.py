@@ -1,13 +1,10 @@
 """What is kept of the point of the sheet that a sample shows. A new output per pixel is a few lines of `store`."""
 
-# No `from __future__ import annotations` here: Taichi reads the annotations of a kernel.
-
 from typing import Any, NamedTuple
 
 from taichi_msm.render import style
 from taichi_msm.render import uniforms as uni
-from taichi_msm.render.camera_kernel import POINT_NUMBERS
-from taichi_msm.render.cell import on_triangle
+from taichi_msm.render.geometry import POINT_NUMBERS, on_triangle
 from taichi_msm.render.samples import keep
 from taichi_msm.system.runtime import ti
 
@@ -122,10 +119,8 @@ def footprint(x, y, s, t, texels_x, texels_y, triangle: ti.template()):
     """Square of the larger of a sample's width and height on the texture, in units of style.SHARP texels.
 
     With x = X / w the derivatives of (x, y) with respect to (s, t) are (R_1, D_1; R_2, D_2) / w, where
-    R_1 = R_x - x R_w and so on; those of (s, t) with respect to (x, y) are the inverse.
-
-    Returns:
-        The square; and 1 where the front of the triangle is seen, else -1.
+    R_1 = R_x - x R_w and so on; those of (s, t) with respect to (x, y) are the inverse. Also gives 1 where the front of
+    the triangle is seen, else -1.
     """
     p, r, d = ti.static((triangle.p, triangle.r, triangle.d))
     r_1 = r[0] - x * r[2]
@@ -145,7 +140,7 @@ def footprint(x, y, s, t, texels_x, texels_y, triangle: ti.template()):
 def distance_to_line(place, right, below):
     """Distance of samples from the nearest line of the mesh [samples], given their distance from its first [cells].
 
-    `right` and `below` are the distances of what the neighbours show of the same triangle.
+    `right` and `below` are those distances of what their neighbours show of the same triangle.
     """
     to_right, to_below = right - place, below - place
     slope = ti.sqrt(to_right * to_right + to_below * to_below)
@@ -157,10 +152,7 @@ def store(
     at, visible, x, y, s, t, column, line,
     triangle: ti.template(), cell: ti.template(), sheet: ti.template(), band: ti.template(),
 ):  # fmt: skip
-    """Keep what the visible samples of a tile show.
-
-    That is the point (s, t) of a triangle of the small quad in this column and line of a cell.
-    """
+    """Keep what the visible samples of a tile show: (s, t) of a triangle of a cell's small quad (column, line)."""
     config, samples = ti.static((band.config, band.samples))
     plane = ti.static(config.plane)
     part = 1.0 / sheet.parts

@@ -1,7 +1,5 @@
 """Bins: squares of the picture, each with a list of the cells whose bounds reach it."""
 
-# No `from __future__ import annotations` here: Taichi reads the annotations of a kernel.
-
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -26,39 +24,23 @@ ROUNDS_OF_SEARCH = 32
 
 
 class Bins(NamedTuple):
-    """Lists of cells.
+    """Lists of cells."""
 
-    Attributes:
-        size: width and height of a bin.
-        across: bins in a row.
-        lengths: of the lists, shape (rows of bins, bins in a row).
-        starts: where each list begins, and the end of the last; on the device.
-        entries: the cells of all lists, on the device. On a GPU, the order within a list is arbitrary.
-    """
-
-    size: int
-    across: int
-    lengths: NDArray[np.int32]
-    starts: Any
-    entries: Any
+    size: int  # width and height of a bin
+    across: int  # bins in a row
+    lengths: NDArray[np.int32]  # of the lists, shape (rows of bins, bins in a row)
+    starts: Any  # where each list begins, and the end of the last; on the device
+    entries: Any  # the cells of all lists, on the device; on a GPU, the order within a list is arbitrary
 
 
 def binned(launches: Launches, bounds: Any, cells: int, extent: tuple[int, int], size: int) -> Bins:
     """List the cells of every bin: on a CPU one after the other, on a GPU all at once.
 
-    Args:
-        launches: of the device.
-        bounds: of all cells, on the device.
-        cells: how many there are.
-        extent: width and height of the picture.
-        size: width of a bin; wider ones are taken where the lists would be too long.
+    The `bounds` of so many cells, in a picture of this width and height, are on the device. Bins have this size, or are
+    larger where the lists would be too long.
     """
-    return (
-        _at_once(launches, bounds, cells, extent, size) if launches.bounded else _in_turn(bounds, cells, extent, size)
-    )
-
-
-def _in_turn(bounds: Any, cells: int, extent: tuple[int, int], size: int) -> Bins:
+    if launches.bounded:
+        return _at_once(launches, bounds, cells, extent, size)
     while True:
         across, down = (-(-side // size) for side in extent)
         ends = np.zeros(across * down + 1, np.int32)

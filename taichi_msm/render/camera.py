@@ -34,34 +34,18 @@ class View(NamedTuple):
 
         x = centre_x + right / w scale,    y = centre_y - up / w scale    [px]
 
-    with w = depth for a pinhole camera, and w = 1 for the orthographic one, whose eye may be anywhere on its plane.
-
-    Attributes:
-        matrix: maps (x, y, z, 1) [m] to (X, Y, w, depth), shape (4, 4): the point is at X / w, Y / w [px], x right
-            and y down from the picture's top-left corner; of two points the one of smaller depth [m] is nearer.
-        near: only what has a larger w than this is drawn [m].
-        axes: unit vectors to the right, up and toward the camera, as rows, shape (3, 3); the last is also the direction
-            of the headlight.
-        eye: origin of depth and of the camera's frame [m], shape (3,).
-        scale: pixels per metre at w = 1.
-        centre: the middle of the picture [px], shape (2,).
-        distance: from the eye to the point that it looks at [m].
-        pinhole: whether it is a pinhole camera.
+    from the top-left corner, with w = depth for a pinhole camera, and w = 1 for the orthographic one, whose eye may be
+    anywhere on its plane.
     """
 
-    matrix: Array
-    near: float
-    axes: Array
-    eye: Array
-    scale: float
-    centre: Array
-    distance: float
+    matrix: Array  # maps (x, y, z, 1) [m] to (X, Y, w, depth) with x = X / w, y = Y / w, shape (4, 4)
+    near: float  # only what has a larger w than this is drawn [m]
+    axes: Array  # unit vectors right, up and toward the camera and its headlight, as rows, shape (3, 3)
+    eye: Array  # origin of depth and of the camera's frame [m], shape (3,)
+    scale: float  # pixels per metre at w = 1
+    centre: Array  # the middle of the picture [px], shape (2,)
+    distance: float  # from the eye to the point that it looks at [m]
     pinhole: bool
-
-    @property
-    def toward(self) -> Array:
-        """Unit vector toward the camera, shape (3,)."""
-        return self.axes[2]
 
     def project(self, points: Array) -> Array:
         """Map points [m], shape (..., 3), to (X, Y, w, depth), shape (..., 4)."""
@@ -70,8 +54,7 @@ class View(NamedTuple):
     def sight(self, pixel: tuple[float, float]) -> View:
         """Give a view in which what is seen at the centre of a pixel has X = 0 and Y = 0.
 
-        Args:
-            pixel: x to the right and y down from the picture's top-left pixel, which is (0, 0).
+        Pixels are counted to the right and down from the picture's top-left one, which is (0, 0).
         """
         matrix = self.matrix.copy()
         for row in (0, 1):
@@ -97,11 +80,7 @@ def calibration(camera: View) -> dict[str, list[list[float]]]:
 
 
 def view(scene: Scene) -> View:
-    """Set up the scene's camera.
-
-    Raises:
-        SceneError: when it sees nothing.
-    """
+    """Set up the scene's camera; raises a SceneError when it sees nothing."""
     if blind := [str(problem) for problem in camera_problems(scene)]:
         raise SceneError(blind)
     camera = scene.render.camera
@@ -144,13 +123,7 @@ def pinhole(scene: Scene) -> Camera:
 
 
 def turned(camera: Camera, right: float, up: float) -> Camera:
-    """Orbit a camera around its target.
-
-    Args:
-        camera: the camera before.
-        right: angle about the sheet's normal [rad].
-        up: angle about the camera's own horizontal axis, over the sheet [rad].
-    """
+    """Orbit a camera around its target: right about the sheet's normal, up about its own horizontal axis [rad]."""
     across, _, toward = _axes(camera)
     turn = _rotation(np.array([0.0, 0.0, 1.0]), right) @ _rotation(across, -up)
     eye = np.array(camera.target) + turn @ np.subtract(camera.eye, camera.target)

@@ -1,30 +1,14 @@
 """What every sample of the picture shows: the nearest point of the surface, and where on the sheet it is.
 
-Vertices are not stored. For a sample inside the outline of a cell, the two equations of cell.py give the small quad;
-the side of the quad's diagonal that the sample is on gives the triangle; and the two linear equations of the triangle
-give the place on it. A cell that is folded or reaches behind the camera is drawn triangle by triangle instead.
+Vertices are not stored. For a sample inside the outline of a cell, the two equations of geometry.py give the small
+quad; the side of the quad's diagonal that the sample is on gives the triangle; and the two linear equations of the
+triangle give the place on it. A cell that is folded or reaches behind the camera is drawn triangle by triangle instead.
 """
-
-# No `from __future__ import annotations` here: Taichi reads the annotations of a kernel.
 
 from typing import Any, NamedTuple
 
+from taichi_msm.render import geometry
 from taichi_msm.render.attributes import cell_at, store
-from taichi_msm.render.camera_kernel import POINT_NUMBERS
-from taichi_msm.render.cell import (
-    OVERSTEP,
-    depth_at,
-    edge,
-    edges,
-    is_whole,
-    is_within,
-    on_triangle,
-    outlined,
-    patch_of,
-    small_quad,
-    triangle_at,
-    triangle_bounds,
-)
 from taichi_msm.render.samples import centres, clip, keep, tiles_of
 from taichi_msm.system.runtime import ti
 
@@ -45,7 +29,7 @@ def largest_edge(p_x, p_y, q_x, q_y, x, y, side, config: ti.template()):
     """
     x += ti.select((q_y - p_y) * side > 0.0, 0.0, config.tile_width - 1.0)
     y += ti.select((q_x - p_x) * side > 0.0, config.tile_height - 1.0, 0.0)
-    return edge(p_x, p_y, q_x, q_y, x, y, side)
+    return geometry.edge(p_x, p_y, q_x, q_y, x, y, side)
 
 
 @ti.func
@@ -73,11 +57,11 @@ def cover_tile(
     config = ti.static(band.config)
     plane = ti.static(config.plane)
     below_diagonal = config.floats(ti.cast(lower, ti.f32)) > 0.5
-    triangle = ti.static(triangle_at(x, y, column, line, 1.0 / sheet.parts, below_diagonal, cell.patch))
-    s, t = on_triangle(x, y, triangle)
+    triangle = ti.static(geometry.triangle_at(x, y, column, line, 1.0 / sheet.parts, below_diagonal, cell.patch))
+    s, t = geometry.on_triangle(x, y, triangle)
     if not cell.patch.whole:
-        inside = inside & is_within(s, t, overstep, band.near, triangle)
-    z = depth_at(s, t, triangle)
+        inside = inside & geometry.is_within(s, t, overstep, band.near, triangle)
+    z = geometry.depth_at(s, t, triangle)
     visible = inside & (z < band.samples[at + plane.depth])
     if ti.static(config.unordered):
         # Of points that are equally far, that of the cell or triangle is seen which comes first.
@@ -99,12 +83,12 @@ def cover(i, j, drawn: ti.template(), sheet: ti.template(), band: ti.template())
     Where cells are unordered, `drawn` is the part of it that is drawn.
     """
     config, floats = ti.static((band.config, band.config.floats))
-    corner = (i * sheet.cols + j) * POINT_NUMBERS
-    outline = ti.static(outlined(corner, sheet.cols, band.near, sheet.point))
-    whole = is_whole(outline)
+    corner = (i * sheet.cols + j) * geometry.POINT_NUMBERS
+    outline = ti.static(geometry.outlined(corner, sheet.cols, band.near, sheet.point))
+    whole = geometry.is_whole(outline)
     if ti.static(config.unordered):
         whole = drawn.whole
-    patch = ti.static(patch_of(corner, sheet.cols, outline.side, whole, sheet.point, False))
+    patch = ti.static(geometry.patch_of(corner, sheet.cols, outline.side, whole, sheet.point, False))
     cell = ti.static(cell_at(i, j, patch, sheet))
     count = ti.cast(sheet.parts, ti.i32)
     first, end = 0, ti.select(whole, 1, 2 * count * count)
@@ -117,9 +101,9 @@ def cover(i, j, drawn: ti.template(), sheet: ti.template(), band: ti.template())
         quad_t = ti.cast(quad // count, ti.f32)
         lower = piece % 2 == 0
         low_x, high_x, low_y, high_y = outline.left, outline.right, outline.top, outline.bottom
-        overstep = OVERSTEP
+        overstep = geometry.OVERSTEP
         if not whole:
-            low_x, high_x, low_y, high_y, overstep = triangle_bounds(
+            low_x, high_x, low_y, high_y, overstep = geometry.triangle_bounds(
                 quad_s, quad_t, lower, 1.0 / sheet.parts, band.near, band.width, band.height, patch
             )
         first_column, end_column, first_row, end_row = clip(low_x - 0.5, high_x + 0.5, low_y - 0.5, high_y + 0.5, band)
@@ -144,10 +128,10 @@ def cover(i, j, drawn: ti.template(), sheet: ti.template(), band: ti.template())
                     reached = reaches(tile_x + 0.5, tile_y + 0.5, outline.side, outline, config)
                     if reached:
                         # Left and upper edges belong to a cell, right and lower ones do not.
-                        of_left, of_right, of_top, of_bottom = edges(x, y, outline.side, outline)
+                        of_left, of_right, of_top, of_bottom = geometry.edges(x, y, outline.side, outline)
                         inside = (of_left >= 0.0) & (of_right > 0.0) & (of_top >= 0.0) & (of_bottom > 0.0)
                         if ti.static(config.refined):
-                            column, line = small_quad(x, y, inside, sheet.parts, patch)
+                            column, line = geometry.small_quad(x, y, inside, sheet.parts, patch)
                 else:
                     # Outside its bounds rounding would decide, in samples that depend on the tiles' shape.
                     inside = (

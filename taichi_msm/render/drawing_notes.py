@@ -15,11 +15,7 @@ WIDEST = 0.25
 
 
 def drawing_notes(scene: Scene) -> Iterator[str]:
-    """List warnings about how a scene is drawn, each in a line.
-
-    Args:
-        scene: a checked scene.
-    """
+    """List warnings about how a scene is drawn, each in a line."""
     if scene.draws:
         yield from _stretched(scene)
         if texture.is_see_through(scene):

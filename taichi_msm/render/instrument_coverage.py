@@ -6,10 +6,8 @@ P - A perpendicular to U has the radius as its length, which is a quadratic equa
 beyond an end of the segment, the line of sight is intersected with the sphere around that end instead.
 """
 
-# No `from __future__ import annotations` here: Taichi reads the annotations of a kernel.
-
 from taichi_msm.render import uniforms as uni
-from taichi_msm.render.camera_kernel import line_of_sight, w_at
+from taichi_msm.render.geometry import line_of_sight, w_at
 from taichi_msm.render.samples import INFINITY, centres, clip, keep, tiles_of
 from taichi_msm.system.runtime import ti
 
@@ -22,11 +20,7 @@ def dot(a_x, a_y, a_z, b_x, b_y, b_z):
 
 @ti.func
 def meet(x, y, n, numbers: ti.template()):
-    """Find where lines of sight meet rod n first.
-
-    Returns:
-        The depth, INFINITY where they miss the rod, and the normal times the radius.
-    """
+    """Find where lines of sight meet rod n first: the depth, INFINITY where they miss; the normal times the radius."""
     rod = uni.RODS + n * uni.ROD_NUMBERS
     tip, axis = rod + uni.TIP, rod + uni.AXIS
     u_x, u_y, u_z = numbers[axis], numbers[axis + 1], numbers[axis + 2]

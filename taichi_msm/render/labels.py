@@ -38,11 +38,6 @@ class Label(NamedTuple):
     of_sheet: bool  # whether it tells of the sheet alone; then it is `nothing` too where an instrument is seen
     dtype: type[np.generic]  # of its values
 
-    @property
-    def numbers(self) -> int:
-        """Its numbers per pixel."""
-        return len(self.planes)
-
 
 # The fields of `Labels`, which the kernel writes one after the other, and the numbers that all of them take per pixel.
 LABELS = {
@@ -53,13 +48,13 @@ LABELS = {
 LABEL_NUMBERS = 4
 
 
-def label_channels(plane: Any) -> list[tuple[int, int, Label]]:
-    """List the planes that labels are written from, each with which of its label's numbers it is, and the label.
+def label_channels(plane: Any) -> list[tuple[int, int, int, Label]]:
+    """List the planes that labels are written from, each with which of how many numbers of which label it is.
 
     A label whose planes are missing stays 0.
     """
     return [
-        (getattr(plane, name), n, label)
+        (getattr(plane, name), n, len(label.planes), label)
         for label in LABELS.values()
         for n, name in enumerate(label.planes)
         if hasattr(plane, name)
@@ -68,15 +63,12 @@ def label_channels(plane: Any) -> list[tuple[int, int, Label]]:
 
 def labels_of(numbers: NDArray[np.float32], size: tuple[int, int]) -> Labels:
     """Split the numbers that the kernel wrote of a picture of this width and height [px]."""
-    values, (width, height) = numbers.reshape(LABEL_NUMBERS, -1), size
-    return Labels(
-        *(
-            values[label.first : label.first + label.numbers]
-            .reshape((height, width, label.numbers)[: 2 + (label.numbers > 1)])
-            .astype(label.dtype, copy=False)
-            for label in LABELS.values()
-        )
-    )
+    (width, height), arrays = size, []
+    for label in LABELS.values():
+        count = len(label.planes)
+        values = numbers.reshape(LABEL_NUMBERS, -1)[label.first : label.first + count]
+        arrays.append(values.reshape((height, width, count)[: 2 + (count > 1)]).astype(label.dtype, copy=False))
+    return Labels(*arrays)
 
 
 class Flow(NamedTuple):
@@ -106,19 +98,12 @@ class Sight(NamedTuple):
 
 
 class Observed(NamedTuple):
-    """The outputs of one frame; None for those that were not asked for.
+    """The outputs of one frame; None for those that were not asked for."""
 
-    Attributes:
-        picture: colours, shape (height, width, 3).
-        labels: what each pixel shows.
-        flow: from the frame before to this one.
-        tracks: where the tracked points are.
-    """
-
-    picture: NDArray[np.uint8] | None = None
+    picture: NDArray[np.uint8] | None = None  # colours, shape (height, width, 3)
     labels: Labels | None = None
-    flow: Flow | None = None
-    tracks: Sight | None = None
+    flow: Flow | None = None  # from the frame before to this one
+    tracks: Sight | None = None  # where the tracked points are
 
 
 def track_grid(count: int) -> NDArray[np.float32]:

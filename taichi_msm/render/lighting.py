@@ -15,21 +15,15 @@ style.SHADE / r^2 of the light.
 Normals are lists, and may have any length.
 """
 
-# No `from __future__ import annotations` here: Taichi reads the annotations of a kernel.
-
 from taichi_msm.render import style
 from taichi_msm.render import uniforms as uni
-from taichi_msm.render.camera_kernel import line_of_sight, w_at
+from taichi_msm.render.geometry import line_of_sight, w_at
 from taichi_msm.system.runtime import ti
 
 
 @ti.func
 def illuminate(x, y, depth, normal: ti.template(), numbers: ti.template()):
-    """Find how samples are lit.
-
-    Returns:
-        N L; M V; d0 / d; and the upward component of the direction into which V is reflected.
-    """
+    """Find how samples are lit: N L; M V; d0 / d; the upward component of the direction into which V is reflected."""
     n_x, n_y, n_z = ti.static((normal[0], normal[1], normal[2]))
     across, above = line_of_sight(x, y, numbers)
     w = w_at(depth, numbers)
@@ -101,11 +95,7 @@ def tilt(normal: ti.template(), rise_x, rise_y, numbers: ti.template()):
 
 @ti.func
 def light_tissue(x, y, depth, normal: ti.template(), rise_x, rise_y, appearance: ti.template()):
-    """Light wet tissue, whose relief rises by so much from texel to texel.
-
-    Returns:
-        The factor of colours, and what is then added to them.
-    """
+    """Light wet tissue, whose relief rises by so much from texel to texel: give the colours' factor and summand."""
     config, numbers = ti.static((appearance.config, appearance.numbers))
     tilted = [normal[n] for n in ti.static(range(3))]
     if ti.static(config.relief):

@@ -20,13 +20,8 @@ def pick(position: NDArray[np.floating], refine: int, view: View, pixel: Pixel) 
     """Find the material point that is drawn at the centre of a pixel, on the nearest of the triangles there.
 
     The camera maps a point to (X, Y, w, depth). Then a = X - x w and b = Y - y w are linear in the point, and both are
-    0 if it is seen at (x, y). This needs no division by w, which is 0 or negative behind the camera.
-
-    Args:
-        position: positions of the mass points [m], shape (rows, cols, 3).
-        refine: vertices inserted between two neighbours, as drawn.
-        view: the camera.
-        pixel: x to the right and y down from the picture's top-left pixel, which is (0, 0).
+    0 if it is seen at (x, y). This needs no division by w, which is 0 or negative behind the camera. Arguments are as
+    for `surface` and `View.sight`.
 
     Returns:
         Fractions of the sheet's width from its left and of its height from its top; None if no surface is there.
@@ -46,10 +41,9 @@ def pick(position: NDArray[np.floating], refine: int, view: View, pixel: Pixel) 
 
 
 def on_rest_plane(view: View, pixel: Pixel) -> NDArray[np.floating] | None:
-    """Find where the line of sight through the centre of a pixel meets the plane of the sheet at rest.
+    """Find x and y [m] where the line of sight through a pixel's centre meets the plane of the sheet at rest.
 
-    Returns:
-        x and y [m]; None if they do not meet in front of the camera.
+    None if they do not meet in front of the camera.
     """
     matrix = view.sight(pixel).matrix
     planar = matrix[:2, :2]

@@ -3,8 +3,6 @@
 What is kept of a band fits into the cache, and no two workers write to one sample, so they need no locks.
 """
 
-# No `from __future__ import annotations` here: Taichi reads the annotations of a kernel.
-
 from collections.abc import Callable
 from functools import cache
 from typing import Any
@@ -14,8 +12,8 @@ from numpy.typing import NDArray
 
 from taichi_msm.render import uniforms as uni
 from taichi_msm.render.attributes import NORMAL_NUMBERS, DrawnSheet, store_normal
-from taichi_msm.render.camera_kernel import POINT_NUMBERS, SEEN, project
 from taichi_msm.render.coverage import cover
+from taichi_msm.render.geometry import POINT_NUMBERS, SEEN, project
 from taichi_msm.render.instrument_coverage import cover_with_rods
 from taichi_msm.render.labels import LABEL_NUMBERS
 from taichi_msm.render.samples import INFINITY, Band, Bytes, DrawingConfig, Floats, Integers, clear
@@ -31,11 +29,7 @@ STORED = POINT_NUMBERS + NORMAL_NUMBERS
 class Bands:
     """The memory of one sheet's pictures on a CPU, and their kernel.
 
-    Args:
-        config: what the kernel is compiled for.
-        points: rows and columns of mass points.
-        size: width and height of the picture [px].
-        texels: as in a `Pyramid`.
+    The sheet has rows and columns of `points`, the picture is of this width and height [px]; texels are from `pyramid`.
     """
 
     def __init__(
@@ -53,12 +47,7 @@ class Bands:
     def draw(
         self, position: NDArray[np.float32], numbers: NDArray[np.float32], sizes: NDArray[np.int32]
     ) -> tuple[NDArray[np.uint8], NDArray[np.float32]]:
-        """Draw the picture, the labels or both, as the config says.
-
-        Args:
-            position: positions of the mass points [m], shape (rows, cols, 3).
-            numbers: as `view_numbers` makes them.
-            sizes: as `sizes_of` makes them.
+        """Draw the picture, the labels or both, as the config says; `numbers` and `sizes` are those of uniforms.py.
 
         Returns:
             Colours, shape (height, width, 3), and labels as `labels_of` takes them; each has meaning only if drawn.
@@ -137,7 +126,6 @@ def cover_band(sheet: ti.template(), band: ti.template()):
 
 @cache
 def _kernel(config: DrawingConfig) -> Callable[..., None]:
-    """Make the kernel of one config."""
     factor = config.supersample
 
     @ti.kernel

@@ -6,8 +6,6 @@ nearest is kept in between. Then a pixel covers its samples with the instruments
 drawn at a time, with a sample a thread.
 """
 
-# No `from __future__ import annotations` here: Taichi reads the annotations of a kernel.
-
 from collections.abc import Callable
 from functools import cache
 
@@ -17,9 +15,16 @@ from numpy.typing import NDArray
 from taichi_msm.render import uniforms as uni
 from taichi_msm.render.attributes import NORMAL_NUMBERS, DrawnSheet, store_normal
 from taichi_msm.render.bins import BOUNDS, ROUNDS_OF_SEARCH, binned, owner, reaches, store_bounds
-from taichi_msm.render.camera_kernel import POINT_NUMBERS, project
-from taichi_msm.render.cell import corner_of, is_whole, outlined, patch_of, triangle_bounds
 from taichi_msm.render.coverage import Part, cover
+from taichi_msm.render.geometry import (
+    POINT_NUMBERS,
+    corner_of,
+    is_whole,
+    outlined,
+    patch_of,
+    project,
+    triangle_bounds,
+)
 from taichi_msm.render.instrument_coverage import cover_with_rods
 from taichi_msm.render.labels import LABEL_NUMBERS
 from taichi_msm.render.samples import INFINITY, Band, Bytes, DrawingConfig, Floats, Integers, clear
@@ -63,11 +68,7 @@ class Threads:
     def draw(
         self, position: NDArray[np.float32], numbers: NDArray[np.float32], sizes: NDArray[np.int32]
     ) -> tuple[NDArray[np.uint8], NDArray[np.float32]]:
-        """Draw the picture, the labels or both; arguments and results as for `rasterizer_cpu.Bands.draw`.
-
-        Raises:
-            DeviceError: when the device cut threads short.
-        """
+        """Draw as `rasterizer_cpu.Bands.draw` does; raises a DeviceError when the device cut threads short."""
         launches, factor = Launches(bounded=True), self._config.supersample
         (width, height), rods = self._size, int(sizes[uni.ROD_COUNT])
         across, down = width * factor, height * factor

@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 from taichi_msm.arguments import are_numbers, as_array
 from taichi_msm.errors import ArgumentError
 from taichi_msm.render.camera import View, view
-from taichi_msm.render.instrument import Rod
 from taichi_msm.render.labels import Flow, Labels, Observed, Sight, track_grid
+from taichi_msm.render.surface import Rod
 from taichi_msm.render.texture import load_texture
 from taichi_msm.scene import Camera, Render, Scene
 
@@ -26,25 +26,15 @@ Array = NDArray[Any]
 
 
 class Shot(NamedTuple):
-    """What is in front of which camera at one time.
+    """What is in front of which camera at one time."""
 
-    Attributes:
-        positions: of the mass points [m], shape (rows, cols, 3).
-        view: the camera.
-        rods: the instruments.
-    """
-
-    positions: Array
+    positions: Array  # of the mass points [m], shape (rows, cols, 3)
     view: View
     rods: Sequence[Rod] = ()
 
 
 class Renderer:
     """Draws and labels the sheet of a scene; call `runtime.start` first. Results are those of `Simulation`'s methods.
-
-    Args:
-        scene: a checked scene.
-        texture: the picture on the sheet, shape (height, width, 3); None: the scene's own, read when it is drawn.
 
     Raises:
         ArgumentError: in the methods, when coordinates or labels are not what they must be.
@@ -116,16 +106,16 @@ class Renderer:
         scene = self.scene
         # Labels need one sample, at the pixel's centre; with several samples per pixel, none is there.
         together = scene.render.supersample == 1
-        picture = labels = flow = tracks = None
+        observed = Observed()
         if scene.draws:
-            picture, labels = self._drawing(picture=True, labels=scene.labels_pixels and together).look(*shot)
-        if scene.labels_pixels and labels is None:
-            labels = self.labels(shot)
+            observed = self._drawing(picture=True, labels=scene.labels_pixels and together).look(*shot)
+        if scene.labels_pixels and observed.labels is None:
+            observed = observed._replace(labels=self.labels(shot))
         if before is not None and scene.asks_for("flow"):
-            flow = self.flow(before, shot)
+            observed = observed._replace(flow=self.flow(before, shot))
         if scene.asks_for("tracks"):
-            tracks = self.locate(track_grid(scene.render.tracks), shot)
-        return Observed(picture, labels, flow, tracks)
+            observed = observed._replace(tracks=self.locate(track_grid(scene.render.tracks), shot))
+        return observed
 
     def close(self) -> None:
         """Free the memory."""

@@ -6,9 +6,9 @@ planes. On a CPU bands of rows of tiles are the unit of parallel work; a worker 
 
 What functions of kernel 2 take: x and y are column and row of a tile's samples, a number for each; `at` the entry of
 `samples` where the tile begins; `numbers` and `sizes` the arrays of uniforms.py; `point` what `project` stores.
-"""
 
-# No `from __future__ import annotations` here: Taichi reads the annotations of a kernel.
+Modules with kernels have no `from __future__ import annotations`: Taichi reads the annotations.
+"""
 
 from collections import namedtuple
 from functools import cache
@@ -39,11 +39,13 @@ class DrawingConfig(NamedTuple):
 
     refined: bool  # whether vertices are inserted between mass points
     supersample: int  # samples per pixel along each axis
-    shading: str  # none, headlight or tissue
+    headlit: bool  # whether the sheet is lit by the headlight
+    tissue: bool  # whether the sheet is shaded as wet tissue
     relief: bool  # whether tissue is shaded with a relief
     vignette: bool  # whether tissue is shaded with a vignette
     wireframe: bool  # whether the mass-point mesh is drawn
     instruments: bool  # whether there are any
+    metal: bool  # whether they are shaded
     picture: bool  # whether colours are written
     labels: bool  # whether labels are written; needs one sample per pixel
     lanes: int  # samples in a tile
@@ -64,21 +66,6 @@ class DrawingConfig(NamedTuple):
         return self.lanes == 1
 
     @property
-    def headlit(self) -> bool:
-        """Whether the sheet is lit by the headlight."""
-        return self.picture and self.shading == "headlight"
-
-    @property
-    def tissue(self) -> bool:
-        """Whether the sheet is shaded as wet tissue."""
-        return self.picture and self.shading == "tissue"
-
-    @property
-    def metal(self) -> bool:
-        """Whether instruments are shaded."""
-        return self.picture and self.instruments
-
-    @property
     def plane(self) -> Any:
         """The planes of a tile by name, and which of its vectors each is."""
         return _planes(self)
@@ -87,11 +74,6 @@ class DrawingConfig(NamedTuple):
     def planes(self) -> int:
         """Vectors stored per tile."""
         return len(self.plane)
-
-    @property
-    def normal_planes(self) -> list[int]:
-        """The planes of the normal in the camera's frame, if what is seen is shaded by it."""
-        return [self.plane.normal_x + n for n in range(3)] if self.tissue or self.metal else []
 
     @property
     def band_rows(self) -> int:

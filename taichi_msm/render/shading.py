@@ -1,7 +1,5 @@
 """The colours of samples, from what they show; then the output for pixels: their colours and their labels."""
 
-# No `from __future__ import annotations` here: Taichi reads the annotations of a kernel.
-
 from typing import Any, NamedTuple
 
 from taichi_msm.render import style
@@ -23,14 +21,7 @@ class Output(NamedTuple):
 
 @ti.func
 def shade(at, left, top, samples: ti.template(), appearance: ti.template()):
-    """Shade a tile: light the texture, draw the mesh over it, then the instruments.
-
-    Args:
-        at: entry where the tile begins.
-        left: its first column of samples.
-        top: its first row.
-        samples: the planes of the tiles.
-        appearance: the texture and the light.
+    """Shade the tile whose first sample is at (left, top): light the texture, then draw the mesh and the instruments.
 
     Returns:
         Red, green and blue.
@@ -44,7 +35,7 @@ def shade(at, left, top, samples: ti.template(), appearance: ti.template()):
         for n in ti.static(range(3)):
             colour[n] *= samples[at + plane.light]
     x, y = centres(left, top, config)
-    normal = [samples[at + n] for n in ti.static(config.normal_planes)]
+    normal = [samples[at + (plane.normal_x + n)] for n in ti.static(range(3 * (config.tissue or config.metal)))]
     if ti.static(config.tissue):
         share, gloss = light_tissue(x, y, depth, normal, rise_x, rise_y, appearance)
         for n in ti.static(range(3)):
@@ -112,15 +103,15 @@ def write_labels(
         sheet = sheet & (samples[at + plane.instrument] <= 0.0)
     values = [
         ti.select(sheet if ti.static(label.of_sheet) else seen, samples[at + entry], label.nothing)
-        for entry, _, label in ti.static(channels)
+        for entry, _number, _count, label in ti.static(channels)
     ]
     for line in ti.static(range(config.tile_height)):
         for n in ti.static(range(config.tile_width)):
             if row + line < end_row and left + n < width:
                 pixel = (row + line) * width + left + n
                 for channel, value in ti.static(zip(channels, values, strict=True)):
-                    _, k, label = ti.static(channel)
-                    place = label.first * output.pixels + label.numbers * pixel + k
+                    _, number, count, label = ti.static(channel)
+                    place = label.first * output.pixels + count * pixel + number
                     output.labels[place] = value[line * config.tile_width + n]
 
 
@@ -131,17 +122,8 @@ def resolve(
 ):  # fmt: skip
     """Shade the samples of a band, or of a part of one, and write its pixels.
 
-    Args:
-        first: entry where the band begins, from the left edge of the picture.
-        row: first row of pixels of the band.
-        end_row: the row after its last.
-        left: first column of pixels.
-        right: the column after its last.
-        across: tiles in a row.
-        width: of the picture [px].
-        samples: the planes of the tiles.
-        appearance: the texture and the light.
-        output: the colours and the labels.
+    The band begins at entry `first`, from the left edge of the picture, and has `across` tiles in a row. The pixels are
+    those in columns `left` to `right` of rows `row` to `end_row`, without the latter, of a picture of this `width`.
     """
     config = ti.static(appearance.config)
     factor, tile_width, tile_height = ti.static((config.supersample, config.tile_width, config.tile_height))

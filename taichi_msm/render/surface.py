@@ -1,4 +1,4 @@
-"""The refined surface as arrays that other programs can draw: vertices, triangles and texture coordinates."""
+"""The refined surface as arrays that other programs can draw; and instruments, whose tips touch it."""
 
 from __future__ import annotations
 
@@ -7,7 +7,10 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from taichi_msm.scene import Sheet
+from taichi_msm.physics.probe_force import control_point
+from taichi_msm.scene import Instrument, Scene, Sheet
+
+Array = NDArray[np.float64]
 
 
 class Surface(NamedTuple):
@@ -25,12 +28,19 @@ class Surface(NamedTuple):
     texture_coordinates: NDArray[np.float64]
 
 
+class Rod(NamedTuple):
+    """The shape and place of an instrument at one time: a rod with rounded ends."""
+
+    tip: Array  # middle of its rounded tip [m], shape (3,)
+    axis: Array  # unit vector from there along the rod, shape (3,)
+    length: float  # between the middles of its ends [m]
+    radius: float  # of the rod and its ends [m]
+
+
 def surface(position: NDArray[np.floating], refine: int) -> Surface:
     """Refine the sheet bilinearly (section 2 of the paper); every small quad is cut from top left to bottom right.
 
-    Args:
-        position: positions of the mass points [m], shape (rows, cols, 3).
-        refine: vertices inserted between two neighbours.
+    The mass points are at `position` [m], shape (rows, cols, 3); `refine` vertices are inserted between neighbours.
     """
     vertices = _between(_between(position, refine, 0), refine, 1)
     rows, cols = vertices.shape[:2]
@@ -47,16 +57,10 @@ def surface(position: NDArray[np.floating], refine: int) -> Surface:
     )
 
 
-def touched(
-    position: NDArray[np.floating], refine: int, sheet: Sheet, rest: NDArray[np.float64]
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Find the point of the refined surface whose rest position is `rest`.
+def touched(position: NDArray[np.floating], refine: int, sheet: Sheet, rest: Array) -> tuple[Array, Array]:
+    """Find the point of the refined surface whose rest position, x and y [m], is `rest`.
 
-    Args:
-        position: positions of the mass points [m], shape (rows, cols, 3).
-        refine: vertices inserted between two neighbours.
-        sheet: the sheet.
-        rest: x and y of the point [m], shape (2,); a point outside the sheet moves with the nearest point of its edge.
+    A point outside the sheet moves with the nearest point of its edge. The mass points are at `position`, as above.
 
     Returns:
         The point [m], and the unit normal of its cell there, upward at rest; both of shape (3,).
@@ -75,6 +79,24 @@ def touched(
     point = a + b * s + c * t + d * (s0 * t0 + s1 * t0 + s0 * t1 + min(s1, t1) / parts)
     beside = np.array([rest[0] - (across - 0.5) * width, rest[1] - (0.5 - down) * height, 0.0])
     return point + beside, normal / max(float(np.linalg.norm(normal)), 1e-300)
+
+
+def rods(scene: Scene, position: NDArray[np.floating], time: float) -> list[Rod]:
+    """Place the instruments of a scene at a time [s]; the mass points are at `position` [m], shape (rows, cols, 3)."""
+    return [
+        rod(probe.instrument, scene, position, control_point(probe, scene.sheet, time))
+        for probe in scene.probes
+        if probe.instrument is not None
+    ]
+
+
+def rod(instrument: Instrument, scene: Scene, position: NDArray[np.floating], rest: Array) -> Rod:
+    """Place an instrument; `rest` is the rest position of the point that it touches, x and y [m], shape (2,)."""
+    shaft = np.array(instrument.shaft) / max(map(abs, instrument.shaft))
+    axis = shaft / np.linalg.norm(shaft)
+    point, normal = touched(position, scene.render.refine, scene.sheet, rest)
+    outward = normal if normal @ axis >= 0 else -normal
+    return Rod(point + instrument.radius * outward, axis, instrument.length, instrument.radius)
 
 
 def _between(values: NDArray[np.floating], refine: int, axis: int) -> NDArray[np.floating]:

@@ -18,11 +18,8 @@ if TYPE_CHECKING:
 def load_texture(scene: Scene, sha256: str | None = None) -> NDArray[np.uint8]:
     """Read the scene's picture: upright, in 8-bit RGB, cut to the scene's region.
 
-    If a file has several pictures, the first is taken; a transparent one is laid over the scene's background.
-
-    Args:
-        scene: which names it.
-        sha256: the SHA-256 that its file must have; None: any.
+    If a file has several pictures, the first is taken; a transparent one is laid over the scene's background. Its file
+    must have the SHA-256, if one is given.
 
     Returns:
         Colours, 0 to 255, shape (height, width, 3), top row first.
@@ -46,11 +43,7 @@ def load_texture(scene: Scene, sha256: str | None = None) -> NDArray[np.uint8]:
 
 
 def require_texture(texture: Any) -> NDArray[np.uint8]:
-    """Check that an array can be the picture on the sheet.
-
-    Raises:
-        ArgumentError: when it cannot.
-    """
+    """Check that an array can be the picture on the sheet; raises an ArgumentError when it cannot."""
     import numpy as np
 
     picture = as_array(texture, "texture")

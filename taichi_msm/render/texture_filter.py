@@ -1,8 +1,12 @@
-"""The colour of the texture for a tile of samples, filtered over what each of them shows."""
+"""The colour of the texture for a tile of samples, filtered over what each of them shows.
 
-# No `from __future__ import annotations` here: Taichi reads the annotations of a kernel.
+It comes from the texture at 1, 1/2, 1/4, ... of its size (mipmaps), so that a sample of many texels shows their mean.
+"""
 
 from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
 
 from taichi_msm.render import uniforms as uni
 from taichi_msm.render.samples import DrawingConfig
@@ -13,12 +17,43 @@ class Appearance(NamedTuple):
     """The picture on the sheet, and the light and the instruments that it is shaded with."""
 
     config: DrawingConfig
-    texels: Any  # as in a `Pyramid`
+    texels: Any  # as `pyramid` gives them
     sizes: Any
     width: Any  # of the first level
     height: Any
     numbers: Any
     rod_count: Any
+
+
+def packed(colours: NDArray[np.uint8]) -> NDArray[np.float32]:
+    """Pack each colour into one number, red + 256 green + 65536 blue, which f32 holds exactly."""
+    return colours.astype(np.float32) @ np.array([1, 1 << 8, 1 << 16], np.float32)
+
+
+def pyramid(texture: NDArray[np.uint8], *, minified: bool) -> tuple[NDArray[np.float32], NDArray[np.int32]]:
+    """Make the levels of a texture, shape (height, width, 3); the last has one texel. Not `minified`: the first alone.
+
+    Returns:
+        The texels of all levels, packed, one row after another; for every level where it begins there, its width and
+        its height, shape (levels, 3).
+    """
+    level, texels, levels, first = texture, [], [], 0
+    while True:
+        height, width, _ = level.shape
+        texels.append(packed(level).ravel())
+        levels.append((first, width, height))
+        first += width * height
+        if not minified or width == height == 1:
+            return np.concatenate(texels), np.array(levels, np.int32)
+        level = halved(level)
+
+
+def halved(colours: NDArray[np.uint8]) -> NDArray[np.uint8]:
+    """Average blocks of 2 x 2 texels; where their number is odd, the last row or column counts twice."""
+    height, width, _ = colours.shape
+    even = np.pad(colours, ((0, height % 2), (0, width % 2), (0, 0)), "edge").astype(np.uint16)
+    sums = even[::2, ::2] + even[1::2, ::2] + even[::2, 1::2] + even[1::2, 1::2]
+    return ((sums + 2) // 4).astype(np.uint8)
 
 
 @ti.func
@@ -48,11 +83,7 @@ def between(upper_left, upper_right, lower_left, lower_right, u, v):
 
 @ti.func
 def fetch(first, width, height, x, y, appearance: ti.template()):
-    """Filter a level bilinearly at (x, y) of its texels.
-
-    Returns:
-        Red, green and blue; and, if there is a relief, the rise of the grey from texel to texel.
-    """
+    """Filter a level bilinearly at (x, y) of its texels: its colour and, for a relief, the grey's rise a texel."""
     config = ti.static(appearance.config)
     # Beyond the middle of its outermost texels the texture does not change.
     texel_x = ti.max(ti.min(x, width - 1.0), 0.0)

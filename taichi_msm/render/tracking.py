@@ -4,37 +4,26 @@ A point is placed on the drawn surface, and projected. It is hidden if another p
 nearer on the same line of sight. Bins tell which cells may be there.
 """
 
-# No `from __future__ import annotations` here: Taichi reads the annotations of a kernel.
-
 import math
 from collections.abc import Sequence
 
 import numpy as np
 from numpy.typing import NDArray
 
+from taichi_msm.render import geometry
 from taichi_msm.render import uniforms as uni
 from taichi_msm.render.bins import BOUNDS, binned, store_bounds
 from taichi_msm.render.camera import View
-from taichi_msm.render.camera_kernel import POINT_NUMBERS, project, w_at
-from taichi_msm.render.cell import (
-    corner_of,
-    depth_at,
-    edges,
-    is_within,
-    on_triangle,
-    outlined,
-    patch_of,
-    small_quad,
-    triangle_at,
-)
-from taichi_msm.render.instrument import Rod
+from taichi_msm.render.geometry import POINT_NUMBERS
 from taichi_msm.render.instrument_coverage import meet
 from taichi_msm.render.labels import NO_FLOW, Flow, Sight
 from taichi_msm.render.samples import INFINITY, Bytes, Doubles, Floats, Integers
-from taichi_msm.render.uniforms import sizes_of, view_numbers
+from taichi_msm.render.surface import Rod
 from taichi_msm.scene import Scene
 from taichi_msm.system.launches import Launches, end_thread
 from taichi_msm.system.runtime import lanes, our_compilation, ti
+
+Array = NDArray[np.floating]
 
 # The smallest width of a bin [px].
 SMALLEST_BIN = 4
@@ -53,44 +42,19 @@ AROUND = 4
 NOWHERE = math.nan
 
 
-def find(
-    scene: Scene,
-    coordinates: NDArray[np.floating],
-    position: NDArray[np.floating],
-    view: View,
-    rods: Sequence[Rod] = (),
-) -> Sight:
-    """Find material points.
+def find(scene: Scene, coordinates: Array, position: Array, view: View, rods: Sequence[Rod] = ()) -> Sight:
+    """Find material points by their coordinates on the sheet, as in `Labels`, shape (n, 2).
 
-    Args:
-        scene: a checked scene; call `runtime.start` first.
-        coordinates: fractions of the sheet's width from its left and of its height from its top, shape (n, 2).
-        position: positions of the mass points [m], shape (rows, cols, 3).
-        view: the camera.
-        rods: the instruments.
-
-    Raises:
-        DeviceError: when the device cut threads short.
+    The mass points are at `position` [m], shape (rows, cols, 3). Raises a DeviceError when threads were cut short.
     """
     pixels, hidden = _search(scene, coordinates, position, view, rods, moved=False)
     return Sight(pixels, hidden.view(np.bool_))
 
 
-def find_flow(
-    scene: Scene,
-    coordinates: NDArray[np.floating],
-    position: NDArray[np.floating],
-    view: View,
-    rods: Sequence[Rod] = (),
-) -> Flow:
-    """Find how far the points that the pixels of another frame show have moved in the picture; errors as for `find`.
+def find_flow(scene: Scene, coordinates: Array, position: Array, view: View, rods: Sequence[Rod] = ()) -> Flow:
+    """Find how far the points that the pixels of another frame show have moved in the picture; else as `find`.
 
-    Args:
-        scene: as for `find`.
-        coordinates: as in the labels of the other frame, shape (height, width, 2); NaN where no sheet is seen.
-        position: positions of the mass points now [m], shape (rows, cols, 3).
-        view: the camera.
-        rods: the instruments now.
+    `coordinates` are those in the labels of the other frame, shape (height, width, 2); NaN where no sheet is seen.
     """
     shape = coordinates.shape[:2]
     moved, hidden = _search(scene, coordinates.reshape(-1, 2), position, view, rods, moved=True)
@@ -98,13 +62,7 @@ def find_flow(
 
 
 def _search(
-    scene: Scene,
-    coordinates: NDArray[np.floating],
-    position: NDArray[np.floating],
-    view: View,
-    rods: Sequence[Rod],
-    *,
-    moved: bool,
+    scene: Scene, coordinates: Array, position: Array, view: View, rods: Sequence[Rod], *, moved: bool
 ) -> tuple[NDArray[np.float32], NDArray[np.uint8]]:
     """Find material points, or how far they are from the centres of all pixels, row by row; and which are hidden."""
     total = len(coordinates)
@@ -115,8 +73,8 @@ def _search(
     # If a bin is half as wide as a cell, the cells of most bins are around one mass point only.
     bin_size = max(SMALLEST_BIN, round((width * height / cells) ** 0.5 / 2))
     launches = Launches(bounded=lanes("f64") == 1)
-    numbers = launches.give(view_numbers(view, scene.render, 1, scene.sheet.size, (1, 1), rods))
-    sizes = sizes_of(scene, np.empty((0, 3), np.int32))
+    numbers = launches.give(uni.view_numbers(view, scene.render, 1, scene.sheet.size, (1, 1), rods))
+    sizes = uni.sizes_of(scene, np.empty((0, 3), np.int32))
     sizes[uni.ROD_COUNT] = len(rods)
     point, cell = (launches.array(np.float64, n) for n in (rows * cols * POINT_NUMBERS, cells * CELL_NUMBERS))
     bounds = launches.array(np.int32, cells * BOUNDS)
@@ -147,13 +105,13 @@ def _outline(
     """Project the mass points, and find the outlines of the cells, and their bounds in whole pixels."""
     for index in range(sizes[uni.ROWS] * sizes[uni.COLS]):
         cols = sizes[uni.COLS]
-        project(position, index // cols, index % cols, cols, numbers, point, True)
+        geometry.project(position, index // cols, index % cols, cols, numbers, point, True)
 
     for index in range((sizes[uni.ROWS] - 1) * (sizes[uni.COLS] - 1)):
         cols, here = sizes[uni.COLS], index * CELL_NUMBERS
-        corner = corner_of(index, cols)
+        corner = geometry.corner_of(index, cols)
         below = corner + cols * POINT_NUMBERS
-        outline = ti.static(outlined(corner, cols, numbers[uni.NEAR], point))
+        outline = ti.static(geometry.outlined(corner, cols, numbers[uni.NEAR], point))
         left, right, top, bottom, side = outline.left, outline.right, outline.top, outline.bottom, outline.side
         if outline.behind:
             left, right, top, bottom = 1.0, -1.0, 1.0, -1.0
@@ -204,10 +162,10 @@ def _depth(x, y, column, line, part, lower, near, patch: ti.template()):
 
     Of a cell that is not whole this is the depth of the triangle below the diagonal, if `lower`, or above.
     """
-    triangle = ti.static(triangle_at(x, y, column, line, part, lower, patch))
-    s, t = on_triangle(x, y, triangle)
-    depth = depth_at(s, t, triangle)
-    return ti.select(patch.whole | is_within(s, t, 0.0, near, triangle), depth, INFINITY)
+    triangle = ti.static(geometry.triangle_at(x, y, column, line, part, lower, patch))
+    s, t = geometry.on_triangle(x, y, triangle)
+    depth = geometry.depth_at(s, t, triangle)
+    return ti.select(patch.whole | geometry.is_within(s, t, 0.0, near, triangle), depth, INFINITY)
 
 
 @ti.func
@@ -229,13 +187,13 @@ def _hides(x, y, depth, index, own, own_triangle, cols, parts, near, point: ti.t
         and y >= cell[here + MIN_Y]
         and y <= cell[here + MAX_Y]
     ):
-        corner = corner_of(index, cols)
-        patch = ti.static(patch_of(corner, cols, side, whole, point, True))
+        corner = geometry.corner_of(index, cols)
+        patch = ti.static(geometry.patch_of(corner, cols, side, whole, point, True))
         if whole:
-            outline = ti.static(outlined(corner, cols, near, point))
-            of_left, of_right, of_top, of_bottom = edges(x, y, side, outline)
+            outline = ti.static(geometry.outlined(corner, cols, near, point))
+            of_left, of_right, of_top, of_bottom = geometry.edges(x, y, side, outline)
             if of_left >= 0.0 and of_right >= 0.0 and of_top >= 0.0 and of_bottom >= 0.0:
-                column, line = small_quad(x, y, True, parts, patch)
+                column, line = geometry.small_quad(x, y, True, parts, patch)
                 hides = _depth(x, y, column, line, part, False, near, patch) < depth
         else:
             per_side = ti.cast(parts, ti.i32)
@@ -256,7 +214,7 @@ def _is_behind_rod(x, y, depth, numbers: ti.template(), sizes: ti.template()):
         across_it = x >= numbers[rod + uni.LEFT] and x <= numbers[rod + uni.RIGHT]
         if across_it and y >= numbers[rod + uni.TOP] and y <= numbers[rod + uni.BOTTOM]:
             met, _, _, _ = meet(x, y, n, numbers)
-            if met < depth and w_at(met, numbers) > numbers[uni.NEAR]:
+            if met < depth and geometry.w_at(met, numbers) > numbers[uni.NEAR]:
                 hides = True
     return hides
 
@@ -287,7 +245,7 @@ def _find(
             s0, t0 = column * part, line * part
             s1, t1 = s - s0, t - t0
             own_triangle = 2 * ti.cast(line * parts + column, ti.i32) + ti.cast(t1 > s1, ti.i32)
-            patch = ti.static(patch_of(corner_of(own, cols), cols, 0.0, True, point, True))
+            patch = ti.static(geometry.patch_of(geometry.corner_of(own, cols), cols, 0.0, True, point, True))
             # In the small quad, D s t is replaced by a function that is linear on either side of the diagonal.
             twist = s0 * t0 + s1 * t0 + s0 * t1 + ti.min(s1, t1) * part
             p = patch.a + patch.b * s + patch.c * t + patch.d * twist

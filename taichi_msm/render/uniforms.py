@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from taichi_msm.render import style
 from taichi_msm.render.camera import View
-from taichi_msm.render.instrument import Rod
+from taichi_msm.render.surface import Rod
 from taichi_msm.scene import Render, Scene
 
 Array = NDArray[np.float64]
@@ -42,6 +42,7 @@ ACROSS, UP, SLOPE_X, SLOPE_Y = 41, 44, 47, 48
 
 # Whatever is in front of a point by less than this counts as the point's own place [m].
 TOUCHING = 49
+TOUCHING_SHARE = 1e-9  # this distance as a fraction of the sheet's larger side
 
 # Then the instruments, each with the middle of its tip and its axis in the camera's frame; its length and radius; and
 # its bounds in the picture [samples].
@@ -49,17 +50,8 @@ RODS, ROD_NUMBERS = 50, 12
 TIP, AXIS, LENGTH, RADIUS, LEFT, TOP, RIGHT, BOTTOM = 0, 3, 6, 7, 8, 9, 10, 11
 
 
-# The above distance, as a fraction of the sheet's larger side.
-TOUCHING_SHARE = 1e-9
-
-
 def sizes_of(scene: Scene, levels: NDArray[np.int32]) -> NDArray[np.int32]:
-    """Put the sizes together, but for what changes from frame to frame.
-
-    Args:
-        scene: a checked scene.
-        levels: of the texture, as in a `Pyramid`.
-    """
+    """Put the sizes together, but for what changes from frame to frame; `levels` of the texture, as of `pyramid`."""
     sizes = np.zeros(LEVELS + levels.size, np.int32)
     sizes[[ROWS, COLS, WIDTH, HEIGHT, LEVEL_COUNT]] = *scene.sheet.points, *scene.render.size, len(levels)
     sizes[LEVELS:] = levels.flat
@@ -69,15 +61,9 @@ def sizes_of(scene: Scene, levels: NDArray[np.int32]) -> NDArray[np.int32]:
 def view_numbers(
     view: View, render: Render, factor: int, sheet: tuple[float, float], texture: tuple[int, int], rods: Sequence[Rod]
 ) -> Array:
-    """Put the numbers together.
+    """Put the numbers together, for `factor` samples per pixel along each axis.
 
-    Args:
-        view: the camera.
-        render: how the scene is drawn.
-        factor: samples per pixel along each axis.
-        sheet: its height and width [m].
-        texture: its width and height [texels].
-        rods: the instruments.
+    The sheet has this height and width [m], its texture this width and height [texels].
     """
     numbers = np.empty(RODS + len(rods) * ROD_NUMBERS)
     numbers[MATRIX:AXES] = (view.matrix * np.array([[factor], [factor], [1], [1]])).ravel()
@@ -100,7 +86,6 @@ def view_numbers(
 
 
 def _rod_numbers(rod: Rod, view: View, factor: int) -> Array:
-    """Give the numbers of an instrument."""
     numbers = np.empty(ROD_NUMBERS)
     numbers[TIP:AXIS] = view.axes @ (rod.tip - view.eye)
     numbers[AXIS:LENGTH] = view.axes @ rod.axis

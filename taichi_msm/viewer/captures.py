@@ -32,16 +32,8 @@ OTHER_VALUES = 1000
 class Film:
     """A GIF of a session, encoded in a hidden folder while the session runs. On closing, it is removed unless moved.
 
-    Args:
-        folder: in which the hidden one is made; made if it does not exist.
-        render: gives the size of the pictures, and the background, a colour that is kept exactly.
-        rate: pictures per second.
-        parts: frames of the session per picture.
-        begin: frame of the session with which it begins.
-        option: what the error says to choose another folder by.
-
-    Raises:
-        FilesError: here and in the methods, when it cannot be written.
+    It shows `rate` pictures per second, each of `parts` frames of the session, from frame `begin` on. A FilesError,
+    here and in the methods, says that it cannot be written, and to choose another folder by `option`.
 
     Attributes:
         pictures: how many it has.
@@ -78,17 +70,11 @@ class Film:
 
 
 class Captures:
-    """The folder where a session saves its files; made with the first file.
+    """The folder where a session of what has this name saves its files; made with the first file.
 
-    Args:
-        folder: the folder.
-        name: what the session is of; written into its scenes.
-
-    Raises:
-        FilesError: in the methods, when the folder cannot be written.
+    Its methods raise a FilesError when the folder cannot be written.
 
     Attributes:
-        folder: the folder.
         saved: the saved files, in order.
     """
 

@@ -1,4 +1,7 @@
-"""The tool in a person's hand, as a probe of a scene: every frame adds the keys that a run needs to repeat it."""
+"""The tool in a person's hand, as a probe of a scene, and the pointer that moves it.
+
+Every frame adds the keys that a run needs to repeat it.
+"""
 
 from __future__ import annotations
 
@@ -7,7 +10,13 @@ from collections import deque
 from collections.abc import Sequence
 from typing import Any
 
+import numpy as np
+from numpy.typing import NDArray
+
+from taichi_msm.render.picking import on_rest_plane
 from taichi_msm.scene import Probe
+from taichi_msm.simulation import Simulation
+from taichi_msm.viewer.viewport import Viewport
 
 # How long a hand takes from no force to the full force [s]. It lets go at once.
 RISE = 0.2
@@ -25,11 +34,8 @@ class HeldTool:
     """Presses at one place at a time.
 
     Presses, moves and releases take effect at the next frame, at most one press or release per frame. So the force
-    jumps only between frames, and it is 0 for at least one frame before the tool acts elsewhere.
-
-    Args:
-        probe: the probe whose force, falloff and offset it has.
-        rate: frames per second.
+    jumps only between frames, and it is 0 for at least one frame before the tool acts elsewhere. It has the force, the
+    falloff and the offset of a probe.
 
     Attributes:
         strength: the percentage of the full force that a press goes up to.
@@ -91,8 +97,7 @@ class HeldTool:
     def follow(self, frame: int) -> Probe | None:
         """Do what was asked for, from one frame to the next.
 
-        Returns:
-            The probe, with the keys that matter for this time; None if the last values of the probe before still hold.
+        Gives the probe, with the keys that matter for this time; None if the last values of the one before still hold.
         """
         begin, end = frame / self._rate, (frame + 1) / self._rate
         if self._asked:
@@ -136,6 +141,69 @@ class HeldTool:
         if len(at) == 1:
             at = [*at, (max(end, 1 / self._rate), *at[0][1:])]
         return self._probe.model_copy(update={"load": tuple(load), "at": tuple(at)})
+
+
+class Controller:
+    """Moves a tool with a pointer over the picture of a simulation."""
+
+    def __init__(self, tool: HeldTool, viewport: Viewport, simulation: Simulation) -> None:
+        self._tool = tool
+        self._viewport = viewport
+        self._simulation = simulation
+        # Where a drag begins: the place of the tool, and the point of the rest plane that was then under the pointer.
+        self._held: tuple[Place, NDArray[np.floating] | None] | None = None
+        self._pointer = (0.0, 0.0)
+        self._hovering: tuple[float, float] | None = None
+
+    def press(self, x: float, y: float, direction: int) -> bool:
+        """Press (1) or pull (-1) what is seen at a pixel; returns whether there is anything."""
+        place = self._simulation.pick((x, y), self._viewport.view)
+        if place is None:
+            return False
+        self._tool.press(place, direction)
+        self._pointer = x, y
+        self._held = place, on_rest_plane(self._viewport.view, self._pointer)
+        return True
+
+    def over(self) -> Place | None:
+        """Find the place on the sheet under a pointer that presses nothing; None if there is none."""
+        if self._tool.held or self._tool.percent != 0 or self._hovering is None:
+            return None
+        return self._simulation.pick(self._hovering, self._viewport.view)
+
+    def hover(self, x: float, y: float) -> None:
+        """Note where a pointer is that presses nothing."""
+        self._hovering = x, y
+
+    def drag(self, x: float, y: float) -> None:
+        """Move the control point as far over the sheet at rest as the pointer moved.
+
+        The deformed sheet cannot serve for this: it gives way to the tool, so each move would cause another.
+        """
+        if self._held is None:
+            return
+        self._pointer = x, y
+        ((across, down), begun), here = self._held, on_rest_plane(self._viewport.view, self._pointer)
+        if begun is None or here is None:
+            return
+        (right, up), (height, width) = here - begun, self._simulation.scene.sheet.size
+        self._tool.move((across + right / width, down - up / height))
+
+    def release(self) -> None:
+        """Let go."""
+        self._held = self._hovering = None
+        if self._tool.held:
+            self._tool.release()
+
+    def hold_on(self) -> None:
+        """Keep the tool where it is after the camera moved; a drag goes on from there."""
+        if self._held is not None:
+            self._held = self._tool.goal, on_rest_plane(self._viewport.view, self._pointer)
+
+    def forget(self) -> None:
+        """Put the tool at rest."""
+        self._tool.rest()
+        self._held = self._hovering = None
 
 
 def _extend(keys: list[Any], key: tuple[float, ...]) -> None:

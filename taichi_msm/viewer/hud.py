@@ -31,13 +31,9 @@ RING = 1 / 50
 
 
 def write(picture: Picture, above: Sequence[str], below: str = "", table: Mapping[str, str] | None = None) -> None:
-    """Write text over a picture, which is changed, as large as its height asks for, on darker panels.
+    """Write text over a picture, shape (height, width, 3), which is changed, on darker panels.
 
-    Args:
-        picture: colours, shape (height, width, 3).
-        above: lines for its top left corner.
-        below: a text for its bottom left corner, wrapped as needed.
-        table: two columns, below the lines at the top.
+    Lines go `above`, into the top left corner, a table of two columns under them; the text `below` is wrapped.
     """
     height, width = picture.shape[:2]
     size = _letter_size(picture)

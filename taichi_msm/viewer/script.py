@@ -1,20 +1,28 @@
-"""A script of events: what a person would do, read from a YAML file."""
+"""A script of events, read from a YAML file: what a person would do. With it a session without a window is filmed."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import closing
+from functools import partial
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, Literal
 
 from pydantic import Field, field_validator, model_validator
 from pydantic_core import PydanticCustomError
 
-from taichi_msm.errors import Problem, SceneError
+from taichi_msm.errors import FilesError, Problem, SceneError, writing
 from taichi_msm.faults import REFUSED
 from taichi_msm.scene import MAX_PIXELS, NotNegative, Number, Pixels, Section, key
 from taichi_msm.scenefile.load import Draft, Kind, read_file
 from taichi_msm.scenefile.validation import parse
+from taichi_msm.viewer.captures import Film
 from taichi_msm.viewer.events import KEYS, Drag, Event, Key, Percent, Press, Release, Turn
+
+if TYPE_CHECKING:
+    from taichi_msm.viewer.session import Session
+
+OPTION = "--record"
 
 LONGEST = 3600.0
 
@@ -97,11 +105,7 @@ def _refused(key: str | int, message: str, **values: str) -> PydanticCustomError
 
 
 def load_script(path: str | Path, size: tuple[int, int]) -> Script:
-    """Read a script for a picture of a width and height [px].
-
-    Raises:
-        SceneError: with all faults, one line each, in the order of the file.
-    """
+    """Read a script for a picture of a width and height [px]; raises a SceneError with all faults, in their order."""
     draft = Draft(str(path), read_file(str(path), _SCRIPT))
     script, problems = parse(Script, draft.data)
     draft.report(problems)
@@ -123,12 +127,9 @@ def _outside(script: Script, size: tuple[int, int]) -> Iterator[Problem]:
 
 
 def timed(script: Script, rate: float, size: tuple[int, int]) -> Iterator[tuple[int, Event]]:
-    """Give the events of a script, each with the frame before which it happens.
+    """Give the events of a script, in order, each with the frame before which it happens.
 
-    Args:
-        script: the script.
-        rate: frames per second.
-        size: width and height of the picture that is shown [px].
+    There are `rate` frames per second, and the picture that is shown has this width and height [px].
     """
     scale = [shown / meant for shown, meant in zip(size, script.size or size, strict=True)]
     x = y = 0.0
@@ -154,3 +155,60 @@ def timed(script: Script, rate: float, size: tuple[int, int]) -> Iterator[tuple[
                     yield frame, Percent(entry.to or 0.0)
                 case "key":
                     yield frame, Key(entry.name or "")
+
+
+def film(
+    session: Session,
+    path: Path,
+    seconds: float,
+    events: Iterable[tuple[int, Event]] = (),
+    progress: Callable[[int, int], None] = lambda done, total: None,
+    say: Callable[[str], None] = lambda notice: None,
+) -> None:
+    """Run a session for some time and film it as a GIF, which replaces an earlier one when it is whole.
+
+    Args:
+        session: it has no window.
+        path: the GIF.
+        seconds: how long.
+        events: as from `timed`, read one at a time.
+        progress: called often, with the frames done and the frames in all; what it raises stops the session there.
+        say: called with what the person should know.
+
+    Raises:
+        FilesError: when the film cannot be written; or, after it was written, when a file that an event was to save
+            could not be.
+    """
+    if path.is_dir():
+        raise FilesError(f"{path}: a directory; choose another {OPTION}")
+    frames = round(seconds * session.rate)
+    events = iter(events)
+    upcoming = next(events, None)
+    failures: list[FilesError] = []
+    notice = ""
+    rate, parts = session.rate / session.parts, session.parts
+    with closing(Film(path.parent, session.scene.render, rate, parts, option=OPTION)) as gif:
+        for frame in range(frames + 1):
+            progress(frame, frames)
+            while upcoming is not None and upcoming[0] <= frame:
+                try:
+                    session.handle(upcoming[1])
+                except FilesError as error:
+                    failures.append(error)
+                if session.notice not in ("", notice):
+                    say(f"{frame / session.rate:g} s: {session.notice}")
+                notice = session.notice
+                upcoming = next(events, None)
+            if frame % parts == 0:
+                gif.show(session.picture(), frame, partial(progress, frame, frames))
+            if frame < frames:
+                session.advance()
+            if session.fault:
+                say(session.fault)
+                break
+        if upcoming is not None:
+            say(f"the film ends at {frame / session.rate:g} s, before some of the script's events")
+        with writing(path, OPTION):
+            gif.encoded(partial(progress, frames, frames)).replace(path)
+    if failures:
+        raise failures[0]

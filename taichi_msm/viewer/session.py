@@ -15,8 +15,7 @@ from taichi_msm.physics.plan import Plan
 from taichi_msm.physics.planning import make_plan
 from taichi_msm.physics.probe_force import probe_force
 from taichi_msm.physics.timestep import with_time
-from taichi_msm.render.instrument import rod, rods
-from taichi_msm.render.surface import touched
+from taichi_msm.render.surface import rod, rods, touched
 from taichi_msm.render.texture import load_texture
 from taichi_msm.scene import MAX_PROBES, Scene
 from taichi_msm.scenefile.resolve import resolve
@@ -26,8 +25,7 @@ from taichi_msm.simulation import Simulation
 from taichi_msm.system import runtime
 from taichi_msm.viewer import events, hud
 from taichi_msm.viewer.captures import Captures, Film, probe_values
-from taichi_msm.viewer.controller import Controller
-from taichi_msm.viewer.held_tool import HeldTool, Place
+from taichi_msm.viewer.held_tool import Controller, HeldTool, Place
 from taichi_msm.viewer.viewport import Viewport
 
 # A session has at most this many frames per second, what a screen shows; each is a whole part of a frame of the scene.
@@ -53,8 +51,7 @@ AVERAGED = 20
 def with_live_frames(plan: Plan) -> tuple[Plan, int]:
     """Divide the frames of a scene into shorter ones, for as many per second as a screen shows; a given step stays.
 
-    Returns:
-        The plan of that scene, and how many of its frames make one of the given scene's.
+    Gives the plan of that scene, and how many of its frames make one of the given scene's.
     """
     scene = plan.scene
     parts = max(1, int(MOST_FRAMES / scene.time.frames_per_second * (1 + 1e-9)))
@@ -68,15 +65,8 @@ def with_live_frames(plan: Plan) -> tuple[Plan, int]:
 class Session:
     """A person presses the tissue of a scene with a tool. Usable in a with statement, which saves a film that is on.
 
-    The tool has the force, the falloff and the offset of the scene's first probe.
-
-    Args:
-        scene: a checked scene with a picture.
-        captures: the folder where the person's pictures, films and scenes are saved.
-        arch: cpu or cuda.
-        threads: number of CPU threads; None takes every core.
-        play: whether the scene's own probes act as well.
-        progress: called often, with the name of the stage; what it raises stops the work there.
+    The tool has the force, the falloff and the offset of the scene's first probe. If it is to `play`, the scene's own
+    probes act as well. `progress` is called often with the name of the stage; what it raises stops the work there.
 
     Raises:
         SceneError: when the scene has no picture, no probe, or no room for another probe.
@@ -161,11 +151,7 @@ class Session:
         return self.scene.model_copy(update={"probes": probes, "time": time, "render": self.viewport.render})
 
     def handle(self, event: events.Event) -> None:
-        """Do what an event asks for; its effect on the tissue is seen in the next frame.
-
-        Raises:
-            FilesError: when a file cannot be saved.
-        """
+        """Do what an event asks for, from the next frame on; raises a FilesError when a file cannot be saved."""
         match event:
             case events.Hover(x, y):
                 self._controller.hover(x, y)

@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 
 from taichi_msm.outputs.gif import Picture
 from taichi_msm.render.camera import View, pinhole, turned
-from taichi_msm.render.instrument import Rod
 from taichi_msm.render.renderer import Renderer, Shot
+from taichi_msm.render.surface import Rod
 from taichi_msm.scene import Camera, Render
 
 

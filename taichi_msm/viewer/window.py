@@ -1,11 +1,12 @@
-"""The window: it turns the pointer and the keys into events, and shows pictures, and does nothing else."""
+"""The window: it turns the pointer and the keys into events, and shows pictures in real time."""
 
 from __future__ import annotations
 
 import os
 import sys
 import time
-from collections.abc import Iterable, Iterator
+from collections import deque
+from collections.abc import Callable, Iterable, Iterator
 
 import numpy as np
 
@@ -15,7 +16,6 @@ from taichi_msm.progress import Pause
 from taichi_msm.system.silence import silenced
 from taichi_msm.viewer import hud
 from taichi_msm.viewer.events import KEYS, NOTCH, Drag, Event, Harder, Hover, Key, Press, Release, Turn
-from taichi_msm.viewer.pacing import Pacing
 from taichi_msm.viewer.session import Session
 
 # No greeting on stdout, and the desktop's effects stay on.
@@ -41,18 +41,20 @@ LEFT, RIGHT = 1, 3
 
 QUIT = Key("q")
 
+# A delay beyond this is not made up for; and no picture waits longer than this for its frames [s].
+LONGEST = 0.1
+
+# The speed is averaged over this time [s].
+OBSERVED = 1.0
+
+# Below this share of real time the speed is reported as too slow.
+SLOW = 0.95
+
 
 class Window:
-    """A window with a picture, which is as large as fits into it. Usable in a with statement, which closes it.
+    """A window with a picture of a width and height [px], as large as fits. A with statement closes it.
 
-    There may be one window at a time: it takes all events of the process.
-
-    Args:
-        title: of the window.
-        size: width, height of the picture [px].
-
-    Raises:
-        DeviceError: when there is no display.
+    There may be one at a time: it takes all events of the process. Raises a DeviceError when there is no display.
     """
 
     def __init__(self, title: str, size: tuple[int, int]) -> None:
@@ -112,8 +114,7 @@ class Window:
 def opening(picture: tuple[int, int], screen: tuple[int, int]) -> tuple[int, int]:
     """Choose the size of a new window; all sizes are width, height [px].
 
-    It is the largest whole multiple of the picture's that takes at most half of the screen each way, or the picture's
-    own, or less if the screen is smaller.
+    It is the largest whole multiple of the picture's in half of the screen each way, or the picture's own if that fits.
     """
     times = max(1, min(screen[0] // (2 * picture[0]), screen[1] // (2 * picture[1])))
     return placed(picture, (min(times * picture[0], screen[0]), min(times * picture[1], screen[1]))).size
@@ -202,6 +203,44 @@ def key_name(event: pygame.Event) -> str | None:
         typed = chr(ord("a") + event.scancode - pygame.KSCAN_A)
     name = ARROWS.get(event.key) or TYPED.get(typed, typed)
     return name if name in KEYS else None
+
+
+class Pacing:
+    """Decides how many frames to simulate before the next picture, so that simulated time keeps up with real time."""
+
+    def __init__(self, rate: float, clock: Callable[[], float]) -> None:
+        self._rate = rate
+        self._clock = clock
+        self._next = clock()
+        # For each of the last pictures, when it began and how many frames were simulated for it.
+        self._pictures: deque[tuple[float, int]] = deque()
+
+    def wait(self) -> float:
+        """Tell how long it is until the next frame is due [s]."""
+        return max(0.0, self._next - self._clock())
+
+    def due(self) -> Iterator[int]:
+        """Count the frames that are due; ends when no more are due, or when the picture must not wait any longer."""
+        begun = self._clock()
+        self._next = max(self._next, begun - LONGEST)
+        count = 0
+        while self._next <= self._clock() and (count == 0 or self._clock() < begun + LONGEST):
+            self._next += 1 / self._rate
+            yield count
+            count += 1
+        self._pictures.append((begun, count))
+        while begun - self._pictures[0][0] > OBSERVED:
+            self._pictures.popleft()
+
+    def said(self) -> str:
+        """Say how many pictures are shown per second, and, if simulated time is too slow, how fast it goes."""
+        if len(self._pictures) < 2:
+            return ""
+        seconds = self._pictures[-1][0] - self._pictures[0][0]
+        shown = f"{(len(self._pictures) - 1) / seconds:.0f} pictures/s"
+        # The last picture is not counted, as its time is not over.
+        speed = sum(count for _, count in list(self._pictures)[:-1]) / self._rate / seconds
+        return shown if speed >= SLOW else f"{shown}  ·  too slow: {speed:.2f} x real time"
 
 
 def show(session: Session, window: Window, pause: Pause) -> None:

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from taichi_msm.render import style
 from taichi_msm.render.camera import view
-from taichi_msm.render.instrument import Rod
+from taichi_msm.render.surface import Rod
 from taichi_msm.scene import Scene
 from tests.reference.shading import headlight, meet, metal, normals, normals_at, sample, tissue
 
@@ -194,7 +194,7 @@ def draw(scene: Scene, position: Array, texture: NDArray[np.uint8], rods: Sequen
     else:
         lit = sample(texture, u, v)
     if scene.render.shading == "headlight":
-        lit *= headlight(normal, camera.toward)[..., None]
+        lit *= headlight(normal, camera.axes[2])[..., None]
     wire = seen.wire[..., None]
     lit = lit * (1 - wire) + np.array(style.WIRE_COLOUR) * wire
     colour = np.where(sheet[..., None], lit, np.array(scene.render.background, float))

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from taichi_msm.render.camera import view
-from taichi_msm.render.instrument import Rod
+from taichi_msm.render.surface import Rod
 from taichi_msm.scene import Scene
 from tests.reference.drawing import look, refine, triangles, weights
 from tests.reference.shading import meet

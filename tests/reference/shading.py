@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from taichi_msm.render import style
 from taichi_msm.render.camera import View
-from taichi_msm.render.instrument import Rod
+from taichi_msm.render.surface import Rod
 from taichi_msm.scene import Scene
 
 Array = NDArray[np.float64]

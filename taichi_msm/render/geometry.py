@@ -1,4 +1,4 @@
-"""A cell of the sheet as the camera sees it, for one sample or a vector of them, in f32 or f64.
+"""Points and cells of the sheet as the camera sees them, for one sample or a vector of them, in f32 or f64.
 
 A point of the surface is represented by (X, Y, w, depth), the product of the camera's matrix and the point. That map is
 linear, so refining the projected mass points is the same as refining the surface, and perspective is no special case.
@@ -10,13 +10,14 @@ It is cut into small quads, and these into triangles along the diagonal from top
 listed row by row: upper left and right, lower left and right.
 """
 
-# No `from __future__ import annotations` here: Taichi reads the annotations of a kernel.
-
 from typing import Any, NamedTuple
 
-from taichi_msm.render.camera_kernel import POINT_NUMBERS, SEEN
+from taichi_msm.render import uniforms as uni
 from taichi_msm.render.samples import INFINITY
 from taichi_msm.system.runtime import ti
+
+# The numbers of a mass point: (X, Y, w, depth), its place in the picture [samples].
+SEEN, POINT_NUMBERS = 4, 6
 
 # A triangle that is drawn by itself is enlarged a little, so that no gap is left beside it: by this fraction of its
 # side, and by this fraction of the picture's, which is what f32 resolves.
@@ -59,6 +60,33 @@ class Triangle(NamedTuple):
     r: Any
     d: Any
     below: Any  # whether it is the one below the diagonal, where t > s
+
+
+@ti.func
+def project(position: ti.template(), i, j, cols, numbers: ti.template(), point: ti.template(), double: ti.template()):
+    """Store the numbers of mass point (i, j); `double` tells that they are in f64, and summed in another order."""
+    here = (i * cols + j) * POINT_NUMBERS
+    x, y, z = position[i, j, 0], position[i, j, 1], position[i, j, 2]
+    for n in ti.static(range(4)):
+        row = uni.MATRIX + 4 * n
+        if ti.static(double):
+            point[here + n] = numbers[row + 3] + numbers[row] * x + numbers[row + 1] * y + numbers[row + 2] * z
+        else:
+            point[here + n] = numbers[row] * x + numbers[row + 1] * y + numbers[row + 2] * z + numbers[row + 3]
+    point[here + SEEN] = point[here] / point[here + 2]
+    point[here + SEEN + 1] = point[here + 1] / point[here + 2]
+
+
+@ti.func
+def w_at(depth, numbers: ti.template()):
+    """Give w of points at a depth."""
+    return depth * numbers[uni.PINHOLE] + (1.0 - numbers[uni.PINHOLE])
+
+
+@ti.func
+def line_of_sight(x, y, numbers: ti.template()):
+    """Give how far points that are seen at (x, y) are to the right and above the axis of view, at w = 1 [m]."""
+    return (x - numbers[uni.CENTRE_X]) * numbers[uni.SPREAD], (numbers[uni.CENTRE_Y] - y) * numbers[uni.SPREAD]
 
 
 @ti.func
