@@ -256,7 +256,7 @@ def covering(code: Code) -> Callable[..., Any]:
     def wire_share(across, down, right_across, right_down, below_across, below_down):
         """Share of the mesh lines in a sample's colour, from its place on the mesh and those of its neighbours.
 
-        See `reference/drawing.py`.
+        See `tests/reference/drawing.py`.
         """
         to_right, to_below = right_across - across, below_across - across
         slope = ti.sqrt(to_right * to_right + to_below * to_below)
