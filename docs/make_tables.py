@@ -1,4 +1,4 @@
-"""Write the tables that come from the program's own words into the pages: keys of a scene, keys of the window, names.
+"""Write the tables that come from the program's own words into the pages: keys, outputs and names.
 
 python docs/make_tables.py
 """
@@ -7,11 +7,13 @@ from __future__ import annotations
 
 import inspect
 import json
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import taichi_msm
+from taichi_msm.outputs.table import OUTPUTS
 from taichi_msm.scenefile.load import schema
 from taichi_msm.viewer.events import KEYS, POINTER
 
@@ -52,6 +54,13 @@ def window_keys() -> str:
     return "| | |\n|---|---|\n" + "\n".join(lines) + "\n"
 
 
+def outputs(*sources: str) -> str:
+    """Give the table of the outputs with these sources."""
+    chosen = [output for output in OUTPUTS.values() if output.source in sources]
+    lines = [f"| `{output.name}` | `{output.file}` | {output.means} |" for output in chosen]
+    return "| `output` | file (that of frame 0) | what it holds |\n|---|---|---|\n" + "\n".join(lines) + "\n"
+
+
 def names() -> str:
     """Give the table of what the package exports, with the first line of each docstring."""
     lines = []
@@ -62,7 +71,13 @@ def names() -> str:
 
 
 # What makes each table, by its page and its name there.
-TABLES = {("scene", "keys"): scene_keys, ("view", "hands"): window_keys, ("python", "names"): names}
+TABLES: dict[tuple[str, str], Callable[[], str]] = {
+    ("scene", "keys"): scene_keys,
+    ("view", "hands"): window_keys,
+    ("python", "names"): names,
+    ("command-line", "outputs"): partial(outputs, "picture", "positions"),
+    ("labels", "labels"): partial(outputs, "labels", "flow", "tracks"),
+}
 
 
 def with_table(text: str, name: str, table: str) -> str:

@@ -62,8 +62,8 @@ class Simulation:
         >>> with Simulation(load_scene("scenes/press.yaml")) as simulation:
         ...     simulation.advance(10)
         ...     picture = simulation.draw("oblique")
-        ...     simulation.positions().shape, picture.shape
-        ((31, 31, 3), (512, 512, 3))
+        >>> simulation.positions().shape, picture.shape
+        ((61, 61, 3), (512, 512, 3))
     """
 
     def __init__(

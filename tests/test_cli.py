@@ -154,7 +154,7 @@ def test_a_study_ends_in_lines_that_the_scene_takes(small: Path) -> None:
     assert (done.returncode, done.stderr) == (0, "")
     found = json.loads(done.stdout)
     assert found["directory"] == "output/small-study"
-    assert found["outputs"] == ["study.png", "study.csv", "study.md", "study.json"]
+    assert found["outputs"] == ["study.png", "study.md", "study.json"]
     assert sorted(path.name for path in (small / "output" / "small-study").iterdir()) == sorted(found["outputs"])
     assert (found["status"], found["tolerance"]) == ("complete", 2e-3)
     assert found["notes"] == ["drawing was left out: the scene names no image"]

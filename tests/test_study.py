@@ -28,8 +28,8 @@ from taichi_msm.study.peer import FailedError, TooSlowError, solve
 from taichi_msm.study.pictures import PictureStudy
 from taichi_msm.study.points import ROUNDS as POINTS_ROUNDS
 from taichi_msm.study.points import PointStudy, lattices
-from taichi_msm.study.result import Drawn, Stepping, Study, Timing
-from taichi_msm.study.stepping import MARGIN, ROUNDS, SteppingStudy, observed_orders
+from taichi_msm.study.result import Drawn, Stepping, Study, Timing, observed_orders
+from taichi_msm.study.stepping import MARGIN, ROUNDS, SteppingStudy
 from taichi_msm.study.terms import TermStudy, variants
 from taichi_msm.system.runtime import Device
 from tests import reference
@@ -53,7 +53,7 @@ def stepping(device: Device) -> Any:
 
 
 def test_stepping_starts_at_the_largest_stable_step_and_halves_it(stepping: SteppingStudy) -> None:
-    points = stepping.points()
+    points = stepping.results
     assert {point.method for point in points} == {"f32 central", "f32 backward", "f64 central", "f64 backward"}
     for method in ("f32 central", "f64 backward"):
         steps = [point.step for point in points if point.method == method]
@@ -66,7 +66,7 @@ def test_stepping_starts_at_the_largest_stable_step_and_halves_it(stepping: Step
 
 
 def test_errors_of_stepping_are_those_of_the_twin(stepping: SteppingStudy) -> None:
-    point = next(point for point in stepping.points() if point.method == "f64 backward")
+    point = next(point for point in stepping.results if point.method == "f64 backward")
     made = with_time(stepping.plan.scene, step=point.step, precision="f64")
     exact = reference.simulate(with_time(made, step=point.step / 64, damping_difference="central"))
     wrong = reference.simulate(made) - exact
@@ -85,13 +85,13 @@ def test_the_reference_is_as_exact_as_it_says(stepping: SteppingStudy) -> None:
     error = np.linalg.norm(solved - stepping.frames, axis=-1).max() / stepping.reference.largest
     # The integrator keeps 1e-12 a step, of some thousand steps.
     assert error < stepping.reference.error + 1e-9
-    for point in stepping.points():
+    for point in stepping.results:
         assert point.error is not None
         assert point.known == (point.error >= MARGIN * stepping.reference.error)
 
 
 def test_observed_orders(stepping: SteppingStudy) -> None:
-    orders = observed_orders(stepping.points())
+    orders = observed_orders(stepping.results)
     assert orders["f64 backward"] == pytest.approx(1, abs=0.15)
     # From the limit of stability down the first halvings are not in the range of the asymptote yet.
     assert orders["f64 central"] == pytest.approx(2, abs=0.3)
@@ -99,7 +99,7 @@ def test_observed_orders(stepping: SteppingStudy) -> None:
 
 def test_orders_are_fitted_above_the_rounding_floor() -> None:
     def point(step: float, error: float, rounding: float) -> Stepping:
-        return Stepping("f32", "central", 1, step, error, rounding, True, Timing(1, 1, 1, 5))
+        return Stepping("f32", "central", 1, step, error, rounding, True, samples=[1.0])
 
     points = [point(0.1**n, 0.1 ** (2 * n) + 1e-6, 1e-6) for n in range(5)]
     # The points of 1e-6 and 2e-6 are mostly rounding; the next is, by 1 %.
@@ -112,7 +112,7 @@ def test_a_series_halves_its_steps_though_they_miss_a_jump(device: Device) -> No
     made = scene(probes=[{**SOFT_PRESS, "load": [[0, 100], [0.13, 100], [0.13, 0]]}], time={"duration": 0.2})
     with closing(SteppingStudy(plan_of(made), device, 0.001, nothing)) as measured:
         measured.run()
-        counts = [point.steps_per_frame for point in measured.points() if point.method == "f64 central"]
+        counts = [point.steps_per_frame for point in measured.results if point.method == "f64 central"]
     assert counts == [9, 18, 36]
 
 
@@ -221,8 +221,8 @@ def test_all_terms_are_timed_on_the_grid_of_the_whole_scene(device: Device, monk
 def test_terms_are_timed(device: Device) -> None:
     measured = TermStudy(plan_of(scene(damping=0, springs={"shear": 10})), device, 0.001, nothing)
     measured.run()
-    assert [term.without for term in measured.points()] == ["", "springs.shear", "probes.0"]
-    assert all(1e-8 < term.seconds.median < 1e-2 and term.seconds.runs == 9 for term in measured.points())
+    assert [term.without for term in measured.results] == ["", "springs.shear", "probes.0"]
+    assert all(1e-8 < term.seconds.median < 1e-2 and term.seconds.runs == 9 for term in measured.results)
 
 
 def tissue(points: tuple[int, int] = (33, 33), **time: Any) -> Scene:
@@ -251,7 +251,7 @@ def points(device: Device) -> PointStudy:
 
 
 def test_the_error_of_points_is_of_order_2(points: PointStudy) -> None:
-    found = points.points()
+    found = points.results
     assert points.notes == []
     assert [one.name for one in found] == ["9 x 9", "17 x 17", "33 x 33", "65 x 65"]
     assert [one.known for one in found[:3]] == [True] * 3
@@ -273,7 +273,7 @@ def test_the_error_of_points_is_that_against_many_more(points: PointStudy, devic
 
     exact = displacements(65)
     largest = np.linalg.norm(exact, axis=-1).max()
-    for found in points.points()[1:3]:
+    for found in points.results[1:3]:
         stride = 64 // (found.rows - 1)
         apart = np.linalg.norm(displacements(found.rows) - exact[:, ::stride, ::stride], axis=-1).max() / largest
         # 65 x 65 have 1/4 of the error of 33 x 33 themselves; and between the points it may be somewhat larger.
@@ -281,7 +281,7 @@ def test_the_error_of_points_is_that_against_many_more(points: PointStudy, devic
 
 
 def test_the_estimate_beside_it_is_that_of_a_run(points: PointStudy, device: Device, tmp_path: Path) -> None:
-    found = points.points()[1]
+    found = points.results[1]
     record = run(tissue((17, 17)), tmp_path / "out", threads=device.threads, estimate_error=True)
     estimate = record["error_estimate"]
     assert estimate is not None
@@ -292,7 +292,7 @@ def test_the_estimate_beside_it_is_that_of_a_run(points: PointStudy, device: Dev
 def test_without_time_for_more_points_the_error_of_the_finest_is_a_bound(points: PointStudy, device: Device) -> None:
     measured = PointStudy(plan_of(tissue()), device, 1e-6, nothing)
     measured.run()
-    found, better = measured.points(), points.points()
+    found, better = measured.results, points.results
     assert measured.notes == ["65 x 65 points were not measured: time or memory"]
     assert [one.name for one in found] == ["9 x 9", "17 x 17", "33 x 33"]
     assert found[0].known
@@ -307,7 +307,7 @@ def test_where_the_finest_is_the_reference_its_error_is_never_known(device: Devi
     slack = made.model_copy(update={"tissue": made.tissue.model_copy(update={"pretension": 0.0, "foundation": 2e6})})
     measured = PointStudy(plan_of(slack), device, 1e-6, nothing)
     measured.run()
-    assert [one.known for one in measured.points()] == [True, False]
+    assert [one.known for one in measured.results] == [True, False]
 
 
 def points_of(plans: Iterable[Plan]) -> list[tuple[int, int]]:
@@ -326,7 +326,7 @@ def test_points_are_quarters_and_halves_of_the_cells() -> None:
 def test_a_sheet_of_too_few_points_is_left_out(device: Device) -> None:
     measured = PointStudy(plan_of(tissue((6, 6))), device, 1.0, nothing)
     measured.run()
-    assert measured.points() == []
+    assert measured.results == []
     assert measured.notes == ["points were not measured: with fewer than 7 a side they cannot be compared"]
 
 
@@ -346,6 +346,7 @@ def test_an_interruption_leaves_the_points_that_were_timed(device: Device) -> No
 
     with pytest.raises(KeyboardInterrupt):
         measure._measure_points(plan_of(tissue((13, 13))), device, measure.QUICK, made, stop)
+    made.finish()
     assert [(one.name, one.seconds.runs) for one in made.points] == [("7 x 7", 1)]
     assert made.points[0].error is not None
 
@@ -359,7 +360,7 @@ def test_pictures_are_judged_by_a_finer_one(device: Device, monkeypatch: pytest.
     position[4, 5, 2] += 0.05
     measured = PictureStudy(made, position, speckle(20, 30), False, nothing)
     measured.run()
-    points = {(point.refine, point.supersample): point for point in measured.points()}
+    points = {(point.refine, point.supersample): point for point in measured.results}
     assert set(points) == {(0, 1), (3, 1), (0, 4), (3, 4)}
     psnr = {setting: point.psnr or 0.0 for setting, point in points.items()}
     assert psnr[3, 4] > max(psnr[0, 4], psnr[3, 1]) > psnr[0, 1]
@@ -393,12 +394,12 @@ def stepping_point(error: float | None, seconds: float, **changes: Any) -> Stepp
         error=error,
         rounding=0.0,
         known=True,
-        seconds=Timing(seconds, seconds, seconds, 5),
+        samples=[seconds],
     )
 
 
 def drawn(refine: int, psnr: float | None, seconds: float, supersample: int = 1) -> Drawn:
-    return Drawn(refine, supersample, psnr, 1, Timing(seconds, seconds, seconds, 5))
+    return Drawn(refine, supersample, psnr, 1, samples=[seconds])
 
 
 def test_the_recommendation_is_the_cheapest_within_the_tolerance() -> None:
@@ -452,4 +453,4 @@ def test_an_interruption_leaves_what_is_done(device: Device) -> None:
         with pytest.raises(KeyboardInterrupt):
             measured.run()
         assert measured.reference is not None
-        assert measured.points()
+        assert measured.results

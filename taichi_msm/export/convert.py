@@ -15,7 +15,7 @@ from taichi_msm.export.formats import FORMATS
 from taichi_msm.progress import Count
 from taichi_msm.results.entries import files
 from taichi_msm.results.finished_run import PUT_BACK, read_run
-from taichi_msm.results.publication import Kind, Listed, Publication
+from taichi_msm.results.publication import Contents, Listed, Publication
 from taichi_msm.results.whole import add
 
 # The file that lists the others.
@@ -29,19 +29,14 @@ def _listed(record: Mapping[str, Any]) -> Listed:
 # The files of all formats: any of them may have been exported to a folder before, or been about to be. A folder with
 # anything else in it is refused, as nobody would find it again among so many files.
 PATTERNS = (r"export\.json", *dict.fromkeys(pattern for row in FORMATS.values() for pattern in row.files))
-EXPORT = Kind("export", RECORD, PATTERNS, _listed, alone=True)
+EXPORT = Contents("export", RECORD, PATTERNS, _listed, alone=True)
 
 
 class Exported(NamedTuple):
-    """What was written.
+    """What was written."""
 
-    Attributes:
-        files: names in the folder, with slashes.
-        notes: what the user should know about them.
-    """
-
-    files: list[str]
-    notes: list[str]
+    files: list[str]  # names in the folder, with slashes
+    notes: list[str]  # what the user should know about them
 
 
 def convert(run: Path, name: str, directory: Path, progress: Count = lambda done, total: None) -> Exported:

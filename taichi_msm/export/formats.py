@@ -6,19 +6,12 @@ from typing import NamedTuple
 
 
 class Format(NamedTuple):
-    """An export format.
+    """An export format."""
 
-    Attributes:
-        means: what it is for, in few words.
-        needs: the entries of a scene's `output` that it is made from.
-        uses: further entries of which it would have more.
-        files: regular expressions for its files, as for `entries.files`.
-    """
-
-    means: str
-    needs: tuple[str, ...]
-    files: tuple[str, ...]
-    uses: tuple[str, ...] = ()
+    means: str  # what it is for, in few words
+    needs: tuple[str, ...]  # the entries of a scene's `output` that it is made from
+    files: tuple[str, ...]  # their names as regular expressions, for `entries.files`
+    uses: tuple[str, ...] = ()  # further entries of `output`, of which it would have more
 
 
 FORMATS = {

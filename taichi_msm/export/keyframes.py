@@ -12,15 +12,10 @@ from taichi_msm.progress import Count
 
 
 class KeyFrames(NamedTuple):
-    """Key frames of a motion.
+    """Key frames of a motion."""
 
-    Attributes:
-        frames: their numbers, in order; the first and the last frame are among them.
-        error: the largest distance between a point in any frame and where the key frames beside it place it [m].
-    """
-
-    frames: list[int]
-    error: float
+    frames: list[int]  # their numbers, in order; the first and the last frame are among them
+    error: float  # the largest distance between a point in any frame and where the key frames beside it place it [m]
 
 
 def key_frames(position: NDArray[np.floating], most: int, progress: Count = lambda done, total: None) -> KeyFrames:
@@ -51,17 +46,11 @@ def key_frames(position: NDArray[np.floating], most: int, progress: Count = lamb
 
 
 class _Span(NamedTuple):
-    """The frames from one key frame to the next; the span with the largest error sorts first.
+    """The frames from one key frame to the next; the span with the largest error sorts first."""
 
-    Attributes:
-        error: minus the largest distance between a point in any of the frames and where the key frames place it [m].
-        frame: the frame with this error.
-        first, last: the key frames.
-    """
-
-    error: float
-    frame: int
-    first: int
+    error: float  # minus the largest distance between a point in any frame and where the key frames place it [m]
+    frame: int  # the frame with this error
+    first: int  # the key frames
     last: int
 
 

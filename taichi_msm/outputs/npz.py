@@ -22,17 +22,11 @@ Shape = tuple[int, ...]
 
 
 class Pieces(NamedTuple):
-    """An array that need not be in memory as a whole.
-
-    Attributes:
-        dtype: of the numbers.
-        shape: of the array.
-        parts: its bytes in C order, in any number of pieces.
-    """
+    """An array that need not be in memory as a whole."""
 
     dtype: DTypeLike
     shape: Shape
-    parts: Iterable[bytes | memoryview]
+    parts: Iterable[NDArray[Any]]  # its numbers in C order, in any number of pieces
 
 
 def write_arrays(file: BinaryIO, arrays: Mapping[str, NDArray[Any] | Pieces]) -> None:
@@ -43,12 +37,12 @@ def write_arrays(file: BinaryIO, arrays: Mapping[str, NDArray[Any] | Pieces]) ->
             with archive.open(zipfile.ZipInfo(f"{name}.npy", EPOCH), "w", force_zip64=True) as entry:
                 entry.write(_header(pieces.dtype, pieces.shape))
                 for part in pieces.parts:
-                    entry.write(part)
+                    entry.write(part.data)
 
 
-def _parts(array: NDArray[Any]) -> Iterable[bytes | memoryview]:
-    """Give the bytes of an array without a second copy of all of them."""
-    return [array.reshape(-1).data.cast("B")] if array.flags.c_contiguous else (row.tobytes() for row in array)
+def _parts(array: NDArray[Any]) -> Iterable[NDArray[Any]]:
+    """Give an array without a second copy of all of it."""
+    return [array] if array.flags.c_contiguous else (np.ascontiguousarray(row) for row in array)
 
 
 def read_array(archive: zipfile.ZipFile, name: str, dtype: DTypeLike, shape: Shape) -> NDArray[Any]:

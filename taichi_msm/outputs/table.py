@@ -16,22 +16,15 @@ FIRST, NUMBER = "0000", r"(?:[0-9]{4}|[1-9][0-9]{4,14})"
 class Output(NamedTuple):
     """An entry of a scene's `output`.
 
-    Attributes:
-        name: in the scene.
-        file: what is written; with a folder, that of the first frame, whose number is 0000.
-        source: the field of `Observed` that holds its values; positions: it is made of the mass points alone. From
-            labels and flow, the field of the output's name is written, in the format of the suffix.
-        means: what the file holds, for users.
-        pixel_bytes: the most that a pixel takes in a file, as one of noise [bytes]; 0: the size is not by pixels.
-        needs_camera: whether it can be used only with the camera's matrices.
+    Of labels and flow, the field of `Labels` or `Flow` with the output's name is written, in the format of the suffix.
     """
 
     name: str
-    file: str
-    source: Literal["picture", "labels", "flow", "tracks", "positions"]
-    means: str
-    pixel_bytes: float = 0
-    needs_camera: bool = False
+    file: str  # with a folder, that of the first frame of a series
+    source: Literal["picture", "labels", "flow", "tracks", "positions"]  # field of `Observed`; positions: none
+    means: str  # what the file holds, for users
+    pixel_bytes: float = 0  # the most that a pixel takes in a file, as one of noise; 0: the size is not by pixels
+    needs_camera: bool = False  # whether it can be used only with the camera's matrices
 
     @property
     def result(self) -> str:

@@ -18,7 +18,7 @@ Array = NDArray[np.float64]
 Window = tuple[slice, slice]
 
 
-class Springs(NamedTuple):
+class SpringFamily(NamedTuple):
     """All springs with the same number of points down and to the right between their ends.
 
     Attributes:
@@ -42,7 +42,7 @@ class Springs(NamedTuple):
         return between, np.linalg.norm(between, axis=-1)
 
 
-def springs(plan: Plan) -> Iterator[Springs]:
+def spring_families(plan: Plan) -> Iterator[SpringFamily]:
     """List the springs along rows, along columns and along both diagonals, each spring once."""
     (rows, cols), (dx, dy), sheet = plan.scene.sheet.points, spacing(plan.scene.sheet), plan.material
     factors = np.ones((rows - 1, cols - 1)) if sheet.factors is None else sheet.factors
@@ -61,10 +61,10 @@ def springs(plan: Plan) -> Iterator[Springs]:
         length = math.hypot(right * dx, down * dy)
         pull = np.broadcast_to(sheet.tension * unmapped * length, own.shape)
         shorter = np.divide(pull, own, out=np.zeros_like(own), where=own > 0)
-        yield Springs(here, there, np.array([right * dx, -down * dy, 0.0]), length, own, length - shorter)
+        yield SpringFamily(here, there, np.array([right * dx, -down * dy, 0.0]), length, own, length - shorter)
 
 
-def elastic_force(every: Sequence[Springs], displacement: Array) -> Array:
+def elastic_force(every: Sequence[SpringFamily], displacement: Array) -> Array:
     """Sum k (L - L0) (Q - P) / L over the neighbours Q of every point P (eq. 2), without the part that cancels at rest.
 
     Args:
@@ -99,7 +99,7 @@ def energy_density(plan: Plan, displacement: Array) -> Array:
         Energy per area at rest [J/m2], shape (rows, cols).
     """
     at_points, (dx, dy) = np.zeros(displacement.shape[:2]), spacing(plan.scene.sheet)
-    for family in springs(plan):
+    for family in spring_families(plan):
         between, length = family.apart(displacement)
         rest = family.length - family.unstretched
         # The part that is linear in the displacements cancels in the sum, as the sheet is in equilibrium at rest.

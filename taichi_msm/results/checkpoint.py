@@ -14,7 +14,7 @@ import os
 import re
 import time
 import zipfile
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from contextlib import ExitStack
 from dataclasses import asdict, fields
 from pathlib import Path
@@ -144,11 +144,6 @@ class Checkpoint:
         if rest or record[:DIGEST_BYTES].tobytes() != self._digest(frame, data.data) or not np.isfinite(position).all():
             raise self._damaged(POSITIONS)
         return position
-
-    def positions(self, frames: int) -> Iterator[memoryview]:
-        """Read the bytes of the positions of the first frames, frame by frame; raises what `position` does."""
-        for frame in range(frames):
-            yield self.position(frame).data.cast("B")
 
     def save(self, saved: Saved) -> str:
         """Save a state of the run, replacing the one saved before; the frames up to it must have been added.

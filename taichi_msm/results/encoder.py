@@ -49,22 +49,14 @@ _CHILD = "import sys; sys.path[:] = {path!r}; from taichi_msm.results.encoder im
 
 
 class Job(NamedTuple):
-    """What to encode: as `frames/0000.png` and so on, as `animation.gif`, or as both.
+    """What to encode: as `frames/0000.png` and so on, as `animation.gif`, or as both."""
 
-    Attributes:
-        folder: where the files go.
-        size: width, height of the pictures [px].
-        rate: frames per second.
-        png, gif: which of them are written.
-        background: a colour that the animation keeps exactly.
-    """
-
-    folder: Path
-    size: tuple[int, int]
-    rate: float
+    folder: Path  # where the files go
+    size: tuple[int, int]  # width, height of the pictures [px]
+    rate: float  # frames per second
     png: bool
     gif: bool
-    background: tuple[int, int, int]
+    background: tuple[int, int, int]  # a colour that the animation keeps exactly
 
     def still(self, number: int) -> Path:
         """Name the PNG of a frame."""

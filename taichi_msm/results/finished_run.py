@@ -21,7 +21,7 @@ from taichi_msm.outputs.table import OUTPUTS, RECORD
 from taichi_msm.physics.lattice import rest_positions
 from taichi_msm.physics.planning import try_plan
 from taichi_msm.picture import PictureError, file_sha256, read_rgb
-from taichi_msm.render import camera
+from taichi_msm.render.camera import camera_problems
 from taichi_msm.results.publication import MAX_RECORD
 from taichi_msm.scene import Scene
 
@@ -37,21 +37,16 @@ PUT_BACK = "put back the picture that it was run with, or run the scene again"
 class FinishedRun:
     """A run that has ended, complete or not.
 
-    Attributes:
-        directory: where its results are.
-        scene: the scene as it was run: with the points, the step and the precision that were chosen, without a
-            tolerance, and with paths of pictures that are relative to the current directory.
-        frames: how many were simulated.
-        sha256: of the files of its pictures, by the keys that name them.
-        overrides: that made the scene from its file.
+    Its scene is that which was run: with the points, the step and the precision that were chosen, without a tolerance,
+    and with paths of pictures that are relative to the current directory.
     """
 
-    directory: Path
+    directory: Path  # where its results are
     scene: Scene
-    frames: int
-    sha256: Mapping[str, str]
-    overrides: list[str]
-    _data: bytes = field(repr=False)
+    frames: int  # how many were simulated
+    sha256: Mapping[str, str]  # of the files of its pictures, by the keys that name them
+    overrides: list[str]  # that made the scene from its file
+    _record: bytes = field(repr=False)
 
     @property
     def time(self) -> NDArray[np.float64]:
@@ -113,7 +108,7 @@ class FinishedRun:
         data = b""
         with suppress(OSError):
             data = (self.directory / RECORD).read_bytes()
-        if data != self._data:
+        if data != self._record:
             raise FilesError(f"{self.directory}: another run replaced these results while they were read; try again")
 
     def require_pictures(self, *, drawn: bool) -> None:
@@ -219,7 +214,7 @@ def _as_run(record: Mapping[str, Any]) -> Scene:
     scene, folder = Scene(**record["scene"]), Path(record["working_directory"])
     if folder != Path.cwd():
         scene = scene.with_pictures(lambda path: str(folder / path))
-    problems = [*try_plan(scene)[1], *camera.problems(scene)]
+    problems = [*try_plan(scene)[1], *camera_problems(scene)]
     # A picture that is missing, or has changed, is reported by the code that needs it.
     if any(problem.path[-1:] != ("image",) for problem in problems):
         raise SceneError([str(problem) for problem in problems])

@@ -18,7 +18,7 @@ from taichi_msm.physics.mesh_error import MeshEstimate
 from taichi_msm.physics.plan import Plan
 from taichi_msm.physics.planning import try_plan
 from taichi_msm.picture import PictureError, file_sha256
-from taichi_msm.render import camera
+from taichi_msm.render.camera import camera_problems
 from taichi_msm.results.checkpoint import CHECKPOINT, MANIFEST, open_manifest, unseal
 from taichi_msm.results.publication import STAGING
 from taichi_msm.scene import Scene
@@ -31,31 +31,18 @@ MAX_BYTES = 1 << 26
 
 @dataclass(frozen=True)
 class Manifest:
-    """Everything that the bits of a result depend on, and facts for its record.
+    """Everything that the bits of a result depend on, and facts for its record."""
 
-    Attributes:
-        given: the scene as it was loaded.
-        scene: the scene with the points, the step and the precision that were chosen.
-        overrides: of the scene file.
-        estimate: of the error, if a tolerance required it before the run; else None.
-        mesh: error of the points, if a tolerance of the sheet required it before the run; else None.
-        asks_estimate: whether to estimate the error beside the run; None: if it is cheap.
-        folder: the current directory, from which the paths of the scene's pictures start.
-        arch: cpu, cuda or vulkan.
-        sha256: of the files of the picture and the maps, by the keys that name them.
-        versions: of all that the results depend on.
-    """
-
-    given: Scene
-    scene: Scene
-    overrides: tuple[str, ...]
-    estimate: Estimate | None
-    mesh: MeshEstimate | None
-    asks_estimate: bool | None
-    folder: str
-    arch: str
-    sha256: Mapping[str, str]
-    versions: Mapping[str, str]
+    given: Scene  # as it was loaded
+    scene: Scene  # with the points, the step and the precision that were chosen
+    overrides: tuple[str, ...]  # of the scene file
+    estimate: Estimate | None  # of the error, if a tolerance required it before the run
+    mesh: MeshEstimate | None  # error of the points, if a tolerance of the sheet required it before the run
+    asks_estimate: bool | None  # whether to estimate the error beside the run; None: if it is cheap
+    folder: str  # the current directory, from which the paths of the scene's pictures start
+    arch: str  # cpu, cuda or vulkan
+    sha256: Mapping[str, str]  # of the files of the picture and the maps, by the keys that name them
+    versions: Mapping[str, str]  # of all that the results depend on
 
     def as_json(self) -> dict[str, Any]:
         """Convert the manifest to data for JSON."""
@@ -121,7 +108,7 @@ def read_manifest(directory: Path) -> tuple[Manifest, Plan]:
     # Not trusted: anybody may have written it.
     numbers = () if manifest.estimate is None else asdict(manifest.estimate).values()
     possible = manifest.arch in ARCHS and all(number >= 0 for number in numbers)
-    if plan is None or problems or not possible or list(camera.problems(manifest.scene)):
+    if plan is None or problems or not possible or list(camera_problems(manifest.scene)):
         raise DamagedError(f"{path} is of a scene that cannot be run; run the scene again")
     return manifest, plan
 

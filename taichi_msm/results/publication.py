@@ -37,24 +37,15 @@ MAX_RECORD = 1 << 28
 Listed = Callable[[str], bool]
 
 
-class Kind(NamedTuple):
-    """What is published.
+class Contents(NamedTuple):
+    """What is published in a directory: the results of a run, or an export. Patterns are those of `entries.files`."""
 
-    Attributes:
-        name: what writes it, in messages.
-        record: the file that lists what was written.
-        patterns: of the names of all files that may be written, as for `entries.files`; the record among them.
-        listed: turns the content of a record into what tells whether it lists a file.
-        alone: whether nothing else may be in the directory.
-        beside: a folder that stays in the staging directory if `keep` is set, and patterns of the files in it.
-    """
-
-    name: str
-    record: str
-    patterns: Collection[str]
-    listed: Callable[[Mapping[str, Any]], Listed]
-    alone: bool = False
-    beside: tuple[str, Collection[str]] | None = None
+    name: str  # what writes it, in messages
+    record: str  # the file that lists what was written
+    patterns: Collection[str]  # of all files that may be written, the record among them
+    listed: Callable[[Mapping[str, Any]], Listed]  # turns the content of a record into what tells of the files
+    alone: bool = False  # whether nothing else may be in the directory
+    beside: tuple[str, Collection[str]] | None = None  # a folder, and patterns of its files, that `keep` is about
 
 
 class Publication:
@@ -62,7 +53,7 @@ class Publication:
 
     Args:
         directory: where the results go; made if it does not exist.
-        published: what they are.
+        contents: what they are.
         names: all that may be published; it is an error if anything but earlier results has one of these names.
 
     Raises:
@@ -76,17 +67,17 @@ class Publication:
         keep: whether the folder beside the new files stays when the with statement is left.
     """
 
-    def __init__(self, directory: Path, published: Kind, names: Collection[str] = ()) -> None:
+    def __init__(self, directory: Path, contents: Contents, names: Collection[str] = ()) -> None:
         self.staging = directory / STAGING
         self.staged = self.staging / NEW
         self.keep = True
         self._directory = directory
-        self._kind = published
+        self._contents = contents
         self._names = names
-        self._record = directory / published.record
-        self._beside, inner = published.beside or ("", ())
+        self._record = directory / contents.record
+        self._beside, inner = contents.beside or ("", ())
         self._patterns = [
-            *(rf"{folder}/{pattern}" for folder in (NEW, WHOLE) for pattern in published.patterns),
+            *(rf"{folder}/{pattern}" for folder in (NEW, WHOLE) for pattern in contents.patterns),
             *(rf"{self._beside}/{pattern}" for pattern in inner),
             *(LOCK, re.escape(EARLIER)),
         ]
@@ -109,7 +100,7 @@ class Publication:
         """
         for name in names:
             if kind(self.staged / name) != FILE:
-                raise FilesError(f"{self.staged / name} was removed during the {self._kind.name}; run it again")
+                raise FilesError(f"{self.staged / name} was removed during the {self._contents.name}; run it again")
         self._require_free(names, self._earlier(self._record))
         self.staged.replace(self.staging / WHOLE)
         self._complete()
@@ -120,13 +111,13 @@ class Publication:
             try:
                 opened.enter_context(self._acquire())
             except BlockingIOError:
-                said = f"another {self._kind.name} is writing there; choose another --out"
+                said = f"another {self._contents.name} is writing there; choose another --out"
                 raise FilesError(f"{self._directory}: {said}") from None
             self._complete()
             self._clear()
             earlier = self._earlier(self._record)
-            if self._kind.alone:
-                for name in files(self._directory, self._kind.patterns, strict=True, besides=(STAGING,)):
+            if self._contents.alone:
+                for name in files(self._directory, self._contents.patterns, strict=True, besides=(STAGING,)):
                     if name not in earlier:
                         raise ForeignError.at(self._directory / name, FILE)
             self._require_free(self._names, earlier)
@@ -149,13 +140,13 @@ class Publication:
             listed = self._listed(record)
         except ValueError:
             raise ForeignError.at(record, FILE) from None
-        return {name for name in files(self._directory, self._kind.patterns, strict=False) if listed(name)}
+        return {name for name in files(self._directory, self._contents.patterns, strict=False) if listed(name)}
 
     def _listed(self, record: Path) -> Listed:
         """Read a record; raises ValueError if it is none, and ForeignError if it is no file."""
         try:
             with require(record, FILE).open("rb") as file:
-                return self._kind.listed(json.loads(file.read(MAX_RECORD)))
+                return self._contents.listed(json.loads(file.read(MAX_RECORD)))
         except (KeyError, TypeError, RecursionError, OverflowError) as error:
             raise ValueError("no record") from error
 
@@ -176,7 +167,7 @@ class Publication:
     def _complete(self) -> None:
         """Move the new files into place, if all are there; after an interruption, go on."""
         whole, aside = self.staging / WHOLE, self.staging / EARLIER
-        record = whole / self._kind.record
+        record = whole / self._contents.record
         if kind(record) is None:
             return  # The record is moved last, so all is done, or nothing is to be done.
         try:
@@ -185,7 +176,7 @@ class Publication:
             raise DamagedError(f"{record} is damaged; remove {self.staging} and run the scene again") from None
         begun = kind(aside) is not None
         earlier = self._earlier(aside if begun else self._record)
-        left = list(files(whole, self._kind.patterns, strict=True))
+        left = list(files(whole, self._contents.patterns, strict=True))
         self._require_free(left, earlier)
         if not begun and kind(self._record) is not None:
             self._record.replace(aside)

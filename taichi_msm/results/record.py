@@ -10,84 +10,50 @@ from taichi_msm.physics.probe_force import ProbeRecord
 
 
 class ErrorRecord(TypedDict):
-    """The error of a run, as fractions of the largest displacement; None: not known, because a pilot diverged.
+    """The error of a run, as fractions of the largest displacement; None: not known, because a pilot diverged."""
 
-    Attributes:
-        error: largest error of any point at any frame, due to the step and to rounding.
-        rounding: the part of it that comes from f32; None also where a coarse pilot does not tell the parts.
-        in_f64: the error of the same step in f64; None likewise.
-        order: of the method.
-        at_least: whether `error` may be larger.
-        mesh_error: the error that the number of points makes; only with tissue.
-        mesh_doubt: why `mesh_error` may be larger; empty: it is about that.
-    """
-
-    error: float | None
-    rounding: float | None
-    in_f64: float | None
-    order: int
-    at_least: bool
-    mesh_error: NotRequired[float | None]
-    mesh_doubt: NotRequired[str]
+    error: float | None  # largest of any point at any frame, due to the step and to rounding
+    rounding: float | None  # the part of it that comes from f32; None also where a coarse pilot does not tell the parts
+    in_f64: float | None  # the error of the same step in f64; None likewise
+    order: int  # of the method
+    at_least: bool  # whether `error` may be larger
+    mesh_error: NotRequired[float | None]  # the error that the number of points makes; only with tissue
+    mesh_doubt: NotRequired[str]  # why `mesh_error` may be larger; empty: it is about that
 
 
 class RunRecord(TypedDict, total=False):
-    """What was run, on which machine, how far it came, and its error.
-
-    Attributes:
-        status: how the run ended.
-        error: where and why the run diverged; only if it did.
-        dump: path of the file with the last good state; only if the run diverged. None: there is no such file.
-        scene: as it was run, with the points, the step and the precision that were chosen.
-        asked: keys by their paths, with the values that the scene had where others were chosen.
-        working_directory: directory from which the paths of the scene's pictures start.
-        sha256: of the files of the picture and the maps, by the keys that name them, such as image and
-            tissue.map.image; without one that could not be read and was not drawn.
-        overrides: of the scene file.
-        points: rows and columns of mass points.
-        step, stable_step: the step, and the largest stable one [s]; None: every step is stable.
-        steps_per_frame, steps: number of steps in a frame, and in the run so far.
-        precision: of the steps.
-        max_displacement: largest displacement [m].
-        shortest_spring, longest_spring: smallest and largest ratio of a spring's length to its rest length.
-        probes: forces of each probe at 100 %.
-        notes: what to know before trusting the result.
-        error_estimate: None: there is none, for the reason in `error_estimate_reason`.
-        resumed: number of frames that an earlier run had simulated.
-        timings: time of every stage [s].
-        arch, device, threads, lanes, workers: the machine, and how it was used.
-        versions: of all that the results depend on.
-        frames, outputs: number of frames, and names of the files written.
-    """
+    """What was run, on which machine, how far it came, and its error."""
 
     status: Literal["complete", "diverged", "interrupted"]
-    error: str
-    dump: str | None
-    scene: dict[str, Any]
-    asked: dict[str, Any]
-    working_directory: str
+    error: str  # where and why the run diverged; only if it did
+    dump: str | None  # file with the last good state; only if the run diverged. None: there is no such file
+    scene: dict[str, Any]  # as it was run, with the points, the step and the precision that were chosen
+    asked: dict[str, Any]  # keys by their paths, with the values of the scene where others were chosen
+    working_directory: str  # from which the paths of the scene's pictures start
+    # Of the files of the picture and the maps, by the keys that name them, such as image and tissue.map.image; without
+    # one that could not be read and was not drawn.
     sha256: dict[str, str]
-    overrides: list[str]
-    points: list[int]
-    step: float
-    stable_step: float | None
+    overrides: list[str]  # of the scene file
+    points: list[int]  # rows and columns of mass points
+    step: float  # [s]
+    stable_step: float | None  # the largest stable step [s]; None: every step is stable
     steps_per_frame: int
-    precision: str
-    steps: int
-    max_displacement: float
-    shortest_spring: float
-    longest_spring: float
-    probes: list[ProbeRecord]
-    notes: list[str]
-    error_estimate: ErrorRecord | None
+    precision: str  # of the steps
+    steps: int  # in the run so far
+    max_displacement: float  # [m]
+    shortest_spring: float  # smallest ratio of a spring's length to its rest length
+    longest_spring: float  # and the largest
+    probes: list[ProbeRecord]  # forces of each at 100 %
+    notes: list[str]  # what to know before trusting the result
+    error_estimate: ErrorRecord | None  # None: there is none, for the reason that follows
     error_estimate_reason: str
-    resumed: int
-    timings: dict[str, float]
+    resumed: int  # number of frames that an earlier run had simulated
+    timings: dict[str, float]  # of every stage [s]
     arch: str
     device: str
     threads: int
     lanes: int
     workers: int
-    versions: dict[str, str]
+    versions: dict[str, str]  # of all that the results depend on
     frames: int
-    outputs: list[str]
+    outputs: list[str]  # names of the files written, and of the folders with a file for every frame

@@ -83,22 +83,19 @@ def replacing(path: Path) -> Iterator[BinaryIO]:
 def place(draft: Path, folder: Path, stem: str, suffix: str) -> Path:
     """Move a file to the first free name of stem-1, stem-2 and so on; replaces none, and returns where it is."""
     number = 1
-    while not _named(draft, path := folder / f"{stem}-{number}{suffix}"):
+    while os.path.lexists(path := folder / f"{stem}-{number}{suffix}") or not _named(draft, path):
         number += 1
     return path
 
 
 def _named(draft: Path, path: Path) -> bool:
-    """Give a file a name, unless another has it."""
+    """Give a file a name, unless another has taken it meanwhile."""
     try:
         # Unlike a rename, a link does not replace another file.
         os.link(draft, path)
     except FileExistsError:
         return False
-    except OSError:
-        # The file system has no links.
-        if os.path.lexists(path):
-            return False
+    except OSError:  # The file system has no links.
         draft.replace(path)
     return True
 
@@ -122,26 +119,13 @@ def lock(path: Path) -> BinaryIO:
     """
     file = path.open("ab", 0)
     try:
-        _take(file.fileno())
-    except BlockingIOError:
+        if sys.platform == "win32":
+            msvcrt.locking(file.fileno(), msvcrt.LK_NBLCK, 1)
+        else:
+            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except (BlockingIOError, PermissionError) as error:  # the latter on Windows
         file.close()
-        raise
+        raise BlockingIOError(*error.args) from None
     except OSError:
         pass  # a file system without locks
     return file
-
-
-def _take(descriptor: int) -> None:
-    """Lock an open file.
-
-    Raises:
-        BlockingIOError: when another process holds the lock.
-        OSError: when the file system has no locks.
-    """
-    if sys.platform == "win32":
-        try:
-            msvcrt.locking(descriptor, msvcrt.LK_NBLCK, 1)
-        except PermissionError as error:
-            raise BlockingIOError(*error.args) from None
-    else:
-        fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)

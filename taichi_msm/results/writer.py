@@ -20,7 +20,7 @@ from taichi_msm.render.labels import Observed
 from taichi_msm.results.checkpoint import CHECKPOINT, PATTERNS, Checkpoint
 from taichi_msm.results.encoder import Encoder, Job
 from taichi_msm.results.labels import LabelWriter
-from taichi_msm.results.publication import Kind, Listed, Publication
+from taichi_msm.results.publication import Contents, Listed, Publication
 from taichi_msm.results.whole import add, create
 from taichi_msm.scene import Scene
 from taichi_msm.timegrid import TimeGrid
@@ -39,7 +39,7 @@ def _listed(record: Mapping[str, Any]) -> Listed:
 
 
 # The results of a run, and beside them the checkpoint from which it can go on.
-RUN = Kind("run", table.RECORD, table.PATTERNS, _listed, beside=(CHECKPOINT, PATTERNS))
+RUN = Contents("run", table.RECORD, table.PATTERNS, _listed, beside=(CHECKPOINT, PATTERNS))
 
 
 class ResultWriter:
@@ -173,7 +173,7 @@ class ResultWriter:
         shape = (frames, *self._scene.sheet.points, 3)
         arrays: dict[str, NDArray[Any] | Pieces] = {
             "time": np.arange(frames) / self._scene.time.frames_per_second,
-            "position": Pieces(checkpoint.precision, shape, checkpoint.positions(frames)),
+            "position": Pieces(checkpoint.precision, shape, map(checkpoint.position, range(frames))),
         }
         with create(self._publication.staged / table.OUTPUTS["trajectory"].path()) as file:
             write_arrays(file, arrays)

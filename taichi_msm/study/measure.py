@@ -5,9 +5,8 @@ from __future__ import annotations
 import os
 import time
 from contextlib import closing
-from dataclasses import dataclass
 from functools import partial
-from typing import Any
+from typing import Any, NamedTuple
 
 from taichi_msm.errors import SceneError
 from taichi_msm.physics.lattice import rest_positions
@@ -22,8 +21,8 @@ from taichi_msm.scenefile.validation import checked
 from taichi_msm.study.peer import FailedError, TooSlowError, solve
 from taichi_msm.study.pictures import PictureStudy
 from taichi_msm.study.points import PointStudy
-from taichi_msm.study.result import Peer, Study, Timing
-from taichi_msm.study.stepping import SteppingStudy, observed_orders
+from taichi_msm.study.result import Peer, Study
+from taichi_msm.study.stepping import SteppingStudy
 from taichi_msm.study.terms import TermStudy
 from taichi_msm.system import resources, runtime
 from taichi_msm.system.runtime import Device
@@ -38,23 +37,14 @@ APART = "no other figure depends on it"
 TRAJECTORIES = 6
 
 
-@dataclass(frozen=True)
-class Effort:
-    """How long the parts of a study may take.
+class Effort(NamedTuple):
+    """How long the parts of a study may take."""
 
-    Attributes:
-        quick: whether to vary the settings of drawing one at a time.
-        longest_run: longest time of stepping through the whole scene once [s].
-        peer: longest time of SciPy for each of its tolerances [s].
-        peer_rtols: these tolerances.
-        sample: time of one measurement of a step [s].
-    """
-
-    quick: bool
-    longest_run: float
-    peer: float
+    quick: bool  # whether to vary the settings of drawing one at a time
+    longest_run: float  # of stepping through the whole scene once [s]
+    peer: float  # of SciPy for each of its tolerances [s]
     peer_rtols: tuple[float, ...]
-    sample: float
+    sample: float  # of one measurement of a step [s]
 
 
 QUICK = Effort(True, longest_run=0.25, peer=10.0, peer_rtols=(1e-4,), sample=0.02)
@@ -91,7 +81,7 @@ def study(
     scene = given.scene
     _require_memory(scene)
     texture = load_texture(scene) if scene.image is not None else None
-    found = Study(
+    results = Study(
         scene=name,
         settings=scene.model_dump(mode="json"),
         status="complete",
@@ -104,23 +94,22 @@ def study(
     scene = plan.scene
     try:
         with closing(SteppingStudy(plan, device, effort.longest_run, partial(progress, "stepping"))) as stepping:
+            results.stepping = stepping.results
             try:
                 stepping.run()
             finally:
-                found.reference, found.stepping = stepping.reference, stepping.points()
-                found.orders = observed_orders(found.stepping)
-        _measure_peer(plan, stepping, effort, found, progress)
-        _measure_pictures(scene, stepping, texture, effort, found, progress)
-        _measure_points(plan, device, effort, found, progress)
+                results.reference = stepping.reference
+        _measure_peer(plan, stepping, effort, results, progress)
+        _measure_pictures(scene, stepping, texture, effort, results, progress)
+        _measure_points(plan, device, effort, results, progress)
         terms = TermStudy(plan, device, effort.sample, partial(progress, "terms"))
-        try:
-            terms.run()
-        finally:
-            found.terms = terms.points()
+        results.terms = terms.results
+        terms.run()
     except KeyboardInterrupt:
-        found.status = "interrupted"
-        found.notes.append("interrupted: what was measured until then")
-    return found
+        results.status = "interrupted"
+        results.notes.append("interrupted: what was measured until then")
+    results.finish()
+    return results
 
 
 def machine(device: Device) -> dict[str, Any]:
@@ -148,7 +137,7 @@ def _require_memory(scene: Scene) -> None:
         )
 
 
-def _measure_peer(plan: Plan, stepping: SteppingStudy, effort: Effort, found: Study, progress: Progress) -> None:
+def _measure_peer(plan: Plan, stepping: SteppingStudy, effort: Effort, results: Study, progress: Progress) -> None:
     """Solve by DOP853 at several tolerances, each as many times as time allows, up to 5."""
     assert stepping.reference is not None
     rtols = effort.peer_rtols
@@ -164,45 +153,45 @@ def _measure_peer(plan: Plan, stepping: SteppingStudy, effort: Effort, found: St
                 samples.append(time.perf_counter() - start)
         except TooSlowError:
             if not samples:
-                found.notes.append(
+                results.notes.append(
                     f"{DOP853} takes more than {effort.peer:g} s at rtol {rtol:g} and was stopped; {APART}"
                 )
                 return
         except FailedError as failure:
-            found.notes.append(
+            results.notes.append(
                 f"{DOP853} finds no step small enough {failure}, at rtol {rtol:g}: forces change too suddenly for it "
                 f"there, as where a spring is pressed to a point or the sheet runs away; {APART}"
             )
             return
         error = stepping.relative(frames)
-        found.peers.append(Peer(rtol, error, stepping.known(error), evaluations, Timing.of(samples)))
+        results.peers.append(Peer(rtol, error, stepping.known(error), evaluations, samples=samples))
 
 
 def _measure_pictures(
-    scene: Scene, stepping: SteppingStudy, texture: Any, effort: Effort, found: Study, progress: Progress
+    scene: Scene, stepping: SteppingStudy, texture: Any, effort: Effort, results: Study, progress: Progress
 ) -> None:
     """Draw the most deformed frame of the reference."""
     if texture is None:
-        found.notes.append("drawing was left out: the scene names no image")
+        results.notes.append("drawing was left out: the scene names no image")
         return
     assert stepping.frames is not None
     deformed = max(stepping.frames, key=lambda frame: (frame**2).sum(axis=-1).max())
     position = rest_positions(scene.sheet) + deformed
     pictures = PictureStudy(scene, position, texture, effort.quick, partial(progress, "drawing"))
+    results.drawing = pictures.results
     try:
         pictures.run()
     finally:
-        found.drawing = pictures.points()
-        found.notes += pictures.notes
+        results.notes += pictures.notes
 
 
-def _measure_points(plan: Plan, device: Device, effort: Effort, found: Study, progress: Progress) -> None:
+def _measure_points(plan: Plan, device: Device, effort: Effort, results: Study, progress: Progress) -> None:
     """Vary the number of points of tissue; with springs, other points would make another sheet."""
     if plan.scene.tissue is None:
         return
     points = PointStudy(plan, device, effort.longest_run, partial(progress, "points"))
+    results.points = points.results
     try:
         points.run()
     finally:
-        found.points = points.points()
-        found.notes += points.notes
+        results.notes += points.notes

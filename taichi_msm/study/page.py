@@ -6,25 +6,40 @@ from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from typing import TypeVar
 
+from taichi_msm.errors import printable
 from taichi_msm.scene import MAX_POINTS
 from taichi_msm.study.result import Drawn, Peer, Points, Stepping, Study
-from taichi_msm.study.table import (
-    DRAWINGS,
-    METHODS,
-    PEERS,
-    SHEETS,
-    Columns,
-    duration,
-    number,
-    shown,
-    size,
-    table,
-    timing,
-    where,
-    wrong,
-)
+from taichi_msm.study.table import Columns, duration, number, size, table, timing, where, wrong
 from taichi_msm.system.compiler import named
 
+METHODS: Columns = {
+    "method": lambda point: point.method,
+    "step": lambda point: duration(point.step),
+    "steps/frame": lambda point: str(point.steps_per_frame),
+    "error": wrong,
+    "of it rounding": lambda point: "" if point.rounding is None else number(point.rounding),
+    "time of the scene": lambda point: timing(point.seconds),
+}
+PEERS: Columns = {
+    "rtol": lambda peer: f"{peer.rtol:g}",
+    "error": wrong,
+    "evaluations": lambda peer: str(peer.evaluations),
+    "time of the scene": lambda peer: timing(peer.seconds),
+}
+DRAWINGS: Columns = {
+    "refine": lambda drawn: str(drawn.refine),
+    "supersample": lambda drawn: str(drawn.supersample),
+    "PSNR": lambda drawn: "equal" if drawn.psnr is None else f"{drawn.psnr:.1f} dB",
+    "largest error": lambda drawn: str(drawn.largest_error),
+    "time of a frame": lambda drawn: timing(drawn.seconds),
+}
+SHEETS: Columns = {
+    "points": lambda points: points.name,
+    "steps/frame": lambda points: str(points.steps_per_frame),
+    "error": wrong,
+    "estimate": lambda points: "not known" if points.estimate is None else number(points.estimate),
+    "time of the scene": lambda points: timing(points.seconds),
+}
 # The columns of stepping that the terminal shows.
 BRIEF = ("method", "step", "error", "time of the scene")
 
@@ -36,15 +51,23 @@ def page(study: Study) -> str:
     versions = study.machine["versions"]
     state = "" if study.status == "complete" else f" ({study.status})"
     blocks = [
-        f"# {shown(study.scene)}: speed against error{state}",
+        f"# {printable(study.scene)}: speed against error{state}",
         f"Measured on {where(study)}, with taichi-msm {versions['taichi-msm']}, {named(versions)}, "
         f"NumPy {versions['numpy']} and Python {versions['python']} ({versions['platform']}). "
         "Times are medians, with the fastest and the slowest in brackets.",
-        *_stepping(study),
-        *_drawing(study),
-        *_points(study),
-        *_terms(study),
+        *(_stepping(study) if study.stepping or study.peers else ()),
     ]
+    if study.drawing:
+        blocks += [
+            "## Drawing",
+            "The most deformed frame, against a picture of high refinement and supersampling. The largest error is of "
+            "any colour of any pixel, from 0 to 255.",
+            _drawings_table(study, study.drawing),
+        ]
+    if study.points:
+        blocks += _points(study)
+    if study.terms:
+        blocks += ["## Terms", _terms_table(study)]
     if study.notes:
         blocks += ["## Notes", "\n".join(f"- {note}" for note in study.notes)]
     blocks += ["## Recommendation", *remarks(study)]
@@ -55,7 +78,7 @@ def page(study: Study) -> str:
 
 def summary(study: Study) -> str:
     """Write the most important results for the terminal, and last the lines to put in the scene."""
-    lines = [f"{shown(study.scene)} on {where(study)}"]
+    lines = [f"{printable(study.scene)} on {where(study)}"]
     if study.reference is not None:
         lines.append(
             f"error: the largest of any point at any frame, as a fraction of {number(study.reference.largest)} m; "
@@ -73,7 +96,7 @@ def summary(study: Study) -> str:
         blocks.append(_drawings_table(study, list(_drawings(study))))
     if study.points:
         blocks.append(_sheets_table(study))
-    notes = [f"note: {shown(note)}" for note in study.notes]
+    notes = [f"note: {printable(note)}" for note in study.notes]
     if said := [*notes, *_bounds([*fastest, *study.points]), *remarks(study)]:
         blocks.append("\n".join(said))
     if recommended := study.recommendation():
@@ -128,8 +151,6 @@ def _shortfall(study: Study) -> str:
 
 
 def _stepping(study: Study) -> Iterator[str]:
-    if not study.stepping and not study.peers:
-        return
     yield "## Stepping"
     if (reference := study.reference) is not None:
         yield (
@@ -148,20 +169,7 @@ def _stepping(study: Study) -> Iterator[str]:
     yield from _bounds([*study.stepping, *study.peers])
 
 
-def _drawing(study: Study) -> Iterator[str]:
-    if not study.drawing:
-        return
-    yield "## Drawing"
-    yield (
-        "The most deformed frame, against a picture of high refinement and supersampling. The largest error is of any "
-        "colour of any pixel, from 0 to 255."
-    )
-    yield _drawings_table(study, study.drawing)
-
-
 def _points(study: Study) -> Iterator[str]:
-    if not study.points:
-        return
     yield "## Points"
     yield (
         "The error is that made by the number of points, at the points and between them, where the displacement is "
@@ -174,17 +182,14 @@ def _points(study: Study) -> Iterator[str]:
     yield from _bounds(study.points)
 
 
-def _terms(study: Study) -> Iterator[str]:
-    if not study.terms:
-        return
-    yield "## Terms"
+def _terms_table(study: Study) -> str:
     whole = study.terms[0].seconds.median
     columns: Columns = {
         "without": lambda term: term.without or "nothing",
         "time of a step": lambda term: timing(term.seconds),
         "of the whole step": lambda term: f"{100 * term.seconds.median / whole:.0f} %",
     }
-    yield table(study.terms, columns)
+    return table(study.terms, columns)
 
 
 def _bounds(points: Sequence[Stepping | Peer | Points]) -> Iterator[str]:

@@ -14,7 +14,7 @@ from taichi_msm.physics.loads import Schedule, key_times, loads_at
 from taichi_msm.physics.material import area_shares
 from taichi_msm.physics.plan import Plan
 from taichi_msm.physics.probe_force import probe_force
-from taichi_msm.physics.springs import elastic_force, springs
+from taichi_msm.physics.springs import elastic_force, spring_families
 from taichi_msm.scene import Scene
 
 # Loads are evaluated this far inside an interval between two keys, as a fraction of it: at its ends they may jump.
@@ -55,7 +55,7 @@ def solve(plan: Plan, rtol: float, atol: float, deadline: float, tick: Callable[
     accelerate, moves = acceleration(plan), ~plan.fixed[..., None]
     state = np.zeros(2 * int(np.prod(shape)))
     evaluations = 0
-    found = []
+    displacements = []
     for start, end, frames in _pieces(scene):
         margin = INSIDE * (end - start)
         first = loads_at(plan, np.array([start + margin, end - margin]))
@@ -76,8 +76,8 @@ def solve(plan: Plan, rtol: float, atol: float, deadline: float, tick: Callable[
             raise FailedError(f"after {solved.t[-1] if solved.t.size else start:.3g} s")
         state = solved.y[:, -1]
         evaluations += solved.nfev
-        found += [column[: state.size // 2].reshape(shape) for column in solved.y.T[: len(frames)]]
-    return np.array(found), evaluations
+        displacements += [column[: state.size // 2].reshape(shape) for column in solved.y.T[: len(frames)]]
+    return np.array(displacements), evaluations
 
 
 def acceleration(plan: Plan) -> Callable[[Array, Array, Schedule], Array]:
@@ -87,7 +87,7 @@ def acceleration(plan: Plan) -> Callable[[Array, Array, Schedule], Array]:
         A function of displacements [m], velocities [m/s], and a schedule of one step, that gives accelerations
         [m/s2]; its arrays have the shape (rows, cols, 3).
     """
-    scene, sheet, every = plan.scene, plan.material, tuple(springs(plan))
+    scene, sheet, every = plan.scene, plan.material, tuple(spring_families(plan))
     (dx, dy), (x, y) = spacing(scene.sheet), axes(scene.sheet)
     shares = area_shares(scene.sheet)
     area = shares if sheet.by_area else np.ones_like(shares)

@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Callable
-from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
@@ -15,7 +14,7 @@ from pydantic import BaseModel
 from taichi_msm.render.rasterizer import Drawing
 from taichi_msm.scene import Scene
 from taichi_msm.scenefile import budget
-from taichi_msm.study.result import Drawn, Timing
+from taichi_msm.study.result import Drawn
 from taichi_msm.system import resources
 
 REFINES = (0, 1, 2, 5, 10, 20)
@@ -27,14 +26,6 @@ FINEST = {"refine": 40, "supersample": 8}
 ROUNDS = 5
 
 Picture = NDArray[np.uint8]
-
-
-@dataclass
-class _Trial:
-    refine: int
-    supersample: int
-    picture: Picture
-    samples: list[float] = field(default_factory=list)
 
 
 class PictureStudy:
@@ -49,6 +40,7 @@ class PictureStudy:
 
     Attributes:
         notes: what was left out.
+        results: a setting each, as far as they are measured.
     """
 
     def __init__(
@@ -64,8 +56,7 @@ class PictureStudy:
         self._position = np.ascontiguousarray(position, np.float32)
         self._texture = texture
         self._progress = progress
-        self._truth: Picture | None = None
-        self._trials: list[_Trial] = []
+        self.results: list[Drawn] = []
         own = scene.render
         self._settings = [
             (refine, supersample)
@@ -77,8 +68,11 @@ class PictureStudy:
     def run(self) -> None:
         """Draw the reference picture, then every setting, taking turns."""
         memory = resources.available_memory() // 2
-        if not self._draw_truth(memory):
+        finest = _with_render(self._scene, **FINEST)
+        if budget.drawing_bytes(finest) > memory:
+            self.notes.append("drawing was not measured: there is no memory for a picture fine enough to compare with")
             return
+        truth = Drawing(finest, self._texture).draw(self._position)
         drawings = []
         for number, (refine, supersample) in enumerate(self._settings):
             self._progress(number, len(self._settings) * ROUNDS)
@@ -91,35 +85,15 @@ class PictureStudy:
                 break
             drawing = Drawing(scene, self._texture)
             drawings.append(drawing)
-            self._trials.append(_Trial(refine, supersample, drawing.draw(self._position)))
+            picture = drawing.draw(self._position)
+            apart = int(np.abs(picture.astype(np.int16) - truth).max())
+            self.results.append(Drawn(refine, supersample, psnr(picture, truth), apart))
         for round_ in range(ROUNDS):
-            for number, (drawing, trial) in enumerate(zip(drawings, self._trials, strict=True)):
+            for number, (drawing, one) in enumerate(zip(drawings, self.results, strict=True)):
                 self._progress(round_ * len(drawings) + number, len(drawings) * ROUNDS)
                 start = time.perf_counter()
                 drawing.draw(self._position)
-                trial.samples.append(time.perf_counter() - start)
-
-    def points(self) -> list[Drawn]:
-        """Give the results so far."""
-        return [self._point(trial) for trial in self._trials if trial.samples]
-
-    def _draw_truth(self, memory: int) -> bool:
-        scene = _with_render(self._scene, **FINEST)
-        if budget.drawing_bytes(scene) > memory:
-            self.notes.append("drawing was not measured: there is no memory for a picture fine enough to compare with")
-            return False
-        self._truth = Drawing(scene, self._texture).draw(self._position)
-        return True
-
-    def _point(self, trial: _Trial) -> Drawn:
-        assert self._truth is not None
-        return Drawn(
-            refine=trial.refine,
-            supersample=trial.supersample,
-            psnr=psnr(trial.picture, self._truth),
-            largest_error=int(np.abs(trial.picture.astype(np.int16) - self._truth).max()),
-            seconds=Timing.of(trial.samples),
-        )
+                one.samples.append(time.perf_counter() - start)
 
 
 def psnr(picture: Picture, truth: Picture) -> float | None:

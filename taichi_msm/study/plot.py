@@ -19,8 +19,9 @@ from matplotlib.lines import Line2D
 from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
 from matplotlib.transforms import offset_copy
 
+from taichi_msm.errors import printable
 from taichi_msm.study.result import Drawn, Peer, Points, Stepping, Study
-from taichi_msm.study.table import duration, mostly_rounding, number, shown, unit, where
+from taichi_msm.study.table import mostly_rounding, number, unit, where
 from taichi_msm.system.compiler import named
 
 # The colours of Okabe and Ito, which the colour-blind can tell apart too.
@@ -35,15 +36,8 @@ PRECISION_LINES: dict[str, dict[str, Any]] = {
 }
 PEER_LINE: dict[str, Any] = {"color": INK, "linestyle": ":", "marker": "D"}
 TOLERANCE_LINE: dict[str, Any] = {"color": GREY, "linewidth": 0.8, "linestyle": (0, (6, 3))}
-RING: dict[str, Any] = {
-    "linestyle": "none",
-    "marker": "o",
-    "markersize": 11,
-    "markerfacecolor": "none",
-    "markeredgecolor": INK,
-    "zorder": 5,
-}
-HOLLOW: dict[str, Any] = {"markerfacecolor": "white"}
+RING: dict[str, Any] = {"ls": "none", "marker": "o", "ms": 11, "mfc": "none", "mec": INK, "zorder": 5}
+HOLLOW: dict[str, Any] = {"mfc": "white"}
 HALF: dict[str, Any] = {"fillstyle": "bottom", "markerfacecoloralt": "white"}
 DOT: dict[str, Any] = {"linestyle": "none", "marker": "o", "color": GREY}
 SUPERSAMPLE_COLOURS = (SKY, BLUE, GREEN, ORANGE, PURPLE, VERMILION)
@@ -128,9 +122,9 @@ def _figure(study: Study) -> Figure:
     FigureCanvasAgg(figure)
     versions = study.machine["versions"]
     state = " (interrupted)" if study.status == "interrupted" else ""
-    figure.suptitle(f"{shown(study.scene)}: speed against error{state}", x=0.01, ha="left", parse_math=False)
+    figure.suptitle(f"{printable(study.scene)}: speed against error{state}", x=0.01, ha="left", parse_math=False)
     machine = f"{where(study)}; taichi-msm {versions['taichi-msm']}, {named(versions)}"
-    figure.supxlabel(f"{_advice(study)}\n{machine}", x=0.01, ha="left", size=8, parse_math=False)
+    figure.supxlabel(f"{_advice(study)}\n{machine}", x=0.01, ha="left", size=8, parse_math=False, wrap=True)
     axes = figure.subplot_mosaic(layout)
     for name, panel in zip("ABCD", every, strict=False):
         panel(axes[name], study)
@@ -139,20 +133,10 @@ def _figure(study: Study) -> Figure:
 
 def _advice(study: Study) -> str:
     """Say in a line what the study recommends."""
-    step, drawn, own, more = study.best_stepping, study.best_drawing, study.own_points, study.more_points
-    settings = []
-    if step is not None:
-        time = duration(step.step).replace("us", "µs")
-        settings.append(f"step {time}, {step.damping_difference} damping difference, {step.precision}")
-    if drawn is not None:
-        settings.append(f"refine {drawn.refine}, supersample {drawn.supersample}")
-    said = f"Recommended (ringed): {'; '.join(settings)}. " if settings else ""
-    if own is not None and more is not None:
-        much = f"{'at most about ' if not own.known else ''}{number(own.error or 0.0)}"
-        return f"{said}{own.name} points make an error of {much}; about {more[0]} x {more[1]} are needed."
-    if study.stepping and step is None:
-        return f"{said}No step measured is within the tolerance of {study.tolerance:g}."
-    return said
+    settings = [line.strip() for line in study.recommendation() if not line.endswith(":")]
+    if study.more_points is None and study.best_stepping is None:
+        settings.append(f"no step measured is within the tolerance of {study.tolerance:g}")
+    return f"Recommended (ringed where measured): {'; '.join(settings)}" if study.stepping else ""
 
 
 def _plot_stepping(axes: Axes, study: Study) -> None:
@@ -198,7 +182,7 @@ def _marks(study: Study) -> Iterator[Line2D]:
     points: list[Point] = [*study.stepping, *study.peers]
     yield Line2D([], [], **TOLERANCE_LINE, label="tolerance")
     if study.best_stepping is not None:
-        yield Line2D([], [], **RING | {"markersize": 8}, label="recommended")
+        yield Line2D([], [], **RING | {"ms": 8}, label="recommended")
     if any(point.known and mostly_rounding(point) for point in points):
         yield Line2D([], [], **DOT | HALF, label="mostly rounding")
     if any(_drawable(point.error) and not point.known for point in points):

@@ -6,8 +6,7 @@ import math
 import time
 from collections.abc import Iterator
 from contextlib import ExitStack, closing
-from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -22,7 +21,7 @@ from taichi_msm.physics.timestep import with_time
 from taichi_msm.progress import Count
 from taichi_msm.scene import MAX_POINTS
 from taichi_msm.scenefile import budget
-from taichi_msm.study.result import Points, Timing
+from taichi_msm.study.result import Points
 from taichi_msm.system.runtime import Device
 
 # Cells a side, relative to those of the scene.
@@ -39,21 +38,12 @@ Field = NDArray[Any]
 Lattice = tuple[int, int]
 
 
-@dataclass
-class _Trial:
+class _Sheet(NamedTuple):
     """A sheet with some number of points, and what is known about it so far."""
 
     plan: Plan
     dynamics: Dynamics
-    estimate: float = math.inf
-    error: float = math.inf
-    known: bool = False
-    samples: list[float] = field(default_factory=list)
-
-    @property
-    def points(self) -> Lattice:
-        """Give the rows and columns."""
-        return self.plan.scene.sheet.points
+    measured: Points
 
 
 class PointStudy:
@@ -74,6 +64,7 @@ class PointStudy:
 
     Attributes:
         notes: what was left out.
+        results: a sheet each, the fewest points first, as far as they are measured.
     """
 
     def __init__(self, plan: Plan, device: Device, longest_run: float, progress: Count) -> None:
@@ -83,7 +74,8 @@ class PointStudy:
         self._device = device
         self._longest_run = longest_run
         self._progress = progress
-        self._trials: list[_Trial] = []
+        self.results: list[Points] = []
+        self._sheets: list[_Sheet] = []
         self._done = 0
 
     def run(self) -> None:
@@ -92,7 +84,7 @@ class PointStudy:
             seconds = 0.0
             for plan in lattices(self._plan):
                 seconds = self._try(plan, opened)
-            if not self._trials:
+            if not self._sheets:
                 self.notes.append(f"points were not measured: with fewer than {FEWEST} a side they cannot be compared")
                 return
             finer = self._finer(self._plan, seconds, self._longest_run)
@@ -102,32 +94,30 @@ class PointStudy:
             else:
                 seconds = self._try(finer, opened)
                 finer = self._finer(finer, seconds, ROUNDS * self._longest_run)
-            if len(self._trials) < 2:
+            if len(self._sheets) < 2:
                 return
             self._measure_errors(finer)
             for _ in range(ROUNDS):
-                for trial in self._trials:
-                    trial.samples.append(self._step_through(trial))
-
-    def points(self) -> list[Points]:
-        """Give the results so far, the fewest points first."""
-        return [self._point(trial) for trial in self._trials if trial.samples]
+                for sheet in self._sheets:
+                    sheet.measured.samples.append(self._step_through(sheet))
 
     def _try(self, plan: Plan, opened: ExitStack) -> float:
         """Run a sheet with its own step beside the pilot that `run` would have; returns the time of stepping [s]."""
-        trial = _Trial(plan, Dynamics(plan, self._device))
-        opened.callback(trial.dynamics.close)
+        dynamics = opened.enter_context(closing(Dynamics(plan, self._device)))
+        sheet = _Sheet(plan, dynamics, Points(*plan.scene.sheet.points, plan.grid.steps_per_frame))
         coarse = coarser(plan)
         assert coarse is not None
-        self._trials.append(trial)
+        self._sheets.append(sheet)
+        self.results.append(sheet.measured)
         self._tick()
-        trial.dynamics.compile()
+        dynamics.compile()
         with closing(MeshPilot(plan, coarse, self._device)) as pilot:
             pilot.compile()
-            first = self._step_through(trial, pilot)
-            trial.estimate = pilot.estimate.error
+            first = self._step_through(sheet, pilot)
+            estimate = pilot.estimate.error
+            sheet.measured.estimate = estimate if estimate < math.inf else None
         # The faster of two runs: what disturbs one may not disturb the other.
-        return min(first, self._step_through(trial))
+        return min(first, self._step_through(sheet))
 
     def _finer(self, plan: Plan, seconds: float, longest_run: float) -> Plan | None:
         """Plan more points; None if a run would take too long or too much memory.
@@ -150,10 +140,10 @@ class PointStudy:
         Args:
             finer: with even more points, for the reference; None: there is no time for it.
         """
-        finest = self._trials[-1].plan if finer is None else finer
+        finest = self._sheets[-1].plan if finer is None else finer
         grid = finest.grid
         with ExitStack() as opened:
-            sheets = [trial.dynamics for trial in self._trials]
+            sheets = [sheet.dynamics for sheet in self._sheets]
             if finer is not None:
                 sheets.append(opened.enter_context(closing(Dynamics(finer, self._device))))
                 sheets[-1].compile()
@@ -175,24 +165,26 @@ class PointStudy:
                 own_error, largest = max(own_error, bound), max(largest, longest(exact))
             self._done += 1
         farthest = farthest_displacement(finest, finest.scene.time.duration)
-        for trial, error in zip(self._trials, errors, strict=False):
-            if largest > farthest:
-                continue
-            if trial.plan is not finest:
-                trial.known = error >= MARGIN * own_error
-                error += 0.0 if trial.known else own_error
-            trial.error = error / largest if largest > 0 else 0.0
+        if not largest <= farthest:
+            return
+        for (plan, _, measured), error in zip(self._sheets, errors, strict=False):
+            if plan is not finest:
+                measured.known = error >= MARGIN * own_error
+                error += 0.0 if measured.known else own_error
+            share = error / largest if largest > 0 else 0.0
+            measured.error = share if share < math.inf else None
 
-    def _step_through(self, trial: _Trial, pilot: MeshPilot | None = None) -> float:
+    def _step_through(self, sheet: _Sheet, pilot: MeshPilot | None = None) -> float:
         """Step through the scene with the sheet's own step; returns the time of stepping alone [s]."""
-        trial.dynamics.restart(trial.plan)
+        plan, dynamics, _ = sheet
+        dynamics.restart(plan)
         seconds = 0.0
-        for _ in range(trial.plan.grid.frames):
+        for _ in range(plan.grid.frames):
             self._tick()
             start = time.perf_counter()
-            trial.dynamics.advance(trial.plan.grid.steps_per_frame)
+            dynamics.advance(plan.grid.steps_per_frame)
             seconds += time.perf_counter() - start
-            displacement = trial.dynamics.displacement()
+            displacement = dynamics.displacement()
             if pilot is not None:
                 pilot.follow(displacement, self._tick)
         self._done += 1
@@ -200,19 +192,7 @@ class PointStudy:
 
     def _tick(self) -> None:
         # For each sheet the estimate, another run and the rounds; for all of them together the errors.
-        self._progress(self._done, 1 + (2 + ROUNDS) * len(self._trials))
-
-    def _point(self, trial: _Trial) -> Points:
-        rows, cols = trial.points
-        return Points(
-            rows=rows,
-            cols=cols,
-            steps_per_frame=trial.plan.grid.steps_per_frame,
-            error=trial.error if trial.error < math.inf else None,
-            known=trial.known,
-            estimate=trial.estimate if trial.estimate < math.inf else None,
-            seconds=Timing.of(trial.samples),
-        )
+        self._progress(self._done, 1 + (2 + ROUNDS) * len(self._sheets))
 
 
 def lattices(plan: Plan) -> Iterator[Plan]:

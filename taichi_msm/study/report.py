@@ -11,7 +11,7 @@ from typing import Any
 from taichi_msm.errors import writing
 from taichi_msm.results.whole import staged
 from taichi_msm.study.page import page
-from taichi_msm.study.result import Study
+from taichi_msm.study.result import Measured, Reference, Stepping, Study
 
 PICTURE, PAGE, RECORD = "study.png", "study.md", "study.json"
 
@@ -58,15 +58,21 @@ def write_report(study: Study, directory: Path) -> list[str]:
 
 def as_record(study: Study) -> dict[str, Any]:
     """Give the whole study as data for JSON; numbers that are not finite become null."""
-    methods = [{"method": one.method, **asdict(one)} for one in study.stepping]
-    return _finite({**asdict(study), "stepping": methods, "recommendation": study.recommendation()})
+    return {**_as_data(vars(study)), "recommendation": study.recommendation()}
 
 
-def _finite(value: Any) -> Any:
+def _as_data(value: Any) -> Any:
+    if isinstance(value, Measured):
+        method = {"method": value.method} if isinstance(value, Stepping) else {}
+        return {**method, **{key: _as_data(inner) for key, inner in vars(value).items() if key != "samples"}} | {
+            "seconds": asdict(value.seconds)
+        }
+    if isinstance(value, Reference):
+        return _as_data(asdict(value))
     if isinstance(value, dict):
-        return {key: _finite(inner) for key, inner in value.items()}
+        return {key: _as_data(inner) for key, inner in value.items()}
     if isinstance(value, (list, tuple)):
-        return [_finite(inner) for inner in value]
+        return [_as_data(inner) for inner in value]
     return None if isinstance(value, float) and not math.isfinite(value) else value
 
 

@@ -8,12 +8,14 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
+import numpy as np
+
 from taichi_msm.scene import MAX_POINTS
 
 # A picture is refined enough if no other one of the same supersampling has a PSNR higher by more than this [dB].
 REFINED_ENOUGH = 0.1
 
-# A stepping that takes up to this many times the time of the fastest one is as fast: so much the clock is off.
+# Timings within 10 % count as equal.
 AS_FAST = 1.1
 
 
@@ -52,9 +54,25 @@ class Reference:
     largest: float
 
 
-@dataclass(frozen=True)
-class Stepping:
-    """One way to step the scene.
+@dataclass
+class Measured:
+    """What is known of one setting so far.
+
+    Attributes:
+        samples: times of repeated, equal work [s].
+    """
+
+    samples: list[float] = field(default_factory=list, kw_only=True)
+
+    @property
+    def seconds(self) -> Timing:
+        """Summarise the times, of which there is at least one."""
+        return Timing.of(self.samples)
+
+
+@dataclass
+class Stepping(Measured):
+    """One way to step the scene; timed is stepping through the whole of it, compiled and warm.
 
     Attributes:
         precision: f32 or f64.
@@ -64,17 +82,15 @@ class Stepping:
         error: largest error of any point at any frame, as a fraction of the largest displacement; None: it diverged.
         rounding: the part of the error that comes from f32; None for f64.
         known: whether the reference is exact enough to know this error; if not, it is an approximate upper bound.
-        seconds: time of stepping through the whole scene, compiled and warm.
     """
 
     precision: str
     damping_difference: str
     steps_per_frame: int
     step: float
-    error: float | None
-    rounding: float | None
-    known: bool
-    seconds: Timing
+    error: float | None = None
+    rounding: float | None = None
+    known: bool = False
 
     @property
     def method(self) -> str:
@@ -82,64 +98,56 @@ class Stepping:
         return f"{self.precision} {self.damping_difference}"
 
 
-@dataclass(frozen=True)
-class Peer:
-    """SciPy's DOP853 on the same equations.
+@dataclass
+class Peer(Measured):
+    """SciPy's DOP853 on the same equations, timed for the whole scene.
 
     Attributes:
         rtol: relative tolerance; the absolute one is rtol x the largest displacement / 10.
-        error: as for `Stepping`.
-        known: as for `Stepping`.
+        error, known: as for `Stepping`.
         evaluations: number of evaluations of the forces.
-        seconds: time of the whole scene.
     """
 
     rtol: float
     error: float
     known: bool
     evaluations: int
-    seconds: Timing
 
 
-@dataclass(frozen=True)
-class Drawn:
-    """One way to draw the most deformed frame.
+@dataclass
+class Drawn(Measured):
+    """One way to draw the most deformed frame, timed for one frame.
 
     Attributes:
         refine, supersample: the settings.
         psnr: against a picture of high refinement and supersampling [dB]; None: they are equal.
         largest_error: of any colour of any pixel, 0 to 255.
-        seconds: time of one frame.
     """
 
     refine: int
     supersample: int
     psnr: float | None
     largest_error: int
-    seconds: Timing
 
 
-@dataclass(frozen=True)
-class Points:
-    """A sheet of tissue with more or fewer points, in f64.
+@dataclass
+class Points(Measured):
+    """A sheet of tissue with more or fewer points, in f64, timed like `Stepping`.
 
     Attributes:
         rows, cols: numbers of points.
         steps_per_frame: of the automatic step with these points.
-        error: that the number of points makes: the largest of any point at any frame, as a fraction of the largest
-            displacement; None: it diverged.
+        error: that the number of points makes, at the points and between them; else as for `Stepping`.
         known: as for `Stepping`.
         estimate: of this error, by the pilot that `run` has beside it; None: not known.
-        seconds: time of stepping through the whole scene, compiled and warm.
     """
 
     rows: int
     cols: int
     steps_per_frame: int
-    error: float | None
-    known: bool
-    estimate: float | None
-    seconds: Timing
+    error: float | None = None
+    known: bool = False
+    estimate: float | None = None
 
     @property
     def name(self) -> str:
@@ -147,17 +155,15 @@ class Points:
         return f"{self.rows} x {self.cols}"
 
 
-@dataclass(frozen=True)
-class Term:
-    """The cost of a step without one term of the model.
+@dataclass
+class Term(Measured):
+    """The cost of a step without one term of the model, timed for one step.
 
     Attributes:
         without: key of the term that is left out; empty: none is.
-        seconds: time of one step.
     """
 
     without: str
-    seconds: Timing
 
 
 @dataclass
@@ -193,6 +199,17 @@ class Study:
     points: list[Points] = field(default_factory=list)
     terms: list[Term] = field(default_factory=list)
     notes: list[str] = field(default_factory=list)
+
+    def finish(self) -> None:
+        """Leave out what was not timed, order the steppings and fit their orders."""
+        self.stepping = sorted(
+            (one for one in self.stepping if one.samples),
+            key=lambda one: (one.precision, one.damping_difference != "central", one.steps_per_frame),
+        )
+        self.orders = observed_orders(self.stepping)
+        self.drawing = [one for one in self.drawing if one.samples]
+        self.points = [one for one in self.points if one.samples]
+        self.terms = [one for one in self.terms if one.samples]
 
     @property
     def points_tolerance(self) -> float:
@@ -277,6 +294,20 @@ class Study:
         if (drawn := self.best_drawing) is not None:
             lines += ["render:", f"  refine: {drawn.refine}", f"  supersample: {drawn.supersample}"]
         return lines
+
+
+def observed_orders(points: list[Stepping]) -> dict[str, float | None]:
+    """Fit the order of every method over the points where the error comes from the step, not from rounding."""
+    orders: dict[str, float | None] = {}
+    for method in dict.fromkeys(point.method for point in points):
+        fit = [
+            (math.log(point.step), math.log(point.error))
+            for point in points
+            if point.method == method and point.error and point.known and (point.rounding or 0) < point.error / 10
+        ]
+        steps, errors = np.array(fit).reshape(-1, 2).T
+        orders[method] = float(np.polyfit(steps, errors, 1)[0]) if len(fit) > 2 else None
+    return orders
 
 
 def _decibels(drawn: Drawn) -> float:

@@ -6,7 +6,7 @@ import math
 import time
 from collections.abc import Iterator
 from contextlib import ExitStack
-from dataclasses import dataclass, field, replace
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -19,7 +19,7 @@ from taichi_msm.physics.planning import make_plan
 from taichi_msm.physics.solver import Dynamics
 from taichi_msm.physics.timestep import stable_steps, with_time
 from taichi_msm.progress import Count
-from taichi_msm.study.result import Reference, Stepping, Timing
+from taichi_msm.study.result import Reference, Stepping
 from taichi_msm.system.runtime import Device
 from taichi_msm.timegrid import Precision
 
@@ -38,18 +38,6 @@ LEAST_HALVINGS = 2
 Frames = NDArray[Any]
 
 
-@dataclass
-class _Trial:
-    """One setting, and what is known about it so far."""
-
-    precision: Precision
-    difference: str
-    steps: int
-    error: float = math.inf
-    rounding: float | None = None
-    samples: list[float] = field(default_factory=list)
-
-
 class SteppingStudy:
     """Measures the stepping of one scene.
 
@@ -62,6 +50,7 @@ class SteppingStudy:
     Attributes:
         frames: displacements of the reference at every frame but the first [m], shape (F, rows, cols, 3).
         reference: the facts about it.
+        results: a setting each, as far as they are measured.
     """
 
     def __init__(self, plan: Plan, device: Device, longest_run: float, progress: Count) -> None:
@@ -75,11 +64,11 @@ class SteppingStudy:
         self.reference: Reference | None = None
         self._longest_run = longest_run
         self._progress = progress
-        self._trials: list[_Trial] = []
+        self.results: list[Stepping] = []
         self._done = 0
         self._to_do = 1
         with ExitStack() as opened:
-            self._dynamics: dict[Precision, Dynamics] = {}
+            self._dynamics: dict[str, Dynamics] = {}
             for precision in PRECISIONS:
                 dynamics = self._dynamics[precision] = Dynamics(plan.with_grid(precision=precision), device)
                 opened.callback(dynamics.close)
@@ -96,15 +85,10 @@ class SteppingStudy:
         self._make_reference(finest)
         for difference, counts in series.items():
             self._measure_errors(difference, counts)
-        self._to_do = self._done + (ROUNDS - 1) * len(self._trials)
+        self._to_do = self._done + (ROUNDS - 1) * len(self.results)
         for _ in range(ROUNDS - 1):
-            for trial in self._trials:
-                self._run(trial.precision, trial.difference, trial.steps, trial.samples)
-
-    def points(self) -> list[Stepping]:
-        """Give the results so far, ordered by method and by falling step."""
-        ordered = sorted(self._trials, key=lambda one: (one.precision, one.difference != "central", one.steps))
-        return [self._point(trial) for trial in ordered if trial.samples]
+            for one in self.results:
+                self._run(one.precision, one.damping_difference, one.steps_per_frame, one.samples)
 
     def relative(self, frames: Frames) -> float:
         """Give the largest error of frames relative to the reference, as a fraction of the largest displacement."""
@@ -147,27 +131,29 @@ class SteppingStudy:
     def _measure_errors(self, difference: str, counts: list[int]) -> None:
         """Run every step once: in f32 until rounding dominates, in f64 until the reference is not exact enough."""
         assert self.reference is not None
-        going = set(PRECISIONS)
+        going, farthest = set(PRECISIONS), farthest_displacement(self.plan, self.plan.scene.time.duration)
         for steps in counts:
             exact: Frames | None = None
             for precision in PRECISIONS:
                 if precision not in going:
                     continue
-                trial = _Trial(precision, difference, steps)
-                frames = self._run(precision, difference, steps, trial.samples)
-                trial.error = self.relative(frames)
-                if longest(frames) > farthest_displacement(self.plan, self.plan.scene.time.duration):
-                    trial.error = math.inf
-                self._trials.append(trial)
+                step = replace(self._grid, steps_per_frame=steps).step
+                samples: list[float] = []
+                frames = self._run(precision, difference, steps, samples)
+                error, rounding = self.relative(frames), None
+                diverged = not error < math.inf or longest(frames) > farthest
                 if precision == "f64":
                     exact = frames
                 elif exact is not None and self.reference.largest > 0:
-                    trial.rounding = longest(frames - exact) / self.reference.largest
-                dominated = trial.rounding is not None and trial.rounding > trial.error / 2
-                if trial.error < math.inf and (dominated or not self.known(trial.error)):
-                    going.discard(precision)
+                    rounding = longest(frames - exact) / self.reference.largest
+                one = Stepping(precision, difference, steps, step, samples=samples)
+                self.results.append(one)
+                if not diverged:
+                    one.error, one.rounding, one.known = error, rounding, self.known(error)
+                    if not one.known or (rounding is not None and rounding > error / 2):
+                        going.discard(precision)
 
-    def _run(self, precision: Precision, difference: str, steps: int, samples: list[float]) -> Frames:
+    def _run(self, precision: str, difference: str, steps: int, samples: list[float]) -> Frames:
         """Step through the scene, and append the time of stepping alone [s] to the samples."""
         dynamics = self._dynamics[precision]
         plan = self._plans[difference].with_grid(precision=precision, steps_per_frame=steps)
@@ -183,30 +169,3 @@ class SteppingStudy:
         samples.append(seconds)
         self._done += 1
         return frames
-
-    def _point(self, trial: _Trial) -> Stepping:
-        finite = trial.error < math.inf
-        return Stepping(
-            precision=trial.precision,
-            damping_difference=trial.difference,
-            steps_per_frame=trial.steps,
-            step=replace(self._grid, steps_per_frame=trial.steps).step,
-            error=trial.error if finite else None,
-            rounding=trial.rounding if finite else None,
-            known=finite and self.known(trial.error),
-            seconds=Timing.of(trial.samples),
-        )
-
-
-def observed_orders(points: list[Stepping]) -> dict[str, float | None]:
-    """Fit the order of every method over the points where the error comes from the step, not from rounding."""
-    orders: dict[str, float | None] = {}
-    for method in dict.fromkeys(point.method for point in points):
-        fit = [
-            (math.log(point.step), math.log(point.error))
-            for point in points
-            if point.method == method and point.error and point.known and (point.rounding or 0) < point.error / 10
-        ]
-        steps, errors = np.array(fit).reshape(-1, 2).T
-        orders[method] = float(np.polyfit(steps, errors, 1)[0]) if len(fit) > 2 else None
-    return orders

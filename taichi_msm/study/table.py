@@ -51,11 +51,6 @@ def mostly_rounding(point: Stepping | Peer | Points) -> bool:
     return isinstance(point, Stepping) and (point.rounding or 0) > (point.error or 0) / 2
 
 
-def shown(text: str) -> str:
-    """Make a file name printable even if it is not UTF-8."""
-    return text.encode("utf-8", "backslashreplace").decode("utf-8")
-
-
 def where(study: Study) -> str:
     """Name the machine."""
     threads = study.machine["threads"]
@@ -78,34 +73,6 @@ def markdown(head: Sequence[str], rows: Sequence[Sequence[str]], left: Sequence[
     return "\n".join([line(head), line(rule), *map(line, rows)])
 
 
-METHODS: Columns = {
-    "method": lambda point: point.method,
-    "step": lambda point: duration(point.step),
-    "steps/frame": lambda point: str(point.steps_per_frame),
-    "error": wrong,
-    "of it rounding": lambda point: "" if point.rounding is None else number(point.rounding),
-    "time of the scene": lambda point: timing(point.seconds),
-}
-PEERS: Columns = {
-    "rtol": lambda peer: f"{peer.rtol:g}",
-    "error": wrong,
-    "evaluations": lambda peer: str(peer.evaluations),
-    "time of the scene": lambda peer: timing(peer.seconds),
-}
-DRAWINGS: Columns = {
-    "refine": lambda drawn: str(drawn.refine),
-    "supersample": lambda drawn: str(drawn.supersample),
-    "PSNR": lambda drawn: "equal" if drawn.psnr is None else f"{drawn.psnr:.1f} dB",
-    "largest error": lambda drawn: str(drawn.largest_error),
-    "time of a frame": lambda drawn: timing(drawn.seconds),
-}
-SHEETS: Columns = {
-    "points": lambda points: points.name,
-    "steps/frame": lambda points: str(points.steps_per_frame),
-    "error": wrong,
-    "estimate": lambda points: "not known" if points.estimate is None else number(points.estimate),
-    "time of the scene": lambda points: timing(points.seconds),
-}
 WORDS = ("method", "without")
 
 

@@ -4,14 +4,14 @@ from __future__ import annotations
 
 import time
 from collections.abc import Iterator
-from contextlib import ExitStack
+from contextlib import ExitStack, closing
 
 from taichi_msm.physics.plan import Plan
 from taichi_msm.physics.planning import make_plan
 from taichi_msm.physics.solver import Dynamics
 from taichi_msm.progress import Count
 from taichi_msm.scene import Scene
-from taichi_msm.study.result import Term, Timing
+from taichi_msm.study.result import Term
 from taichi_msm.system.runtime import Device
 
 ROUNDS = 9
@@ -21,10 +21,13 @@ class TermStudy:
     """Measures the time of a step with each term left out in turn.
 
     Args:
-        scene: a checked scene.
+        plan: of the scene.
         device: what `runtime.start` returned.
         sample: approximate time of one measurement [s].
         progress: called with the measurements done and all of them; may raise KeyboardInterrupt.
+
+    Attributes:
+        results: the whole scene first.
     """
 
     def __init__(self, plan: Plan, device: Device, sample: float, progress: Count) -> None:
@@ -32,31 +35,26 @@ class TermStudy:
         # All variants have the steps of the whole scene: without a spring the automatic step would be another.
         self._grid = plan.grid
         grid = {"steps_per_frame": plan.grid.steps_per_frame, "precision": plan.grid.precision}
-        self._variants = {name: make_plan(scene, plan.image).with_grid(**grid) for name, scene in variants(plan.scene)}
-        self._samples: dict[str, list[float]] = {name: [] for name in self._variants}
+        self._plans = [make_plan(scene, plan.image).with_grid(**grid) for _, scene in variants(plan.scene)]
+        self.results = [Term(without) for without, _ in variants(plan.scene)]
         self._sample = sample
         self._progress = progress
 
     def run(self) -> None:
         """Compile every variant, and then let them step in turn."""
         with ExitStack() as opened:
-            sheets: dict[str, Dynamics] = {}
-            for name, plan in self._variants.items():
-                self._progress(0, len(self._variants))
-                sheets[name] = Dynamics(plan, self._device)
-                opened.callback(sheets[name].close)
-                sheets[name].compile()
-            frames = self._frames(sheets[""])
+            sheets: list[Dynamics] = []
+            for plan in self._plans:
+                self._progress(0, len(self._plans))
+                sheets.append(opened.enter_context(closing(Dynamics(plan, self._device))))
+                sheets[-1].compile()
+            frames = self._frames(sheets[0])
             for round_ in range(ROUNDS):
-                for number, (name, plan) in enumerate(self._variants.items()):
+                for number, (term, sheet) in enumerate(zip(self.results, sheets, strict=True)):
                     self._progress(round_ * len(sheets) + number, ROUNDS * len(sheets))
                     # From rest, so that all variants step through the same part of the scene.
-                    sheets[name].restart(plan)
-                    self._samples[name].append(_step_seconds(sheets[name], frames))
-
-    def points(self) -> list[Term]:
-        """Give the results so far, the whole scene first."""
-        return [Term(name, Timing.of(samples)) for name, samples in self._samples.items() if samples]
+                    sheet.restart(sheet.plan)
+                    term.samples.append(_step_seconds(sheet, frames))
 
     def _frames(self, whole: Dynamics) -> int:
         """Count the frames that a measurement takes."""

@@ -16,7 +16,7 @@ from taichi_msm.outputs.gif import Picture
 LETTER = 1 / 36
 SMALLEST, LARGEST = 11, 22
 
-# Width of a letter as a share of its height; in most texts letters are narrower on average.
+# Width of a letter as a share of its height, at most on average.
 LETTER_WIDTH = 0.56
 
 # How many times darker the picture is behind text.

@@ -113,17 +113,16 @@ class Session:
         self._film: Film | None = None
         self._others = scene.probes if play else ()
         self._instrument = scene.probes[0].instrument
+        self._lift = probe_force(scene.probes[0], scene.sheet).force[2]
         self.tool = HeldTool(scene.probes[0], scene.time.frames_per_second)
         plan = plan.with_probes((*self._others, self.tool.recorded(0)))
         self.scene = plan.scene
         self._figures, self._keys = True, False
-        self._once = False
-        # Frames whose time went by, those while it was paused too.
+        self._once = self._warned = self.paused = False
+        # Frames that have passed, including those while it was paused.
         self._elapsed = 0
         self._notice, self._notice_until = "", 0
-        self._warned = False
         self.fault = ""
-        self.paused = False
         self.seconds_a_frame = 0.0
         progress("compile")
         # Without outputs nothing is compiled for them.
@@ -195,7 +194,9 @@ class Session:
         if (self.paused and not self._once) or self.fault:
             return
         self._once = False
-        self._warn_of_length()
+        if self.frame % CHECKED == 0 and not self._warned and probe_values(self.recorded()) > NEARLY * MAX_NODES:
+            self._warned = True
+            self.say("this session will soon be too long for a scene: save it now (w), then reset it (r)")
         begun = time.perf_counter()
         try:
             if probe := self.tool.follow(self.frame):
@@ -208,15 +209,9 @@ class Session:
         self.seconds_a_frame += share * (spent - self.seconds_a_frame)
 
     def picture(self, pacing: str = "") -> Picture:
-        """Draw the tissue, and write the texts over it.
+        """Draw the tissue, and write the texts over it, `pacing` among them: how fast pictures come.
 
         A film that is on takes the picture without texts; if it cannot, the film ends.
-
-        Args:
-            pacing: a text about the speed of the pictures.
-
-        Returns:
-            Colours, shape (height, width, 3).
         """
         picture = self._draw()
         if self.tool.percent != 0 and self._instrument is None and (pixel := self.viewport.pixel(self._touched())):
@@ -251,12 +246,6 @@ class Session:
 
     def __exit__(self, *_: object) -> None:
         self.close()
-
-    def _warn_of_length(self) -> None:
-        """Warn once before the session becomes too long for a scene file."""
-        if self.frame % CHECKED == 0 and not self._warned and probe_values(self.recorded()) > NEARLY * MAX_NODES:
-            self._warned = True
-            self.say("this session will soon be too long for a scene: save it now (w), then reset it (r)")
 
     def _draw(self) -> Picture:
         """Draw the tissue and the instruments; the tool's is where the tool acts, or would if it were pressed."""
@@ -294,11 +283,11 @@ class Session:
             case ".":
                 self._once = self.paused
             case "r":
-                self._once = False
+                self._once = self._warned = False
                 self._simulation.restore(self._beginning)
                 self._controller.forget()
                 self._simulation.steer((*self._others, self.tool.recorded(0)))
-                self._warned, self.fault = False, ""
+                self.fault = ""
             case "p":
                 self.say(f"saved {self._captures.save_picture(self._draw())}")
             case "g":
@@ -328,7 +317,7 @@ class Session:
     @property
     def _pulls(self) -> bool:
         """Whether the force of the tool points away from the sheet; a scene's force may do so by itself."""
-        return self.tool.percent * probe_force(self.scene.probes[-1], self.scene.sheet).force[2] > 0
+        return self.tool.percent * self._lift > 0
 
     def _figure_lines(self, pacing: str) -> list[str]:
         tool, speed = self.tool, ""
@@ -345,15 +334,14 @@ class Session:
 
 
 def _require_usable(scene: Scene, *, play: bool) -> None:
-    problems = []
-    if scene.image is None:
-        problems.append("image: missing; a session needs one, name it here or with --image")
-    if not scene.probes:
-        problems.append("probes: empty; the tool takes its force from the first probe, add one")
-    if play and len(scene.probes) == MAX_PROBES:
-        problems.append(f"probes: {MAX_PROBES} leave no room for the tool; remove one, or leave out --play")
-    if problems:
-        raise SceneError(problems)
+    faults = {
+        "image: missing; a session needs one, name it here or with --image": scene.image is None,
+        "probes: empty; the tool takes its force from the first probe, add one": not scene.probes,
+        f"probes: {MAX_PROBES} leave no room for the tool; remove one, or leave out --play": play
+        and len(scene.probes) == MAX_PROBES,
+    }
+    if any(faults.values()):
+        raise SceneError([message for message, is_so in faults.items() if is_so])
 
 
 def length(metres: float) -> str:
