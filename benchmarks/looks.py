@@ -19,7 +19,7 @@ from benchmarks.whole_run import SCENE, command
 from taichi_msm.outputs import table
 from taichi_msm.render.camera import view
 from taichi_msm.render.instrument import rods
-from taichi_msm.render.rasterizer import Drawing, structure
+from taichi_msm.render.rasterizer import Drawing, drawing_config
 from taichi_msm.render.tracking import find_flow
 from taichi_msm.scene import Scene
 from taichi_msm.system import runtime
@@ -60,7 +60,7 @@ def variants(problem: Problem) -> dict[str, Callable[[], Any]]:
         return problem.scene.model_copy(update={"render": render})
 
     def picture(made: Scene, *, picture: bool = True, labels: bool = False) -> Callable[[], Any]:
-        drawing = Drawing(made, problem.texture, structure(made, picture=picture, labels=labels))
+        drawing = Drawing(made, problem.texture, drawing_config(made, picture=picture, labels=labels))
         return lambda: drawing.look(position, None, rods(made, position, 0.2))
 
     held = problem.scene.probes[0].model_copy(update={"instrument": INSTRUMENT})

@@ -183,7 +183,7 @@ def check(scene: str, image: str | None, overrides: tuple[str, ...], as_json: bo
     """Validate SCENE and print the steps, time, memory and disk space it needs; compute nothing."""
     from taichi_msm.physics import probe_force
     from taichi_msm.physics.probe_force import in_words, probe_records
-    from taichi_msm.render.notes import notes as drawing_notes
+    from taichi_msm.render.drawing_notes import drawing_notes
     from taichi_msm.scenefile import budget, duration
     from taichi_msm.scenefile.load import load_plan
 
@@ -352,7 +352,7 @@ def view(
     loaded = load_scene(scene, overrides, image)
     directory = result_directory(out, f"{Path(scene).stem}-live")
 
-    from taichi_msm.render.notes import notes as drawing_notes
+    from taichi_msm.render.drawing_notes import drawing_notes
     from taichi_msm.viewer.script import load_script, timed
 
     done = load_script(script, loaded.render.size) if script is not None else None

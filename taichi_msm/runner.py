@@ -33,8 +33,8 @@ from taichi_msm.physics.run_notes import run_notes
 from taichi_msm.physics.run_progress import RunProgress
 from taichi_msm.physics.workload import ENCODING
 from taichi_msm.progress import Progress
+from taichi_msm.render.drawing_notes import drawing_notes
 from taichi_msm.render.labels import Observed
-from taichi_msm.render.notes import notes as drawing_notes
 from taichi_msm.render.texture import load_texture
 from taichi_msm.results.manifest import Manifest, digests, read_manifest
 from taichi_msm.results.record import RunRecord

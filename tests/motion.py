@@ -8,23 +8,23 @@ import numpy as np
 from numpy.typing import NDArray
 
 from taichi_msm.physics.error_control import Estimate, longest
-from taichi_msm.physics.kernel import Structure
+from taichi_msm.physics.kernel import SheetLayout
 from taichi_msm.physics.plan import Plan
 from taichi_msm.physics.probe_force import probe_records
 from taichi_msm.physics.run_notes import run_notes
 from taichi_msm.physics.run_progress import RunProgress
-from taichi_msm.physics.solver import Dynamics, structure
+from taichi_msm.physics.solver import Dynamics, layout_of
 from taichi_msm.scene import Scene
 from taichi_msm.system.runtime import Device
 from tests.scenes import plan_of
 
 
-def structure_of(made: Scene, device: Device, cores: int | None = None) -> Structure:
+def structure_of(made: Scene, device: Device, cores: int | None = None) -> SheetLayout:
     """What the kernel of a scene's own steps is compiled for."""
-    return structure(plan_of(made), device, cores)
+    return layout_of(plan_of(made), device, cores)
 
 
-def dynamics_of(made: Scene, device: Device, layout: Structure | None = None) -> Dynamics:
+def dynamics_of(made: Scene, device: Device, layout: SheetLayout | None = None) -> Dynamics:
     """The sheet of a scene, with the scene's own steps."""
     return Dynamics(plan_of(made), device, layout)
 

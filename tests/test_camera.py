@@ -7,7 +7,7 @@ import pytest
 from numpy.typing import NDArray
 
 from taichi_msm.errors import SceneError
-from taichi_msm.render.camera import problems, view
+from taichi_msm.render.camera import camera_problems, view
 from taichi_msm.scene import MAX_SUPERSAMPLE, Camera, Scene
 from taichi_msm.simulation import Simulation
 from taichi_msm.system.runtime import Device
@@ -66,13 +66,13 @@ def test_the_distance_of_the_target_does_not_matter(away: float) -> None:
 
 
 def test_cameras_that_see_nothing_are_refused() -> None:
-    assert [str(p) for p in problems(with_camera({"eye": [0, 0, 0]}))] == [
+    assert [str(p) for p in camera_problems(with_camera({"eye": [0, 0, 0]}))] == [
         "render.camera.eye: [0.0, 0.0, 0.0] is also the target; move one of them"
     ]
-    assert [str(p) for p in problems(with_camera({"eye": [0, 2, 0]}))] == [
+    assert [str(p) for p in camera_problems(with_camera({"eye": [0, 2, 0]}))] == [
         "render.camera.up: [0.0, 1.0, 0.0] is zero or along the line of sight; take a direction across it"
     ]
-    assert not list(problems(with_camera({"eye": [0, 0, 1]})))
+    assert not list(camera_problems(with_camera({"eye": [0, 0, 1]})))
 
 
 @pytest.mark.parametrize("fov", [0, 1e-300, 9.99e-4, 180])
@@ -127,7 +127,7 @@ def test_extreme_cameras_draw_without_a_warning_or_are_refused(
         render={"camera": camera, "size": [8, 8], "shading": "tissue", "supersample": 1},
         probes=[{"force": [0, 0, 0], "instrument": rod}],
     )
-    if list(problems(made)):
+    if list(camera_problems(made)):
         return
     with Simulation(made, threads=device.threads, texture=np.zeros((2, 2, 3), np.uint8)) as simulation:
         assert simulation.draw().shape == (8, 8, 3)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from itertools import pairwise
 from typing import Any
 
@@ -14,7 +13,7 @@ from taichi_msm.physics.lattice import rest_positions
 from taichi_msm.render import bins, rasterizer_gpu
 from taichi_msm.render.camera import view
 from taichi_msm.render.instrument import rods
-from taichi_msm.render.rasterizer import Drawing, structure
+from taichi_msm.render.rasterizer import Drawing, drawing_config
 from taichi_msm.render.rasterizer_cpu import Bands
 from taichi_msm.scene import Scene
 from taichi_msm.system import launches
@@ -118,10 +117,10 @@ def test_the_shape_of_a_tile_does_not_change_the_bits(lanes: int, device: Device
     ]
     for render in renders:
         made, texture = with_instruments(drawable(**render)), speckle(300, 200)
-        position, code = dented(made), structure(made, labels="supersample" not in render)
+        position, config = dented(made), drawing_config(made, labels="supersample" not in render)
         placed = rods(made, position, 0)
-        expected = Drawing(made, texture, code).look(position, rods=placed)
-        alone = Drawing(made, texture, replace(code, lanes=lanes)).look(position, rods=placed)
+        expected = Drawing(made, texture, config).look(position, rods=placed)
+        alone = Drawing(made, texture, config._replace(lanes=lanes)).look(position, rods=placed)
         np.testing.assert_array_equal(alone.picture, expected.picture)
         for label, other in zip(alone.labels or (), expected.labels or (), strict=True):
             np.testing.assert_array_equal(label, other)
@@ -136,7 +135,7 @@ def test_launches_do_not_change_the_bits(parts: int, device: Device, monkeypatch
     made = with_instruments(drawable((9, 11), size=[60, 50], refine=2, camera="top", supersample=2))
     rng = np.random.default_rng(6)
     position = rest_positions(made.sheet) + rng.normal(0, 0.03, (9, 11, 3)) * [1, 1, 0]
-    placed, texture, code = rods(made, position, 0), speckle(30, 20), replace(structure(made), lanes=1)
+    placed, texture, config = rods(made, position, 0), speckle(30, 20), drawing_config(made)._replace(lanes=1)
     begun: list[int] = []
     launch = launches.Launches.launch
 
@@ -153,13 +152,13 @@ def test_launches_do_not_change_the_bits(parts: int, device: Device, monkeypatch
 
     monkeypatch.setattr(launches.Launches, "launch", counted)
     monkeypatch.setattr(rasterizer_gpu, "binned", shuffled)
-    pictures = [Drawing(made, texture, code).draw(position, rods=placed)]
+    pictures = [Drawing(made, texture, config).draw(position, rods=placed)]
     few = len(begun)
     monkeypatch.setattr(launches, "MOST_ROUNDS", launches.SPARE + 250)
     monkeypatch.setattr(launches, "THREADS", 700)
     monkeypatch.setattr(rasterizer_gpu, "THREADS", 700)
     monkeypatch.setattr(rasterizer_gpu, "MOST_PARTS", parts)
-    pictures += [Drawing(made, texture, code).draw(position, rods=placed) for _ in range(3)]
+    pictures += [Drawing(made, texture, config).draw(position, rods=placed) for _ in range(3)]
     assert len(begun) > 30 * few
     expected = Drawing(made, texture).draw(position, rods=placed)
     for picture in pictures:
@@ -171,7 +170,7 @@ def test_the_bound_of_a_thread_is_asserted(device: Device, monkeypatch: pytest.M
     made = with_instruments(drawable((4, 4), size=[9, 7], refine=64, camera="oblique", supersample=4))
     made = made.model_copy(update={"probes": made.probes * 8})
     position = np.random.default_rng(4).normal(0, 0.2, (4, 4, 3))
-    drawing = Drawing(made, speckle(8, 8), replace(structure(made), lanes=1))
+    drawing = Drawing(made, speckle(8, 8), drawing_config(made)._replace(lanes=1))
     monkeypatch.setattr(rasterizer_gpu, "MOST_PARTS", 1)
     drawing.draw(position, rods=rods(made, position, 0))
     monkeypatch.setattr(launches, "MOST_ROUNDS", launches.SPARE + 3 * 2 * 65**2)
@@ -246,7 +245,7 @@ def test_points_thrown_far_away_do_not_make_bits_depend_on_tiles(far: float, dev
         position = rest_positions(made.sheet)
         position[point] = far
         pictures = [
-            Drawing(made, texture, replace(structure(made), lanes=lanes)).draw(position) for lanes in (1, 4, 8, 16)
+            Drawing(made, texture, drawing_config(made)._replace(lanes=lanes)).draw(position) for lanes in (1, 4, 8, 16)
         ]
         assert all((picture == pictures[0]).all() for picture in pictures), point
 
@@ -381,5 +380,7 @@ def test_wireframe_draws_the_mass_point_mesh(device: Device) -> None:
 
 
 def test_only_what_the_picture_needs_is_compiled(device: Device) -> None:
-    assert structure(drawable(shading="none")).layout == {}
-    assert structure(drawable()) == structure(drawable((5, 6), camera="oblique", background=[1, 1, 1], size=[9, 9]))
+    assert drawing_config(drawable(shading="none")).plane._fields == ("depth", "texel_x", "texel_y")
+    assert drawing_config(drawable()) == drawing_config(
+        drawable((5, 6), camera="oblique", background=[1, 1, 1], size=[9, 9])
+    )

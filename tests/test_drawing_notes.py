@@ -11,7 +11,7 @@ import pytest
 from PIL import Image
 
 from taichi_msm.physics.lattice import spacing
-from taichi_msm.render.notes import notes
+from taichi_msm.render.drawing_notes import drawing_notes
 from taichi_msm.scene import Scene
 from taichi_msm.scenefile.load import load_scene
 from tests.conftest import Program
@@ -32,7 +32,7 @@ def carrying(tmp_path: Path, size: tuple[int, int], **changes: Any) -> Scene:
     ],
 )
 def test_instruments_that_can_hardly_be_meant(instrument: dict[str, Any], said: str) -> None:
-    (note,) = notes(scene(probes=[{**PRESS, "instrument": instrument}]))
+    (note,) = drawing_notes(scene(probes=[{**PRESS, "instrument": instrument}]))
     assert note.startswith(said)
 
 
@@ -45,7 +45,7 @@ def test_instruments_that_can_hardly_be_meant(instrument: dict[str, Any], said: 
     ],
 )
 def test_a_stretched_picture_and_two_ways_out(tmp_path: Path, size: tuple[int, int], sheet: str, part: str) -> None:
-    (note,) = notes(carrying(tmp_path, size))
+    (note,) = drawing_notes(carrying(tmp_path, size))
     width, height = size
     assert note == (
         f"the picture of {width} x {height} pixels is stretched onto a sheet 0.4 m wide and 0.3 m high; "
@@ -53,8 +53,8 @@ def test_a_stretched_picture_and_two_ways_out(tmp_path: Path, size: tuple[int, i
         f'--set "region=[{part}]" cuts a part like the sheet'
     )
     like_picture = {**SHEET, "size": [float(side) for side in sheet.split(",")]}
-    assert not list(notes(scene(image=str(tmp_path / "picture.png"), sheet=like_picture, output=["png"])))
-    assert not list(notes(carrying(tmp_path, size, region=[int(number) for number in part.split(",")])))
+    assert not list(drawing_notes(scene(image=str(tmp_path / "picture.png"), sheet=like_picture, output=["png"])))
+    assert not list(drawing_notes(carrying(tmp_path, size, region=[int(number) for number in part.split(",")])))
 
 
 @pytest.mark.parametrize("size", [(900, 500), (300, 700)])
@@ -62,43 +62,45 @@ def test_tissue_like_the_picture_has_square_cells(tmp_path: Path, size: tuple[in
     Image.new("RGB", size).save(tmp_path / "picture.png")
     press = ["image=picture.png", "probes.0.instrument=null"]
     (tmp_path / "press.yaml").write_text((root / "scenes/press.yaml").read_text())
-    (note,) = notes(load_scene(tmp_path / "press.yaml", press))
+    (note,) = drawing_notes(load_scene(tmp_path / "press.yaml", press))
     settings = re.findall(r'--set "(sheet[^"]+)"', note)
     assert [setting.partition("=")[0] for setting in settings] == ["sheet.size", "sheet.points"]
     made = load_scene(tmp_path / "press.yaml", [*press, *settings])
-    assert not list(notes(made))
+    assert not list(drawing_notes(made))
     down, across = spacing(made.sheet)
     assert down == pytest.approx(across, rel=0.02)
 
 
 def test_the_part_is_within_the_region(tmp_path: Path) -> None:
-    (note,) = notes(carrying(tmp_path, (800, 600), region=[100, 50, 600, 300]))
+    (note,) = drawing_notes(carrying(tmp_path, (800, 600), region=[100, 50, 600, 300]))
     assert note.endswith('--set "region=[200,50,400,300]" cuts a part like the sheet')
 
 
 @pytest.mark.parametrize(("size", "cuts"), [((3, 4000), False), ((5, 5), False), ((20, 12), True)])
 def test_a_small_picture_may_have_no_such_part(tmp_path: Path, size: tuple[int, int], cuts: bool) -> None:
     """Of 3 or of 5 columns, no whole number of rows has the proportions 4 : 3; of 12 rows, 16 columns have."""
-    (note,) = notes(carrying(tmp_path, size))
+    (note,) = drawing_notes(carrying(tmp_path, size))
     assert note.endswith("cuts a part like the sheet") == cuts
     assert cuts or note.endswith("makes the sheet like the picture")
 
 
 @pytest.mark.parametrize("size", [(400, 300), (407, 300), (393, 300), (64, 48)])
 def test_a_picture_like_the_sheet(tmp_path: Path, size: tuple[int, int]) -> None:
-    assert not list(notes(carrying(tmp_path, size)))
+    assert not list(drawing_notes(carrying(tmp_path, size)))
 
 
 @pytest.mark.parametrize("size", [(409, 300), (392, 300)])
 def test_a_picture_a_little_unlike_the_sheet(tmp_path: Path, size: tuple[int, int]) -> None:
-    assert list(notes(carrying(tmp_path, size)))
+    assert list(drawing_notes(carrying(tmp_path, size)))
 
 
 @pytest.mark.parametrize("shading", ["none", "headlight"])
 def test_a_light_without_tissue(tmp_path: Path, shading: str) -> None:
-    (note,) = notes(carrying(tmp_path, (400, 300), render={"light": {"gloss": 0.1}, "shading": shading}))
+    (note,) = drawing_notes(carrying(tmp_path, (400, 300), render={"light": {"gloss": 0.1}, "shading": shading}))
     assert note == f"render.light has no effect with shading: {shading}; take render.shading: tissue"
-    assert not list(notes(carrying(tmp_path, (400, 300), render={"light": {"gloss": 0.1}, "shading": "tissue"})))
+    assert not list(
+        drawing_notes(carrying(tmp_path, (400, 300), render={"light": {"gloss": 0.1}, "shading": "tissue"}))
+    )
 
 
 @pytest.mark.parametrize(("alpha", "seen"), [(254, True), (255, False)])
@@ -108,19 +110,19 @@ def test_a_picture_that_is_see_through(tmp_path: Path, alpha: int, seen: bool) -
     picture.putpixel((399, 299), (200, 100, 50, alpha))
     picture.save(tmp_path / "picture.png")
     said = ["the picture is see-through in parts, which show render.background: [9, 8, 7]"]
-    assert list(notes(made)) == (said if seen else [])
+    assert list(drawing_notes(made)) == (said if seen else [])
 
 
 def test_a_palette_with_a_transparent_colour_is_see_through(tmp_path: Path) -> None:
     made = carrying(tmp_path, (400, 300))
     Image.new("P", (400, 300)).save(tmp_path / "picture.png", transparency=0)
-    (note,) = notes(made)
+    (note,) = drawing_notes(made)
     assert note.startswith("the picture is see-through")
 
 
 def test_without_pictures_there_is_nothing_to_stretch(tmp_path: Path) -> None:
     made = carrying(tmp_path, (10, 300))
-    assert not list(notes(made.model_copy(update={"output": ("trajectory",)})))
+    assert not list(drawing_notes(made.model_copy(update={"output": ("trajectory",)})))
 
 
 def test_check_and_run_say_it(tmp_path: Path, program: Program) -> None:

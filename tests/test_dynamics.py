@@ -15,9 +15,13 @@ from numpy.typing import NDArray
 
 from taichi_msm.errors import MsmError
 from taichi_msm.physics import kernel_cpu, kernel_gpu
-from taichi_msm.physics.kernel import Structure
+from taichi_msm.physics.kernel import SheetLayout
 from taichi_msm.physics.lattice import rest_positions
 from taichi_msm.physics.solver import POINTS_PER_WORKER
+from taichi_msm.physics.terms.damping import DampingTerm
+from taichi_msm.physics.terms.foundation import FoundationTerm
+from taichi_msm.physics.terms.probes import ProbeTerm
+from taichi_msm.physics.terms.springs import SpringTerm
 from taichi_msm.scene import MAX_POINTS, Scene
 from taichi_msm.system import resources
 from taichi_msm.system.launches import MOST_ROUNDS, THREADS
@@ -30,7 +34,7 @@ from tests.scenes import PRESS, SHEET, SPRINGS, plan_of, random_scene, scene, wi
 ROUNDING = {"f32": 2.0**-24, "f64": 2.0**-53}
 
 
-def simulate(made: Scene, device: Device, layout: Structure | None = None) -> NDArray[Any]:
+def simulate(made: Scene, device: Device, layout: SheetLayout | None = None) -> NDArray[Any]:
     """Displacements of every frame, shape (F + 1, rows, cols, 3)."""
     grid, dynamics = plan_of(made).grid, dynamics_of(made, device, layout)
     frames = [dynamics.displacement()]
@@ -41,7 +45,7 @@ def simulate(made: Scene, device: Device, layout: Structure | None = None) -> ND
     return np.array(frames)
 
 
-def assert_like_twin(made: Scene, device: Device, layout: Structure | None = None) -> None:
+def assert_like_twin(made: Scene, device: Device, layout: SheetLayout | None = None) -> None:
     twin = reference.simulate(made) - rest_positions(made.sheet)
     # A rounding of a step, of the size of a rest length, is amplified by at most the number of steps squared;
     # in practice by far less. Chaos is kept away by small displacements and few steps.
@@ -71,12 +75,12 @@ def test_random_scene_is_like_the_twin(seed: int, precision: str, device: Device
     assert_like_twin(random_scene(seed, precision), device)
 
 
-def with_lanes(layout: Structure, lanes: int) -> Structure:
+def with_lanes(layout: SheetLayout, lanes: int) -> SheetLayout:
     """The same sheet in other vectors."""
     return replace(layout, code=replace(layout.code, lanes=lanes))
 
 
-def as_on_a_gpu(layout: Structure) -> Structure:
+def as_on_a_gpu(layout: SheetLayout) -> SheetLayout:
     """The same sheet in the memory of a GPU."""
     return replace(with_lanes(layout, 1), workers=0, depth=1)
 
@@ -211,16 +215,10 @@ def test_a_frame_of_a_small_sheet_is_one_launch(device: Device) -> None:
 
 
 def test_absent_terms_are_left_out(device: Device) -> None:
-    bare = structure_of(scene(springs={"structural": 1}, probes=[]), device).code
-    assert (bare.structural, bare.shear, bare.virtual, bare.open_edges, bare.slots_move) == (
-        True,
-        False,
-        False,
-        False,
-        (),
-    )
-    assert not structure_of(scene(probes=[]), device).code.virtual, "loaded, but nothing ever loads"
-    assert structure_of(scene(), device).code.virtual
+    bare = structure_of(scene(springs={"structural": 1}, probes=[], damping=0), device).code
+    assert bare.terms == (SpringTerm(True, False, False, False, False, False), ProbeTerm((), ()))
+    assert not structure_of(scene(probes=[]), device).code.get(FoundationTerm), "loaded, but nothing ever loads"
+    assert structure_of(scene(), device).code.get(FoundationTerm)
     assert structure_of(scene(), device).code.lanes == lanes("f64")
 
 
@@ -520,11 +518,11 @@ def test_rests_grow_while_workers_give_up_and_are_forgotten_when_they_do_not(
     monkeypatch.setattr("time.process_time", lambda: next(had))
     # As long as nobody wants our cores, a worker that gives up is an accident, and rests stay the shortest.
     monkeypatch.setattr(resources, "waited_for_cores", lambda: 0.0)
-    sweep.advance(10_000, (), np.empty(0))
+    sweep.advance(10_000, np.empty(0))
     assert taken[1] > 1000
     taken = [0, 0]
     monkeypatch.setattr(resources, "waited_for_cores", wait_as_long_as_we_run)
-    sweep.advance(10_000, (), np.empty(0))
+    sweep.advance(10_000, np.empty(0))
     assert sum(taken) == 10_000
     assert taken[1] < 100
     # During a rest nobody waits, which makes the next one no shorter.
@@ -532,13 +530,13 @@ def test_rests_grow_while_workers_give_up_and_are_forgotten_when_they_do_not(
     with monkeypatch.context() as patch:
         patch.setattr("time.process_time", lambda: now)
         patch.setattr(resources, "waited_for_cores", lambda: 0.001 * taken[1])
-        sweep.advance(10_000, (), np.empty(0))
+        sweep.advance(10_000, np.empty(0))
     assert taken[1] < 200
     # Undisturbed for minutes, and then disturbed once: the rest is the shortest again.
     patient = True
-    sweep.advance(1_000_000, (), np.empty(0))
+    sweep.advance(1_000_000, np.empty(0))
     patient, taken = False, [0, 0]
-    sweep.advance(5, (), np.empty(0))
+    sweep.advance(5, np.empty(0))
     # One step in each launch of all; the rest of 2 ms takes pieces of one and two steps.
     assert taken == [3, 2]
 
@@ -597,6 +595,6 @@ def test_a_second_sheet_of_the_same_terms_compiles_nothing(device: Device, monke
 
 def test_damping_of_0_is_left_out(device: Device) -> None:
     # Not multiplied by 1: what a scene does not use is not in its kernel.
-    assert not structure_of(scene(damping=0), device).code.damped
-    assert structure_of(scene(), device).code.damped
+    assert not structure_of(scene(damping=0), device).code.get(DampingTerm)
+    assert structure_of(scene(), device).code.get(DampingTerm)
     assert_like_twin(scene(damping=0, time={"duration": 0.08}), device)

@@ -13,7 +13,7 @@ from taichi_msm.render import tracking
 from taichi_msm.render.camera import view
 from taichi_msm.render.instrument import rods
 from taichi_msm.render.labels import Labels
-from taichi_msm.render.rasterizer import Drawing, structure
+from taichi_msm.render.rasterizer import Drawing, drawing_config
 from taichi_msm.render.tracking import find, find_flow
 from taichi_msm.scene import Scene
 from taichi_msm.system import launches
@@ -26,9 +26,9 @@ CAMERAS = pytest.mark.parametrize("camera", ["top", "oblique", NEAR], ids=["top"
 
 
 def look(made: Scene, position: Array) -> Labels:
-    code = structure(made, picture=False, labels=True)
+    config = drawing_config(made, picture=False, labels=True)
     placed = rods(made, position, 0)
-    found = Drawing(made, np.zeros((1, 1, 3), np.uint8), code).look(position, rods=placed).labels
+    found = Drawing(made, np.zeros((1, 1, 3), np.uint8), config).look(position, rods=placed).labels
     assert found is not None
     return found
 

@@ -13,11 +13,11 @@ import pytest
 import taichi_msm
 import taichi_msm.runner
 from taichi_msm.cli import main
-from taichi_msm.physics import lattice, material, slots, stiffness_map, timestep
+from taichi_msm.physics import lattice, slots, stiffness_map, terms, timestep
 
 DERIVED = [
-    (material, "material"),
-    (material, "highest_frequency"),
+    (terms, "material_of"),
+    (terms, "highest_frequency"),
     (slots, "probe_slots"),
     (lattice, "fixed_points"),
     (stiffness_map, "read"),
@@ -57,7 +57,7 @@ def test_a_run_derives_everything_once(root: Path, tmp_path: Path, calls: Counte
 def test_pilots_with_fewer_points_derive_their_own_sheets_once(root: Path, tmp_path: Path, calls: Counter[str]) -> None:
     short = ["--set", "time.duration=0.08", "--set", "output=[]", "--estimate-error", "--quiet"]
     assert main(["run", str(root / "scenes/tumour.yaml"), "--out", str(tmp_path / "out"), *short]) == 0
-    assert {calls[name] for name in ("material", "fixed_points", "factors", "stable_step")} == {3}
+    assert {calls[name] for name in ("material_of", "fixed_points", "factors", "stable_step")} == {3}
     assert calls["read"] == 1, "the map's file"
 
 

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from taichi_msm.errors import SceneError
-from taichi_msm.render.texture import image_size, load_texture, problems
+from taichi_msm.render.texture import image_problems, image_size, load_texture
 from taichi_msm.scene import Scene
 from tests.scenes import speckle
 
@@ -46,7 +46,7 @@ def scene(image: str | None, **keys: Any) -> Scene:
 
 
 def faults(image: str | None, **keys: Any) -> list[str]:
-    return [str(problem) for problem in problems(scene(image, **keys))]
+    return [str(problem) for problem in image_problems(scene(image, **keys))]
 
 
 def refusal(image: str, **keys: Any) -> str:
@@ -306,7 +306,7 @@ def test_broken_pictures_bring_up_no_other_error() -> None:
             for at in rng.integers(0, len(whole), 3):
                 broken[at] = rng.integers(0, 256)
             Path(name).write_bytes(broken)
-            list(problems(scene(name)))
+            list(image_problems(scene(name)))
             try:
                 load_texture(scene(name))
             except SceneError:
@@ -326,7 +326,7 @@ def test_a_jpeg_of_too_many_scans(tmp_path: Path, monkeypatch: pytest.MonkeyPatc
     made = scene(image="a.jpg")
     for copies, refused in ((0, False), (1300, False), (1400, True)):
         Path("a.jpg").write_bytes(whole[:-2] + copies * last + b"\xff\xd9" + b"\xff\xda" * 4000)
-        found = [str(problem) for problem in problems(made)]
+        found = [str(problem) for problem in image_problems(made)]
         assert found == (
             [f"image: a.jpg has {copies + 10} scans, and 1333 are allowed; save it again"] if refused else []
         )
@@ -337,7 +337,7 @@ def test_a_jpeg_of_too_many_scans(tmp_path: Path, monkeypatch: pytest.MonkeyPatc
     Image.fromarray(speckle(300, 500)).save(file, "JPEG")
     whole = file.getvalue()
     Path("a.jpg").write_bytes(whole[:-2] + 1400 * whole[whole.rfind(b"\xff\xda") : -2] + b"\xff\xd9")
-    assert ["1401 scans" in str(problem) for problem in problems(made)] == [True]
+    assert ["1401 scans" in str(problem) for problem in image_problems(made)] == [True]
 
 
 def test_a_picture_of_too_many_rows(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -346,7 +346,7 @@ def test_a_picture_of_too_many_rows(tmp_path: Path, monkeypatch: pytest.MonkeyPa
     for size in ((1, 65536), (65536, 1)):
         Image.new("L", size).save("a.png")
         expected = f"image: a.png has {size[0]} x {size[1]} pixels; a side may have at most 65535, cut it"
-        assert [str(problem) for problem in problems(scene(image="a.png"))] == [expected]
+        assert [str(problem) for problem in image_problems(scene(image="a.png"))] == [expected]
     Image.new("L", (1, 65535)).save("a.png")
     assert load_texture(scene(image="a.png")).shape == (65535, 1, 3)
 

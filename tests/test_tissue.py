@@ -18,10 +18,14 @@ from taichi_msm.errors import ArgumentError, FilesError, SceneError
 from taichi_msm.physics import kernel_gpu, probe_force
 from taichi_msm.physics.error_control import longest
 from taichi_msm.physics.lattice import rest_positions
-from taichi_msm.physics.material import stiffness
 from taichi_msm.physics.mesh_error import FEWEST, CubicSampling, MeshEstimate, MeshPilot, choose_points, coarser
 from taichi_msm.physics.plan import Plan
 from taichi_msm.physics.stiffness_map import MapImage
+from taichi_msm.physics.terms.bending import BendingTerm
+from taichi_msm.physics.terms.damping import DampingTerm
+from taichi_msm.physics.terms.foundation import FoundationTerm
+from taichi_msm.physics.terms.probes import ProbeTerm
+from taichi_msm.physics.terms.springs import SpringTerm, stiffness
 from taichi_msm.runner import resume, run
 from taichi_msm.scene import Scene
 from taichi_msm.scenefile.load import load_scene
@@ -96,10 +100,13 @@ def test_in_f32_it_is_like_the_twin_but_for_rounding(seed: int, image: str, devi
 
 def test_the_random_tissues_have_every_term(image: str, device: Device) -> None:
     codes = [structure_of(random_tissue(seed, image), device).code for seed in SEEDS]
-    for term in ("mapped", "tense", "bending", "virtual", "damped", "open_edges", "by_area"):
-        assert len({getattr(code, term) for code in codes}) == 2, term
-    assert {moves for code in codes for moves in code.slots_move} == {False, True}
-    assert {by_area for code in codes for by_area in code.slots_by_area} == {False, True}
+    for kind in (FoundationTerm, DampingTerm, BendingTerm):
+        assert {code.get(kind) is None for code in codes} == {False, True}, kind
+    springs, probes = [code.require(SpringTerm) for code in codes], [code.require(ProbeTerm) for code in codes]
+    for flag in ("mapped", "tense", "open_edges", "by_area"):
+        assert {getattr(term, flag) for term in springs} == {False, True}, flag
+    assert {moves for term in probes for moves in term.moves} == {False, True}
+    assert {by_area for term in probes for by_area in term.by_area} == {False, True}
 
 
 @pytest.mark.parametrize(
@@ -108,7 +115,7 @@ def test_the_random_tissues_have_every_term(image: str, device: Device) -> None:
 def test_bands_do_not_change_the_bits(seed: int, image: str, device: Device) -> None:
     made = random_tissue(seed, image)
     layout = structure_of(made, device)
-    assert layout.code.mapped or layout.code.bending
+    assert layout.code.require(SpringTerm).mapped or layout.code.get(BendingTerm)
     plain = simulate(made, device)
     assert simulate(made, device, replace(layout, workers=2)).tobytes() == plain.tobytes()
     dynamics = dynamics_of(made, device, replace(layout, workers=3))

@@ -23,10 +23,10 @@ from skfem.models.elasticity import linear_elasticity, plane_stress
 
 from taichi_msm.physics.lattice import fixed_points, rest_positions, spacing
 from taichi_msm.physics.loads import loads_at
-from taichi_msm.physics.material import highest_frequency
 from taichi_msm.physics.probe_force import spread
 from taichi_msm.physics.springs import energy_density
 from taichi_msm.physics.state import State
+from taichi_msm.physics.terms import highest_frequency
 from taichi_msm.scene import Probe, Scene
 from taichi_msm.system.runtime import Device
 from tests import reference

@@ -20,7 +20,7 @@ from taichi_msm.physics.lattice import rest_positions
 from taichi_msm.render.camera import view
 from taichi_msm.render.instrument import rods
 from taichi_msm.render.labels import track_grid
-from taichi_msm.render.rasterizer import Drawing, structure
+from taichi_msm.render.rasterizer import Drawing, drawing_config
 from taichi_msm.render.tracking import find, find_flow
 from taichi_msm.scene import Scene
 from taichi_msm.scenefile.load import load_scene
@@ -152,7 +152,7 @@ def looks() -> dict[str, NDArray[Any]]:
     position, view_now = draped(made), view(made)
     placed, texture = rods(made, position, 0), speckle(300, 400)
     seen["picture"] = Drawing(made, texture).draw(position, rods=placed)
-    labels = Drawing(made, texture, structure(made, picture=False, labels=True)).look(position, rods=placed).labels
+    labels = Drawing(made, texture, drawing_config(made, picture=False, labels=True)).look(position, rods=placed).labels
     assert labels is not None
     seen |= {f"label_{name}": value for name, value in labels._asdict().items()}
     moved = position + np.array([0.002, 0.001, 0])

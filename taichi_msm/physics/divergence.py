@@ -8,14 +8,13 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from taichi_msm.physics.lattice import axes, spacing
-from taichi_msm.physics.loads import Envelope, decay
+from taichi_msm.physics.lattice import spacing
+from taichi_msm.physics.loads import Envelope
 from taichi_msm.physics.plan import Plan
-from taichi_msm.physics.probe_force import probe_force
 from taichi_msm.physics.run_progress import RunProgress
-from taichi_msm.physics.slots import ProbeSlot
 from taichi_msm.physics.state import Reading
-from taichi_msm.scene import Scene
+from taichi_msm.physics.terms import TERMS
+from taichi_msm.physics.terms.probes import free_acceleration, norm
 
 # No deformation displaces a point by more than this many sheet sizes; a sheet that nothing holds may also fly away.
 MOST_SHEET_SIZES = 10.0
@@ -33,15 +32,6 @@ def _is_held(plan: Plan) -> bool:
     return plan.scene.sheet.fixed not in ("none", ()) and min(plan.material.across, plan.material.down) > 0
 
 
-def _free_acceleration(plan: Plan) -> float:
-    """Bound the acceleration that the probes give to a free point [m/s^2]."""
-    forces = (
-        probe_force(probe, plan.scene.sheet).size * max(abs(percent) for _, percent in probe.load) / 100
-        for probe in plan.scene.probes
-    )
-    return sum(forces) / plan.material.mass
-
-
 def farthest_displacement(plan: Plan, time: float, acceleration: float | None = None) -> float:
     """Bound the displacement of a point [m]; if one is larger, the simulation has diverged.
 
@@ -56,7 +46,7 @@ def farthest_displacement(plan: Plan, time: float, acceleration: float | None = 
     if plan.material.virtual > 0 and not plan.material.always:
         # The virtual springs may accelerate a point from far away, and let go of it when it is fast.
         return math.inf
-    return most + (_free_acceleration(plan) if acceleration is None else acceleration) * time * time / 2
+    return most + (free_acceleration(plan) if acceleration is None else acceleration) * time * time / 2
 
 
 class Watch:
@@ -81,8 +71,8 @@ class Watch:
         self.progress = progress or RunProgress()
         self._plan, self._grid = plan, plan.grid
         self._loads = Envelope(plan)
-        self._acceleration = _free_acceleration(plan)
-        self._shares = np.array([_share(slot, plan.scene) for slot in plan.slots])
+        self._acceleration = free_acceleration(plan)
+        self._shares = np.array([norm(slot, plan.scene) for slot in plan.slots])
         self._swing = SWING / max(1e-9, 1 - (plan.grid.step / plan.stable_step) ** 2)
         self._least = _underflow(plan)
 
@@ -90,7 +80,7 @@ class Watch:
         """Expect other loads from now on; control points move if they did before."""
         self._plan = plan
         self._loads = Envelope(plan)
-        self._acceleration = max(self._acceleration, _free_acceleration(plan))
+        self._acceleration = max(self._acceleration, free_acceleration(plan))
 
     def follow(self, reading: Reading) -> str:
         """Judge the next frame, as `judge` does, and record its progress if it is sound."""
@@ -184,17 +174,7 @@ def _underflow(plan: Plan) -> float:
     """Give the energy below which the squares that it is summed from underflow [J]."""
     tiny = float(np.finfo(np.float32 if plan.grid.precision == "f32" else np.float64).tiny)
     (dx, dy), material = spacing(plan.scene.sheet), plan.material
-    stiffness = max(material.across, material.down) + material.shear
     inertia = material.mass / plan.grid.step**2
-    return math.prod(plan.scene.sheet.points) * tiny * (inertia + stiffness * (dx**2 + dy**2))
-
-
-def _share(slot: ProbeSlot, scene: Scene) -> float:
-    """Bound |F| over all points for a force of 1 N at the control point."""
-    if not slot.moves:
-        return float(np.linalg.norm(decay(scene.probes[slot.probe], scene.sheet)))
-    # The moving control point is within half a cell's diagonal of some lattice point. The sheet around that point lies
-    # within four sheets that meet there, and their norm is twice that of one.
-    x, y = axes(scene.sheet)
-    nearest = np.maximum(np.hypot(x - x[0], y - y[0]) - math.hypot(*spacing(scene.sheet)) / 2, 0)
-    return 2 * float(np.linalg.norm(probe_force(scene.probes[slot.probe], scene.sheet).decay(nearest)))
+    # Squares are summed, and squares times a stiffness.
+    springs = max(1.0, sum(term.bound(material, plan.scene.sheet) for term in TERMS)) * (dx**2 + dy**2)
+    return math.prod(plan.scene.sheet.points) * tiny * (inertia + springs)

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from taichi_msm.physics.material import Material
+from taichi_msm.physics.material import Material, has_fixed_border
 from taichi_msm.physics.slots import ProbeSlot, probe_slots
 from taichi_msm.physics.stiffness_map import MapImage
 from taichi_msm.scene import Probe, Scene
@@ -37,6 +37,11 @@ class Plan:
     stable_step: float
     grid: TimeGrid
     slots: tuple[ProbeSlot, ...]
+
+    @property
+    def open_edges(self) -> bool:
+        """Whether a point at an edge moves."""
+        return not has_fixed_border(self.fixed)
 
     def with_grid(self, **changes: Any) -> Plan:
         """Change attributes of the time grid: steps_per_frame, precision."""

@@ -7,10 +7,11 @@ from dataclasses import replace
 from taichi_msm.errors import Problem, SceneError
 from taichi_msm.physics import stiffness_map, timestep, workload
 from taichi_msm.physics.lattice import fixed_points
-from taichi_msm.physics.material import kind_problems, material, tissue_problems
+from taichi_msm.physics.material import kind_problems, tissue_problems
 from taichi_msm.physics.plan import Plan
 from taichi_msm.physics.slots import probe_slots
 from taichi_msm.physics.stiffness_map import MapImage
+from taichi_msm.physics.terms import material_of
 from taichi_msm.picture import PictureError
 from taichi_msm.scene import Scene
 from taichi_msm.timegrid import TimeGrid
@@ -29,7 +30,7 @@ def make_plan(scene: Scene, image: MapImage | None = None) -> Plan:
 
 
 def try_plan(scene: Scene, image: MapImage | None = None) -> tuple[Plan | None, list[Problem]]:
-    """Plan a scene for a CPU, or find what is wrong with what its sheet is made of, and with its steps.
+    """Plan a scene for a CPU, or find what is wrong with what its sheet is material of, and with its steps.
 
     Args:
         scene: whose keys are valid each by itself.
@@ -48,14 +49,16 @@ def try_plan(scene: Scene, image: MapImage | None = None) -> tuple[Plan | None, 
             image = stiffness_map.read(scene.stiffness_map)
         except PictureError as error:
             problems.append(Problem((scene.kind, "map", "image"), str(error)))
-    sheet = material(scene, image)
-    problems += tissue_problems(scene, fixed, sheet.factors)
+    material = material_of(scene, image)
+    problems += tissue_problems(scene, fixed, material.factors)
     if problems:
         return None, problems
-    limit = timestep.stable_step(sheet, scene.sheet, scene.time.damping_difference)
+    limit = timestep.stable_step(material, scene.sheet, scene.time.damping_difference)
     steps = timestep.steps_per_frame(scene.time, limit)
     grid = TimeGrid(scene.time.frames_per_second, scene.time.frames, steps, "f64")
-    plan = on(Plan(scene, image, fixed, sheet, limit, grid, probe_slots(scene.probes, scene.sheet, grid.step)), "cpu")
+    plan = on(
+        Plan(scene, image, fixed, material, limit, grid, probe_slots(scene.probes, scene.sheet, grid.step)), "cpu"
+    )
     return plan, list(timestep.step_problems(plan))
 
 

@@ -16,7 +16,7 @@ from taichi_msm.physics.run_progress import RunProgress
 from taichi_msm.scene import MAX_POINTS
 
 # The stability limit holds while no spring is compressed below this share of its rest length (see
-# `material.highest_frequency`).
+# `SpringTerm.bound`).
 SHORTEST = 0.5
 
 # No tissue can be stretched to more than this many times its rest length.

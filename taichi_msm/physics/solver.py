@@ -1,16 +1,8 @@
 """The interface to kernel 1, which computes the force on every point and its Verlet step, a frame in few launches.
 
-State of point P: its displacement u_n = x_n - X and the last difference d_n = u_n - u_{n-1}, from which the Verlet
-step (eq. 6 to 9) reads
-
-    d_{n+1} = keep d_n + gain F_n,    u_{n+1} = u_n + d_{n+1}
-
-    central:   keep = (1 - g h / 2) / (1 + g h / 2)    gain = h^2 / m / (1 + g h / 2)    g = C / m
-    backward:  keep = 1 - g h                          gain = h^2 / m
-    step 0:    d_0 = 0                                 gain = h^2 / m / 2
-
-This is the position form rearranged so that nothing cancels: in f32 it keeps the digits of a small motion on a large
-sheet.
+State of point P: its displacement u_n = x_n - X and the last difference d_n = u_n - u_{n-1}, which a Verlet step
+changes as `terms.damping` tells. This is the position form (eq. 6 to 9) rearranged so that nothing cancels: in f32 it
+keeps the digits of a small motion on a large sheet.
 """
 
 from __future__ import annotations
@@ -22,37 +14,29 @@ import numpy as np
 from numpy.typing import NDArray
 
 from taichi_msm.errors import ArgumentError, DeviceError, MsmError
-from taichi_msm.physics.kernel import (
-    ACROSS,
-    AREA,
-    BENT,
-    BYTES,
-    COLUMN_ROWS,
-    HAS_LEFT,
-    HAS_RIGHT,
-    LEAST,
-    MEASURES,
-    MOST,
-    MOTION,
-    MOVES,
-    SLOT_COLUMN,
-    SLOT_COLUMNS,
-    STRETCHED,
-    TENSE,
-    Code,
-    ReadArguments,
-    Start,
-    Structure,
-)
+from taichi_msm.physics.kernel import BYTES, SheetLayout, SheetReading, Start, StepKernel
 from taichi_msm.physics.kernel_cpu import Sweep
 from taichi_msm.physics.kernel_gpu import STEPS_PER_LAUNCH, Gather
 from taichi_msm.physics.lattice import axes, spacing
-from taichi_msm.physics.loads import decay, schedule
-from taichi_msm.physics.material import area_shares, has_fixed_border, stiffness
+from taichi_msm.physics.loads import schedule
+from taichi_msm.physics.material import area_shares
 from taichi_msm.physics.plan import Plan
-from taichi_msm.physics.probe_force import probe_force
 from taichi_msm.physics.state import Reading, State
-from taichi_msm.physics.verlet import coefficients
+from taichi_msm.physics.terms import terms_of
+from taichi_msm.physics.terms.damping import coefficients
+from taichi_msm.physics.terms.probes import ProbeTerm, standing, standing_decays
+from taichi_msm.physics.terms.springs import LEAST, MOST, SpringTerm
+from taichi_msm.physics.terms.term import (
+    ACROSS,
+    AREA,
+    COLUMN_ROWS,
+    GAIN,
+    HAS_LEFT,
+    HAS_RIGHT,
+    MOTION,
+    MOVES,
+    StepCode,
+)
 from taichi_msm.progress import Pause
 from taichi_msm.system.resources import available_threads
 from taichi_msm.system.runtime import Device, lanes
@@ -76,7 +60,7 @@ MAX_STEPS_PER_LAUNCH = 8192
 STEPS_PER_TABLE = 4096
 
 
-def structure(plan: Plan, device: Device, cores: int | None = None) -> Structure:
+def layout_of(plan: Plan, device: Device, cores: int | None = None) -> SheetLayout:
     """Choose how a sheet is laid out and shared out, and what is compiled for it: only the terms that the scene has.
 
     Args:
@@ -87,9 +71,7 @@ def structure(plan: Plan, device: Device, cores: int | None = None) -> Structure
     Raises:
         DeviceError: when the device cannot do what the scene needs.
     """
-    rows, cols = plan.scene.sheet.points
-    fixed, material, precision = plan.fixed, plan.material, plan.grid.precision
-    open_edges = not has_fixed_border(fixed)
+    (rows, cols), fixed, precision = plan.scene.sheet.points, plan.fixed, plan.grid.precision
     fixed_rows = bool(fixed[0].all()), bool(fixed[-1].all())
     if device.arch == "cpu":
         # Workers wait by spinning, so more workers than cores would only hold each other up.
@@ -97,29 +79,15 @@ def structure(plan: Plan, device: Device, cores: int | None = None) -> Structure
         workers = max(1, min(cores, rows * cols // POINTS_PER_WORKER, (rows - sum(fixed_rows)) // 2))
     else:
         workers = 0
-    code = Code(
-        precision=precision,
-        lanes=lanes(precision),
-        structural=max(material.across, material.down) > 0,
-        shear=material.shear > 0,
-        open_edges=open_edges,
-        by_area=open_edges and material.by_area,
-        mapped=material.factors is not None,
-        tense=material.tension > 0,
-        bending=material.bending > 0,
-        virtual=material.virtual > 0,
-        damped=material.drag > 0,
-        slots_move=_moves(plan),
-        slots_by_area=_slots_by_area(plan),
-    )
-    if device.arch == "vulkan" and precision == "f64" and any(code.slots_move):
+    code = StepCode(precision, lanes(precision), plan.open_edges and plan.material.by_area, terms_of(plan))
+    if device.arch == "vulkan" and precision == "f64" and any(slot.moves for slot in plan.slots):
         raise DeviceError(
             "--arch vulkan: has no exp in f64, which control points that move need; take time.precision: f32 without a "
             "tolerance or an estimate of the error, or --arch cpu"
         )
     fits = workers == 0 or rows // workers * cols * NUMBERS_PER_POINT * BYTES[precision] <= CACHE
-    depth = 1 if fits or code.bending else DEPTH
-    return Structure(rows, cols, workers, depth, fixed_rows, code)
+    depth = 1 if fits or code.reach > 1 else DEPTH
+    return SheetLayout(rows, cols, workers, depth, fixed_rows, code)
 
 
 class Dynamics:
@@ -128,30 +96,22 @@ class Dynamics:
     Args:
         plan: of the scene.
         device: what `runtime.start` returned.
-        layout: a structure in the place of the scene's own; for tests.
+        layout: in the place of the scene's own; for tests.
         cores: number of cores that stepping may use; None: all.
 
     Attributes:
         plan: of what is stepped.
-        structure: what the kernels are compiled for.
+        structure: the layout, and what the kernels are compiled for.
         steps_done: number of steps taken.
         launches: number of times that a series of steps was taken, each followed by a call of `pause`.
         torn: whether an exception, such as KeyboardInterrupt, came while steps were taken, so that it is not known how
             many were; then only `restart` helps.
     """
 
-    def __init__(
-        self,
-        plan: Plan,
-        device: Device,
-        layout: Structure | None = None,
-        cores: int | None = None,
-    ) -> None:
-        self._device = device
-        self._cores = cores
-        self._layout = layout
+    def __init__(self, plan: Plan, device: Device, layout: SheetLayout | None = None, cores: int | None = None) -> None:
+        self._device, self._layout, self._cores = device, layout, cores
         self.launches = 0
-        self._sheet: Sweep | Gather | None = None
+        self._sheet: StepKernel | None = None
         self.restart(plan)
 
     def restart(self, plan: Plan, state: State | None = None) -> None:
@@ -162,7 +122,7 @@ class Dynamics:
             state: what `state` returned for the same points and steps, to continue from; None: at rest.
         """
         self.plan = plan
-        self.structure = self._layout or structure(plan, self._device, self._cores)
+        self.structure = self._layout or layout_of(plan, self._device, self._cores)
         self._begin(state)
 
     def steer(self, plan: Plan) -> None:
@@ -174,17 +134,16 @@ class Dynamics:
         Raises:
             ArgumentError: when the new probes need another kernel.
         """
-        moves = _moves(plan)
-        if moves != self.structure.code.slots_move:
-            before = _in_words(self.structure.code.slots_move)
+        probes, before = ProbeTerm.of(plan), self.structure.code.require(ProbeTerm)
+        if probes.moves != before.moves:
             raise ArgumentError(
-                f"probes: which control points move or jump cannot change (before: {before}; now: {_in_words(moves)}); "
-                "restart with the new scene"
+                f"probes: which control points move or jump cannot change (before: {_in_words(before.moves)}; now: "
+                f"{_in_words(probes.moves)}); restart with the new scene"
             )
-        if _slots_by_area(plan) != self.structure.code.slots_by_area:
+        if probes.by_area != before.by_area:
             raise ArgumentError("probes: one has total instead of force, or the reverse; restart with the new scene")
-        if _standing(plan) != _standing(self.plan):
-            self._moving.set_decay(_standing_decays(plan))
+        if standing(plan) != standing(self.plan):
+            self._moving.set_decay(standing_decays(plan))
         self.plan = plan
         # A caller that steers will steer again in a frame, so no more loads than those of a frame are tabulated.
         self._first_tabled, self._loads = self.steps_done, self._table(self.steps_done, plan.grid.steps_per_frame)
@@ -210,7 +169,7 @@ class Dynamics:
         while self.steps_done < end:
             count = min(most, end - self.steps_done)
             self.torn = True
-            self._moving.advance(count, self._arguments, self._next_loads(count))
+            self._moving.advance(count, self._next_loads(count))
             self.steps_done += count
             self.torn = False
             self.launches += 1
@@ -218,7 +177,7 @@ class Dynamics:
 
     def compile(self) -> None:
         """Compile the step and the read-out without moving anything."""
-        self._moving.compile(self._arguments, self._loads)
+        self._moving.compile(self._loads)
         self.displacement()
 
     def displacement(self) -> NDArray[Any]:
@@ -238,29 +197,25 @@ class Dynamics:
         """Read the displacements and measure the sheet, in the scene's precision."""
         self._require_whole()
         displacement, measures = self._copy(differences=False)
+        code, plan = self.structure.code, self.plan
+        springs = measures[:, code.first_measure(SpringTerm) :]
+        # The measures are (L^2 - L0^2) / L0^2.
         shortest, longest = (
-            math.sqrt(max(0.0, 1.0 + float(one))) for one in (measures[:, LEAST].min(), measures[:, MOST].max())
+            math.sqrt(max(0.0, 1.0 + float(extreme))) for extreme in (springs[:, LEAST].min(), springs[:, MOST].max())
         )
         sums = measures.sum(axis=0, dtype=np.float64)
-        material, (dx, dy) = self.plan.material, spacing(self.plan.scene.sheet)
-        squares = np.array([dx**2, dy**2, dx**2 + dy**2])
-        stiffness = np.ones(3) if self.structure.code.mapped else np.array(material.stiffness)
-        springs = (stiffness * sums[STRETCHED : STRETCHED + 3] + material.tensions * sums[TENSE : TENSE + 3]) @ squares
-        motion = material.mass * sums[MOTION] / self.plan.grid.step**2
-        return Reading(
-            self.steps_done,
-            displacement,
-            shortest,
-            longest,
-            float(springs + motion + material.bending * sums[BENT]) / 2,
-        )
+        energy = plan.material.mass * float(sums[MOTION]) / plan.grid.step**2
+        for term in code.terms:
+            first = code.first_measure(type(term))
+            energy += term.energy(sums[first : first + len(term.reductions)], plan)
+        return Reading(self.steps_done, displacement, shortest, longest, energy / 2)
 
     def _copy(self, *, differences: bool) -> tuple[NDArray[Any], NDArray[Any]]:
         """Copy the displacements or the differences, and the measures of every row."""
-        s = self.structure
-        out, measures = np.empty((s.rows, s.cols, 3), self._real), np.empty((s.rows, MEASURES), self._real)
-        self._moving.read(spacing(self.plan.scene.sheet), ReadArguments(differences, out, measures))
-        return out, measures
+        rows, cols, code = self.structure.rows, self.structure.cols, self.structure.code
+        values, measures = np.empty((rows, cols, 3), self._real), np.empty((rows, code.first_measure(None)), self._real)
+        self._moving.read(SheetReading(differences, values, measures))
+        return values, measures
 
     def _require_whole(self) -> None:
         if self.torn:
@@ -271,7 +226,7 @@ class Dynamics:
         self._sheet = None
 
     @property
-    def _moving(self) -> Sweep | Gather:
+    def _moving(self) -> StepKernel:
         assert self._sheet is not None, "it is closed"
         return self._sheet
 
@@ -279,18 +234,9 @@ class Dynamics:
         """Prepare the sheet at rest or in a given state."""
         self._real = np.dtype(np.float32 if self.structure.code.precision == "f32" else np.float64)
         self.steps_done, self.torn = 0 if state is None else state.steps, True
-        plan = self.plan
-        self._verlet = coefficients(plan.material, plan.grid.step, plan.scene.time.damping_difference)
-        self._arguments = self._numbers()
         self._first_tabled, self._loads = self.steps_done, self._table(self.steps_done, STEPS_PER_TABLE)
         self._place(state)
         self.torn = False
-
-    def _numbers(self) -> tuple[float, ...]:
-        """List the scene's numbers in the order of the kernel's arguments."""
-        material, sheet = self.plan.material, self.plan.scene.sheet
-        numbers = *material.stiffness, *material.tensions, material.bending
-        return self._verlet.keep, *spacing(sheet), *numbers, sheet.size[0] / 2
 
     def _next_loads(self, count: int) -> NDArray[Any]:
         """Give the table of the loads of the next steps, shape (count, columns)."""
@@ -303,77 +249,37 @@ class Dynamics:
 
     def _table(self, first: int, count: int) -> NDArray[Any]:
         """Tabulate the loads of steps first, ..., first + count - 1, shape (count, columns)."""
-        plan, loads = self.plan, schedule(self.plan, first, count)
-        table = np.empty((count, self.structure.code.load_columns))
-        table[:, 0] = self._verlet.gain
+        plan, code, loads = self.plan, self.structure.code, schedule(self.plan, first, count)
+        table, verlet = np.empty((count, code.first_column(None))), coefficients(plan)
+        table[:, GAIN] = verlet.gain
         if first == 0:
-            table[0, 0] = self._verlet.first_gain
-        table[:, 1] = plan.material.virtual * loads.active
-        slot = table[:, SLOT_COLUMN:].reshape(count, len(plan.slots), SLOT_COLUMNS)
-        slot[..., :3] = loads.strength
-        slot[..., 3:5] = loads.point
-        for n, part in enumerate(plan.slots):
-            acts = probe_force(plan.scene.probes[part.probe], plan.scene.sheet)
-            slot[:, n, 5:] = acts.falloff, acts.shift, acts.offset
+            table[0, GAIN] = verlet.first_gain
+        for term in code.terms:
+            first_column = code.first_column(type(term))
+            table[:, first_column : first_column + term.column_count] = term.columns(plan, loads)
         # Loads too large for f32 become infinite; the next reading of the sheet shows it.
         with np.errstate(over="ignore"):
             return table.astype(self._real)
 
     def _place(self, state: State | None) -> None:
         """Fill the arrays of the sheet."""
-        s, plan, sheet = self.structure, self.plan, self.plan.scene.sheet
-        moves, column, areas = ~plan.fixed, np.arange(s.cols), area_shares(sheet)
+        layout, plan, sheet = self.structure, self.plan, self.plan.scene.sheet
+        moves, column, areas = ~plan.fixed, np.arange(layout.cols), area_shares(sheet)
         # Rows are of three kinds: the first, any in between, the last.
-        kinds = [0, s.rows // 2, -1]
-        shares = areas[kinds] if s.code.by_area else np.ones((3, s.cols))
-        by_column = np.empty((COLUMN_ROWS, s.cols))
+        kinds = [0, layout.rows // 2, -1]
+        shares = areas[kinds] if layout.code.by_area else np.ones((3, layout.cols))
+        by_column = np.empty((COLUMN_ROWS, layout.cols))
         by_column[MOVES : MOVES + 3] = moves[kinds] / shares
         by_column[AREA : AREA + 3] = areas[kinds]
         by_column[ACROSS] = axes(sheet)[0]
         by_column[HAS_LEFT] = column > 0
-        by_column[HAS_RIGHT] = column < s.cols - 1
+        by_column[HAS_RIGHT] = column < layout.cols - 1
+        numbers = *spacing(sheet), sheet.size[0] / 2, *(n for term in layout.code.terms for n in term.numbers(plan))
+        stiffness = layout.code.require(SpringTerm).laid_out(plan)
         self._sheet = None  # Frees its memory before another sheet takes some.
-        kind = Sweep if s.workers else Gather
-        begun = None if state is None else (state.displacement, state.difference)
-        self._sheet = kind(s, Start(by_column, _standing_decays(plan), _mapped_stiffness(plan), begun))
-
-
-def _moves(plan: Plan) -> tuple[bool, ...]:
-    """Tell for every slot whether its control point moves."""
-    return tuple(slot.moves for slot in plan.slots)
-
-
-def _slots_by_area(plan: Plan) -> tuple[bool, ...]:
-    """Tell for every slot whether there are points at a free edge, and these get less of its force than others."""
-    open_edges = not has_fixed_border(plan.fixed)
-    return tuple(open_edges and plan.scene.probes[slot.probe].total is not None for slot in plan.slots)
-
-
-def _mapped_stiffness(plan: Plan) -> tuple[NDArray[Any], NDArray[Any], NDArray[Any]] | None:
-    """Give the stiffness k - tau of every spring in the form of `Start`; None without a map."""
-    material = plan.material
-    if material.factors is None:
-        return None
-    parts = zip(stiffness(material, material.factors), material.tensions, strict=True)
-    along_rows, along_columns, diagonals = (np.maximum(k - tension, 0) for k, tension in parts)
-    return (
-        np.pad(along_rows, ((0, 0), (0, 1))),
-        np.pad(along_columns, ((1, 1), (0, 0))),
-        np.pad(diagonals, ((1, 1), (0, 1))),
-    )
-
-
-def _standing(plan: Plan) -> list[tuple[object, ...]]:
-    """List everything that the decays of the standing slots depend on."""
-    probes = [plan.scene.probes[slot.probe] for slot in plan.slots if not slot.moves]
-    return [(probe.at, probe_force(probe, plan.scene.sheet)[1:]) for probe in probes]
-
-
-def _standing_decays(plan: Plan) -> NDArray[np.float64]:
-    """Evaluate the decays of all standing slots, shape (slots, rows, cols)."""
-    scene = plan.scene
-    return np.array([decay(scene.probes[slot.probe], scene.sheet) for slot in plan.slots if not slot.moves])
+        kind = Sweep if layout.workers else Gather
+        self._sheet = kind(layout, Start(np.array(numbers), by_column, standing_decays(plan), stiffness, state))
 
 
 def _in_words(moves: tuple[bool, ...]) -> str:
-    return ", ".join("yes" if one else "no" for one in moves) or "none"
+    return ", ".join("yes" if slot_moves else "no" for slot_moves in moves) or "none"

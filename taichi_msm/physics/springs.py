@@ -10,8 +10,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from taichi_msm.physics.lattice import spacing
-from taichi_msm.physics.material import area_shares, stiffness
+from taichi_msm.physics.material import area_shares
 from taichi_msm.physics.plan import Plan
+from taichi_msm.physics.terms.springs import stiffness
 
 Array = NDArray[np.float64]
 Window = tuple[slice, slice]
@@ -44,15 +45,16 @@ class SpringFamily(NamedTuple):
 def spring_families(plan: Plan) -> Iterator[SpringFamily]:
     """List the springs along rows, along columns and along both diagonals, each spring once."""
     (rows, cols), (dx, dy), sheet = plan.scene.sheet.points, spacing(plan.scene.sheet), plan.material
-    k = stiffness(sheet, np.ones((rows - 1, cols - 1)) if sheet.factors is None else sheet.factors)
+    factors = np.ones((rows - 1, cols - 1)) if sheet.factors is None else sheet.factors
+    across, down_columns, shear = stiffness(sheet, factors)
     # Under tension a spring pulls at rest as if there were no map; at edges half as strongly, like its stiffness.
     shares = (np.where(np.isin(np.arange(count), (0, count - 1)), 0.5, 1.0) for count in (rows, cols))
     of_rows, of_columns = np.ix_(*shares) if sheet.by_area else (1.0, 1.0)
     for down, right, own, unmapped in (
-        (0, 1, k.across, sheet.across * of_rows),
-        (1, 0, k.down, sheet.down * of_columns),
-        (1, 1, k.shear, sheet.shear),
-        (1, -1, k.shear, sheet.shear),
+        (0, 1, across, sheet.across * of_rows),
+        (1, 0, down_columns, sheet.down * of_columns),
+        (1, 1, shear, sheet.shear),
+        (1, -1, shear, sheet.shear),
     ):
         here = slice(0, rows - down), slice(max(0, -right), cols - max(0, right))
         there = slice(down, rows), slice(max(0, right), cols - max(0, -right))

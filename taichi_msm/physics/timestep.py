@@ -9,8 +9,9 @@ from typing import Any
 
 from taichi_msm.errors import Problem
 from taichi_msm.physics.lattice import spacing
-from taichi_msm.physics.material import Material, highest_frequency
+from taichi_msm.physics.material import Material
 from taichi_msm.physics.plan import Plan
+from taichi_msm.physics.terms import highest_frequency
 from taichi_msm.scene import WHOLE, Scene, Sheet, Time
 
 # Lengths [m] whose squares, and a few of their products, f32 holds.

@@ -7,12 +7,16 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from taichi_msm.render.samples import Integers
 from taichi_msm.system.launches import Launches, end_thread
 from taichi_msm.system.runtime import our_compilation, ti
 
 # The bounds of a cell: its first and last column and row, within the picture; the last is before the first for a cell
 # that is not seen.
 FIRST_X, FIRST_Y, LAST_X, LAST_Y, BOUNDS = range(5)
+
+# Farther from the picture nothing is followed.
+FARTHEST = 1e6
 
 # The largest number of entries in all lists, per cell and bin.
 MOST_ENTRIES = 64
@@ -71,10 +75,10 @@ def _in_turn(bounds: Any, cells: int, extent: tuple[int, int], size: int) -> Bin
 
 
 def _at_once(launches: Launches, bounds: Any, cells: int, extent: tuple[int, int], size: int) -> Bins:
-    found = launches.take(bounds).reshape(cells, 2, 2)
+    corners = launches.take(bounds).reshape(cells, 2, 2)
     while True:
         across, down = (-(-side // size) for side in extent)
-        reached = np.maximum(found[:, 1] // size - found[:, 0] // size + 1, 0).prod(axis=1, dtype=np.int64)
+        reached = np.maximum(corners[:, 1] // size - corners[:, 0] // size + 1, 0).prod(axis=1, dtype=np.int64)
         ends = np.cumsum(reached)
         if ends[-1] <= MOST_ENTRIES * (cells + across * down):
             break
@@ -92,6 +96,28 @@ def _at_once(launches: Launches, bounds: Any, cells: int, extent: tuple[int, int
 
 
 @ti.func
+def store_bounds(cell, left, right, top, bottom, width, height, bounds: ti.template()):
+    """Store the bounds of a cell in a picture of this width and height."""
+    here = cell * BOUNDS
+    bounds[here + FIRST_X] = ti.cast(ti.floor(ti.math.clamp(left, 0.0, FARTHEST)), ti.i32)
+    bounds[here + FIRST_Y] = ti.cast(ti.floor(ti.math.clamp(top, 0.0, FARTHEST)), ti.i32)
+    bounds[here + LAST_X] = ti.cast(ti.floor(ti.math.clamp(right, -1.0, width - 1.0)), ti.i32)
+    bounds[here + LAST_Y] = ti.cast(ti.floor(ti.math.clamp(bottom, -1.0, height - 1.0)), ti.i32)
+
+
+@ti.func
+def reaches(cell, x, y, bounds: ti.template()):
+    """Tell whether (x, y) is within the bounds of a cell."""
+    here = cell * BOUNDS
+    return (
+        bounds[here + FIRST_X] <= x
+        and x <= bounds[here + LAST_X]
+        and bounds[here + FIRST_Y] <= y
+        and y <= bounds[here + LAST_Y]
+    )
+
+
+@ti.func
 def _reached(cell, size, bounds: ti.template()):
     """Give the bins that a cell reaches: their first and end column, their first and end row."""
     here = cell * BOUNDS
@@ -104,13 +130,7 @@ def _reached(cell, size, bounds: ti.template()):
 
 
 @ti.kernel
-def _count(
-    cells: ti.i32,
-    size: ti.i32,
-    across: ti.i32,
-    bounds: ti.types.ndarray(dtype=ti.i32, ndim=1),
-    ends: ti.types.ndarray(dtype=ti.i32, ndim=1),
-):
+def _count(cells: ti.i32, size: ti.i32, across: ti.i32, bounds: Integers, ends: Integers):
     """Count the cells of every bin; the count of bin n is in entry n + 1."""
     ti.loop_config(serialize=True)
     for cell in range(cells):
@@ -121,14 +141,7 @@ def _count(
 
 
 @ti.kernel
-def _fill(
-    cells: ti.i32,
-    size: ti.i32,
-    across: ti.i32,
-    bounds: ti.types.ndarray(dtype=ti.i32, ndim=1),
-    ends: ti.types.ndarray(dtype=ti.i32, ndim=1),
-    entries: ti.types.ndarray(dtype=ti.i32, ndim=1),
-):
+def _fill(cells: ti.i32, size: ti.i32, across: ti.i32, bounds: Integers, ends: Integers, entries: Integers):
     """List the cells of every bin; `ends` holds where each list begins, and afterwards where it ends."""
     ti.loop_config(serialize=True)
     for cell in range(cells):
@@ -154,18 +167,9 @@ def owner(item, count, ends: ti.template()):
 
 @ti.kernel
 def _enter(
-    first: ti.i32,
-    end: ti.i32,
-    ended: ti.types.ndarray(dtype=ti.i32, ndim=1),
-    cells: ti.i32,
-    size: ti.i32,
-    across: ti.i32,
-    bounds: ti.types.ndarray(dtype=ti.i32, ndim=1),
-    ends: ti.types.ndarray(dtype=ti.i32, ndim=1),
-    counts: ti.types.ndarray(dtype=ti.i32, ndim=1),
-    squares: ti.types.ndarray(dtype=ti.i32, ndim=1),
-    places: ti.types.ndarray(dtype=ti.i32, ndim=1),
-):
+    first: ti.i32, end: ti.i32, ended: Integers, cells: ti.i32, size: ti.i32, across: ti.i32,
+    bounds: Integers, ends: Integers, counts: Integers, squares: Integers, places: Integers,
+):  # fmt: skip
     """Find the bin and the place in its list of every entry, and so the length of every list."""
     for entry in range(first, end):
         cell = owner(entry, cells, ends)
@@ -179,16 +183,9 @@ def _enter(
 
 @ti.kernel
 def _enlist(
-    first: ti.i32,
-    end: ti.i32,
-    ended: ti.types.ndarray(dtype=ti.i32, ndim=1),
-    cells: ti.i32,
-    ends: ti.types.ndarray(dtype=ti.i32, ndim=1),
-    squares: ti.types.ndarray(dtype=ti.i32, ndim=1),
-    places: ti.types.ndarray(dtype=ti.i32, ndim=1),
-    starts: ti.types.ndarray(dtype=ti.i32, ndim=1),
-    entries: ti.types.ndarray(dtype=ti.i32, ndim=1),
-):
+    first: ti.i32, end: ti.i32, ended: Integers, cells: ti.i32, ends: Integers, squares: Integers, places: Integers,
+    starts: Integers, entries: Integers,
+):  # fmt: skip
     """Put every entry into its place."""
     for entry in range(first, end):
         entries[starts[squares[entry]] + places[entry]] = owner(entry, cells, ends)

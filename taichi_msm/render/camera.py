@@ -63,6 +63,21 @@ class View(NamedTuple):
         """Unit vector toward the camera, shape (3,)."""
         return self.axes[2]
 
+    def project(self, points: Array) -> Array:
+        """Map points [m], shape (..., 3), to (X, Y, w, depth), shape (..., 4)."""
+        return points @ self.matrix[:, :3].T + self.matrix[:, 3]
+
+    def sight(self, pixel: tuple[float, float]) -> View:
+        """Give a view in which what is seen at the centre of a pixel has X = 0 and Y = 0.
+
+        Args:
+            pixel: x to the right and y down from the picture's top-left pixel, which is (0, 0).
+        """
+        matrix = self.matrix.copy()
+        for row in (0, 1):
+            matrix[row] -= (pixel[row] + 0.5) * matrix[2]
+        return self._replace(matrix=matrix)
+
 
 def calibration(camera: View) -> dict[str, list[list[float]]]:
     """Describe a camera by the matrices that other programs use.
@@ -72,13 +87,13 @@ def calibration(camera: View) -> dict[str, list[list[float]]]:
         pinhole also, in OpenCV's convention (x right, y down, z forward): intrinsics, 3 x 3; pose, 3 x 4, from the
         world to the camera.
     """
-    found = {"projection": camera.matrix[:3].tolist()}
+    matrices = {"projection": camera.matrix[:3].tolist()}
     if camera.pinhole:
         turn = camera.axes * np.array([[1.0], [-1.0], [-1.0]])
         x, y = camera.centre.tolist()
-        found["intrinsics"] = [[camera.scale, 0.0, x], [0.0, camera.scale, y], [0.0, 0.0, 1.0]]
-        found["pose"] = np.concatenate([turn, -turn @ camera.eye[:, None]], axis=1).tolist()
-    return found
+        matrices["intrinsics"] = [[camera.scale, 0.0, x], [0.0, camera.scale, y], [0.0, 0.0, 1.0]]
+        matrices["pose"] = np.concatenate([turn, -turn @ camera.eye[:, None]], axis=1).tolist()
+    return matrices
 
 
 def view(scene: Scene) -> View:
@@ -87,7 +102,7 @@ def view(scene: Scene) -> View:
     Raises:
         SceneError: when it sees nothing.
     """
-    if blind := [str(problem) for problem in problems(scene)]:
+    if blind := [str(problem) for problem in camera_problems(scene)]:
         raise SceneError(blind)
     camera = scene.render.camera
     if camera == "top":
@@ -97,7 +112,7 @@ def view(scene: Scene) -> View:
     return _pinhole(_oblique(scene), scene)
 
 
-def problems(scene: Scene) -> Iterator[Problem]:
+def camera_problems(scene: Scene) -> Iterator[Problem]:
     """Say why a pinhole camera sees nothing, or cannot be computed, if so."""
     camera = scene.render.camera
     if not isinstance(camera, Camera):

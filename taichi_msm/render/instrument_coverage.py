@@ -8,27 +8,9 @@ beyond an end of the segment, the line of sight is intersected with the sphere a
 
 # No `from __future__ import annotations` here: Taichi reads the annotations of a kernel.
 
-from collections.abc import Callable
-from functools import cache
-from typing import Any
-
-from taichi_msm.render.numbers import (
-    AXIS,
-    BOTTOM,
-    CENTRE_X,
-    CENTRE_Y,
-    LEFT,
-    LENGTH,
-    PINHOLE,
-    RADIUS,
-    RIGHT,
-    ROD_NUMBERS,
-    RODS,
-    SPREAD,
-    TIP,
-    TOP,
-)
-from taichi_msm.render.samples import DEPTH, INFINITY, Code
+from taichi_msm.render import uniforms as uni
+from taichi_msm.render.camera_kernel import line_of_sight, w_at
+from taichi_msm.render.samples import INFINITY, centres, clip, keep, tiles_of
 from taichi_msm.system.runtime import ti
 
 
@@ -42,25 +24,18 @@ def dot(a_x, a_y, a_z, b_x, b_y, b_z):
 def meet(x, y, n, numbers: ti.template()):
     """Find where lines of sight meet rod n first.
 
-    Args:
-        x: column of the samples.
-        y: their row.
-        n: number of the rod.
-        numbers: as `view_numbers` makes them.
-
     Returns:
         The depth, INFINITY where they miss the rod, and the normal times the radius.
     """
-    rod = RODS + n * ROD_NUMBERS
-    tip, axis = rod + TIP, rod + AXIS
+    rod = uni.RODS + n * uni.ROD_NUMBERS
+    tip, axis = rod + uni.TIP, rod + uni.AXIS
     u_x, u_y, u_z = numbers[axis], numbers[axis + 1], numbers[axis + 2]
-    length, radius = numbers[rod + LENGTH], numbers[rod + RADIUS]
+    length, radius = numbers[rod + uni.LENGTH], numbers[rod + uni.RADIUS]
     # The line of sight P = O + D t; here t is counted from the depth of the tip, and the tip is at 0.
     start = numbers[tip + 2] * (-1.0)
-    across = (x - numbers[CENTRE_X]) * numbers[SPREAD]
-    up = (numbers[CENTRE_Y] - y) * numbers[SPREAD]
-    d_x, d_y, d_z = across * numbers[PINHOLE], up * numbers[PINHOLE], -1.0
-    w = start * numbers[PINHOLE] + (1.0 - numbers[PINHOLE])
+    across, up = line_of_sight(x, y, numbers)
+    d_x, d_y, d_z = across * numbers[uni.PINHOLE], up * numbers[uni.PINHOLE], -1.0
+    w = w_at(start, numbers)
     o_x, o_y, o_z = across * w - numbers[tip], up * w - numbers[tip + 1], 0.0
     # The side of the rod: a t^2 + 2 b t + c = 0.
     d_d = dot(d_x, d_y, d_z, d_x, d_y, d_z)
@@ -92,56 +67,31 @@ def meet(x, y, n, numbers: ti.template()):
     )
 
 
-@cache
-def instruments(code: Code) -> Callable[..., Any]:
-    """Make Taichi's function that covers the samples of a band with the instruments.
+@ti.func
+def cover_tile_with_rod(at, x, y, n, band: ti.template()):
+    """Cover a tile of samples with rod n."""
+    plane, samples = ti.static((band.config.plane, band.samples))
+    depth, n_x, n_y, n_z = meet(x, y, n, band.numbers)
+    visible = (w_at(depth, band.numbers) > band.near) & (depth < samples[at + plane.depth])
+    keep(at + plane.depth, visible, depth, samples)
+    keep(at + plane.instrument, visible, 255.0, samples)
+    if ti.static(band.config.metal):
+        keep(at + plane.normal_x, visible, n_x, samples)
+        keep(at + plane.normal_y, visible, n_y, samples)
+        keep(at + plane.normal_z, visible, n_z, samples)
 
-    Args:
-        code: what it is compiled for.
-    """
-    floats = code.floats
-    columns = [lane % code.tile_width + 0.5 for lane in range(code.lanes)]
-    lines = [lane // code.tile_width + 0.5 for lane in range(code.lanes)]
 
-    @ti.func
-    def cover_tile(at, x, y, n, band: ti.template()):
-        """Cover a tile of samples with rod n."""
-        depth, n_x, n_y, n_z = meet(x, y, n, band.numbers)
-        samples = ti.static(band.samples)
-        in_front = depth * band.numbers[PINHOLE] + (1.0 - band.numbers[PINHOLE]) > band.near
-        visible = in_front & (depth < samples[at + DEPTH])
-        samples[at + DEPTH] = ti.select(visible, depth, samples[at + DEPTH])
-        mask = at + ti.static(code.layout["instrument"])
-        samples[mask] = ti.select(visible, 1.0, samples[mask])
-        if ti.static(code.metal):
-            for name, value in ti.static((("normal_x", n_x), ("normal_y", n_y), ("normal_z", n_z))):
-                plane = at + ti.static(code.layout[name])
-                samples[plane] = ti.select(visible, value, samples[plane])
-
-    @ti.func
-    def cover(count, band: ti.template()):
-        """Cover a band with the instruments.
-
-        Args:
-            count: how many there are.
-            band: the band.
-        """
-        numbers = ti.static(band.numbers)
-        for n in range(count):
-            rod = RODS + n * ROD_NUMBERS
-            if numbers[rod + TOP] < band.bottom and numbers[rod + BOTTOM] > band.top:
-                first_row = ti.cast(ti.max(ti.floor(numbers[rod + TOP]), band.top), ti.i32)
-                end_row = ti.cast(ti.min(ti.ceil(numbers[rod + BOTTOM]), band.bottom), ti.i32)
-                first_line = (first_row - band.top) // code.tile_height
-                end_line = (end_row - band.top + (code.tile_height - 1)) // code.tile_height
-                first_column = ti.cast(ti.max(ti.floor(numbers[rod + LEFT]), band.left), ti.i32)
-                end_column = ti.cast(ti.min(ti.ceil(numbers[rod + RIGHT]), band.right), ti.i32)
-                first_tile = first_column // code.tile_width
-                end_tile = (end_column + (code.tile_width - 1)) // code.tile_width
-                for line in range(first_line, end_line):
-                    for tile in range(first_tile, end_tile):
-                        x = floats(columns) + ti.cast(tile * code.tile_width, ti.f32)
-                        y = floats(lines) + ti.cast(band.top + line * code.tile_height, ti.f32)
-                        cover_tile(band.first + (line * band.across + tile) * code.planes, x, y, n, band)
-
-    return cover
+@ti.func
+def cover_with_rods(count, band: ti.template()):
+    """Cover a band with its `count` instruments."""
+    config, numbers = ti.static((band.config, band.numbers))
+    for n in range(count):
+        rod = uni.RODS + n * uni.ROD_NUMBERS
+        top, bottom = numbers[rod + uni.TOP], numbers[rod + uni.BOTTOM]
+        if top < band.bottom and bottom > band.top:
+            left, right, upper, lower = clip(numbers[rod + uni.LEFT], numbers[rod + uni.RIGHT], top, bottom, band)
+            first_tile, end_tile, first_line, end_line = tiles_of(left, right, upper, lower, band)
+            for line in range(first_line, end_line):
+                for tile in range(first_tile, end_tile):
+                    x, y = centres(tile * config.tile_width, band.top + line * config.tile_height, config)
+                    cover_tile_with_rod(band.first + (line * band.across + tile) * config.planes, x, y, n, band)

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from typing import NamedTuple
+import math
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -26,6 +27,56 @@ class Labels(NamedTuple):
     coordinates: NDArray[np.float32]
     depth: NDArray[np.float32]
     instrument: NDArray[np.uint8]
+
+
+class Label(NamedTuple):
+    """How kernel 2 writes a label: one number or several for every pixel, row by row."""
+
+    first: int  # numbers per pixel of the labels before it
+    planes: tuple[str, ...]  # where a tile of samples has the numbers (samples.py)
+    nothing: float  # the number where nothing is seen
+    of_sheet: bool  # whether it tells of the sheet alone; then it is `nothing` too where an instrument is seen
+    dtype: type[np.generic]  # of its values
+
+    @property
+    def numbers(self) -> int:
+        """Its numbers per pixel."""
+        return len(self.planes)
+
+
+# The fields of `Labels`, which the kernel writes one after the other, and the numbers that all of them take per pixel.
+LABELS = {
+    "coordinates": Label(0, ("across", "down"), math.nan, of_sheet=True, dtype=np.float32),
+    "depth": Label(2, ("depth",), 0.0, of_sheet=False, dtype=np.float32),
+    "instrument": Label(3, ("instrument",), 0.0, of_sheet=False, dtype=np.uint8),
+}
+LABEL_NUMBERS = 4
+
+
+def label_channels(plane: Any) -> list[tuple[int, int, Label]]:
+    """List the planes that labels are written from, each with which of its label's numbers it is, and the label.
+
+    A label whose planes are missing stays 0.
+    """
+    return [
+        (getattr(plane, name), n, label)
+        for label in LABELS.values()
+        for n, name in enumerate(label.planes)
+        if hasattr(plane, name)
+    ]
+
+
+def labels_of(numbers: NDArray[np.float32], size: tuple[int, int]) -> Labels:
+    """Split the numbers that the kernel wrote of a picture of this width and height [px]."""
+    values, (width, height) = numbers.reshape(LABEL_NUMBERS, -1), size
+    return Labels(
+        *(
+            values[label.first : label.first + label.numbers]
+            .reshape((height, width, label.numbers)[: 2 + (label.numbers > 1)])
+            .astype(label.dtype, copy=False)
+            for label in LABELS.values()
+        )
+    )
 
 
 class Flow(NamedTuple):

@@ -32,16 +32,16 @@ def pick(position: NDArray[np.floating], refine: int, view: View, pixel: Pixel) 
         Fractions of the sheet's width from its left and of its height from its top; None if no surface is there.
     """
     rows, cols = position.shape[:2]
-    matrix = _seen_from(view, pixel)
-    found: list[Seen] = []
-    cells = np.argwhere(_may_show(position, matrix))
+    sight = view.sight(pixel)
+    seen: list[Seen] = []
+    cells = np.argwhere(_may_show(position, sight))
     for first in range(0, len(cells), CELLS):
         i, j = cells[first : first + CELLS].T
         corners = np.stack([position[i + down, j + right] for down in (0, 1) for right in (0, 1)], axis=1)
-        found += _in_cells(corners @ matrix[:, :3].T + matrix[:, 3], i, j, refine, view.near)
-    if not found:
+        seen += _in_cells(sight.project(corners), i, j, refine, view.near)
+    if not seen:
         return None
-    _, (across, down) = min(found)
+    _, (across, down) = min(seen)
     return across / (cols - 1), down / (rows - 1)
 
 
@@ -51,7 +51,7 @@ def on_rest_plane(view: View, pixel: Pixel) -> NDArray[np.floating] | None:
     Returns:
         x and y [m]; None if they do not meet in front of the camera.
     """
-    matrix = _seen_from(view, pixel)
+    matrix = view.sight(pixel).matrix
     planar = matrix[:2, :2]
     size = np.linalg.norm(planar, axis=1).prod()
     if not abs(np.linalg.det(planar)) > 1e-9 * size:
@@ -60,19 +60,11 @@ def on_rest_plane(view: View, pixel: Pixel) -> NDArray[np.floating] | None:
     return point if matrix[2] @ [*point, 0, 1] > view.near else None
 
 
-def _seen_from(view: View, pixel: Pixel) -> Array:
-    """Give the matrix that maps a point to (a, b, w, depth), shape (4, 4)."""
-    matrix = view.matrix.copy()
-    for row in (0, 1):
-        matrix[row] -= (pixel[row] + 0.5) * matrix[2]
-    return matrix
-
-
-def _may_show(position: NDArray[np.floating], matrix: Array) -> NDArray[np.bool_]:
-    """Mark the cells in which a and b can both be 0, given the matrix that maps a point to (a, b, w, depth)."""
+def _may_show(position: NDArray[np.floating], sight: View) -> NDArray[np.bool_]:
+    """Mark the cells in which a and b can both be 0."""
     rows, cols = position.shape[:2]
     marked = np.ones((rows - 1, cols - 1), dtype=bool)
-    for row in matrix[:2]:
+    for row in sight.matrix[:2]:
         # One number per point at a time: for a large sheet, all of them together do not fit into the cache.
         value = position @ row[:3] + row[3]
         for side in (value <= 0, value >= 0):
@@ -97,7 +89,7 @@ def _in_cells(corners: Array, i: NDArray[np.intp], j: NDArray[np.intp], refine: 
     quads = np.stack([vertex[:, :-1, :-1], vertex[:, :-1, 1:], vertex[:, 1:, :-1], vertex[:, 1:, 1:]], axis=-2)
     cell, line, column = np.nonzero(_around_zero(quads))
     quad = quads[cell, line, column]
-    found = []
+    seen: list[Seen] = []
     for third in (1, 2):  # the third corner, beside the two ends of the diagonal: upper right, lower left
         triangle = quad[:, [0, third, 3]]
         p, q, r = np.moveaxis(triangle[..., :2], 1, 0)
@@ -108,8 +100,8 @@ def _in_cells(corners: Array, i: NDArray[np.intp], j: NDArray[np.intp], refine: 
         for n in np.flatnonzero((share >= 0).all(axis=-1) & (w > near)):
             across = j[cell[n]] + (column[n] + share[n, 2] + (third == 1) * share[n, 1]) / parts
             along = i[cell[n]] + (line[n] + share[n, 2] + (third == 2) * share[n, 1]) / parts
-            found.append((float(depth[n]), (float(across), float(along))))
-    return found
+            seen.append((float(depth[n]), (float(across), float(along))))
+    return seen
 
 
 def _cross(p: Array, q: Array) -> Array:

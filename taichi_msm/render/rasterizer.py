@@ -15,31 +15,27 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from taichi_msm.render import uniforms as uni
 from taichi_msm.render.camera import View, view
 from taichi_msm.render.instrument import Rod
-from taichi_msm.render.labels import Labels
-from taichi_msm.render.numbers import COLS, HEIGHT, LEVEL_COUNT, LEVELS, ROD_COUNT, ROWS, WIDTH, view_numbers
+from taichi_msm.render.labels import Labels, labels_of
 from taichi_msm.render.pyramid import pyramid
 from taichi_msm.render.rasterizer_cpu import Bands
 from taichi_msm.render.rasterizer_gpu import Threads
-from taichi_msm.render.samples import Code
+from taichi_msm.render.samples import DrawingConfig
+from taichi_msm.render.uniforms import sizes_of, view_numbers
 from taichi_msm.scene import Scene
 from taichi_msm.system.runtime import lanes
 
 
 class Drawn(NamedTuple):
-    """What was drawn of one frame.
+    """What was drawn of one frame."""
 
-    Attributes:
-        picture: colours, shape (height, width, 3); None where only labels are drawn.
-        labels: what each pixel shows; None where only the picture is drawn.
-    """
-
-    picture: NDArray[np.uint8] | None
-    labels: Labels | None
+    picture: NDArray[np.uint8] | None  # colours, shape (height, width, 3); None where only labels are drawn
+    labels: Labels | None  # what each pixel shows; None where only the picture is drawn
 
 
-def structure(scene: Scene, *, picture: bool = True, labels: bool = False) -> Code:
+def drawing_config(scene: Scene, *, picture: bool = True, labels: bool = False) -> DrawingConfig:
     """Decide what the kernel must be compiled for to draw a scene.
 
     Args:
@@ -48,13 +44,13 @@ def structure(scene: Scene, *, picture: bool = True, labels: bool = False) -> Co
         labels: whether labels are wanted; for both together, the scene must have one sample per pixel.
     """
     render = scene.render
-    return Code(
+    return DrawingConfig(
         refined=render.refine > 0,
         supersample=render.supersample if picture else 1,
         shading=render.shading,
         relief=render.shading == "tissue" and picture and render.light.relief != 0,
         vignette=render.shading == "tissue" and picture and render.light.vignette != 0,
-        wireframe=render.wireframe,
+        wireframe=render.wireframe and picture,
         instruments=scene.has_instruments,
         picture=picture,
         labels=labels,
@@ -68,25 +64,22 @@ class Drawing:
     Args:
         scene: a checked scene.
         texture: the picture on the sheet, shape (height, width, 3).
-        code: what the kernel is compiled for; None: what the scene's picture needs.
+        config: what the kernel is compiled for; None: what the scene's picture needs.
     """
 
-    def __init__(self, scene: Scene, texture: NDArray[np.uint8], code: Code | None = None) -> None:
+    def __init__(self, scene: Scene, texture: NDArray[np.uint8], config: DrawingConfig | None = None) -> None:
         self.scene = scene
-        self.code = code or structure(scene)
+        self.config = config or drawing_config(scene)
         self._view = view(scene)
         self._known: tuple[View, NDArray[np.float32]] | None = None
         self._texture_size = texture.shape[1], texture.shape[0]
-        texels, levels = pyramid(texture, minified=self.code.tissue)
-        (rows, cols), (width, height) = scene.sheet.points, scene.render.size
-        self._sizes = np.zeros(LEVELS + levels.size, np.int32)
-        self._sizes[[ROWS, COLS, WIDTH, HEIGHT, LEVEL_COUNT]] = rows, cols, width, height, len(levels)
-        self._sizes[LEVELS:] = levels.flat
-        form = Threads if self.code.lanes == 1 else Bands
-        self._form: Bands | Threads = form(self.code, scene.sheet.points, scene.render.size, texels)
+        texels, levels = pyramid(texture, minified=self.config.tissue)
+        self._sizes = sizes_of(scene, levels)
+        form = Threads if self.config.lanes == 1 else Bands
+        self._form: Bands | Threads = form(self.config, scene.sheet.points, scene.render.size, texels)
 
     def draw(self, position: NDArray[Any], camera: View | None = None, rods: Sequence[Rod] = ()) -> NDArray[np.uint8]:
-        """Draw the sheet, where the code has a picture.
+        """Draw the sheet, where the config has a picture.
 
         Args:
             position: positions of the mass points [m], shape (rows, cols, 3).
@@ -101,30 +94,20 @@ class Drawing:
         return picture
 
     def look(self, position: NDArray[Any], camera: View | None = None, rods: Sequence[Rod] = ()) -> Drawn:
-        """Draw the picture, the labels or both, as the code says; arguments as for `draw`."""
-        (width, height), code = self.scene.render.size, self.code
-        self._sizes[ROD_COUNT] = len(rods)
+        """Draw the picture, the labels or both, as the config says; arguments as for `draw`."""
+        self._sizes[uni.ROD_COUNT] = len(rods)
         numbers = self._numbers(camera or self._view, rods)
         picture, labels = self._form.draw(np.ascontiguousarray(position, np.float32), numbers, self._sizes)
-        seen = np.ascontiguousarray(picture) if code.picture else None
-        if not code.labels:
-            return Drawn(seen, None)
-        pixels = width * height
-        coordinates, depth, instrument = np.split(labels, [2 * pixels, 3 * pixels])
         return Drawn(
-            seen,
-            Labels(
-                coordinates.reshape(height, width, 2),
-                depth.reshape(height, width),
-                instrument.reshape(height, width).astype(np.uint8),
-            ),
+            np.ascontiguousarray(picture) if self.config.picture else None,
+            labels_of(labels, self.scene.render.size) if self.config.labels else None,
         )
 
     def _numbers(self, camera: View, rods: Sequence[Rod]) -> NDArray[np.float32]:
         """Give the numbers of a view; without instruments they are computed again only when the camera changes."""
         if rods or self._known is None or self._known[0] is not camera:
             render, size = self.scene.render, self.scene.sheet.size
-            numbers = view_numbers(camera, render, self.code.supersample, size, self._texture_size, rods)
+            numbers = view_numbers(camera, render, self.config.supersample, size, self._texture_size, rods)
             if rods:
                 return numbers.astype(np.float32)
             self._known = camera, numbers.astype(np.float32)

@@ -10,29 +10,21 @@ drawn at a time, with a sample a thread.
 
 from collections.abc import Callable
 from functools import cache
-from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from taichi_msm.render.bins import BOUNDS, FIRST_X, FIRST_Y, LAST_X, LAST_Y, ROUNDS_OF_SEARCH, binned, owner
-from taichi_msm.render.coverage import (
-    FARTHEST,
-    POINT_NUMBERS,
-    SEEN,
-    Band,
-    Part,
-    Surface,
-    corners,
-    covering,
-    triangle_bounds,
-)
-from taichi_msm.render.instrument_coverage import instruments
-from taichi_msm.render.numbers import COLS, HEIGHT, LEVEL_COUNT, LEVELS, NEAR, PARTS, ROD_COUNT, ROWS, WIDTH
-from taichi_msm.render.patch import seen_side
-from taichi_msm.render.projection import projection
-from taichi_msm.render.samples import DEPTH, INFINITY, Code
-from taichi_msm.render.shading import Out, Texture, resolving
+from taichi_msm.render import uniforms as uni
+from taichi_msm.render.attributes import NORMAL_NUMBERS, DrawnSheet, store_normal
+from taichi_msm.render.bins import BOUNDS, ROUNDS_OF_SEARCH, binned, owner, reaches, store_bounds
+from taichi_msm.render.camera_kernel import POINT_NUMBERS, project
+from taichi_msm.render.cell import corner_of, is_whole, outlined, patch_of, triangle_bounds
+from taichi_msm.render.coverage import Part, cover
+from taichi_msm.render.instrument_coverage import cover_with_rods
+from taichi_msm.render.labels import LABEL_NUMBERS
+from taichi_msm.render.samples import INFINITY, Band, Bytes, DrawingConfig, Floats, Integers, clear
+from taichi_msm.render.shading import Output, resolve
+from taichi_msm.render.texture_filter import Appearance
 from taichi_msm.system.launches import THREADS, Launches, end_thread
 from taichi_msm.system.runtime import our_compilation, ti
 
@@ -46,32 +38,27 @@ MARGIN = 1.5
 MOST_PARTS = 1 << 22
 
 
-class Kernels(NamedTuple):
-    """The kernels of one code."""
-
-    project: Callable[..., None]
-    bound: Callable[..., None]
-    cover: Callable[..., None]
-    resolve: Callable[..., None]
-
-
 class Threads:
     """The memory of one sheet's pictures on a GPU, and their kernels; arguments as for `rasterizer_cpu.Bands`."""
 
-    def __init__(self, code: Code, points: tuple[int, int], size: tuple[int, int], texels: NDArray[np.float32]) -> None:
-        self._code, self._size, self._kernels = code, size, _kernels(code)
+    def __init__(
+        self, config: DrawingConfig, points: tuple[int, int], size: tuple[int, int], texels: NDArray[np.float32]
+    ) -> None:
+        self._config, self._size = config, size
+        self._project, self._bound = _sheet_kernels(config)
+        self._cover, self._resolve = _picture_kernels(config)
         launches = Launches(bounded=True)
         (rows, cols), (width, height) = points, size
         self._cells = (rows - 1) * (cols - 1)
-        across = width * code.supersample
+        across = width * config.supersample
         # Rows of pixels in a strip.
-        self._rows = min(max(1, THREADS // (across * code.supersample)), height)
+        self._rows = min(max(1, THREADS // (across * config.supersample)), height)
         self._texels = launches.give(texels)
-        self._point = launches.array(np.float32, rows * cols * POINT_NUMBERS)
+        self._point = launches.array(np.float32, rows * cols * (POINT_NUMBERS + NORMAL_NUMBERS))
         self._pieces = launches.array(np.int32, self._cells)
-        self._samples = ti.ndarray(code.floats, self._rows * code.supersample * across * code.planes)
-        self._colours = launches.array(np.uint8, 3 * width * height if code.picture else 1)
-        self._labels = launches.array(np.float32, 4 * width * height if code.labels else 1)
+        self._samples = ti.ndarray(config.floats, self._rows * config.supersample * across * config.planes)
+        self._colours = launches.array(np.uint8, 3 * width * height if config.picture else 1)
+        self._labels = launches.array(np.float32, LABEL_NUMBERS * width * height if config.labels else 1)
 
     def draw(
         self, position: NDArray[np.float32], numbers: NDArray[np.float32], sizes: NDArray[np.int32]
@@ -81,12 +68,12 @@ class Threads:
         Raises:
             DeviceError: when the device cut threads short.
         """
-        launches, kernels, factor = Launches(bounded=True), self._kernels, self._code.supersample
-        (width, height), rods = self._size, int(sizes[ROD_COUNT])
+        launches, factor = Launches(bounded=True), self._config.supersample
+        (width, height), rods = self._size, int(sizes[uni.ROD_COUNT])
         across, down = width * factor, height * factor
         view = launches.give(numbers), launches.give(sizes)
         with our_compilation(optimised=False):
-            kernels.project(position, *view, self._point, self._pieces)
+            self._project(position, *view, self._point, self._pieces)
         pieces = launches.take(self._pieces)
         together = max(1, min(-(-int(pieces.sum(dtype=np.int64)) // MOST_PARTS), int(pieces.max())))
         # What is behind the eye makes one empty part.
@@ -94,206 +81,154 @@ class Threads:
         parts = int(ends[-1])
         owners, bounds = launches.array(np.int32, 2 * parts), launches.array(np.int32, BOUNDS * parts)
         launches.launch(
-            kernels.bound, parts, together, *view, launches.give(ends), self._point, self._pieces, owners, bounds,
+            self._bound, parts, together, *view, launches.give(ends), self._point, self._pieces, owners, bounds,
             rounds=ROUNDS_OF_SEARCH + together,
         )  # fmt: skip
         bin_size = max(SMALLEST_BIN, round((across * down / self._cells) ** 0.5))
         bins = binned(launches, bounds, parts, (across, down), bin_size)
+        sizes[[uni.BIN_SIZE, uni.BINS_ACROSS]] = bins.size, bins.across
+        view = view[0], launches.give(sizes)
         # A sample takes one round for a part, and for each of its triangles one and one or two for tiles.
         rounds_of_part = 1 + 3 * together
         rounds_of_rods = rods * (1 + factor * (1 + factor))
-        rounds_of_shading = factor * (1 + factor * (1 + int(sizes[LEVEL_COUNT]) + rods)) + 2
+        rounds_of_shading = factor * (1 + factor * (1 + int(sizes[uni.LEVEL_COUNT]) + rods)) + 2
         for row in range(0, height, self._rows):
             rows = min(self._rows, height - row)
             top, bottom = row * factor, (row + rows) * factor
             longest = int(bins.lengths[top // bins.size : (bottom - 1) // bins.size + 1].max())
             for listed, count in launches.parts(longest, rounds_of_part):
                 launches.launch(
-                    kernels.cover, rows * factor * across,
+                    self._cover, rows * factor * across,
                     top, listed, count, together, *view, self._point, self._pieces, owners, bounds,
-                    bins.size, bins.across, bins.starts, bins.entries, self._samples,
+                    bins.starts, bins.entries, self._samples,
                     rounds=count * rounds_of_part,
                 )  # fmt: skip
             launches.launch(
-                kernels.resolve, rows * width,
+                self._resolve, rows * width,
                 row, *view, self._texels, self._samples, self._colours, self._labels,
                 rounds=rounds_of_rods + rounds_of_shading,
             )  # fmt: skip
         launches.require_ended()
-        colours = launches.take(self._colours) if self._code.picture else np.empty(0, np.uint8)
+        colours = launches.take(self._colours) if self._config.picture else np.empty(0, np.uint8)
         return colours.reshape(-1, width, 3), launches.take(self._labels)
 
 
 @cache
-def _kernels(code: Code) -> Kernels:
-    """Make the kernels of one code."""
-    factor, floats, planes = code.supersample, code.floats, code.planes
-    project_point, cover_with = projection(code), covering(code)
-    cover_rods, resolve_samples = instruments(code), resolving(code)
-
-    @ti.func
-    def count_pieces(cell, near, parts, cols, point: ti.template()):
-        """Give 1 for a cell that is drawn as a whole, else the number of its triangles; 0 if it is behind the eye."""
-        at = (cell // (cols - 1) * cols + cell % (cols - 1)) * POINT_NUMBERS
-        below = at + cols * POINT_NUMBERS
-        before, behind, resolved = True, True, True
-        for corner in ti.static((at, at + POINT_NUMBERS, below, below + POINT_NUMBERS)):
-            before = before and point[corner + 2] > near
-            behind = behind and point[corner + 2] <= near
-            resolved = resolved and abs(point[corner + SEEN]) < FARTHEST and abs(point[corner + SEEN + 1]) < FARTHEST
-        at, below = at + SEEN, below + SEEN
-        side = seen_side(
-            point[at], point[at + 1], point[at + POINT_NUMBERS], point[at + POINT_NUMBERS + 1],
-            point[below], point[below + 1], point[below + POINT_NUMBERS], point[below + POINT_NUMBERS + 1],
-        )  # fmt: skip
-        per_side = ti.cast(parts, ti.i32)
-        return ti.select(behind, 0, ti.select(before and resolved and side != 0, 1, 2 * per_side * per_side))
+def _sheet_kernels(config: DrawingConfig) -> tuple[Callable[..., None], Callable[..., None]]:
+    """Make the kernels that project the sheet, and find the bounds of its parts."""
+    factor = config.supersample
 
     @ti.kernel
-    def project(
-        position: ti.types.ndarray(dtype=ti.f32, ndim=3),
-        numbers: ti.types.ndarray(dtype=ti.f32, ndim=1),
-        sizes: ti.types.ndarray(dtype=ti.i32, ndim=1),
-        point: ti.types.ndarray(dtype=ti.f32, ndim=1),
-        pieces: ti.types.ndarray(dtype=ti.i32, ndim=1),
-    ):
-        """Project the mass points, and tell in how many pieces each cell is drawn."""
-        for index in range(sizes[ROWS] * sizes[COLS]):
-            rows, cols = sizes[ROWS], sizes[COLS]
-            project_point(position, numbers, point, index // cols, index % cols, rows, cols)
+    def project_points(
+        position: ti.types.ndarray(dtype=ti.f32, ndim=3), numbers: Floats, sizes: Integers, point: Floats,
+        pieces: Integers,
+    ):  # fmt: skip
+        """Project the mass points, and tell in how many pieces each cell is drawn.
 
-        for cell in range((sizes[ROWS] - 1) * (sizes[COLS] - 1)):
-            pieces[cell] = count_pieces(cell, numbers[NEAR], numbers[PARTS], sizes[COLS], point)
+        This is 1 for a cell that is drawn as a whole, else the number of its triangles; 0 if it is behind the eye.
+        """
+        for index in range(sizes[uni.ROWS] * sizes[uni.COLS]):
+            rows, cols = sizes[uni.ROWS], sizes[uni.COLS]
+            project(position, index // cols, index % cols, cols, numbers, point, False)
+            store_normal(position, index // cols, index % cols, rows, cols, config, numbers, point)
+
+        for cell in range((sizes[uni.ROWS] - 1) * (sizes[uni.COLS] - 1)):
+            cols, parts = sizes[uni.COLS], ti.cast(numbers[uni.PARTS], ti.i32)
+            outline = ti.static(outlined(corner_of(cell, cols), cols, numbers[uni.NEAR], point))
+            pieces[cell] = ti.select(outline.behind, 0, ti.select(is_whole(outline), 1, 2 * parts * parts))
 
     @ti.kernel
     def bound(
-        first: ti.i32,
-        end: ti.i32,
-        ended: ti.types.ndarray(dtype=ti.i32, ndim=1),
-        together: ti.i32,
-        numbers: ti.types.ndarray(dtype=ti.f32, ndim=1),
-        sizes: ti.types.ndarray(dtype=ti.i32, ndim=1),
-        ends: ti.types.ndarray(dtype=ti.i32, ndim=1),
-        point: ti.types.ndarray(dtype=ti.f32, ndim=1),
-        pieces: ti.types.ndarray(dtype=ti.i32, ndim=1),
-        owners: ti.types.ndarray(dtype=ti.i32, ndim=1),
-        bounds: ti.types.ndarray(dtype=ti.i32, ndim=1),
-    ):
+        first: ti.i32, end: ti.i32, ended: Integers, together: ti.i32, numbers: Floats, sizes: Integers,
+        ends: Integers, point: Floats, pieces: Integers, owners: Integers, bounds: Integers,
+    ):  # fmt: skip
         """Find the cell and the first piece of every part, which has `together` pieces; and its bounds [samples]."""
         for item in range(first, end):
-            cols, width, height = sizes[COLS], sizes[WIDTH] * factor, sizes[HEIGHT] * factor
-            cell = owner(item, (sizes[ROWS] - 1) * (cols - 1), ends)
+            cols, width, height = sizes[uni.COLS], sizes[uni.WIDTH] * factor, sizes[uni.HEIGHT] * factor
+            cell = owner(item, (sizes[uni.ROWS] - 1) * (cols - 1), ends)
             parts_of_cell = ti.max((pieces[cell] + together - 1) // together, 1)
             piece = (item - ends[cell] + parts_of_cell) * together
             owners[2 * item], owners[2 * item + 1] = cell, piece
-            corner = (cell // (cols - 1) * cols + cell % (cols - 1)) * POINT_NUMBERS
-            a, right, down, far = corners(corner, cols, point)
-            left, right_end, top, bottom = INFINITY, -INFINITY, INFINITY, -INFINITY
-            if pieces[cell] == 1:
-                for n in ti.static(range(4)):
-                    at = corner + (n % 2 + n // 2 * cols) * POINT_NUMBERS + SEEN
-                    left, right_end = ti.min(left, point[at]), ti.max(right_end, point[at])
-                    top, bottom = ti.min(top, point[at + 1]), ti.max(bottom, point[at + 1])
-            else:
-                b, c, d = right - a, down - a, far - right - (down - a)
-                per_side = ti.cast(numbers[PARTS], ti.i32)
+            outline = ti.static(outlined(corner_of(cell, cols), cols, numbers[uni.NEAR], point))
+            left, right, top, bottom = outline.left, outline.right, outline.top, outline.bottom
+            if pieces[cell] != 1:
+                left, right, top, bottom = INFINITY, -INFINITY, INFINITY, -INFINITY
+                patch = ti.static(patch_of(corner_of(cell, cols), cols, outline.side, False, point, False))
+                per_side = ti.cast(numbers[uni.PARTS], ti.i32)
                 for n in range(piece, ti.min(piece + together, pieces[cell])):
                     s, t = ti.cast(n // 2 % per_side, ti.f32), ti.cast(n // 2 // per_side, ti.f32)
                     low_x, high_x, low_y, high_y, _ = triangle_bounds(
-                        s, t, n % 2 == 0, 1.0 / numbers[PARTS], numbers[NEAR], width, height, a, b, c, d
+                        s, t, n % 2 == 0, 1.0 / numbers[uni.PARTS], numbers[uni.NEAR], width, height, patch
                     )
                     if not high_x < low_x:
                         # Where it is NaN it may be anywhere.
                         if not (low_x <= high_x and low_y <= high_y):
                             low_x, high_x, low_y, high_y = -INFINITY, INFINITY, -INFINITY, INFINITY
-                        left, right_end = ti.min(left, low_x), ti.max(right_end, high_x)
+                        left, right = ti.min(left, low_x), ti.max(right, high_x)
                         top, bottom = ti.min(top, low_y), ti.max(bottom, high_y)
-            at = item * BOUNDS
-            bounds[at + FIRST_X] = ti.cast(ti.floor(ti.math.clamp(left - MARGIN, 0.0, FARTHEST)), ti.i32)
-            bounds[at + FIRST_Y] = ti.cast(ti.floor(ti.math.clamp(top - MARGIN, 0.0, FARTHEST)), ti.i32)
-            bounds[at + LAST_X] = ti.cast(ti.floor(ti.math.clamp(right_end + MARGIN, -1.0, width - 1.0)), ti.i32)
-            bounds[at + LAST_Y] = ti.cast(ti.floor(ti.math.clamp(bottom + MARGIN, -1.0, height - 1.0)), ti.i32)
+            store_bounds(item, left - MARGIN, right + MARGIN, top - MARGIN, bottom + MARGIN, width, height, bounds)
             end_thread(ended)
 
+    return project_points, bound
+
+
+@cache
+def _picture_kernels(config: DrawingConfig) -> tuple[Callable[..., None], Callable[..., None]]:
+    """Make the kernels that cover the samples of a strip, and shade its pixels."""
+    factor, planes = config.supersample, config.planes
+
     @ti.kernel
-    def cover(
-        first: ti.i32,
-        end: ti.i32,
-        ended: ti.types.ndarray(dtype=ti.i32, ndim=1),
-        top: ti.i32,
-        listed: ti.i32,
-        count: ti.i32,
-        together: ti.i32,
-        numbers: ti.types.ndarray(dtype=ti.f32, ndim=1),
-        sizes: ti.types.ndarray(dtype=ti.i32, ndim=1),
-        point: ti.types.ndarray(dtype=ti.f32, ndim=1),
-        pieces: ti.types.ndarray(dtype=ti.i32, ndim=1),
-        owners: ti.types.ndarray(dtype=ti.i32, ndim=1),
-        bounds: ti.types.ndarray(dtype=ti.i32, ndim=1),
-        bin_size: ti.i32,
-        bins_across: ti.i32,
-        starts: ti.types.ndarray(dtype=ti.i32, ndim=1),
-        entries: ti.types.ndarray(dtype=ti.i32, ndim=1),
-        samples: ti.types.ndarray(dtype=floats, ndim=1),
-    ):
+    def cover_samples(
+        first: ti.i32, end: ti.i32, ended: Integers, top: ti.i32, listed: ti.i32, count: ti.i32, together: ti.i32,
+        numbers: Floats, sizes: Integers, point: Floats, pieces: Integers, owners: Integers, bounds: Integers,
+        starts: Integers, entries: Integers, samples: ti.types.ndarray(dtype=config.floats, ndim=1),
+    ):  # fmt: skip
         """Cover the samples of a strip that begins at row `top`, with `count` parts of their lists from `listed` on."""
         for index in range(first, end):
-            rows, cols, width, height = sizes[ROWS], sizes[COLS], sizes[WIDTH] * factor, sizes[HEIGHT] * factor
+            rows, cols, parts = sizes[uni.ROWS], sizes[uni.COLS], numbers[uni.PARTS]
+            width, height = sizes[uni.WIDTH] * factor, sizes[uni.HEIGHT] * factor
             x, y = index % width, top + index // width
+            line, near = index // width * width * planes, numbers[uni.NEAR]
+            texture_width, texture_height = sizes[uni.LEVELS + 1], sizes[uni.LEVELS + 2]
+            sheet = ti.static(DrawnSheet(point, rows, cols, parts, texture_width, texture_height))
+            band = ti.static(Band(config, samples, line, width, x, x + 1, y, y + 1, width, height, near, numbers))
             if listed == 0:
-                samples[index * planes + DEPTH] = floats(INFINITY)
-                if ti.static(code.instruments):
-                    samples[index * planes + ti.static(code.layout["instrument"])] = floats(0)
-            surface = ti.static(Surface(point, rows, cols, numbers[PARTS], sizes[LEVELS + 1], sizes[LEVELS + 2]))
-            line = index // width * width * planes
-            band = ti.static(Band(samples, line, width, x, x + 1, y, y + 1, width, height, numbers[NEAR], numbers))
-            square = y // bin_size * bins_across + x // bin_size
+                clear(index * planes, band)
+            square = y // sizes[uni.BIN_SIZE] * sizes[uni.BINS_ACROSS] + x // sizes[uni.BIN_SIZE]
             begin = starts[square] + listed
             for n in range(begin, ti.min(begin + count, starts[square + 1])):
-                here = entries[n] * BOUNDS
-                if (
-                    bounds[here + FIRST_X] <= x
-                    and x <= bounds[here + LAST_X]
-                    and bounds[here + FIRST_Y] <= y
-                    and y <= bounds[here + LAST_Y]
-                ):
+                if reaches(entries[n], x, y, bounds):
                     cell, piece = owners[2 * entries[n]], owners[2 * entries[n] + 1]
                     whole, last = pieces[cell] == 1, ti.min(piece + together, pieces[cell])
                     part = ti.static(Part(whole, piece, last))
-                    cover_with(cell // (cols - 1), cell % (cols - 1), part, surface, band)
+                    cover(cell // (cols - 1), cell % (cols - 1), part, sheet, band)
             end_thread(ended)
 
     @ti.kernel
-    def resolve(
-        first: ti.i32,
-        end: ti.i32,
-        ended: ti.types.ndarray(dtype=ti.i32, ndim=1),
-        row: ti.i32,
-        numbers: ti.types.ndarray(dtype=ti.f32, ndim=1),
-        sizes: ti.types.ndarray(dtype=ti.i32, ndim=1),
-        texels: ti.types.ndarray(dtype=ti.f32, ndim=1),
-        samples: ti.types.ndarray(dtype=floats, ndim=1),
-        colours: ti.types.ndarray(dtype=ti.u8, ndim=1),
-        labels: ti.types.ndarray(dtype=ti.f32, ndim=1),
-    ):
+    def resolve_pixels(
+        first: ti.i32, end: ti.i32, ended: Integers, row: ti.i32, numbers: Floats, sizes: Integers, texels: Floats,
+        samples: ti.types.ndarray(dtype=config.floats, ndim=1), colours: Bytes, labels: Floats,
+    ):  # fmt: skip
         """Cover the pixels of a strip that begins at `row` with the instruments, and write them."""
         for index in range(first, end):
-            width, height, rod_count = sizes[WIDTH], sizes[HEIGHT], sizes[ROD_COUNT]
+            width, height, rod_count = sizes[uni.WIDTH], sizes[uni.HEIGHT], sizes[uni.ROD_COUNT]
             x, y = index % width, row + index // width
             left, top, across = x * factor, y * factor, width * factor
             line = (y - row) * factor * across * planes
-            if ti.static(code.instruments):
+            if ti.static(config.instruments):
                 band = ti.static(
                     Band(
-                        samples, line, across, left, left + factor, top, top + factor,
-                        across, height * factor, numbers[NEAR], numbers,
+                        config, samples, line, across, left, left + factor, top, top + factor,
+                        across, height * factor, numbers[uni.NEAR], numbers,
                     )
                 )  # fmt: skip
-                cover_rods(rod_count, band)
-            texture = ti.static(Texture(texels, sizes, sizes[LEVELS + 1], sizes[LEVELS + 2], numbers, rod_count))
+                cover_with_rods(rod_count, band)
+            appearance = ti.static(
+                Appearance(config, texels, sizes, sizes[uni.LEVELS + 1], sizes[uni.LEVELS + 2], numbers, rod_count)
+            )
             pixels = width * height
-            out = ti.static(Out(colours, labels, pixels))
-            resolve_samples(samples, line, y, y + 1, x, x + 1, across, width, texture, out)
+            output = ti.static(Output(colours, labels, pixels))
+            resolve(line, y, y + 1, x, x + 1, across, width, samples, appearance, output)
             end_thread(ended)
 
-    return Kernels(project, bound, cover, resolve)
+    return cover_samples, resolve_pixels

@@ -134,11 +134,11 @@ class Renderer:
     def _drawing(self, style: Render | None = None, *, picture: bool, labels: bool) -> Drawing:
         key = self._key(style or self.scene.render, picture=picture, labels=labels)
         if key not in self._drawings:
-            from taichi_msm.render.rasterizer import Drawing, structure
+            from taichi_msm.render.rasterizer import Drawing, drawing_config
 
             scene = self.scene if style is None else self.scene.model_copy(update={"render": style})
             texture = self._texture() if picture else np.zeros((1, 1, 3), np.uint8)
-            self._drawings[key] = Drawing(scene, texture, structure(scene, picture=picture, labels=labels))
+            self._drawings[key] = Drawing(scene, texture, drawing_config(scene, picture=picture, labels=labels))
         return self._drawings[key]
 
     def _key(self, style: Render, *, picture: bool, labels: bool) -> tuple[object, ...]:

@@ -1,16 +1,20 @@
-"""What is stored of every sample of the picture between covering and shading, and its layout in memory.
+"""What kernel 2 is compiled for, and what is stored of every sample of the picture between covering and shading.
 
 Samples are pixels, or parts of pixels where these are supersampled. A tile of samples is one vector: 4 x 4 samples for
-the 16 lanes of AVX-512, 4 x 2 for 8 lanes, 4 x 1 for 4, a single one on a GPU. A tile takes `planes` vectors. On a CPU
-bands of rows of tiles are the unit of parallel work; a worker stores one band at a time.
+the 16 lanes of AVX-512, 4 x 2 for 8 lanes, 4 x 1 for 4, a single one on a GPU. A tile takes several vectors, its
+planes. On a CPU bands of rows of tiles are the unit of parallel work; a worker stores one band at a time.
+
+What functions of kernel 2 take: x and y are column and row of a tile's samples, a number for each; `at` the entry of
+`samples` where the tile begins; `numbers` and `sizes` the arrays of uniforms.py; `point` what `project` stores.
 """
 
-from __future__ import annotations
+# No `from __future__ import annotations` here: Taichi reads the annotations of a kernel.
 
-from dataclasses import dataclass
-from functools import cached_property
-from typing import Any
+from collections import namedtuple
+from functools import cache
+from typing import Any, NamedTuple
 
+from taichi_msm.render.labels import LABELS
 from taichi_msm.system.runtime import ti
 
 # Approximate number of rows of samples in a band on a CPU.
@@ -19,41 +23,30 @@ BAND_ROWS = 16
 # Samples in a row of a tile, if there are that many lanes.
 TILE_WIDTH = 4
 
-# The first planes of every tile: the depth of what is seen, and its place in the texture [texels]. Other planes follow
-# as the code needs them (`Code.layout`).
-DEPTH, TEXEL_X, TEXEL_Y = 0, 1, 2
-
 # Farther than anything that is drawn.
 INFINITY = 3e38
 
 
-@dataclass(frozen=True)
-class Code:
-    """What kernel 2 is compiled for; all else it takes as arguments.
+# Types of a kernel's arguments.
+Floats = ti.types.ndarray(dtype=ti.f32, ndim=1)
+Doubles = ti.types.ndarray(dtype=ti.f64, ndim=1)
+Integers = ti.types.ndarray(dtype=ti.i32, ndim=1)
+Bytes = ti.types.ndarray(dtype=ti.u8, ndim=1)
 
-    Attributes:
-        refined: whether vertices are inserted between mass points.
-        supersample: samples per pixel along each axis.
-        shading: none, headlight or tissue.
-        relief: whether tissue is shaded with a relief.
-        vignette: whether tissue is shaded with a vignette.
-        wireframe: whether the mass-point mesh is drawn.
-        instruments: whether there are any.
-        picture: whether colours are written.
-        labels: whether labels are written; needs one sample per pixel.
-        lanes: samples in a tile.
-    """
 
-    refined: bool
-    supersample: int
-    shading: str
-    relief: bool
-    vignette: bool
-    wireframe: bool
-    instruments: bool
-    picture: bool
-    labels: bool
-    lanes: int
+class DrawingConfig(NamedTuple):
+    """What kernel 2 is compiled for; all else it takes as arguments."""
+
+    refined: bool  # whether vertices are inserted between mass points
+    supersample: int  # samples per pixel along each axis
+    shading: str  # none, headlight or tissue
+    relief: bool  # whether tissue is shaded with a relief
+    vignette: bool  # whether tissue is shaded with a vignette
+    wireframe: bool  # whether the mass-point mesh is drawn
+    instruments: bool  # whether there are any
+    picture: bool  # whether colours are written
+    labels: bool  # whether labels are written; needs one sample per pixel
+    lanes: int  # samples in a tile
 
     @property
     def tile_width(self) -> int:
@@ -81,34 +74,24 @@ class Code:
         return self.picture and self.shading == "tissue"
 
     @property
-    def wires(self) -> bool:
-        """Whether the mesh is drawn over the sheet."""
-        return self.picture and self.wireframe
-
-    @property
     def metal(self) -> bool:
         """Whether instruments are shaded."""
         return self.picture and self.instruments
 
-    @cached_property
-    def layout(self) -> dict[str, int]:
-        """Map the names of the planes after the first three to the vector of a tile that each is."""
-        wanted = {
-            "light": self.headlit,  # share of the headlight that comes back
-            "wire": self.wires,  # share of the mesh's lines in the colour
-            **dict.fromkeys(("across", "down"), self.labels),  # the material point, fractions of the sheet
-            "instrument": self.instruments,  # 1 where an instrument is seen, else 0
-            **dict.fromkeys(("normal_x", "normal_y", "normal_z"), self.tissue or self.metal),  # in the camera's frame
-            **dict.fromkeys(("cell", "triangle"), self.unordered),  # their numbers
-            "footprint": self.tissue,  # square of the texels of a sample's longer side
-            **dict.fromkeys(("red", "green", "blue"), self.picture and self.supersample > 1),  # to be averaged
-        }
-        return {name: TEXEL_Y + 1 + n for n, name in enumerate(name for name, there in wanted.items() if there)}
+    @property
+    def plane(self) -> Any:
+        """The planes of a tile by name, and which of its vectors each is."""
+        return _planes(self)
 
     @property
     def planes(self) -> int:
         """Vectors stored per tile."""
-        return TEXEL_Y + 1 + len(self.layout)
+        return len(self.plane)
+
+    @property
+    def normal_planes(self) -> list[int]:
+        """The planes of the normal in the camera's frame, if what is seen is shaded by it."""
+        return [self.plane.normal_x + n for n in range(3)] if self.tissue or self.metal else []
 
     @property
     def band_rows(self) -> int:
@@ -126,27 +109,96 @@ class Code:
         return self.supersample == 1 and self.tile_width == TILE_WIDTH
 
     def tiles_across(self, width: int) -> int:
-        """Count the tiles in a row.
-
-        Args:
-            width: of the picture [px].
-        """
+        """Count the tiles in a row of a picture of this width [px]."""
         return -(-width * self.supersample // self.tile_width)
 
-    def band_vectors(self, width: int) -> int:
-        """Count the vectors that a worker stores.
-
-        Args:
-            width: of the picture [px].
-        """
-        return self.band_lines * self.tiles_across(width) * self.planes
-
-    @cached_property
+    @property
     def floats(self) -> Any:
         """Taichi's type of one floating-point number per lane."""
         return ti.types.vector(self.lanes, ti.f32)
 
-    @cached_property
+    @property
     def integers(self) -> Any:
         """Taichi's type of one whole number per lane."""
         return ti.types.vector(self.lanes, ti.i32)
+
+
+@cache
+def _planes(config: DrawingConfig) -> Any:
+    """Number the planes that a config needs."""
+    needed = {
+        **{name: config.labels for label in LABELS.values() for name in label.planes},
+        **dict.fromkeys(("depth", "texel_x", "texel_y"), True),  # of what is seen; its place in the texture [texels]
+        "light": config.headlit,  # share of the headlight that comes back
+        "wire": config.wireframe,  # share of the mesh's lines in the colour
+        "instrument": config.instruments,  # 255 where an instrument is seen, else 0
+        **dict.fromkeys(("normal_x", "normal_y", "normal_z"), config.tissue or config.metal),  # in the camera's frame
+        **dict.fromkeys(("cell", "triangle"), config.unordered),  # their numbers
+        "footprint": config.tissue,  # square of the texels of a sample's longer side
+        **dict.fromkeys(("red", "green", "blue"), config.picture and config.supersample > 1),  # to be averaged
+    }
+    names = [name for name, there in needed.items() if there]
+    return namedtuple("Planes", names)(*range(len(names)))
+
+
+class Band(NamedTuple):
+    """A band of the picture, or a part of one, and the view; all in samples."""
+
+    config: DrawingConfig
+    samples: Any  # the planes of all tiles that are kept
+    first: Any  # entry of `samples` where the band begins, from the left edge of the picture
+    across: Any  # tiles in a row
+    left: Any  # first column
+    right: Any  # the column after the last
+    top: Any  # first row
+    bottom: Any  # the row after the last
+    width: Any  # of the picture
+    height: Any
+    near: Any  # only what is farther than this is drawn
+    numbers: Any
+
+
+@ti.func
+def clip(low_x, high_x, low_y, high_y, band: ti.template()):
+    """Clip a rectangle to a band: give its first and end column, its first and end row of samples."""
+    return (
+        ti.cast(ti.math.clamp(ti.floor(low_x), band.left, band.right), ti.i32),
+        ti.cast(ti.math.clamp(ti.ceil(high_x), band.left, band.right), ti.i32),
+        ti.cast(ti.math.clamp(ti.floor(low_y), band.top, band.bottom), ti.i32),
+        ti.cast(ti.math.clamp(ti.ceil(high_y), band.top, band.bottom), ti.i32),
+    )
+
+
+@ti.func
+def tiles_of(first_column, end_column, first_row, end_row, band: ti.template()):
+    """Give the tiles of a rectangle of samples: the first and end tile in a line of tiles, the first and end line."""
+    width, height = ti.static((band.config.tile_width, band.config.tile_height))
+    return (
+        first_column // width,
+        (end_column + (width - 1)) // width,
+        (first_row - band.top) // height,
+        (end_row - band.top + (height - 1)) // height,
+    )
+
+
+@ti.func
+def centres(left, top, config: ti.template()):
+    """Give x and y of the samples of a tile, whose upper left corner is at (left, top)."""
+    width = ti.static(config.tile_width)
+    columns = config.floats([lane % width + 0.5 for lane in ti.static(range(config.lanes))])
+    lines = config.floats([lane // width + 0.5 for lane in ti.static(range(config.lanes))])
+    return columns + ti.cast(left, ti.f32), lines + ti.cast(top, ti.f32)
+
+
+@ti.func
+def clear(at, band: ti.template()):
+    """Empty a tile."""
+    band.samples[at + band.config.plane.depth] = band.config.floats(INFINITY)
+    if ti.static(band.config.instruments):
+        band.samples[at + band.config.plane.instrument] = band.config.floats(0)
+
+
+@ti.func
+def keep(at, visible, value, samples: ti.template()):
+    """Store a plane's value for the samples where it is visible."""
+    samples[at] = ti.select(visible, value, samples[at])

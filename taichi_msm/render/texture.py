@@ -53,14 +53,14 @@ def require_texture(texture: Any) -> NDArray[np.uint8]:
     """
     import numpy as np
 
-    found = as_array(texture, "texture")
-    is_picture = found.dtype == np.uint8 and found.ndim == 3 and found.shape[2] == 3
-    if not (is_picture and min(found.shape) > 0 and max(found.shape) <= MAX_SIDE):
+    picture = as_array(texture, "texture")
+    is_picture = picture.dtype == np.uint8 and picture.ndim == 3 and picture.shape[2] == 3
+    if not (is_picture and min(picture.shape) > 0 and max(picture.shape) <= MAX_SIDE):
         raise ArgumentError(
-            f"texture: {found.dtype} of shape {found.shape} is not a picture; take uint8 of shape (height, width, 3), "
-            f"up to {MAX_SIDE} a side, such as numpy.asarray(image.convert('RGB'))"
+            f"texture: {picture.dtype} of shape {picture.shape} is not a picture; take uint8 of shape "
+            f"(height, width, 3), up to {MAX_SIDE} a side, such as numpy.asarray(image.convert('RGB'))"
         )
-    return found
+    return picture
 
 
 def image_size(scene: Scene) -> tuple[int, int] | None:
@@ -79,7 +79,7 @@ def is_see_through(scene: Scene) -> bool:
         return False
 
 
-def problems(scene: Scene) -> Iterator[Problem]:
+def image_problems(scene: Scene) -> Iterator[Problem]:
     """Find, from the file's header alone, why the scene's picture or the region of it cannot be used."""
     size = None
     if scene.image is not None:

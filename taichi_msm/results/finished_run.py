@@ -21,7 +21,7 @@ from taichi_msm.outputs.table import OUTPUTS, RECORD
 from taichi_msm.physics.lattice import rest_positions
 from taichi_msm.physics.planning import try_plan
 from taichi_msm.picture import PictureError, file_sha256, read_rgb
-from taichi_msm.render import camera
+from taichi_msm.render.camera import camera_problems
 from taichi_msm.results.publication import MAX_RECORD
 from taichi_msm.scene import Scene
 
@@ -214,7 +214,7 @@ def _as_run(record: Mapping[str, Any]) -> Scene:
     scene, folder = Scene(**record["scene"]), Path(record["working_directory"])
     if folder != Path.cwd():
         scene = scene.with_pictures(lambda path: str(folder / path))
-    problems = [*try_plan(scene)[1], *camera.problems(scene)]
+    problems = [*try_plan(scene)[1], *camera_problems(scene)]
     # A picture that is missing, or has changed, is reported by the code that needs it.
     if any(problem.path[-1:] != ("image",) for problem in problems):
         raise SceneError([str(problem) for problem in problems])

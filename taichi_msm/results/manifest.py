@@ -18,7 +18,7 @@ from taichi_msm.physics.mesh_error import MeshEstimate
 from taichi_msm.physics.plan import Plan
 from taichi_msm.physics.planning import try_plan
 from taichi_msm.picture import PictureError, file_sha256
-from taichi_msm.render import camera
+from taichi_msm.render.camera import camera_problems
 from taichi_msm.results.checkpoint import CHECKPOINT, MANIFEST, open_manifest, unseal
 from taichi_msm.results.publication import STAGING
 from taichi_msm.scene import Scene
@@ -108,7 +108,7 @@ def read_manifest(directory: Path) -> tuple[Manifest, Plan]:
     # Not trusted: anybody may have written it.
     numbers = () if manifest.estimate is None else asdict(manifest.estimate).values()
     possible = manifest.arch in ARCHS and all(number >= 0 for number in numbers)
-    if plan is None or problems or not possible or list(camera.problems(manifest.scene)):
+    if plan is None or problems or not possible or list(camera_problems(manifest.scene)):
         raise DamagedError(f"{path} is of a scene that cannot be run; run the scene again")
     return manifest, plan
 

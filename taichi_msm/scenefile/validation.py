@@ -12,7 +12,8 @@ from taichi_msm.errors import ArgumentError, Problem, SceneError
 from taichi_msm.physics.plan import Plan
 from taichi_msm.physics.planning import try_plan
 from taichi_msm.physics.stiffness_map import MapImage
-from taichi_msm.render import camera, texture
+from taichi_msm.render.camera import camera_problems
+from taichi_msm.render.texture import image_problems
 from taichi_msm.scene import Scene, Section
 from taichi_msm.scenefile import budget
 
@@ -64,9 +65,9 @@ def _joint_check(
         picture: whether to check its picture too.
     """
     plan, problems = try_plan(scene, image)
-    problems += camera.problems(scene)
+    problems += camera_problems(scene)
     if picture:
-        problems += texture.problems(scene)
+        problems += image_problems(scene)
     if plan is not None:
         problems += budget.size_problems(plan)
     return plan, problems

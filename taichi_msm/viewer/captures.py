@@ -5,7 +5,7 @@ from __future__ import annotations
 import filecmp
 import os
 import shutil
-from contextlib import ExitStack
+from contextlib import ExitStack, closing
 from pathlib import Path
 from typing import Any
 
@@ -76,12 +76,6 @@ class Film:
         """End it."""
         self._opened.close()
 
-    def __enter__(self) -> Film:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self.close()
-
 
 class Captures:
     """The folder where a session saves its files; made with the first file.
@@ -125,7 +119,7 @@ class Captures:
 
     def save_film(self, film: Film) -> Path:
         """End a film that has a picture, and save it; returns its file."""
-        with film, writing(self.folder):
+        with closing(film), writing(self.folder):
             return self._place(film.encoded(), "film", ".gif")
 
     def _place(self, draft: Path, stem: str, suffix: str) -> Path:

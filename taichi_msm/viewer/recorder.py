@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable
+from contextlib import closing
 from functools import partial
 from pathlib import Path
 
@@ -44,7 +45,7 @@ def record(
     failures: list[FilesError] = []
     notice = ""
     rate, parts = session.rate / session.parts, session.parts
-    with Film(path.parent, session.scene.render, rate, parts, option=OPTION) as film:
+    with closing(Film(path.parent, session.scene.render, rate, parts, option=OPTION)) as film:
         for frame in range(frames + 1):
             progress(frame, frames)
             while upcoming is not None and upcoming[0] <= frame:

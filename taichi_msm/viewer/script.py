@@ -24,6 +24,7 @@ SECONDS = f"a number from 0 to {LONGEST:g}, in seconds"
 
 # The key that every kind of entry needs besides its time.
 NEEDS = {"press": "at", "pull": "at", "drag": "at", "release": "", "turn": "by", "percent": "to", "key": "name"}
+*KINDS, LAST_KIND = NEEDS
 
 # The kinds that may last; such an entry is spread over the frames of its duration.
 LASTING = ("drag", "turn")
@@ -39,7 +40,7 @@ class Entry(Section):
 
     t: Seconds = key(means="when, or when it begins [s]", expects=SECONDS)
     do: Literal["press", "pull", "drag", "release", "turn", "percent", "key"] = key(
-        means="what is done", expects="press, pull, drag, release, turn, percent or key"
+        means="what is done", expects=f"{', '.join(KINDS)} or {LAST_KIND}"
     )
     at: Pair | None = key(
         None, means="the pixel", expects="for press, pull and drag [x, y] in pixels from the top left"
@@ -55,10 +56,9 @@ class Entry(Section):
     def _complete(self) -> Entry:
         for name in ("at", "by", "to", "name"):
             given, needed = getattr(self, name) is not None, NEEDS[self.do] == name
-            if given and not needed:
-                raise _refused(name, "{do} takes none; remove it", do=self.do)
-            if needed and not given:
-                raise _refused(name, "missing; {do} needs it", do=self.do)
+            if given != needed:
+                message = "missing; {do} needs it" if needed else "{do} takes none; remove it"
+                raise _refused(name, message, do=self.do)
         if self.name is not None and self.name not in PRESSABLE:
             message = "there is no key '{name}' here; expected one of: {keys}"
             raise _refused("name", message, name=self.name, keys=", ".join(PRESSABLE))

@@ -119,7 +119,7 @@ class Session:
         self.scene = plan.scene
         self._figures, self._keys = True, False
         self._once = self._warned = self.paused = False
-        # Frames whose time went by, those while it was paused too.
+        # Frames that have passed, including those while it was paused.
         self._elapsed = 0
         self._notice, self._notice_until = "", 0
         self.fault = ""

@@ -14,13 +14,15 @@ from numpy.typing import NDArray
 from taichi_msm.render import style
 from taichi_msm.render.camera import View
 from taichi_msm.render.instrument import Rod
-from taichi_msm.scene import Render
+from taichi_msm.scene import Render, Scene
 
 Array = NDArray[np.float64]
 
-# Indices into the array of sizes. Three are counters: rows of mass points that workers have taken, rows projected,
-# bands taken. Last come the levels of the texture, each with its first texel, its width and its height.
-ROWS, COLS, WIDTH, HEIGHT, ROD_COUNT, ROWS_TAKEN, ROWS_PROJECTED, BANDS_TAKEN, LEVEL_COUNT, LEVELS = range(10)
+# Indices into the array of sizes: of the sheet, the picture and its bins. Three are counters: rows of mass points that
+# workers have taken, rows projected, bands taken. Last come the levels of the texture, each with its first texel, its
+# width and its height.
+ROWS, COLS, WIDTH, HEIGHT, ROD_COUNT, BIN_SIZE, BINS_ACROSS = range(7)
+ROWS_TAKEN, ROWS_PROJECTED, BANDS_TAKEN, LEVEL_COUNT, LEVELS = range(7, 12)
 LEVEL_SIZES = 3
 
 # Indices into the array of numbers. The camera: its matrix, row after row; its axes; only what is farther than NEAR is
@@ -38,10 +40,30 @@ LIGHT_X, LIGHT_Y, FARNESS, UNIT, AMBIENT, GLOSS, VIGNETTE = range(34, 41)
 # to texel.
 ACROSS, UP, SLOPE_X, SLOPE_Y = 41, 44, 47, 48
 
+# Whatever is in front of a point by less than this counts as the point's own place [m].
+TOUCHING = 49
+
 # Then the instruments, each with the middle of its tip and its axis in the camera's frame; its length and radius; and
 # its bounds in the picture [samples].
-RODS, ROD_NUMBERS = 49, 12
+RODS, ROD_NUMBERS = 50, 12
 TIP, AXIS, LENGTH, RADIUS, LEFT, TOP, RIGHT, BOTTOM = 0, 3, 6, 7, 8, 9, 10, 11
+
+
+# The above distance, as a fraction of the sheet's larger side.
+TOUCHING_SHARE = 1e-9
+
+
+def sizes_of(scene: Scene, levels: NDArray[np.int32]) -> NDArray[np.int32]:
+    """Put the sizes together, but for what changes from frame to frame.
+
+    Args:
+        scene: a checked scene.
+        levels: of the texture, as in a `Pyramid`.
+    """
+    sizes = np.zeros(LEVELS + levels.size, np.int32)
+    sizes[[ROWS, COLS, WIDTH, HEIGHT, LEVEL_COUNT]] = *scene.sheet.points, *scene.render.size, len(levels)
+    sizes[LEVELS:] = levels.flat
+    return sizes
 
 
 def view_numbers(
@@ -70,7 +92,8 @@ def view_numbers(
     numbers[LIGHT_X:ACROSS] = x, y, far, unit, light.ambient, light.gloss, light.vignette
     numbers[ACROSS:UP], numbers[UP:SLOPE_X] = view.axes[:, 0], view.axes[:, 1]
     height = light.relief / 100 / 255 * max(sheet)
-    numbers[SLOPE_X:RODS] = height * texture[0] / sheet[1], -height * texture[1] / sheet[0]
+    numbers[SLOPE_X:TOUCHING] = height * texture[0] / sheet[1], -height * texture[1] / sheet[0]
+    numbers[TOUCHING] = TOUCHING_SHARE * max(sheet)
     for n, rod in enumerate(rods):
         numbers[RODS + n * ROD_NUMBERS : RODS + (n + 1) * ROD_NUMBERS] = _rod_numbers(rod, view, factor)
     return numbers
@@ -86,7 +109,7 @@ def _rod_numbers(rod: Rod, view: View, factor: int) -> Array:
     ends = np.stack([rod.tip, rod.tip + rod.axis * rod.length])
     corner = np.array(np.meshgrid(*[(-rod.radius, rod.radius)] * 3)).reshape(3, -1).T @ view.axes
     boxes = (ends[:, None] + corner).reshape(-1, 3)
-    x, y, w = view.matrix[:3, :3] @ boxes.T + view.matrix[:3, 3:]
+    x, y, w, _ = view.project(boxes).T
     size = 2 * view.centre
     bounds = np.array([0, 0, *size])
     if (w > view.near).all():

@@ -1,4 +1,4 @@
-"""What is drawn otherwise than it can be meant."""
+"""Warnings about a scene that will not look as intended."""
 
 from __future__ import annotations
 
@@ -14,8 +14,8 @@ STRETCHED = 1.02
 WIDEST = 0.25
 
 
-def notes(scene: Scene) -> Iterator[str]:
-    """Say what is remarkable about how a scene is drawn, each in a line.
+def drawing_notes(scene: Scene) -> Iterator[str]:
+    """List warnings about how a scene is drawn, each in a line.
 
     Args:
         scene: a checked scene.
@@ -44,7 +44,7 @@ def notes(scene: Scene) -> Iterator[str]:
 
 
 def _stretched(scene: Scene) -> Iterator[str]:
-    """Tell of a picture that is stretched onto the sheet, and of two ways out."""
+    """Warn of a picture that is stretched onto the sheet, and name two remedies."""
     size = texture.image_size(scene)
     if size is None:
         return
@@ -59,7 +59,7 @@ def _stretched(scene: Scene) -> Iterator[str]:
         cells = (max(scene.sheet.points) - 1) / max(height, width)
         rows, cols = (max(1, round(cells * count)) + 1 for count in (height, width))
         settings += f' --set "sheet.points=[{rows},{cols}]"'
-    said = (
+    warning = (
         f"the picture of {width} x {height} pixels is stretched onto a sheet {wide:g} m wide and {high:g} m high; "
         f"{settings} makes the sheet like the picture"
     )
@@ -67,9 +67,9 @@ def _stretched(scene: Scene) -> Iterator[str]:
     # Of few pixels, even the part whose proportions are nearest to the sheet's may be stretched.
     if cut_width and cut_height and _fits(wide * cut_height, high * cut_width):
         cut = left + (width - cut_width) // 2, top + (height - cut_height) // 2, cut_width, cut_height
-        said += f', --set "region=[{",".join(map(str, cut))}]" cuts a part like the sheet'
-    yield said
+        warning += f', --set "region=[{",".join(map(str, cut))}]" cuts a part like the sheet'
+    yield warning
 
 
-def _fits(one: float, other: float) -> bool:
-    return other / STRETCHED < one < other * STRETCHED
+def _fits(area: float, expected: float) -> bool:
+    return expected / STRETCHED < area < expected * STRETCHED

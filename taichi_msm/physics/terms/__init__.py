@@ -1,0 +1,53 @@
+"""The terms of the model, a file each: what its keys mean, its force, its energy and its bound of the step.
+
+docs/architecture.md tells how to add one.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+from taichi_msm.physics import stiffness_map
+from taichi_msm.physics.lattice import spacing
+from taichi_msm.physics.material import Material
+from taichi_msm.physics.plan import Plan
+from taichi_msm.physics.stiffness_map import MapImage
+from taichi_msm.physics.terms.bending import BendingTerm
+from taichi_msm.physics.terms.damping import DampingTerm
+from taichi_msm.physics.terms.foundation import FoundationTerm
+from taichi_msm.physics.terms.probes import ProbeTerm
+from taichi_msm.physics.terms.springs import SpringTerm
+from taichi_msm.physics.terms.term import Term
+from taichi_msm.scene import Scene, Sheet
+
+# All terms. What they contribute is added up in this order, on which the last bits depend.
+TERMS: tuple[type[Term], ...] = (SpringTerm, FoundationTerm, DampingTerm, BendingTerm, ProbeTerm)
+
+
+def material_of(scene: Scene, image: MapImage | None) -> Material:
+    """Find the numbers of a scene's sheet.
+
+    Args:
+        scene: in which `kind_problems` finds nothing.
+        image: of its map; None: it has none.
+    """
+    (rows, cols), (dx, dy), mass, factors = scene.sheet.points, spacing(scene.sheet), scene.sheet.mass, None
+    if image is not None:
+        assert scene.stiffness_map is not None
+        factors = stiffness_map.factors(scene.stiffness_map, image, rows - 1, cols - 1)
+    if scene.tissue is not None:
+        mass = scene.tissue.density * scene.tissue.thickness * (dx * dy)
+    assert mass is not None
+    derived: dict[str, Any] = {name: value for term in TERMS for name, value in term.derive(scene).items()}
+    return Material(mass=mass, by_area=scene.tissue is not None, factors=factors, **derived)
+
+
+def terms_of(plan: Plan) -> tuple[Term, ...]:
+    """List the terms that a scene has."""
+    return tuple(term for kind in TERMS if (term := kind.of(plan)) is not None)
+
+
+def highest_frequency(material: Material, sheet: Sheet) -> float:
+    """Bound the highest angular frequency of the sheet [rad/s] in any shape without springs below half their length."""
+    return math.sqrt(sum(term.bound(material, sheet) for term in TERMS) / material.mass)

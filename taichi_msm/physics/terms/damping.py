@@ -1,0 +1,78 @@
+"""Damping: a force against the velocity, C v on every point. Scene: `damping`, or `tissue.damping`.
+
+In a Verlet step, d_{n+1} = keep d_n + gain F_n and u_{n+1} = u_n + d_{n+1} (eq. 6 to 9), with g = C / m and the step h,
+
+    central:   keep = (1 - g h / 2) / (1 + g h / 2)    gain = h^2 / m / (1 + g h / 2)
+    backward:  keep = 1 - g h                          gain = h^2 / m
+    step 0:    d_0 = 0                                 gain = h^2 / m / 2
+"""
+
+# No `from __future__ import annotations` here: Taichi reads the annotations of a kernel.
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Any, ClassVar, NamedTuple
+
+from typing_extensions import Self
+
+from taichi_msm.physics.plan import Plan
+from taichi_msm.physics.terms.term import StepCode, Term
+from taichi_msm.scene import Scene
+
+
+class Coefficients(NamedTuple):
+    """The coefficients of a step.
+
+    Attributes:
+        keep: factor by which the damping reduces the last difference.
+        gain: displacement per force in one step [m/N].
+        first_gain: the same for the first step, which starts at rest [m/N].
+    """
+
+    keep: float
+    gain: float
+    first_gain: float
+
+
+def coefficients(plan: Plan) -> Coefficients:
+    """Compute the coefficients of a step, with central or backward differences for the velocity."""
+    material, h = plan.material, plan.grid.step
+    g, whole = material.drag, h * h / material.mass
+    if plan.scene.time.damping_difference == "central":
+        return Coefficients((1 - g * h / 2) / (1 + g * h / 2), whole / (1 + g * h / 2), whole / 2)
+    return Coefficients(1 - g * h, whole, whole / 2)
+
+
+@dataclass(frozen=True)
+class DampingTerm(Term):
+    """Damping of every point. It adds no energy, and its limit on the step is in `timestep.stable_step`."""
+
+    numbers_count: ClassVar[int] = 1
+
+    @staticmethod
+    def derive(scene: Scene) -> dict[str, Any]:
+        """Give C / m [1/s]."""
+        if scene.tissue is not None:
+            return {"drag": scene.tissue.damping}
+        assert scene.sheet.mass is not None
+        return {"drag": scene.damping / scene.sheet.mass}
+
+    @classmethod
+    def of(cls, plan: Plan) -> Self | None:
+        """Leave it out if it is 0."""
+        return cls() if plan.material.drag > 0 else None
+
+    def numbers(self, plan: Plan) -> tuple[float, ...]:
+        """Give the factor `keep`."""
+        return (coefficients(plan).keep,)
+
+    def reducing(self, code: StepCode) -> Sequence[Callable[..., Any]]:
+        """Make the function that reduces the last difference."""
+        ti = code.ti
+        keep = code.first_number(DampingTerm)
+
+        @ti.func
+        def reduce(d_x, d_y, d_z, sheet: ti.template()):
+            return d_x * sheet.numbers[keep], d_y * sheet.numbers[keep], d_z * sheet.numbers[keep]
+
+        return (reduce,)

@@ -1,0 +1,83 @@
+"""The foundation, or virtual springs: each pulls a point back to its rest position.
+
+Scene: `springs.virtual` and `virtual_active`, or `tissue.foundation` and `foundation_active`. The force is -K u.
+"""
+
+# No `from __future__ import annotations` here: Taichi reads the annotations of a kernel.
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+from numpy.typing import NDArray
+from typing_extensions import Self
+
+from taichi_msm.physics.lattice import spacing
+from taichi_msm.physics.loads import Schedule
+from taichi_msm.physics.material import Material
+from taichi_msm.physics.plan import Plan
+from taichi_msm.physics.terms.term import AREA, StepCode, Term
+from taichi_msm.scene import Scene, Sheet
+
+
+@dataclass(frozen=True)
+class FoundationTerm(Term):
+    """Virtual springs. Their energy is not measured: `divergence` bounds it.
+
+    Attributes:
+        by_area: whether they are softer at an open edge, where less of the sheet's area belongs to a point.
+    """
+
+    by_area: bool
+
+    @staticmethod
+    def derive(scene: Scene) -> dict[str, Any]:
+        """Give K, of a tissue foundation dx dy, or 0 if it never acts; and whether it acts without a load."""
+        if scene.tissue is not None:
+            k, active = scene.tissue.foundation * math.prod(spacing(scene.sheet)), scene.tissue.foundation_active
+        else:
+            assert scene.springs is not None
+            k, active = scene.springs.virtual, scene.springs.virtual_active
+        always = active == "always"
+        return {"virtual": k if always or scene.probes else 0.0, "always": always}
+
+    @classmethod
+    def of(cls, plan: Plan) -> Self | None:
+        """Leave them out if they never act."""
+        return cls(plan.open_edges and plan.material.by_area) if plan.material.virtual > 0 else None
+
+    @staticmethod
+    def bound(material: Material, sheet: Sheet) -> float:
+        """Give the part of m w^2, which is K [N/m]."""
+        del sheet
+        return material.virtual
+
+    @property
+    def column_count(self) -> int:
+        """One column: K, times the share of it that acts."""
+        return 1
+
+    def columns(self, plan: Plan, loads: Schedule) -> NDArray[Any]:
+        """Give K at every step [N/m]."""
+        return plan.material.virtual * loads.active[:, None]
+
+    def forces(self, code: StepCode) -> Sequence[Callable[..., Any]]:
+        """Make the function that adds -K u."""
+        ti = code.ti
+        by_area, column = self.by_area, code.first_column(FoundationTerm)
+
+        @ti.func
+        def add(force_x, force_y, force_z, sheet: ti.template(), entry: ti.template(), now: ti.template()):
+            if ti.static(by_area):
+                held = now[column] * sheet.by_column[(AREA + entry.row.kind) * sheet.width + entry.b]
+                force_x = force_x - held * entry.x
+                force_y = force_y - held * entry.y
+                force_z = force_z - held * entry.z
+            else:
+                force_x = force_x - now[column] * entry.x
+                force_y = force_y - now[column] * entry.y
+                force_z = force_z - now[column] * entry.z
+            return force_x, force_y, force_z
+
+        return (add,)

@@ -1,0 +1,124 @@
+"""The loads: what probes exert on the points around their control points. Scene: `probes`.
+
+The force on a point at the distance d is F exp(-max(falloff d + shift, offset)) (see `probe_force`). It is
+tabulated for every step, in a few columns for each slot (see `slots`). Where a control point stands, its decay is an
+array.
+"""
+
+# No `from __future__ import annotations` here: Taichi reads the annotations of a kernel.
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from typing_extensions import Self
+
+from taichi_msm.physics.lattice import axes, spacing
+from taichi_msm.physics.loads import Schedule, decay
+from taichi_msm.physics.plan import Plan
+from taichi_msm.physics.probe_force import probe_force
+from taichi_msm.physics.slots import ProbeSlot
+from taichi_msm.physics.terms.term import ACROSS, AREA, DY, TOP, StepCode, Term
+from taichi_msm.scene import Scene
+
+# Columns of a slot: force (3), control point (2), falloff, shift and offset.
+FORCE, POINT, FALLOFF, SHIFT, OFFSET, SLOT_COLUMNS = 0, 3, 5, 6, 7, 8
+
+
+@dataclass(frozen=True)
+class ProbeTerm(Term):
+    """The loads.
+
+    Attributes:
+        moves: for every slot, whether its control point moves.
+        by_area: for every slot, whether points at an open edge get less of its force.
+    """
+
+    moves: tuple[bool, ...]
+    by_area: tuple[bool, ...]
+
+    @classmethod
+    def of(cls, plan: Plan) -> Self:
+        """Tell which slots stand."""
+        probes = plan.scene.probes
+        by_area = tuple(plan.open_edges and probes[slot.probe].total is not None for slot in plan.slots)
+        return cls(tuple(slot.moves for slot in plan.slots), by_area)
+
+    @property
+    def column_count(self) -> int:
+        """A few columns for each slot."""
+        return SLOT_COLUMNS * len(self.moves)
+
+    def columns(self, plan: Plan, loads: Schedule) -> NDArray[Any]:
+        """Give forces and places of every slot."""
+        slots = np.empty((len(loads.active), len(self.moves), SLOT_COLUMNS))
+        slots[..., FORCE:POINT] = loads.strength
+        slots[..., POINT:FALLOFF] = loads.point
+        for n, slot in enumerate(plan.slots):
+            acts = probe_force(plan.scene.probes[slot.probe], plan.scene.sheet)
+            slots[:, n, FALLOFF:] = acts.falloff, acts.shift, acts.offset
+        return slots.reshape(len(slots), self.column_count)
+
+    def forces(self, code: StepCode) -> Sequence[Callable[..., Any]]:
+        """Make the function that adds the forces of all slots."""
+        ti = code.ti
+        moves, by_area, first = self.moves, self.by_area, code.first_column(ProbeTerm)
+        vector, lanes = code.vector, code.lanes
+        standing = [moves[:n].count(False) for n in range(len(moves))]
+
+        @ti.func
+        def add(force_x, force_y, force_z, sheet: ti.template(), entry: ti.template(), now: ti.template()):
+            for n in ti.static(range(len(moves))):
+                column = ti.static(first + SLOT_COLUMNS * n)
+                share = vector(0)
+                if ti.static(moves[n]):
+                    off_x = sheet.by_column[ACROSS * sheet.width + entry.b] - now[column + POINT]
+                    off_y = sheet.numbers[TOP] - entry.row.i * sheet.numbers[DY] - now[column + POINT + 1]
+                    exponent = now[column + FALLOFF] * ti.sqrt(off_x * off_x + off_y * off_y) + now[column + SHIFT]
+                    exponent = ti.max(exponent, now[column + OFFSET])
+                    share = vector([ti.exp(-exponent[lane]) for lane in ti.static(range(lanes))])
+                    if ti.static(by_area[n]):
+                        share *= sheet.by_column[(AREA + entry.row.kind) * sheet.width + entry.b]
+                else:
+                    share = sheet.decay[(standing[n] * sheet.rows + entry.row.i) * sheet.width + entry.b]
+                force_x += now[column] * share
+                force_y += now[column + 1] * share
+                force_z += now[column + 2] * share
+            return force_x, force_y, force_z
+
+        return (add,)
+
+
+def standing_decays(plan: Plan) -> NDArray[np.float64]:
+    """Evaluate the decays of all standing slots, shape (slots, rows, cols)."""
+    scene = plan.scene
+    return np.array([decay(scene.probes[slot.probe], scene.sheet) for slot in plan.slots if not slot.moves])
+
+
+def standing(plan: Plan) -> list[tuple[object, ...]]:
+    """List everything that the decays of the standing slots depend on."""
+    probes = [plan.scene.probes[slot.probe] for slot in plan.slots if not slot.moves]
+    return [(probe.at, probe_force(probe, plan.scene.sheet)[1:]) for probe in probes]
+
+
+def free_acceleration(plan: Plan) -> float:
+    """Bound the acceleration that the probes give to a free point [m/s^2]."""
+    forces = (
+        probe_force(probe, plan.scene.sheet).size * max(abs(percent) for _, percent in probe.load) / 100
+        for probe in plan.scene.probes
+    )
+    return sum(forces) / plan.material.mass
+
+
+def norm(slot: ProbeSlot, scene: Scene) -> float:
+    """Bound |F| over all points for a force of 1 N at the control point."""
+    if not slot.moves:
+        return float(np.linalg.norm(decay(scene.probes[slot.probe], scene.sheet)))
+    # The moving control point is within half a cell's diagonal of some lattice point. The sheet around that point lies
+    # within four sheets that meet there, and their norm is twice that of one.
+    x, y = axes(scene.sheet)
+    nearest = np.maximum(np.hypot(x - x[0], y - y[0]) - math.hypot(*spacing(scene.sheet)) / 2, 0)
+    return 2 * float(np.linalg.norm(probe_force(scene.probes[slot.probe], scene.sheet).decay(nearest)))

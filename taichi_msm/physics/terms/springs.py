@@ -1,0 +1,309 @@
+"""Springs between neighbours: along rows, along columns and along both diagonals of a cell.
+
+Scene: `springs.structural`, `springs.shear` and `springs.map`, or `tissue.young`, `thickness`, `pretension` and `map`.
+
+The force of P on its neighbour Q is, with q = u_P - u_Q and the rest vector o from Q to P,
+
+    k (L - L0) (P - Q) / L = k (L^2 - L0^2) / (L^2 + L0 L) (o + q),    L^2 - L0^2 = q (q + 2 o)         (eq. 2)
+
+which keeps the digits of a small motion on a large sheet. The force of Q on P is the opposite, to the bit.
+
+Of a tissue each cell, dx by dy, adds to the springs along its edges and diagonals (f: the factor of the map there)
+
+    along x     f E t (9/8 dy/dx - 3/8 dx/dy) / 2        along y: the same with x and y exchanged
+    diagonals   f 3/16 E t (dx^2 + dy^2) / (dx dy)
+
+so that the lattice is an isotropic sheet in plane stress. Springs impose its Poisson's ratio of 1/3; docs/model.md has
+the derivation.
+
+Under a tension S each spring pulls at rest with tau L. Here tau = k1 e, where k1 is its stiffness for f = 1 and
+e = S / (3/2 E t). Its force, less that at rest, which cancels, is
+
+    (k - tau) (1 - L0 / L) (o + q) + tau q
+
+and its energy ((k - tau) (L - L0)^2 + tau q^2) / 2.
+"""
+
+# No `from __future__ import annotations` here: Taichi reads the annotations of a kernel.
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Any, ClassVar, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+from typing_extensions import Self
+
+from taichi_msm.physics.lattice import spacing
+from taichi_msm.physics.material import Material
+from taichi_msm.physics.plan import Plan
+from taichi_msm.physics.stiffness_map import largest_mean
+from taichi_msm.physics.terms.term import AREA, DX, DY, HAS_LEFT, HAS_RIGHT, StepCode, Term
+from taichi_msm.scene import Scene, Sheet
+
+# Families of springs.
+ALONG_ROW, ALONG_COLUMN, DIAGONAL = range(3)
+
+# Measures: the smallest and the largest (L^2 - L0^2) / L0^2; for every family the sum of (k - tau) (L / L0 - 1)^2;
+# and then, under tension, the sum of |q|^2 / L0^2.
+LEAST, MOST, STRETCHED, TENSE = 0, 1, 2, 5
+
+# Prevents a division by 0 at L = 0, where the force is then 0, as P - Q is. A literal in a kernel is always f32.
+TINY = 1e-36
+
+
+class SpringFunctions(NamedTuple):
+    """Taichi's functions for the forces of springs, and for where they find their stiffness."""
+
+    along: Callable[..., Any]
+    to_other_row: Callable[..., Any]
+    of_row: Callable[..., Any]
+    of_column: Callable[..., Any]
+    of_diagonal: Callable[..., Any]
+
+
+@dataclass(frozen=True)
+class SpringTerm(Term):
+    """Springs between neighbours.
+
+    Attributes:
+        structural, shear: whether there are springs along rows and columns, and along diagonals.
+        open_edges: whether a point at an edge moves, so that springs beyond the edge must be left out.
+        by_area: whether springs along such an edge are softer than others, because they belong to one cell.
+        mapped: whether the stiffness of every spring is read from an array; it is 0 where there is no spring.
+        tense: whether the sheet is under tension at rest.
+    """
+
+    structural: bool
+    shear: bool
+    open_edges: bool
+    by_area: bool
+    mapped: bool
+    tense: bool
+
+    reach: ClassVar[int] = 1
+    # k - tau, and then tau, of each family.
+    numbers_count: ClassVar[int] = 6
+    reductions: ClassVar[tuple[str, ...]] = ("min", "max", "sum", "sum", "sum", "sum", "sum", "sum")
+
+    @staticmethod
+    def derive(scene: Scene) -> dict[str, Any]:
+        """Take over the springs, or make a sheet of a tissue: see the module."""
+        tissue, springs = scene.tissue, scene.springs
+        if tissue is None:
+            assert springs is not None
+            return {"across": springs.structural, "down": springs.structural, "shear": springs.shear, "tension": 0.0}
+        dx, dy = spacing(scene.sheet)
+        membrane = tissue.young * tissue.thickness
+        return {
+            "across": membrane * (9 / 8 * dy / dx - 3 / 8 * dx / dy),
+            "down": membrane * (9 / 8 * dx / dy - 3 / 8 * dy / dx),
+            "shear": 3 / 16 * membrane * (dx * dx + dy * dy) / (dx * dy),
+            "tension": tissue.pretension / (1.5 * membrane),
+        }
+
+    @classmethod
+    def of(cls, plan: Plan) -> Self:
+        """Leave out the families that have no stiffness."""
+        material, open_edges = plan.material, plan.open_edges
+        return cls(
+            structural=max(material.across, material.down) > 0,
+            shear=material.shear > 0,
+            open_edges=open_edges,
+            by_area=open_edges and material.by_area,
+            mapped=material.factors is not None,
+            tense=material.tension > 0,
+        )
+
+    @staticmethod
+    def bound(material: Material, sheet: Sheet) -> float:
+        """Bound the part of m w^2 of the springs, as long as none is shorter than half its length [N/m].
+
+        The energy is a sum over cells. The springs of a cell have at most the energy k / 2 |q|^2, so that no mode of a
+        cell with a quarter of the points' mass at its corners has more than
+
+            m w^2 = 4 max(across + down, across + 2 shear, down + 2 shear)
+
+        and hence no mode of the sheet. If factors differ, each cell takes the share of a point's mass that it has of
+        the point's stiffness; the maximum is then multiplied by the largest mean of the factors around a point.
+        """
+        del sheet
+        across, down, shear, largest = material.across, material.down, material.shear, 1.0
+        if material.factors is not None:
+            largest = largest_mean(material.factors) if material.by_area else float(material.factors.max())
+        return 4 * max(across + down, across + 2 * shear, down + 2 * shear) * largest
+
+    def numbers(self, plan: Plan) -> tuple[float, ...]:
+        """Give k - tau and tau of every family [N/m]."""
+        return *plan.material.stiffness, *plan.material.tensions
+
+    def energy(self, sums: NDArray[Any], plan: Plan) -> float:
+        """Give twice the energy [J]."""
+        dx, dy = spacing(plan.scene.sheet)
+        squares = np.array([dx**2, dy**2, dx**2 + dy**2])
+        return float((sums[STRETCHED:TENSE] + plan.material.tensions * sums[TENSE:]) @ squares)
+
+    def between(self, code: StepCode) -> SpringFunctions:
+        """Make the functions for the forces of springs."""
+        ti = code.ti
+        tense, mapped, by_area = self.tense, self.mapped, self.by_area and not self.mapped
+        leaves_out, real, first = self.open_edges and not self.mapped, code.real, code.first_number(SpringTerm)
+        first_tension = first + 3
+
+        @ti.func
+        def pull(weighted, square, length, to_x, to_y, to_z, tension, x, y, z):
+            """Force along the deformed spring, from k (L^2 - L0^2) and L^2, plus tension times the difference."""
+            force = weighted / (square + length * ti.sqrt(square))
+            force_x, force_y, force_z = force * to_x, force * to_y, force * to_z
+            if ti.static(tense):
+                force_x += tension * x
+                force_y += tension * y
+                force_z += tension * z
+            return force_x, force_y, force_z
+
+        @ti.func
+        def along(sheet: ti.template(), right, here_x, here_y, here_z, k, exists):
+            """Force of a point displaced by `here` on its right neighbour, in entry `right` of u; exists: 0 if none."""
+            dx = sheet.numbers[DX]
+            x, y, z = here_x - sheet.u[0][right], here_y - sheet.u[1][right], here_z - sheet.u[2][right]
+            to_x = x - dx
+            rest = y * y + z * z
+            weighted = k * (x * (to_x - dx) + rest)
+            if ti.static(leaves_out):
+                weighted *= exists
+            tension = sheet.numbers[first_tension + ALONG_ROW]
+            return pull(weighted, to_x * to_x + (rest + TINY), dx, to_x, y, z, tension, x, y, z)
+
+        @ti.func
+        def to_other_row(
+            sheet: ti.template(), entry, right: ti.template(), here_x, here_y, here_z, up, length, k, exists
+        ):
+            """Force of a point displaced by `here` on that in `entry`, `right` columns on in the row above."""
+            x, y, z = here_x - sheet.u[0][entry], here_y - sheet.u[1][entry], here_z - sheet.u[2][entry]
+            to_x = x
+            to_y = y - up
+            rest = z * z
+            longer = x * x + (y * (to_y - up) + rest)
+            if ti.static(right != 0):
+                to_x = x - right * sheet.numbers[DX]
+                longer = x * (to_x - right * sheet.numbers[DX]) + (y * (to_y - up) + rest)
+            weighted = k * longer
+            if ti.static(leaves_out):
+                weighted *= exists
+            tension = sheet.numbers[first_tension + ti.static(DIAGONAL if right else ALONG_COLUMN)]
+            return pull(weighted, to_x * to_x + to_y * to_y + (rest + TINY), length, to_x, to_y, z, tension, x, y, z)
+
+        @ti.func
+        def of_row(sheet: ti.template(), i, kind, b):
+            """Stiffness of the spring to the right of entry b of row i; one along an edge belongs to one cell."""
+            if ti.static(mapped):
+                return sheet.stiffness[i * sheet.width + b]
+            elif ti.static(by_area):  # noqa: RET505  # Taichi would compile the rest as well.
+                return sheet.numbers[first + ALONG_ROW] * ti.select(kind == 1, ti.cast(1, real), ti.cast(0.5, real))
+            else:
+                return sheet.numbers[first + ALONG_ROW]
+
+        @ti.func
+        def of_column(sheet: ti.template(), lower, b):
+            """Stiffness of the spring between entry b of row `lower` and the row before."""
+            if ti.static(mapped):
+                return sheet.stiffness[(sheet.rows + lower) * sheet.width + b]
+            elif ti.static(by_area):  # noqa: RET505
+                return sheet.numbers[first + ALONG_COLUMN] * sheet.by_column[(AREA + 1) * sheet.width + b]
+            else:
+                return sheet.numbers[first + ALONG_COLUMN]
+
+        @ti.func
+        def of_diagonal(sheet: ti.template(), lower, b):
+            """Stiffness of the diagonals of the cell right of entry b, between row `lower` and the row before."""
+            if ti.static(mapped):
+                return sheet.stiffness[(2 * sheet.rows + 1 + lower) * sheet.width + b]
+            else:  # noqa: RET505
+                return sheet.numbers[first + DIAGONAL]
+
+        return SpringFunctions(along, to_other_row, of_row, of_column, of_diagonal)
+
+    def measuring(self, code: StepCode) -> Sequence[Callable[..., None]]:
+        """Make the function that measures the springs to the right of an entry and to the row below it."""
+        ti = code.ti
+        tense, open_edges, vector, first = self.tense, self.open_edges, code.vector, code.first_measure(SpringTerm)
+        _, _, of_row, of_column, of_diagonal = self.between(code)
+        # Of every family that there is: rows and columns from one end to the other, for each of its springs.
+        structural = ((ALONG_ROW, 0, (1,)), (ALONG_COLUMN, 1, (0,))) if self.structural else ()
+        families = structural + (((DIAGONAL, 1, (-1, 1)),) if self.shear else ())
+
+        @ti.func
+        def longer(sheet: ti.template(), p, q, b, right: ti.template(), x0, y0):
+            """(L^2 - L0^2) / L0^2 and |q|^2 / L0^2 of the spring from entry b of row p to entry b + right of row q."""
+            here, there = p * sheet.width + b, q * sheet.width + b + right
+            x = sheet.u[0][there] - sheet.u[0][here]
+            y = sheet.u[1][there] - sheet.u[1][here]
+            z = sheet.u[2][there] - sheet.u[2][here]
+            square = x0 * x0 + y0 * y0
+            share = (x * (x + 2 * x0) + (y * (y + 2 * y0) + z * z)) / square
+            apart = (x * x + y * y + z * z) / square
+            # Beyond the edge there is no spring.
+            if ti.static(open_edges and right != 0):
+                side = ti.static(HAS_LEFT if right < 0 else HAS_RIGHT)
+                share = ti.select(sheet.by_column[side * sheet.width + b] > 0, share, vector(0))
+            return share, apart
+
+        @ti.func
+        def measure(measures: ti.template(), sheet: ti.template(), p, i, kind, b):
+            dx, dy = sheet.numbers[DX], sheet.numbers[DY]
+            for family, down, rights in ti.static(families):
+                if i + down < sheet.rows:
+                    stretched, tense_part = vector(0), vector(0)
+                    for right in ti.static(rights):
+                        k = vector(0)
+                        if ti.static(family == ALONG_ROW):
+                            k += of_row(sheet, i, kind, b)
+                        elif ti.static(family == ALONG_COLUMN):
+                            k += of_column(sheet, i + 1, b)
+                        else:
+                            k += of_diagonal(sheet, i + 1, b + ti.static(min(right, 0)))
+                        share, apart = longer(sheet, p, p + down, b, right, right * dx, -down * dy)
+                        measures[first + LEAST] = ti.min(measures[first + LEAST], share)
+                        measures[first + MOST] = ti.max(measures[first + MOST], share)
+                        # L / L0 - 1; rounding may put the share below -1.
+                        stretch = share / (1 + ti.sqrt(ti.max(share + 1, vector(0))))
+                        stretched += stretch * stretch * k
+                        tense_part += apart
+                    measures[first + STRETCHED + family] += stretched
+                    if ti.static(tense):
+                        measures[first + TENSE + family] += tense_part
+
+        return (measure,)
+
+    def laid_out(self, plan: Plan) -> NDArray[Any] | None:
+        """Give the array of stiffness: k - tau of every spring [N/m], shape (stiffness_rows, cols); None without a map.
+
+        Along rows come as many rows as the sheet has; along columns and diagonals one more, of which the first and the
+        last are zeros, as are the entries of springs beyond the last column.
+        """
+        material = plan.material
+        if material.factors is None:
+            return None
+        pads = ((0, 0), (0, 1)), ((1, 1), (0, 0)), ((1, 1), (0, 1))
+        families = zip(stiffness(material, material.factors), material.tensions, pads, strict=True)
+        return np.concatenate([np.pad(np.maximum(k - tension, 0), pad) for k, tension, pad in families])
+
+
+def stiffness(material: Material, factors: NDArray[Any]) -> tuple[NDArray[Any], NDArray[Any], NDArray[Any]]:
+    """Assemble the stiffness k of every spring from its cells [N/m].
+
+    Args:
+        material: of the sheet.
+        factors: of every cell, shape (rows - 1, cols - 1).
+
+    Returns:
+        Along rows, shape (rows, cols - 1); along columns, shape (rows - 1, cols); along both diagonals of a cell.
+    """
+    above_and_below, beside = np.pad(factors, ((1, 1), (0, 0))), np.pad(factors, ((0, 0), (1, 1)))
+    across = material.across / 2 * (above_and_below[:-1] + above_and_below[1:])
+    down = material.down / 2 * (beside[:, :-1] + beside[:, 1:])
+    if not material.by_area:
+        # A spring at an edge is as stiff as any other: with the factor of its only cell, not with half of it.
+        across[[0, -1]] *= 2
+        down[:, [0, -1]] *= 2
+    return across, down, material.shear * factors

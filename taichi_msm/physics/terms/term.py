@@ -1,0 +1,220 @@
+"""What a term of the model is, and what a kernel tells a term's functions about a sheet."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Any, ClassVar, NamedTuple, TypeVar
+
+import numpy as np
+from numpy.typing import NDArray
+from typing_extensions import Self
+
+from taichi_msm.physics.loads import Schedule
+from taichi_msm.physics.material import Material
+from taichi_msm.physics.plan import Plan
+from taichi_msm.scene import Scene, Sheet
+
+# Rows of the array by_column. MOVES and AREA have three each, for a first, a middle and a last row of the sheet.
+MOVES, AREA, ACROSS, HAS_LEFT, HAS_RIGHT, COLUMN_ROWS = 0, 3, 6, 7, 8, 9
+
+# The first numbers of a sheet: dx, dy, and y of the first row. Those of its terms follow.
+DX, DY, TOP, GEOMETRY = range(4)
+
+# The first column of the table of loads: what a force of 1 N adds to the last difference [m]. Those of terms follow.
+GAIN, STEP_COLUMNS = 0, 1
+
+# The first measure of a row: the sum of |d|^2 times the share of mass. Those of terms follow.
+MOTION, STEP_MEASURES = 0, 1
+
+
+class Term:
+    """A term of the model as kernels are compiled for it: a frozen dataclass, without the numbers of a sheet.
+
+    The kernels know by name the terms that act between points, springs and bending; others need only the functions
+    here.
+
+    Attributes:
+        reach: how many rows away a point may be that the force depends on.
+        numbers_count: how many of the sheet's numbers belong to the term.
+        reductions: how each of its measures is reduced to one number of a row: "min", "max" or "sum".
+    """
+
+    reach: ClassVar[int] = 0
+    numbers_count: ClassVar[int] = 0
+    reductions: ClassVar[tuple[str, ...]] = ()
+
+    @classmethod
+    def of(cls, plan: Plan) -> Self | None:
+        """Choose what is compiled for a scene; None if it does not have the term."""
+        raise NotImplementedError
+
+    @staticmethod
+    def derive(scene: Scene) -> dict[str, Any]:
+        """Derive the attributes of `Material` that the term's keys of a scene stand for."""
+        del scene
+        return {}
+
+    @staticmethod
+    def bound(material: Material, sheet: Sheet) -> float:
+        """Bound the part of m w^2 that the term has in any motion [N/m]."""
+        del material, sheet
+        return 0.0
+
+    def numbers(self, plan: Plan) -> tuple[float, ...]:
+        """Give its numbers."""
+        del plan
+        return ()
+
+    @property
+    def column_count(self) -> int:
+        """How many columns of the table of loads belong to the term."""
+        return 0
+
+    def columns(self, plan: Plan, loads: Schedule) -> NDArray[Any]:
+        """Give its columns of the table of loads, shape (steps, column_count)."""
+        del plan
+        return np.empty((len(loads.active), 0))
+
+    def energy(self, sums: NDArray[Any], plan: Plan) -> float:
+        """Give twice its energy [J], from its measures summed up."""
+        del sums, plan
+        return 0.0
+
+    def forces(self, code: StepCode) -> Sequence[Callable[..., Any]]:
+        """Make Taichi's functions force(force_x, force_y, force_z, sheet, entry, now) that add to the force on a point.
+
+        They return the new force; `now` is the row of the table of loads, a list of variables.
+        """
+        del code
+        return ()
+
+    def reducing(self, code: StepCode) -> Sequence[Callable[..., Any]]:
+        """Make Taichi's functions reduce(d_x, d_y, d_z, sheet) that change the last difference of a point."""
+        del code
+        return ()
+
+    def measuring(self, code: StepCode) -> Sequence[Callable[..., None]]:
+        """Make Taichi's functions measure(measures, sheet, p, i, kind, b) for entry b of row i, which is row p of u."""
+        del code
+        return ()
+
+
+AnyTerm = TypeVar("AnyTerm", bound=Term)
+
+
+@dataclass(frozen=True)
+class StepCode:
+    """What the kernels of a sheet are compiled for; everything else is an argument.
+
+    Attributes:
+        precision: f32 or f64.
+        lanes: of a vector; columns are cut into as many strips.
+        by_area: whether points at an open edge have less mass than others, because they belong to fewer cells.
+        terms: those that the scene has, always with springs and probes; in the order of `terms.TERMS`.
+    """
+
+    precision: str
+    lanes: int
+    by_area: bool
+    terms: tuple[Term, ...]
+
+    @property
+    def reach(self) -> int:
+        """How many rows on either side of a band its steps depend on."""
+        return max(term.reach for term in self.terms)
+
+    @property
+    def ti(self) -> Any:
+        """Taichi; terms import it only here, because `check` needs their bounds without a compiler."""
+        from taichi_msm.system.runtime import ti
+
+        return ti
+
+    @property
+    def real(self) -> Any:
+        """Taichi's type of a number."""
+        return getattr(self.ti, self.precision)
+
+    @property
+    def vector(self) -> Any:
+        """Taichi's type of a vector of lanes."""
+        return self.ti.types.vector(self.lanes, self.real)
+
+    @property
+    def vectors(self) -> Any:
+        """Taichi's type of an array of vectors."""
+        return self.ti.types.ndarray(dtype=self.vector, ndim=1)
+
+    def get(self, kind: type[AnyTerm]) -> AnyTerm | None:
+        """Give the term of a kind; None if there is none."""
+        return next((term for term in self.terms if isinstance(term, kind)), None)
+
+    def require(self, kind: type[AnyTerm]) -> AnyTerm:
+        """Give the term of a kind that every scene has."""
+        term = self.get(kind)
+        assert term is not None, kind
+        return term
+
+    def first_number(self, kind: type[Term] | None) -> int:
+        """Give the index of the first number of a term; None: how many numbers there are."""
+        return GEOMETRY + sum(term.numbers_count for term in self._before(kind))
+
+    def first_column(self, kind: type[Term] | None) -> int:
+        """Give the first column of a term in the table of loads; None: how many columns there are."""
+        return STEP_COLUMNS + sum(term.column_count for term in self._before(kind))
+
+    def first_measure(self, kind: type[Term] | None) -> int:
+        """Give the index of the first measure of a term; None: how many measures there are."""
+        return STEP_MEASURES + sum(len(term.reductions) for term in self._before(kind))
+
+    def _before(self, kind: type[Term] | None) -> tuple[Term, ...]:
+        kinds = [type(term) for term in self.terms]
+        return self.terms if kind is None else self.terms[: kinds.index(kind)]
+
+
+class KernelSheet(NamedTuple):
+    """A sheet within a kernel; its arrays are those of `kernel`.
+
+    Attributes:
+        u, d: displacements, with bending also moments, and last differences; three arrays each, for x, y and z.
+        by_column, stiffness, decay: one array each.
+        numbers: of the sheet and of its terms, a list of variables.
+        rows: of points.
+        width: entries of a row.
+    """
+
+    u: Any
+    d: Any
+    by_column: Any
+    stiffness: Any
+    decay: Any
+    numbers: Any
+    rows: Any
+    width: Any
+
+
+class KernelRow(NamedTuple):
+    """A row of the sheet within a kernel.
+
+    Attributes:
+        i: its number.
+        kind: 0 for the first row of the sheet, 2 for the last, else 1.
+        before, at, after: with bending, rows of u with the moments of the row before, of row i and of the row after.
+    """
+
+    i: Any
+    kind: Any
+    before: Any
+    at: Any
+    after: Any
+
+
+class Entry(NamedTuple):
+    """An entry b of a row within a kernel, which is a point in each lane, displaced by (x, y, z) [m]."""
+
+    row: KernelRow
+    b: Any
+    x: Any
+    y: Any
+    z: Any

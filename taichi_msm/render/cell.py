@@ -1,0 +1,255 @@
+"""A cell of the sheet as the camera sees it, for one sample or a vector of them, in f32 or f64.
+
+A point of the surface is represented by (X, Y, w, depth), the product of the camera's matrix and the point. That map is
+linear, so refining the projected mass points is the same as refining the surface, and perspective is no special case.
+In a cell, with s to the right and t down, the surface between the four mass points is
+
+    P(s, t) = A + B s + C t + D s t,    seen at sample (x, y) where    X - x w = 0,  Y - y w = 0.
+
+It is cut into small quads, and these into triangles along the diagonal from top left to bottom right. Corners are
+listed row by row: upper left and right, lower left and right.
+"""
+
+# No `from __future__ import annotations` here: Taichi reads the annotations of a kernel.
+
+from typing import Any, NamedTuple
+
+from taichi_msm.render.camera_kernel import POINT_NUMBERS, SEEN
+from taichi_msm.render.samples import INFINITY
+from taichi_msm.system.runtime import ti
+
+# A triangle that is drawn by itself is enlarged a little, so that no gap is left beside it: by this fraction of its
+# side, and by this fraction of the picture's, which is what f32 resolves.
+OVERSTEP = 1e-5
+OVERSTEP_OF_PICTURE = 2e-6
+
+# In f32, a cell is drawn as a whole only if its outline stays within this distance [samples].
+FARTHEST = float(1 << 16)
+
+
+class Outline(NamedTuple):
+    """A cell in the picture."""
+
+    x: Any  # of its corners, a list
+    y: Any
+    left: Any  # its bounds
+    right: Any
+    top: Any
+    bottom: Any
+    side: Any  # 1 where its front is seen, -1 where its back is, 0 if it is folded
+    in_front: Any  # whether all of its corners are in front of the camera
+    behind: Any  # whether none is
+
+
+class Patch(NamedTuple):
+    """The surface between four mass points."""
+
+    a: Any  # coefficients, each (X, Y, w, depth)
+    b: Any
+    c: Any
+    d: Any
+    side: Any  # as in its `Outline`
+    whole: Any  # whether it is drawn as a whole, and not triangle by triangle
+
+
+class Triangle(NamedTuple):
+    """The triangle P + R s + D t of a small quad that a sample is on; P, R and D are lists of X, Y, w and depth."""
+
+    p: Any
+    r: Any
+    d: Any
+    below: Any  # whether it is the one below the diagonal, where t > s
+
+
+@ti.func
+def corner_of(cell, cols):
+    """Give the first number of a cell's upper left mass point."""
+    return (cell // (cols - 1) * cols + cell % (cols - 1)) * POINT_NUMBERS
+
+
+@ti.func
+def outlined(corner, cols, near, point: ti.template()):
+    """Find the `Outline` of the cell whose upper left mass point has its numbers from `corner` on."""
+    below = corner + cols * POINT_NUMBERS
+    corners = ti.static((corner, corner + POINT_NUMBERS, below, below + POINT_NUMBERS))
+    x = [point[at + SEEN] for at in corners]
+    y = [point[at + SEEN + 1] for at in corners]
+    w = [point[at + 2] for at in corners]
+    side = seen_side(x, y)
+    in_front = w[0] > near and w[1] > near and w[2] > near and w[3] > near
+    behind = w[0] <= near and w[1] <= near and w[2] <= near and w[3] <= near
+    left, right = ti.min(x[0], x[1], x[2], x[3]), ti.max(x[0], x[1], x[2], x[3])
+    top, bottom = ti.min(y[0], y[1], y[2], y[3]), ti.max(y[0], y[1], y[2], y[3])
+    return ti.static(Outline(x, y, left, right, top, bottom, side, in_front, behind))
+
+
+@ti.func
+def is_whole(outline: ti.template()):
+    """Tell whether a cell can be drawn as a whole in f32."""
+    return (
+        outline.in_front
+        and outline.side != 0
+        and ti.max(-outline.left, outline.right) < FARTHEST
+        and ti.max(-outline.top, outline.bottom) < FARTHEST
+    )
+
+
+@ti.func
+def patch_of(corner, cols, side, whole, point: ti.template(), double: ti.template()):
+    """Make the `Patch` of a cell; `double` tells that numbers are in f64, where D is summed in another order."""
+    below = corner + cols * POINT_NUMBERS
+    a = ti.Vector([point[corner + n] for n in ti.static(range(4))])
+    right = ti.Vector([point[corner + POINT_NUMBERS + n] for n in ti.static(range(4))])
+    down = ti.Vector([point[below + n] for n in ti.static(range(4))])
+    far = ti.Vector([point[below + POINT_NUMBERS + n] for n in ti.static(range(4))])
+    b, c = right - a, down - a
+    d = far - right - down + a if ti.static(double) else far - right - c
+    return ti.static(Patch(a, b, c, d, side, whole))
+
+
+@ti.func
+def edge(p_x, p_y, q_x, q_y, x, y, side):
+    """Twice the signed area of p, q and (x, y), times side, which is 1 or -1.
+
+    The sign tells on which side of the line (x, y) is. Both cells of an edge get the same bits, but for the sign.
+    """
+    right, down = (q_x - p_x) * side, (q_y - p_y) * side
+    return right * (y - p_y) - down * (x - p_x)
+
+
+@ti.func
+def edges(x, y, side, outline: ti.template()):
+    """Give `edge` for the left, right, upper and lower edge of a cell; none is negative where the cell is seen."""
+    p, q = ti.static((outline.x, outline.y))
+    return (
+        edge(p[0], q[0], p[2], q[2], x, y, -side),
+        edge(p[1], q[1], p[3], q[3], x, y, side),
+        edge(p[0], q[0], p[1], q[1], x, y, side),
+        edge(p[2], q[2], p[3], q[3], x, y, -side),
+    )
+
+
+@ti.func
+def turn(p_x, p_y, q_x, q_y, r_x, r_y):
+    """Twice the signed area of p, q and r: above 0 if the path from p over q to r turns right in the picture."""
+    return (q_x - p_x) * (r_y - q_y) - (q_y - p_y) * (r_x - q_x)
+
+
+@ti.func
+def seen_side(x: ti.template(), y: ti.template()):
+    """Tell which side of a cell is seen, given its corners: 1: front; -1: back; 0: both, as it is folded."""
+    turns = [
+        turn(x[n], y[n], x[m], y[m], x[k], y[k]) for n, m, k in ti.static(((0, 1, 3), (1, 3, 2), (3, 2, 0), (2, 0, 1)))
+    ]
+    least, most = ti.min(turns[0], turns[1], turns[2], turns[3]), ti.max(turns[0], turns[1], turns[2], turns[3])
+    return ti.select(least > 0, 1.0, ti.select(most < 0, -1.0, 0.0))
+
+
+@ti.func
+def small_quad(x, y, inside, parts, patch: ti.template()):
+    """Find column and line of the small quads of a patch that are seen at (x, y).
+
+    `inside` are those that it covers; `parts` is the number of small quads along its side.
+    """
+    coefficients = ti.static((patch.a, patch.b, patch.c, patch.d))
+    a_1, b_1, c_1, d_1 = [k[0] - x * k[2] for k in coefficients]
+    a_2, b_2, c_2, d_2 = [k[1] - y * k[2] for k in coefficients]
+    # Eliminating t gives bd s^2 + (ad + bc) s + ac = 0; eliminating s gives an equation with the same discriminant.
+    ad = a_1 * d_2 - d_1 * a_2
+    bc = b_1 * c_2 - c_1 * b_2
+    ac = a_1 * c_2 - c_1 * a_2
+    ab = a_1 * b_2 - b_1 * a_2
+    bd = b_1 * d_2 - d_1 * b_2
+    linear = ad + bc
+    root = ti.sqrt(ti.max(linear * linear - 4.0 * bd * ac, 0.0)) * patch.side
+    s = ti.select(inside, -2.0 * ac / (linear + root), 0.0)
+    t = ti.select(inside, -2.0 * ab / (ad - bc - root), 0.0)
+    return (
+        ti.max(ti.min(ti.floor(s * parts), parts - 1.0), 0.0),
+        ti.max(ti.min(ti.floor(t * parts), parts - 1.0), 0.0),
+    )
+
+
+@ti.func
+def triangle_at(x, y, column, line, part, lower, patch: ti.template()):
+    """Find the `Triangle` of a small quad that (x, y) is on; in a patch that is not whole, the `lower` or upper one.
+
+    The small quad is in this column and line of the cell, and `part` is its side as a fraction of the cell's.
+    """
+    a, b, c, d = ti.static((patch.a, patch.b, patch.c, patch.d))
+    s0 = column * part
+    t0 = line * part
+    p = [a[n] + b[n] * s0 + (c[n] + d[n] * s0) * t0 for n in ti.static(range(4))]
+    # The small quad: P + R s + Q t + twist s t.
+    r = [(b[n] + d[n] * t0) * part for n in ti.static(range(4))]
+    q = [(c[n] + d[n] * s0) * part for n in ti.static(range(4))]
+    twist = d * (part * part)
+    f_w = p[2] + r[2] + q[2] + twist[2]
+    below = (
+        (p[0] - x * p[2]) * (p[1] + r[1] + q[1] + twist[1] - y * f_w)
+        - (p[1] - y * p[2]) * (p[0] + r[0] + q[0] + twist[0] - x * f_w)
+    ) * patch.side >= 0.0
+    if not patch.whole:
+        below = lower
+    for n in ti.static(range(4)):
+        r[n] = ti.select(below, r[n] + twist[n], r[n])
+        q[n] = ti.select(below, q[n], q[n] + twist[n])
+    return ti.static(Triangle(p, r, q, below))
+
+
+@ti.func
+def on_triangle(x, y, triangle: ti.template()):
+    """Find (s, t) where the triangle is seen at (x, y)."""
+    coefficients = ti.static((triangle.p, triangle.r, triangle.d))
+    p_1, r_1, d_1 = [k[0] - x * k[2] for k in coefficients]
+    p_2, r_2, d_2 = [k[1] - y * k[2] for k in coefficients]
+    share = 1.0 / (r_1 * d_2 - r_2 * d_1)
+    return (p_2 * d_1 - p_1 * d_2) * share, (p_1 * r_2 - p_2 * r_1) * share
+
+
+@ti.func
+def is_within(s, t, overstep, near, triangle: ti.template()):
+    """Tell whether (s, t) is in a triangle that is enlarged by a fraction of its side, and in front of the camera."""
+    larger = ti.select(triangle.below, t, s)
+    smaller = ti.select(triangle.below, s, t)
+    return (
+        (smaller >= -overstep)
+        & (larger <= 1.0 + overstep)
+        & (smaller <= larger + overstep)
+        & (triangle.p[2] + triangle.r[2] * s + triangle.d[2] * t > near)
+    )
+
+
+@ti.func
+def depth_at(s, t, triangle: ti.template()):
+    """Give the depth of a triangle's plane at (s, t)."""
+    return triangle.p[3] + triangle.r[3] * s + triangle.d[3] * t
+
+
+@ti.func
+def triangle_bounds(column, line, lower, part, near, width, height, patch: ti.template()):
+    """Find the bounds of a small triangle in a picture of this width and height; other arguments as for `triangle_at`.
+
+    Returns:
+        Least and largest x, least and largest y; and by what fraction of its side it is enlarged.
+    """
+    a, b, c, d = ti.static((patch.a, patch.b, patch.c, patch.d))
+    low_x, high_x, low_y, high_y = 0.0, ti.cast(width, ti.f32), -INFINITY, INFINITY
+    overstep = OVERSTEP
+    s0, t0 = column * part, line * part
+    s1, t1 = (column + 1) * part, (line + 1) * part
+    p = a + b * s0 + (c + d * s0) * t0
+    q = a + b * s1 + (c + d * s1) * t1
+    r = a + b * s0 + (c + d * s0) * t1
+    if not lower:
+        r = a + b * s1 + (c + d * s1) * t0
+    if p[2] > near and q[2] > near and r[2] > near:
+        low_x = ti.min(p[0] / p[2], q[0] / q[2], r[0] / r[2])
+        high_x = ti.max(p[0] / p[2], q[0] / q[2], r[0] / r[2])
+        low_y = ti.min(p[1] / p[2], q[1] / q[2], r[1] / r[2])
+        high_y = ti.max(p[1] / p[2], q[1] / q[2], r[1] / r[2])
+        extent = ti.max(high_x - low_x, high_y - low_y, 1e-3)
+        overstep += OVERSTEP_OF_PICTURE * (width + height) / extent
+    elif p[2] <= near and q[2] <= near and r[2] <= near:
+        high_x = -1.0
+    return low_x, high_x, low_y, high_y, overstep
