@@ -17,8 +17,7 @@ from PIL import Image
 
 from taichi_msm.errors import FilesError
 from taichi_msm.export.convert import convert
-from taichi_msm.export.kitti import encode
-from taichi_msm.export.png16 import png16
+from taichi_msm.export.kitti import encode, png16
 from taichi_msm.outputs.flo import read_flo
 from taichi_msm.results.finished_run import reading
 from tests.outputs import files

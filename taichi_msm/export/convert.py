@@ -40,13 +40,9 @@ class Exported(NamedTuple):
 
 
 def convert(run: Path, name: str, directory: Path, progress: Count = lambda done, total: None) -> Exported:
-    """Convert the results of a run; the files replace those of an earlier export.
+    """Convert the results of a run to the format of this name; the files replace those of an earlier export.
 
-    Args:
-        run: the folder of the run's results.
-        name: of the format, one of `FORMATS`.
-        directory: where the files go; made if it does not exist.
-        progress: called with the frames done and the frames in all; what it raises stops the work, and no file changes.
+    `progress` is called with the frames done and the frames in all; what it raises stops the work, and no file changes.
 
     Raises:
         FilesError: when a file that is needed is missing or damaged, or the directory cannot be written.

@@ -9,11 +9,15 @@ Browsers store the targets in a texture with a layer for each, and WebGL 2 guara
 frames, or with so many points that the file would be too large, is reduced to key frames, and the largest error of this
 is reported.
 
-Source: the glTF 2.0 specification of Khronos, sections 3.7.2.2 (morph targets) and 3.11 (animations).
+Source: the glTF 2.0 specification of Khronos, sections 3.6 (accessors), 3.7.2.2 (morph targets), 3.11 (animations) and
+4.4 (GLB).
 """
 
 from __future__ import annotations
 
+import json
+import struct
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -21,7 +25,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from taichi_msm import __version__
-from taichi_msm.export.glb import INDICES, VERTICES, Binary
 from taichi_msm.export.keyframes import key_frames
 from taichi_msm.export.mesh import REFINE, picture_png, unit_normals
 from taichi_msm.progress import Count
@@ -40,14 +43,20 @@ VERTEX_BYTES = 2 * 3 * 4
 # OpenGL's constants for filtering a picture, and for clamping it at its edge.
 LINEAR, MIPMAPS, CLAMPED = 9729, 9987, 33071
 
+MAGIC, VERSION = b"glTF", 2
+JSON, BINARY = b"JSON", b"BIN\0"
+
+COMPONENTS = {"f": 5126, "u": 5125}  # float32, uint32
+KINDS = {1: "SCALAR", 2: "VEC2", 3: "VEC3"}
+# What a buffer holds: vertices, or indices of vertices.
+VERTICES, INDICES = 34962, 34963
+
+# Every part begins at a multiple of this many bytes.
+ALIGNMENT = 4
+
 
 def write(run: FinishedRun, folder: Path, progress: Count) -> list[str]:
-    """Write the surface of a run, with its picture.
-
-    Raises:
-        FilesError: when the run has no trajectory, or it is damaged.
-        SceneError: when the picture is missing.
-    """
+    """Write the surface of a run, with its picture; raises what `FinishedRun.positions` and `picture_png` do."""
     positions, picture, binary = run.positions(), picture_png(run), Binary()
     most = max(1, min(MOST_TARGETS, MOST_BYTES // (VERTEX_BYTES * positions[0, ..., 0].size)))
     keys = key_frames(positions, 1 + most, progress)
@@ -133,3 +142,60 @@ def _texture(picture: bytes, binary: Binary) -> dict[str, Any]:
         "images": [{"name": "picture", "mimeType": "image/png", "bufferView": binary.view(picture)}],
         "samplers": [{"magFilter": LINEAR, "minFilter": MIPMAPS, "wrapS": CLAMPED, "wrapT": CLAMPED}],
     }
+
+
+class Binary:
+    """The binary chunk of a .glb file as it grows: its container has JSON, and this chunk that the JSON refers to.
+
+    It is written here because a header of 12 bytes and two chunks cost less than pygltflib and what that depends on.
+    """
+
+    def __init__(self) -> None:
+        self._views: list[dict[str, Any]] = []
+        self._accessors: list[dict[str, Any]] = []
+        self._parts: list[bytes | memoryview] = []
+        self._length = 0
+
+    def view(self, data: bytes | memoryview, target: int | None = None) -> int:
+        """Add bytes, and return the number of their view; `target` tells what they are for."""
+        place = {"buffer": 0, "byteOffset": self._length, "byteLength": len(data)}
+        self._views.append(place if target is None else {**place, "target": target})
+        self._parts += [data, _padding(len(data), b"\0")]
+        self._length += _padded(len(data))
+        return len(self._views) - 1
+
+    def accessor(self, values: NDArray[Any], target: int | None = None, *, bounds: bool = False) -> int:
+        """Add numbers, and return the number of their accessor, which has their `bounds` if asked for.
+
+        They are float32 or uint32, one number or a vector in each row; `target` tells what they are for.
+        """
+        rows = np.ascontiguousarray(values).reshape(len(values), -1)
+        accessor = {
+            "bufferView": self.view(rows.data.cast("B"), target),
+            "componentType": COMPONENTS[rows.dtype.kind],
+            "count": len(rows),
+            "type": KINDS[rows.shape[1]],
+        }
+        if bounds:
+            accessor |= {"min": rows.min(axis=0).tolist(), "max": rows.max(axis=0).tolist()}
+        self._accessors.append(accessor)
+        return len(self._accessors) - 1
+
+    def container(self, document: dict[str, Any]) -> Iterator[bytes | memoryview]:
+        """Give the parts of a file with these data and the document that refers to them."""
+        own = {"accessors": self._accessors, "bufferViews": self._views, "buffers": [{"byteLength": self._length}]}
+        text = json.dumps({**document, **own}, separators=(",", ":"), allow_nan=False).encode()
+        text += _padding(len(text), b" ")
+        yield struct.pack("<4sII", MAGIC, VERSION, 12 + 8 + len(text) + 8 + self._length)
+        yield struct.pack("<I4s", len(text), JSON)
+        yield text
+        yield struct.pack("<I4s", self._length, BINARY)
+        yield from self._parts
+
+
+def _padded(length: int) -> int:
+    return -(-length // ALIGNMENT) * ALIGNMENT
+
+
+def _padding(length: int, filler: bytes) -> bytes:
+    return filler * (_padded(length) - length)

@@ -22,12 +22,8 @@ def key_frames(position: NDArray[np.floating], most: int, progress: Count = lamb
     """Choose the key frames of a motion: all frames, unless they are too many.
 
     If they are, the first and the last frame are key frames to begin with. Then the frame that the key frames represent
-    worst becomes a key frame too, again and again. So key frames are close together where the motion is sudden.
-
-    Args:
-        position: positions [m] at equal distances in time, shape (frames, rows, cols, 3).
-        most: the largest number of key frames; 2 or more.
-        progress: called with the number of key frames chosen so far, and `most`.
+    worst becomes a key frame too, up to `most`, 2 or more. So key frames are close together where the motion is sudden.
+    Positions [m] are at equal distances in time, shape (frames, rows, cols, 3).
 
     Source: Douglas and Peucker 1973, for all points together and with a given number instead of a tolerance.
     """

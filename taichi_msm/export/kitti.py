@@ -15,13 +15,15 @@ Source: the development kit of KITTI's scene flow benchmark 2015, readme.txt and
 
 from __future__ import annotations
 
+import struct
+import zlib
+from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
 from taichi_msm.errors import FilesError
-from taichi_msm.export.png16 import png16
 from taichi_msm.outputs.flo import read_flo
 from taichi_msm.outputs.table import OUTPUTS
 from taichi_msm.progress import Count
@@ -30,13 +32,19 @@ from taichi_msm.results.whole import add
 
 SCALE, ZERO, LARGEST = 64.0, 32768.0, 65535.0
 
+# Of PNGs.
+SIGNATURE = b"\x89PNG\r\n\x1a\n"
+DEPTH, RGB = 16, 2
+# The filter that keeps the difference from the row above, byte by byte.
+UP = 2
+
+# Level 1 takes a tenth of the time of the default (17 against 169 ms for rough flow of 512 x 512 pixels) for 7 % more
+# bytes.
+COMPRESS_LEVEL = 1
+
 
 def write(run: FinishedRun, folder: Path, progress: Count) -> list[str]:
-    """Write the flow of a run, and its frames and occlusion if it has them.
-
-    Raises:
-        FilesError: when the run has no flow, or when a file is missing or damaged.
-    """
+    """Write the flow of a run, and its frames and occlusion if it has them."""
     pairs = run.frames - 1
     if pairs == 0:
         raise FilesError(f"{run.directory}: has only one frame, and flow needs two; run the scene to its end")
@@ -63,14 +71,9 @@ def write(run: FinishedRun, folder: Path, progress: Count) -> list[str]:
 
 
 def encode(flow: NDArray[np.float32], seen: NDArray[np.bool_] | None = None) -> NDArray[np.uint16]:
-    """Turn flow into the colours of KITTI.
+    """Turn flow to the right and down [px], shape (height, width, 2), into the colours of KITTI, shape (..., 3).
 
-    Args:
-        flow: to the right and down [px], shape (height, width, 2); values that do not fit are not valid.
-        seen: where flow can be valid at all, shape (height, width); None: everywhere.
-
-    Returns:
-        Red, green and blue, shape (height, width, 3).
+    Values that do not fit are not valid, nor are those where nothing is `seen`, shape (height, width).
     """
     # In double precision, so that the only rounding is to the nearest whole number.
     scaled = np.rint(flow.astype(np.float64) * SCALE + ZERO)
@@ -81,6 +84,32 @@ def encode(flow: NDArray[np.float32], seen: NDArray[np.bool_] | None = None) -> 
     colours[valid, :2] = scaled[valid]
     colours[valid, 2] = 1
     return colours
+
+
+def png16(picture: NDArray[np.uint16]) -> bytes:
+    """Encode colours, shape (height, width, 3), as a PNG of 16 bits a channel.
+
+    It is written here, in half a page: Pillow has no such pictures in colour, pypng has had no release since 2022, and
+    OpenCV would be 60 MB to install for one call.
+
+    Source: the PNG specification of the W3C (third edition), sections 9 (filters) and 11 (chunks).
+    """
+    height, width, _ = picture.shape
+    rows = picture.astype(">u2").view(np.uint8).reshape(height, -1)
+    above = np.zeros_like(rows)
+    above[1:] = rows[:-1]
+    filtered = np.full((height, 1 + rows.shape[1]), UP, np.uint8)
+    filtered[:, 1:] = rows - above
+    header = struct.pack(">IIBBBBB", width, height, DEPTH, RGB, 0, 0, 0)
+    data = zlib.compress(filtered.tobytes(), COMPRESS_LEVEL)
+    return b"".join([SIGNATURE, *_chunk(b"IHDR", header), *_chunk(b"IDAT", data), *_chunk(b"IEND", b"")])
+
+
+def _chunk(kind: bytes, data: bytes) -> Iterator[bytes]:
+    yield struct.pack(">I", len(data))
+    yield kind
+    yield data
+    yield struct.pack(">I", zlib.crc32(data, zlib.crc32(kind)))
 
 
 def _copy(run: FinishedRun, number: int, path: Path) -> None:

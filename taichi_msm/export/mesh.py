@@ -21,8 +21,7 @@ PICTURE = "picture.png"
 def picture_png(run: FinishedRun) -> bytes | None:
     """Encode the picture on the sheet, cut to the scene's region; None if the scene names none.
 
-    Raises:
-        SceneError: when it is missing, or can no longer be used.
+    Raises a SceneError when it is missing, or can no longer be used.
     """
     if run.scene.image is None:
         return None
@@ -32,15 +31,10 @@ def picture_png(run: FinishedRun) -> bytes | None:
 
 
 def unit_normals(position: NDArray[np.floating]) -> NDArray[np.float64]:
-    """Give unit normals of the points, the same as for the light in pictures; along z where a fold leaves none.
+    """Give unit normals of points at `position`, shape (rows, cols, 3), the same as for the light in pictures.
 
-    They come from central differences, at edges from one-sided ones.
-
-    Args:
-        position: positions [m], shape (rows, cols, 3).
-
-    Returns:
-        Normals, toward the viewer at rest, shape (rows cols, 3).
+    They come from central differences, at edges from one-sided ones, have shape (rows cols, 3), and are toward the
+    viewer at rest, along z where a fold leaves none.
     """
     place = position.astype(np.float64)
     normal = np.cross(np.gradient(place, axis=1), -np.gradient(place, axis=0)).reshape(-1, 3)

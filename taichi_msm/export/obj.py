@@ -28,12 +28,7 @@ EXACT = "%.9g"
 
 
 def write(run: FinishedRun, folder: Path, progress: Count) -> list[str]:
-    """Write the surface of every frame, its material and the picture.
-
-    Raises:
-        FilesError: when the run has no trajectory, or it is damaged.
-        SceneError: when the picture is missing.
-    """
+    """Write the surface of every frame, its material and the picture; raises as `gltf.write` does."""
     positions, picture = run.positions(), picture_png(run)
     if picture is not None:
         add(folder / PICTURE, picture)

@@ -43,11 +43,7 @@ class _Pickler(pickle.Pickler):
 
 
 def write(run: FinishedRun, folder: Path, progress: Count) -> list[str]:
-    """Write the tracks of a run and its frames.
-
-    Raises:
-        FilesError: when the run has no tracks or no frames, a file is damaged, or the video does not fit into memory.
-    """
+    """Write the tracks of a run and its frames; raises a FilesError when the video does not fit into memory."""
     width, height = run.scene.render.size
     points, occluded = read_tracks(run)
     # Readers hold the whole video in memory; writing it takes twice that.
@@ -69,14 +65,9 @@ def write(run: FinishedRun, folder: Path, progress: Count) -> list[str]:
 
 
 def read_tracks(run: FinishedRun) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
-    """Read the tracks of a run.
+    """Read where each point is [px], shape (tracks, frames, 2), and whether it is hidden, shape (tracks, frames).
 
-    Returns:
-        Where each point is [px], shape (tracks, frames, 2), and whether it is hidden, shape (tracks, frames). A point
-        behind the eye has no place in the picture's plane; it is hidden and at (0, 0).
-
-    Raises:
-        FilesError: when there are none, or they are damaged.
+    A point behind the eye has no place in the picture's plane; it is hidden and at (0, 0).
     """
     path = run.result("tracks")
     with reading(path), zipfile.ZipFile(path) as archive:

@@ -42,10 +42,7 @@ Array = NDArray[np.floating]
 def write(run: FinishedRun, folder: Path, progress: Count) -> list[str]:
     """Write the surface of every frame, their times and the picture.
 
-    Raises:
-        FilesError: when the run has no trajectory, or it is damaged.
-        SceneError: when the picture or the map is missing.
-        NotInstalledError: when VTK is not installed.
+    Raises as `gltf.write` does; and a NotInstalledError when VTK is not installed.
     """
     try:
         import vtkmodules.vtkIOXML  # noqa: F401
@@ -71,15 +68,9 @@ def write(run: FinishedRun, folder: Path, progress: Count) -> list[str]:
 
 
 def speed(positions: Array, time: Array, frame: int) -> Array:
-    """Give the speed of the points, by the difference of the frames on either side; 0 in the first, which is at rest.
+    """Give the speed of the points in a frame [m/s], shape (rows, cols), by the difference of the frames beside it.
 
-    Args:
-        positions: of every frame [m], shape (frames, rows, cols, 3).
-        time: of every frame [s], shape (frames,).
-        frame: which one.
-
-    Returns:
-        Speed [m/s], shape (rows, cols).
+    It is 0 in the first, which is at rest. `positions` [m] are of all frames, shape (frames, rows, cols, 3).
 
     Order: 2 in the time of a frame; 1 in the last frame, and wherever the load jumps.
     """

@@ -20,19 +20,7 @@ def write_flo(file: BinaryIO, flow: NDArray[np.float32]) -> None:
 
 
 def read_flo(path: Path, size: tuple[int, int]) -> NDArray[np.float32]:
-    """Read a file of flow.
-
-    Args:
-        path: of the file.
-        size: width, height that it must have [px].
-
-    Returns:
-        Flow to the right and down [px], shape (height, width, 2).
-
-    Raises:
-        OSError: when it cannot be read.
-        ValueError: when it is not a flow of that size.
-    """
+    """Read flow as above; raises ValueError when the file has no flow of this width and height [px]."""
     width, height = size
     header, length = _header(width, height), 8 * width * height
     with path.open("rb") as file:

@@ -46,9 +46,7 @@ def shades(picture: Picture) -> Picture:
 class Palette:
     """The colours that all frames share.
 
-    Args:
-        samples: colours like those of the frames to come, shape (height, width, 3).
-        background: a colour that is kept exactly, whatever the samples are.
+    They are chosen for samples, shape (height, width, 3), like the frames to come; the background is kept exactly.
     """
 
     def __init__(self, samples: Picture, background: tuple[int, int, int]) -> None:
@@ -81,13 +79,8 @@ class GifWriter:
     """An animation that loops for ever; frame f lasts from f / rate to (f + 1) / rate, in whole 1/100 s.
 
     A frame that would be shown for less than 2/100 s is left out, except the last one, for which the one before is
-    shortened. A frame equal to the one before is left out too, and the one before lasts longer.
-
-    Args:
-        file: open for writing; it is closed in the end.
-        size: width, height [px].
-        rate: frames per second.
-        palette: the colours of all frames.
+    shortened. A frame equal to the one before is left out too, and the one before lasts longer. The size is width and
+    height [px]; `close` closes the file.
     """
 
     def __init__(self, file: BinaryIO, size: tuple[int, int], rate: float, palette: Palette) -> None:

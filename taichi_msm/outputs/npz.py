@@ -46,11 +46,9 @@ def _parts(array: NDArray[Any]) -> Iterable[NDArray[Any]]:
 
 
 def read_array(archive: zipfile.ZipFile, name: str, dtype: DTypeLike, shape: Shape) -> NDArray[Any]:
-    """Read an array that `write_arrays` wrote; it must have this dtype and shape.
+    """Read an array that `write_arrays` wrote; raises ValueError before memory is allocated if dtype or shape differ.
 
-    Raises:
-        ValueError: when dtype or shape differ; raised before memory is allocated for the array.
-        Exception: whatever `zipfile` raises for a damaged archive.
+    Of a damaged archive it raises whatever `zipfile` does.
     """
     header, info = _header(dtype, shape), _entry(archive, name, dtype, shape)
     # Checks the CRC-32.

@@ -1,8 +1,8 @@
 """The files from which another process can continue an unfinished run: its manifest, its frames and its last state.
 
 Every part has a checksum, which is verified before the part is used: a SHA-256 for the manifest, one for the positions
-of every frame, and the CRC-32 of the archive for the arrays of the state. What
-they say is not trusted, as anybody may have written them.
+of every frame, and the CRC-32 of the archive for the arrays of the state. What they say is not trusted, as anybody may
+have written them.
 """
 
 from __future__ import annotations
@@ -43,13 +43,9 @@ DIGEST_BYTES = 32
 
 
 class Checkpoint:
-    """A folder from which a run can continue, no matter when its process is killed.
+    """A folder, made by `begin`, from which a run can continue, no matter when its process is killed.
 
-    Args:
-        folder: for its files; made by `begin`.
-        grid: the steps of the run.
-        points: rows and columns of the sheet.
-        keeps_positions: whether the positions of the frames are kept.
+    A FilesError, of the methods that read, says which part is damaged.
 
     Attributes:
         frames: number of frames added so far.
@@ -93,12 +89,7 @@ class Checkpoint:
         (self._folder / MANIFEST).unlink(missing_ok=True)
 
     def reopen(self) -> Saved | None:
-        """Continue an earlier run; returns the state that it saved last, or None to continue from rest.
-
-        Raises:
-            DamagedError: when the files do not belong together.
-            OSError: when they cannot be read.
-        """
+        """Continue an earlier run; returns the state that it saved last, or None to continue from rest."""
         self.close()
         path = self._folder / POSITIONS
         try:
@@ -128,11 +119,7 @@ class Checkpoint:
         self.frames += 1
 
     def position(self, frame: int) -> NDArray[Any]:
-        """Read the positions of a frame [m], shape (rows, cols, 3).
-
-        Raises:
-            DamagedError: when they are not as they were written.
-        """
+        """Read the positions of a frame [m], shape (rows, cols, 3)."""
         assert self._positions is not None, "begin or reopen comes first"
         record = np.empty(self._record_bytes, np.uint8)
         self._positions.seek(frame * self._record_bytes)
@@ -148,8 +135,7 @@ class Checkpoint:
     def save(self, saved: Saved) -> str:
         """Save a state of the run, replacing the one saved before; the frames up to it must have been added.
 
-        Returns:
-            The path of the file, which has the arrays of `State` and the numbers of `RunProgress` by name.
+        Gives the path of the file, which has the arrays of `State` and the numbers of `RunProgress` by name.
         """
         start = time.perf_counter()
         path = self._folder / STATE
@@ -160,11 +146,7 @@ class Checkpoint:
         return str(path)
 
     def load(self) -> Saved | None:
-        """Read the state that was saved last; None: none was.
-
-        Raises:
-            DamagedError: when it cannot be a state of this run.
-        """
+        """Read the state that was saved last; None: none was."""
         like = self._arrays(Saved(State(0, np.empty(0), np.empty(0)), RunProgress()))
         sheet = self.precision, self._shape
         kinds = {name: sheet if array.size == 0 else (array.dtype, array.shape) for name, array in like.items()}
@@ -207,12 +189,7 @@ class Checkpoint:
 
 
 def open_manifest(directory: Path) -> BinaryIO:
-    """Open the manifest of the unfinished run in a directory.
-
-    Raises:
-        OSError: when there is none.
-        ForeignError: when there is a link or a device in its place.
-    """
+    """Open the manifest of the unfinished run in a directory; raises OSError or ForeignError when there is none."""
     checkpoint = require(require(directory / STAGING, FOLDER) / CHECKPOINT, FOLDER)
     return require(checkpoint / MANIFEST, FILE).open("rb")
 

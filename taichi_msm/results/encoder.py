@@ -71,14 +71,9 @@ class Report(NamedTuple):
 
 
 class Encoder:
-    """A process that encodes pictures.
+    """A process that encodes pictures, and holds the file descriptors that it inherits open while it lives.
 
-    Args:
-        job: what to encode.
-        inherit: file descriptors that the process holds open while it lives.
-
-    Raises:
-        OSError: here or in the methods, when a file cannot be written or the process ends; at the latest in `finish`.
+    An OSError, in any method and at the latest in `finish`, says that a file cannot be written or the process ended.
     """
 
     def __init__(self, job: Job, inherit: tuple[int, ...] = ()) -> None:
@@ -196,16 +191,7 @@ def main() -> None:
 
 
 def encode(job: Job, source: BinaryIO, hurry: Event) -> Report:
-    """Encode the pictures of a stream until it ends.
-
-    Args:
-        job: what to encode.
-        source: the bytes of the pictures, one after another.
-        hurry: once this is set, pictures that are not being encoded yet are given up.
-
-    Raises:
-        OSError: when a file cannot be written.
-    """
+    """Encode the pictures of a stream of bytes until it ends; in a hurry those are given up that are not begun."""
     width, height = job.size
     depth = max(1, min(WAITING, WAITING_BYTES // (3 * width * height)))
     parent = os.getppid()

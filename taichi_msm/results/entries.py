@@ -30,11 +30,7 @@ def kind(path: Path) -> str | None:
 
 
 def require(path: Path, wanted: str) -> Path:
-    """Make sure that an entry, if it exists, is of a kind; returns its path.
-
-    Raises:
-        ForeignError: when it is of another kind.
-    """
+    """Make sure that an entry, if it exists, is of a kind, or raise a ForeignError; returns its path."""
     if (actual := kind(path)) not in (None, wanted):
         raise ForeignError.at(path, str(actual))
     return path
@@ -43,14 +39,8 @@ def require(path: Path, wanted: str) -> Path:
 def files(top: Path, patterns: Collection[str], *, strict: bool, besides: Collection[str] = ()) -> Iterator[str]:
     """List the files in a folder and below whose names, with slashes, match a pattern; no link is followed.
 
-    Args:
-        top: the folder.
-        patterns: regular expressions. All parts but the last of each are names of folders, and no expressions.
-        strict: whether anything else is an error.
-        besides: entries of the folder that are passed over.
-
-    Raises:
-        ForeignError: names the first other entry.
+    Patterns are regular expressions in their last part, and names of folders before it. If `strict`, the first other
+    entry is a ForeignError, but for those `besides`.
     """
     allowed, folders = re.compile("|".join(patterns)), parents(patterns)
 
@@ -70,11 +60,7 @@ def files(top: Path, patterns: Collection[str], *, strict: bool, besides: Collec
 
 
 def clear(top: Path, patterns: Collection[str], keep: Collection[str] = ()) -> None:
-    """Remove all entries of a folder but those to keep, if it has only files that match a pattern, as for `files`.
-
-    Raises:
-        ForeignError: when it has others; then nothing is removed.
-    """
+    """Remove all entries of a folder but those to keep; before, raise a ForeignError if `files` does not allow one."""
     list(files(top, patterns, strict=True))
     for path in list(top.iterdir()):
         if path.name in keep:

@@ -54,10 +54,7 @@ class FinishedRun:
         return np.arange(self.frames) / self.scene.time.frames_per_second
 
     def positions(self) -> NDArray[np.floating]:
-        """Map the trajectory into memory, after reading it once to find damage.
-
-        Returns:
-            Positions [m], shape (frames, rows, cols, 3), read-only.
+        """Map the trajectory [m], shape (frames, rows, cols, 3), read-only, after reading it once to find damage.
 
         Raises:
             FilesError: when there is none, or it is damaged or belongs to another run.
@@ -77,8 +74,7 @@ class FinishedRun:
     def picture(self, key: str, frame: int) -> NDArray[np.uint8]:
         """Read a picture that was written for an entry of `output`; colours, shape (height, width, 3).
 
-        Raises:
-            FilesError: when it is missing or cannot be read, or has another size than the scene's.
+        Raises a FilesError when it is missing or cannot be read, or has another size than the scene's.
         """
         path = self.result(key, frame)
         try:
@@ -91,11 +87,7 @@ class FinishedRun:
 
     @contextmanager
     def unchanged(self) -> Iterator[None]:
-        """Make sure that everything that is read in the block is of this run.
-
-        Raises:
-            FilesError: when another run has published its results meanwhile; also instead of what the block raises.
-        """
+        """Raise a FilesError when another run publishes its results in the block; also instead of what that raises."""
         try:
             yield
         except MsmError:
@@ -112,11 +104,7 @@ class FinishedRun:
             raise FilesError(f"{self.directory}: another run replaced these results while they were read; try again")
 
     def require_pictures(self, *, drawn: bool) -> None:
-        """Make sure that the maps, and if it is `drawn` the picture, are those that were run, by their SHA-256.
-
-        Raises:
-            FilesError: when one of them is missing or has changed.
-        """
+        """Raise a FilesError if a map, or the picture if it is `drawn`, is not what was run, by its SHA-256."""
         for key, path in self.scene.pictures.items():
             if key == "image" and not drawn:
                 continue
@@ -142,8 +130,7 @@ class FinishedRun:
     def result(self, key: str, frame: int = 0) -> Path:
         """Find a file that was written for an entry of `output`, of a frame if there is one for each.
 
-        Raises:
-            FilesError: when it is not there.
+        Raises a FilesError when it is not there.
         """
         result, path = OUTPUTS[key].result, self.directory / OUTPUTS[key].path(frame)
         if not self.has(key):
@@ -158,9 +145,6 @@ class FinishedRun:
 
 def read_run(directory: str | Path) -> FinishedRun:
     """Read the record of a run; its other results are read only when they are asked for.
-
-    Args:
-        directory: where the results are.
 
     Raises:
         ArgumentError: when the directory cannot be a path.
@@ -184,11 +168,7 @@ def read_run(directory: str | Path) -> FinishedRun:
 
 @contextmanager
 def reading(path: Path) -> Iterator[None]:
-    """Turn any error that is raised while a result is read into one line with its remedy.
-
-    Raises:
-        FilesError: instead of any other error; damaged archives and records raise nearly anything.
-    """
+    """Turn any error while a result is read into a FilesError; damaged archives and records raise nearly anything."""
     try:
         yield
     except FilesError:
@@ -206,11 +186,7 @@ def damaged(path: Path) -> FilesError:
 
 
 def _as_run(record: Mapping[str, Any]) -> Scene:
-    """Make the scene of a record, whose pictures are found from the current directory.
-
-    Raises:
-        Exception: when the scene cannot be run, or the record lacks something.
-    """
+    """Make the scene of a record, whose pictures are found from the current directory."""
     scene, folder = Scene(**record["scene"]), Path(record["working_directory"])
     if folder != Path.cwd():
         scene = scene.with_pictures(lambda path: str(folder / path))

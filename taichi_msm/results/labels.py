@@ -8,7 +8,6 @@ from pathlib import Path
 from typing import Any, BinaryIO
 
 import numpy as np
-from numpy.typing import NDArray
 from PIL import Image
 
 from taichi_msm.outputs.flo import write_flo
@@ -24,12 +23,7 @@ COMPRESS_LEVEL = 1
 
 
 class LabelWriter:
-    """Writes the labels of a run, frame by frame.
-
-    Args:
-        folder: where the files go.
-        scene: what is run; its `output` says which labels are wanted.
-    """
+    """Writes the labels that a scene's `output` asks for into a folder, frame by frame."""
 
     def __init__(self, folder: Path, scene: Scene) -> None:
         self._folder = folder
@@ -71,17 +65,9 @@ class LabelWriter:
                 write_arrays(file, {"coordinates": grid, "points": points, "occluded": occluded})
 
 
-def _write_depth(file: BinaryIO, depth: NDArray[np.float32]) -> None:
-    Image.fromarray(depth).save(file, "TIFF")
-
-
-def _write_mask(file: BinaryIO, mask: NDArray[np.uint8]) -> None:
-    Image.fromarray(mask).save(file, "PNG", compress_level=COMPRESS_LEVEL)
-
-
 _WRITERS: dict[str, Callable[[BinaryIO, Any], None]] = {
     ".npy": np.save,
-    ".tiff": _write_depth,
+    ".tiff": lambda file, depth: Image.fromarray(depth).save(file, "TIFF"),
     ".flo": write_flo,
-    ".png": _write_mask,
+    ".png": lambda file, mask: Image.fromarray(mask).save(file, "PNG", compress_level=COMPRESS_LEVEL),
 }

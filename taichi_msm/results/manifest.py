@@ -49,14 +49,9 @@ class Manifest:
         return cast(dict[str, Any], _MANIFEST.dump_python(self, mode="json"))
 
     def require_same(self, sha256: Mapping[str, str], versions: Mapping[str, str]) -> None:
-        """Make sure that the rest of the run would have the same bits as if it had not been interrupted.
+        """Raise a FilesError if the rest of the run would have other bits than if it had not been interrupted.
 
-        Args:
-            sha256: of its picture and map now, by `digests`.
-            versions: of this process.
-
-        Raises:
-            FilesError: when the picture, a map or a version has changed.
+        This is so when the picture, a map, by their `digests`, or a version has changed.
         """
         for key, path in self.scene.pictures.items():
             if sha256.get(key) != self.sha256.get(key):
@@ -85,8 +80,7 @@ def read_manifest(directory: Path) -> tuple[Manifest, Plan]:
     """Read the manifest of the unfinished run into a directory, and plan its scene.
 
     Raises:
-        FilesError: when there is no such run.
-        DamagedError: when the manifest is damaged or impossible.
+        FilesError: when there is no such run, or its manifest is damaged or impossible (DamagedError).
         SceneError: when the map of its scene cannot be read.
     """
     path = directory / STAGING / CHECKPOINT / MANIFEST

@@ -51,10 +51,7 @@ class Contents(NamedTuple):
 class Publication:
     """New contents for a directory. Leaving the with statement without `publish` discards them.
 
-    Args:
-        directory: where the results go; made if it does not exist.
-        contents: what they are.
-        names: all that may be published; it is an error if anything but earlier results has one of these names.
+    `names` are all that may be published; it is an error if anything but earlier results has one of them.
 
     Raises:
         FilesError: on entering, when another process publishes there, or something is in the way that no run has put
@@ -90,14 +87,7 @@ class Publication:
         return (self._lock.fileno(),) if os.name == "posix" else ()
 
     def publish(self, names: Collection[str]) -> None:
-        """Replace earlier results by the staged files.
-
-        Args:
-            names: the names of the files, all staged, with the record among them.
-
-        Raises:
-            FilesError: when a staged file was removed, or something that no run has written is in its place.
-        """
+        """Replace earlier results by the staged files of these names, with the record among them."""
         for name in names:
             if kind(self.staged / name) != FILE:
                 raise FilesError(f"{self.staged / name} was removed during the {self._contents.name}; run it again")

@@ -40,10 +40,7 @@ def ensured(folder: Path) -> Iterator[None]:
 def staged(folder: Path) -> Iterator[Path]:
     """Make a hidden folder to write files in until they are moved out; it is removed with those that are left.
 
-    What a killed process has left there is removed before.
-
-    Args:
-        folder: where the files belong; made if it does not exist.
+    What a killed process has left there is removed before. The folder where the files belong is made if missing.
     """
     with ensured(folder):
         _clear_abandoned(folder)
@@ -114,8 +111,7 @@ def add(path: Path, data: bytes) -> None:
 def lock(path: Path) -> BinaryIO:
     """Lock a file, made if missing, until it is closed here and in all processes that have inherited it.
 
-    Raises:
-        BlockingIOError: when another process holds the lock.
+    Raises BlockingIOError when another process holds the lock.
     """
     file = path.open("ab", 0)
     try:

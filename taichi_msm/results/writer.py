@@ -47,14 +47,7 @@ class ResultWriter:
 
     Within the with statement the files grow in a hidden folder. Leaving it without `publish` removes them. But once a
     run with a manifest has a frame, its checkpoint replaces any earlier one, and stays until results are published as
-    complete.
-
-    Args:
-        directory: where the results go; made if it does not exist. Files there that no run has written stay.
-        scene: what is run; its `output` says which files are wanted.
-        grid: its steps.
-        manifest: what another process must know to continue this run, in JSON.
-        resumes: whether this run continues from its checkpoint in the directory.
+    complete. A run that `resumes` continues from its checkpoint. Files that no run has written stay.
 
     Raises:
         FilesError: on entering and in every method, when the directory cannot be written, another run writes there,
@@ -103,10 +96,7 @@ class ResultWriter:
             return self._checkpoint.position(frame)
 
     def add(self, position: NDArray[Any], observed: Observed, pause: Pause = lambda: None) -> None:
-        """Add the next frame: positions [m], shape (rows, cols, 3), and what else is wanted of it.
-
-        `pause` is called some times a second while the encoder takes no more; if it raises, the picture is given up.
-        """
+        """Add the next frame: positions [m], shape (rows, cols, 3), and what else is wanted; `pause`: as `Encoder`."""
         with writing(self._directory):
             # Positions come first: whenever the run is interrupted, there are at least as many of them as pictures.
             if self.stored == 0:
@@ -148,10 +138,9 @@ class ResultWriter:
         self._finished = True
 
     def publish(self, record: Mapping[str, Any]) -> dict[str, Any]:
-        """Write run.json, and replace earlier results by the new ones.
+        """Write run.json: the record, "frames", their number, and "outputs", all results; replace earlier results.
 
-        Returns:
-            The content of run.json: the record, and "frames", their number, and "outputs", the names of all results.
+        Gives the content of run.json.
         """
         self.finish()
         with writing(self._directory):
