@@ -133,7 +133,7 @@ class SpringTerm(Term):
         return float((sums[STRETCHED:TENSE] + plan.material.tensions * sums[TENSE:]) @ squares)
 
     def between(self, code: StepCode) -> tuple[Callable[..., Any], ...]:
-        """Make the functions for the force along a row, that to another row, and the stiffness of each family."""
+        """Make the functions for the forces of springs along a row and to another one, and for their stiffness."""
         ti = code.ti
         tense, mapped, by_area = self.tense, self.mapped, self.by_area and not self.mapped
         leaves_out, real, first = self.open_edges and not self.mapped, code.real, code.first_number(SpringTerm)
