@@ -17,7 +17,7 @@ from PIL import Image
 
 from taichi_msm.export import gltf
 from taichi_msm.export.convert import convert
-from taichi_msm.export.keyframes import key_frames
+from taichi_msm.export.gltf import key_frames
 from taichi_msm.export.mesh import unit_normals
 from tests.scenes import speckle
 

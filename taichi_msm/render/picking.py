@@ -67,12 +67,6 @@ def _may_show(position: NDArray[np.floating], sight: View) -> NDArray[np.bool_]:
     return marked
 
 
-def _around_zero(corners: Array) -> NDArray[np.bool_]:
-    """Mark the figures, given by their corners of shape (..., corners, 4), in which a and b can both be 0."""
-    least, most = corners[..., :2].min(axis=-2), corners[..., :2].max(axis=-2)
-    return ((least <= 0) & (most >= 0)).all(axis=-1)
-
-
 def _in_cells(corners: Array, i: NDArray[np.intp], j: NDArray[np.intp], refine: int, near: float) -> list[Seen]:
     """List what is seen of some cells at the pixel: each time the depth, and the place in cells from the top left."""
     parts = refine + 1
@@ -81,7 +75,9 @@ def _in_cells(corners: Array, i: NDArray[np.intp], j: NDArray[np.intp], refine: 
     a, right, down, far = (corners[:, None, None, n] for n in range(4))
     vertex = a + (right - a) * s + (down - a) * t + (far - right - down + a) * s * t
     quads = np.stack([vertex[:, :-1, :-1], vertex[:, :-1, 1:], vertex[:, 1:, :-1], vertex[:, 1:, 1:]], axis=-2)
-    cell, line, column = np.nonzero(_around_zero(quads))
+    # Only where a and b can both be 0.
+    least, most = quads[..., :2].min(axis=-2), quads[..., :2].max(axis=-2)
+    cell, line, column = np.nonzero(((least <= 0) & (most >= 0)).all(axis=-1))
     quad = quads[cell, line, column]
     seen: list[Seen] = []
     for third in (1, 2):  # the third corner, beside the two ends of the diagonal: upper right, lower left
