@@ -19,10 +19,7 @@ PICTURE = "picture.png"
 
 
 def picture_png(run: FinishedRun) -> bytes | None:
-    """Encode the picture on the sheet, cut to the scene's region; None if the scene names none.
-
-    Raises a SceneError when it is missing, or can no longer be used.
-    """
+    """Encode the picture on the sheet, cut to the scene's region; None if none is named, a SceneError if unusable."""
     if run.scene.image is None:
         return None
     file = io.BytesIO()

@@ -52,10 +52,7 @@ class View(NamedTuple):
         return points @ self.matrix[:, :3].T + self.matrix[:, 3]
 
     def sight(self, pixel: tuple[float, float]) -> View:
-        """Give a view in which what is seen at the centre of a pixel has X = 0 and Y = 0.
-
-        Pixels are counted to the right and down from the picture's top-left one, which is (0, 0).
-        """
+        """Give a view in which what is seen at the centre of a pixel, right and down from (0, 0), has X = Y = 0."""
         matrix = self.matrix.copy()
         for row in (0, 1):
             matrix[row] -= (pixel[row] + 0.5) * matrix[2]

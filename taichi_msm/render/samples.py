@@ -26,7 +26,6 @@ TILE_WIDTH = 4
 # Farther than anything that is drawn.
 INFINITY = 3e38
 
-
 # Types of a kernel's arguments.
 Floats = ti.types.ndarray(dtype=ti.f32, ndim=1)
 Doubles = ti.types.ndarray(dtype=ti.f64, ndim=1)

@@ -16,16 +16,10 @@ if TYPE_CHECKING:
 
 
 def load_texture(scene: Scene, sha256: str | None = None) -> NDArray[np.uint8]:
-    """Read the scene's picture: upright, in 8-bit RGB, cut to the scene's region.
+    """Read the scene's picture: upright, in 8-bit RGB, cut to the scene's region, shape (height, width, 3).
 
     If a file has several pictures, the first is taken; a transparent one is laid over the scene's background. Its file
-    must have the SHA-256, if one is given.
-
-    Returns:
-        Colours, 0 to 255, shape (height, width, 3), top row first.
-
-    Raises:
-        SceneError: when the scene names no picture, or the picture cannot be used.
+    must have the SHA-256, if one is given. Raises a SceneError when there is none, or it cannot be used.
     """
     import numpy as np
 

@@ -49,10 +49,7 @@ AVERAGED = 20
 
 
 def with_live_frames(plan: Plan) -> tuple[Plan, int]:
-    """Divide the frames of a scene into shorter ones, for as many per second as a screen shows; a given step stays.
-
-    Gives the plan of that scene, and how many of its frames make one of the given scene's.
-    """
+    """Divide a scene's frames into as many equal parts as a screen shows; give that plan, and the parts of a frame."""
     scene = plan.scene
     parts = max(1, int(MOST_FRAMES / scene.time.frames_per_second * (1 + 1e-9)))
     if scene.time.step != "auto":
