@@ -38,9 +38,9 @@ _SCRIPT = Kind("script", "events")
 class Entry(Section):
     """One entry of a script."""
 
-    t: Seconds = key(means="when, or when it begins [s]", expects=SECONDS)
+    t: Seconds = key(..., means="when, or when it begins [s]", expects=SECONDS)
     do: Literal["press", "pull", "drag", "release", "turn", "percent", "key"] = key(
-        means="what is done", expects=f"{', '.join(KINDS)} or {LAST_KIND}"
+        ..., means="what is done", expects=f"{', '.join(KINDS)} or {LAST_KIND}"
     )
     at: Pair | None = key(
         None, means="the pixel", expects="for press, pull and drag [x, y] in pixels from the top left"
@@ -75,7 +75,7 @@ class Script(Section):
         means="width, height of the picture that the pixels are of [px]; others are scaled; default: the session's",
         expects=f"two whole numbers, 1 to {MAX_PIXELS}: [width, height] in pixels",
     )
-    events: tuple[Entry, ...] = key(means="what is done, in order", expects="a list of mappings with t and do")
+    events: tuple[Entry, ...] = key(..., means="what is done, in order", expects="a list of mappings with t and do")
 
     @field_validator("events", mode="after")
     @classmethod
