@@ -85,12 +85,7 @@ Point = Stepping | Peer | Points
 
 
 def plot(study: Study, path: Path) -> None:
-    """Draw the parts that a study has measured.
-
-    Args:
-        study: with at least one of the `panels`.
-        path: of the PNG.
-    """
+    """Draw the parts that a study has measured, at least one of the `panels`, as a PNG."""
     with style.context(STYLE, after_reset=True), warnings.catch_warnings():
         # The name of a scene may contain characters that the font lacks.
         warnings.filterwarnings("ignore", "Glyph .* missing")
@@ -162,7 +157,7 @@ def _plot_stepping(axes: Axes, study: Study) -> None:
 
 
 def _plot_line(axes: Axes, points: Sequence[Point], line: dict[str, Any], label: str) -> Line2D:
-    """Draw a line through points; markers are hollow for upper bounds, and half filled where rounding dominates.
+    """Draw a line through points; markers are hollow for upper bounds, half filled where rounding dominates.
 
     Returns:
         Its entry in the legend.
