@@ -159,8 +159,7 @@ def run(
                     progress=progress,
                 )
     except KeyboardInterrupt:
-        report("interrupted", [f"interrupted; nothing was written{going_on(directory)}"], as_json)
-        return interruption.code
+        return interrupted(interruption, as_json, f"interrupted; nothing was written{going_on(directory)}")
     if resume is None:
         duration.learn(plan, record)
     if as_json:
@@ -297,8 +296,7 @@ def study(
             progress=interruptible(bar, interruption),
         )
     if not results.stepping:
-        report("interrupted", ["interrupted; nothing was written"], as_json)
-        return interruption.code
+        return interrupted(interruption, as_json)
     if results.status == "interrupted" and (directory / RECORD).exists():
         # An earlier study is not replaced by part of a new one.
         directory = without_link(directory / "interrupted", "--out")
@@ -387,8 +385,7 @@ def view(
                     recorder.record(session, Path(record), seconds, events, progress, notices.append)
                 click.echo(printable(record))
     except KeyboardInterrupt:
-        report("interrupted", ["interrupted" if record is None else "interrupted; no film was written"], as_json=False)
-        return interruption.code
+        return interrupted(interruption, False, "interrupted" if record is None else "interrupted; no film was written")
     finally:
         tell(notices)
         for path in captures.saved:
@@ -422,8 +419,7 @@ def export(directory: str, name: str, out: str | None, quiet: bool, as_json: boo
         with Progress(quiet=quiet or as_json) as bar:
             done = convert(run, name, folder, partial(interruptible(bar, interruption), "export"))
     except KeyboardInterrupt:
-        report("interrupted", ["interrupted; nothing was written"], as_json)
-        return interruption.code
+        return interrupted(interruption, as_json)
     if as_json:
         print_json({"directory": str(folder), "format": name, **done._asdict()})
     elif not quiet:
@@ -526,6 +522,12 @@ def interruptible(bar: Progress, interruption: Interruption) -> Callable[[str, i
 def print_json(value: Any) -> None:
     """Print one JSON object."""
     click.echo(json.dumps(value, indent=2, allow_nan=False))
+
+
+def interrupted(interruption: Interruption, as_json: bool, said: str = "interrupted; nothing was written") -> int:
+    """Say that there are no results, and give the exit code."""
+    report("interrupted", [said], as_json)
+    return interruption.code
 
 
 def report(status: str, lines: Sequence[str], as_json: bool) -> None:

@@ -31,15 +31,10 @@ MAX_LINES = 100
 
 
 class Kind(NamedTuple):
-    """What a file should be.
+    """What a file should be."""
 
-    Attributes:
-        name: what it is called.
-        needs: the keys that it must have.
-    """
-
-    name: str
-    needs: str
+    name: str  # what it is called
+    needs: str  # the keys that it must have
 
 
 _SCENE = Kind("scene", "sheet, tissue or springs, and time")
@@ -86,10 +81,11 @@ def load_plan(
         isinstance(overrides, (Sequence, Mapping)) and all(isinstance(one, str) for one in overrides)
     ):
         raise ArgumentError(f'overrides: {overrides!r}; take ["sheet.points=[61,61]"] or {{"sheet.points": [61, 61]}}')
-    draft = Draft(str(path), read_file(str(path), _SCENE))
+    draft = Draft(str(path), _SCENE)
     for override in _parse_overrides(overrides):
         draft.override(override)
-    draft.find_pictures(Path(path).parent, PICTURES if image is None else MAPS)
+    for key in PICTURES if image is None else MAPS:
+        draft.find_picture(key, Path(path).parent)
     if image is not None:
         draft.override(_Override(f"--image {cut(str(image))}", IMAGE, str(image)))
     plan, problems = validate(draft.data)
@@ -100,11 +96,7 @@ def load_plan(
 
 
 def schema() -> dict[str, Any]:
-    """Describe the scene for editors, as JSON Schema (draft 2020-12).
-
-    It has the rules for single keys; those for several keys together, such as the stability limit of the step, are
-    checked when a scene is loaded.
-    """
+    """Describe the scene for editors, as JSON Schema (draft 2020-12): the rules for single keys."""
     return {"$schema": "https://json-schema.org/draft/2020-12/schema"} | Scene.model_json_schema()
 
 
@@ -133,7 +125,7 @@ def _parse_text(text: str) -> _Override:
         document = read(value)
     except UnreadableError as error:
         return _Override(name, path, problems=[Problem(path, str(error))])
-    faults = [Problem(path + fault.path, fault.message) for fault in document.faults]
+    faults = [Problem(path + fault.path, fault.message) for _, fault in document.faults]
     return _Override(name, path, document.data, faults)
 
 
@@ -159,38 +151,31 @@ def _parse_key(key: str) -> Key:
 
 
 class _Place(NamedTuple):
-    """Where a key was given; places are sorted in the order of reading: the file, then the overrides.
+    """Where a key was given; places are sorted in the order of reading: the file, then the overrides."""
 
-    Attributes:
-        source: 0 for the file; 1, 2, ... for the overrides.
-        mark: line and column in the file.
-        name: of the place in messages, such as press.yaml:7:3.
-    """
-
-    source: int
-    mark: Mark
-    name: str
+    source: int  # 0 for the file; 1, 2, ... for the overrides
+    mark: Mark  # in the file
+    name: str  # of the place in messages, such as press.yaml:7:3
 
 
 class Draft:
-    """The content of a file while overrides are applied to it.
-
-    Args:
-        name: of the file.
-        document: its content.
+    """The content of a file, a mapping whose keys are not checked, while overrides are applied to it.
 
     Attributes:
         data: its content, with the overrides applied so far.
         problems: found so far, each with its place.
+
+    Raises:
+        SceneError: when the file contains no mapping, or cannot be read.
     """
 
-    def __init__(self, name: str, document: Document) -> None:
-        self._name = name
-        self._marks = document.marks
+    def __init__(self, name: str, kind: Kind) -> None:
+        document = _read_file(name, kind)
+        self._name, self._marks = name, document.marks
         self._overrides = 0
         self._overridden: dict[Key, _Place] = {}
         self.data: dict[str, Any] = document.data
-        self.problems = [(self._in_file(mark), Problem(key, message)) for mark, key, message in document.faults]
+        self.problems = [(self._in_file(mark), problem) for mark, problem in document.faults]
 
     def override(self, override: _Override) -> None:
         """Apply an override."""
@@ -201,12 +186,8 @@ class Draft:
         elif problem := self._put(override.path, override.value, place):
             self.problems.append((place, problem))
 
-    def find_pictures(self, folder: Path, keys: Sequence[Key]) -> None:
-        """Change the paths of pictures, given relative to a folder, to paths from the current directory."""
-        for key in keys:
-            self._find_picture(key, folder)
-
-    def _find_picture(self, key: Key, folder: Path) -> None:
+    def find_picture(self, key: Key, folder: Path) -> None:
+        """Change the path of a picture, given relative to a folder, to one from the current directory."""
         holder: Any = self.data
         for part in key[:-1]:
             holder = holder.get(part) if isinstance(holder, dict) else None
@@ -280,15 +261,9 @@ def _is_below(path: Path, folder: Path) -> bool:
         return True
 
 
-def read_file(name: str, kind: Kind) -> Document:
-    """Read a file that contains a mapping, without checking its keys.
-
-    Raises:
-        SceneError: when it contains no mapping, or cannot be read.
-    """
-    text = _read_text(name, kind)
+def _read_file(name: str, kind: Kind) -> Document:
     try:
-        document = read(text)
+        document = read(_read_text(name, kind))
     except UnreadableError as error:
         raise _error(f"{name}:{error.mark.line}:{error.mark.column}", str(error)) from None
     if document.data is None:

@@ -12,7 +12,7 @@ from pydantic_core import PydanticCustomError
 from taichi_msm.errors import Problem, SceneError
 from taichi_msm.faults import REFUSED
 from taichi_msm.scene import MAX_PIXELS, NotNegative, Number, Pixels, Section, key
-from taichi_msm.scenefile.load import Draft, Kind, read_file
+from taichi_msm.scenefile.load import Draft, Kind
 from taichi_msm.scenefile.validation import parse
 from taichi_msm.viewer.events import KEYS, Drag, Event, Key, Percent, Press, Release, Turn
 
@@ -102,7 +102,7 @@ def load_script(path: str | Path, size: tuple[int, int]) -> Script:
     Raises:
         SceneError: with all faults, one line each, in the order of the file.
     """
-    draft = Draft(str(path), read_file(str(path), _SCRIPT))
+    draft = Draft(str(path), _SCRIPT)
     script, problems = parse(Script, draft.data)
     draft.report(problems)
     draft.report(_outside(script, script.size or size) if script is not None else ())
