@@ -34,18 +34,13 @@ class FailedError(Exception):
 def solve(plan: Plan, rtol: float, atol: float, deadline: float, tick: Callable[[], None]) -> tuple[Array, int]:
     """Integrate from key to key of the loads, between which they are smooth.
 
-    Args:
-        plan: of the scene.
-        rtol: relative tolerance.
-        atol: absolute tolerance of displacements [m] and velocities [m/s].
-        deadline: `time.perf_counter()` at which to give up.
-        tick: called now and then; may raise to stop.
+    The absolute tolerance is of displacements [m] and velocities [m/s]; `tick` is called now and then.
 
     Returns:
         Displacements at every frame but the first [m], shape (F, rows, cols, 3); and the number of evaluations.
 
     Raises:
-        TooSlowError: at the deadline.
+        TooSlowError: when `time.perf_counter()` has come to the deadline.
         FailedError: when SciPy fails.
     """
     from scipy.integrate import solve_ivp

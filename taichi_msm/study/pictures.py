@@ -32,15 +32,9 @@ Picture = NDArray[np.uint8]
 def measure_pictures(
     scene: Scene, position: NDArray[Any], texture: Picture, quick: bool, study: Study, progress: Count
 ) -> None:
-    """Draw the reference picture, then every setting, taking turns.
+    """Draw the reference picture, then every setting, taking turns; `quick` varies the settings one at a time.
 
-    Args:
-        scene: a checked scene with a picture.
-        position: of the mass points [m], shape (rows, cols, 3).
-        texture: the picture on the sheet, shape (height, width, 3).
-        quick: whether to vary refinement and supersampling one at a time.
-        study: takes the results and the notes about what was left out.
-        progress: called with the drawings done and the drawings in all; may raise KeyboardInterrupt.
+    The positions of the points [m] have the shape (rows, cols, 3), the picture on the sheet (height, width, 3).
     """
     position = np.ascontiguousarray(position, np.float32)
     memory = resources.available_memory() // 2

@@ -55,13 +55,9 @@ class PointStudy:
     The reference is a sheet with more points than all those listed, if there is time for it. Otherwise it is the finest
     of those listed, whose own error is then known only as a bound.
 
-    Args:
-        plan: of the scene.
-        device: to compute on.
-        longest_run: approximate time that a run may take [s]. The reference is run only once, and may take as long as
-            all the runs together by which another sheet is timed.
-        study: takes the results, the fewest points first, and the notes about what was left out.
-        progress: called with the work done and all of it; may raise KeyboardInterrupt: what is done is kept.
+    A run takes up to about `longest_run` seconds; the reference, which is run only once, as long as all the runs
+    together by which another sheet is timed. The results in `study` come with the fewest points first; `progress` may
+    raise KeyboardInterrupt: they stay.
     """
 
     def __init__(self, plan: Plan, device: Device, longest_run: float, study: Study, progress: Count) -> None:

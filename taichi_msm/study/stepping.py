@@ -38,14 +38,9 @@ Frames = NDArray[Any]
 
 
 class SteppingStudy:
-    """Measures the stepping of one scene.
+    """Measures the stepping of a checked scene, in runs of up to about `longest_run` seconds.
 
-    Args:
-        plan: of a checked scene.
-        device: to compute on.
-        longest_run: approximate time that a run may take [s].
-        study: takes the results and the facts about the reference.
-        progress: called with the runs done and the runs in all; may raise KeyboardInterrupt: what is done is kept.
+    `progress` may raise KeyboardInterrupt: the results in `study` stay.
 
     Attributes:
         frames: displacements of the reference at every frame but the first [m], shape (F, rows, cols, 3).

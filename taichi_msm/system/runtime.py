@@ -162,11 +162,7 @@ def stop() -> None:
 
 
 def require_here() -> None:
-    """Make sure that Taichi can be used in this process and thread.
-
-    Raises:
-        MsmError: in a process forked from the one that started Taichi, or in another thread than the one that did.
-    """
+    """Make sure that Taichi can be used here; MsmError: another process or thread started it."""
     process, thread = _home
     if process != os.getpid():
         raise MsmError(
@@ -215,7 +211,11 @@ def _cache() -> dict[str, Any]:
         folder.mkdir(parents=True, exist_ok=True)
         with tempfile.TemporaryFile(dir=folder):
             pass
-        _require_room(folder)
+        if hasattr(os, "statvfs"):
+            free = os.statvfs(folder)
+            # Some file systems without a limit of files report a limit of 0.
+            if (free.f_files > 0 and free.f_favail < CACHE_FILES) or free.f_bavail * free.f_frsize < CACHE_BYTES:
+                raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
     except OSError:
         # When a process ends, Taichi crashes if it cannot write to the folder, even if the cache is off.
         os.environ.pop(chosen().folder_variable, None)
@@ -226,15 +226,6 @@ def _cache() -> dict[str, Any]:
         if time.time() - lock.stat().st_mtime > STALE_LOCK:
             lock.unlink()
     return {}
-
-
-def _require_room(folder: Path) -> None:
-    """Raise OSError if the files of a run's kernels may not fit into a folder."""
-    if hasattr(os, "statvfs"):
-        free = os.statvfs(folder)
-        # Some file systems without a limit of files report a limit of 0.
-        if (free.f_files > 0 and free.f_favail < CACHE_FILES) or free.f_bavail * free.f_frsize < CACHE_BYTES:
-            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
 
 
 def _require_address_space() -> None:
