@@ -6,8 +6,8 @@ import codecs
 import json
 import re
 import stat
-from collections.abc import Iterable, Iterator, Mapping, Sequence
-from itertools import chain
+from collections.abc import Iterable, Mapping, Sequence
+from itertools import chain, starmap
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -82,7 +82,8 @@ def load_plan(
     ):
         raise ArgumentError(f'overrides: {overrides!r}; take ["sheet.points=[61,61]"] or {{"sheet.points": [61, 61]}}')
     draft = Draft(str(path), _SCENE)
-    for override in _parse_overrides(overrides):
+    parsed = starmap(_parse_value, overrides.items()) if isinstance(overrides, Mapping) else map(_parse_text, overrides)
+    for override in parsed:
         draft.override(override)
     for key in PICTURES if image is None else MAPS:
         draft.find_picture(key, Path(path).parent)
@@ -107,12 +108,6 @@ class _Override(NamedTuple):
     path: Key
     value: Any = None
     problems: Sequence[Problem] = ()
-
-
-def _parse_overrides(overrides: Sequence[str] | Mapping[str, Any]) -> Iterator[_Override]:
-    if isinstance(overrides, Mapping):
-        return (_parse_value(key, value) for key, value in overrides.items())
-    return (_parse_text(text) for text in overrides)
 
 
 def _parse_text(text: str) -> _Override:
@@ -214,8 +209,11 @@ class Draft:
     def lines(self) -> list[str]:
         """Format the problems in the order of their places."""
         ordered = sorted(self.problems, key=lambda item: item[0][:2])
-        lines = [_line(place.name, problem) for place, problem in ordered[:MAX_LINES]]
-        return lines if len(lines) == len(ordered) else [*lines, "and more"]
+        shown = [
+            f"{place.name}: {Problem(tuple(cut(str(part)) for part in problem.path), problem.message)}"
+            for place, problem in ordered[:MAX_LINES]
+        ]
+        return shown if len(shown) == len(ordered) else [*shown, "and more"]
 
     def _in_file(self, mark: Mark) -> _Place:
         return _Place(0, mark, f"{self._name}:{mark.line}:{mark.column}")
@@ -265,11 +263,12 @@ def _read_file(name: str, kind: Kind) -> Document:
     try:
         document = read(_read_text(name, kind))
     except UnreadableError as error:
-        raise _error(f"{name}:{error.mark.line}:{error.mark.column}", str(error)) from None
+        raise SceneError([f"{name}:{error.mark.line}:{error.mark.column}: {error}"]) from None
     if document.data is None:
-        raise _error(f"{name}:1:1", f"no keys; a {kind.name} needs at least {kind.needs}")
+        raise SceneError([f"{name}:1:1: no keys; a {kind.name} needs at least {kind.needs}"])
     if not isinstance(document.data, dict):
-        raise _error(f"{name}:1:1", f"{flow(document.data)} is not a {kind.name}; expected keys such as {kind.needs}")
+        said = f"{flow(document.data)} is not a {kind.name}; expected keys such as {kind.needs}"
+        raise SceneError([f"{name}:1:1: {said}"])
     return document
 
 
@@ -280,30 +279,21 @@ def _read_text(name: str, kind: Kind) -> str:
         if not stat.S_ISREG(mode):
             # Opening a pipe would block until its other end is opened.
             what = "a directory" if stat.S_ISDIR(mode) else "not a regular file"
-            raise _error(name, f"{what}; name a {kind.name} file")
+            raise SceneError([f"{name}: {what}; name a {kind.name} file"])
         with path.open("rb") as file:
             raw = file.read(MAX_BYTES + 1).removeprefix(codecs.BOM_UTF8)
     except ValueError:
-        raise _error(name, f"not a path; name a {kind.name} file") from None
+        raise SceneError([f"{name}: not a path; name a {kind.name} file"]) from None
     except OSError as error:
-        raise _error(name, (error.strerror or str(error)).lower()) from None
+        raise SceneError([f"{name}: {(error.strerror or str(error)).lower()}"]) from None
     if len(raw) > MAX_BYTES:
-        raise _error(name, f"larger than {MAX_BYTES // 2**20} MiB; a {kind.name} is smaller")
+        raise SceneError([f"{name}: larger than {MAX_BYTES // 2**20} MiB; a {kind.name} is smaller"])
     try:
         return raw.decode()
     except UnicodeDecodeError as error:
         if path.suffix.lower() in SUFFIXES:
-            said = f"a picture; name a {kind.name}, and the picture by --image"
-            raise _error(name, said if kind is _SCENE else f"a picture; name a {kind.name}") from None
+            by = ", and the picture by --image" if kind is _SCENE else ""
+            raise SceneError([f"{name}: a picture; name a {kind.name}{by}"]) from None
         before = raw[: error.start].decode()
         mark = mark_at(before, len(before))
-        raise _error(f"{name}:{mark.line}:{mark.column}", "not UTF-8; save the file as UTF-8") from None
-
-
-def _error(place: str, message: str) -> SceneError:
-    return SceneError([_line(place, Problem((), message))])
-
-
-def _line(place: str, problem: Problem) -> str:
-    """Format a problem as one line."""
-    return f"{place}: {Problem(tuple(cut(str(part)) for part in problem.path), problem.message)}"
+        raise SceneError([f"{name}:{mark.line}:{mark.column}: not UTF-8; save the file as UTF-8"]) from None
