@@ -79,7 +79,7 @@ class Playback:
     def __enter__(self) -> Playback:
         return self
 
-    def __exit__(self, *error: object) -> None:
+    def __exit__(self, *_: object) -> None:
         self.close()
 
     def _at(self, frame: int) -> tuple[NDArray[np.floating], float]:
