@@ -124,7 +124,9 @@ def run(
     typed = [*overrides, *([f"image={image}"] if image is not None else [])]
     if resume is not None:
         require_alone(context, "--resume continues", RESUMABLE)
-        directory = unfinished(resume)
+        directory = result_directory(resume, option="--resume")
+        if not going_on(directory):
+            raise click.BadParameter(f"there is no unfinished run in {resume}", param_hint="--resume")
     elif again is not None:
         require_alone(context, "--again repeats", REPEATABLE)
         directory = result_directory(again, option="--again") if out is None else result_directory(out)
@@ -449,13 +451,6 @@ def repeated(directory: str) -> tuple[Plan, list[str]]:
     return checked(earlier.scene), earlier.overrides
 
 
-def unfinished(directory: str) -> Path:
-    """Make sure that a directory has a run to resume."""
-    if not going_on(result_directory(directory, option="--resume")):
-        raise click.BadParameter(f"there is no unfinished run in {directory}", param_hint="--resume")
-    return Path(directory)
-
-
 def result_directory(out: str | None, default: str = "", option: str = "--out") -> Path:
     """Choose where results go."""
     if out == "":
@@ -538,13 +533,9 @@ def report(status: str, lines: Sequence[str], as_json: bool) -> None:
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Run the command line.
+    """Run the command line, with arguments instead of the process's, and give the exit code.
 
-    Args:
-        arguments: what follows the program's name; None takes the process's.
-
-    Returns:
-        The exit code: 0 done, 1 a bug, 2 wrong scene or arguments, 3 diverged, 4 files, 130 Ctrl-C, 143 SIGTERM.
+    0 done, 1 a bug, 2 wrong scene or arguments, 3 diverged, 4 files, 130 Ctrl-C, 143 SIGTERM.
     """
     words = list(sys.argv[1:] if arguments is None else arguments)
     try:

@@ -150,16 +150,22 @@ def _scans(file: BinaryIO) -> int:
     return scans
 
 
+def irregular(path: Path) -> str:
+    """Say what a path is instead of a regular file, without opening it: opening a pipe would wait for its other end."""
+    mode = path.stat().st_mode
+    if stat.S_ISREG(mode):
+        return ""
+    return "a directory" if stat.S_ISDIR(mode) else "not a regular file"
+
+
 def _require_file(path: str) -> None:
-    """Refuse anything but a regular file, without opening it: opening a pipe would wait for its other end."""
     try:
-        mode = Path(path).stat().st_mode
+        kind = irregular(Path(path))
     except ValueError:
         raise PictureError(f"{path} is not a path; name a picture") from None
     except OSError as error:
         raise _unreadable(path, error) from None
-    if not stat.S_ISREG(mode):
-        kind = "a directory" if stat.S_ISDIR(mode) else "not a regular file"
+    if kind:
         raise PictureError(f"{path} is {kind}; name a picture")
 
 

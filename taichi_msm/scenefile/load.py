@@ -5,7 +5,6 @@ from __future__ import annotations
 import codecs
 import json
 import re
-import stat
 from collections.abc import Iterable, Mapping, Sequence
 from itertools import chain, starmap
 from pathlib import Path
@@ -14,7 +13,7 @@ from typing import Any, NamedTuple
 from taichi_msm.errors import ArgumentError, Key, Problem, SceneError
 from taichi_msm.faults import cut, flow
 from taichi_msm.physics.plan import Plan
-from taichi_msm.picture import SUFFIXES
+from taichi_msm.picture import SUFFIXES, irregular
 from taichi_msm.scene import MAX_PATH, Scene
 from taichi_msm.scenefile.validation import validate
 from taichi_msm.scenefile.yaml_reader import MAX_DEPTH, Document, Mark, UnreadableError, mark_at, read
@@ -275,10 +274,7 @@ def _read_file(name: str, kind: Kind) -> Document:
 def _read_text(name: str, kind: Kind) -> str:
     path = Path(name)
     try:
-        mode = path.stat().st_mode
-        if not stat.S_ISREG(mode):
-            # Opening a pipe would block until its other end is opened.
-            what = "a directory" if stat.S_ISDIR(mode) else "not a regular file"
+        if what := irregular(path):
             raise SceneError([f"{name}: {what}; name a {kind.name} file"])
         with path.open("rb") as file:
             raw = file.read(MAX_BYTES + 1).removeprefix(codecs.BOM_UTF8)
