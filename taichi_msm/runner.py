@@ -7,7 +7,7 @@ import platform
 import sys
 import time
 from collections.abc import Iterator, Mapping, Sequence
-from contextlib import ExitStack, closing, contextmanager, suppress
+from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import replace
 from functools import partial
 from operator import attrgetter
@@ -30,7 +30,7 @@ from taichi_msm.physics.plan import Plan
 from taichi_msm.physics.probe_force import probe_records
 from taichi_msm.physics.run_error import Known, RunError
 from taichi_msm.physics.run_notes import run_notes
-from taichi_msm.physics.run_progress import RunProgress
+from taichi_msm.physics.state import RunProgress
 from taichi_msm.physics.workload import ENCODING
 from taichi_msm.progress import Progress
 from taichi_msm.render.drawing_notes import drawing_notes
@@ -277,7 +277,7 @@ class _Run:
             self._known = Known(manifest.estimate, pilots.reason, manifest.mesh)
             if not pilots.reason:
                 try:
-                    self._error = opened.enter_context(closing(RunError(plan, pilots, self._known, device, cores)))
+                    self._error = RunError(plan, pilots, self._known, device, cores)
                 except DeviceError:
                     self._known = self._known._replace(reason=f"{device.arch} cannot run this scene in f64")
             self._open = opened.pop_all()

@@ -13,7 +13,7 @@ import pytest
 import taichi_msm
 import taichi_msm.runner
 from taichi_msm.cli import main
-from taichi_msm.physics import lattice, slots, stiffness_map, terms, timestep
+from taichi_msm.physics import lattice, planning, slots, stiffness_map, terms
 
 DERIVED = [
     (terms, "material_of"),
@@ -22,8 +22,8 @@ DERIVED = [
     (lattice, "fixed_points"),
     (stiffness_map, "read"),
     (stiffness_map, "factors"),
-    (timestep, "stable_step"),
-    (timestep, "steps_per_frame"),
+    (planning, "stable_step"),
+    (planning, "steps_per_frame"),
 ]
 
 

@@ -11,7 +11,6 @@ the largest displacement of any point at any frame.
 from __future__ import annotations
 
 import math
-from contextlib import ExitStack, closing
 from dataclasses import dataclass
 from functools import partial
 from itertools import pairwise
@@ -74,36 +73,38 @@ def order(plan: Plan) -> int:
 
 
 def estimate_error(plan: Plan, device: Device, progress: Count = lambda done, total: None) -> Estimate:
-    """Estimate the error of a run.
-
-    Args:
-        plan: of the run.
-        device: what `runtime.start` returned.
-        progress: called with the frames done and the frames in all.
-    """
-    with closing(Trials(plan, device)) as trials:
-        return trials.estimate(plan.grid.steps_per_frame, progress)
+    """Estimate the error of a run; progress counts frames."""
+    return Trials(plan, device).estimate(plan.grid.steps_per_frame, progress)
 
 
 def choose_step(plan: Plan, device: Device, progress: Count = lambda done, total: None) -> tuple[Plan, Estimate]:
-    """Find the largest stable step whose estimated error is within the scene's tolerance.
+    """Find the largest stable step whose estimated error is within the scene's tolerance, and this error.
 
-    Args:
-        plan: of a scene with a tolerance, whose steps do without it; no fewer are tried.
-        device: what `runtime.start` returned.
-        progress: called with the frames done and the frames in all of each pilot run.
-
-    Returns:
-        The plan with that step, and its error.
+    No fewer steps than the plan's are tried; progress counts the frames of each pilot run.
 
     Raises:
         SceneError: when no step meets the tolerance; names a precision or a tolerance that would do.
     """
-    tolerance = plan.scene.time.tolerance
+    tolerance, steps, trials = plan.scene.time.tolerance, plan.grid.steps_per_frame, Trials(plan, device)
     assert tolerance is not None
-    with closing(Trials(plan, device)) as trials:
-        estimate = _search(tolerance, plan.grid.steps_per_frame, trials, progress)
-    return plan.with_grid(steps_per_frame=estimate.steps_per_frame), estimate
+    too_few, enough, failures = steps - 1, None, []
+    for _ in range(MOST_PILOTS):
+        tried = trials.estimate(steps, progress)
+        if tried.error <= tolerance:
+            enough = tried
+        else:
+            too_few = steps
+            failures.append(tried)
+            if tried.rounding > CLOSE * tolerance or _stuck(failures):
+                break
+        if enough and (enough.error >= CLOSE * tolerance or enough.steps_per_frame - too_few <= 1):
+            break
+        steps = max(_next(tried, tolerance), too_few + 1)
+        if enough and steps >= enough.steps_per_frame:
+            break
+    if not enough:
+        raise SceneError([_out_of_reach(tolerance, failures)])
+    return plan.with_grid(steps_per_frame=enough.steps_per_frame), enough
 
 
 class Pilot:
@@ -116,7 +117,7 @@ class Pilot:
     Args:
         plan: of the run.
         steps: steps per frame of the pilot, as in `Pilots`; 0: the error is not known.
-        device: what `runtime.start` returned.
+        device: on which it runs.
         cores: number of cores that stepping may use; None: all. With as many as the run has, its kernels are reused.
 
     Attributes:
@@ -129,18 +130,11 @@ class Pilot:
     def __init__(self, plan: Plan, steps: int, device: Device, cores: int | None = None) -> None:
         self._order, exact = order(plan), plan.with_grid(precision="f64")
         coarse = 0 < steps < plan.grid.steps_per_frame
-        with ExitStack() as opened:
-
-            def dynamics() -> Dynamics:
-                sheet = Dynamics(exact, device, cores=cores)
-                opened.callback(sheet.close)
-                return sheet
-
-            self._other = dynamics()
-            # A run in f64 is itself the one with its own steps.
-            self._same = None if plan.grid.precision == "f64" or coarse else dynamics()
-            self._open = opened.pop_all()
         self._parted = plan.grid.precision == "f64" or not coarse
+        self._other = Dynamics(exact, device, cores=cores)
+        # A run in f64 is itself the one with its own steps.
+        own = plan.grid.precision == "f64" or coarse
+        self._same = None if own else Dynamics(exact, device, cores=cores)
         self._margin = 1.0
         if coarse:
             shown = (plan.grid.steps_per_frame / steps) ** self._order - 1
@@ -201,30 +195,17 @@ class Pilot:
             rounding, in_f64 = 0.0 if self._parted else error, error
         return Estimate(self._plan.grid.steps_per_frame, error, rounding, in_f64, self._order, self._parted)
 
-    def close(self) -> None:
-        """Free the memory."""
-        self._open.close()
-
 
 class Trials:
     """Runs of a scene with different steps, one after the other, each with a pilot beside it."""
 
     def __init__(self, plan: Plan, device: Device) -> None:
         self._plan = plan
-        with ExitStack() as opened:
-            self._pilot = Pilot(plan, fine_steps(plan), device)
-            opened.callback(self._pilot.close)
-            self._own = Dynamics(plan, device)
-            opened.callback(self._own.close)
-            self._open = opened.pop_all()
+        self._pilot = Pilot(plan, fine_steps(plan), device)
+        self._own = Dynamics(plan, device)
 
     def estimate(self, steps: int, progress: Count) -> Estimate:
-        """Run the scene, and estimate its error.
-
-        Args:
-            steps: steps per frame.
-            progress: called with the frames done and the frames in all.
-        """
+        """Run the scene with so many steps per frame, and estimate its error; progress counts frames."""
         plan = self._plan.with_grid(steps_per_frame=steps)
         fine, frames = fine_steps(plan), plan.grid.frames
         self._pilot.restart(plan, fine)
@@ -243,10 +224,6 @@ class Trials:
         rest = rest_positions(self._plan.scene.sheet)
         return (rest + displacement).astype(np.float32) - rest
 
-    def close(self) -> None:
-        """Free the memory."""
-        self._open.close()
-
 
 def longest(vectors: NDArray[Any]) -> float:
     """Give the length of the longest vector, shape (..., 3); infinite if one is not finite."""
@@ -259,29 +236,6 @@ def _above(error: float) -> float:
     """Round up to one digit, with a margin of 20 %."""
     digit = 10.0 ** math.floor(math.log10(error))
     return float(f"{math.ceil(1.2 * error / digit) * digit:.3g}")
-
-
-def _search(tolerance: float, least: int, trials: Trials, progress: Count) -> Estimate:
-    """Search between too few steps per frame and enough."""
-    too_few, enough, failures = least - 1, None, []
-    steps = least
-    for _ in range(MOST_PILOTS):
-        tried = trials.estimate(steps, progress)
-        if tried.error <= tolerance:
-            enough = tried
-        else:
-            too_few = steps
-            failures.append(tried)
-            if tried.rounding > CLOSE * tolerance or _stuck(failures):
-                break
-        if enough and (enough.error >= CLOSE * tolerance or enough.steps_per_frame - too_few <= 1):
-            return enough
-        steps = max(_next(tried, tolerance), too_few + 1)
-        if enough and steps >= enough.steps_per_frame:
-            return enough
-    if enough:
-        return enough
-    raise SceneError([_out_of_reach(tolerance, failures)])
 
 
 def _next(tried: Estimate, tolerance: float) -> int:

@@ -53,22 +53,9 @@ class Material:
     factors: Array | None
 
     @property
-    def stiffness(self) -> tuple[float, float, float]:
-        """Stiffness less tension, k - tau, of springs along rows, along columns and of diagonals [N/m]."""
-        return self._times(1 - self.tension)
-
-    @property
     def tensions(self) -> tuple[float, float, float]:
         """Tension per length, tau, of springs along rows, along columns and of diagonals [N/m]."""
-        return self._times(self.tension)
-
-    def _times(self, factor: float) -> tuple[float, float, float]:
-        return self.across * factor, self.down * factor, self.shear * factor
-
-    @property
-    def has_springs(self) -> bool:
-        """Whether there are springs between points."""
-        return max(self.across, self.down, self.shear) > 0
+        return self.across * self.tension, self.down * self.tension, self.shear * self.tension
 
 
 def area_shares(sheet: Sheet) -> Array:
@@ -115,13 +102,7 @@ def kind_problems(scene: Scene) -> Iterator[Problem]:
 
 
 def tissue_problems(scene: Scene, fixed: NDArray[np.bool_], factors: Array | None) -> Iterator[Problem]:
-    """Find tissue that is impossible.
-
-    Args:
-        scene: in which `kind_problems` finds nothing.
-        fixed: which points of its sheet are fixed, shape (rows, cols).
-        factors: of the stiffness of its cells; None: not known, or there is no map.
-    """
+    """Find tissue that is impossible, where `kind_problems` finds nothing; factors None: not known, or no map."""
     tissue, sheet = scene.tissue, scene.sheet
     if tissue is None:
         return

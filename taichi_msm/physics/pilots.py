@@ -10,7 +10,7 @@ import math
 from typing import NamedTuple
 
 from taichi_msm.physics.plan import Plan
-from taichi_msm.physics.timestep import stable_steps
+from taichi_msm.physics.planning import stable_steps
 from taichi_msm.physics.workload import affords_pilots
 
 # An error below this needs no finer pilot: nobody sees it, and twice as much or half of it would mean the same.
@@ -46,15 +46,9 @@ class Pilots(NamedTuple):
 
 
 def choose_pilots(plan: Plan, *, asked: bool = False) -> Pilots:
-    """Choose the pilots of a run.
-
-    Args:
-        plan: of the run.
-        asked: whether they are wanted whatever they cost.
-    """
-    scene, own = plan.scene, plan.grid.steps_per_frame
-    coarse, fine = coarse_steps(plan), fine_steps(plan)
-    points = POINTS if scene.tissue is not None else 0.0
+    """Choose the pilots of a run; asked: whatever they cost."""
+    own, coarse, fine = plan.grid.steps_per_frame, coarse_steps(plan), fine_steps(plan)
+    points = POINTS if plan.scene.tissue is not None else 0.0
     # Beside a run in f32 a fine pilot has another one with the run's own steps.
     fine_cost = fine / own + (plan.grid.precision == "f32")
     first = (1 + points) * coarse / own if coarse else fine_cost + points
@@ -63,7 +57,7 @@ def choose_pilots(plan: Plan, *, asked: bool = False) -> Pilots:
     if not coarse:
         return Pilots(fine, 0, points > 0, first)
     # Where no positions are kept, the run is repeated beside the pilot that follows.
-    again = 0.0 if scene.output else 1.0
+    again = 0.0 if plan.scene.output else 1.0
     follows = asked or affords_pilots(plan, first + fine_cost + again)
     return Pilots(coarse, fine if follows else 0, points > 0, first)
 

@@ -65,10 +65,7 @@ class ProbeSlot:
 def probe_slots(probes: Sequence[Probe], sheet: Sheet, h: float) -> tuple[ProbeSlot, ...]:
     """List the slots of all probes.
 
-    Args:
-        probes: of the scene, in its order.
-        sheet: on which they act.
-        h: half-width of the hat, which is the step [s]; 0 if loads are not averaged: every probe then has one slot.
+    h: half-width of the hat, which is the step [s]; 0 if loads are not averaged: every probe then has one slot.
     """
     slots = []
     for index, probe in enumerate(probes):

@@ -26,21 +26,13 @@ class MapImage(NamedTuple):
 
 
 def read(stiffness_map: StiffnessMap) -> MapImage:
-    """Read the file of a map.
-
-    Raises:
-        PictureError: when the file cannot be used.
-    """
+    """Read the file of a map; PictureError: it cannot be used."""
     sha256 = file_sha256(stiffness_map.image)
     return MapImage(np.asarray(read_rgb(stiffness_map.image, (0, 0, 0), sha256).convert("L")), sha256)
 
 
 def factors(stiffness_map: StiffnessMap, image: MapImage, rows: int, cols: int) -> Array:
-    """Interpolate the factors at the centres of the cells: bilinearly between texels, constant beyond them.
-
-    Returns:
-        Shape (rows, cols).
-    """
+    """Interpolate the factors at the centres of rows x cols cells: bilinearly between texels, constant beyond them."""
     grey = image.grey.astype(float)
     height, width = grey.shape
     row = np.clip((np.arange(rows) + 0.5) / rows * height - 0.5, 0, height - 1)

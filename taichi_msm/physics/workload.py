@@ -48,12 +48,7 @@ class Work(NamedTuple):
 
 
 def work(plan: Plan, pilots: float) -> Work:
-    """Count the work of a run.
-
-    Args:
-        plan: of the run.
-        pilots: their steps in f64 for each step of the run, counted in steps of the whole sheet.
-    """
+    """Count the work of a run; pilots: their steps in f64 for each step of it, counted in steps of the whole sheet."""
     steps = _steps(plan)
     stepping = DOUBLE * steps if plan.grid.precision == "f64" else steps
     return Work(START, stepping, DOUBLE * pilots * steps, _other(plan.scene) - START)

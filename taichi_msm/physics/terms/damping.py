@@ -45,7 +45,7 @@ def coefficients(plan: Plan) -> Coefficients:
 
 @dataclass(frozen=True)
 class DampingTerm(Term):
-    """Damping of every point. It adds no energy, and its limit on the step is in `timestep.stable_step`."""
+    """Damping of every point. It adds no energy, and its limit on the step is in `planning.stable_step`."""
 
     numbers_count: ClassVar[int] = 1
 

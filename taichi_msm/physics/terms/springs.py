@@ -135,7 +135,9 @@ class SpringTerm(Term):
 
     def numbers(self, plan: Plan) -> tuple[float, ...]:
         """Give k - tau and tau of every family [N/m]."""
-        return *plan.material.stiffness, *plan.material.tensions
+        material = plan.material
+        less = 1 - material.tension
+        return material.across * less, material.down * less, material.shear * less, *material.tensions
 
     def energy(self, sums: NDArray[Any], plan: Plan) -> float:
         """Give twice the energy [J]."""
