@@ -1,4 +1,4 @@
-"""The notes on what a scene's pictures will hardly show as it was meant."""
+"""Warnings about a scene that will not look as intended."""
 
 from __future__ import annotations
 

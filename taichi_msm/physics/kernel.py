@@ -153,7 +153,9 @@ class SheetArrays:
         self.by_column = self.rows(len(start.by_column))
         self.decay = self.rows(max(1, len(start.decay)) * layout.rows)
         self.stiffness = self.rows(1 if start.stiffness is None else len(start.stiffness))
-        write(self.numbers, np.repeat(start.numbers[:, None], lanes, axis=1))
+        real = np.float32 if layout.code.precision == "f32" else np.float64
+        with np.errstate(over="ignore"):
+            write(self.numbers, np.repeat(start.numbers[:, None].astype(real), lanes, axis=1))
         self._set(self.by_column, start.by_column)
         if start.stiffness is not None:
             self._set(self.stiffness, start.stiffness)

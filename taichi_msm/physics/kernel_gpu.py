@@ -8,7 +8,7 @@ and u_{n+1} by turns; with bending, a third one holds the moments.
 
 from collections.abc import Callable
 from functools import cache
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,19 +23,12 @@ from taichi_msm.system.runtime import our_compilation, ti
 STEPS_PER_LAUNCH = 8
 
 
-class GpuKernels(NamedTuple):
-    """The kernels of one code."""
-
-    advance: Callable[..., None]
-    read: Callable[..., None]
-
-
 class Gather:
     """The state of a sheet in the memory of a GPU, and its kernels: a `StepKernel`."""
 
     def __init__(self, layout: SheetLayout, start: Start) -> None:
         self._layout = layout
-        self._kernels = _kernels(layout.code)
+        self._advance, self._read = _kernels(layout.code)
         # Which of the two buffers holds u_n. Each has a halo of one row above and below.
         self._now = 0
         buffer = np.pad(np.arange(layout.rows, dtype=np.int32), 1, constant_values=-1)
@@ -45,7 +38,7 @@ class Gather:
     def advance(self, count: int, table: NDArray[Any]) -> None:
         """Take at most STEPS_PER_LAUNCH steps; table: of the loads, shape (count, columns)."""
         with our_compilation():
-            self._kernels.advance(self._now, count, self._layout.rows, self._layout.cols, table, *self._arrays.all)
+            self._advance(self._now, count, self._layout.rows, self._layout.cols, table, *self._arrays.all)
         self._now = (self._now + count) % 2
 
     def compile(self, table: NDArray[Any]) -> None:
@@ -60,13 +53,13 @@ class Gather:
         """Copy displacements or differences, and measure every row."""
         with our_compilation():
             first = self._now * (self._layout.rows + 2) + 1
-            self._kernels.read(first, self._layout.rows, self._layout.cols, *wanted, *self._arrays.all)
+            self._read(first, self._layout.rows, self._layout.cols, *wanted, *self._arrays.all)
 
 
 @cache
-def _kernels(code: StepCode) -> GpuKernels:
+def _kernels(code: StepCode) -> tuple[Callable[..., None], Callable[..., None]]:
     """Make the kernels of one code; each is compiled when it is first launched."""
-    return GpuKernels(_advancing(code), reading(code, parallel=True, iterations=1))
+    return _advancing(code), reading(code, parallel=True, iterations=1)
 
 
 def _gathering(code: StepCode) -> Callable[..., None]:

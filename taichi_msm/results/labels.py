@@ -15,7 +15,7 @@ from taichi_msm.outputs.flo import write_flo
 from taichi_msm.outputs.npz import write_arrays
 from taichi_msm.outputs.table import CAMERA, OUTPUTS, results
 from taichi_msm.render.camera import calibration, view
-from taichi_msm.render.labels import Observed, Sight, track_grid
+from taichi_msm.render.labels import Observed, track_grid
 from taichi_msm.results.whole import add, create
 from taichi_msm.scene import Scene
 
@@ -36,8 +36,9 @@ class LabelWriter:
         self._scene = scene
         wanted = [output for name, output in OUTPUTS.items() if name in scene.output]
         self._series = [output for output in wanted if output.source in ("labels", "flow")]
-        tracked = scene.asks_for("tracks")
-        self._tracks = Tracks(scene.render.tracks, scene.time.frames + 1) if tracked else None
+        # Tracks are held until all are there, as their file has them point by point.
+        shape = scene.render.tracks**2 if scene.asks_for("tracks") else 0, scene.time.frames + 1
+        self._points, self._occluded = np.empty((*shape, 2), np.float32), np.empty(shape, np.bool_)
         self._added = 0
 
     def add(self, frame: int, observed: Observed) -> None:
@@ -50,8 +51,8 @@ class LabelWriter:
                 path.parent.mkdir(exist_ok=True)
                 with create(path) as file:
                     _WRITERS[path.suffix](file, getattr(getattr(observed, output.source), output.name))
-        if self._tracks is not None and observed.tracks is not None:
-            self._tracks.add(frame, observed.tracks)
+        if observed.tracks is not None:
+            self._points[:, frame], self._occluded[:, frame] = observed.tracks
 
     def finish(self, frames: int) -> None:
         """Keep the files of the first frames only, this many, and write those that belong to all frames together."""
@@ -63,33 +64,11 @@ class LabelWriter:
         if CAMERA in results(self._scene.output):
             matrices = {"size": list(self._scene.render.size), **calibration(view(self._scene))}
             add(self._folder / CAMERA, (json.dumps(matrices, indent=2) + "\n").encode())
-        if self._tracks is not None:
+        if self._scene.asks_for("tracks"):
+            points, occluded = self._points[:, :frames], self._occluded[:, :frames]
+            grid = track_grid(self._scene.render.tracks)
             with create(self._folder / OUTPUTS["tracks"].path()) as file:
-                self._tracks.write(file, frames)
-
-
-class Tracks:
-    """The tracks of a run, frame by frame; held until all are there, as a file has them point by point.
-
-    Args:
-        count: points along each side of their grid.
-        frames: how many frames there may be.
-    """
-
-    def __init__(self, count: int, frames: int) -> None:
-        self._coordinates = track_grid(count)
-        self._points = np.empty((count * count, frames, 2), np.float32)
-        self._occluded = np.empty((count * count, frames), np.bool_)
-
-    def add(self, frame: int, sight: Sight) -> None:
-        """Add where the points are in a frame."""
-        self._points[:, frame] = sight.pixels
-        self._occluded[:, frame] = sight.hidden
-
-    def write(self, file: BinaryIO, frames: int) -> None:
-        """Write the first so many frames as tracks.npz."""
-        points, occluded = self._points[:, :frames], self._occluded[:, :frames]
-        write_arrays(file, {"coordinates": self._coordinates, "points": points, "occluded": occluded})
+                write_arrays(file, {"coordinates": grid, "points": points, "occluded": occluded})
 
 
 def _write_depth(file: BinaryIO, depth: NDArray[np.float32]) -> None:

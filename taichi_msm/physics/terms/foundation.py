@@ -50,7 +50,6 @@ class FoundationTerm(Term):
     @staticmethod
     def bound(material: Material, sheet: Sheet) -> float:
         """Give the part of m w^2, which is K [N/m]."""
-        del sheet
         return material.virtual
 
     @property

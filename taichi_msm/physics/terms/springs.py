@@ -28,7 +28,7 @@ and its energy ((k - tau) (L - L0)^2 + tau q^2) / 2.
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Any, ClassVar, NamedTuple
+from typing import Any, ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -50,16 +50,6 @@ LEAST, MOST, STRETCHED, TENSE = 0, 1, 2, 5
 
 # Prevents a division by 0 at L = 0, where the force is then 0, as P - Q is. A literal in a kernel is always f32.
 TINY = 1e-36
-
-
-class SpringFunctions(NamedTuple):
-    """Taichi's functions for the forces of springs, and for where they find their stiffness."""
-
-    along: Callable[..., Any]
-    to_other_row: Callable[..., Any]
-    of_row: Callable[..., Any]
-    of_column: Callable[..., Any]
-    of_diagonal: Callable[..., Any]
 
 
 @dataclass(frozen=True)
@@ -127,7 +117,6 @@ class SpringTerm(Term):
         and hence no mode of the sheet. If factors differ, each cell takes the share of a point's mass that it has of
         the point's stiffness; the maximum is then multiplied by the largest mean of the factors around a point.
         """
-        del sheet
         across, down, shear, largest = material.across, material.down, material.shear, 1.0
         if material.factors is not None:
             largest = largest_mean(material.factors) if material.by_area else float(material.factors.max())
@@ -145,8 +134,8 @@ class SpringTerm(Term):
         squares = np.array([dx**2, dy**2, dx**2 + dy**2])
         return float((sums[STRETCHED:TENSE] + plan.material.tensions * sums[TENSE:]) @ squares)
 
-    def between(self, code: StepCode) -> SpringFunctions:
-        """Make the functions for the forces of springs."""
+    def between(self, code: StepCode) -> tuple[Callable[..., Any], ...]:
+        """Make the functions for the forces of springs along a row and to another one, and for their stiffness."""
         ti = code.ti
         tense, mapped, by_area = self.tense, self.mapped, self.by_area and not self.mapped
         leaves_out, real, first = self.open_edges and not self.mapped, code.real, code.first_number(SpringTerm)
@@ -223,7 +212,7 @@ class SpringTerm(Term):
             else:  # noqa: RET505
                 return sheet.numbers[first + DIAGONAL]
 
-        return SpringFunctions(along, to_other_row, of_row, of_column, of_diagonal)
+        return along, to_other_row, of_row, of_column, of_diagonal
 
     def measuring(self, code: StepCode) -> Sequence[Callable[..., None]]:
         """Make the function that measures the springs to the right of an entry and to the row below it."""

@@ -52,18 +52,15 @@ class Term:
     @staticmethod
     def derive(scene: Scene) -> dict[str, Any]:
         """Derive the attributes of `Material` that the term's keys of a scene stand for."""
-        del scene
         return {}
 
     @staticmethod
     def bound(material: Material, sheet: Sheet) -> float:
         """Bound the part of m w^2 that the term has in any motion [N/m]."""
-        del material, sheet
         return 0.0
 
     def numbers(self, plan: Plan) -> tuple[float, ...]:
         """Give its numbers."""
-        del plan
         return ()
 
     @property
@@ -73,12 +70,10 @@ class Term:
 
     def columns(self, plan: Plan, loads: Schedule) -> NDArray[Any]:
         """Give its columns of the table of loads, shape (steps, column_count)."""
-        del plan
         return np.empty((len(loads.active), 0))
 
     def energy(self, sums: NDArray[Any], plan: Plan) -> float:
         """Give twice its energy [J], from its measures summed up."""
-        del sums, plan
         return 0.0
 
     def forces(self, code: StepCode) -> Sequence[Callable[..., Any]]:
@@ -86,17 +81,14 @@ class Term:
 
         They return the new force; `now` is the row of the table of loads, a list of variables.
         """
-        del code
         return ()
 
     def reducing(self, code: StepCode) -> Sequence[Callable[..., Any]]:
         """Make Taichi's functions reduce(d_x, d_y, d_z, sheet) that change the last difference of a point."""
-        del code
         return ()
 
     def measuring(self, code: StepCode) -> Sequence[Callable[..., None]]:
         """Make Taichi's functions measure(measures, sheet, p, i, kind, b) for entry b of row i, which is row p of u."""
-        del code
         return ()
 
 
