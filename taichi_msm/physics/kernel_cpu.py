@@ -73,12 +73,12 @@ class Sweep:
         self._borders = self._border_rows()
         moments = 0 if layout.code.get(BendingTerm) is None else MOMENTS * layout.workers
         sheet_rows = np.arange(layout.rows, dtype=np.int32), self._borders, np.full(moments, -1, np.int32)
-        self._arrays = SheetArrays(layout, np.concatenate(sheet_rows), start)
+        self.arrays = SheetArrays(layout, np.concatenate(sheet_rows), start)
         # Rows of `carried` per worker: one for each step of a pass, and then a page, which no prefetcher crosses.
         row_bytes = layout.width * layout.code.lanes * BYTES[layout.code.precision]
         self._carried_rows = layout.depth - (-PAGE // row_bytes)
         # Forces carried to the next row, for every worker and step of a pass.
-        self._carried = [self._arrays.rows(layout.workers * self._carried_rows) for _ in range(3)]
+        self._carried = [self.arrays.rows(layout.workers * self._carried_rows) for _ in range(3)]
         self._progress = np.zeros(layout.workers * WORKER_STRIDE, np.int64)
 
     def advance(self, count: int, table: NDArray[Any]) -> None:
@@ -100,16 +100,12 @@ class Sweep:
             self._launch_together(0, 0, table)
             self._copy_borders()
 
-    def set_decay(self, decay: NDArray[Any]) -> None:
-        """Replace the decays of the standing slots, shape (slots, rows, cols)."""
-        self._arrays.set_decay(decay)
-
     def read(self, wanted: SheetReading) -> None:
         """Copy displacements or differences, and measure every row."""
         layout = self._layout
         read = self._kernels.read_together if layout.workers > 1 else self._kernels.read_alone
         with our_compilation():
-            read(0, layout.rows, layout.cols, *wanted, *self._arrays.all)
+            read(0, layout.rows, layout.cols, *wanted, *self.arrays.all)
 
     def _advance_alone(self, done: int, end: int, table: NDArray[Any]) -> None:
         """Take the steps from `done` to `end` with a single worker."""
@@ -168,7 +164,7 @@ class Sweep:
     def _copy_borders(self) -> None:
         """Bring the copies of the rows at the borders of bands up to date, after steps of a single worker."""
         with our_compilation():
-            self._kernels.copy(*self._arrays.u, self._borders, self._layout.rows, self._layout.width)
+            self._kernels.copy(*self.arrays.u, self._borders, self._layout.rows, self._layout.width)
         self._progress[::COUNTER_STRIDE] = self._steps
 
     def _start_pass(self) -> None:
@@ -184,7 +180,7 @@ class Sweep:
             self._first_row, self._end_row, layout.rows + len(self._borders), PATIENCE,
         ])  # fmt: skip
         with our_compilation():
-            kernel(sizes, self._progress, table, *self._carried, *self._arrays.all)
+            kernel(sizes, self._progress, table, *self._carried, *self.arrays.all)
         self._steps += count
 
     def _border_rows(self) -> NDArray[np.int32]:

@@ -61,12 +61,7 @@ STEPS_PER_TABLE = 4096
 
 
 def layout_of(plan: Plan, device: Device, cores: int | None = None) -> SheetLayout:
-    """Choose how a sheet is laid out and shared out, and what is compiled for it: only the terms that the scene has.
-
-    Args:
-        plan: of the scene.
-        device: what `runtime.start` returned.
-        cores: number of cores that stepping may use; None: all.
+    """Choose how a sheet is laid out and shared out among cores, None: all, and what is compiled for it.
 
     Raises:
         DeviceError: when the device cannot do what the scene needs.
@@ -94,8 +89,6 @@ class Dynamics:
     """The sheet in motion.
 
     Args:
-        plan: of the scene.
-        device: what `runtime.start` returned.
         layout: in the place of the scene's own; for tests.
         cores: number of cores that stepping may use; None: all.
 
@@ -117,19 +110,18 @@ class Dynamics:
     def restart(self, plan: Plan, state: State | None = None) -> None:
         """Begin again with the same scene or another; nothing is compiled if only numbers differ.
 
-        Args:
-            plan: of the scene.
-            state: what `state` returned for the same points and steps, to continue from; None: at rest.
+        state: what `state` returned for the same points and steps, to continue from; None: at rest.
         """
         self.plan = plan
         self.structure = self._layout or layout_of(plan, self._device, self._cores)
-        self._begin(state)
+        self._real = np.dtype(np.float32 if self.structure.code.precision == "f32" else np.float64)
+        self.steps_done, self.torn = 0 if state is None else state.steps, True
+        self._first_tabled, self._loads = self.steps_done, self._table(self.steps_done, STEPS_PER_TABLE)
+        self._place(state)
+        self.torn = False
 
     def steer(self, plan: Plan) -> None:
-        """Continue with other loads and the same steps.
-
-        Args:
-            plan: with other probes, each of which moves, jumps or stands as its predecessor did.
+        """Continue with other probes, each of which moves, jumps or stands as its predecessor did, and the same steps.
 
         Raises:
             ArgumentError: when the new probes need another kernel.
@@ -143,17 +135,15 @@ class Dynamics:
         if probes.by_area != before.by_area:
             raise ArgumentError("probes: one has total instead of force, or the reverse; restart with the new scene")
         if standing(plan) != standing(self.plan):
-            self._moving.set_decay(standing_decays(plan))
+            self._moving.arrays.set_decay(standing_decays(plan))
         self.plan = plan
         # A caller that steers will steer again in a frame, so no more loads than those of a frame are tabulated.
         self._first_tabled, self._loads = self.steps_done, self._table(self.steps_done, plan.grid.steps_per_frame)
 
     def advance(self, steps: int, pause: Pause = lambda: None) -> None:
-        """Take a number of steps.
+        """Take a number of steps, with a pause after every launch.
 
-        Args:
-            steps: how many.
-            pause: called after every launch. An exception from it stops the sheet there; another call continues.
+        An exception from it stops the sheet there; another call continues.
 
         Raises:
             MsmError: when the sheet is torn; so do `state` and `read`.
@@ -181,11 +171,7 @@ class Dynamics:
         self.displacement()
 
     def displacement(self) -> NDArray[Any]:
-        """Read the displacements.
-
-        Returns:
-            x - X [m], shape (rows, cols, 3), in the scene's precision.
-        """
+        """Read the displacements x - X [m], shape (rows, cols, 3), in the scene's precision."""
         return self.read().displacement
 
     def state(self) -> State:
@@ -229,14 +215,6 @@ class Dynamics:
     def _moving(self) -> StepKernel:
         assert self._sheet is not None, "it is closed"
         return self._sheet
-
-    def _begin(self, state: State | None) -> None:
-        """Prepare the sheet at rest or in a given state."""
-        self._real = np.dtype(np.float32 if self.structure.code.precision == "f32" else np.float64)
-        self.steps_done, self.torn = 0 if state is None else state.steps, True
-        self._first_tabled, self._loads = self.steps_done, self._table(self.steps_done, STEPS_PER_TABLE)
-        self._place(state)
-        self.torn = False
 
     def _next_loads(self, count: int) -> NDArray[Any]:
         """Give the table of the loads of the next steps, shape (count, columns)."""

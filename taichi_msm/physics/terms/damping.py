@@ -68,11 +68,11 @@ class DampingTerm(Term):
 
     def reducing(self, code: StepCode) -> Sequence[Callable[..., Any]]:
         """Make the function that reduces the last difference."""
-        ti = code.ti
-        keep = code.first_number(DampingTerm)
+        ti, keep = code.ti, code.first_number(DampingTerm)
 
         @ti.func
-        def reduce(d_x, d_y, d_z, sheet: ti.template()):
-            return d_x * sheet.numbers[keep], d_y * sheet.numbers[keep], d_z * sheet.numbers[keep]
+        def reduce(d: ti.template(), sheet: ti.template()):
+            for c in ti.static(range(3)):
+                d[c] *= sheet.numbers[keep]
 
         return (reduce,)

@@ -70,7 +70,7 @@ class ProbeTerm(Term):
         standing = [moves[:n].count(False) for n in range(len(moves))]
 
         @ti.func
-        def add(force_x, force_y, force_z, sheet: ti.template(), entry: ti.template(), now: ti.template()):
+        def add(force: ti.template(), sheet: ti.template(), entry: ti.template(), now: ti.template()):
             for n in ti.static(range(len(moves))):
                 column = ti.static(first + SLOT_COLUMNS * n)
                 share = vector(0)
@@ -84,10 +84,8 @@ class ProbeTerm(Term):
                         share *= sheet.by_column[(AREA + entry.row.kind) * sheet.width + entry.b]
                 else:
                     share = sheet.decay[(standing[n] * sheet.rows + entry.row.i) * sheet.width + entry.b]
-                force_x += now[column] * share
-                force_y += now[column + 1] * share
-                force_z += now[column + 2] * share
-            return force_x, force_y, force_z
+                for c in ti.static(range(3)):
+                    force[c] += now[column + c] * share
 
         return (add,)
 

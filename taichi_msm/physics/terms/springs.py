@@ -142,35 +142,32 @@ class SpringTerm(Term):
         first_tension = first + 3
 
         @ti.func
-        def pull(weighted, square, length, to_x, to_y, to_z, tension, x, y, z):
-            """Force along the deformed spring, from k (L^2 - L0^2) and L^2, plus tension times the difference."""
-            force = weighted / (square + length * ti.sqrt(square))
-            force_x, force_y, force_z = force * to_x, force * to_y, force * to_z
+        def pull(weighted, square, length, to: ti.template(), tension, q: ti.template()):
+            """Force along the deformed spring, from k (L^2 - L0^2) and L^2, plus tension times the difference q."""
+            share = weighted / (square + length * ti.sqrt(square))
+            force = [share * to[c] for c in ti.static(range(3))]
             if ti.static(tense):
-                force_x += tension * x
-                force_y += tension * y
-                force_z += tension * z
-            return force_x, force_y, force_z
+                for c in ti.static(range(3)):
+                    force[c] += tension * q[c]
+            return force
 
         @ti.func
-        def along(sheet: ti.template(), right, here_x, here_y, here_z, k, exists):
+        def along(sheet: ti.template(), right, here: ti.template(), k, exists):
             """Force of a point displaced by `here` on its right neighbour, in entry `right` of u; exists: 0 if none."""
             dx = sheet.numbers[DX]
-            x, y, z = here_x - sheet.u[0][right], here_y - sheet.u[1][right], here_z - sheet.u[2][right]
+            x, y, z = here[0] - sheet.u[0][right], here[1] - sheet.u[1][right], here[2] - sheet.u[2][right]
             to_x = x - dx
             rest = y * y + z * z
             weighted = k * (x * (to_x - dx) + rest)
             if ti.static(leaves_out):
                 weighted *= exists
             tension = sheet.numbers[first_tension + ALONG_ROW]
-            return pull(weighted, to_x * to_x + (rest + TINY), dx, to_x, y, z, tension, x, y, z)
+            return pull(weighted, to_x * to_x + (rest + TINY), dx, [to_x, y, z], tension, [x, y, z])
 
         @ti.func
-        def to_other_row(
-            sheet: ti.template(), entry, right: ti.template(), here_x, here_y, here_z, up, length, k, exists
-        ):
+        def to_other_row(sheet: ti.template(), entry, right: ti.template(), here: ti.template(), up, length, k, exists):
             """Force of a point displaced by `here` on that in `entry`, `right` columns on in the row above."""
-            x, y, z = here_x - sheet.u[0][entry], here_y - sheet.u[1][entry], here_z - sheet.u[2][entry]
+            x, y, z = here[0] - sheet.u[0][entry], here[1] - sheet.u[1][entry], here[2] - sheet.u[2][entry]
             to_x = x
             to_y = y - up
             rest = z * z
@@ -182,7 +179,8 @@ class SpringTerm(Term):
             if ti.static(leaves_out):
                 weighted *= exists
             tension = sheet.numbers[first_tension + ti.static(DIAGONAL if right else ALONG_COLUMN)]
-            return pull(weighted, to_x * to_x + to_y * to_y + (rest + TINY), length, to_x, to_y, z, tension, x, y, z)
+            square = to_x * to_x + to_y * to_y + (rest + TINY)
+            return pull(weighted, square, length, [to_x, to_y, z], tension, [x, y, z])
 
         @ti.func
         def of_row(sheet: ti.template(), i, kind, b):

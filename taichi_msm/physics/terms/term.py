@@ -77,14 +77,14 @@ class Term:
         return 0.0
 
     def forces(self, code: StepCode) -> Sequence[Callable[..., Any]]:
-        """Make Taichi's functions force(force_x, force_y, force_z, sheet, entry, now) that add to the force on a point.
+        """Make Taichi's functions add(force, sheet, entry, now) that add to the force on a point, a list of x, y and z.
 
-        They return the new force; `now` is the row of the table of loads, a list of variables.
+        `now` is the row of the table of loads, a list of variables.
         """
         return ()
 
     def reducing(self, code: StepCode) -> Sequence[Callable[..., Any]]:
-        """Make Taichi's functions reduce(d_x, d_y, d_z, sheet) that change the last difference of a point."""
+        """Make Taichi's functions reduce(d, sheet) that change the last difference of a point, a list of x, y and z."""
         return ()
 
     def measuring(self, code: StepCode) -> Sequence[Callable[..., None]]:
@@ -203,10 +203,8 @@ class KernelRow(NamedTuple):
 
 
 class Entry(NamedTuple):
-    """An entry b of a row within a kernel, which is a point in each lane, displaced by (x, y, z) [m]."""
+    """An entry b of a row within a kernel, which is a point in each lane; u: its displacement, a list of x, y and z."""
 
     row: KernelRow
     b: Any
-    x: Any
-    y: Any
-    z: Any
+    u: Any
