@@ -25,7 +25,7 @@ from taichi_msm.errors import DamagedError, DeviceError, DivergedError, FilesErr
 from taichi_msm.physics.error_control import Estimate
 from taichi_msm.physics.lattice import rest_positions
 from taichi_msm.physics.mesh_error import MeshEstimate
-from taichi_msm.physics.pilots import Pilots, choose_pilots, no_pilots
+from taichi_msm.physics.pilots import Pilots, choose_pilots
 from taichi_msm.physics.plan import Plan
 from taichi_msm.physics.probe_force import probe_records
 from taichi_msm.physics.run_error import Known, RunError
@@ -408,11 +408,11 @@ def _pilots(manifest: Manifest, plan: Plan, device: Device, *, resumed: bool) ->
     """Choose the pilots of a run, or say why there are none."""
     asked = manifest.asks_estimate
     if asked is False:
-        return no_pilots("not asked for")
+        return Pilots(reason="not asked for")
     if asked is None and device.arch != "cpu":
-        return no_pilots("on a GPU, this needs --estimate-error")
+        return Pilots(reason="on a GPU, this needs --estimate-error")
     if resumed and not plan.scene.output:
-        return no_pilots("the frames before the interruption were not kept")
+        return Pilots(reason="the frames before the interruption were not kept")
     return choose_pilots(plan, asked=asked is True)
 
 

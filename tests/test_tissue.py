@@ -17,9 +17,9 @@ from taichi_msm.errors import ArgumentError, FilesError, SceneError
 from taichi_msm.physics import kernel_gpu, probe_force
 from taichi_msm.physics.error_control import longest
 from taichi_msm.physics.lattice import rest_positions
+from taichi_msm.physics.material import MapImage
 from taichi_msm.physics.mesh_error import FEWEST, CubicSampling, MeshEstimate, MeshPilot, choose_points, coarser
 from taichi_msm.physics.plan import Plan
-from taichi_msm.physics.stiffness_map import MapImage
 from taichi_msm.physics.terms.bending import BendingTerm
 from taichi_msm.physics.terms.damping import DampingTerm
 from taichi_msm.physics.terms.foundation import FoundationTerm

@@ -25,15 +25,10 @@ MOST_SECONDS = 10.0
 
 @dataclass(frozen=True)
 class Diagnosis:
-    """What was found out about a divergence.
+    """What was found out about a divergence."""
 
-    Attributes:
-        message: the time, the step, the point, the key that is the most likely cause, and the remedy.
-        good: the last sound state of the run; None: only the start is known to be sound.
-    """
-
-    message: str
-    good: Saved | None
+    message: str  # the time, the step, the point, the key that is the most likely cause, and the remedy
+    good: Saved | None  # the last sound state of the run; None: only the start is known to be sound
 
 
 def diagnose(dynamics: Dynamics, start: Saved | None, pause: Pause) -> Diagnosis:

@@ -126,18 +126,13 @@ def message(time: float, step: int, wrong: str, *, exact: bool) -> str:
 
 
 class Farthest(NamedTuple):
-    """The point that is farthest from its rest position, or not finite.
+    """The point that is farthest from its rest position, or not finite."""
 
-    Attributes:
-        row, column: of the point.
-        distance: from its rest position [m].
-        reach: root of the sum of the squared displacements of all points [m].
-    """
-
+    # row, column: of the point
     row: int
     column: int
-    distance: float
-    reach: float
+    distance: float  # from its rest position [m]
+    reach: float  # root of the sum of the squared displacements of all points [m]
 
 
 def farthest(displacement: NDArray[np.floating]) -> Farthest:

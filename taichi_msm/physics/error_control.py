@@ -44,26 +44,20 @@ LARGEST_CUT = 8.0
 
 @dataclass(frozen=True)
 class Estimate:
-    """What is known about the error of a step.
+    """What is known about the error of a step."""
 
-    Attributes:
-        steps_per_frame: of the step.
-        error: largest error, as a fraction of the largest displacement; infinite if it is not known because a pilot
-            diverged or the step does not resolve the damping.
-        rounding: the part of the error that comes from f32, including that of positions in the trajectory; 0 in f64.
-        in_f64: the error of the same step in f64.
-        order: of the method in this scene.
-        parted: whether the two parts are known; else, by a coarse pilot beside a run in f32, neither is larger than the
-            error told.
-        at_least: whether the error may be larger, as a coarse pilot shows one that only a fine one would tell.
-    """
-
-    steps_per_frame: int
+    steps_per_frame: int  # of the step
+    # largest error, as a fraction of the largest displacement; infinite if it is not known because a pilot diverged or
+    # the step does not resolve the damping
     error: float
+    # the part of the error that comes from f32, including that of positions in the trajectory; 0 in f64
     rounding: float
-    in_f64: float
-    order: int
+    in_f64: float  # the error of the same step in f64
+    order: int  # of the method in this scene
+    # whether the two parts are known; else, by a coarse pilot beside a run in f32, neither is larger than the error
+    # told
     parted: bool = True
+    # whether the error may be larger, as a coarse pilot shows one that only a fine one would tell
     at_least: bool = False
 
 

@@ -22,7 +22,7 @@ wrong results; so unary minus, `-=`, abs, any and all are not used on vectors, a
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any, NamedTuple, Protocol
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -37,22 +37,15 @@ BYTES = {"f32": 4, "f64": 8}
 
 @dataclass(frozen=True)
 class SheetLayout:
-    """How a sheet is laid out in memory and shared out among workers, and the code that steps it.
+    """How a sheet is laid out in memory and shared out among workers, and the code that steps it."""
 
-    Attributes:
-        rows, cols: points of the sheet.
-        workers: number of bands of rows that are stepped in parallel; 0 on a GPU, where all points are.
-        depth: number of steps that a band takes in one sweep.
-        fixed_rows: whether all points of the first row are fixed, and all of the last.
-        code: what the kernels are compiled for.
-    """
-
+    # rows, cols: points of the sheet
     rows: int
     cols: int
-    workers: int
-    depth: int
-    fixed_rows: tuple[bool, bool]
-    code: StepCode
+    workers: int  # number of bands of rows that are stepped in parallel; 0 on a GPU, where all points are
+    depth: int  # number of steps that a band takes in one sweep
+    fixed_rows: tuple[bool, bool]  # whether all points of the first row are fixed, and all of the last
+    code: StepCode  # what the kernels are compiled for
 
     @property
     def strip(self) -> int:
@@ -66,35 +59,13 @@ class SheetLayout:
 
 
 class Start(NamedTuple):
-    """What the arrays of a sheet hold at the start.
+    """What the arrays of a sheet hold at the start."""
 
-    Attributes:
-        numbers: of the sheet and its terms.
-        by_column: shape (COLUMN_ROWS, cols).
-        decay: of the standing slots, shape (standing slots, rows, cols).
-        stiffness: as many rows as it takes; None without a map.
-        state: to continue from; None: at rest.
-    """
-
-    numbers: NDArray[Any]
-    by_column: NDArray[Any]
-    decay: NDArray[Any]
-    stiffness: NDArray[Any] | None
-    state: State | None
-
-
-class SheetReading(NamedTuple):
-    """What is read from a sheet, in the order of the kernel's arguments.
-
-    Attributes:
-        differences: True: read d; False: read u.
-        values: receives it, shape (rows, cols, 3).
-        measures: receives the measures of every row of points, shape (rows, measures).
-    """
-
-    differences: bool
-    values: NDArray[Any]
-    measures: NDArray[Any]
+    numbers: NDArray[Any]  # of the sheet and its terms
+    by_column: NDArray[Any]  # shape (COLUMN_ROWS, cols)
+    decay: NDArray[Any]  # of the standing slots, shape (standing slots, rows, cols)
+    stiffness: NDArray[Any] | None  # as many rows as it takes; None without a map
+    state: State | None  # to continue from; None: at rest
 
 
 def in_lanes(layout: SheetLayout, values: NDArray[Any]) -> NDArray[Any]:
@@ -158,23 +129,6 @@ class SheetArrays:
     def rows(self, count: int) -> Any:
         """Allocate an array of `count` rows; its content is arbitrary."""
         return self._memory.array(self._layout.code.precision, self._layout.code.lanes, count * self._layout.width)
-
-
-class StepKernel(Protocol):
-    """A form of kernel 1: the state of a sheet in the memory of a device, made of a layout and a start."""
-
-    arrays: SheetArrays
-
-    def __init__(self, layout: SheetLayout, start: Start) -> None: ...
-
-    def advance(self, count: int, table: NDArray[Any]) -> None:
-        """Take a number of steps; table: of the loads, shape (count, columns)."""
-
-    def compile(self, table: NDArray[Any]) -> None:
-        """Compile everything that steps may need, without taking one."""
-
-    def read(self, wanted: SheetReading) -> None:
-        """Copy displacements or differences, and measure every row."""
 
 
 def point_step(code: StepCode) -> Callable[..., None]:

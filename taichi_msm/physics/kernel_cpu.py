@@ -9,7 +9,7 @@ continue until all workers have taken the same steps; after that a single worker
 import time
 from collections.abc import Callable
 from functools import cache
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -24,7 +24,7 @@ from taichi_msm.physics.bands import (
     WORKER_STRIDE,
     advancing,
 )
-from taichi_msm.physics.kernel import BYTES, SheetArrays, SheetLayout, SheetReading, Start, reading
+from taichi_msm.physics.kernel import BYTES, SheetArrays, SheetLayout, Start, reading
 from taichi_msm.physics.terms.bending import BendingTerm
 from taichi_msm.physics.terms.term import StepCode
 from taichi_msm.system import resources
@@ -46,22 +46,12 @@ SHORTEST_REST, LONGEST_REST, HALF_LIFE = 0.002, 0.2, 0.02
 CROWDED = 0.2
 
 
-class CpuKernels(NamedTuple):
-    """The kernels of one code."""
-
-    advance_alone: Callable[..., None]
-    advance_together: Callable[..., None]
-    read_alone: Callable[..., None]
-    read_together: Callable[..., None]
-    copy: Callable[..., None]
-
-
 class Sweep:
-    """The state of a sheet in the memory of a CPU, and its kernels: a `StepKernel`."""
+    """The state of a sheet in the memory of a CPU, and its kernels."""
 
     def __init__(self, layout: SheetLayout, start: Start) -> None:
         self._layout = layout
-        self._kernels = _kernels(layout.code)
+        self._advance, self._read = _kernels(layout.code, parallel=layout.workers > 1)
         self._steps = 0
         self._rest = self._rests_until = 0.0
         # Time that all workers have stepped undisturbed since the last rest [s].
@@ -100,17 +90,15 @@ class Sweep:
             self._launch_together(0, 0, table)
             self._copy_borders()
 
-    def read(self, wanted: SheetReading) -> None:
-        """Copy displacements or differences, and measure every row."""
-        layout = self._layout
-        read = self._kernels.read_together if layout.workers > 1 else self._kernels.read_alone
+    def read(self, differences: bool, values: NDArray[Any], measures: NDArray[Any]) -> None:
+        """Copy displacements or differences into values, shape (rows, cols, 3), and the measures of every row."""
         with our_compilation():
-            read(0, layout.rows, layout.cols, *wanted, *self.arrays.all)
+            self._read(0, self._layout.rows, self._layout.cols, differences, values, measures, *self.arrays.all)
 
     def _advance_alone(self, done: int, end: int, table: NDArray[Any]) -> None:
         """Take the steps from `done` to `end` with a single worker."""
         self._start_pass()
-        self._launch(self._kernels.advance_alone, 1, end - done, table[done:])
+        self._launch(_kernels(self._layout.code, parallel=False)[0], 1, end - done, table[done:])
 
     def _advance_while_resting(self, done: int, end: int, table: NDArray[Any]) -> int:
         """Take steps with a single worker until it is time for all of them; returns how many are done."""
@@ -149,7 +137,7 @@ class Sweep:
         """Launch all workers; returns how many steps they have taken, and whether one gave up."""
         workers, depth, count, first = self._layout.workers, self._layout.depth, end - done, self._steps
         self._start_pass()
-        self._launch(self._kernels.advance_together, workers, count, table[done:])
+        self._launch(self._advance, workers, count, table[done:])
         passes, rounds = self._progress[TURN::WORKER_STRIDE], self._progress[ROUND::WORKER_STRIDE]
         gave_up = not (passes * depth >= count).all()
         if gave_up:
@@ -157,14 +145,14 @@ class Sweep:
             count = min(count, int((passes + (rounds >= 0)).max()) * depth)
             while not (passes * depth >= count).all():
                 self._steps = first
-                self._launch(self._kernels.advance_together, workers, count, table[done:])
+                self._launch(self._advance, workers, count, table[done:])
             self._steps = first + count
         return count, gave_up
 
     def _copy_borders(self) -> None:
         """Bring the copies of the rows at the borders of bands up to date, after steps of a single worker."""
         with our_compilation():
-            self._kernels.copy(*self.arrays.u, self._borders, self._layout.rows, self._layout.width)
+            _copying(self._layout.code)(*self.arrays.u, self._borders, self._layout.rows, self._layout.width)
         self._progress[::COUNTER_STRIDE] = self._steps
 
     def _start_pass(self) -> None:
@@ -198,17 +186,13 @@ class Sweep:
 
 
 @cache
-def _kernels(code: StepCode) -> CpuKernels:
-    """Make the kernels of one code; each is compiled when it is first launched."""
-    return CpuKernels(
-        advancing(code, parallel=False),
-        advancing(code, parallel=True),
-        reading(code, parallel=False, iterations=1),
-        reading(code, parallel=True, iterations=ITERATIONS_PER_THREAD),
-        _copying(code),
-    )
+def _kernels(code: StepCode, *, parallel: bool) -> tuple[Callable[..., None], Callable[..., None]]:
+    """Make the kernels of one code that step and read; each is compiled when it is first launched."""
+    iterations = ITERATIONS_PER_THREAD if parallel else 1
+    return advancing(code, parallel=parallel), reading(code, parallel=parallel, iterations=iterations)
 
 
+@cache
 def _copying(code: StepCode) -> Callable[..., None]:
     """Make the kernel that updates the copies of the rows at the borders of bands."""
     vectors = code.vectors

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from taichi_msm.physics.kernel import SheetArrays, SheetLayout, SheetReading, Start, point_step, reading
+from taichi_msm.physics.kernel import SheetArrays, SheetLayout, Start, point_step, reading
 from taichi_msm.physics.terms.bending import BendingTerm
 from taichi_msm.physics.terms.springs import SpringTerm
 from taichi_msm.physics.terms.term import DX, DY, HAS_LEFT, HAS_RIGHT, Entry, KernelRow, KernelSheet, StepCode
@@ -24,7 +24,7 @@ STEPS_PER_LAUNCH = 8
 
 
 class Gather:
-    """The state of a sheet in the memory of a GPU, and its kernels: a `StepKernel`."""
+    """The state of a sheet in the memory of a GPU, and its kernels, with the methods of `Sweep`."""
 
     def __init__(self, layout: SheetLayout, start: Start) -> None:
         self._layout = layout
@@ -45,11 +45,11 @@ class Gather:
         """Compile the steps without taking one."""
         self.advance(0, table)
 
-    def read(self, wanted: SheetReading) -> None:
-        """Copy displacements or differences, and measure every row."""
+    def read(self, differences: bool, values: NDArray[Any], measures: NDArray[Any]) -> None:
+        """Copy displacements or differences into values, shape (rows, cols, 3), and the measures of every row."""
+        first, layout = self._now * (self._layout.rows + 2) + 1, self._layout
         with our_compilation():
-            first = self._now * (self._layout.rows + 2) + 1
-            self._read(first, self._layout.rows, self._layout.cols, *wanted, *self.arrays.all)
+            self._read(first, layout.rows, layout.cols, differences, values, measures, *self.arrays.all)
 
 
 @cache

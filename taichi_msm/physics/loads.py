@@ -19,9 +19,8 @@ from numpy.typing import NDArray
 
 from taichi_msm.physics.lattice import axes
 from taichi_msm.physics.material import area_shares
-from taichi_msm.physics.plan import Plan
+from taichi_msm.physics.plan import EDGE, Plan, ProbeSegment, ProbeSlot, probe_slots
 from taichi_msm.physics.probe_force import control_points, probe_force
-from taichi_msm.physics.slots import EDGE, ProbeSegment, ProbeSlot, probe_slots
 from taichi_msm.scene import Probe, Scene, Sheet
 
 # A time before all others [s].
@@ -31,19 +30,12 @@ Array = NDArray[np.float64]
 
 
 class Schedule(NamedTuple):
-    """The loads at consecutive steps.
+    """The loads at consecutive steps."""
 
-    Attributes:
-        slots: where the probes act; the columns of the arrays.
-        strength: force at the control point before the decay [N], shape (steps, slots, 3).
-        point: control point, x and y at rest [m], shape (steps, slots, 2).
-        active: share of their stiffness with which the virtual springs act, 0 to 1; shape (steps,).
-    """
-
-    slots: tuple[ProbeSlot, ...]
-    strength: Array
-    point: Array
-    active: Array
+    slots: tuple[ProbeSlot, ...]  # where the probes act; the columns of the arrays
+    strength: Array  # force at the control point before the decay [N], shape (steps, slots, 3)
+    point: Array  # control point, x and y at rest [m], shape (steps, slots, 2)
+    active: Array  # share of their stiffness with which the virtual springs act, 0 to 1; shape (steps,)
 
 
 def decay(probe: Probe, sheet: Sheet) -> Array:

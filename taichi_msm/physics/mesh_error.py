@@ -34,12 +34,11 @@ from numpy.typing import NDArray
 
 from taichi_msm.errors import SceneError
 from taichi_msm.physics.error_control import longest
-from taichi_msm.physics.material import LONGEST_CELL, cell_ratio
+from taichi_msm.physics.material import LONGEST_CELL, MapImage, cell_ratio
 from taichi_msm.physics.plan import Plan
 from taichi_msm.physics.planning import on, stable_steps, try_plan
 from taichi_msm.physics.probe_force import sums
 from taichi_msm.physics.solver import Dynamics
-from taichi_msm.physics.stiffness_map import MapImage
 from taichi_msm.progress import Count, Pause
 from taichi_msm.scene import MAX_POINTS, Probe, Scene, Sheet
 from taichi_msm.system.runtime import Device
@@ -70,15 +69,10 @@ FEWEST = 7
 
 @dataclass(frozen=True)
 class MeshEstimate:
-    """What is known about the error that the number of points makes.
+    """What is known about the error that the number of points makes."""
 
-    Attributes:
-        error: largest error, as a fraction of the largest displacement; infinite: not known.
-        doubt: why it may be larger; empty: it is about that.
-    """
-
-    error: float
-    doubt: str = ""
+    error: float  # largest error, as a fraction of the largest displacement; infinite: not known
+    doubt: str = ""  # why it may be larger; empty: it is about that
 
 
 def coarser(plan: Plan) -> Plan | None:
@@ -121,8 +115,6 @@ class MeshPilot:
     Args:
         plan: of the run that it is compared with.
         coarse: what `coarser` returned for it.
-        device: on which it runs.
-        cores: number of cores that stepping may use; None: all.
 
     Raises:
         DeviceError: when the device cannot run it in f64.
@@ -148,12 +140,7 @@ class MeshPilot:
         self._sheets[0].compile()
 
     def follow(self, displacement: NDArray[Any], pause: Pause) -> None:
-        """Step to the next frame, and compare.
-
-        Args:
-            displacement: of the run at that frame [m], shape (rows, cols, 3).
-            pause: called several times a second; after an exception from it the pilot cannot continue.
-        """
+        """Step to the next frame, and compare, as a `Pilot` does."""
         self._largest = max(self._largest, longest(displacement))
         finer = displacement
         for n, (sheet, sampling) in enumerate(zip(self._sheets, self._samplings, strict=True)):
@@ -168,24 +155,19 @@ class MeshPilot:
         """What the frames so far show."""
         if self._largest == 0:
             return MeshEstimate(0.0)
-        if not self._differences[0] / self._largest < math.inf:
+        first, *others = self._differences
+        if not first / self._largest < math.inf:
             return MeshEstimate(math.inf)
-        order, doubt = self.order, ""
+        order, doubt = None, ""
+        if others and first > 0:
+            order = math.log(others[0] / first) / math.log(self._ratio) if others[0] > 0 else -math.inf
         assumed = 1.0 if order is None else max(1.0, min(order, 2 - ABOVE * (order - 2)))
-        relative = self._differences[0] / (self._ratio**assumed - 1) / self._largest
+        relative = first / (self._ratio**assumed - 1) / self._largest
         if order is not None and not LOWEST_ORDER <= order <= HIGHEST_ORDER:
             doubt = "runs with fewer points do not converge"
         elif self._material.bending == 0 and self._shortest < 1 - self._material.tension - SLACK:
             doubt = "tissue without bending is pressed together, and with more points wrinkles more"
         return MeshEstimate((2 if doubt else 1) * relative + self._missing, doubt)
-
-    @property
-    def order(self) -> float | None:
-        """Order in the length of the cells that the frames so far show; None: there is no third run."""
-        first, *others = self._differences
-        if not others or first == 0:
-            return None
-        return math.log(others[0] / first) / math.log(self._ratio) if others[0] > 0 else -math.inf
 
 
 def with_points(scene: Scene, points: tuple[int, int]) -> Scene:
@@ -201,11 +183,8 @@ def choose_points(
 ) -> tuple[Plan, MeshEstimate]:
     """Find the fewest points, approximately, whose error is within the sheet's tolerance, and this error.
 
-    Args:
-        plan: of a scene with such a tolerance. No fewer points than its own are tried; cells keep their shape.
-        device: on which pilots run.
-        check: plans a scene with other points and the same map; raises SceneError if it cannot be run.
-        progress: counts the frames of each pilot run.
+    No fewer points than the plan's are tried, and cells keep their shape. `check` plans a scene with other points and
+    the same map; progress counts the frames of each pilot run.
 
     Raises:
         SceneError: when even the largest possible number of points is too small, or cannot be run.
@@ -252,12 +231,7 @@ def _estimate(plan: Plan, device: Device, progress: Count) -> MeshEstimate:
 
 
 class CubicSampling:
-    """Interpolates displacements of one lattice at the points of another lattice of the same sheet, by cubics.
-
-    Args:
-        of: rows, columns of the points whose displacements are given; 4 or more each.
-        to: rows, columns of the points at which they are wanted.
-    """
+    """Interpolates displacements of a lattice of 4 x 4 points or more at the points of another, by cubics."""
 
     def __init__(self, of: tuple[int, int], to: tuple[int, int]) -> None:
         self._axes = [_cubics(given - 1, asked - 1) for given, asked in zip(of, to, strict=True)]

@@ -8,12 +8,10 @@ from dataclasses import replace
 from typing import Any
 
 from taichi_msm.errors import Problem, SceneError
-from taichi_msm.physics import stiffness_map, workload
+from taichi_msm.physics import workload
 from taichi_msm.physics.lattice import fixed_points, spacing
-from taichi_msm.physics.material import Material, kind_problems, tissue_problems
-from taichi_msm.physics.plan import Plan
-from taichi_msm.physics.slots import probe_slots
-from taichi_msm.physics.stiffness_map import MapImage
+from taichi_msm.physics.material import MapImage, Material, kind_problems, read_map, tissue_problems
+from taichi_msm.physics.plan import Plan, probe_slots
 from taichi_msm.physics.terms import highest_frequency, material_of
 from taichi_msm.picture import PictureError
 from taichi_msm.scene import WHOLE, Scene, Sheet, Time
@@ -24,11 +22,7 @@ SMALLEST_SINGLE, LARGEST_SINGLE = 1e-15, 1e17
 
 
 def make_plan(scene: Scene, image: MapImage | None = None) -> Plan:
-    """Plan a scene for a CPU; arguments as for `try_plan`.
-
-    Raises:
-        SceneError: with all that makes its sheet or its steps impossible.
-    """
+    """Plan a scene for a CPU as `try_plan` does; SceneError: with all that makes its sheet or its steps impossible."""
     plan, problems = try_plan(scene, image)
     if plan is None or problems:
         raise SceneError([str(problem) for problem in problems])
@@ -36,15 +30,11 @@ def make_plan(scene: Scene, image: MapImage | None = None) -> Plan:
 
 
 def try_plan(scene: Scene, image: MapImage | None = None) -> tuple[Plan | None, list[Problem]]:
-    """Plan a scene for a CPU, or find what is wrong with what its sheet is made of, and with its steps.
+    """Plan a scene for a CPU, None where there can be no plan, and find what is wrong with its sheet and its steps.
 
     Args:
         scene: whose keys are valid each by itself.
-        image: of its map, from the plan of a scene with the same map: a run reads it once, and so has one map even if
-            its file changes meanwhile. None: it is read.
-
-    Returns:
-        The plan, or None where there can be none; and the problems.
+        image: of its map, from the plan of a scene with the same map; None: it is read.
     """
     problems = list(kind_problems(scene))
     if problems:
@@ -52,7 +42,7 @@ def try_plan(scene: Scene, image: MapImage | None = None) -> tuple[Plan | None, 
     fixed = fixed_points(scene.sheet)
     if scene.stiffness_map is not None and image is None:
         try:
-            image = stiffness_map.read(scene.stiffness_map)
+            image = read_map(scene.stiffness_map)
         except PictureError as error:
             problems.append(Problem((scene.kind, "map", "image"), str(error)))
     material = material_of(scene, image)

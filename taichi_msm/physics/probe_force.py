@@ -37,21 +37,13 @@ LEAST_REACHING = 0.8
 
 
 class ProbeForce(NamedTuple):
-    """How a probe acts: force exp(-max(falloff d + shift, offset)) on a point at the distance d.
+    """How a probe acts: force exp(-max(falloff d + shift, offset)) on a point at the distance d."""
 
-    Attributes:
-        force: [N] at 100 %, before the decay.
-        falloff: [1/m].
-        shift: offset - falloff radius, so that the exponent is that of the flat end up to its rim.
-        offset: exponent on the flat end.
-        by_area: whether the force on a point is multiplied by its share of a cell's area.
-    """
-
-    force: tuple[float, float, float]
-    falloff: float
-    shift: float
-    offset: float
-    by_area: bool
+    force: tuple[float, float, float]  # [N] at 100 %, before the decay
+    falloff: float  # [1/m]
+    shift: float  # offset - falloff radius, so that the exponent is that of the flat end up to its rim
+    offset: float  # exponent on the flat end
+    by_area: bool  # whether the force on a point is multiplied by its share of a cell's area
 
     @property
     def size(self) -> float:
@@ -128,17 +120,11 @@ def sums(probe: Probe, sheet: Sheet, finer: int = 1) -> tuple[float, float]:
 
 
 class ProbeRecord(TypedDict):
-    """The forces of a probe at 100 %, at the first place of its control point.
+    """The forces of a probe at 100 %, at the first place of its control point."""
 
-    Attributes:
-        total_force: sum over all points [N].
-        flat_end_force: the part of a `total` that acts under the tool's flat end, on a wide sheet [N].
-        largest_pressure: largest force on a point per area that belongs to it [Pa].
-    """
-
-    total_force: float
-    flat_end_force: float
-    largest_pressure: float
+    total_force: float  # sum over all points [N]
+    flat_end_force: float  # the part of a `total` that acts under the tool's flat end, on a wide sheet [N]
+    largest_pressure: float  # largest force on a point per area that belongs to it [Pa]
 
 
 def probe_records(scene: Scene) -> list[ProbeRecord]:

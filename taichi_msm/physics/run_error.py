@@ -20,17 +20,11 @@ from taichi_msm.system.runtime import Device
 
 
 class Known(NamedTuple):
-    """What is known about the error of a run.
+    """What is known about the error of a run."""
 
-    Attributes:
-        estimate: the error due to the step and to rounding; None: not estimated.
-        reason: why it was not estimated.
-        mesh: the error due to the number of points; None: not estimated.
-    """
-
-    estimate: Estimate | None = None
-    reason: str = ""
-    mesh: MeshEstimate | None = None
+    estimate: Estimate | None = None  # the error due to the step and to rounding; None: not estimated
+    reason: str = ""  # why it was not estimated
+    mesh: MeshEstimate | None = None  # the error due to the number of points; None: not estimated
 
 
 class RunError:
@@ -68,9 +62,7 @@ class RunError:
     def finish(self, displacements: Iterator[NDArray[Any]] | None, progress: Count) -> None:
         """After the last frame, take a finer pilot where the coarse one shows an error that matters.
 
-        Args:
-            displacements: of the run at all frames but the first [m]; None: not kept, and the run is repeated.
-            progress: counts the frames.
+        displacements: of the run at all frames but the first [m]; None: not kept, and the run is repeated.
         """
         if self._time is None or not self._pilots.after or self._time.estimate.error < ENOUGH:
             return

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from taichi_msm.errors import ArgumentError, DeviceError, MsmError
-from taichi_msm.physics.kernel import BYTES, SheetLayout, SheetReading, Start, StepKernel
+from taichi_msm.physics.kernel import BYTES, SheetLayout, Start
 from taichi_msm.physics.kernel_cpu import Sweep
 from taichi_msm.physics.kernel_gpu import STEPS_PER_LAUNCH, Gather
 from taichi_msm.physics.lattice import axes, spacing
@@ -104,7 +104,7 @@ class Dynamics:
     def __init__(self, plan: Plan, device: Device, layout: SheetLayout | None = None, cores: int | None = None) -> None:
         self._device, self._layout, self._cores = device, layout, cores
         self.launches = 0
-        self._sheet: StepKernel | None = None
+        self._sheet: Sweep | Gather | None = None
         self.restart(plan)
 
     def restart(self, plan: Plan, state: State | None = None) -> None:
@@ -200,7 +200,7 @@ class Dynamics:
         """Copy the displacements or the differences, and the measures of every row."""
         rows, cols, code = self.structure.rows, self.structure.cols, self.structure.code
         values, measures = np.empty((rows, cols, 3), self._real), np.empty((rows, code.first_measure(None)), self._real)
-        self._moving.read(SheetReading(differences, values, measures))
+        self._moving.read(differences, values, measures)
         return values, measures
 
     def _require_whole(self) -> None:
@@ -212,7 +212,7 @@ class Dynamics:
         self._sheet = None
 
     @property
-    def _moving(self) -> StepKernel:
+    def _moving(self) -> Sweep | Gather:
         assert self._sheet is not None, "it is closed"
         return self._sheet
 
@@ -228,10 +228,10 @@ class Dynamics:
     def _table(self, first: int, count: int) -> NDArray[Any]:
         """Tabulate the loads of steps first, ..., first + count - 1, shape (count, columns)."""
         plan, code, loads = self.plan, self.structure.code, schedule(self.plan, first, count)
-        table, verlet = np.empty((count, code.first_column(None))), coefficients(plan)
-        table[:, GAIN] = verlet.gain
+        table, (_, gain, first_gain) = np.empty((count, code.first_column(None))), coefficients(plan)
+        table[:, GAIN] = gain
         if first == 0:
-            table[0, GAIN] = verlet.first_gain
+            table[0, GAIN] = first_gain
         for term in code.terms:
             first_column = code.first_column(type(term))
             table[:, first_column : first_column + term.column_count] = term.columns(plan, loads)

@@ -19,22 +19,15 @@ Window = tuple[slice, slice]
 
 
 class SpringFamily(NamedTuple):
-    """All springs with the same number of points down and to the right between their ends.
+    """All springs with the same number of points down and to the right between their ends."""
 
-    Attributes:
-        here, there: select the points at their ends; `there` is down or to the right of `here`.
-        offset: vector from here to there at rest [m], x right, y up, z.
-        length: at rest [m].
-        stiffness: k of each [N/m], shape as selected by `here`.
-        unstretched: length at which each has no force [m]; shorter than `length` under tension.
-    """
-
+    # here, there: select the points at their ends; `there` is down or to the right of `here`
     here: Window
     there: Window
-    offset: Array
-    length: float
-    stiffness: Array
-    unstretched: Array
+    offset: Array  # vector from here to there at rest [m], x right, y up, z
+    length: float  # at rest [m]
+    stiffness: Array  # k of each [N/m], shape as selected by `here`
+    unstretched: Array  # length at which each has no force [m]; shorter than `length` under tension
 
     def apart(self, displacement: Array) -> tuple[Array, Array]:
         """Give the vectors from one end of each spring to the other, and their lengths [m]."""

@@ -32,19 +32,12 @@ MOST_FOR_PILOTS = 2 / 5
 
 
 class Work(NamedTuple):
-    """The work of the parts of a run.
+    """The work of the parts of a run."""
 
-    Attributes:
-        start: starting Python and Taichi, and compiling the kernels.
-        stepping: all steps.
-        pilots: those that go with the run.
-        pictures: drawing and encoding.
-    """
-
-    start: float
-    stepping: float
-    pilots: float
-    pictures: float
+    start: float  # starting Python and Taichi, and compiling the kernels
+    stepping: float  # all steps
+    pilots: float  # those that go with the run
+    pictures: float  # drawing and encoding
 
 
 def work(plan: Plan, pilots: float) -> Work:

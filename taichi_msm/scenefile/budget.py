@@ -45,29 +45,19 @@ OUTPUT_NUMBERS = 15
 
 @dataclass(frozen=True)
 class Budget:
-    """What a scene needs.
+    """What a scene needs."""
 
-    Attributes:
-        points, steps, frames: numbers of mass points, of time steps, and of frames including that at rest.
-        simulation_bytes: memory for the state of the sheet and its output.
-        drawing_bytes: memory for a frame and the texture; 0 if nothing is drawn.
-        track_bytes: memory for the tracks, which are held until the run ends, and size of their file.
-        picture_bytes: size of the files with pictures and labels, at most.
-        trajectory_bytes: size of the trajectory.
-        record_bytes: size of the record and of the camera, at most.
-        working_bytes: additional disk space that is used until the run ends.
-    """
-
+    # points, steps, frames: numbers of mass points, of time steps, and of frames including that at rest
     points: int
     steps: int
     frames: int
-    simulation_bytes: int
-    drawing_bytes: int
-    track_bytes: int
-    picture_bytes: int
-    trajectory_bytes: int
-    record_bytes: int
-    working_bytes: int
+    simulation_bytes: int  # memory for the state of the sheet and its output
+    drawing_bytes: int  # memory for a frame and the texture; 0 if nothing is drawn
+    track_bytes: int  # memory for the tracks, which are held until the run ends, and size of their file
+    picture_bytes: int  # size of the files with pictures and labels, at most
+    trajectory_bytes: int  # size of the trajectory
+    record_bytes: int  # size of the record and of the camera, at most
+    working_bytes: int  # additional disk space that is used until the run ends
 
     @property
     def memory_bytes(self) -> int:

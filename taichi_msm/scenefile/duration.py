@@ -44,15 +44,10 @@ Kept = dict[str, tuple[float, float]]
 
 
 class Duration(NamedTuple):
-    """How long a run will take.
+    """How long a run will take."""
 
-    Attributes:
-        seconds: from start to end [s].
-        measured: whether that is known from earlier runs, and not only from the calibration.
-    """
-
-    seconds: float
-    measured: bool
+    seconds: float  # from start to end [s]
+    measured: bool  # whether that is known from earlier runs, and not only from the calibration
 
 
 def estimate(plan: Plan) -> Duration:

@@ -23,13 +23,9 @@ from taichi_msm.scene import Scene, Sheet
 
 @dataclass(frozen=True)
 class FoundationTerm(Term):
-    """Virtual springs. Their energy is not measured: `divergence` bounds it.
+    """Virtual springs. Their energy is not measured: `divergence` bounds it."""
 
-    Attributes:
-        by_area: whether they are softer at an open edge, where less of the sheet's area belongs to a point.
-    """
-
-    by_area: bool
+    by_area: bool  # whether they are softer at an open edge, where less of the sheet's area belongs to a point
 
     @staticmethod
     def derive(scene: Scene) -> dict[str, Any]:

@@ -35,9 +35,8 @@ from numpy.typing import NDArray
 from typing_extensions import Self
 
 from taichi_msm.physics.lattice import spacing
-from taichi_msm.physics.material import Material
+from taichi_msm.physics.material import Material, largest_mean
 from taichi_msm.physics.plan import Plan
-from taichi_msm.physics.stiffness_map import largest_mean
 from taichi_msm.physics.terms.term import AREA, DX, DY, HAS_LEFT, HAS_RIGHT, StepCode, Term
 from taichi_msm.scene import Scene, Sheet
 
@@ -54,22 +53,15 @@ TINY = 1e-36
 
 @dataclass(frozen=True)
 class SpringTerm(Term):
-    """Springs between neighbours.
+    """Springs between neighbours."""
 
-    Attributes:
-        structural, shear: whether there are springs along rows and columns, and along diagonals.
-        open_edges: whether a point at an edge moves, so that springs beyond the edge must be left out.
-        by_area: whether springs along such an edge are softer than others, because they belong to one cell.
-        mapped: whether the stiffness of every spring is read from an array; it is 0 where there is no spring.
-        tense: whether the sheet is under tension at rest.
-    """
-
+    # structural, shear: whether there are springs along rows and columns, and along diagonals
     structural: bool
     shear: bool
-    open_edges: bool
-    by_area: bool
-    mapped: bool
-    tense: bool
+    open_edges: bool  # whether a point at an edge moves, so that springs beyond the edge must be left out
+    by_area: bool  # whether springs along such an edge are softer than others, because they belong to one cell
+    mapped: bool  # whether the stiffness of every spring is read from an array; it is 0 where there is no spring
+    tense: bool  # whether the sheet is under tension at rest
 
     reach: ClassVar[int] = 1
     # k - tau, and then tau, of each family.
@@ -279,14 +271,9 @@ class SpringTerm(Term):
 
 
 def stiffness(material: Material, factors: NDArray[Any]) -> tuple[NDArray[Any], NDArray[Any], NDArray[Any]]:
-    """Assemble the stiffness k of every spring from its cells [N/m].
+    """Assemble the stiffness k of every spring from the factors of its cells, shape (rows - 1, cols - 1) [N/m].
 
-    Args:
-        material: of the sheet.
-        factors: of every cell, shape (rows - 1, cols - 1).
-
-    Returns:
-        Along rows, shape (rows, cols - 1); along columns, shape (rows - 1, cols); along both diagonals of a cell.
+    Along rows, shape (rows, cols - 1); along columns, shape (rows - 1, cols); along both diagonals of a cell.
     """
     above_and_below, beside = np.pad(factors, ((1, 1), (0, 0))), np.pad(factors, ((0, 0), (1, 1)))
     across = material.across / 2 * (above_and_below[:-1] + above_and_below[1:])

@@ -33,15 +33,11 @@ class Term:
 
     The kernels know by name the terms that act between points, springs and bending; others need only the functions
     here.
-
-    Attributes:
-        reach: how many rows away a point may be that the force depends on.
-        numbers_count: how many of the sheet's numbers belong to the term.
-        reductions: how each of its measures is reduced to one number of a row: "min", "max" or "sum".
     """
 
-    reach: ClassVar[int] = 0
-    numbers_count: ClassVar[int] = 0
+    reach: ClassVar[int] = 0  # how many rows away a point may be that the force depends on
+    numbers_count: ClassVar[int] = 0  # how many of the sheet's numbers belong to the term
+    # how each of its measures is reduced to one number of a row: "min", "max" or "sum"
     reductions: ClassVar[tuple[str, ...]] = ()
 
     @classmethod
@@ -97,19 +93,12 @@ AnyTerm = TypeVar("AnyTerm", bound=Term)
 
 @dataclass(frozen=True)
 class StepCode:
-    """What the kernels of a sheet are compiled for; everything else is an argument.
+    """What the kernels of a sheet are compiled for; everything else is an argument."""
 
-    Attributes:
-        precision: f32 or f64.
-        lanes: of a vector; columns are cut into as many strips.
-        by_area: whether points at an open edge have less mass than others, because they belong to fewer cells.
-        terms: those that the scene has, always with springs and probes; in the order of `terms.TERMS`.
-    """
-
-    precision: str
-    lanes: int
-    by_area: bool
-    terms: tuple[Term, ...]
+    precision: str  # f32 or f64
+    lanes: int  # of a vector; columns are cut into as many strips
+    by_area: bool  # whether points at an open edge have less mass than others, because they belong to fewer cells
+    terms: tuple[Term, ...]  # those that the scene has, always with springs and probes; in the order of `terms.TERMS`
 
     @property
     def reach(self) -> int:
@@ -166,37 +155,26 @@ class StepCode:
 
 
 class KernelSheet(NamedTuple):
-    """A sheet within a kernel; its arrays are those of `kernel`.
+    """A sheet within a kernel; its arrays are those of `kernel`."""
 
-    Attributes:
-        u, d: displacements, with bending also moments, and last differences; three arrays each, for x, y and z.
-        by_column, stiffness, decay: one array each.
-        numbers: of the sheet and of its terms, a list of variables.
-        rows: of points.
-        width: entries of a row.
-    """
-
+    # u, d: displacements, with bending also moments, and last differences; three arrays each, for x, y and z
     u: Any
     d: Any
+    # by_column, stiffness, decay: one array each
     by_column: Any
     stiffness: Any
     decay: Any
-    numbers: Any
-    rows: Any
-    width: Any
+    numbers: Any  # of the sheet and of its terms, a list of variables
+    rows: Any  # of points
+    width: Any  # entries of a row
 
 
 class KernelRow(NamedTuple):
-    """A row of the sheet within a kernel.
+    """A row of the sheet within a kernel."""
 
-    Attributes:
-        i: its number.
-        kind: 0 for the first row of the sheet, 2 for the last, else 1.
-        before, at, after: with bending, rows of u with the moments of the row before, of row i and of the row after.
-    """
-
-    i: Any
-    kind: Any
+    i: Any  # its number
+    kind: Any  # 0 for the first row of the sheet, 2 for the last, else 1
+    # before, at, after: with bending, rows of u with the moments of the row before, of row i and of the row after
     before: Any
     at: Any
     after: Any
