@@ -47,18 +47,17 @@ class Estimate:
     """What is known about the error of a step."""
 
     steps_per_frame: int  # of the step
-    # largest error, as a fraction of the largest displacement; infinite if it is not known because a pilot diverged or
-    # the step does not resolve the damping
+    # The largest error, as a fraction of the largest displacement; infinite if it is not known because a pilot diverged
+    # or the step does not resolve the damping.
     error: float
-    # the part of the error that comes from f32, including that of positions in the trajectory; 0 in f64
-    rounding: float
+    rounding: float  # the part of the error that comes from f32, also of positions in the trajectory; 0 in f64
     in_f64: float  # the error of the same step in f64
     order: int  # of the method in this scene
-    # whether the two parts are known; else, by a coarse pilot beside a run in f32, neither is larger than the error
-    # told
+    # Whether the two parts are known; else, by a coarse pilot beside a run in f32, neither is larger than the error.
     parted: bool = True
-    # whether the error may be larger, as a coarse pilot shows one that only a fine one would tell
-    at_least: bool = False
+    at_least: bool = (
+        False  # whether the error may be larger, as a coarse pilot shows one that only a fine one would tell
+    )
 
 
 def order(plan: Plan) -> int:

@@ -14,16 +14,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from taichi_msm.physics.bands import (
-    COUNTER_STRIDE,
-    MOMENTS,
-    PLACE_END,
-    ROUND,
-    STEP,
-    TURN,
-    WORKER_STRIDE,
-    advancing,
-)
+from taichi_msm.physics.bands import COUNTER_STRIDE, MOMENTS, PLACE_END, ROUND, STEP, TURN, WORKER_STRIDE, advancing
 from taichi_msm.physics.kernel import BYTES, SheetArrays, SheetLayout, Start, reading
 from taichi_msm.physics.terms.bending import BendingTerm
 from taichi_msm.physics.terms.term import StepCode
@@ -52,6 +43,7 @@ class Sweep:
     def __init__(self, layout: SheetLayout, start: Start) -> None:
         self._layout = layout
         self._advance, self._read = _kernels(layout.code, parallel=layout.workers > 1)
+        self._alone, _ = _kernels(layout.code, parallel=False)
         self._steps = 0
         self._rest = self._rests_until = 0.0
         # Time that all workers have stepped undisturbed since the last rest [s].
@@ -98,7 +90,7 @@ class Sweep:
     def _advance_alone(self, done: int, end: int, table: NDArray[Any]) -> None:
         """Take the steps from `done` to `end` with a single worker."""
         self._start_pass()
-        self._launch(_kernels(self._layout.code, parallel=False)[0], 1, end - done, table[done:])
+        self._launch(self._alone, 1, end - done, table[done:])
 
     def _advance_while_resting(self, done: int, end: int, table: NDArray[Any]) -> int:
         """Take steps with a single worker until it is time for all of them; returns how many are done."""

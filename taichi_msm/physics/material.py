@@ -48,8 +48,7 @@ class Material:
     always: bool  # whether the virtual springs always act; else only under a load
     bending: float  # D dx dy [N m3]
     by_area: bool  # whether points and springs at an edge get less than others, as in tissue
-    # of the stiffness at the centre of every cell, shape (rows - 1, cols - 1); None without a map
-    factors: Array | None
+    factors: Array | None  # of the stiffness of every cell, shape (rows - 1, cols - 1); None without a map
 
     @property
     def tensions(self) -> tuple[float, float, float]:

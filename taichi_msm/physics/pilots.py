@@ -31,10 +31,9 @@ class Pilots(NamedTuple):
     """The pilots of a run."""
 
     beside: int = 0  # steps per frame of the pilot that goes with the run; 0: there is none
-    after: int = 0  # steps per frame of the one that follows where the first one shows too large an error; 0: none
+    after: int = 0  # steps per frame of the one that follows if the first one shows too large an error; 0: none
     points: bool = False  # whether pilots with fewer points go with the run
-    # of those that go with the run: their steps for each step of the run, counted in steps of the whole sheet
-    cost: float = 0.0
+    cost: float = 0.0  # of those that go with the run: for each of its steps theirs, in steps of the whole sheet
     reason: str = ""  # why there are none
 
 

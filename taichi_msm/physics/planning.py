@@ -20,6 +20,9 @@ from taichi_msm.timegrid import TimeGrid
 # Lengths [m] whose squares, and a few of their products, f32 holds.
 SMALLEST_SINGLE, LARGEST_SINGLE = 1e-15, 1e17
 
+# Keeps a frame that is exactly n limits long from being cut into n + 1 steps by rounding.
+SLACK = 1 - 1e-12
+
 
 def make_plan(scene: Scene, image: MapImage | None = None) -> Plan:
     """Plan a scene for a CPU as `try_plan` does; SceneError: with all that makes its sheet or its steps impossible."""
@@ -81,8 +84,7 @@ def stable_step(material: Material, sheet: Sheet, difference: str) -> float:
 
 def stable_steps(plan: Plan) -> int:
     """Count the fewest stable steps of a frame."""
-    # The small slack keeps a frame that is exactly n limits from being cut into n + 1 by rounding.
-    return max(1, math.ceil(1 / plan.grid.frames_per_second / plan.stable_step * (1 - 1e-12)))
+    return max(1, math.ceil(1 / plan.grid.frames_per_second / plan.stable_step * SLACK))
 
 
 def steps_per_frame(time: Time, limit: float) -> int:
@@ -93,8 +95,7 @@ def steps_per_frame(time: Time, limit: float) -> int:
     """
     frame = 1 / time.frames_per_second
     if time.step == "auto":
-        # The small slack keeps a frame that is exactly n half-limits from being cut into n + 1 by rounding.
-        return max(1, math.ceil(2 * frame / limit * (1 - 1e-12)))
+        return max(1, math.ceil(2 * frame / limit * SLACK))
     return max(1, round(frame / time.step))
 
 

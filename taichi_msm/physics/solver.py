@@ -26,17 +26,7 @@ from taichi_msm.physics.terms import terms_of
 from taichi_msm.physics.terms.damping import coefficients
 from taichi_msm.physics.terms.probes import ProbeTerm, standing, standing_decays
 from taichi_msm.physics.terms.springs import LEAST, MOST, SpringTerm
-from taichi_msm.physics.terms.term import (
-    ACROSS,
-    AREA,
-    COLUMN_ROWS,
-    GAIN,
-    HAS_LEFT,
-    HAS_RIGHT,
-    MOTION,
-    MOVES,
-    StepCode,
-)
+from taichi_msm.physics.terms.term import ACROSS, AREA, COLUMN_ROWS, GAIN, HAS_LEFT, HAS_RIGHT, MOTION, MOVES, StepCode
 from taichi_msm.progress import Pause
 from taichi_msm.system.resources import available_threads
 from taichi_msm.system.runtime import Device, lanes

@@ -1,7 +1,7 @@
 """The loads: what probes exert on the points around their control points. Scene: `probes`.
 
-The force on a point at the distance d is F exp(-max(falloff d + shift, offset)) (see `probe_force`), tabulated for every
-step in a few columns for each `ProbeSlot`. Where a control point stands, its decay is an array.
+The force on a point at the distance d is F exp(-max(falloff d + shift, offset)) (see `probe_force`), tabulated for
+every step in a few columns for each `ProbeSlot`. Where a control point stands, its decay is an array.
 """
 
 # No `from __future__ import annotations` here: Taichi reads the annotations of a kernel.

@@ -37,8 +37,7 @@ class Term:
 
     reach: ClassVar[int] = 0  # how many rows away a point may be that the force depends on
     numbers_count: ClassVar[int] = 0  # how many of the sheet's numbers belong to the term
-    # how each of its measures is reduced to one number of a row: "min", "max" or "sum"
-    reductions: ClassVar[tuple[str, ...]] = ()
+    reductions: ClassVar[tuple[str, ...]] = ()  # how each of its measures becomes one of a row: "min", "max" or "sum"
 
     @classmethod
     def of(cls, plan: Plan) -> Self | None:
