@@ -21,10 +21,10 @@ from skfem import Basis, BilinearForm, ElementQuad2, ElementVector, LinearForm, 
 from skfem.helpers import dot
 from skfem.models.elasticity import linear_elasticity, plane_stress
 
+from taichi_msm.physics.elasticity import energy_density
 from taichi_msm.physics.lattice import fixed_points, rest_positions, spacing
 from taichi_msm.physics.loads import loads_at
 from taichi_msm.physics.probe_force import spread
-from taichi_msm.physics.springs import energy_density
 from taichi_msm.physics.state import State
 from taichi_msm.physics.terms import highest_frequency
 from taichi_msm.scene import Probe, Scene

@@ -23,9 +23,9 @@ from numpy.typing import NDArray
 
 from taichi_msm.errors import NotInstalledError
 from taichi_msm.export.mesh import PICTURE, REFINE, picture_png
+from taichi_msm.physics.elasticity import energy_density
 from taichi_msm.physics.lattice import rest_positions
 from taichi_msm.physics.planning import make_plan
-from taichi_msm.physics.springs import energy_density
 from taichi_msm.progress import Count
 from taichi_msm.render.surface import surface
 from taichi_msm.results.finished_run import FinishedRun

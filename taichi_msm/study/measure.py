@@ -178,10 +178,7 @@ def _measure_pictures(
     position = rest_positions(scene.sheet) + deformed
     pictures = PictureStudy(scene, position, texture, effort.quick, partial(progress, "drawing"))
     results.drawing = pictures.results
-    try:
-        pictures.run()
-    finally:
-        results.notes += pictures.notes
+    _run(pictures, results)
 
 
 def _measure_points(plan: Plan, device: Device, effort: Effort, results: Study, progress: Progress) -> None:
@@ -190,7 +187,12 @@ def _measure_points(plan: Plan, device: Device, effort: Effort, results: Study, 
         return
     points = PointStudy(plan, device, effort.longest_run, partial(progress, "points"))
     results.points = points.results
+    _run(points, results)
+
+
+def _run(part: PictureStudy | PointStudy, results: Study) -> None:
+    """Measure a part, and keep its notes even if it is interrupted."""
     try:
-        points.run()
+        part.run()
     finally:
-        results.notes += points.notes
+        results.notes += part.notes

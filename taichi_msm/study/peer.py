@@ -9,12 +9,12 @@ from itertools import pairwise
 import numpy as np
 from numpy.typing import NDArray
 
+from taichi_msm.physics.elasticity import elastic_force, spring_families
 from taichi_msm.physics.lattice import axes, spacing
 from taichi_msm.physics.loads import Schedule, key_times, loads_at
 from taichi_msm.physics.material import area_shares
 from taichi_msm.physics.plan import Plan
 from taichi_msm.physics.probe_force import probe_force
-from taichi_msm.physics.springs import elastic_force, spring_families
 from taichi_msm.scene import Scene
 
 # Loads are evaluated this far inside an interval between two keys, as a fraction of it: at its ends they may jump.

@@ -41,7 +41,7 @@ class SteppingStudy:
     """Measures the stepping of one scene.
 
     Args:
-        scene: a checked scene.
+        plan: of the scene.
         device: what `runtime.start` returned.
         longest_run: approximate time that a run may take [s].
         progress: called with the runs done and the runs in all; may raise KeyboardInterrupt: what is done is kept.
