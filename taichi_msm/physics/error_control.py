@@ -108,9 +108,7 @@ class Pilot:
     r^-p - 1 times the error of the step; where that is less than MARGIN times, the difference is enlarged accordingly.
 
     Args:
-        plan: of the run.
-        steps: steps per frame of the pilot, as in `Pilots`; 0: the error is not known.
-        device: on which it runs.
+        steps: per frame of the pilot, as in `Pilots`; 0: the error is not known.
         cores: number of cores that stepping may use; None: all. With as many as the run has, its kernels are reused.
 
     Attributes:

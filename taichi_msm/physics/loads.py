@@ -179,11 +179,7 @@ class _Line:
 
 
 def _by_turns(line: _Line, jumps: Array, turns: int, t: Array, h: float) -> tuple[Array, NDArray[np.intp]]:
-    """Share the load of a probe whose control point jumps out among its slots.
-
-    Returns:
-        For every slot, its percent and the index of its segment at each step, both of shape (steps, slots).
-    """
+    """Share the load of a probe that jumps out among its slots: percent and index of the segment, (steps, slots)."""
     bounds = np.concatenate([[-math.inf], jumps, [math.inf]])
     first = jumps.searchsorted(t - h * (1 - EDGE), "right")
     last = jumps.searchsorted(t + h * (1 - EDGE), "left")

@@ -97,10 +97,6 @@ class Plan:
         return replace(self, grid=grid, slots=probe_slots(self.scene.probes, self.scene.sheet, grid.step))
 
     def with_probes(self, probes: Sequence[Probe | Mapping[str, Any]]) -> Plan:
-        """Replace the probes.
-
-        Raises:
-            SceneError: when one of them is not a probe.
-        """
+        """Replace the probes; SceneError: one of them is not a probe."""
         scene = self.scene.model_copy(update={"probes": tuple(probes)})
         return replace(self, scene=scene, slots=probe_slots(scene.probes, scene.sheet, self.grid.step))
