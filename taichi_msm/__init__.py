@@ -39,33 +39,14 @@ if TYPE_CHECKING:
 
 __version__ = "0.1.0"
 
+# The modules of all names but errors and the sections of a scene.
 _HOMES = {
-    **dict.fromkeys(
-        ("ArgumentError", "DeviceError", "DivergedError", "FilesError", "MsmError", "NotInstalledError", "SceneError"),
-        "errors",
-    ),
-    **dict.fromkeys(
-        (
-            "Camera",
-            "Instrument",
-            "Light",
-            "Probe",
-            "Render",
-            "Scene",
-            "Sheet",
-            "Springs",
-            "StiffnessMap",
-            "Time",
-            "Tissue",
-        ),
-        "scene",
-    ),
     **dict.fromkeys(("Flow", "Labels", "Sight"), "render.labels"),
+    **dict.fromkeys(("resume", "run"), "runner"),
     "Playback": "playback",
     "Simulation": "simulation",
     "Surface": "render.surface",
     "load_scene": "scenefile.load",
-    **dict.fromkeys(("resume", "run"), "runner"),
 }
 
 __all__ = [
@@ -100,8 +81,9 @@ __all__ = [
 
 
 def __getattr__(name: str) -> Any:
-    if name not in _HOMES:
+    if name not in __all__:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
     from importlib import import_module
 
-    return getattr(import_module(f"{__name__}.{_HOMES[name]}"), name)
+    home = _HOMES.get(name, "errors" if name.endswith("Error") else "scene")
+    return getattr(import_module(f"{__name__}.{home}"), name)

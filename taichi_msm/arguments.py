@@ -13,11 +13,7 @@ if TYPE_CHECKING:
 
 
 def as_array(values: Any, name: str) -> NDArray[Any]:
-    """Turn an argument into an array.
-
-    Raises:
-        ArgumentError: when that is impossible, such as for rows of different lengths.
-    """
+    """Turn an argument into an array; ArgumentError: it is impossible, such as for rows of different lengths."""
     # Imported here, so that a scene can be checked without importing NumPy.
     import numpy as np
 
@@ -33,20 +29,12 @@ def are_numbers(array: NDArray[Any], shape: tuple[int, ...]) -> bool:
 
 
 def require_frame_count(frames: int) -> None:
-    """Make sure that a number of frames is a whole number, 0 or more.
-
-    Raises:
-        ArgumentError: when it is not.
-    """
+    """Make sure that a number of frames is a whole number, 0 or more; ArgumentError: it is not."""
     if isinstance(frames, bool) or not isinstance(frames, Integral) or frames < 0:
         raise ArgumentError(f"{frames!r} frames cannot be simulated; take a whole number, 0 or more")
 
 
 def require_path(directory: str | Path) -> None:
-    """Make sure that an argument can be the path of a directory.
-
-    Raises:
-        ArgumentError: when it cannot.
-    """
+    """Make sure that an argument can be the path of a directory; ArgumentError: it cannot."""
     if not isinstance(directory, (str, Path)) or "\0" in str(directory):
         raise ArgumentError(f"directory: {directory!r}; take a path")

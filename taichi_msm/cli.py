@@ -124,7 +124,9 @@ def run(
     typed = [*overrides, *([f"image={image}"] if image is not None else [])]
     if resume is not None:
         require_alone(context, "--resume continues", RESUMABLE)
-        directory = unfinished(resume)
+        directory = result_directory(resume, option="--resume")
+        if not going_on(directory):
+            raise click.BadParameter(f"there is no unfinished run in {resume}", param_hint="--resume")
     elif again is not None:
         require_alone(context, "--again repeats", REPEATABLE)
         directory = result_directory(again, option="--again") if out is None else result_directory(out)
@@ -159,8 +161,7 @@ def run(
                     progress=progress,
                 )
     except KeyboardInterrupt:
-        report("interrupted", [f"interrupted; nothing was written{going_on(directory)}"], as_json)
-        return interruption.code
+        return interrupted(interruption, as_json, f"interrupted; nothing was written{going_on(directory)}")
     if resume is None:
         duration.learn(plan, record)
     if as_json:
@@ -297,8 +298,7 @@ def study(
             progress=interruptible(bar, interruption),
         )
     if not results.stepping:
-        report("interrupted", ["interrupted; nothing was written"], as_json)
-        return interruption.code
+        return interrupted(interruption, as_json)
     if results.status == "interrupted" and (directory / RECORD).exists():
         # An earlier study is not replaced by part of a new one.
         directory = without_link(directory / "interrupted", "--out")
@@ -387,8 +387,7 @@ def view(
                     recorder.record(session, Path(record), seconds, events, progress, notices.append)
                 click.echo(printable(record))
     except KeyboardInterrupt:
-        report("interrupted", ["interrupted" if record is None else "interrupted; no film was written"], as_json=False)
-        return interruption.code
+        return interrupted(interruption, False, "interrupted" if record is None else "interrupted; no film was written")
     finally:
         tell(notices)
         for path in captures.saved:
@@ -422,8 +421,7 @@ def export(directory: str, name: str, out: str | None, quiet: bool, as_json: boo
         with Progress(quiet=quiet or as_json) as bar:
             done = convert(run, name, folder, partial(interruptible(bar, interruption), "export"))
     except KeyboardInterrupt:
-        report("interrupted", ["interrupted; nothing was written"], as_json)
-        return interruption.code
+        return interrupted(interruption, as_json)
     if as_json:
         print_json({"directory": str(folder), "format": name, **done._asdict()})
     elif not quiet:
@@ -451,13 +449,6 @@ def repeated(directory: str) -> tuple[Plan, list[str]]:
     earlier = read_run(result_directory(directory, option="--again"))
     earlier.require_pictures(drawn=earlier.scene.draws or "image" in earlier.sha256)
     return checked(earlier.scene), earlier.overrides
-
-
-def unfinished(directory: str) -> Path:
-    """Make sure that a directory has a run to resume."""
-    if not going_on(result_directory(directory, option="--resume")):
-        raise click.BadParameter(f"there is no unfinished run in {directory}", param_hint="--resume")
-    return Path(directory)
 
 
 def result_directory(out: str | None, default: str = "", option: str = "--out") -> Path:
@@ -528,6 +519,12 @@ def print_json(value: Any) -> None:
     click.echo(json.dumps(value, indent=2, allow_nan=False))
 
 
+def interrupted(interruption: Interruption, as_json: bool, said: str = "interrupted; nothing was written") -> int:
+    """Say that there are no results, and give the exit code."""
+    report("interrupted", [said], as_json)
+    return interruption.code
+
+
 def report(status: str, lines: Sequence[str], as_json: bool) -> None:
     """Say why there are no results."""
     tell(lines)
@@ -536,13 +533,9 @@ def report(status: str, lines: Sequence[str], as_json: bool) -> None:
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Run the command line.
+    """Run the command line, with arguments instead of the process's, and give the exit code.
 
-    Args:
-        arguments: what follows the program's name; None takes the process's.
-
-    Returns:
-        The exit code: 0 done, 1 a bug, 2 wrong scene or arguments, 3 diverged, 4 files, 130 Ctrl-C, 143 SIGTERM.
+    0 done, 1 a bug, 2 wrong scene or arguments, 3 diverged, 4 files, 130 Ctrl-C, 143 SIGTERM.
     """
     words = list(sys.argv[1:] if arguments is None else arguments)
     try:

@@ -6,7 +6,6 @@ import sys
 import time
 from collections.abc import Mapping
 from pathlib import Path
-from types import TracebackType
 from typing import TYPE_CHECKING, Any
 
 from taichi_msm.errors import printable
@@ -33,7 +32,6 @@ STAGES = {
     "film": "filming",
     "export": "exporting",
 }
-
 
 # Time between two lines when stderr is not a terminal [s].
 LINE_EVERY = 10.0
@@ -71,21 +69,13 @@ class Progress:
             self._bar.start()
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         if self._bar is not None:
             self._bar.stop()
 
 
 class _Pace:
-    """How fast a stage goes.
-
-    Args:
-        stage: its name.
-        done: how much of it was done when it began; this took no time.
-        now: when that was [s].
-    """
+    """How fast a stage goes, of which a part was done when it began."""
 
     def __init__(self, stage: str, done: int, now: float) -> None:
         self.stage, self.done = stage, done
@@ -113,13 +103,10 @@ def rough_time(seconds: float) -> str:
 
 def _bar() -> Bar:
     from rich.console import Console
-    from rich.progress import BarColumn, MofNCompleteColumn, TextColumn, TimeElapsedColumn
-    from rich.progress import Progress as Bar
+    from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
 
-    columns = TextColumn("{task.description:24}"), BarColumn(), MofNCompleteColumn()
-    return Bar(
-        *columns, TimeElapsedColumn(), TextColumn("{task.fields[left]}"), console=Console(stderr=True), transient=True
-    )
+    columns = TextColumn("{task.description:24}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn()
+    return Progress(*columns, TextColumn("{task.fields[left]}"), console=Console(stderr=True), transient=True)
 
 
 def summary(record: Mapping[str, Any], directory: Path) -> str:

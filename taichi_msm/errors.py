@@ -16,15 +16,10 @@ MAX_NAME = 60
 
 @dataclass(frozen=True)
 class Problem:
-    """One fault of a scene.
+    """One fault of a scene."""
 
-    Attributes:
-        path: the key at fault, e.g. ("probes", 0, "load").
-        message: the value, what is wrong with it, and the remedy; without the key.
-    """
-
-    path: Key
-    message: str
+    path: Key  # of the key at fault
+    message: str  # the value, what is wrong with it, and the remedy; without the key
 
     @property
     def key(self) -> str:
@@ -74,9 +69,7 @@ class DivergedError(MsmError):
 
     def __init__(self, message: str, step: int, time: float, point: tuple[int, int]) -> None:
         super().__init__(message)
-        self.step = step
-        self.time = time
-        self.point = point
+        self.step, self.time, self.point = step, time, point
 
     def __reduce__(self) -> tuple[type[DivergedError], tuple[str, int, float, tuple[int, int]]]:
         return type(self), (str(self), self.step, self.time, self.point)
@@ -115,15 +108,7 @@ def did_you_mean(name: str, known: Iterable[str]) -> str:
 
 @contextmanager
 def writing(place: object, option: str = "--out") -> Iterator[None]:
-    """Turn any error of the operating system into one line with its remedy.
-
-    Args:
-        place: the path that the message says cannot be written.
-        option: the option that the message says chooses another path.
-
-    Raises:
-        FilesError: instead of an OSError.
-    """
+    """Raise a FilesError instead of an OSError: `place` cannot be written, and `option` chooses another."""
     try:
         yield
     except OSError as error:

@@ -10,6 +10,7 @@ from types import UnionType
 from typing import Any, Literal, NamedTuple, Union, get_args, get_origin
 
 from pydantic import BaseModel, ValidationError
+from pydantic_core import PydanticCustomError
 
 from taichi_msm.errors import Key, Problem, did_you_mean
 
@@ -17,14 +18,18 @@ from taichi_msm.errors import Key, Problem, did_you_mean
 LARGEST = 1e30
 SMALLEST = 1e-30
 
-# The type of the errors that validators raise. Their message goes to the user as it is, and their context may name the
-# `key` (or item) below the validated value that is at fault.
+# The type of the errors that validators raise.
 REFUSED = "refused"
 
 MAX_SHOWN = 60
 
 # The most faults that are reported; a broken file of the largest size can have tens of thousands.
 MAX_FAULTS = 1000
+
+
+def refused(message: str, key: str | int | None = None) -> PydanticCustomError:
+    """Make the error that a validator raises: the user reads this message, at a key or item below the value, if any."""
+    return PydanticCustomError(REFUSED, message, None if key is None else {"key": key})
 
 
 def flow(value: Any) -> str:
@@ -38,64 +43,30 @@ def cut(text: str) -> str:
 
 
 def key_problems(error: ValidationError, section: type[BaseModel], data: Any) -> list[Problem]:
-    """Say what is wrong with plain data.
-
-    Args:
-        error: what pydantic found.
-        section: the model that the data should match.
-        data: mappings and sequences.
-    """
+    """Say what pydantic found wrong with plain data that a model should match."""
     faults = [_fault(one, section) for one in error.errors(include_url=False, include_input=False)[:MAX_FAULTS]]
     return [Problem(fault.path, _message(fault, data)) for fault in _drop_short(_choose_kinds(faults))]
 
 
 class _Fault(NamedTuple):
-    """One of pydantic's errors, in terms of the document.
+    """One of pydantic's errors, in terms of the document."""
 
-    Attributes:
-        path: the key at fault.
-        kind: pydantic's type of the error.
-        text: its message.
-        context: the numbers and names in the message.
-        section: the section that the key belongs to.
-        expects: what the key may hold.
-        choice: the key, or the nearest one above it, that may hold values of several kinds; None: there is none.
-        branch: the kind that was tried.
-        words: those that the value may be.
-    """
-
-    path: Key
-    kind: str
+    path: Key  # of the key at fault
+    kind: str  # pydantic's type of the error
     text: str
-    context: dict[str, Any]
-    section: type[BaseModel]
-    expects: str
-    choice: Key | None
-    branch: str
-    words: tuple[str, ...]
-
-
-class _Field(NamedTuple):
-    """What `_fault` needs to know of a key.
-
-    Attributes:
-        section: that of the key, or the one below it.
-        expects: what it may hold.
-        has_choice: whether it may hold values of several kinds.
-        words: those that it may be, and those that the items of its list may be.
-    """
-
-    section: type[BaseModel]
-    expects: str
-    has_choice: bool
-    words: tuple[tuple[str, ...], tuple[str, ...]]
+    context: dict[str, Any]  # the numbers and names in the text
+    section: type[BaseModel]  # that the key belongs to
+    expects: str  # what the key may hold
+    choice: Key | None  # the key, or the nearest one above it, that may hold values of several kinds
+    branch: str  # the kind that was tried
+    words: tuple[str, ...]  # those that the value may be
 
 
 def _fault(error: Any, section: type[BaseModel]) -> _Fault:
     """Follow an error's location through the models, skipping pydantic's names for the kinds of a value."""
     path: Key = ()
     expects, choice, branch = "", None, ""
-    words: tuple[tuple[str, ...], tuple[str, ...]] = (), ()
+    words: tuple[tuple[str, ...], ...] = (), ()
     parts = iter(error["loc"])
     for part in parts:
         path += (part,)
@@ -106,28 +77,25 @@ def _fault(error: Any, section: type[BaseModel]) -> _Fault:
     context = error.get("ctx", {})
     if "key" in context:
         path += (context["key"],)
-    return _Fault(
-        path,
-        error["type"],
-        error["msg"],
-        context,
-        section,
-        expects,
-        choice,
-        branch,
-        words[bool(path) and isinstance(path[-1], int)],
-    )
+    in_list = bool(path) and isinstance(path[-1], int)
+    return _Fault(path, error["type"], error["msg"], context, section, expects, choice, branch, words[in_list])
 
 
 @cache
-def _describe(section: type[BaseModel], name: str) -> _Field:
+def _describe(section: type[BaseModel], name: str) -> tuple[type[BaseModel], str, bool, tuple[tuple[str, ...], ...]]:
+    """Describe a key.
+
+    Returns:
+        Its section, or the one below it; what it may hold; whether that may be of several kinds; the words that it may
+        be, and those that the items of its list may be.
+    """
     field = section.model_fields[name]
     extra = field.json_schema_extra
     assert isinstance(extra, dict)
     kinds = [kind for kind in get_args(field.annotation) if kind is not type(None)]
     has_choice = get_origin(field.annotation) in (Union, UnionType) and len(kinds) > 1
-    words = tuple(_words(field.annotation, 0)), tuple(_words(field.annotation, 1))
-    return _Field(next(_sections(field.annotation), section), str(extra["expects"]), has_choice, words)
+    words = tuple(tuple(_words(field.annotation, depth)) for depth in (0, 1))
+    return next(_sections(field.annotation), section), str(extra["expects"]), has_choice, words
 
 
 def _words(annotation: Any, depth: int) -> Iterator[str]:

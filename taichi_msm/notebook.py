@@ -53,9 +53,7 @@ _names = count()
 class Player:
     """Frames with a button and a slider, which a notebook shows as the value of a cell.
 
-    Args:
-        frames: pictures of one size, shape (height, width, 3) each, at least one.
-        rate: frames per second.
+    At least one picture, all of one size, shape (height, width, 3), at a rate of frames per second.
     """
 
     def __init__(self, frames: Sequence[NDArray[np.uint8]], rate: float) -> None:

@@ -11,7 +11,7 @@ from mmap import ACCESS_READ, mmap
 from pathlib import Path
 from typing import TYPE_CHECKING, BinaryIO
 
-from taichi_msm.system.silence import silenced
+from taichi_msm.system.streams import silenced
 
 if TYPE_CHECKING:
     from PIL import Image
@@ -41,15 +41,8 @@ class PictureError(Exception):
 def read_rgb(path: str, background: tuple[int, int, int], sha256: str | None = None) -> Image.Image:
     """Read a picture, upright, in 8-bit RGB; a transparent one is laid over the background.
 
-    If a file has several pictures, the first is taken.
-
-    Args:
-        path: of the file.
-        background: red, green and blue under a transparent picture.
-        sha256: the SHA-256 that the file must have, in hexadecimal; None: any.
-
-    Raises:
-        PictureError: when the file cannot be used.
+    If a file has several pictures, the first is taken. PictureError: it cannot be used, or has not this SHA-256, in
+    hexadecimal.
     """
     from PIL import ImageOps
 
@@ -70,21 +63,13 @@ def picture_size(path: str) -> tuple[int, int]:
 
 
 def has_transparency(path: str) -> bool:
-    """Tell whether any pixel of a picture lets the background through.
-
-    Raises:
-        PictureError: when the file cannot be used.
-    """
+    """Tell whether any pixel of a picture lets the background through."""
     with _open(path) as image:
         return image.has_transparency_data and image.convert("RGBA").getchannel("A").getextrema() != (255, 255)
 
 
 def file_sha256(path: str) -> str:
-    """Compute the SHA-256 of a picture's file, in hexadecimal.
-
-    Raises:
-        PictureError: when the file cannot be read.
-    """
+    """Compute the SHA-256 of a picture's file, in hexadecimal."""
     _require_file(path)
     try:
         with Path(path).open("rb") as file:
@@ -97,10 +82,6 @@ def file_sha256(path: str) -> str:
 def _open(path: str, sha256: str | None = None) -> Iterator[Image.Image]:
     """Open a picture for a block that decodes it.
 
-    Args:
-        path: of the file.
-        sha256: the SHA-256 that the file must have; None: any.
-
     Raises:
         PictureError: instead of any error of Pillow, here or in the block; broken pictures raise many types.
     """
@@ -112,7 +93,7 @@ def _open(path: str, sha256: str | None = None) -> Iterator[Image.Image]:
         warnings.simplefilter("ignore")
         warnings.simplefilter("error", Image.DecompressionBombWarning)
         try:
-            with Path(path).open("rb") as file, Image.open(_of(path, file, sha256), formats=PICTURE_FORMATS) as image:
+            with _file(path, sha256) as file, Image.open(file, formats=PICTURE_FORMATS) as image:
                 if max(image.size) > MAX_SIDE:
                     said = f"has {image.width} x {image.height} pixels; a side may have at most {MAX_SIDE}, cut it"
                     raise PictureError(f"{path} {said}")
@@ -137,13 +118,15 @@ def _open(path: str, sha256: str | None = None) -> Iterator[Image.Image]:
             raise PictureError(f"{path} cannot be decoded ({error}); save it again") from None
 
 
-def _of(path: str, file: BinaryIO, sha256: str | None) -> BinaryIO:
-    """Make sure that an open file has a SHA-256, and give it at its beginning; raises PictureError."""
-    if sha256 is not None:
-        if _sha256(file) != sha256:
-            raise PictureError(f"{path} is not the file that was run, as its SHA-256 tells; put that one back")
-        file.seek(0)
-    return file
+@contextmanager
+def _file(path: str, sha256: str | None) -> Iterator[BinaryIO]:
+    """Open a file, which must have a SHA-256 if one is given; raises PictureError."""
+    with Path(path).open("rb") as file:
+        if sha256 is not None:
+            if _sha256(file) != sha256:
+                raise PictureError(f"{path} is not the file that was run, as its SHA-256 tells; put that one back")
+            file.seek(0)
+        yield file
 
 
 def _sha256(file: BinaryIO) -> str:
@@ -155,32 +138,34 @@ def _sha256(file: BinaryIO) -> str:
 
 def _scans(file: BinaryIO) -> int:
     """Count the scans of a JPEG, which may be broken."""
+    at, scans = 2, 0
     with mmap(file.fileno(), 0, access=ACCESS_READ) as data:
-        return _count_scans(data)
-
-
-def _count_scans(data: mmap) -> int:
-    place, scans = 2, 0
-    while (place := data.find(b"\xff", place)) >= 0 and (marker := data[place + 1 : place + 2]) not in (b"", b"\xd9"):
-        # Stuffed and padding bytes and restarts have no length; they occur within the data of a scan.
-        if marker in b"\x00\x01\xff" or b"\xd0" <= marker <= b"\xd8":
-            place += 1 if marker == b"\xff" else 2
-            continue
-        scans += marker == b"\xda"
-        place += 2 + int.from_bytes(data[place + 2 : place + 4], "big")
+        while (at := data.find(b"\xff", at)) >= 0 and (marker := data[at + 1 : at + 2]) not in (b"", b"\xd9"):
+            # Stuffed and padding bytes and restarts have no length; they occur within the data of a scan.
+            if marker in b"\x00\x01\xff" or b"\xd0" <= marker <= b"\xd8":
+                at += 1 if marker == b"\xff" else 2
+                continue
+            scans += marker == b"\xda"
+            at += 2 + int.from_bytes(data[at + 2 : at + 4], "big")
     return scans
 
 
+def irregular(path: Path) -> str:
+    """Say what a path is instead of a regular file, without opening it: opening a pipe would wait for its other end."""
+    mode = path.stat().st_mode
+    if stat.S_ISREG(mode):
+        return ""
+    return "a directory" if stat.S_ISDIR(mode) else "not a regular file"
+
+
 def _require_file(path: str) -> None:
-    """Refuse anything but a regular file, without opening it: opening a pipe would wait for its other end."""
     try:
-        mode = Path(path).stat().st_mode
+        kind = irregular(Path(path))
     except ValueError:
         raise PictureError(f"{path} is not a path; name a picture") from None
     except OSError as error:
         raise _unreadable(path, error) from None
-    if not stat.S_ISREG(mode):
-        kind = "a directory" if stat.S_ISDIR(mode) else "not a regular file"
+    if kind:
         raise PictureError(f"{path} is {kind}; name a picture")
 
 
@@ -193,17 +178,12 @@ def _to_rgb(image: Image.Image, background: tuple[int, int, int]) -> Image.Image
     from PIL import Image
 
     if image.mode in _MODES_16_BIT:
-        image = _to_8_bit(image)
+        import numpy as np
+
+        # 16-bit grey, 65535 to 255, rounded to the nearest; Pillow's own conversion clips at 255.
+        grey = np.asarray(image).astype(np.uint32)
+        image = Image.fromarray(((grey * 255 + 32767) // 65535).astype(np.uint8))
     if not image.has_transparency_data:
         return image.convert("RGB")
     below = Image.new("RGBA", image.size, (*background, 255))
     return Image.alpha_composite(below, image.convert("RGBA")).convert("RGB")
-
-
-def _to_8_bit(image: Image.Image) -> Image.Image:
-    """Scale 16-bit grey to 8 bits, 65535 to 255, rounding to the nearest; Pillow's own conversion clips at 255."""
-    import numpy as np
-    from PIL import Image
-
-    grey = np.asarray(image).astype(np.uint32)
-    return Image.fromarray(((grey * 255 + 32767) // 65535).astype(np.uint8))

@@ -12,7 +12,6 @@ from dataclasses import replace
 from functools import partial
 from operator import attrgetter
 from pathlib import Path
-from types import TracebackType
 from typing import Any, NamedTuple, cast
 
 import numpy as np
@@ -50,13 +49,9 @@ from taichi_msm.system.runtime import Device
 
 
 class Stopwatch:
-    """Adds up the time of every stage of a run; a stage within another one interrupts it.
+    """Adds up the time of every stage of a run [s]; a stage within another one interrupts it.
 
-    Args:
-        started: `time.perf_counter()` when the first stage, startup, began; None: now.
-
-    Attributes:
-        seconds: time of every stage so far [s].
+    The first stage, startup, began at `started`, a `time.perf_counter()`; None: now.
     """
 
     def __init__(self, started: float | None) -> None:
@@ -138,8 +133,8 @@ def run(
     budget.require_disk(plan, folder)
     device = runtime.start(arch, threads)
     sha256 = digests(plan)
-    texture = load_texture(plan.scene, sha256.get("image")) if plan.scene.draws else None
     given = plan.scene
+    texture = load_texture(given, sha256.get("image")) if given.draws else None
     seeks = given.sheet.tolerance is not None or given.time.tolerance is not None
     with watch.stage("pilot" if seeks else "startup"):
         plan, estimate, mesh = resolve(plan, device, partial(progress, "pilot"))
@@ -147,18 +142,8 @@ def run(
         budget.require_disk(plan, folder)
     with writing(directory):
         here = str(Path.cwd())
-    manifest = Manifest(
-        given,
-        plan.scene,
-        tuple(overrides),
-        estimate,
-        mesh,
-        estimate_error,
-        here,
-        arch,
-        sha256,
-        versions(),
-    )
+    made = tuple(overrides)
+    manifest = Manifest(given, plan.scene, made, estimate, mesh, estimate_error, here, arch, sha256, versions())
     task = _Task(manifest, plan, texture, device, folder)
     if begun := _begun(manifest, folder):
         with suppress(DamagedError):
@@ -217,26 +202,19 @@ def _with_versions(begun: Manifest) -> Manifest:
 
 
 class _Task(NamedTuple):
-    """What is to be run.
+    """What is to be run."""
 
-    Attributes:
-        manifest: as it is written down.
-        plan: of its scene, in which nothing is left open.
-        texture: the picture on the sheet; None: nothing is drawn.
-        device: what `runtime.start` returned.
-        directory: where the results go.
-    """
-
-    manifest: Manifest
-    plan: Plan
-    texture: NDArray[np.uint8] | None
+    manifest: Manifest  # as it is written down
+    plan: Plan  # of its scene, in which nothing is left open
+    texture: NDArray[np.uint8] | None  # the picture on the sheet, if anything is drawn
     device: Device
-    directory: Path
+    directory: Path  # where the results go
 
 
 def _carry_out(task: _Task, watch: Stopwatch, progress: Progress, *, resumes: bool) -> RunRecord:
     """Simulate and draw all frames, or those that the unfinished run in the directory lacks."""
-    with _Run(task, watch, progress, resumes=resumes) as run:
+    with ExitStack() as opened:
+        run = _Run(task, watch, progress, opened, resumes=resumes)
         run.check_stored_frames()
         with watch.stage("hand over"):
             try:
@@ -251,42 +229,28 @@ def _carry_out(task: _Task, watch: Stopwatch, progress: Progress, *, resumes: bo
 
 
 class _Run:
-    """A run under way: a simulation, the pilots beside it, and the results as they grow."""
+    """A run under way: a simulation, the pilots beside it, and the results as they grow; all opened in a stack."""
 
-    def __init__(self, task: _Task, watch: Stopwatch, progress: Progress, *, resumes: bool) -> None:
+    def __init__(self, task: _Task, watch: Stopwatch, progress: Progress, opened: ExitStack, *, resumes: bool) -> None:
         self._task, self._watch, self._progress = task, watch, progress
-        self._frames = task.plan.grid.frames + 1
-        self._resumes = resumes
-        self._open = ExitStack()
-
-    def __enter__(self) -> _Run:
-        plan, device, manifest = self._task.plan, self._task.device, self._task.manifest
-        self._progress("compile", 0, self._frames)
+        plan, device, manifest = task.plan, task.device, task.manifest
+        self._frames = plan.grid.frames + 1
+        progress("compile", 0, self._frames)
         cores = free_cores(plan)
-        with ExitStack() as opened:
-            # In this order, so that the encoder starts up while kernels are compiled.
-            self._writer = opened.enter_context(
-                ResultWriter(self._task.directory, plan.scene, plan.grid, manifest.as_json(), resumes=self._resumes)
-            )
-            self._simulation = opened.enter_context(
-                Simulation(plan, device.arch, device.threads, self._task.texture, cores)
-            )
-            self._resumed = self._writer.stored
-            pilots = _pilots(manifest, plan, device, resumed=self._resumed > 0)
-            self._error: RunError | None = None
-            self._known = Known(manifest.estimate, pilots.reason, manifest.mesh)
-            if not pilots.reason:
-                try:
-                    self._error = RunError(plan, pilots, self._known, device, cores)
-                except DeviceError:
-                    self._known = self._known._replace(reason=f"{device.arch} cannot run this scene in f64")
-            self._open = opened.pop_all()
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        self._open.close()
+        # In this order, so that the encoder starts up while kernels are compiled.
+        self._writer = opened.enter_context(
+            ResultWriter(task.directory, plan.scene, plan.grid, manifest.as_json(), resumes=resumes)
+        )
+        self._simulation = opened.enter_context(Simulation(plan, device.arch, device.threads, task.texture, cores))
+        self._resumed = self._writer.stored
+        pilots = _pilots(manifest, plan, device, resumed=self._resumed > 0)
+        self._error: RunError | None = None
+        self._known = Known(manifest.estimate, pilots.reason, manifest.mesh)
+        if not pilots.reason:
+            try:
+                self._error = RunError(plan, pilots, self._known, device, cores)
+            except DeviceError:
+                self._known = self._known._replace(reason=f"{device.arch} cannot run this scene in f64")
 
     def check_stored_frames(self) -> None:
         """Find damage in the stored positions before they are used."""
@@ -342,11 +306,7 @@ class _Run:
             writer.finish(partial(self._progress, "frames", self._frames, self._frames))
 
     def keep_finished_frames(self) -> dict[str, Any]:
-        """Save what an interrupted run has.
-
-        Raises:
-            KeyboardInterrupt: when there is no new frame.
-        """
+        """Save what an interrupted run has; KeyboardInterrupt: no new frame."""
         writer, simulation = self._writer, self._simulation
         # An interruption outside `progress` may come before the last frame is stored.
         if simulation.steps > 0 and simulation.frame < writer.stored and not simulation.torn:

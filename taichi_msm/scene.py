@@ -15,12 +15,11 @@ from pydantic import (
     field_validator,
     model_validator,
 )
-from pydantic_core import PydanticCustomError
 from typing_extensions import Self
 
 from taichi_msm import faults
 from taichi_msm.errors import ArgumentError, SceneError
-from taichi_msm.faults import LARGEST, REFUSED, SMALLEST
+from taichi_msm.faults import LARGEST, SMALLEST, refused
 from taichi_msm.outputs.table import OUTPUTS
 
 MAX_POINTS = 4096
@@ -64,8 +63,8 @@ Vector = tuple[Number, Number, Number]
 Fraction = Annotated[Number, Field(ge=-1, le=2)]
 
 
-def key(default: Any = ..., *, means: str, expects: str) -> Any:
-    """Describe one key: what it means (with its unit) and, for errors, what it may hold."""
+def key(default: Any, means: str, expects: str) -> Any:
+    """Describe one key: its default (... where it is required), what it means, and what errors say that it may hold."""
     return Field(default, description=means, json_schema_extra={"expects": expects})
 
 
@@ -114,24 +113,20 @@ class Sheet(Section):
     """The sheet of mass points."""
 
     points: tuple[Count, Count] = key(
-        means="rows, columns of mass points", expects=f"two whole numbers, 2 to {MAX_POINTS}: [rows, cols]"
+        ..., "rows, columns of mass points", f"two whole numbers, 2 to {MAX_POINTS}: [rows, cols]"
     )
     size: tuple[Positive, Positive] = key(
-        means="height, width of the sheet at rest [m]", expects="two numbers above 0: [height, width] in metres"
+        ..., "height, width of the sheet at rest [m]", "two numbers above 0: [height, width] in metres"
     )
-    mass: Positive | None = key(
-        None, means="mass of one point [kg]; required with springs", expects="a number above 0, in kg"
-    )
+    mass: Positive | None = key(None, "mass of one point [kg]; required with springs", "a number above 0, in kg")
     fixed: Literal["border", "corners", "none"] | tuple[Side, ...] = key(
-        "border",
-        means="the points that never move",
-        expects="border, corners, none, or a list of top, bottom, left, right",
+        "border", "the points that never move", "border, corners, none, or a list of top, bottom, left, right"
     )
     tolerance: Tolerance | None = key(
         None,
-        means="with tissue: largest allowed error due to the number of points, as a fraction of the largest "
+        "with tissue: largest allowed error due to the number of points, as a fraction of the largest "
         "displacement; pilot runs find how many more points are needed",
-        expects=f"a number, {SMALLEST_TOLERANCE:g} to {LARGEST_TOLERANCE:g}",
+        f"a number, {SMALLEST_TOLERANCE:g} to {LARGEST_TOLERANCE:g}",
     )
 
 
@@ -139,81 +134,69 @@ class StiffnessMap(Section):
     """Stiffness that differs from place to place, by the grey of an image over the whole sheet."""
 
     image: FilePath = key(
-        means="a picture whose grey tells the stiffness; relative to the scene file, in its folder or below",
-        expects="the path of a picture",
+        ...,
+        "a picture whose grey tells the stiffness; relative to the scene file, in its folder or below",
+        "the path of a picture",
     )
     range: tuple[Positive, Positive] = key(
-        means="factor of the stiffness where the picture is black, and where it is white; linear between",
-        expects="two numbers above 0: [black, white]",
+        ...,
+        "factor of the stiffness where the picture is black, and where it is white; linear between",
+        "two numbers above 0: [black, white]",
     )
 
 
 class Springs(Section):
     """The stiffness of each family of springs, per spring, as in the paper; 0 leaves a family out."""
 
-    structural: NotNegative = key(
-        0.0, means="springs to the 4 nearest neighbours [N/m]", expects="a number, 0 or more, in N/m"
-    )
-    shear: NotNegative = key(
-        0.0, means="springs to the 4 diagonal neighbours [N/m]", expects="a number, 0 or more, in N/m"
-    )
-    virtual: NotNegative = key(
-        0.0, means="springs from each point to its rest position [N/m]", expects="a number, 0 or more, in N/m"
-    )
+    structural: NotNegative = key(0.0, "springs to the 4 nearest neighbours [N/m]", "a number, 0 or more, in N/m")
+    shear: NotNegative = key(0.0, "springs to the 4 diagonal neighbours [N/m]", "a number, 0 or more, in N/m")
+    virtual: NotNegative = key(0.0, "springs from each point to its rest position [N/m]", "a number, 0 or more, in N/m")
     virtual_active: Literal["loaded", "always"] = key(
-        "loaded",
-        means="when the virtual springs exist: while any probe's percent is not 0, or always",
-        expects="loaded or always",
+        "loaded", "when the virtual springs exist: while any probe's percent is not 0, or always", "loaded or always"
     )
     map: StiffnessMap | None = key(
-        None, means="factor of structural and shear from place to place", expects="a mapping with image and range"
+        None, "factor of structural and shear from place to place", "a mapping with image and range"
     )
 
 
 class Tissue(Section):
     """Tissue in physical units: a sheet of plane stress with Poisson's ratio 1/3, the same at any number of points."""
 
-    young: Positive = key(means="Young's modulus E [Pa]", expects="a number above 0, in Pa")
-    thickness: Positive = key(means="thickness t of the sheet [m]", expects="a number above 0, in metres")
-    density: Positive = key(means="density [kg/m3]", expects="a number above 0, in kg/m3")
+    young: Positive = key(..., "Young's modulus E [Pa]", "a number above 0, in Pa")
+    thickness: Positive = key(..., "thickness t of the sheet [m]", "a number above 0, in metres")
+    density: Positive = key(..., "density [kg/m3]", "a number above 0, in kg/m3")
     foundation: NotNegative = key(
         0.0,
-        means="stiffness of the tissue underneath, as virtual springs: force per area and displacement [N/m3]",
-        expects="a number, 0 or more, in N/m3",
+        "stiffness of the tissue underneath, as virtual springs: force per area and displacement [N/m3]",
+        "a number, 0 or more, in N/m3",
     )
     foundation_active: Literal["loaded", "always"] = key(
-        "loaded",
-        means="when the foundation acts: while any probe's percent is not 0, or always",
-        expects="loaded or always",
+        "loaded", "when the foundation acts: while any probe's percent is not 0, or always", "loaded or always"
     )
-    damping: NotNegative = key(0.0, means="C / m [1/s]", expects="a number, 0 or more, in 1/s")
+    damping: NotNegative = key(0.0, "C / m [1/s]", "a number, 0 or more, in 1/s")
     pretension: NotNegative = key(
-        0.0,
-        means="tension S of the sheet at rest [N/m]; every side must be fixed",
-        expects="a number, 0 or more, in N/m",
+        0.0, "tension S of the sheet at rest [N/m]; every side must be fixed", "a number, 0 or more, in N/m"
     )
     bending: Literal["plate"] | NotNegative = key(
         0.0,
-        means="bending stiffness D [N m]; plate: E t^3 / (12 (1 - nu^2)); every side must be fixed, and is hinged",
-        expects="plate, or a number, 0 or more, in N m",
+        "bending stiffness D [N m]; plate: E t^3 / (12 (1 - nu^2)); every side must be fixed, and is hinged",
+        "plate, or a number, 0 or more, in N m",
     )
-    map: StiffnessMap | None = key(
-        None, means="factor of young from place to place", expects="a mapping with image and range"
-    )
+    map: StiffnessMap | None = key(None, "factor of young from place to place", "a mapping with image and range")
 
 
 class Instrument(Section):
     """The rod that is drawn for a probe: metal, with a rounded tip that touches the sheet at the control point."""
 
-    radius: Positive = key(means="radius of the rod [m]", expects="a number above 0, in metres")
-    shaft: Vector = key(means="direction from the tip along the rod", expects="three numbers, not all 0: [x, y, z]")
-    length: Positive = key(means="length of the rod [m]", expects="a number above 0, in metres")
+    radius: Positive = key(..., "radius of the rod [m]", "a number above 0, in metres")
+    shaft: Vector = key(..., "direction from the tip along the rod", "three numbers, not all 0: [x, y, z]")
+    length: Positive = key(..., "length of the rod [m]", "a number above 0, in metres")
 
     @field_validator("shaft", mode="after")
     @classmethod
     def _leads_somewhere(cls, shaft: Vector) -> Vector:
         if not any(abs(number) >= SMALLEST for number in shaft):
-            raise PydanticCustomError(REFUSED, "has no direction; take one such as [0.3, -0.5, 1]")
+            raise refused("has no direction; take one such as [0.3, -0.5, 1]")
         return shaft
 
 
@@ -224,43 +207,39 @@ class Probe(Section):
 
     at: tuple[Fraction, Fraction] | Annotated[tuple[tuple[Number, Fraction, Fraction], ...], Field(min_length=1)] = key(
         (0.5, 0.5),
-        means="control point: fraction of the width from the left, of the height from the top; "
+        "control point: fraction of the width from the left, of the height from the top; "
         "or keys [[t, across, down], ...], linear between, held outside",
-        expects="[across, down], fractions from -1 to 2, or keys [[t, across, down], ...]",
+        "[across, down], fractions from -1 to 2, or keys [[t, across, down], ...]",
     )
     total: Vector | None = key(
-        None,
-        means="force of the whole tool on a wide sheet at 100 % [N]",
-        expects="three numbers: [x, y, z] in newtons",
+        None, "force of the whole tool on a wide sheet at 100 % [N]", "three numbers: [x, y, z] in newtons"
     )
     force: Vector | None = key(
         None,
-        means="with springs, instead of total: force on one point at 100 %, before decay and offset [N]",
-        expects="three numbers: [x, y, z] in newtons",
+        "with springs, instead of total: force on one point at 100 %, before decay and offset [N]",
+        "three numbers: [x, y, z] in newtons",
     )
     load: Annotated[tuple[tuple[Number, Number], ...], Field(min_length=1)] = key(
         ((0.0, 100.0),),
-        means="keys [t, percent], linear between; 0 before the first, the last value after the last; "
+        "keys [t, percent], linear between; 0 before the first, the last value after the last; "
         "two keys at one time are a jump",
-        expects="keys [[t, percent], ...], t in seconds",
+        "keys [[t, percent], ...], t in seconds",
     )
     falloff: NotNegative = key(
         150.0,
-        means="decay of the force with the distance from the control point, or from the tool's flat end [1/m]",
-        expects="a number, 0 or more, in 1/m",
+        "decay of the force with the distance from the control point, or from the tool's flat end [1/m]",
+        "a number, 0 or more, in 1/m",
     )
     radius: NotNegative = key(
-        0.0,
-        means="radius of the tool's flat end, where the force does not decay [m]",
-        expects="a number, 0 or more, in m",
+        0.0, "radius of the tool's flat end, where the force does not decay [m]", "a number, 0 or more, in m"
     )
     offset: Annotated[Number, Field(ge=-50, le=1000)] = key(
         DEFAULT_OFFSET,
-        means="with force only: subtracted in the exponent of the decay, so also at the control point",
-        expects="a number, -50 to 1000",
+        "with force only: subtracted in the exponent of the decay, so also at the control point",
+        "a number, -50 to 1000",
     )
     instrument: Instrument | None = key(
-        None, means="the rod that is drawn for the tool", expects="a mapping with radius, shaft and length"
+        None, "the rod that is drawn for the tool", "a mapping with radius, shaft and length"
     )
 
     @field_validator("force", mode="after")
@@ -270,10 +249,11 @@ class Probe(Section):
             return force  # A fault of its own.
         total = info.data["total"]
         if force is None and total is None:
-            said = "missing; expected total (whole tool) or, with springs, force (one point): [x, y, z] in newtons"
-            raise PydanticCustomError(REFUSED, said)
+            raise refused(
+                "missing; expected total (whole tool) or, with springs, force (one point): [x, y, z] in newtons"
+            )
         if force is not None and total is not None:
-            raise PydanticCustomError(REFUSED, "is given together with total; remove one of them")
+            raise refused("is given together with total; remove one of them")
         return force
 
     @field_validator("falloff", "offset", mode="after")
@@ -281,11 +261,9 @@ class Probe(Section):
     def _fit_total(cls, value: float, info: ValidationInfo) -> float:
         if info.data.get("total") is not None:
             if info.field_name == "falloff" and value < SMALLEST:
-                said = f"{value:g} would spread total over an infinite area; take a number above 0, in 1/m"
-                raise PydanticCustomError(REFUSED, said)
+                raise refused(f"{value:g} would spread total over an infinite area; take a number above 0, in 1/m")
             if info.field_name == "offset" and value != DEFAULT_OFFSET:
-                said = "goes with force, not with total; remove offset"
-                raise PydanticCustomError(REFUSED, said)
+                raise refused("goes with force, not with total; remove offset")
         return value
 
     @field_validator("at", "load", mode="after")
@@ -296,16 +274,10 @@ class Probe(Section):
         times = [entry[0] for entry in keys]
         for n in range(1, len(times)):
             if times[n] < times[n - 1]:
-                raise PydanticCustomError(
-                    REFUSED,
-                    "goes back in time, from {before} s to {now} s; sort the keys by time",
-                    {"key": n, "before": f"{times[n - 1]:g}", "now": f"{times[n]:g}"},
-                )
+                raise refused(f"goes back in time, from {times[n - 1]:g} s to {times[n]:g} s; sort the keys by time", n)
             if n > 1 and times[n] == times[n - 2]:
-                raise PydanticCustomError(
-                    REFUSED,
-                    "third key at {now} s; a jump is two keys at one time, so remove the middle one",
-                    {"key": n, "now": f"{times[n]:g}"},
+                raise refused(
+                    f"third key at {times[n]:g} s; a jump is two keys at one time, so remove the middle one", n
                 )
         return keys
 
@@ -314,31 +286,30 @@ class Time(Section):
     """The time span, the frames and the steps."""
 
     duration: Positive = key(
-        means="simulated time [s]; duration x frames_per_second is a whole number",
-        expects="a number above 0, in seconds",
+        ..., "simulated time [s]; duration x frames_per_second is a whole number", "a number above 0, in seconds"
     )
-    frames_per_second: Positive = key(25.0, means="frames per simulated second", expects="a number above 0")
+    frames_per_second: Positive = key(25.0, "frames per simulated second", "a number above 0")
     step: Literal["auto"] | Positive = key(
         "auto",
-        means="time step [s], a whole fraction of a frame; auto: half the stability limit or less",
-        expects="auto, or a number above 0, in seconds",
+        "time step [s], a whole fraction of a frame; auto: half the stability limit or less",
+        "auto, or a number above 0, in seconds",
     )
     tolerance: Tolerance | None = key(
         None,
-        means="with step: auto, largest allowed error of any frame due to the step, as a fraction of the largest "
+        "with step: auto, largest allowed error of any frame due to the step, as a fraction of the largest "
         "displacement; pilot runs find the step",
-        expects=f"a number, {SMALLEST_TOLERANCE:g} to {LARGEST_TOLERANCE:g}",
+        f"a number, {SMALLEST_TOLERANCE:g} to {LARGEST_TOLERANCE:g}",
     )
     damping_difference: Literal["central", "backward"] = key(
         "central",
-        means="finite difference for the velocity in the damping: central is of order 2, backward "
+        "finite difference for the velocity in the damping: central is of order 2, backward "
         "(the paper's eq. 3) of order 1",
-        expects="central or backward",
+        "central or backward",
     )
     precision: Literal["auto", "f32", "f64"] = key(
         "auto",
-        means="floating-point precision; auto: f64 if stepping is a small part of the run, else f32",
-        expects="auto, f32 or f64",
+        "floating-point precision; auto: f64 if stepping is a small part of the run, else f32",
+        "auto, f32 or f64",
     )
 
     @property
@@ -351,93 +322,77 @@ class Time(Section):
         frames = self.duration * self.frames_per_second
         if not 0.5 < frames <= 1e9 or abs(frames - round(frames)) > WHOLE:
             nearest = max(1, round(min(frames, 1e9))) / self.frames_per_second
-            raise PydanticCustomError(
-                REFUSED,
-                "{duration} s x {rate} frames per second = {frames} frames, not a whole number up to 1e9; "
-                "try {nearest}",
-                {
-                    "key": "duration",
-                    "duration": f"{self.duration:.12g}",
-                    "rate": f"{self.frames_per_second:.12g}",
-                    "frames": f"{frames:.12g}",
-                    "nearest": f"{nearest:.12g}",
-                },
+            raise refused(
+                f"{self.duration:.12g} s x {self.frames_per_second:.12g} frames per second = {frames:.12g} frames, "
+                f"not a whole number up to 1e9; try {nearest:.12g}",
+                "duration",
             )
         return self
 
     @model_validator(mode="after")
     def _one_way_to_the_step(self) -> Time:
         if self.tolerance is not None and self.step != "auto":
-            raise PydanticCustomError(
-                REFUSED,
-                "a tolerance chooses the step, but step is {step}; set step: auto or remove the tolerance",
-                {"key": "tolerance", "step": f"{self.step:.12g}"},
-            )
+            said = f"a tolerance chooses the step, but step is {self.step:.12g}"
+            raise refused(f"{said}; set step: auto or remove the tolerance", "tolerance")
         return self
 
 
 class Camera(Section):
     """A pinhole camera."""
 
-    eye: Vector = key(means="where the camera is [m]", expects="three numbers: [x, y, z] in metres")
-    target: Vector = key(
-        (0.0, 0.0, 0.0), means="the point it looks at [m]", expects="three numbers: [x, y, z] in metres"
-    )
-    up: Vector = key(
-        (0.0, 1.0, 0.0), means="the direction that is up in the picture", expects="three numbers: [x, y, z]"
-    )
+    eye: Vector = key(..., "where the camera is [m]", "three numbers: [x, y, z] in metres")
+    target: Vector = key((0.0, 0.0, 0.0), "the point it looks at [m]", "three numbers: [x, y, z] in metres")
+    up: Vector = key((0.0, 1.0, 0.0), "the direction that is up in the picture", "three numbers: [x, y, z]")
     fov: Annotated[Number, Field(ge=MIN_FOV, lt=180)] = key(
         40.0,
-        means="angle from the picture's bottom to its top [degrees]",
-        expects=f"a number from {MIN_FOV:g} to below 180, in degrees",
+        "angle from the picture's bottom to its top [degrees]",
+        f"a number from {MIN_FOV:g} to below 180, in degrees",
     )
 
 
 class Light(Section):
     """How shading: tissue lights the sheet, from beside the camera."""
 
-    ambient: Share = key(0.2, means="share of the light that comes from everywhere", expects="a number, 0 to 1")
-    gloss: Share = key(0.4, means="brightness of the wet highlight, as a fraction of white", expects="a number, 0 to 1")
+    ambient: Share = key(0.2, "share of the light that comes from everywhere", "a number, 0 to 1")
+    gloss: Share = key(0.4, "brightness of the wet highlight, as a fraction of white", "a number, 0 to 1")
     relief: Annotated[Number, Field(ge=-MAX_RELIEF, le=MAX_RELIEF)] = key(
         0.0,
-        means="height of white in the picture above black, in percent of the sheet's larger side",
-        expects=f"a number, -{MAX_RELIEF} to {MAX_RELIEF}",
+        "height of white in the picture above black, in percent of the sheet's larger side",
+        f"a number, -{MAX_RELIEF} to {MAX_RELIEF}",
     )
-    vignette: Share = key(0.0, means="how much darker the picture's corners are", expects="a number, 0 to 1")
+    vignette: Share = key(0.0, "how much darker the picture's corners are", "a number, 0 to 1")
 
 
 class Render(Section):
     """How a frame is drawn."""
 
     size: tuple[Pixels, Pixels] = key(
-        (512, 512),
-        means="width, height of a frame [px]",
-        expects=f"two whole numbers, 1 to {MAX_PIXELS}: [width, height] in pixels",
+        (512, 512), "width, height of a frame [px]", f"two whole numbers, 1 to {MAX_PIXELS}: [width, height] in pixels"
     )
     refine: Annotated[Whole, Field(ge=0, le=MAX_REFINE)] = key(
-        10, means="points inserted between two neighbours when drawing", expects=f"a whole number, 0 to {MAX_REFINE}"
+        10, "points inserted between two neighbours when drawing", f"a whole number, 0 to {MAX_REFINE}"
     )
     camera: Literal["top", "oblique"] | Camera = key(
         "top",
-        means="top: straight down, to scale; oblique: tilted, shows depth; or a pinhole camera",
-        expects="top, oblique, or {eye: [x, y, z], target: [x, y, z], up: [x, y, z], fov: degrees}",
+        "top: straight down, to scale; oblique: tilted, shows depth; or a pinhole camera",
+        "top, oblique, or {eye: [x, y, z], target: [x, y, z], up: [x, y, z], fov: degrees}",
     )
     shading: Literal["none", "headlight", "tissue"] = key(
         "headlight",
-        means="none: the picture's own colours; headlight: lit from the camera; tissue: wet tissue in the light of an "
+        "none: the picture's own colours; headlight: lit from the camera; tissue: wet tissue in the light of an "
         "endoscope",
-        expects="none, headlight or tissue",
+        "none, headlight or tissue",
     )
-    light: Light = key(Light(), means="the light, with shading: tissue", expects="a mapping")
-    wireframe: StrictBool = key(False, means="draw the mass-point mesh over the surface", expects="true or false")
+    light: Light = key(Light(), "the light, with shading: tissue", "a mapping")
+    wireframe: StrictBool = key(False, "draw the mass-point mesh over the surface", "true or false")
     supersample: Annotated[Whole, Field(ge=1, le=MAX_SUPERSAMPLE)] = key(
-        1, means="samples per pixel along each axis", expects=f"a whole number, 1 to {MAX_SUPERSAMPLE}"
+        1, "samples per pixel along each axis", f"a whole number, 1 to {MAX_SUPERSAMPLE}"
     )
     background: tuple[Byte, Byte, Byte] = key(
-        (0, 0, 0), means="colour where no surface is", expects="three whole numbers, 0 to 255: [red, green, blue]"
+        (0, 0, 0), "colour where no surface is", "three whole numbers, 0 to 255: [red, green, blue]"
     )
     tracks: Annotated[Whole, Field(ge=1, le=MAX_TRACKS)] = key(
-        16, means="material points along each side of the grid of tracks", expects=f"a whole number, 1 to {MAX_TRACKS}"
+        16, "material points along each side of the grid of tracks", f"a whole number, 1 to {MAX_TRACKS}"
     )
 
 
@@ -457,34 +412,28 @@ class Scene(Section):
 
     image: FilePath | None = key(
         None,
-        means="the picture on the sheet: PNG, JPEG, WebP, BMP or TIFF; relative to the scene file, "
+        "the picture on the sheet: PNG, JPEG, WebP, BMP or TIFF; relative to the scene file, "
         "in its folder or below; required to draw",
-        expects="the path of a picture",
+        "the path of a picture",
     )
     region: tuple[Whole, Whole, Whole, Whole] | None = key(
         None,
-        means="x, y, width, height [px] of the part of the image that the sheet carries; default: all of it",
-        expects="four whole numbers: [x, y, width, height] in pixels",
+        "x, y, width, height [px] of the part of the image that the sheet carries; default: all of it",
+        "four whole numbers: [x, y, width, height] in pixels",
     )
-    sheet: Sheet = key(means="the sheet of mass points", expects="a mapping with points and size")
-    tissue: Tissue | None = key(
-        None, means="what the sheet is made of", expects="a mapping with young, thickness and density"
-    )
-    springs: Springs | None = key(
-        None, means="instead of tissue: the springs", expects="a mapping with structural, shear, virtual"
-    )
-    damping: NotNegative = key(
-        0.0, means="with springs: C, force per velocity [N s/m]", expects="a number, 0 or more, in N s/m"
-    )
+    sheet: Sheet = key(..., "the sheet of mass points", "a mapping with points and size")
+    tissue: Tissue | None = key(None, "what the sheet is made of", "a mapping with young, thickness and density")
+    springs: Springs | None = key(None, "instead of tissue: the springs", "a mapping with structural, shear, virtual")
+    damping: NotNegative = key(0.0, "with springs: C, force per velocity [N s/m]", "a number, 0 or more, in N s/m")
     probes: Annotated[tuple[Probe, ...], Field(max_length=MAX_PROBES)] = key(
-        (), means="the tools", expects=f"a list of at most {MAX_PROBES} mappings with at, total or force, load"
+        (), "the tools", f"a list of at most {MAX_PROBES} mappings with at, total or force, load"
     )
-    time: Time = key(means="time span, frames and steps", expects="a mapping with at least duration")
-    render: Render = key(Render(), means="how a frame is drawn", expects="a mapping")
+    time: Time = key(..., "time span, frames and steps", "a mapping with at least duration")
+    render: Render = key(Render(), "how a frame is drawn", "a mapping")
     output: tuple[OutputName, ...] = key(
         ("png", "gif", "trajectory"),
-        means="what is written besides run.json; [] simulates only",
-        expects=f"a list of {', '.join(OUTPUTS)}",
+        "what is written besides run.json; [] simulates only",
+        f"a list of {', '.join(OUTPUTS)}",
     )
 
     def asks_for(self, *sources: str) -> bool:
@@ -519,8 +468,7 @@ class Scene(Section):
     @property
     def stiffness_map(self) -> StiffnessMap | None:
         """The map of the springs or the tissue."""
-        sheet = self.tissue or self.springs
-        return None if sheet is None else sheet.map
+        return self.maps.get("map")
 
     @property
     def maps(self) -> dict[str, StiffnessMap]:
@@ -544,9 +492,7 @@ class Scene(Section):
     @model_validator(mode="after")
     def _picture_given(self) -> Scene:
         if self.draws and self.image is None:
-            raise PydanticCustomError(
-                REFUSED,
-                "a picture is needed to draw png or gif; name one, or set output to [trajectory] or []",
-                {"key": "image"},
+            raise refused(
+                "a picture is needed to draw png or gif; name one, or set output to [trajectory] or []", "image"
             )
         return self

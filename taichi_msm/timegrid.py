@@ -13,18 +13,12 @@ class TimeGrid:
     """The steps of a run; `physics.planning` decides them for a scene.
 
     Times are quotients of whole numbers of steps, never sums of steps.
-
-    Attributes:
-        frames_per_second: frames per simulated second [1/s].
-        frames: F, the number of frame intervals; F + 1 frames are drawn.
-        steps_per_frame: number of steps from one frame to the next, 1 or more.
-        precision: floating-point precision of the steps.
     """
 
-    frames_per_second: float
-    frames: int
-    steps_per_frame: int
-    precision: Precision
+    frames_per_second: float  # [1/s]
+    frames: int  # F, the number of frame intervals; F + 1 frames are drawn
+    steps_per_frame: int  # from one frame to the next, 1 or more
+    precision: Precision  # of the steps
 
     @property
     def steps(self) -> int:

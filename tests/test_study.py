@@ -25,18 +25,22 @@ from taichi_msm.runner import run
 from taichi_msm.scene import Scene
 from taichi_msm.study import measure, pictures, terms
 from taichi_msm.study.peer import FailedError, TooSlowError, solve
-from taichi_msm.study.pictures import PictureStudy
+from taichi_msm.study.pictures import measure_pictures
 from taichi_msm.study.points import ROUNDS as POINTS_ROUNDS
 from taichi_msm.study.points import PointStudy, lattices
 from taichi_msm.study.result import Drawn, Stepping, Study, Timing, observed_orders
 from taichi_msm.study.stepping import MARGIN, ROUNDS, SteppingStudy
-from taichi_msm.study.terms import TermStudy, variants
+from taichi_msm.study.terms import measure_terms, variants
 from taichi_msm.system.runtime import Device
 from tests import reference
 from tests.motion import frames_on, structure_of
 from tests.scenes import PRESS, SPRINGS, plan_of, scene, speckle
 
 SOFT_PRESS = {**PRESS, "force": [0, 300, -1000]}
+
+
+def study_of(made: Scene) -> Study:
+    return Study("press", made.model_dump(), "complete", 1e-3, {})
 
 
 def nothing(done: int, total: int) -> None:
@@ -47,13 +51,13 @@ def nothing(done: int, total: int) -> None:
 def stepping(device: Device) -> Any:
     """A study of a small scene with a release on a step."""
     made = scene(probes=[SOFT_PRESS], damping=0.02, time={"damping_difference": "backward"})
-    with closing(SteppingStudy(plan_of(made), device, 0.05, nothing)) as measured:
+    with closing(SteppingStudy(plan_of(made), device, 0.05, study_of(made), nothing)) as measured:
         measured.run()
         yield measured
 
 
 def test_stepping_starts_at_the_largest_stable_step_and_halves_it(stepping: SteppingStudy) -> None:
-    points = stepping.results
+    points = stepping.study.stepping
     assert {point.method for point in points} == {"f32 central", "f32 backward", "f64 central", "f64 backward"}
     for method in ("f32 central", "f64 backward"):
         steps = [point.step for point in points if point.method == method]
@@ -66,32 +70,32 @@ def test_stepping_starts_at_the_largest_stable_step_and_halves_it(stepping: Step
 
 
 def test_errors_of_stepping_are_those_of_the_twin(stepping: SteppingStudy) -> None:
-    point = next(point for point in stepping.results if point.method == "f64 backward")
+    point = next(point for point in stepping.study.stepping if point.method == "f64 backward")
     made = with_time(stepping.plan.scene, step=point.step, precision="f64")
     exact = reference.simulate(with_time(made, step=point.step / 64, damping_difference="central"))
     wrong = reference.simulate(made) - exact
     largest = np.linalg.norm(exact - exact[0], axis=-1).max()
     # 64 times finer, of order 2 beside one of order 1, the twin is off by 1 % of the error or less.
     assert point.error == pytest.approx(np.linalg.norm(wrong, axis=-1).max() / largest, rel=0.01)
-    assert stepping.reference is not None
-    assert stepping.reference.largest == pytest.approx(largest, rel=1e-5)
+    assert stepping.study.reference is not None
+    assert stepping.study.reference.largest == pytest.approx(largest, rel=1e-5)
 
 
 def test_the_reference_is_as_exact_as_it_says(stepping: SteppingStudy) -> None:
     assert stepping.frames is not None
-    assert stepping.reference is not None
+    assert stepping.study.reference is not None
     made = with_time(stepping.plan.scene, damping_difference="central")
     solved, _ = solve(plan_of(made), 1e-12, 1e-14, float("inf"), lambda: None)
-    error = np.linalg.norm(solved - stepping.frames, axis=-1).max() / stepping.reference.largest
+    error = np.linalg.norm(solved - stepping.frames, axis=-1).max() / stepping.study.reference.largest
     # The integrator keeps 1e-12 a step, of some thousand steps.
-    assert error < stepping.reference.error + 1e-9
-    for point in stepping.results:
+    assert error < stepping.study.reference.error + 1e-9
+    for point in stepping.study.stepping:
         assert point.error is not None
-        assert point.known == (point.error >= MARGIN * stepping.reference.error)
+        assert point.known == (point.error >= MARGIN * stepping.study.reference.error)
 
 
 def test_observed_orders(stepping: SteppingStudy) -> None:
-    orders = observed_orders(stepping.results)
+    orders = observed_orders(stepping.study.stepping)
     assert orders["f64 backward"] == pytest.approx(1, abs=0.15)
     # From the limit of stability down the first halvings are not in the range of the asymptote yet.
     assert orders["f64 central"] == pytest.approx(2, abs=0.3)
@@ -110,9 +114,9 @@ def test_orders_are_fitted_above_the_rounding_floor() -> None:
 def test_a_series_halves_its_steps_though_they_miss_a_jump(device: Device) -> None:
     # A release at 3.25 frames, which no ninth of a frame meets.
     made = scene(probes=[{**SOFT_PRESS, "load": [[0, 100], [0.13, 100], [0.13, 0]]}], time={"duration": 0.2})
-    with closing(SteppingStudy(plan_of(made), device, 0.001, nothing)) as measured:
+    with closing(SteppingStudy(plan_of(made), device, 0.001, study_of(made), nothing)) as measured:
         measured.run()
-        counts = [point.steps_per_frame for point in measured.results if point.method == "f64 central"]
+        counts = [point.steps_per_frame for point in measured.study.stepping if point.method == "f64 central"]
     assert counts == [9, 18, 36]
 
 
@@ -138,9 +142,9 @@ def test_a_timing_is_a_median_with_its_spread() -> None:
 
 
 def test_an_error_near_that_of_the_reference_is_not_known(stepping: SteppingStudy) -> None:
-    assert stepping.reference is not None
-    assert stepping.known(21 * stepping.reference.error)
-    assert not stepping.known(19 * stepping.reference.error)
+    assert stepping.study.reference is not None
+    assert stepping.known(21 * stepping.study.reference.error)
+    assert not stepping.known(19 * stepping.study.reference.error)
 
 
 def test_dop853_gives_up_in_time() -> None:
@@ -174,7 +178,8 @@ def test_why_dop853_is_left_out_is_told(
         raise raised
 
     monkeypatch.setattr(measure, "solve", solve)
-    found = Study("press", scene().model_dump(), "complete", 1e-3, {})
+    found = study_of(scene())
+    found.reference = stepping.study.reference
     measure._measure_peer(plan_of(scene()), stepping, measure.QUICK, found, lambda stage, done, total: None)
     who = "DOP853, SciPy's general integrator, which the study compares its own steps with,"
     assert found.notes == [f"{who} {said}; no other figure depends on it"]
@@ -213,16 +218,17 @@ def test_all_terms_are_timed_on_the_grid_of_the_whole_scene(device: Device, monk
 
     monkeypatch.setattr(terms, "Dynamics", Recorded)
     made = scene(time={"precision": "auto"})
-    TermStudy(plan_of(made), device, 0.0001, nothing).run()
+    measure_terms(plan_of(made), device, 0.0001, study_of(made), nothing)
     assert len(grids) == len(list(variants(made)))
     assert set(grids) == {plan_of(made).grid} != {plan_of(variant).grid for _, variant in variants(made)}
 
 
 def test_terms_are_timed(device: Device) -> None:
-    measured = TermStudy(plan_of(scene(damping=0, springs={"shear": 10})), device, 0.001, nothing)
-    measured.run()
-    assert [term.without for term in measured.results] == ["", "springs.shear", "probes.0"]
-    assert all(1e-8 < term.seconds.median < 1e-2 and term.seconds.runs == 9 for term in measured.results)
+    made = scene(damping=0, springs={"shear": 10})
+    study = study_of(made)
+    measure_terms(plan_of(made), device, 0.001, study, nothing)
+    assert [term.without for term in study.terms] == ["", "springs.shear", "probes.0"]
+    assert all(1e-8 < term.seconds.median < 1e-2 and term.seconds.runs == 9 for term in study.terms)
 
 
 def tissue(points: tuple[int, int] = (33, 33), **time: Any) -> Scene:
@@ -243,15 +249,19 @@ def tissue(points: tuple[int, int] = (33, 33), **time: Any) -> Scene:
     )
 
 
+def points_study(made: Scene, device: Device, longest_run: float) -> Study:
+    study = study_of(made)
+    PointStudy(plan_of(made), device, longest_run, study, nothing).run()
+    return study
+
+
 @pytest.fixture(scope="module")
-def points(device: Device) -> PointStudy:
-    measured = PointStudy(plan_of(tissue()), device, 2.0, nothing)
-    measured.run()
-    return measured
+def points(device: Device) -> Study:
+    return points_study(tissue(), device, 2.0)
 
 
-def test_the_error_of_points_is_of_order_2(points: PointStudy) -> None:
-    found = points.results
+def test_the_error_of_points_is_of_order_2(points: Study) -> None:
+    found = points.points
     assert points.notes == []
     assert [one.name for one in found] == ["9 x 9", "17 x 17", "33 x 33", "65 x 65"]
     assert [one.known for one in found[:3]] == [True] * 3
@@ -264,7 +274,7 @@ def test_the_error_of_points_is_of_order_2(points: PointStudy) -> None:
     assert found[3].steps_per_frame / found[2].steps_per_frame == pytest.approx(2, abs=0.05)
 
 
-def test_the_error_of_points_is_that_against_many_more(points: PointStudy, device: Device) -> None:
+def test_the_error_of_points_is_that_against_many_more(points: Study, device: Device) -> None:
     many = tissue((65, 65))
     steps = plan_of(many).grid.steps_per_frame
 
@@ -273,15 +283,15 @@ def test_the_error_of_points_is_that_against_many_more(points: PointStudy, devic
 
     exact = displacements(65)
     largest = np.linalg.norm(exact, axis=-1).max()
-    for found in points.results[1:3]:
+    for found in points.points[1:3]:
         stride = 64 // (found.rows - 1)
         apart = np.linalg.norm(displacements(found.rows) - exact[:, ::stride, ::stride], axis=-1).max() / largest
         # 65 x 65 have 1/4 of the error of 33 x 33 themselves; and between the points it may be somewhat larger.
         assert apart <= (found.error or 0.0) < 1.6 * apart
 
 
-def test_the_estimate_beside_it_is_that_of_a_run(points: PointStudy, device: Device, tmp_path: Path) -> None:
-    found = points.results[1]
+def test_the_estimate_beside_it_is_that_of_a_run(points: Study, device: Device, tmp_path: Path) -> None:
+    found = points.points[1]
     record = run(tissue((17, 17)), tmp_path / "out", threads=device.threads, estimate_error=True)
     estimate = record["error_estimate"]
     assert estimate is not None
@@ -289,10 +299,9 @@ def test_the_estimate_beside_it_is_that_of_a_run(points: PointStudy, device: Dev
     assert estimate["mesh_error"] == pytest.approx(found.estimate, rel=0.01)
 
 
-def test_without_time_for_more_points_the_error_of_the_finest_is_a_bound(points: PointStudy, device: Device) -> None:
-    measured = PointStudy(plan_of(tissue()), device, 1e-6, nothing)
-    measured.run()
-    found, better = measured.results, points.results
+def test_without_time_for_more_points_the_error_of_the_finest_is_a_bound(points: Study, device: Device) -> None:
+    measured = points_study(tissue(), device, 1e-6)
+    found, better = measured.points, points.points
     assert measured.notes == ["65 x 65 points were not measured: time or memory"]
     assert [one.name for one in found] == ["9 x 9", "17 x 17", "33 x 33"]
     assert found[0].known
@@ -305,9 +314,7 @@ def test_where_the_finest_is_the_reference_its_error_is_never_known(device: Devi
     made = tissue((13, 13))
     assert made.tissue is not None
     slack = made.model_copy(update={"tissue": made.tissue.model_copy(update={"pretension": 0.0, "foundation": 2e6})})
-    measured = PointStudy(plan_of(slack), device, 1e-6, nothing)
-    measured.run()
-    assert [one.known for one in measured.results] == [True, False]
+    assert [one.known for one in points_study(slack, device, 1e-6).points] == [True, False]
 
 
 def points_of(plans: Iterable[Plan]) -> list[tuple[int, int]]:
@@ -324,28 +331,26 @@ def test_points_are_quarters_and_halves_of_the_cells() -> None:
 
 
 def test_a_sheet_of_too_few_points_is_left_out(device: Device) -> None:
-    measured = PointStudy(plan_of(tissue((6, 6))), device, 1.0, nothing)
-    measured.run()
-    assert measured.results == []
+    measured = points_study(tissue((6, 6)), device, 1.0)
+    assert measured.points == []
     assert measured.notes == ["points were not measured: with fewer than 7 a side they cannot be compared"]
 
 
 def test_springs_have_no_part_of_points(device: Device) -> None:
-    made = Study("press", scene().model_dump(), "complete", 1e-3, {})
-    measure._measure_points(plan_of(scene()), device, measure.QUICK, made, lambda stage, done, total: None)
+    made = points_study(scene(), device, 1.0)
     assert (made.points, made.notes) == ([], [])
 
 
 def test_an_interruption_leaves_the_points_that_were_timed(device: Device) -> None:
-    made = Study("press", tissue((13, 13)).model_dump(), "complete", 1e-3, {})
+    made = study_of(tissue((13, 13)))
 
-    def stop(stage: str, done: int, total: int) -> None:
+    def stop(done: int, total: int) -> None:
         # The estimates and the errors of three are done, and one was timed once.
         if done == 2 * 3 + 1 + 1:
             raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):
-        measure._measure_points(plan_of(tissue((13, 13))), device, measure.QUICK, made, stop)
+        PointStudy(plan_of(tissue((13, 13))), device, measure.QUICK.longest_run, made, stop).run()
     made.finish()
     assert [(one.name, one.seconds.runs) for one in made.points] == [("7 x 7", 1)]
     assert made.points[0].error is not None
@@ -358,9 +363,9 @@ def test_pictures_are_judged_by_a_finer_one(device: Device, monkeypatch: pytest.
     made = scene(render={"size": [60, 45], "camera": "oblique", "refine": 3})
     position = rest_positions(made.sheet)
     position[4, 5, 2] += 0.05
-    measured = PictureStudy(made, position, speckle(20, 30), False, nothing)
-    measured.run()
-    points = {(point.refine, point.supersample): point for point in measured.results}
+    study = study_of(made)
+    measure_pictures(made, position, speckle(20, 30), False, study, nothing)
+    points = {(point.refine, point.supersample): point for point in study.drawing}
     assert set(points) == {(0, 1), (3, 1), (0, 4), (3, 4)}
     psnr = {setting: point.psnr or 0.0 for setting, point in points.items()}
     assert psnr[3, 4] > max(psnr[0, 4], psnr[3, 1]) > psnr[0, 1]
@@ -380,10 +385,9 @@ def test_psnr_is_of_values_to_255() -> None:
     assert pictures.psnr(black, black) is None
 
 
-def test_a_quick_study_of_pictures_varies_one_at_a_time(device: Device) -> None:
+def test_a_quick_study_of_pictures_varies_one_at_a_time() -> None:
     made = scene(render={"size": [6, 4], "refine": 2, "supersample": 3})
-    measured = PictureStudy(made, rest_positions(made.sheet), speckle(3, 3), True, nothing)
-    settings = measured._settings
+    settings = list(pictures.settings(made, quick=True))
     assert settings == [(2, 1), (2, 2), *((refine, 3) for refine in (0, 1, 2, 5, 10, 20)), (2, 4)]
 
 
@@ -403,7 +407,7 @@ def drawn(refine: int, psnr: float | None, seconds: float, supersample: int = 1)
 
 
 def test_the_recommendation_is_the_cheapest_within_the_tolerance() -> None:
-    made = Study("press", scene().model_dump(), "complete", 1e-3, {})
+    made = study_of(scene())
     assert made.recommendation() == []
     made.stepping = [
         stepping_point(2e-3, 1.0),
@@ -427,7 +431,7 @@ def test_the_recommendation_is_the_cheapest_within_the_tolerance() -> None:
 
 def test_the_step_recommended_is_one_that_a_scene_takes() -> None:
     # Written with few digits, it must still divide a frame.
-    made = Study("press", scene().model_dump(), "complete", 1e-3, {})
+    made = study_of(scene())
     made.stepping = [stepping_point(1e-4, 1.0, step=1 / 25 / 77, steps_per_frame=77)]
     text = made.recommendation()[1].split(": ")[1]
     assert plan_of(with_time(scene(), step=float(text))).grid.steps_per_frame == 77
@@ -435,7 +439,7 @@ def test_the_step_recommended_is_one_that_a_scene_takes() -> None:
 
 
 def test_of_one_method_the_largest_step_is_recommended() -> None:
-    made = Study("press", scene().model_dump(), "complete", 1e-3, {})
+    made = study_of(scene())
     made.stepping = [stepping_point(5e-4, 1.1, step=0.001), stepping_point(1e-4, 1.0, step=0.0005)]
     assert made.best_stepping is made.stepping[0]
 
@@ -449,8 +453,8 @@ def test_an_interruption_leaves_what_is_done(device: Device) -> None:
         if calls > 90:
             raise KeyboardInterrupt
 
-    with closing(SteppingStudy(plan_of(scene(probes=[SOFT_PRESS])), device, 0.01, stop)) as measured:
+    with closing(SteppingStudy(plan_of(scene(probes=[SOFT_PRESS])), device, 0.01, study_of(scene()), stop)) as measured:
         with pytest.raises(KeyboardInterrupt):
             measured.run()
-        assert measured.reference is not None
-        assert measured.results
+        assert measured.study.reference is not None
+        assert measured.study.stepping

@@ -5,16 +5,15 @@ from __future__ import annotations
 import codecs
 import json
 import re
-import stat
-from collections.abc import Iterable, Iterator, Mapping, Sequence
-from itertools import chain
+from collections.abc import Iterable, Mapping, Sequence
+from itertools import chain, starmap
 from pathlib import Path
 from typing import Any, NamedTuple
 
 from taichi_msm.errors import ArgumentError, Key, Problem, SceneError
 from taichi_msm.faults import cut, flow
 from taichi_msm.physics.plan import Plan
-from taichi_msm.picture import SUFFIXES
+from taichi_msm.picture import SUFFIXES, irregular
 from taichi_msm.scene import MAX_PATH, Scene
 from taichi_msm.scenefile.validation import validate
 from taichi_msm.scenefile.yaml_reader import MAX_DEPTH, Document, Mark, UnreadableError, mark_at, read
@@ -31,15 +30,10 @@ MAX_LINES = 100
 
 
 class Kind(NamedTuple):
-    """What a file should be.
+    """What a file should be."""
 
-    Attributes:
-        name: what it is called.
-        needs: the keys that it must have.
-    """
-
-    name: str
-    needs: str
+    name: str  # what it is called
+    needs: str  # the keys that it must have
 
 
 _SCENE = Kind("scene", "sheet, tissue or springs, and time")
@@ -86,10 +80,12 @@ def load_plan(
         isinstance(overrides, (Sequence, Mapping)) and all(isinstance(one, str) for one in overrides)
     ):
         raise ArgumentError(f'overrides: {overrides!r}; take ["sheet.points=[61,61]"] or {{"sheet.points": [61, 61]}}')
-    draft = Draft(str(path), read_file(str(path), _SCENE))
-    for override in _parse_overrides(overrides):
+    draft = Draft(str(path), _SCENE)
+    parsed = starmap(_parse_value, overrides.items()) if isinstance(overrides, Mapping) else map(_parse_text, overrides)
+    for override in parsed:
         draft.override(override)
-    draft.find_pictures(Path(path).parent, PICTURES if image is None else MAPS)
+    for key in PICTURES if image is None else MAPS:
+        draft.find_picture(key, Path(path).parent)
     if image is not None:
         draft.override(_Override(f"--image {cut(str(image))}", IMAGE, str(image)))
     plan, problems = validate(draft.data)
@@ -100,11 +96,7 @@ def load_plan(
 
 
 def schema() -> dict[str, Any]:
-    """Describe the scene for editors, as JSON Schema (draft 2020-12).
-
-    It has the rules for single keys; those for several keys together, such as the stability limit of the step, are
-    checked when a scene is loaded.
-    """
+    """Describe the scene for editors, as JSON Schema (draft 2020-12): the rules for single keys."""
     return {"$schema": "https://json-schema.org/draft/2020-12/schema"} | Scene.model_json_schema()
 
 
@@ -117,12 +109,6 @@ class _Override(NamedTuple):
     problems: Sequence[Problem] = ()
 
 
-def _parse_overrides(overrides: Sequence[str] | Mapping[str, Any]) -> Iterator[_Override]:
-    if isinstance(overrides, Mapping):
-        return (_parse_value(key, value) for key, value in overrides.items())
-    return (_parse_text(text) for text in overrides)
-
-
 def _parse_text(text: str) -> _Override:
     key, equals, value = text.partition("=")
     name = f"--set {cut(key)}{equals}{cut(value)}"
@@ -133,7 +119,7 @@ def _parse_text(text: str) -> _Override:
         document = read(value)
     except UnreadableError as error:
         return _Override(name, path, problems=[Problem(path, str(error))])
-    faults = [Problem(path + fault.path, fault.message) for fault in document.faults]
+    faults = [Problem(path + fault.path, fault.message) for _, fault in document.faults]
     return _Override(name, path, document.data, faults)
 
 
@@ -159,38 +145,31 @@ def _parse_key(key: str) -> Key:
 
 
 class _Place(NamedTuple):
-    """Where a key was given; places are sorted in the order of reading: the file, then the overrides.
+    """Where a key was given; places are sorted in the order of reading: the file, then the overrides."""
 
-    Attributes:
-        source: 0 for the file; 1, 2, ... for the overrides.
-        mark: line and column in the file.
-        name: of the place in messages, such as press.yaml:7:3.
-    """
-
-    source: int
-    mark: Mark
-    name: str
+    source: int  # 0 for the file; 1, 2, ... for the overrides
+    mark: Mark  # in the file
+    name: str  # of the place in messages, such as press.yaml:7:3
 
 
 class Draft:
-    """The content of a file while overrides are applied to it.
-
-    Args:
-        name: of the file.
-        document: its content.
+    """The content of a file, a mapping whose keys are not checked, while overrides are applied to it.
 
     Attributes:
         data: its content, with the overrides applied so far.
         problems: found so far, each with its place.
+
+    Raises:
+        SceneError: when the file contains no mapping, or cannot be read.
     """
 
-    def __init__(self, name: str, document: Document) -> None:
-        self._name = name
-        self._marks = document.marks
+    def __init__(self, name: str, kind: Kind) -> None:
+        document = _read_file(name, kind)
+        self._name, self._marks = name, document.marks
         self._overrides = 0
         self._overridden: dict[Key, _Place] = {}
         self.data: dict[str, Any] = document.data
-        self.problems = [(self._in_file(mark), Problem(key, message)) for mark, key, message in document.faults]
+        self.problems = [(self._in_file(mark), problem) for mark, problem in document.faults]
 
     def override(self, override: _Override) -> None:
         """Apply an override."""
@@ -201,12 +180,8 @@ class Draft:
         elif problem := self._put(override.path, override.value, place):
             self.problems.append((place, problem))
 
-    def find_pictures(self, folder: Path, keys: Sequence[Key]) -> None:
-        """Change the paths of pictures, given relative to a folder, to paths from the current directory."""
-        for key in keys:
-            self._find_picture(key, folder)
-
-    def _find_picture(self, key: Key, folder: Path) -> None:
+    def find_picture(self, key: Key, folder: Path) -> None:
+        """Change the path of a picture, given relative to a folder, to one from the current directory."""
         holder: Any = self.data
         for part in key[:-1]:
             holder = holder.get(part) if isinstance(holder, dict) else None
@@ -233,8 +208,11 @@ class Draft:
     def lines(self) -> list[str]:
         """Format the problems in the order of their places."""
         ordered = sorted(self.problems, key=lambda item: item[0][:2])
-        lines = [_line(place.name, problem) for place, problem in ordered[:MAX_LINES]]
-        return lines if len(lines) == len(ordered) else [*lines, "and more"]
+        shown = [
+            f"{place.name}: {Problem(tuple(cut(str(part)) for part in problem.path), problem.message)}"
+            for place, problem in ordered[:MAX_LINES]
+        ]
+        return shown if len(shown) == len(ordered) else [*shown, "and more"]
 
     def _in_file(self, mark: Mark) -> _Place:
         return _Place(0, mark, f"{self._name}:{mark.line}:{mark.column}")
@@ -280,55 +258,38 @@ def _is_below(path: Path, folder: Path) -> bool:
         return True
 
 
-def read_file(name: str, kind: Kind) -> Document:
-    """Read a file that contains a mapping, without checking its keys.
-
-    Raises:
-        SceneError: when it contains no mapping, or cannot be read.
-    """
-    text = _read_text(name, kind)
+def _read_file(name: str, kind: Kind) -> Document:
     try:
-        document = read(text)
+        document = read(_read_text(name, kind))
     except UnreadableError as error:
-        raise _error(f"{name}:{error.mark.line}:{error.mark.column}", str(error)) from None
+        raise SceneError([f"{name}:{error.mark.line}:{error.mark.column}: {error}"]) from None
     if document.data is None:
-        raise _error(f"{name}:1:1", f"no keys; a {kind.name} needs at least {kind.needs}")
+        raise SceneError([f"{name}:1:1: no keys; a {kind.name} needs at least {kind.needs}"])
     if not isinstance(document.data, dict):
-        raise _error(f"{name}:1:1", f"{flow(document.data)} is not a {kind.name}; expected keys such as {kind.needs}")
+        said = f"{flow(document.data)} is not a {kind.name}; expected keys such as {kind.needs}"
+        raise SceneError([f"{name}:1:1: {said}"])
     return document
 
 
 def _read_text(name: str, kind: Kind) -> str:
     path = Path(name)
     try:
-        mode = path.stat().st_mode
-        if not stat.S_ISREG(mode):
-            # Opening a pipe would block until its other end is opened.
-            what = "a directory" if stat.S_ISDIR(mode) else "not a regular file"
-            raise _error(name, f"{what}; name a {kind.name} file")
+        if what := irregular(path):
+            raise SceneError([f"{name}: {what}; name a {kind.name} file"])
         with path.open("rb") as file:
             raw = file.read(MAX_BYTES + 1).removeprefix(codecs.BOM_UTF8)
     except ValueError:
-        raise _error(name, f"not a path; name a {kind.name} file") from None
+        raise SceneError([f"{name}: not a path; name a {kind.name} file"]) from None
     except OSError as error:
-        raise _error(name, (error.strerror or str(error)).lower()) from None
+        raise SceneError([f"{name}: {(error.strerror or str(error)).lower()}"]) from None
     if len(raw) > MAX_BYTES:
-        raise _error(name, f"larger than {MAX_BYTES // 2**20} MiB; a {kind.name} is smaller")
+        raise SceneError([f"{name}: larger than {MAX_BYTES // 2**20} MiB; a {kind.name} is smaller"])
     try:
         return raw.decode()
     except UnicodeDecodeError as error:
         if path.suffix.lower() in SUFFIXES:
-            said = f"a picture; name a {kind.name}, and the picture by --image"
-            raise _error(name, said if kind is _SCENE else f"a picture; name a {kind.name}") from None
+            by = ", and the picture by --image" if kind is _SCENE else ""
+            raise SceneError([f"{name}: a picture; name a {kind.name}{by}"]) from None
         before = raw[: error.start].decode()
         mark = mark_at(before, len(before))
-        raise _error(f"{name}:{mark.line}:{mark.column}", "not UTF-8; save the file as UTF-8") from None
-
-
-def _error(place: str, message: str) -> SceneError:
-    return SceneError([_line(place, Problem((), message))])
-
-
-def _line(place: str, problem: Problem) -> str:
-    """Format a problem as one line."""
-    return f"{place}: {Problem(tuple(cut(str(part)) for part in problem.path), problem.message)}"
+        raise SceneError([f"{name}:{mark.line}:{mark.column}: not UTF-8; save the file as UTF-8"]) from None

@@ -15,30 +15,15 @@ from taichi_msm.system.runtime import Device
 
 
 class Resolved(NamedTuple):
-    """A plan in which nothing is left open.
-
-    Attributes:
-        plan: its scene has the points, the step and the precision that were chosen.
-        estimate: of the error, if a tolerance of the time required it; else None.
-        mesh: the error of the points, if a tolerance of the sheet required it; else None.
-    """
+    """A plan in which nothing is left open: its scene has the points, the step and the precision that were chosen."""
 
     plan: Plan
-    estimate: Estimate | None
-    mesh: MeshEstimate | None
+    estimate: Estimate | None  # of the error, if a tolerance of the time required it
+    mesh: MeshEstimate | None  # the error of the points, if a tolerance of the sheet required it
 
 
 def resolve(plan: Plan, device: Device, progress: Count = lambda done, total: None) -> Resolved:
-    """Choose what a checked scene leaves open, by pilot runs where it has tolerances.
-
-    Args:
-        plan: what `checked` returned.
-        device: what `runtime.start` returned.
-        progress: called with the frames done and the frames in all of each pilot run.
-
-    Raises:
-        SceneError: when no points or no step meet a tolerance.
-    """
+    """Choose what a checked scene leaves open, by pilot runs where it has tolerances; SceneError: none meet them."""
     estimate = mesh = None
     plan = planning.on(plan, device.arch)
     if plan.scene.sheet.tolerance is not None:

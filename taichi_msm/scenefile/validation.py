@@ -34,10 +34,7 @@ def validate(data: dict[str, Any]) -> tuple[Plan | None, list[Problem]]:
     """Check a scene: first each key by itself, then several keys together.
 
     If some sections are faulty, the checks of several keys still run on the others, so that all problems are reported
-    at once.
-
-    Returns:
-        The scene's plan, or None if there is any problem; and the problems.
+    at once. Returns the scene's plan, or None if there is any problem; and the problems.
     """
     problems: list[Problem] = []
     plan = None
@@ -57,13 +54,7 @@ def validate(data: dict[str, Any]) -> tuple[Plan | None, list[Problem]]:
 def _joint_check(
     scene: Scene, image: MapImage | None = None, *, picture: bool = True
 ) -> tuple[Plan | None, list[Problem]]:
-    """Plan a scene whose keys are valid each by itself, and find what is wrong with several keys together.
-
-    Args:
-        scene: the scene.
-        image: of its map, as for `try_plan`.
-        picture: whether to check its picture too.
-    """
+    """Plan a scene whose keys are valid each by itself, and find what is wrong with several keys together."""
     plan, problems = try_plan(scene, image)
     problems += camera_problems(scene)
     if picture:
@@ -74,11 +65,7 @@ def _joint_check(
 
 
 def checked(scene: Plan | Scene | Mapping[str, Any], image: MapImage | None = None) -> Plan:
-    """Check a scene, except for its picture, and plan it for a CPU.
-
-    Args:
-        scene: a scene, which may have been made in Python, or a mapping of its keys; a plan was checked before.
-        image: of its map, as for `try_plan`.
+    """Check a scene but for its picture, or a mapping of its keys, and plan it for a CPU; a plan was checked before.
 
     Raises:
         ArgumentError: when it is none of these.
@@ -111,11 +98,7 @@ def _spare(data: dict[str, Any], problems: list[Problem]) -> dict[str, Any]:
 
 
 def parse(model: type[Model], data: dict[str, Any]) -> tuple[Model | None, list[Problem]]:
-    """Check each section of a file by itself.
-
-    Returns:
-        The model made of the file, or None if there is any problem; and the problems.
-    """
+    """Check each key by itself; returns the model, or None if there is any problem, and the problems."""
     try:
         return model.model_validate(data), []
     except ValidationError as error:

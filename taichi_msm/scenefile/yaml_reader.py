@@ -13,7 +13,7 @@ from typing import Any, NamedTuple
 
 import yaml
 
-from taichi_msm.errors import Key
+from taichi_msm.errors import Key, Problem
 from taichi_msm.faults import cut
 
 MAX_DEPTH = 20
@@ -55,26 +55,12 @@ class Mark(NamedTuple):
     column: int
 
 
-class Fault(NamedTuple):
-    """A fault of one node that does not keep the rest of the text from being read."""
-
-    mark: Mark
-    path: Key
-    message: str
-
-
 class Document(NamedTuple):
-    """The content of a text.
+    """The content of a text."""
 
-    Attributes:
-        data: None, bool, int, float, str, and lists and dicts of these; None for an empty text.
-        marks: places of all keys and of all items of lists.
-        faults: the first MAX_FAULTS faults that did not stop the reading.
-    """
-
-    data: Any
-    marks: dict[Key, Mark]
-    faults: list[Fault]
+    data: Any  # None, bool, int, float, str, and lists and dicts of these; None for an empty text
+    marks: dict[Key, Mark]  # of all keys and of all items of lists
+    faults: list[tuple[Mark, Problem]]  # the first MAX_FAULTS of those that did not stop the reading
 
 
 class UnreadableError(Exception):
@@ -86,11 +72,7 @@ class UnreadableError(Exception):
 
 
 def read(text: str) -> Document:
-    """Read one YAML document.
-
-    Raises:
-        UnreadableError: when the text is not YAML, nests too deeply or is too long; the rest is not read.
-    """
+    """Read one YAML document; UnreadableError: it is none, nests too deeply or is too long."""
     if bad := _NOT_ALLOWED.search(text):
         said = f"character U+{ord(bad[0]):04X} is not allowed; remove it"
         raise UnreadableError(mark_at(text, bad.start()), said)
@@ -144,7 +126,7 @@ class _Reader:
 
     def __init__(self, events: Iterator[Any]) -> None:
         self.marks: dict[Key, Mark] = {(): Mark(1, 1)}
-        self.faults: list[Fault] = []
+        self.faults: list[tuple[Mark, Problem]] = []
         self._events = events
         self._nodes = 0
 
@@ -191,7 +173,7 @@ class _Reader:
 
     def _refuse(self, event: Any, path: Key, message: str) -> None:
         if len(self.faults) < MAX_FAULTS:
-            self.faults.append(Fault(_mark(event.start_mark), path, message))
+            self.faults.append((_mark(event.start_mark), Problem(path, message)))
 
     def _items(self, path: Key) -> list[Any]:
         items: list[Any] = []

@@ -18,11 +18,11 @@ from taichi_msm.runner import versions
 from taichi_msm.scene import Scene
 from taichi_msm.scenefile.validation import checked
 from taichi_msm.study.peer import FailedError, TooSlowError, solve
-from taichi_msm.study.pictures import PictureStudy
+from taichi_msm.study.pictures import measure_pictures
 from taichi_msm.study.points import PointStudy
 from taichi_msm.study.result import Peer, Study
 from taichi_msm.study.stepping import SteppingStudy
-from taichi_msm.study.terms import TermStudy
+from taichi_msm.study.terms import measure_terms
 from taichi_msm.system import resources, runtime
 from taichi_msm.system.runtime import Device
 
@@ -39,15 +39,14 @@ TRAJECTORIES = 6
 class Effort(NamedTuple):
     """How long the parts of a study may take."""
 
-    quick: bool  # whether to vary the settings of drawing one at a time
     longest_run: float  # of stepping through the whole scene once [s]
     peer: float  # of SciPy for each of its tolerances [s]
     peer_rtols: tuple[float, ...]
     sample: float  # of one measurement of a step [s]
 
 
-QUICK = Effort(True, longest_run=0.25, peer=10.0, peer_rtols=(1e-4,), sample=0.02)
-FULL = Effort(False, longest_run=2.0, peer=30.0, peer_rtols=(1e-3, 1e-5, 1e-7), sample=0.1)
+QUICK = Effort(longest_run=0.25, peer=10.0, peer_rtols=(1e-4,), sample=0.02)
+FULL = Effort(longest_run=2.0, peer=30.0, peer_rtols=(1e-3, 1e-5, 1e-7), sample=0.1)
 
 
 def study(
@@ -60,17 +59,11 @@ def study(
     threads: int | None = None,
     progress: Progress = lambda stage, done, total: None,
 ) -> Study:
-    """Measure the cost and the error of the settings of a scene on this machine.
+    """Measure the cost and the error of the settings of a scene on this machine, under a name for the report.
 
-    Args:
-        scene: what `load_scene` returned.
-        name: of the scene, for the report.
-        tolerance: largest allowed error, as a fraction of the largest displacement; None: the scene's, or else 1e-3.
-        quick: whether to measure fewer settings in less time: about a minute for a small sheet.
-        arch: cpu or cuda.
-        threads: number of CPU threads; None takes every core.
-        progress: called with the stage, the work done and all of it. If it raises KeyboardInterrupt, the study returns
-            what is done.
+    The tolerance is a fraction of the largest displacement; None: the scene's, or else 1e-3. `quick` measures fewer
+    settings, in about a minute for a small sheet. If `progress` raises KeyboardInterrupt, the study returns what is
+    done.
 
     Raises:
         SceneError: when the picture cannot be decoded, or the trajectories do not fit in memory.
@@ -92,18 +85,19 @@ def study(
     plan = on(make_plan(with_time(scene, tolerance=None), given.image), device.arch)
     scene = plan.scene
     try:
-        with closing(SteppingStudy(plan, device, effort.longest_run, partial(progress, "stepping"))) as stepping:
-            results.stepping = stepping.results
-            try:
-                stepping.run()
-            finally:
-                results.reference = stepping.reference
+        stepping = SteppingStudy(plan, device, effort.longest_run, results, partial(progress, "stepping"))
+        with closing(stepping):
+            stepping.run()
         _measure_peer(plan, stepping, effort, results, progress)
-        _measure_pictures(scene, stepping, texture, effort, results, progress)
-        _measure_points(plan, device, effort, results, progress)
-        terms = TermStudy(plan, device, effort.sample, partial(progress, "terms"))
-        results.terms = terms.results
-        terms.run()
+        if texture is None:
+            results.notes.append("drawing was left out: the scene names no image")
+        else:
+            assert stepping.frames is not None
+            deformed = max(stepping.frames, key=lambda frame: (frame**2).sum(axis=-1).max())
+            position = rest_positions(scene.sheet) + deformed
+            measure_pictures(scene, position, texture, quick, results, partial(progress, "drawing"))
+        PointStudy(plan, device, effort.longest_run, results, partial(progress, "points")).run()
+        measure_terms(plan, device, effort.sample, results, partial(progress, "terms"))
     except KeyboardInterrupt:
         results.status = "interrupted"
         results.notes.append("interrupted: what was measured until then")
@@ -128,23 +122,21 @@ def _require_memory(scene: Scene) -> None:
     needed = TRAJECTORIES * scene.time.frames * rows * cols * 3 * 8
     available = resources.available_memory()
     if needed > available:
-        raise SceneError(
-            [
-                f"time.duration: a study keeps the trajectories of all frames, {needed / 2**30:.3g} GiB here, but "
-                f"{available / 2**30:.3g} GiB is free; study a shorter time.duration or fewer sheet.points"
-            ]
+        said = (
+            f"time.duration: a study keeps the trajectories of all frames, {needed / 2**30:.3g} GiB here, but "
+            f"{available / 2**30:.3g} GiB is free; study a shorter time.duration or fewer sheet.points"
         )
+        raise SceneError([said])
 
 
 def _measure_peer(plan: Plan, stepping: SteppingStudy, effort: Effort, results: Study, progress: Progress) -> None:
     """Solve by DOP853 at several tolerances, each as many times as time allows, up to 5."""
-    assert stepping.reference is not None
-    rtols = effort.peer_rtols
-    for index, rtol in enumerate(rtols):
+    assert results.reference is not None
+    for index, rtol in enumerate(effort.peer_rtols):
         samples: list[float] = []
         deadline = time.perf_counter() + effort.peer
-        atol = rtol * (stepping.reference.largest or 1.0) / 10
-        tick = partial(progress, "dop853", index, len(rtols))
+        atol = rtol * (results.reference.largest or 1.0) / 10
+        tick = partial(progress, "dop853", index, len(effort.peer_rtols))
         try:
             while len(samples) < 5:
                 start = time.perf_counter()
@@ -152,47 +144,15 @@ def _measure_peer(plan: Plan, stepping: SteppingStudy, effort: Effort, results: 
                 samples.append(time.perf_counter() - start)
         except TooSlowError:
             if not samples:
-                results.notes.append(
-                    f"{DOP853} takes more than {effort.peer:g} s at rtol {rtol:g} and was stopped; {APART}"
-                )
+                said = f"takes more than {effort.peer:g} s at rtol {rtol:g} and was stopped"
+                results.notes.append(f"{DOP853} {said}; {APART}")
                 return
         except FailedError as failure:
-            results.notes.append(
-                f"{DOP853} finds no step small enough {failure}, at rtol {rtol:g}: forces change too suddenly for it "
-                f"there, as where a spring is pressed to a point or the sheet runs away; {APART}"
+            said = (
+                f"finds no step small enough {failure}, at rtol {rtol:g}: forces change too suddenly for it there, as "
+                "where a spring is pressed to a point or the sheet runs away"
             )
+            results.notes.append(f"{DOP853} {said}; {APART}")
             return
         error = stepping.relative(frames)
         results.peers.append(Peer(rtol, error, stepping.known(error), evaluations, samples=samples))
-
-
-def _measure_pictures(
-    scene: Scene, stepping: SteppingStudy, texture: Any, effort: Effort, results: Study, progress: Progress
-) -> None:
-    """Draw the most deformed frame of the reference."""
-    if texture is None:
-        results.notes.append("drawing was left out: the scene names no image")
-        return
-    assert stepping.frames is not None
-    deformed = max(stepping.frames, key=lambda frame: (frame**2).sum(axis=-1).max())
-    position = rest_positions(scene.sheet) + deformed
-    pictures = PictureStudy(scene, position, texture, effort.quick, partial(progress, "drawing"))
-    results.drawing = pictures.results
-    _run(pictures, results)
-
-
-def _measure_points(plan: Plan, device: Device, effort: Effort, results: Study, progress: Progress) -> None:
-    """Vary the number of points of tissue; with springs, other points would make another sheet."""
-    if plan.scene.tissue is None:
-        return
-    points = PointStudy(plan, device, effort.longest_run, partial(progress, "points"))
-    results.points = points.results
-    _run(points, results)
-
-
-def _run(part: PictureStudy | PointStudy, results: Study) -> None:
-    """Measure a part, and keep its notes even if it is interrupted."""
-    try:
-        part.run()
-    finally:
-        results.notes += part.notes

@@ -40,6 +40,10 @@ SHEETS: Columns = {
     "estimate": lambda points: "not known" if points.estimate is None else number(points.estimate),
     "time of the scene": lambda points: timing(points.seconds),
 }
+TERMS: Columns = {
+    "without": lambda term: term.without or "nothing",
+    "time of a step": lambda term: timing(term.seconds),
+}
 # The columns of stepping that the terminal shows.
 BRIEF = ("method", "step", "error", "time of the scene")
 
@@ -67,7 +71,9 @@ def page(study: Study) -> str:
     if study.points:
         blocks += _points(study)
     if study.terms:
-        blocks += ["## Terms", _terms_table(study)]
+        whole = study.terms[0].seconds.median
+        share: Columns = {"of the whole step": lambda term: f"{100 * term.seconds.median / whole:.0f} %"}
+        blocks += ["## Terms", table(study.terms, {**TERMS, **share})]
     if study.notes:
         blocks += ["## Notes", "\n".join(f"- {note}" for note in study.notes)]
     blocks += ["## Recommendation", *remarks(study)]
@@ -85,7 +91,7 @@ def summary(study: Study) -> str:
             f"tolerance {study.tolerance:g}"
         )
     methods = dict.fromkeys(point.method for point in study.stepping)
-    every = [_best([one for one in study.stepping if one.method == method], study.tolerance) for method in methods]
+    every = (_best([one for one in study.stepping if one.method == method], study.tolerance) for method in methods)
     fastest = [one for one in every if one]
     blocks = ["\n".join(lines)]
     if fastest:
@@ -118,14 +124,14 @@ def remarks(study: Study) -> Iterator[str]:
         yield f"{own.name} points make an error of {bound}{beside}; the tolerance is {study.points_tolerance:g}."
         return
     rows, cols = more
+    points = f"{rows} x {cols}"
     if max(more) > MAX_POINTS:
         advice = (
-            f"About {rows} x {cols} would be within it, and a scene may have {MAX_POINTS} a side: take a wider "
+            f"About {points} would be within it, and a scene may have {MAX_POINTS} a side: take a wider "
             "tool (probes.N.radius, a smaller falloff), or allow a larger error with --tolerance."
         )
     else:
         measured = any((one.rows, one.cols) == more for one in study.points)
-        points = f"{rows} x {cols}"
         enough = f"{points} are within it" if measured else f"Take about {points} (extrapolated, not measured)"
         advice = f"{enough}; with time.tolerance a run finds the step for them."
     yield (
@@ -180,16 +186,6 @@ def _points(study: Study) -> Iterator[str]:
     )
     yield _sheets_table(study)
     yield from _bounds(study.points)
-
-
-def _terms_table(study: Study) -> str:
-    whole = study.terms[0].seconds.median
-    columns: Columns = {
-        "without": lambda term: term.without or "nothing",
-        "time of a step": lambda term: timing(term.seconds),
-        "of the whole step": lambda term: f"{100 * term.seconds.median / whole:.0f} %",
-    }
-    return table(study.terms, columns)
 
 
 def _bounds(points: Sequence[Stepping | Peer | Points]) -> Iterator[str]:

@@ -34,18 +34,13 @@ class FailedError(Exception):
 def solve(plan: Plan, rtol: float, atol: float, deadline: float, tick: Callable[[], None]) -> tuple[Array, int]:
     """Integrate from key to key of the loads, between which they are smooth.
 
-    Args:
-        plan: of the scene.
-        rtol: relative tolerance.
-        atol: absolute tolerance of displacements [m] and velocities [m/s].
-        deadline: `time.perf_counter()` at which to give up.
-        tick: called now and then.
+    The absolute tolerance is of displacements [m] and velocities [m/s]; `tick` is called now and then.
 
     Returns:
         Displacements at every frame but the first [m], shape (F, rows, cols, 3); and the number of evaluations.
 
     Raises:
-        TooSlowError: at the deadline.
+        TooSlowError: when `time.perf_counter()` has come to the deadline.
         FailedError: when SciPy fails.
     """
     from scipy.integrate import solve_ivp
@@ -81,11 +76,9 @@ def solve(plan: Plan, rtol: float, atol: float, deadline: float, tick: Callable[
 
 
 def acceleration(plan: Plan) -> Callable[[Array, Array, Schedule], Array]:
-    """Prepare the right side of eq. 1 over the mass.
+    """Prepare the right side of eq. 1 over the mass: displacements [m] and velocities [m/s] to accelerations [m/s2].
 
-    Returns:
-        A function of displacements [m], velocities [m/s], and a schedule of one step, that gives accelerations
-        [m/s2]; its arrays have the shape (rows, cols, 3).
+    The arrays have the shape (rows, cols, 3), and the schedule one step.
     """
     scene, sheet, every = plan.scene, plan.material, tuple(spring_families(plan))
     (dx, dy), (x, y) = spacing(scene.sheet), axes(scene.sheet)

@@ -4,17 +4,18 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Callable
+from collections.abc import Iterator
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 from pydantic import BaseModel
 
+from taichi_msm.progress import Count
 from taichi_msm.render.rasterizer import Drawing
 from taichi_msm.scene import Scene
 from taichi_msm.scenefile import budget
-from taichi_msm.study.result import Drawn
+from taichi_msm.study.result import Drawn, Study
 from taichi_msm.system import resources
 
 REFINES = (0, 1, 2, 5, 10, 20)
@@ -28,72 +29,48 @@ ROUNDS = 5
 Picture = NDArray[np.uint8]
 
 
-class PictureStudy:
-    """Measures the drawing of one position of the sheet.
+def measure_pictures(
+    scene: Scene, position: NDArray[Any], texture: Picture, quick: bool, study: Study, progress: Count
+) -> None:
+    """Draw the reference picture, then every setting, taking turns; `quick` varies the settings one at a time.
 
-    Args:
-        scene: a checked scene with a picture.
-        position: of the mass points [m], shape (rows, cols, 3).
-        texture: the picture on the sheet, shape (height, width, 3).
-        quick: whether to vary refinement and supersampling one at a time.
-        progress: called with the drawings done and the drawings in all; may raise KeyboardInterrupt.
-
-    Attributes:
-        notes: what was left out.
-        results: a setting each, as far as they are measured.
+    The positions of the points [m] have the shape (rows, cols, 3), the picture on the sheet (height, width, 3).
     """
+    position = np.ascontiguousarray(position, np.float32)
+    memory = resources.available_memory() // 2
+    finest = _with_render(scene, **FINEST)
+    if budget.drawing_bytes(finest) > memory:
+        study.notes.append("drawing was not measured: there is no memory for a picture fine enough to compare with")
+        return
+    truth = Drawing(finest, texture).draw(position)
+    drawings, compared = [], list(settings(scene, quick))
+    for number, (refine, supersample) in enumerate(compared):
+        progress(number, len(compared) * ROUNDS)
+        changed = _with_render(scene, refine=refine, supersample=supersample)
+        memory -= budget.drawing_bytes(changed)
+        if memory < 0:
+            study.notes.append(f"drawing was not measured from refine {refine}, supersample {supersample} on: memory")
+            break
+        drawing = Drawing(changed, texture)
+        drawings.append(drawing)
+        picture = drawing.draw(position)
+        apart = int(np.abs(picture.astype(np.int16) - truth).max())
+        study.drawing.append(Drawn(refine, supersample, psnr(picture, truth), apart))
+    for round_ in range(ROUNDS):
+        for number, (drawing, drawn) in enumerate(zip(drawings, study.drawing, strict=True)):
+            progress(round_ * len(drawings) + number, len(drawings) * ROUNDS)
+            start = time.perf_counter()
+            drawing.draw(position)
+            drawn.samples.append(time.perf_counter() - start)
 
-    def __init__(
-        self,
-        scene: Scene,
-        position: NDArray[Any],
-        texture: Picture,
-        quick: bool,
-        progress: Callable[[int, int], None],
-    ) -> None:
-        self.notes: list[str] = []
-        self._scene = scene
-        self._position = np.ascontiguousarray(position, np.float32)
-        self._texture = texture
-        self._progress = progress
-        self.results: list[Drawn] = []
-        own = scene.render
-        self._settings = [
-            (refine, supersample)
-            for supersample in sorted({*SUPERSAMPLES, own.supersample})
-            for refine in sorted({*REFINES, own.refine})
-            if not quick or refine == own.refine or supersample == own.supersample
-        ]
 
-    def run(self) -> None:
-        """Draw the reference picture, then every setting, taking turns."""
-        memory = resources.available_memory() // 2
-        finest = _with_render(self._scene, **FINEST)
-        if budget.drawing_bytes(finest) > memory:
-            self.notes.append("drawing was not measured: there is no memory for a picture fine enough to compare with")
-            return
-        truth = Drawing(finest, self._texture).draw(self._position)
-        drawings = []
-        for number, (refine, supersample) in enumerate(self._settings):
-            self._progress(number, len(self._settings) * ROUNDS)
-            scene = _with_render(self._scene, refine=refine, supersample=supersample)
-            memory -= budget.drawing_bytes(scene)
-            if memory < 0:
-                self.notes.append(
-                    f"drawing was not measured from refine {refine}, supersample {supersample} on: memory"
-                )
-                break
-            drawing = Drawing(scene, self._texture)
-            drawings.append(drawing)
-            picture = drawing.draw(self._position)
-            apart = int(np.abs(picture.astype(np.int16) - truth).max())
-            self.results.append(Drawn(refine, supersample, psnr(picture, truth), apart))
-        for round_ in range(ROUNDS):
-            for number, (drawing, one) in enumerate(zip(drawings, self.results, strict=True)):
-                self._progress(round_ * len(drawings) + number, len(drawings) * ROUNDS)
-                start = time.perf_counter()
-                drawing.draw(self._position)
-                one.samples.append(time.perf_counter() - start)
+def settings(scene: Scene, quick: bool) -> Iterator[tuple[int, int]]:
+    """List refinements and supersamplings to compare; `quick`: with one of them as in the scene."""
+    own = scene.render
+    for supersample in sorted({*SUPERSAMPLES, own.supersample}):
+        for refine in sorted({*REFINES, own.refine}):
+            if not quick or refine == own.refine or supersample == own.supersample:
+                yield refine, supersample
 
 
 def psnr(picture: Picture, truth: Picture) -> float | None:

@@ -57,21 +57,16 @@ STYLE = {
     "axes.linewidth": 0.6,
     "axes.axisbelow": True,
     "axes.grid": True,
-    "axes.spines.top": False,
-    "axes.spines.right": False,
+    **dict.fromkeys(("axes.spines.top", "axes.spines.right"), False),
     "grid.color": PALE,
     "grid.linewidth": 0.5,
-    "xtick.color": GREY,
-    "ytick.color": GREY,
-    "xtick.labelcolor": INK,
-    "ytick.labelcolor": INK,
-    "xtick.minor.width": 0.4,
-    "ytick.minor.width": 0.4,
+    **dict.fromkeys(("xtick.color", "ytick.color"), GREY),
+    **dict.fromkeys(("xtick.labelcolor", "ytick.labelcolor"), INK),
+    **dict.fromkeys(("xtick.minor.width", "ytick.minor.width"), 0.4),
     "lines.linewidth": 1.2,
     "lines.markersize": 4.5,
     "legend.frameon": False,
-    "legend.fontsize": 7.5,
-    "legend.title_fontsize": 7.5,
+    **dict.fromkeys(("legend.fontsize", "legend.title_fontsize"), 7.5),
 }
 
 DPI = 200
@@ -85,12 +80,7 @@ Point = Stepping | Peer | Points
 
 
 def plot(study: Study, path: Path) -> None:
-    """Draw the parts that a study has measured.
-
-    Args:
-        study: with at least one of the `panels`.
-        path: of the PNG.
-    """
+    """Draw the parts that a study has measured, at least one of the `panels`, as a PNG."""
     with style.context(STYLE, after_reset=True), warnings.catch_warnings():
         # The name of a scene may contain characters that the font lacks.
         warnings.filterwarnings("ignore", "Glyph .* missing")
@@ -162,7 +152,7 @@ def _plot_stepping(axes: Axes, study: Study) -> None:
 
 
 def _plot_line(axes: Axes, points: Sequence[Point], line: dict[str, Any], label: str) -> Line2D:
-    """Draw a line through points; markers are hollow for upper bounds, and half filled where rounding dominates.
+    """Draw a line through points; markers are hollow for upper bounds, half filled where rounding dominates.
 
     Returns:
         Its entry in the legend.
@@ -243,14 +233,9 @@ def _plot_terms(axes: Axes, study: Study) -> None:
     times = [scale * term.seconds.median for term in study.terms]
     below = [scale * (term.seconds.median - term.seconds.fastest) for term in study.terms]
     above = [scale * (term.seconds.slowest - term.seconds.median) for term in study.terms]
-    bars = axes.barh(
-        rows,
-        times,
-        height=0.6,
-        color=[SKY if term.without else SILVER for term in study.terms],
-        xerr=(below, above),
-        error_kw={"linewidth": 0.8, "ecolor": INK},
-    )
+    colours = [SKY if term.without else SILVER for term in study.terms]
+    error_line = {"linewidth": 0.8, "ecolor": INK}
+    bars = axes.barh(rows, times, height=0.6, color=colours, xerr=(below, above), error_kw=error_line)
     axes.bar_label(bars, [number(time) for time in times], padding=3, size=7, color=GREY)
     axes.axvline(times[0], **TOLERANCE_LINE, zorder=0)
     axes.set_yticks(rows, [f"without {term.without}" if term.without else "whole step" for term in study.terms])
@@ -265,7 +250,8 @@ def _plot_spread(
     axes: Axes, at: Sequence[float], points: Sequence[Point | Drawn], colour: str, scale: float = 1
 ) -> None:
     """Draw a thin line from the fastest to the slowest run of every point."""
-    fastest, slowest = ([scale * end for end in list(_extremes(points))[start::2]] for start in (0, 1))
+    fastest = [scale * point.seconds.fastest for point in points]
+    slowest = [scale * point.seconds.slowest for point in points]
     axes.vlines(at, fastest, slowest, color=colour, linewidth=0.7, alpha=0.6)
 
 

@@ -20,7 +20,7 @@ from taichi_msm.physics.solver import Dynamics
 from taichi_msm.progress import Count
 from taichi_msm.scene import MAX_POINTS
 from taichi_msm.scenefile import budget
-from taichi_msm.study.result import Points
+from taichi_msm.study.result import Points, Study
 from taichi_msm.system.runtime import Device
 
 # Cells a side, relative to those of the scene.
@@ -54,42 +54,37 @@ class PointStudy:
     The reference is a sheet with more points than all those listed, if there is time for it. Otherwise it is the finest
     of those listed, whose own error is then known only as a bound.
 
-    Args:
-        plan: of a scene with tissue.
-        device: what `runtime.start` returned.
-        longest_run: approximate time that a run may take [s]. The reference is run only once, and may take as long as
-            all the runs together by which another sheet is timed.
-        progress: called with the work done and all of it; may raise KeyboardInterrupt: what is done is kept.
-
-    Attributes:
-        notes: what was left out.
-        results: a sheet each, the fewest points first, as far as they are measured.
+    A run takes up to about `longest_run` seconds; the reference, which is run only once, as long as all the runs
+    together by which another sheet is timed. The results in `study` come with the fewest points first; `progress` may
+    raise KeyboardInterrupt: they stay.
     """
 
-    def __init__(self, plan: Plan, device: Device, longest_run: float, progress: Count) -> None:
-        self.notes: list[str] = []
+    def __init__(self, plan: Plan, device: Device, longest_run: float, study: Study, progress: Count) -> None:
         scene = with_time(plan.scene, step="auto", tolerance=None, precision="f64")
         self._plan = make_plan(with_points(scene, scene.sheet.points), plan.image)
-        self._device = device
-        self._longest_run = longest_run
-        self._progress = progress
-        self.results: list[Points] = []
+        self._device, self._longest_run, self._study, self._progress = device, longest_run, study, progress
         self._sheets: list[_Sheet] = []
         self._done = 0
 
     def run(self) -> None:
-        """Compute the estimates, then the errors, then measure the times."""
+        """Compute the estimates, then the errors, then measure the times; with springs nothing.
+
+        Other points would make another sheet of springs.
+        """
+        if self._plan.scene.tissue is None:
+            return
         with ExitStack() as opened:
             seconds = 0.0
             for plan in lattices(self._plan):
                 seconds = self._try(plan, opened)
             if not self._sheets:
-                self.notes.append(f"points were not measured: with fewer than {FEWEST} a side they cannot be compared")
+                said = f"points were not measured: with fewer than {FEWEST} a side they cannot be compared"
+                self._study.notes.append(said)
                 return
             finer = self._finer(self._plan, seconds, self._longest_run)
             if finer is None:
                 rows, cols = _scaled(self._plan, FINER)
-                self.notes.append(f"{rows} x {cols} points were not measured: time or memory")
+                self._study.notes.append(f"{rows} x {cols} points were not measured: time or memory")
             else:
                 seconds = self._try(finer, opened)
                 finer = self._finer(finer, seconds, ROUNDS * self._longest_run)
@@ -107,7 +102,7 @@ class PointStudy:
         coarse = coarser(plan)
         assert coarse is not None
         self._sheets.append(sheet)
-        self.results.append(sheet.measured)
+        self._study.points.append(sheet.measured)
         self._tick()
         dynamics.compile()
         pilot = MeshPilot(plan, coarse, self._device)
@@ -119,12 +114,10 @@ class PointStudy:
         return min(first, self._step_through(sheet))
 
     def _finer(self, plan: Plan, seconds: float, longest_run: float) -> Plan | None:
-        """Plan more points; None if a run would take too long or too much memory.
+        """Plan more points than a plan has, through which it took `seconds` to step.
 
-        Args:
-            plan: what is to be refined.
-            seconds: time that stepping through it took [s].
-            longest_run: time that stepping through the finer one may take [s].
+        Returns:
+            The plan; None if stepping through it would take longer than `longest_run` [s], or too much memory.
         """
         points = _scaled(plan, FINER)
         if max(points) > MAX_POINTS:
@@ -134,11 +127,7 @@ class PointStudy:
         return None if seconds * work[1] / work[0] > longest_run or any(budget.size_problems(finer)) else finer
 
     def _measure_errors(self, finer: Plan | None) -> None:
-        """Step through the scene with all sheets side by side, and compare them frame by frame.
-
-        Args:
-            finer: with even more points, for the reference; None: there is no time for it.
-        """
+        """Step through the scene with all sheets side by side, and with a finer one if any; compare every frame."""
         finest = self._sheets[-1].plan if finer is None else finer
         grid = finest.grid
         with ExitStack() as opened:
@@ -219,7 +208,7 @@ def _reference(fields: list[Field]) -> tuple[Field, float]:
     fields, or of u from u_r if there are only two.
 
     Args:
-        fields: two or more fields of displacements [m], the fewest points first, each of shape (rows, cols, 3).
+        fields: two or more of displacements [m], the fewest points first, each of shape (rows, cols, 3).
 
     Returns:
         u* at the points of the finest field [m], and an approximate bound of its error [m].

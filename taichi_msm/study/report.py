@@ -19,26 +19,19 @@ WITHOUT_MATPLOTLIB = "study.png needs matplotlib: pip install matplotlib"
 
 
 def require_writable(directory: Path) -> None:
-    """Check before a long measurement that its report can be written.
-
-    Raises:
-        FilesError: when it cannot.
-    """
+    """Check before a long measurement that its report can be written; raises FilesError."""
     with writing(directory), staged(directory):
         pass
 
 
 def write_report(study: Study, directory: Path) -> list[str]:
-    """Write the report of a study, replacing an earlier one.
+    """Write the report of a study, replacing an earlier one; other files in the directory stay.
 
-    Every file is written as a whole or not at all; study.json is the last.
-
-    Args:
-        study: complete or not; a note is added to it if the picture cannot be drawn.
-        directory: created if it does not exist. Its other files stay.
+    Every file is written as a whole or not at all, study.json last. A note is added to the study if its picture cannot
+    be drawn.
 
     Returns:
-        The names of the files written, study.json last.
+        The names of the files, study.json last.
 
     Raises:
         FilesError: when the directory cannot be written.

@@ -21,12 +21,7 @@ AS_FAST = 1.1
 
 @dataclass(frozen=True)
 class Timing:
-    """Times of repeated, equal work.
-
-    Attributes:
-        median, fastest, slowest: of the times [s].
-        runs: number of repetitions.
-    """
+    """Times of repeated, equal work [s], and the number of repetitions."""
 
     median: float
     fastest: float
@@ -41,28 +36,18 @@ class Timing:
 
 @dataclass(frozen=True)
 class Reference:
-    """The solution that errors of the stepping refer to: central differences in f64, extrapolated.
+    """The solution that errors of the stepping refer to: central differences in f64, extrapolated."""
 
-    Attributes:
-        steps_per_frame: of its finest run.
-        error: its own error, estimated by halving the step, as a fraction of the largest displacement.
-        largest: the largest displacement of any point at any frame [m].
-    """
-
-    steps_per_frame: int
-    error: float
-    largest: float
+    steps_per_frame: int  # of its finest run
+    error: float  # its own, estimated by halving the step, as a fraction of the largest displacement
+    largest: float  # displacement of any point at any frame [m]
 
 
 @dataclass
 class Measured:
-    """What is known of one setting so far.
+    """What is known of one setting so far."""
 
-    Attributes:
-        samples: times of repeated, equal work [s].
-    """
-
-    samples: list[float] = field(default_factory=list, kw_only=True)
+    samples: list[float] = field(default_factory=list, kw_only=True)  # times of repeated, equal work [s]
 
     @property
     def seconds(self) -> Timing:
@@ -75,11 +60,7 @@ class Stepping(Measured):
     """One way to step the scene; timed is stepping through the whole of it, compiled and warm.
 
     Attributes:
-        precision: f32 or f64.
-        damping_difference: central or backward.
-        steps_per_frame: number of steps in a frame.
-        step: the step h that follows from it [s].
-        error: largest error of any point at any frame, as a fraction of the largest displacement; None: it diverged.
+        error: largest of any point at any frame, as a fraction of the largest displacement; None: it diverged.
         rounding: the part of the error that comes from f32; None for f64.
         known: whether the reference is exact enough to know this error; if not, it is an approximate upper bound.
     """
@@ -87,7 +68,7 @@ class Stepping(Measured):
     precision: str
     damping_difference: str
     steps_per_frame: int
-    step: float
+    step: float  # h [s]
     error: float | None = None
     rounding: float | None = None
     known: bool = False
@@ -100,54 +81,37 @@ class Stepping(Measured):
 
 @dataclass
 class Peer(Measured):
-    """SciPy's DOP853 on the same equations, timed for the whole scene.
+    """SciPy's DOP853 on the same equations, timed for the whole scene; error and known as for `Stepping`."""
 
-    Attributes:
-        rtol: relative tolerance; the absolute one is rtol x the largest displacement / 10.
-        error, known: as for `Stepping`.
-        evaluations: number of evaluations of the forces.
-    """
-
-    rtol: float
+    rtol: float  # relative tolerance; the absolute one is rtol x the largest displacement / 10
     error: float
     known: bool
-    evaluations: int
+    evaluations: int  # of the forces
 
 
 @dataclass
 class Drawn(Measured):
-    """One way to draw the most deformed frame, timed for one frame.
-
-    Attributes:
-        refine, supersample: the settings.
-        psnr: against a picture of high refinement and supersampling [dB]; None: they are equal.
-        largest_error: of any colour of any pixel, 0 to 255.
-    """
+    """One way to draw the most deformed frame, timed for one frame."""
 
     refine: int
     supersample: int
-    psnr: float | None
-    largest_error: int
+    psnr: float | None  # against a picture of high refinement and supersampling [dB]; None: they are equal
+    largest_error: int  # of any colour of any pixel, 0 to 255
 
 
 @dataclass
 class Points(Measured):
-    """A sheet of tissue with more or fewer points, in f64, timed like `Stepping`.
+    """A sheet of tissue with more or fewer points, in f64, timed like `Stepping`; error and known are as there.
 
-    Attributes:
-        rows, cols: numbers of points.
-        steps_per_frame: of the automatic step with these points.
-        error: that the number of points makes, at the points and between them; else as for `Stepping`.
-        known: as for `Stepping`.
-        estimate: of this error, by the pilot that `run` has beside it; None: not known.
+    The error is that which the number of points makes, at the points and between them.
     """
 
     rows: int
     cols: int
-    steps_per_frame: int
+    steps_per_frame: int  # of the automatic step with these points
     error: float | None = None
     known: bool = False
-    estimate: float | None = None
+    estimate: float | None = None  # of this error, by the pilot that `run` has beside it; None: not known
 
     @property
     def name(self) -> str:
@@ -157,48 +121,28 @@ class Points(Measured):
 
 @dataclass
 class Term(Measured):
-    """The cost of a step without one term of the model, timed for one step.
+    """The cost of a step without one term of the model, timed for one step."""
 
-    Attributes:
-        without: key of the term that is left out; empty: none is.
-    """
-
-    without: str
+    without: str  # key of the term that is left out; empty: none is
 
 
 @dataclass
 class Study:
-    """Speed against error of one scene on one machine.
+    """Speed against error of one scene on one machine."""
 
-    Attributes:
-        scene: its name.
-        settings: the scene with its defaults filled in.
-        status: complete or interrupted.
-        tolerance: largest allowed error, as a fraction of the largest displacement.
-        machine: cpu, cores, arch, threads, bits of a vector and versions.
-        reference: None if the study was interrupted before there was one.
-        stepping: ordered by method and, within a method, by falling step.
-        orders: of every method, by regression over the points where the step makes the error; None: too few of them.
-        peers: DOP853 at several tolerances.
-        drawing: ordered by supersample and refine; empty if the scene has no picture.
-        points: with tissue, from few to many; empty if the scene has springs.
-        terms: the first leaves nothing out.
-        notes: what a reader must know, such as parts left out and why.
-    """
-
-    scene: str
-    settings: dict[str, Any]
-    status: str
-    tolerance: float
-    machine: dict[str, Any]
-    reference: Reference | None = None
-    stepping: list[Stepping] = field(default_factory=list)
-    orders: dict[str, float | None] = field(default_factory=dict)
+    scene: str  # its name
+    settings: dict[str, Any]  # the scene with its defaults filled in
+    status: str  # complete or interrupted
+    tolerance: float  # largest allowed error, as a fraction of the largest displacement
+    machine: dict[str, Any]  # cpu, cores, arch, threads, bits of a vector and versions
+    reference: Reference | None = None  # None: interrupted before there was one
+    stepping: list[Stepping] = field(default_factory=list)  # by method and, within a method, by falling step
+    orders: dict[str, float | None] = field(default_factory=dict)  # `observed_orders`
     peers: list[Peer] = field(default_factory=list)
-    drawing: list[Drawn] = field(default_factory=list)
-    points: list[Points] = field(default_factory=list)
-    terms: list[Term] = field(default_factory=list)
-    notes: list[str] = field(default_factory=list)
+    drawing: list[Drawn] = field(default_factory=list)  # by supersample and refine; empty without a picture
+    points: list[Points] = field(default_factory=list)  # from few to many; empty with springs
+    terms: list[Term] = field(default_factory=list)  # the first leaves nothing out
+    notes: list[str] = field(default_factory=list)  # what a reader must know, such as parts left out and why
 
     def finish(self) -> None:
         """Leave out what was not timed, order the steppings and fit their orders."""
@@ -247,9 +191,9 @@ class Study:
 
     @property
     def best_stepping(self) -> Stepping | None:
-        """Find the fastest stepping within the tolerance, or one that is as fast and less wrong; None if there is none.
+        """Find the fastest stepping within the tolerance, or one that is as fast and less wrong.
 
-        None, too, where the scene needs other points, for which no step was measured. Of every method only
+        None where there is none, or the scene needs other points, for which no step was measured. Of every method only
         its largest step counts, so that noise of the clock cannot prefer a smaller one.
         """
         if self.more_points is not None:
@@ -264,9 +208,9 @@ class Study:
     def best_drawing(self) -> Drawn | None:
         """Find the fastest sufficient refinement at the scene's own supersampling."""
         own = self.settings["render"]["supersample"]
-        same = [one for one in self.drawing if one.supersample == own]
-        best = max((_decibels(one) for one in same), default=0.0)
-        good = [one for one in same if _decibels(one) >= best - REFINED_ENOUGH]
+        decibels = [(math.inf if one.psnr is None else one.psnr, one) for one in self.drawing if one.supersample == own]
+        enough = max((psnr for psnr, _ in decibels), default=0.0) - REFINED_ENOUGH
+        good = [one for psnr, one in decibels if psnr >= enough]
         return min(good, key=lambda one: one.seconds.median, default=None)
 
     def recommendation(self) -> list[str]:
@@ -297,7 +241,7 @@ class Study:
 
 
 def observed_orders(points: list[Stepping]) -> dict[str, float | None]:
-    """Fit the order of every method over the points where the error comes from the step, not from rounding."""
+    """Fit the order of every method over the points where the error comes from the step; None: too few of them."""
     orders: dict[str, float | None] = {}
     for method in dict.fromkeys(point.method for point in points):
         fit = [
@@ -308,7 +252,3 @@ def observed_orders(points: list[Stepping]) -> dict[str, float | None]:
         steps, errors = np.array(fit).reshape(-1, 2).T
         orders[method] = float(np.polyfit(steps, errors, 1)[0]) if len(fit) > 2 else None
     return orders
-
-
-def _decibels(drawn: Drawn) -> float:
-    return float("inf") if drawn.psnr is None else drawn.psnr

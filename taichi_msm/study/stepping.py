@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Iterator
-from contextlib import ExitStack
 from dataclasses import replace
 from typing import Any
 
@@ -18,7 +17,7 @@ from taichi_msm.physics.plan import Plan
 from taichi_msm.physics.planning import make_plan, stable_steps, with_time
 from taichi_msm.physics.solver import Dynamics
 from taichi_msm.progress import Count
-from taichi_msm.study.result import Reference, Stepping
+from taichi_msm.study.result import Reference, Stepping, Study
 from taichi_msm.system.runtime import Device
 from taichi_msm.timegrid import Precision
 
@@ -38,40 +37,26 @@ Frames = NDArray[Any]
 
 
 class SteppingStudy:
-    """Measures the stepping of one scene.
+    """Measures the stepping of a checked scene, in runs of up to about `longest_run` seconds.
 
-    Args:
-        plan: of the scene.
-        device: what `runtime.start` returned.
-        longest_run: approximate time that a run may take [s].
-        progress: called with the runs done and the runs in all; may raise KeyboardInterrupt: what is done is kept.
+    `progress` may raise KeyboardInterrupt: the results in `study` stay.
 
     Attributes:
         frames: displacements of the reference at every frame but the first [m], shape (F, rows, cols, 3).
-        reference: the facts about it.
-        results: a setting each, as far as they are measured.
     """
 
-    def __init__(self, plan: Plan, device: Device, longest_run: float, progress: Count) -> None:
+    def __init__(self, plan: Plan, device: Device, longest_run: float, study: Study, progress: Count) -> None:
         self.plan = plan
-        self._grid = plan.grid
         self._plans = {
             difference: make_plan(with_time(plan.scene, damping_difference=difference, step="auto"), plan.image)
             for difference in DIFFERENCES
         }
         self.frames: Frames | None = None
-        self.reference: Reference | None = None
-        self._longest_run = longest_run
-        self._progress = progress
-        self.results: list[Stepping] = []
-        self._done = 0
-        self._to_do = 1
-        with ExitStack() as opened:
-            self._dynamics: dict[str, Dynamics] = {}
-            for precision in PRECISIONS:
-                dynamics = self._dynamics[precision] = Dynamics(plan.with_grid(precision=precision), device)
-                opened.callback(dynamics.close)
-            self._open = opened.pop_all()
+        self._longest_run, self.study, self._progress = longest_run, study, progress
+        self._done, self._to_do = 0, 1
+        self._dynamics: dict[str, Dynamics] = {
+            one: Dynamics(plan.with_grid(precision=one), device) for one in PRECISIONS
+        }
 
     def run(self) -> None:
         """Compute the reference, then the errors, then measure the times."""
@@ -84,25 +69,30 @@ class SteppingStudy:
         self._make_reference(finest)
         for difference, counts in series.items():
             self._measure_errors(difference, counts)
-        self._to_do = self._done + (ROUNDS - 1) * len(self.results)
+        self._to_do = self._done + (ROUNDS - 1) * len(self.study.stepping)
         for _ in range(ROUNDS - 1):
-            for one in self.results:
+            for one in self.study.stepping:
                 self._run(one.precision, one.damping_difference, one.steps_per_frame, one.samples)
 
     def relative(self, frames: Frames) -> float:
         """Give the largest error of frames relative to the reference, as a fraction of the largest displacement."""
         assert self.frames is not None
-        assert self.reference is not None
-        return longest(frames - self.frames) / self.reference.largest if self.reference.largest > 0 else 0.0
+        largest = self._reference.largest
+        return longest(frames - self.frames) / largest if largest > 0 else 0.0
 
     def known(self, error: float) -> bool:
         """Tell whether the reference is exact enough to know an error."""
-        assert self.reference is not None
-        return error >= MARGIN * self.reference.error
+        return error >= MARGIN * self._reference.error
 
     def close(self) -> None:
         """Free the memory."""
-        self._open.close()
+        for dynamics in self._dynamics.values():
+            dynamics.close()
+
+    @property
+    def _reference(self) -> Reference:
+        assert self.study.reference is not None
+        return self.study.reference
 
     def _series(self, difference: str) -> Iterator[int]:
         """Give the steps per frame of a series: of the largest stable step, doubled until a run would take too long."""
@@ -125,31 +115,25 @@ class SteppingStudy:
         self.frames = fine + (fine - middle) / 3
         largest = longest(self.frames)
         error = longest(self.frames - before) / largest if largest > 0 else 0.0
-        self.reference = Reference(4 * finest, error, largest)
+        self.study.reference = Reference(4 * finest, error, largest)
 
     def _measure_errors(self, difference: str, counts: list[int]) -> None:
         """Run every step once: in f32 until rounding dominates, in f64 until the reference is not exact enough."""
-        assert self.reference is not None
         going, farthest = set(PRECISIONS), farthest_displacement(self.plan, self.plan.scene.time.duration)
         for steps in counts:
             exact: Frames | None = None
-            for precision in PRECISIONS:
-                if precision not in going:
-                    continue
-                step = replace(self._grid, steps_per_frame=steps).step
-                samples: list[float] = []
-                frames = self._run(precision, difference, steps, samples)
+            for precision in (one for one in PRECISIONS if one in going):
+                point = Stepping(precision, difference, steps, replace(self.plan.grid, steps_per_frame=steps).step)
+                frames = self._run(precision, difference, steps, point.samples)
                 error, rounding = self.relative(frames), None
-                diverged = not error < math.inf or longest(frames) > farthest
                 if precision == "f64":
                     exact = frames
-                elif exact is not None and self.reference.largest > 0:
-                    rounding = longest(frames - exact) / self.reference.largest
-                one = Stepping(precision, difference, steps, step, samples=samples)
-                self.results.append(one)
-                if not diverged:
-                    one.error, one.rounding, one.known = error, rounding, self.known(error)
-                    if not one.known or (rounding is not None and rounding > error / 2):
+                elif exact is not None and self._reference.largest > 0:
+                    rounding = longest(frames - exact) / self._reference.largest
+                self.study.stepping.append(point)
+                if error < math.inf and longest(frames) <= farthest:
+                    point.error, point.rounding, point.known = error, rounding, self.known(error)
+                    if not point.known or (rounding is not None and rounding > error / 2):
                         going.discard(precision)
 
     def _run(self, precision: str, difference: str, steps: int, samples: list[float]) -> Frames:

@@ -77,13 +77,7 @@ WORDS = ("method", "without")
 
 
 def table(measured: Sequence[Any], columns: Columns, mark: Callable[[Any], str] | None = None) -> str:
-    """Write measurements as a table.
-
-    Args:
-        measured: what each row is about.
-        columns: how each cell is written, by the names of the columns.
-        mark: gives what stands in a last column without a name, if any row has something to say there.
-    """
+    """Write measurements as a table, one in a row; `mark` may give more for a last column without a name."""
     if mark and any(map(mark, measured)):
         columns = {**columns, "": mark}
     rows = [[cell(one) for cell in columns.values()] for one in measured]

@@ -11,76 +11,50 @@ from taichi_msm.physics.planning import make_plan
 from taichi_msm.physics.solver import Dynamics
 from taichi_msm.progress import Count
 from taichi_msm.scene import Scene
-from taichi_msm.study.result import Term
+from taichi_msm.study.result import Study, Term
 from taichi_msm.system.runtime import Device
 
 ROUNDS = 9
 
-
-class TermStudy:
-    """Measures the time of a step with each term left out in turn.
-
-    Args:
-        plan: of the scene.
-        device: what `runtime.start` returned.
-        sample: approximate time of one measurement [s].
-        progress: called with the measurements done and all of them; may raise KeyboardInterrupt.
-
-    Attributes:
-        results: the whole scene first.
-    """
-
-    def __init__(self, plan: Plan, device: Device, sample: float, progress: Count) -> None:
-        self._device = device
-        # All variants have the steps of the whole scene: without a spring the automatic step would be another.
-        self._grid = plan.grid
-        grid = {"steps_per_frame": plan.grid.steps_per_frame, "precision": plan.grid.precision}
-        self._plans = [make_plan(scene, plan.image).with_grid(**grid) for _, scene in variants(plan.scene)]
-        self.results = [Term(without) for without, _ in variants(plan.scene)]
-        self._sample = sample
-        self._progress = progress
-
-    def run(self) -> None:
-        """Compile every variant, and then let them step in turn."""
-        with ExitStack() as opened:
-            sheets: list[Dynamics] = []
-            for plan in self._plans:
-                self._progress(0, len(self._plans))
-                sheets.append(opened.enter_context(closing(Dynamics(plan, self._device))))
-                sheets[-1].compile()
-            frames = self._frames(sheets[0])
-            for round_ in range(ROUNDS):
-                for number, (term, sheet) in enumerate(zip(self.results, sheets, strict=True)):
-                    self._progress(round_ * len(sheets) + number, ROUNDS * len(sheets))
-                    # From rest, so that all variants step through the same part of the scene.
-                    sheet.restart(sheet.plan)
-                    term.samples.append(_step_seconds(sheet, frames))
-
-    def _frames(self, whole: Dynamics) -> int:
-        """Count the frames that a measurement takes."""
-        seconds = _step_seconds(whole, 1) * self._grid.steps_per_frame
-        return max(1, min(self._grid.frames, round(self._sample / seconds)))
-
-
 # The terms of a sheet that can be left out, and the values that leave them out.
 SPRING_TERMS: dict[str, float | None] = {"structural": 0.0, "shear": 0.0, "virtual": 0.0, "map": None}
 TISSUE_TERMS: dict[str, float | None] = {
-    "foundation": 0.0,
-    "damping": 0.0,
-    "pretension": 0.0,
-    "bending": 0.0,
+    **dict.fromkeys(("foundation", "damping", "pretension", "bending"), 0.0),
     "map": None,
 }
+
+
+def measure_terms(plan: Plan, device: Device, sample: float, study: Study, progress: Count) -> None:
+    """Measure the time of a step with each term left out in turn, in samples of about so many seconds."""
+    # All variants have the steps of the whole scene: without a spring the automatic step would be another.
+    grid = {"steps_per_frame": plan.grid.steps_per_frame, "precision": plan.grid.precision}
+    plans = {without: make_plan(scene, plan.image).with_grid(**grid) for without, scene in variants(plan.scene)}
+    study.terms += map(Term, plans)
+    with ExitStack() as opened:
+        sheets: list[Dynamics] = []
+        for variant in plans.values():
+            progress(0, len(plans))
+            sheets.append(opened.enter_context(closing(Dynamics(variant, device))))
+            sheets[-1].compile()
+        frames = round(sample / (_step_seconds(sheets[0], 1) * plan.grid.steps_per_frame))
+        frames = max(1, min(plan.grid.frames, frames))
+        for round_ in range(ROUNDS):
+            for number, (term, sheet) in enumerate(zip(study.terms, sheets, strict=True)):
+                progress(round_ * len(sheets) + number, ROUNDS * len(sheets))
+                # From rest, so that all variants step through the same part of the scene.
+                sheet.restart(sheet.plan)
+                term.samples.append(_step_seconds(sheet, frames))
 
 
 def variants(scene: Scene) -> Iterator[tuple[str, Scene]]:
     """Give the scene without each of its terms in turn, by the term's key; the first variant is the whole scene."""
     yield "", scene
-    section, terms = ("springs", SPRING_TERMS) if scene.tissue is None else ("tissue", TISSUE_TERMS)
-    sheet = getattr(scene, section)
+    terms, sheet = (SPRING_TERMS, scene.springs) if scene.tissue is None else (TISSUE_TERMS, scene.tissue)
+    assert sheet is not None
     for name, absent in terms.items():
         if getattr(sheet, name) not in (0, None):
-            yield f"{section}.{name}", scene.model_copy(update={section: sheet.model_copy(update={name: absent})})
+            rest = sheet.model_copy(update={name: absent})
+            yield f"{scene.kind}.{name}", scene.model_copy(update={scene.kind: rest})
     if scene.damping > 0:
         yield "damping", scene.model_copy(update={"damping": 0.0})
     for index in range(len(scene.probes)):

@@ -14,8 +14,6 @@ from typing import Any
 
 from taichi_msm.errors import DeviceError, NotInstalledError, did_you_mean
 
-__all__ = ["CHOICE", "COMPILERS", "Compiler", "Parts", "chosen", "named", "what_decides_bits"]
-
 # The environment variable that chooses.
 CHOICE = "TAICHI_MSM_COMPILER"
 
@@ -25,27 +23,17 @@ Parts = list[tuple[Any, str, Any]]
 
 @dataclass(frozen=True)
 class Compiler:
-    """A compiler that can be imported.
+    """A compiler that can be imported."""
 
-    Attributes:
-        name: of its package, also in run.json.
-        title: its name in a sentence.
-        prefix: of its environment variables.
-        cache: folder of compiled kernels, from the home directory.
-        lock: on that folder, from the folder.
-        tested: the version whose results on a CPU have the same bits as those of the other compiler.
-        pythons: that it can be installed for.
-        look: time of a look at a counter that another thread writes [s], measured on Zen 4: Taichi's LLVM fences it by
-            `mfence`, that of Quadrants by a locked `or`.
-    """
-
-    name: str
-    title: str
-    prefix: str
-    cache: str
-    lock: str
-    tested: str
-    pythons: str
+    name: str  # of its package, also in run.json
+    title: str  # its name in a sentence
+    prefix: str  # of its environment variables
+    cache: str  # folder of compiled kernels, from the home directory
+    lock: str  # on that folder, from the folder
+    tested: str  # the version whose results on a CPU have the same bits as those of the other compiler
+    pythons: str  # that it can be installed for
+    # Time of a look at a counter that another thread writes [s], measured on Zen 4: Taichi's LLVM fences it by
+    # `mfence`, that of Quadrants by a locked `or`.
     look: float
 
     @property
@@ -69,11 +57,7 @@ class Compiler:
         return f"{self.prefix}_OFFLINE_CACHE_FILE_PATH"
 
     def folder(self) -> Path:
-        """Give the folder of compiled kernels.
-
-        Raises:
-            RuntimeError: when there is no home directory.
-        """
+        """Give the folder of compiled kernels; RuntimeError: there is no home directory."""
         return Path(os.environ.get(self.folder_variable) or Path.home() / self.cache)
 
     def load(self) -> Any:
@@ -135,32 +119,29 @@ class Compiler:
         ]
 
 
+_TAICHI = Compiler(
+    name="taichi",
+    title="Taichi",
+    prefix="TI",
+    cache=".cache/taichi/ticache",
+    lock="ticache.lock",
+    tested="1.7.4",
+    pythons="Python 3.10 to 3.13",
+    look=33e-9,
+)
+_QUADRANTS = Compiler(
+    name="quadrants",
+    title="Quadrants",
+    prefix="QD",
+    cache=".cache/quadrants/qdcache",
+    lock="kernel_compilation_manager/qdcache.lock",
+    tested="1.4.0",
+    pythons="Python 3.12 to 3.14",
+    look=3.4e-9,
+)
+
 # The first of them that is installed is taken.
-COMPILERS = {
-    one.name: one
-    for one in (
-        Compiler(
-            name="taichi",
-            title="Taichi",
-            prefix="TI",
-            cache=".cache/taichi/ticache",
-            lock="ticache.lock",
-            tested="1.7.4",
-            pythons="Python 3.10 to 3.13",
-            look=33e-9,
-        ),
-        Compiler(
-            name="quadrants",
-            title="Quadrants",
-            prefix="QD",
-            cache=".cache/quadrants/qdcache",
-            lock="kernel_compilation_manager/qdcache.lock",
-            tested="1.4.0",
-            pythons="Python 3.12 to 3.14",
-            look=3.4e-9,
-        ),
-    )
-}
+COMPILERS = {one.name: one for one in (_TAICHI, _QUADRANTS)}
 
 
 @cache
@@ -190,12 +171,7 @@ def named(versions: Mapping[str, str]) -> str:
 
 
 def what_decides_bits(versions: Mapping[str, str], arch: str) -> dict[str, str]:
-    """Leave out of some versions that of the compiler, if its results have the same bits as another one's.
-
-    Args:
-        versions: by name.
-        arch: cpu, cuda or vulkan; the bits are known to be the same on a CPU only.
-    """
+    """Leave out of some versions that of the compiler, if its results are known to have the bits of another one's."""
     return {
         name: version
         for name, version in versions.items()

@@ -65,14 +65,10 @@ class Launches:
         return array.to_numpy() if self.bounded else array
 
     def parts(self, length: int, rounds: int) -> Iterator[tuple[int, int]]:
-        """Split a list that threads go through into parts for one launch each, at least one.
-
-        Args:
-            length: of the list.
-            rounds: most rounds that a thread takes for an entry.
+        """Split a list that threads go through, in up to `rounds` rounds an entry, into parts for one launch each.
 
         Returns:
-            The first entry of each part, and its length.
+            The first entry of each part, and its length; at least one part.
         """
         most = max(1, length)
         if self.bounded:
@@ -84,11 +80,8 @@ class Launches:
     def launch(self, kernel: Callable[..., None], total: int, *arguments: Any, rounds: int) -> None:
         """Launch a kernel for the indices below `total`.
 
-        Args:
-            kernel: takes the first index, the one after the last, the array for `end_thread`, and the arguments.
-            total: number of indices.
-            arguments: further arguments.
-            rounds: most rounds of all loops together that it takes for an index.
+        It takes the first index, the one after the last, the array for `end_thread`, and the arguments; and at most
+        `rounds` rounds of all loops together for an index.
         """
         most = total
         if self.bounded:
@@ -101,11 +94,7 @@ class Launches:
                 kernel(first, min(first + most, total), self._ended, *arguments)
 
     def require_ended(self) -> None:
-        """Make sure that every index of every launch was worked on to its end.
-
-        Raises:
-            DeviceError: when the device cut threads short.
-        """
+        """Make sure that every index of every launch was worked on to its end; DeviceError: it was not."""
         if not self.bounded:
             return
         # The device counts in 32 bits.

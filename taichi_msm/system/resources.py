@@ -43,11 +43,13 @@ def available_memory() -> int:
 
     Without /proc it is all physical memory; sys.maxsize if the system does not report that.
     """
-    try:
+    with contextlib.suppress(OSError, KeyError, ValueError, IndexError):
         free = _free_memory(Path("/proc/meminfo"))
         return min(free, _control_group_rest(Path("/proc/self/cgroup"), CONTROL_GROUPS))
-    except (OSError, KeyError, ValueError, IndexError):
-        return _physical_memory()
+    try:
+        return os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
+    except (AttributeError, OSError, ValueError):
+        return sys.maxsize
 
 
 def _free_memory(meminfo: Path) -> int:
@@ -73,10 +75,3 @@ def _group_rest(group: Path) -> int:
         return sys.maxsize
     # Cached files count as used, but are dropped when memory is needed.
     return sys.maxsize if limit == "max" else max(0, int(limit) - used + int(cached.get("inactive_file", 0)))
-
-
-def _physical_memory() -> int:
-    try:
-        return os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
-    except (AttributeError, OSError, ValueError):
-        return sys.maxsize

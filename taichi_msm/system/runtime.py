@@ -23,23 +23,7 @@ from numpy.typing import NDArray
 from taichi_msm.errors import ArgumentError, DeviceError, MsmError, did_you_mean
 from taichi_msm.system import resources
 from taichi_msm.system.compiler import Parts, chosen
-from taichi_msm.system.silence import silenced
-
-__all__ = [
-    "ARCHS",
-    "ITERATIONS_PER_THREAD",
-    "Device",
-    "Memory",
-    "lanes",
-    "our_compilation",
-    "require_here",
-    "start",
-    "started",
-    "stop",
-    "ti",
-    "vector_bits",
-    "write",
-]
+from taichi_msm.system.streams import silenced
 
 ti = chosen().load()
 
@@ -72,17 +56,11 @@ ITERATIONS_PER_THREAD = 512
 
 @dataclass(frozen=True)
 class Device:
-    """The device that kernels run on.
+    """The device that kernels run on."""
 
-    Attributes:
-        arch: cpu, cuda or vulkan.
-        threads: number of CPU threads.
-        name: of the processor or the GPU; empty if the system does not tell it.
-    """
-
-    arch: str
-    threads: int
-    name: str = field(default="", compare=False)
+    arch: str  # cpu, cuda or vulkan
+    threads: int  # of a CPU
+    name: str = field(default="", compare=False)  # of the processor or the GPU; empty if the system does not tell it
 
 
 class Memory:
@@ -93,12 +71,9 @@ class Memory:
         weakref.finalize(self, _give_back, self._taken, _free)
 
     def array(self, precision: str, lanes: int, length: int) -> Any:
-        """Allocate a one-dimensional array, or reuse one; its content is arbitrary.
+        """Allocate a one-dimensional array, or reuse a longer one; its content is arbitrary.
 
-        Args:
-            precision: f32 or f64.
-            lanes: numbers in a vector; 0: an array of plain numbers.
-            length: smallest length of the array; a reused one may be longer.
+        Its entries are vectors of so many lanes, or numbers if that is 0.
         """
         kind = precision, lanes
         fitting = [array for array in _free[kind] if array.shape[0] >= length]
@@ -113,12 +88,7 @@ class Memory:
 
 
 def write(array: Any, values: NDArray[Any]) -> None:
-    """Set the first entries of an array of vectors, and all others to zero.
-
-    Args:
-        array: one-dimensional.
-        values: shape (entries, lanes).
-    """
+    """Set the first entries of an array of vectors to values, shape (entries, lanes), and all others to zero."""
     real = np.float32 if array.dtype == ti.f32 else np.float64
     array.from_numpy(np.pad(values.astype(real), ((0, array.shape[0] - len(values)), (0, 0))))
 
@@ -137,11 +107,7 @@ _home = (0, 0)
 
 
 def lanes(precision: str) -> int:
-    """Give the numbers that a vector register of the processor holds; 1 on a GPU, where every point is a thread.
-
-    Args:
-        precision: f32 or f64.
-    """
+    """Give the numbers that a vector register of the processor holds; 1 on a GPU, where every point is a thread."""
     if started().arch != "cpu":
         return 1
     return vector_bits() // (32 if precision == "f32" else 64)
@@ -160,10 +126,6 @@ def started() -> Device:
 
 def start(arch: str = "cpu", threads: int | None = None) -> Device:
     """Start Taichi, or return the device if it was started in the same way before.
-
-    Args:
-        arch: cpu, cuda or vulkan.
-        threads: number of CPU threads; None takes every core.
 
     Raises:
         ArgumentError: when the number of threads is not valid.
@@ -200,11 +162,7 @@ def stop() -> None:
 
 
 def require_here() -> None:
-    """Make sure that Taichi can be used in this process and thread.
-
-    Raises:
-        MsmError: in a process forked from the one that started Taichi, or in another thread than the one that did.
-    """
+    """Make sure that Taichi can be used here; MsmError: another process or thread started it."""
     process, thread = _home
     if process != os.getpid():
         raise MsmError(
@@ -220,11 +178,8 @@ def our_compilation(*, optimised: bool = True) -> contextlib.AbstractContextMana
 
     Every operation is rounded by IEEE 754, so that the bits of a result do not depend on threads, lanes or compiler
     optimisation. On a CPU vectors stay vectors (docs/decisions/0010). Taichi's optimisation of control flow is left
-    out: it takes half the compile time, and LLVM does the same again.
-
-    Args:
-        optimised: False leaves Taichi's other optimisations to LLVM too. It must be the same at every launch of a
-            kernel.
+    out: it takes half the compile time, and LLVM does the same again. `optimised=False` leaves Taichi's other
+    optimisations to LLVM too; it must be the same at every launch of a kernel.
     """
     config = ti.lang.impl.current_cfg()
     options: Parts = [
@@ -256,7 +211,11 @@ def _cache() -> dict[str, Any]:
         folder.mkdir(parents=True, exist_ok=True)
         with tempfile.TemporaryFile(dir=folder):
             pass
-        _require_room(folder)
+        if hasattr(os, "statvfs"):
+            free = os.statvfs(folder)
+            # Some file systems without a limit of files report a limit of 0.
+            if (free.f_files > 0 and free.f_favail < CACHE_FILES) or free.f_bavail * free.f_frsize < CACHE_BYTES:
+                raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
     except OSError:
         # When a process ends, Taichi crashes if it cannot write to the folder, even if the cache is off.
         os.environ.pop(chosen().folder_variable, None)
@@ -267,15 +226,6 @@ def _cache() -> dict[str, Any]:
         if time.time() - lock.stat().st_mtime > STALE_LOCK:
             lock.unlink()
     return {}
-
-
-def _require_room(folder: Path) -> None:
-    """Raise OSError if the files of a run's kernels may not fit into a folder."""
-    if hasattr(os, "statvfs"):
-        free = os.statvfs(folder)
-        # Some file systems without a limit of files report a limit of 0.
-        if (free.f_files > 0 and free.f_favail < CACHE_FILES) or free.f_bavail * free.f_frsize < CACHE_BYTES:
-            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
 
 
 def _require_address_space() -> None:

@@ -25,7 +25,7 @@ class Interruption:
     """
 
     def __init__(self) -> None:
-        self.code = _code(signal.SIGINT)
+        self.code = 128 + signal.SIGINT
         self._requested = False
 
     def listen(self) -> None:
@@ -34,16 +34,12 @@ class Interruption:
             signal.signal(number, self._request)
 
     def grant(self) -> None:
-        """Stop here if a stop was requested.
-
-        Raises:
-            KeyboardInterrupt: when a signal came since `listen`.
-        """
+        """Raise KeyboardInterrupt if a signal came since `listen`."""
         if self._requested:
             raise KeyboardInterrupt
 
     def _request(self, number: int, _frame: FrameType | None) -> None:
-        self.code = _code(number)
+        self.code = 128 + number
         if self._requested:
             _end(self.code, b"interrupted twice; ended at once\n")
         self._requested = True
@@ -58,14 +54,10 @@ def leave_at_once() -> None:
 
 
 def _leave(number: int, _frame: FrameType | None) -> None:
-    _end(_code(number), b"interrupted; nothing was written\n")
+    _end(128 + number, b"interrupted; nothing was written\n")
 
 
 def _end(code: int, message: bytes) -> None:
     with suppress(OSError):  # nobody can read it
         os.write(_outlet, message)
     os._exit(code)
-
-
-def _code(number: int) -> int:
-    return 128 + number

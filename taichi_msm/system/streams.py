@@ -5,11 +5,10 @@ from __future__ import annotations
 import io
 import os
 import sys
-from collections.abc import Iterable
-from contextlib import suppress
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager, suppress
+from pathlib import Path
 from typing import TextIO
-
-import click
 
 from taichi_msm.errors import printable
 
@@ -28,6 +27,9 @@ def open_missing() -> None:
 
 def tell(lines: Iterable[str]) -> None:
     """Write lines to stderr, whatever characters they contain; discard them if nobody can read them."""
+    # Imported here, as the library needs no command line.
+    import click
+
     try:
         for line in lines:
             click.echo(printable(line), err=True)
@@ -41,3 +43,21 @@ def mute(stream: TextIO) -> None:
         nowhere = os.open(os.devnull, os.O_WRONLY)
         os.dup2(nowhere, stream.fileno())
         os.close(nowhere)
+
+
+@contextmanager
+def silenced(*descriptors: int, into: str = os.devnull) -> Iterator[None]:
+    """Discard, or write into a file, what libraries write to some file descriptors; a closed one stays closed."""
+    with Path(into).open("wb") as nowhere:
+        kept = {}
+        for descriptor in descriptors:
+            with suppress(OSError):
+                kept[descriptor] = os.dup(descriptor)
+        for descriptor in kept:
+            os.dup2(nowhere.fileno(), descriptor)
+        try:
+            yield
+        finally:
+            for descriptor, copy in kept.items():
+                os.dup2(copy, descriptor)
+                os.close(copy)

@@ -12,7 +12,7 @@ from pydantic_core import PydanticCustomError
 from taichi_msm.errors import Problem, SceneError
 from taichi_msm.faults import REFUSED
 from taichi_msm.scene import MAX_PIXELS, NotNegative, Number, Pixels, Section, key
-from taichi_msm.scenefile.load import Draft, Kind, read_file
+from taichi_msm.scenefile.load import Draft, Kind
 from taichi_msm.scenefile.validation import parse
 from taichi_msm.viewer.events import KEYS, Drag, Event, Key, Percent, Press, Release, Turn
 
@@ -38,9 +38,9 @@ _SCRIPT = Kind("script", "events")
 class Entry(Section):
     """One entry of a script."""
 
-    t: Seconds = key(means="when, or when it begins [s]", expects=SECONDS)
+    t: Seconds = key(..., means="when, or when it begins [s]", expects=SECONDS)
     do: Literal["press", "pull", "drag", "release", "turn", "percent", "key"] = key(
-        means="what is done", expects=f"{', '.join(KINDS)} or {LAST_KIND}"
+        ..., means="what is done", expects=f"{', '.join(KINDS)} or {LAST_KIND}"
     )
     at: Pair | None = key(
         None, means="the pixel", expects="for press, pull and drag [x, y] in pixels from the top left"
@@ -75,7 +75,7 @@ class Script(Section):
         means="width, height of the picture that the pixels are of [px]; others are scaled; default: the session's",
         expects=f"two whole numbers, 1 to {MAX_PIXELS}: [width, height] in pixels",
     )
-    events: tuple[Entry, ...] = key(means="what is done, in order", expects="a list of mappings with t and do")
+    events: tuple[Entry, ...] = key(..., means="what is done, in order", expects="a list of mappings with t and do")
 
     @field_validator("events", mode="after")
     @classmethod
@@ -102,7 +102,7 @@ def load_script(path: str | Path, size: tuple[int, int]) -> Script:
     Raises:
         SceneError: with all faults, one line each, in the order of the file.
     """
-    draft = Draft(str(path), read_file(str(path), _SCRIPT))
+    draft = Draft(str(path), _SCRIPT)
     script, problems = parse(Script, draft.data)
     draft.report(problems)
     draft.report(_outside(script, script.size or size) if script is not None else ())

@@ -12,7 +12,7 @@ import numpy as np
 from taichi_msm.errors import DeviceError, FilesError
 from taichi_msm.outputs.gif import Picture
 from taichi_msm.progress import Pause
-from taichi_msm.system.silence import silenced
+from taichi_msm.system.streams import silenced
 from taichi_msm.viewer import hud
 from taichi_msm.viewer.events import KEYS, NOTCH, Drag, Event, Harder, Hover, Key, Press, Release, Turn
 from taichi_msm.viewer.pacing import Pacing
