@@ -7,7 +7,7 @@ import platform
 import sys
 import time
 from collections.abc import Iterator, Mapping, Sequence
-from contextlib import ExitStack, closing, contextmanager, suppress
+from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import replace
 from functools import partial
 from operator import attrgetter
@@ -24,12 +24,12 @@ from taichi_msm.errors import DamagedError, DeviceError, DivergedError, FilesErr
 from taichi_msm.physics.error_control import Estimate
 from taichi_msm.physics.lattice import rest_positions
 from taichi_msm.physics.mesh_error import MeshEstimate
-from taichi_msm.physics.pilots import Pilots, choose_pilots, no_pilots
+from taichi_msm.physics.pilots import Pilots, choose_pilots
 from taichi_msm.physics.plan import Plan
 from taichi_msm.physics.probe_force import probe_records
 from taichi_msm.physics.run_error import Known, RunError
 from taichi_msm.physics.run_notes import run_notes
-from taichi_msm.physics.run_progress import RunProgress
+from taichi_msm.physics.state import RunProgress
 from taichi_msm.physics.workload import ENCODING
 from taichi_msm.progress import Progress
 from taichi_msm.render.drawing_notes import drawing_notes
@@ -248,7 +248,7 @@ class _Run:
         self._known = Known(manifest.estimate, pilots.reason, manifest.mesh)
         if not pilots.reason:
             try:
-                self._error = opened.enter_context(closing(RunError(plan, pilots, self._known, device, cores)))
+                self._error = RunError(plan, pilots, self._known, device, cores)
             except DeviceError:
                 self._known = self._known._replace(reason=f"{device.arch} cannot run this scene in f64")
 
@@ -368,11 +368,11 @@ def _pilots(manifest: Manifest, plan: Plan, device: Device, *, resumed: bool) ->
     """Choose the pilots of a run, or say why there are none."""
     asked = manifest.asks_estimate
     if asked is False:
-        return no_pilots("not asked for")
+        return Pilots(reason="not asked for")
     if asked is None and device.arch != "cpu":
-        return no_pilots("on a GPU, this needs --estimate-error")
+        return Pilots(reason="on a GPU, this needs --estimate-error")
     if resumed and not plan.scene.output:
-        return no_pilots("the frames before the interruption were not kept")
+        return Pilots(reason="the frames before the interruption were not kept")
     return choose_pilots(plan, asked=asked is True)
 
 

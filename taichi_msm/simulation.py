@@ -16,9 +16,8 @@ from taichi_msm.physics.diagnosis import Diagnosis, diagnose
 from taichi_msm.physics.divergence import Watch, farthest
 from taichi_msm.physics.lattice import axes
 from taichi_msm.physics.plan import Plan
-from taichi_msm.physics.run_progress import RunProgress, Saved
 from taichi_msm.physics.solver import Dynamics
-from taichi_msm.physics.state import Reading
+from taichi_msm.physics.state import Reading, RunProgress, Saved
 from taichi_msm.progress import Pause
 from taichi_msm.render.labels import Flow, Labels, Observed, Sight
 from taichi_msm.render.picking import pick

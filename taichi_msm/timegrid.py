@@ -10,7 +10,7 @@ Precision = Literal["f32", "f64"]
 
 @dataclass(frozen=True)
 class TimeGrid:
-    """The steps of a run; `physics.timestep.time_grid` decides them for a scene.
+    """The steps of a run; `physics.planning` decides them for a scene.
 
     Times are quotients of whole numbers of steps, never sums of steps.
     """

@@ -12,8 +12,8 @@ from taichi_msm.physics.kernel import SheetLayout
 from taichi_msm.physics.plan import Plan
 from taichi_msm.physics.probe_force import probe_records
 from taichi_msm.physics.run_notes import run_notes
-from taichi_msm.physics.run_progress import RunProgress
 from taichi_msm.physics.solver import Dynamics, layout_of
+from taichi_msm.physics.state import RunProgress
 from taichi_msm.scene import Scene
 from taichi_msm.system.runtime import Device
 from tests.scenes import plan_of

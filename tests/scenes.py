@@ -8,8 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from taichi_msm.physics.plan import Plan
-from taichi_msm.physics.planning import try_plan
-from taichi_msm.physics.timestep import with_time
+from taichi_msm.physics.planning import try_plan, with_time
 from taichi_msm.scene import Scene
 from taichi_msm.timegrid import TimeGrid
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from contextlib import closing, suppress
+from contextlib import suppress
 from functools import partial
 from typing import Any
 
@@ -17,8 +17,8 @@ from taichi_msm.physics.error_control import Estimate, Trials, choose_step, esti
 from taichi_msm.physics.mesh_error import MeshEstimate
 from taichi_msm.physics.pilots import coarse_steps, fine_steps
 from taichi_msm.physics.plan import Plan
-from taichi_msm.physics.run_progress import RunProgress
-from taichi_msm.physics.timestep import with_time
+from taichi_msm.physics.planning import with_time
+from taichi_msm.physics.state import RunProgress
 from taichi_msm.scene import Scene
 from taichi_msm.simulation import Simulation
 from taichi_msm.system.runtime import Device
@@ -76,8 +76,8 @@ def test_the_step_chosen_is_right_and_the_largest(kind: str, precision: str, tol
     assert estimate.steps_per_frame == grid.steps_per_frame >= plan_of(made).grid.steps_per_frame
     if grid.steps_per_frame > plan_of(made).grid.steps_per_frame:
         # Half as many steps would not have done.
-        with closing(Trials(plan, device)) as trials:
-            assert trials.estimate(grid.steps_per_frame // 2, lambda done, total: None).error > tolerance
+        fewer = Trials(plan, device).estimate(grid.steps_per_frame // 2, lambda done, total: None)
+        assert fewer.error > tolerance
 
 
 @pytest.mark.parametrize("difference", ["central", "backward"])
@@ -110,9 +110,6 @@ class Falling:
 
     def displacement(self) -> NDArray[np.float64]:
         return np.array([[[1 + self.h**self.p, 0, 0]]])
-
-    def close(self) -> None:
-        pass
 
 
 @pytest.mark.parametrize(("difference", "p"), [("central", 2), ("backward", 1)])

@@ -13,8 +13,7 @@ import numpy as np
 import pytest
 
 from taichi_msm.errors import DamagedError
-from taichi_msm.physics.run_progress import RunProgress, Saved
-from taichi_msm.physics.state import State
+from taichi_msm.physics.state import RunProgress, Saved, State
 from taichi_msm.results.checkpoint import MANIFEST, POSITIONS, STATE, Checkpoint, seal, unseal
 from taichi_msm.results.manifest import Manifest, read_manifest
 from taichi_msm.scene import Scene

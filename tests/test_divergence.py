@@ -12,8 +12,7 @@ import pytest
 from taichi_msm import DivergedError, Simulation
 from taichi_msm.physics.diagnosis import Diagnosis
 from taichi_msm.physics.divergence import farthest_displacement
-from taichi_msm.physics.run_progress import RunProgress, Saved
-from taichi_msm.physics.state import State
+from taichi_msm.physics.state import RunProgress, Saved, State
 from taichi_msm.scene import Scene
 from taichi_msm.system.runtime import Device
 from tests.scenes import SHEET, plan_of, scene, with_steps

@@ -13,10 +13,9 @@ import pytest
 from taichi_msm import load_scene, resume, run
 from taichi_msm.physics import pilots, workload
 from taichi_msm.physics.pilots import ENOUGH, Pilots, choose_pilots
-from taichi_msm.physics.planning import on
-from taichi_msm.physics.run_progress import RunProgress
+from taichi_msm.physics.planning import on, with_time
 from taichi_msm.physics.solver import Dynamics
-from taichi_msm.physics.timestep import with_time
+from taichi_msm.physics.state import RunProgress
 from taichi_msm.physics.workload import affords_pilots
 from taichi_msm.progress import Pause
 from taichi_msm.results.record import RunRecord

@@ -31,7 +31,7 @@ from taichi_msm import (
     run,
 )
 from taichi_msm.physics.lattice import rest_positions
-from taichi_msm.physics.timestep import with_time
+from taichi_msm.physics.planning import with_time
 from taichi_msm.render.camera import view
 from taichi_msm.system.resources import processor
 from taichi_msm.system.runtime import Device

@@ -8,7 +8,7 @@ import pytest
 from scipy.integrate import quad
 
 from taichi_msm.physics.loads import Envelope, key_times, loads_at, schedule
-from taichi_msm.physics.slots import probe_slots
+from taichi_msm.physics.plan import probe_slots
 from taichi_msm.scene import Scene
 from tests.scenes import PRESS, SPRINGS, plan_of, scene
 

@@ -13,17 +13,17 @@ import pytest
 import taichi_msm
 import taichi_msm.runner
 from taichi_msm.cli import main
-from taichi_msm.physics import lattice, slots, stiffness_map, terms, timestep
+from taichi_msm.physics import lattice, material, plan, planning, terms
 
 DERIVED = [
     (terms, "material_of"),
     (terms, "highest_frequency"),
-    (slots, "probe_slots"),
+    (plan, "probe_slots"),
     (lattice, "fixed_points"),
-    (stiffness_map, "read"),
-    (stiffness_map, "factors"),
-    (timestep, "stable_step"),
-    (timestep, "steps_per_frame"),
+    (material, "read_map"),
+    (material, "map_factors"),
+    (planning, "stable_step"),
+    (planning, "steps_per_frame"),
 ]
 
 
@@ -57,8 +57,8 @@ def test_a_run_derives_everything_once(root: Path, tmp_path: Path, calls: Counte
 def test_pilots_with_fewer_points_derive_their_own_sheets_once(root: Path, tmp_path: Path, calls: Counter[str]) -> None:
     short = ["--set", "time.duration=0.08", "--set", "output=[]", "--estimate-error", "--quiet"]
     assert main(["run", str(root / "scenes/tumour.yaml"), "--out", str(tmp_path / "out"), *short]) == 0
-    assert {calls[name] for name in ("material_of", "fixed_points", "factors", "stable_step")} == {3}
-    assert calls["read"] == 1, "the map's file"
+    assert {calls[name] for name in ("material_of", "fixed_points", "map_factors", "stable_step")} == {3}
+    assert calls["read_map"] == 1, "the map's file"
 
 
 def test_a_check_derives_everything_once(root: Path, calls: Counter[str], capsys: pytest.CaptureFixture[str]) -> None:

@@ -15,12 +15,12 @@ from pydantic import BaseModel
 from taichi_msm.physics.lattice import rest_positions
 from taichi_msm.physics.mesh_error import with_points
 from taichi_msm.physics.plan import Plan
+from taichi_msm.physics.planning import with_time
 from taichi_msm.physics.solver import Dynamics
 from taichi_msm.physics.terms.damping import DampingTerm
 from taichi_msm.physics.terms.foundation import FoundationTerm
 from taichi_msm.physics.terms.probes import ProbeTerm
 from taichi_msm.physics.terms.springs import SpringTerm
-from taichi_msm.physics.timestep import with_time
 from taichi_msm.runner import run
 from taichi_msm.scene import Scene
 from taichi_msm.study import measure, pictures, terms

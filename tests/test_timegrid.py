@@ -12,8 +12,7 @@ import pytest
 from taichi_msm import Simulation
 from taichi_msm.physics.error_control import choose_step
 from taichi_msm.physics.loads import schedule
-from taichi_msm.physics.planning import on
-from taichi_msm.physics.timestep import with_chosen_grid
+from taichi_msm.physics.planning import on, with_chosen_grid
 from taichi_msm.system.runtime import Device
 from taichi_msm.timegrid import TimeGrid
 from tests.scenes import PRESS, plan_of, scene

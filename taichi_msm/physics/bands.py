@@ -46,25 +46,18 @@ MOMENTS = 3
 
 
 class RowBand(NamedTuple):
-    """A worker's band of rows, within a kernel.
+    """A worker's band of rows, within a kernel."""
 
-    Attributes:
-        worker, workers: its worker; all workers.
-        low, high: its first row, and the row after its last.
-        way: 1 if its worker sweeps down, -1 if up.
-        rows: of the sheet.
-        patience: as in the sizes.
-        progress: of all workers.
-    """
-
+    # worker, workers: its worker; all workers
     worker: Any
     workers: Any
+    # low, high: its first row, and the row after its last
     low: Any
     high: Any
-    way: Any
-    rows: Any
-    patience: Any
-    progress: Any
+    way: Any  # 1 if its worker sweeps down, -1 if up
+    rows: Any  # of the sheet
+    patience: Any  # as in the sizes
+    progress: Any  # of all workers
 
 
 def stepping_row(code: StepCode, *, parallel: bool) -> Callable[..., Any]:

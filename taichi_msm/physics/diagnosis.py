@@ -13,8 +13,8 @@ from taichi_msm.physics.divergence import Watch, farthest
 from taichi_msm.physics.lattice import axes
 from taichi_msm.physics.plan import Plan
 from taichi_msm.physics.probe_force import control_points, probe_force
-from taichi_msm.physics.run_progress import RunProgress, Saved
 from taichi_msm.physics.solver import Dynamics
+from taichi_msm.physics.state import RunProgress, Saved
 from taichi_msm.progress import Pause
 from taichi_msm.scene import Scene
 
@@ -25,24 +25,16 @@ MOST_SECONDS = 10.0
 
 @dataclass(frozen=True)
 class Diagnosis:
-    """What was found out about a divergence.
+    """What was found out about a divergence."""
 
-    Attributes:
-        message: the time, the step, the point, the key that is the most likely cause, and the remedy.
-        good: the last sound state of the run; None: only the start is known to be sound.
-    """
-
-    message: str
-    good: Saved | None
+    message: str  # the time, the step, the point, the key that is the most likely cause, and the remedy
+    good: Saved | None  # the last sound state of the run; None: only the start is known to be sound
 
 
 def diagnose(dynamics: Dynamics, start: Saved | None, pause: Pause) -> Diagnosis:
-    """Find out how a run diverged within the current frame.
+    """Find out how a run diverged within the current frame, from a sound state on; None: from rest.
 
-    Args:
-        dynamics: of the run; its state afterwards is arbitrary.
-        start: a sound state of the run; None: at rest.
-        pause: called often; an exception from it stops the search.
+    The state of the dynamics afterwards is arbitrary.
     """
     plan, grid, bad = dynamics.plan, dynamics.plan.grid, dynamics.steps_done
     state, progress = start or (None, RunProgress())
@@ -69,18 +61,15 @@ def diagnose(dynamics: Dynamics, start: Saved | None, pause: Pause) -> Diagnosis
     dynamics.restart(plan, low)
     dynamics.advance(1)
     reading = dynamics.read()
-    wrong = watch.judge(reading)
     cause = _cause(dynamics, high, farthest(reading.displacement)[:2], pause)
-    message = divergence.message(grid.time(high), high, f"{wrong}; {cause}", exact=True)
-    return Diagnosis(message, Saved(low, watch.progress))
+    said = f"{watch.judge(reading)}; {cause}"
+    return Diagnosis(divergence.message(grid.time(high), high, said, exact=True), Saved(low, watch.progress))
 
 
 def _cause(dynamics: Dynamics, bad: int, point: tuple[int, int], pause: Pause) -> str:
     """Name the key that is the most likely cause: the step, if a finer one does not diverge, or else a force."""
     plan, grid = dynamics.plan, dynamics.plan.grid
-    scene = plan.scene
-    frames = -(-bad // grid.steps_per_frame)
-    tried, end = math.inf, time.monotonic() + MOST_SECONDS
+    frames, tried, end = -(-bad // grid.steps_per_frame), math.inf, time.monotonic() + MOST_SECONDS
 
     def pause_or_stop() -> None:
         pause()
@@ -96,8 +85,8 @@ def _cause(dynamics: Dynamics, bad: int, point: tuple[int, int], pause: Pause) -
         if went_well:
             return f"likely cause: time.step, {grid.step:.6g} s; with {finer.grid.step:.9g} s it does not diverge here"
         tried = finer.grid.step
-    index, force = _strongest_probe(scene, point)
-    name = "force" if scene.probes[index].total is None else "total"
+    index, force = _strongest_probe(plan.scene, point)
+    name = "force" if plan.scene.probes[index].total is None else "total"
     said = f"likely cause: probes.{index}.{name}, which reaches {force:.3g} N at this point"
     if tried < math.inf:
         return f"{said}; take less, as it diverges with every time.step that was tried, down to {tried:.3g} s"

@@ -11,8 +11,7 @@ from numpy.typing import NDArray
 from taichi_msm.physics.lattice import spacing
 from taichi_msm.physics.loads import Envelope
 from taichi_msm.physics.plan import Plan
-from taichi_msm.physics.run_progress import RunProgress
-from taichi_msm.physics.state import Reading
+from taichi_msm.physics.state import Reading, RunProgress
 from taichi_msm.physics.terms import TERMS
 from taichi_msm.physics.terms.probes import free_acceleration, norm
 
@@ -27,21 +26,14 @@ SWING = 4.0
 ROUNDING = 1e-9
 
 
-def _is_held(plan: Plan) -> bool:
-    """Tell whether springs connect every point to a fixed one; shear springs alone may skip every other point."""
-    return plan.scene.sheet.fixed not in ("none", ()) and min(plan.material.across, plan.material.down) > 0
-
-
 def farthest_displacement(plan: Plan, time: float, acceleration: float | None = None) -> float:
-    """Bound the displacement of a point [m]; if one is larger, the simulation has diverged.
+    """Bound the displacement of a point at a time [m]; if one is larger, the simulation has diverged.
 
-    Args:
-        plan: of the run.
-        time: since the beginning [s].
-        acceleration: most that the probes have given to a free point so far [m/s^2]; None: most that the scene's can.
+    acceleration: most that the probes have given to a free point so far [m/s^2]; None: most that the scene's can.
     """
     most = MOST_SHEET_SIZES * max(plan.scene.sheet.size)
-    if _is_held(plan):
+    # Springs then connect every point to a fixed one; shear springs alone may skip every other point.
+    if plan.scene.sheet.fixed not in ("none", ()) and min(plan.material.across, plan.material.down) > 0:
         return most
     if plan.material.virtual > 0 and not plan.material.always:
         # The virtual springs may accelerate a point from far away, and let go of it when it is fast.
@@ -59,12 +51,8 @@ class Watch:
 
     The virtual springs hold another K / 2 |u|^2; when they begin to act, it is added for the displacements then.
 
-    Args:
-        plan: of the run.
-        progress: of the frame where the watch begins.
-
     Attributes:
-        progress: of the last frame that was found sound.
+        progress: of the last frame that was found sound; at first, of the frame where the watch begins.
     """
 
     def __init__(self, plan: Plan, progress: RunProgress | None = None) -> None:
@@ -133,30 +121,18 @@ class Watch:
 
 
 def message(time: float, step: int, wrong: str, *, exact: bool) -> str:
-    """Say where a run diverged.
-
-    Args:
-        time: of the step at which it was found [s].
-        step: its number.
-        wrong: what `Watch` says of it.
-        exact: whether the step before was still sound.
-    """
+    """Say at what time and step a run diverged, and what `Watch` says; exact: the step before was still sound."""
     return f"diverged {'at' if exact else 'before'} {time:.6g} s, step {step}: {wrong}"
 
 
 class Farthest(NamedTuple):
-    """The point that is farthest from its rest position, or not finite.
+    """The point that is farthest from its rest position, or not finite."""
 
-    Attributes:
-        row, column: of the point.
-        distance: from its rest position [m].
-        reach: root of the sum of the squared displacements of all points [m].
-    """
-
+    # row, column: of the point
     row: int
     column: int
-    distance: float
-    reach: float
+    distance: float  # from its rest position [m]
+    reach: float  # root of the sum of the squared displacements of all points [m]
 
 
 def farthest(displacement: NDArray[np.floating]) -> Farthest:
@@ -165,9 +141,8 @@ def farthest(displacement: NDArray[np.floating]) -> Farthest:
         square = np.einsum("ijk,ijk->ij", displacement, displacement, dtype=np.float64)
         # Where there is a NaN, argmax gives its index.
         row, column = (int(index) for index in np.unravel_index(square.argmax(), square.shape))
-        return Farthest(
-            row, column, float(np.linalg.norm(displacement[row, column].astype(float))), math.sqrt(square.sum())
-        )
+        distance = float(np.linalg.norm(displacement[row, column].astype(float)))
+        return Farthest(row, column, distance, math.sqrt(square.sum()))
 
 
 def _underflow(plan: Plan) -> float:

@@ -19,22 +19,15 @@ Window = tuple[slice, slice]
 
 
 class SpringFamily(NamedTuple):
-    """All springs with the same number of points down and to the right between their ends.
+    """All springs with the same number of points down and to the right between their ends."""
 
-    Attributes:
-        here, there: select the points at their ends; `there` is down or to the right of `here`.
-        offset: vector from here to there at rest [m], x right, y up, z.
-        length: at rest [m].
-        stiffness: k of each [N/m], shape as selected by `here`.
-        unstretched: length at which each has no force [m]; shorter than `length` under tension.
-    """
-
+    # here, there: select the points at their ends; `there` is down or to the right of `here`
     here: Window
     there: Window
-    offset: Array
-    length: float
-    stiffness: Array
-    unstretched: Array
+    offset: Array  # vector from here to there at rest [m], x right, y up, z
+    length: float  # at rest [m]
+    stiffness: Array  # k of each [N/m], shape as selected by `here`
+    unstretched: Array  # length at which each has no force [m]; shorter than `length` under tension
 
     def apart(self, displacement: Array) -> tuple[Array, Array]:
         """Give the vectors from one end of each spring to the other, and their lengths [m]."""
@@ -67,12 +60,7 @@ def spring_families(plan: Plan) -> Iterator[SpringFamily]:
 def elastic_force(every: Sequence[SpringFamily], displacement: Array) -> Array:
     """Sum k (L - L0) (Q - P) / L over the neighbours Q of every point P (eq. 2), without the part that cancels at rest.
 
-    Args:
-        every: the springs of a sheet.
-        displacement: x - X [m], shape (rows, cols, 3).
-
-    Returns:
-        Force [N], shape (rows, cols, 3).
+    Displacement x - X [m] and force [N] have shape (rows, cols, 3).
     """
     force = np.zeros_like(displacement)
     for family in every:
@@ -91,12 +79,8 @@ def energy_density(plan: Plan, displacement: Array) -> Array:
     Each end of a spring gets half of its energy, and a point has the share of the sheet's area at rest that
     `area_shares` gives it, so that the sum of density times area is the energy of all springs.
 
-    Args:
-        plan: of the scene.
-        displacement: x - X [m], shape (rows, cols, 3).
-
     Returns:
-        Energy per area at rest [J/m2], shape (rows, cols).
+        Energy per area at rest [J/m2], shape (rows, cols), for displacements x - X [m], shape (rows, cols, 3).
     """
     at_points, (dx, dy) = np.zeros(displacement.shape[:2]), spacing(plan.scene.sheet)
     for family in spring_families(plan):

@@ -11,7 +11,6 @@ the largest displacement of any point at any frame.
 from __future__ import annotations
 
 import math
-from contextlib import ExitStack, closing
 from dataclasses import dataclass
 from functools import partial
 from itertools import pairwise
@@ -45,27 +44,20 @@ LARGEST_CUT = 8.0
 
 @dataclass(frozen=True)
 class Estimate:
-    """What is known about the error of a step.
+    """What is known about the error of a step."""
 
-    Attributes:
-        steps_per_frame: of the step.
-        error: largest error, as a fraction of the largest displacement; infinite if it is not known because a pilot
-            diverged or the step does not resolve the damping.
-        rounding: the part of the error that comes from f32, including that of positions in the trajectory; 0 in f64.
-        in_f64: the error of the same step in f64.
-        order: of the method in this scene.
-        parted: whether the two parts are known; else, by a coarse pilot beside a run in f32, neither is larger than the
-            error told.
-        at_least: whether the error may be larger, as a coarse pilot shows one that only a fine one would tell.
-    """
-
-    steps_per_frame: int
+    steps_per_frame: int  # of the step
+    # The largest error, as a fraction of the largest displacement; infinite if it is not known because a pilot diverged
+    # or the step does not resolve the damping.
     error: float
-    rounding: float
-    in_f64: float
-    order: int
+    rounding: float  # the part of the error that comes from f32, also of positions in the trajectory; 0 in f64
+    in_f64: float  # the error of the same step in f64
+    order: int  # of the method in this scene
+    # Whether the two parts are known; else, by a coarse pilot beside a run in f32, neither is larger than the error.
     parted: bool = True
-    at_least: bool = False
+    at_least: bool = (
+        False  # whether the error may be larger, as a coarse pilot shows one that only a fine one would tell
+    )
 
 
 def order(plan: Plan) -> int:
@@ -74,36 +66,38 @@ def order(plan: Plan) -> int:
 
 
 def estimate_error(plan: Plan, device: Device, progress: Count = lambda done, total: None) -> Estimate:
-    """Estimate the error of a run.
-
-    Args:
-        plan: of the run.
-        device: what `runtime.start` returned.
-        progress: called with the frames done and the frames in all.
-    """
-    with closing(Trials(plan, device)) as trials:
-        return trials.estimate(plan.grid.steps_per_frame, progress)
+    """Estimate the error of a run; progress counts frames."""
+    return Trials(plan, device).estimate(plan.grid.steps_per_frame, progress)
 
 
 def choose_step(plan: Plan, device: Device, progress: Count = lambda done, total: None) -> tuple[Plan, Estimate]:
-    """Find the largest stable step whose estimated error is within the scene's tolerance.
+    """Find the largest stable step whose estimated error is within the scene's tolerance, and this error.
 
-    Args:
-        plan: of a scene with a tolerance, whose steps do without it; no fewer are tried.
-        device: what `runtime.start` returned.
-        progress: called with the frames done and the frames in all of each pilot run.
-
-    Returns:
-        The plan with that step, and its error.
+    No fewer steps than the plan's are tried; progress counts the frames of each pilot run.
 
     Raises:
         SceneError: when no step meets the tolerance; names a precision or a tolerance that would do.
     """
-    tolerance = plan.scene.time.tolerance
+    tolerance, steps, trials = plan.scene.time.tolerance, plan.grid.steps_per_frame, Trials(plan, device)
     assert tolerance is not None
-    with closing(Trials(plan, device)) as trials:
-        estimate = _search(tolerance, plan.grid.steps_per_frame, trials, progress)
-    return plan.with_grid(steps_per_frame=estimate.steps_per_frame), estimate
+    too_few, enough, failures = steps - 1, None, []
+    for _ in range(MOST_PILOTS):
+        tried = trials.estimate(steps, progress)
+        if tried.error <= tolerance:
+            enough = tried
+        else:
+            too_few = steps
+            failures.append(tried)
+            if tried.rounding > CLOSE * tolerance or _stuck(failures):
+                break
+        if enough and (enough.error >= CLOSE * tolerance or enough.steps_per_frame - too_few <= 1):
+            break
+        steps = max(_next(tried, tolerance), too_few + 1)
+        if enough and steps >= enough.steps_per_frame:
+            break
+    if not enough:
+        raise SceneError([_out_of_reach(tolerance, failures)])
+    return plan.with_grid(steps_per_frame=enough.steps_per_frame), enough
 
 
 class Pilot:
@@ -114,9 +108,7 @@ class Pilot:
     r^-p - 1 times the error of the step; where that is less than MARGIN times, the difference is enlarged accordingly.
 
     Args:
-        plan: of the run.
-        steps: steps per frame of the pilot, as in `Pilots`; 0: the error is not known.
-        device: what `runtime.start` returned.
+        steps: per frame of the pilot, as in `Pilots`; 0: the error is not known.
         cores: number of cores that stepping may use; None: all. With as many as the run has, its kernels are reused.
 
     Attributes:
@@ -129,18 +121,11 @@ class Pilot:
     def __init__(self, plan: Plan, steps: int, device: Device, cores: int | None = None) -> None:
         self._order, exact = order(plan), plan.with_grid(precision="f64")
         coarse = 0 < steps < plan.grid.steps_per_frame
-        with ExitStack() as opened:
-
-            def dynamics() -> Dynamics:
-                sheet = Dynamics(exact, device, cores=cores)
-                opened.callback(sheet.close)
-                return sheet
-
-            self._other = dynamics()
-            # A run in f64 is itself the one with its own steps.
-            self._same = None if plan.grid.precision == "f64" or coarse else dynamics()
-            self._open = opened.pop_all()
         self._parted = plan.grid.precision == "f64" or not coarse
+        self._other = Dynamics(exact, device, cores=cores)
+        # A run in f64 is itself the one with its own steps.
+        own = plan.grid.precision == "f64" or coarse
+        self._same = None if own else Dynamics(exact, device, cores=cores)
         self._margin = 1.0
         if coarse:
             shown = (plan.grid.steps_per_frame / steps) ** self._order - 1
@@ -201,30 +186,17 @@ class Pilot:
             rounding, in_f64 = 0.0 if self._parted else error, error
         return Estimate(self._plan.grid.steps_per_frame, error, rounding, in_f64, self._order, self._parted)
 
-    def close(self) -> None:
-        """Free the memory."""
-        self._open.close()
-
 
 class Trials:
     """Runs of a scene with different steps, one after the other, each with a pilot beside it."""
 
     def __init__(self, plan: Plan, device: Device) -> None:
         self._plan = plan
-        with ExitStack() as opened:
-            self._pilot = Pilot(plan, fine_steps(plan), device)
-            opened.callback(self._pilot.close)
-            self._own = Dynamics(plan, device)
-            opened.callback(self._own.close)
-            self._open = opened.pop_all()
+        self._pilot = Pilot(plan, fine_steps(plan), device)
+        self._own = Dynamics(plan, device)
 
     def estimate(self, steps: int, progress: Count) -> Estimate:
-        """Run the scene, and estimate its error.
-
-        Args:
-            steps: steps per frame.
-            progress: called with the frames done and the frames in all.
-        """
+        """Run the scene with so many steps per frame, and estimate its error; progress counts frames."""
         plan = self._plan.with_grid(steps_per_frame=steps)
         fine, frames = fine_steps(plan), plan.grid.frames
         self._pilot.restart(plan, fine)
@@ -243,10 +215,6 @@ class Trials:
         rest = rest_positions(self._plan.scene.sheet)
         return (rest + displacement).astype(np.float32) - rest
 
-    def close(self) -> None:
-        """Free the memory."""
-        self._open.close()
-
 
 def longest(vectors: NDArray[Any]) -> float:
     """Give the length of the longest vector, shape (..., 3); infinite if one is not finite."""
@@ -259,29 +227,6 @@ def _above(error: float) -> float:
     """Round up to one digit, with a margin of 20 %."""
     digit = 10.0 ** math.floor(math.log10(error))
     return float(f"{math.ceil(1.2 * error / digit) * digit:.3g}")
-
-
-def _search(tolerance: float, least: int, trials: Trials, progress: Count) -> Estimate:
-    """Search between too few steps per frame and enough."""
-    too_few, enough, failures = least - 1, None, []
-    steps = least
-    for _ in range(MOST_PILOTS):
-        tried = trials.estimate(steps, progress)
-        if tried.error <= tolerance:
-            enough = tried
-        else:
-            too_few = steps
-            failures.append(tried)
-            if tried.rounding > CLOSE * tolerance or _stuck(failures):
-                break
-        if enough and (enough.error >= CLOSE * tolerance or enough.steps_per_frame - too_few <= 1):
-            return enough
-        steps = max(_next(tried, tolerance), too_few + 1)
-        if enough and steps >= enough.steps_per_frame:
-            return enough
-    if enough:
-        return enough
-    raise SceneError([_out_of_reach(tolerance, failures)])
 
 
 def _next(tried: Estimate, tolerance: float) -> int:

@@ -22,7 +22,7 @@ wrong results; so unary minus, `-=`, abs, any and all are not used on vectors, a
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any, NamedTuple, Protocol
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -37,22 +37,15 @@ BYTES = {"f32": 4, "f64": 8}
 
 @dataclass(frozen=True)
 class SheetLayout:
-    """How a sheet is laid out in memory and shared out among workers, and the code that steps it.
+    """How a sheet is laid out in memory and shared out among workers, and the code that steps it."""
 
-    Attributes:
-        rows, cols: points of the sheet.
-        workers: number of bands of rows that are stepped in parallel; 0 on a GPU, where all points are.
-        depth: number of steps that a band takes in one sweep.
-        fixed_rows: whether all points of the first row are fixed, and all of the last.
-        code: what the kernels are compiled for.
-    """
-
+    # rows, cols: points of the sheet
     rows: int
     cols: int
-    workers: int
-    depth: int
-    fixed_rows: tuple[bool, bool]
-    code: StepCode
+    workers: int  # number of bands of rows that are stepped in parallel; 0 on a GPU, where all points are
+    depth: int  # number of steps that a band takes in one sweep
+    fixed_rows: tuple[bool, bool]  # whether all points of the first row are fixed, and all of the last
+    code: StepCode  # what the kernels are compiled for
 
     @property
     def strip(self) -> int:
@@ -66,65 +59,19 @@ class SheetLayout:
 
 
 class Start(NamedTuple):
-    """What the arrays of a sheet hold at the start.
+    """What the arrays of a sheet hold at the start."""
 
-    Attributes:
-        numbers: of the sheet and its terms.
-        by_column: content of the array by_column, shape (COLUMN_ROWS, cols).
-        decay: of the standing slots, shape (standing slots, rows, cols).
-        stiffness: content of the array stiffness; None without a map.
-        state: to continue from; None: at rest.
-    """
-
-    numbers: NDArray[Any]
-    by_column: NDArray[Any]
-    decay: NDArray[Any]
-    stiffness: NDArray[Any] | None
-    state: State | None
-
-
-class SheetReading(NamedTuple):
-    """What is read from a sheet, in the order of the kernel's arguments.
-
-    Attributes:
-        differences: True: read d; False: read u.
-        values: receives it, shape (rows, cols, 3).
-        measures: receives the measures of every row of points, shape (rows, measures).
-    """
-
-    differences: bool
-    values: NDArray[Any]
-    measures: NDArray[Any]
-
-
-class StepKernel(Protocol):
-    """A form of kernel 1: the state of a sheet in the memory of a device, made of a layout and a start."""
-
-    def __init__(self, layout: SheetLayout, start: Start) -> None: ...
-
-    def advance(self, count: int, table: NDArray[Any]) -> None:
-        """Take a number of steps; table: of the loads, shape (count, columns)."""
-
-    def compile(self, table: NDArray[Any]) -> None:
-        """Compile everything that steps may need, without taking one."""
-
-    def set_decay(self, decay: NDArray[Any]) -> None:
-        """Replace the decays of the standing slots, shape (slots, rows, cols)."""
-
-    def read(self, wanted: SheetReading) -> None:
-        """Copy displacements or differences, and measure every row."""
+    numbers: NDArray[Any]  # of the sheet and its terms
+    by_column: NDArray[Any]  # shape (COLUMN_ROWS, cols)
+    decay: NDArray[Any]  # of the standing slots, shape (standing slots, rows, cols)
+    stiffness: NDArray[Any] | None  # as many rows as it takes; None without a map
+    state: State | None  # to continue from; None: at rest
 
 
 def in_lanes(layout: SheetLayout, values: NDArray[Any]) -> NDArray[Any]:
-    """Lay columns out in strips with their halo.
+    """Lay columns of values, shape (..., cols), out in strips with their halo, shape (entries, lanes).
 
-    Args:
-        layout: of the sheet.
-        values: shape (..., cols).
-
-    Returns:
-        Shape (entries, lanes), in the precision of the code. Entries without a column are 0, and values too large for
-        the precision infinite.
+    In the precision of the code: values too large for it become infinite. Entries without a column are 0.
     """
     column = np.arange(layout.code.lanes) * layout.strip + np.arange(-1, layout.strip + 1)[:, None]
     inside = (column >= 0) & (column < layout.cols)
@@ -159,14 +106,10 @@ class SheetArrays:
         self._set(self.by_column, start.by_column)
         if start.stiffness is not None:
             self._set(self.stiffness, start.stiffness)
+        state, held = start.state, (stored >= 0)[:, None]
         for c in range(3):
-            if start.state is None:
-                self._set(self.u[c], none)
-                self._set(self.d[c], none)
-            else:
-                held = (stored >= 0)[:, None]
-                self._set(self.u[c], np.where(held, start.state.displacement[stored, :, c], 0))
-                self._set(self.d[c], start.state.difference[..., c])
+            self._set(self.u[c], none if state is None else np.where(held, state.displacement[stored, :, c], 0))
+            self._set(self.d[c], none if state is None else state.difference[..., c])
         self.set_decay(start.decay)
 
     @property
@@ -199,28 +142,20 @@ def point_step(code: StepCode) -> Callable[..., None]:
     reducing = [reduce for term in code.terms for reduce in term.reducing(code)]
 
     @ti.func
-    def move(
-        sheet: ti.template(), entry: ti.template(), target, spring_x, spring_y, spring_z, now: ti.template()
-    ):  # fmt: skip
-        """Step an entry, and store it in row `target` of u; now: its row of the table of loads."""
-        force_x, force_y, force_z = spring_x, spring_y, spring_z
-        for force in ti.static(forces):
-            force_x, force_y, force_z = force(force_x, force_y, force_z, sheet, entry, now)
-
+    def move(sheet: ti.template(), entry: ti.template(), target, force: ti.template(), now: ti.template()):
+        """Step an entry, and store it in row `target` of u; force: of springs; now: its row of the table of loads."""
+        for add in ti.static(forces):
+            add(force, sheet, entry, now)
         gain = now[GAIN] * sheet.by_column[(MOVES + entry.row.kind) * sheet.width + entry.b]
         at = entry.row.i * sheet.width + entry.b
-        d_x, d_y, d_z = sheet.d[0][at], sheet.d[1][at], sheet.d[2][at]
+        d = [sheet.d[c][at] for c in ti.static(range(3))]
         for reduce in ti.static(reducing):
-            d_x, d_y, d_z = reduce(d_x, d_y, d_z, sheet)
-        d_x += gain * force_x
-        d_y += gain * force_y
-        d_z += gain * force_z
-        sheet.d[0][at] = d_x
-        sheet.d[1][at] = d_y
-        sheet.d[2][at] = d_z
-        sheet.u[0][target * sheet.width + entry.b] = entry.x + d_x
-        sheet.u[1][target * sheet.width + entry.b] = entry.y + d_y
-        sheet.u[2][target * sheet.width + entry.b] = entry.z + d_z
+            reduce(d, sheet)
+        for c in ti.static(range(3)):
+            d[c] += gain * force[c]
+        for c in ti.static(range(3)):
+            sheet.d[c][at] = d[c]
+            sheet.u[c][target * sheet.width + entry.b] = entry.u[c] + d[c]
 
     return move
 

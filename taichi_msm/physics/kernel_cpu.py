@@ -9,22 +9,13 @@ continue until all workers have taken the same steps; after that a single worker
 import time
 from collections.abc import Callable
 from functools import cache
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from taichi_msm.physics.bands import (
-    COUNTER_STRIDE,
-    MOMENTS,
-    PLACE_END,
-    ROUND,
-    STEP,
-    TURN,
-    WORKER_STRIDE,
-    advancing,
-)
-from taichi_msm.physics.kernel import BYTES, SheetArrays, SheetLayout, SheetReading, Start, reading
+from taichi_msm.physics.bands import COUNTER_STRIDE, MOMENTS, PLACE_END, ROUND, STEP, TURN, WORKER_STRIDE, advancing
+from taichi_msm.physics.kernel import BYTES, SheetArrays, SheetLayout, Start, reading
 from taichi_msm.physics.terms.bending import BendingTerm
 from taichi_msm.physics.terms.term import StepCode
 from taichi_msm.system import resources
@@ -46,22 +37,13 @@ SHORTEST_REST, LONGEST_REST, HALF_LIFE = 0.002, 0.2, 0.02
 CROWDED = 0.2
 
 
-class CpuKernels(NamedTuple):
-    """The kernels of one code."""
-
-    advance_alone: Callable[..., None]
-    advance_together: Callable[..., None]
-    read_alone: Callable[..., None]
-    read_together: Callable[..., None]
-    copy: Callable[..., None]
-
-
 class Sweep:
-    """The state of a sheet in the memory of a CPU, and its kernels: a `StepKernel`."""
+    """The state of a sheet in the memory of a CPU, and its kernels."""
 
     def __init__(self, layout: SheetLayout, start: Start) -> None:
         self._layout = layout
-        self._kernels = _kernels(layout.code)
+        self._advance, self._read = _kernels(layout.code, parallel=layout.workers > 1)
+        self._alone, _ = _kernels(layout.code, parallel=False)
         self._steps = 0
         self._rest = self._rests_until = 0.0
         # Time that all workers have stepped undisturbed since the last rest [s].
@@ -73,12 +55,12 @@ class Sweep:
         self._borders = self._border_rows()
         moments = 0 if layout.code.get(BendingTerm) is None else MOMENTS * layout.workers
         sheet_rows = np.arange(layout.rows, dtype=np.int32), self._borders, np.full(moments, -1, np.int32)
-        self._arrays = SheetArrays(layout, np.concatenate(sheet_rows), start)
+        self.arrays = SheetArrays(layout, np.concatenate(sheet_rows), start)
         # Rows of `carried` per worker: one for each step of a pass, and then a page, which no prefetcher crosses.
         row_bytes = layout.width * layout.code.lanes * BYTES[layout.code.precision]
         self._carried_rows = layout.depth - (-PAGE // row_bytes)
         # Forces carried to the next row, for every worker and step of a pass.
-        self._carried = [self._arrays.rows(layout.workers * self._carried_rows) for _ in range(3)]
+        self._carried = [self.arrays.rows(layout.workers * self._carried_rows) for _ in range(3)]
         self._progress = np.zeros(layout.workers * WORKER_STRIDE, np.int64)
 
     def advance(self, count: int, table: NDArray[Any]) -> None:
@@ -100,21 +82,15 @@ class Sweep:
             self._launch_together(0, 0, table)
             self._copy_borders()
 
-    def set_decay(self, decay: NDArray[Any]) -> None:
-        """Replace the decays of the standing slots, shape (slots, rows, cols)."""
-        self._arrays.set_decay(decay)
-
-    def read(self, wanted: SheetReading) -> None:
-        """Copy displacements or differences, and measure every row."""
-        layout = self._layout
-        read = self._kernels.read_together if layout.workers > 1 else self._kernels.read_alone
+    def read(self, differences: bool, values: NDArray[Any], measures: NDArray[Any]) -> None:
+        """Copy displacements or differences into values, shape (rows, cols, 3), and the measures of every row."""
         with our_compilation():
-            read(0, layout.rows, layout.cols, *wanted, *self._arrays.all)
+            self._read(0, self._layout.rows, self._layout.cols, differences, values, measures, *self.arrays.all)
 
     def _advance_alone(self, done: int, end: int, table: NDArray[Any]) -> None:
         """Take the steps from `done` to `end` with a single worker."""
         self._start_pass()
-        self._launch(self._kernels.advance_alone, 1, end - done, table[done:])
+        self._launch(self._alone, 1, end - done, table[done:])
 
     def _advance_while_resting(self, done: int, end: int, table: NDArray[Any]) -> int:
         """Take steps with a single worker until it is time for all of them; returns how many are done."""
@@ -153,7 +129,7 @@ class Sweep:
         """Launch all workers; returns how many steps they have taken, and whether one gave up."""
         workers, depth, count, first = self._layout.workers, self._layout.depth, end - done, self._steps
         self._start_pass()
-        self._launch(self._kernels.advance_together, workers, count, table[done:])
+        self._launch(self._advance, workers, count, table[done:])
         passes, rounds = self._progress[TURN::WORKER_STRIDE], self._progress[ROUND::WORKER_STRIDE]
         gave_up = not (passes * depth >= count).all()
         if gave_up:
@@ -161,14 +137,14 @@ class Sweep:
             count = min(count, int((passes + (rounds >= 0)).max()) * depth)
             while not (passes * depth >= count).all():
                 self._steps = first
-                self._launch(self._kernels.advance_together, workers, count, table[done:])
+                self._launch(self._advance, workers, count, table[done:])
             self._steps = first + count
         return count, gave_up
 
     def _copy_borders(self) -> None:
         """Bring the copies of the rows at the borders of bands up to date, after steps of a single worker."""
         with our_compilation():
-            self._kernels.copy(*self._arrays.u, self._borders, self._layout.rows, self._layout.width)
+            _copying(self._layout.code)(*self.arrays.u, self._borders, self._layout.rows, self._layout.width)
         self._progress[::COUNTER_STRIDE] = self._steps
 
     def _start_pass(self) -> None:
@@ -184,7 +160,7 @@ class Sweep:
             self._first_row, self._end_row, layout.rows + len(self._borders), PATIENCE,
         ])  # fmt: skip
         with our_compilation():
-            kernel(sizes, self._progress, table, *self._carried, *self._arrays.all)
+            kernel(sizes, self._progress, table, *self._carried, *self.arrays.all)
         self._steps += count
 
     def _border_rows(self) -> NDArray[np.int32]:
@@ -202,17 +178,13 @@ class Sweep:
 
 
 @cache
-def _kernels(code: StepCode) -> CpuKernels:
-    """Make the kernels of one code; each is compiled when it is first launched."""
-    return CpuKernels(
-        advancing(code, parallel=False),
-        advancing(code, parallel=True),
-        reading(code, parallel=False, iterations=1),
-        reading(code, parallel=True, iterations=ITERATIONS_PER_THREAD),
-        _copying(code),
-    )
+def _kernels(code: StepCode, *, parallel: bool) -> tuple[Callable[..., None], Callable[..., None]]:
+    """Make the kernels of one code that step and read; each is compiled when it is first launched."""
+    iterations = ITERATIONS_PER_THREAD if parallel else 1
+    return advancing(code, parallel=parallel), reading(code, parallel=parallel, iterations=iterations)
 
 
+@cache
 def _copying(code: StepCode) -> Callable[..., None]:
     """Make the kernel that updates the copies of the rows at the borders of bands."""
     vectors = code.vectors

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from taichi_msm.physics.kernel import SheetArrays, SheetLayout, SheetReading, Start, point_step, reading
+from taichi_msm.physics.kernel import SheetArrays, SheetLayout, Start, point_step, reading
 from taichi_msm.physics.terms.bending import BendingTerm
 from taichi_msm.physics.terms.springs import SpringTerm
 from taichi_msm.physics.terms.term import DX, DY, HAS_LEFT, HAS_RIGHT, Entry, KernelRow, KernelSheet, StepCode
@@ -24,7 +24,7 @@ STEPS_PER_LAUNCH = 8
 
 
 class Gather:
-    """The state of a sheet in the memory of a GPU, and its kernels: a `StepKernel`."""
+    """The state of a sheet in the memory of a GPU, and its kernels, with the methods of `Sweep`."""
 
     def __init__(self, layout: SheetLayout, start: Start) -> None:
         self._layout = layout
@@ -33,27 +33,23 @@ class Gather:
         self._now = 0
         buffer = np.pad(np.arange(layout.rows, dtype=np.int32), 1, constant_values=-1)
         moments = np.full(0 if layout.code.get(BendingTerm) is None else layout.rows + 2, -1, np.int32)
-        self._arrays = SheetArrays(layout, np.concatenate([buffer, buffer, moments]), start)
+        self.arrays = SheetArrays(layout, np.concatenate([buffer, buffer, moments]), start)
 
     def advance(self, count: int, table: NDArray[Any]) -> None:
         """Take at most STEPS_PER_LAUNCH steps; table: of the loads, shape (count, columns)."""
         with our_compilation():
-            self._advance(self._now, count, self._layout.rows, self._layout.cols, table, *self._arrays.all)
+            self._advance(self._now, count, self._layout.rows, self._layout.cols, table, *self.arrays.all)
         self._now = (self._now + count) % 2
 
     def compile(self, table: NDArray[Any]) -> None:
         """Compile the steps without taking one."""
         self.advance(0, table)
 
-    def set_decay(self, decay: NDArray[Any]) -> None:
-        """Replace the decays of the standing slots, shape (slots, rows, cols)."""
-        self._arrays.set_decay(decay)
-
-    def read(self, wanted: SheetReading) -> None:
-        """Copy displacements or differences, and measure every row."""
+    def read(self, differences: bool, values: NDArray[Any], measures: NDArray[Any]) -> None:
+        """Copy displacements or differences into values, shape (rows, cols, 3), and the measures of every row."""
+        first, layout = self._now * (self._layout.rows + 2) + 1, self._layout
         with our_compilation():
-            first = self._now * (self._layout.rows + 2) + 1
-            self._read(first, self._layout.rows, self._layout.cols, *wanted, *self._arrays.all)
+            self._read(first, layout.rows, layout.cols, differences, values, measures, *self.arrays.all)
 
 
 @cache
@@ -73,10 +69,8 @@ def _gathering(code: StepCode) -> Callable[..., None]:
     @ti.func
     def by_row(sheet: ti.template(), p, q, lower, b, row_exists, up):
         """Force of entry b of row p on row q, which is `up` above; summed in the order of a sweep."""
-        here = p * sheet.width + b
-        here_x, here_y, here_z = sheet.u[0][here], sheet.u[1][here], sheet.u[2][here]
-        dx = sheet.numbers[DX]
-        force_x, force_y, force_z = vector(0), vector(0), vector(0)
+        u, dx = [sheet.u[c][p * sheet.width + b] for c in ti.static(range(3))], sheet.numbers[DX]
+        force = [vector(0) for _ in ti.static(range(3))]
         for right in ti.static((-1, 0, 1)):
             if ti.static(structural if right == 0 else shear):
                 k, length, exists = vector(1), ti.abs(up), vector(1)
@@ -87,14 +81,10 @@ def _gathering(code: StepCode) -> Callable[..., None]:
                     length = ti.sqrt(dx * dx + up * up)
                 if ti.static(right != 0 and leaves_out):
                     exists = sheet.by_column[ti.static(HAS_LEFT if right < 0 else HAS_RIGHT) * sheet.width + b]
-                x, y, z = to_other_row(
-                    sheet, q * sheet.width + b + right, right, here_x, here_y, here_z, up, length, k,
-                    exists * row_exists,
-                )  # fmt: skip
-                force_x += x
-                force_y += y
-                force_z += z
-        return force_x, force_y, force_z
+                pull = to_other_row(sheet, q * sheet.width + b + right, right, u, up, length, k, exists * row_exists)
+                for c in ti.static(range(3)):
+                    force[c] += pull[c]
+        return force
 
     @ti.func
     def by_right(sheet: ti.template(), p, i, kind, b):
@@ -102,8 +92,8 @@ def _gathering(code: StepCode) -> Callable[..., None]:
         exists, here = vector(1), p * sheet.width + b
         if ti.static(leaves_out):
             exists = sheet.by_column[HAS_RIGHT * sheet.width + b]
-        k = of_row(sheet, i, kind, b) * vector(1)
-        return along(sheet, here + 1, sheet.u[0][here], sheet.u[1][here], sheet.u[2][here], k, exists)
+        k, u = of_row(sheet, i, kind, b) * vector(1), [sheet.u[c][here] for c in ti.static(range(3))]
+        return along(sheet, here + 1, u, k, exists)
 
     @ti.func
     def step(sheet: ti.template(), loads: ti.template(), now, i, b, n):
@@ -113,21 +103,20 @@ def _gathering(code: StepCode) -> Callable[..., None]:
         kind = ti.select(i == rows - 1, 2, ti.select(i == 0, 0, 1))
         below, above = ti.cast(i < rows - 1, real), ti.cast(i > 0, real)
         dy = sheet.numbers[DY]
-        below_x, below_y, below_z = by_row(sheet, p, p + 1, i + 1, b, below, 0 - dy)
-        above_x, above_y, above_z = by_row(sheet, p, p - 1, i, b, above, dy)
-        force_x, force_y, force_z = 0 - (below_x + above_x), 0 - (below_y + above_y), 0 - (below_z + above_z)
+        on_below = by_row(sheet, p, p + 1, i + 1, b, below, 0 - dy)
+        on_above = by_row(sheet, p, p - 1, i, b, above, dy)
+        force = [0 - (on_below[c] + on_above[c]) for c in ti.static(range(3))]
         if ti.static(structural):
-            right_x, right_y, right_z = by_right(sheet, p, i, kind, b)
-            left_x, left_y, left_z = by_right(sheet, p, i, kind, b - 1)
-            force_x += left_x - right_x
-            force_y += left_y - right_y
-            force_z += left_z - right_z
+            on_right = by_right(sheet, p, i, kind, b)
+            of_left = by_right(sheet, p, i, kind, b - 1)
+            for c in ti.static(range(3)):
+                force[c] += of_left[c] - on_right[c]
         row = [loads[n, c] for c in ti.static(range(columns))]
-        x, y, z = sheet.u[0][p * width + b], sheet.u[1][p * width + b], sheet.u[2][p * width + b]
+        u = [sheet.u[c][p * width + b] for c in ti.static(range(3))]
         before, at, after = 2 * (rows + 2) + i, 2 * (rows + 2) + i + 1, 2 * (rows + 2) + i + 2
         line = ti.static(KernelRow(i, kind, before, at, after))
-        entry = ti.static(Entry(line, b, x, y, z))
-        move(sheet, entry, (1 - now) * (rows + 2) + i + 1, force_x, force_y, force_z, row)
+        entry = ti.static(Entry(line, b, u))
+        move(sheet, entry, (1 - now) * (rows + 2) + i + 1, force, row)
 
     return step
 

@@ -26,22 +26,14 @@ def axes(sheet: Sheet) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
 
 
 def rest_positions(sheet: Sheet) -> NDArray[np.float64]:
-    """Give the rest positions of the points, X_ij = (x_j, y_i, 0).
-
-    Returns:
-        Rest positions [m], shape (rows, cols, 3).
-    """
+    """Give the rest positions of the points, X_ij = (x_j, y_i, 0) [m], shape (rows, cols, 3)."""
     position = np.zeros((*sheet.points, 3))
     position[..., 0], position[..., 1] = axes(sheet)
     return position
 
 
 def fixed_points(sheet: Sheet) -> NDArray[np.bool_]:
-    """Mark the points that never move.
-
-    Returns:
-        True where fixed, shape (rows, cols).
-    """
+    """Mark the points that never move, shape (rows, cols)."""
     fixed = np.zeros(sheet.points, dtype=bool)
     if sheet.fixed == "corners":
         fixed[np.ix_((0, -1), (0, -1))] = True

@@ -19,9 +19,8 @@ from numpy.typing import NDArray
 
 from taichi_msm.physics.lattice import axes
 from taichi_msm.physics.material import area_shares
-from taichi_msm.physics.plan import Plan
+from taichi_msm.physics.plan import EDGE, Plan, ProbeSegment, ProbeSlot, probe_slots
 from taichi_msm.physics.probe_force import control_points, probe_force
-from taichi_msm.physics.slots import EDGE, ProbeSegment, ProbeSlot, probe_slots
 from taichi_msm.scene import Probe, Scene, Sheet
 
 # A time before all others [s].
@@ -31,27 +30,16 @@ Array = NDArray[np.float64]
 
 
 class Schedule(NamedTuple):
-    """The loads at consecutive steps.
+    """The loads at consecutive steps."""
 
-    Attributes:
-        slots: where the probes act; the columns of the arrays.
-        strength: force at the control point before the decay [N], shape (steps, slots, 3).
-        point: control point, x and y at rest [m], shape (steps, slots, 2).
-        active: share of their stiffness with which the virtual springs act, 0 to 1; shape (steps,).
-    """
-
-    slots: tuple[ProbeSlot, ...]
-    strength: Array
-    point: Array
-    active: Array
+    slots: tuple[ProbeSlot, ...]  # where the probes act; the columns of the arrays
+    strength: Array  # force at the control point before the decay [N], shape (steps, slots, 3)
+    point: Array  # control point, x and y at rest [m], shape (steps, slots, 2)
+    active: Array  # share of their stiffness with which the virtual springs act, 0 to 1; shape (steps,)
 
 
 def decay(probe: Probe, sheet: Sheet) -> Array:
-    """Evaluate the decay of a probe around its control point, which stands; of one that moves, around its first place.
-
-    Returns:
-        Share of the force that each point feels, shape (rows, cols).
-    """
+    """Give the share of a probe's force that each point feels at its control point's first place, (rows, cols)."""
     acts, (at_x, at_y) = probe_force(probe, sheet), control_points(probe, sheet)[1][0]
     x, y = axes(sheet)
     shares = acts.decay(np.hypot(x - at_x, y - at_y))
@@ -68,8 +56,7 @@ def schedule(plan: Plan, first: int, count: int) -> Schedule:
         turns, segments, jumps = len(own), parts[own[0]].segments, parts[own[0]].jumps
         line = _load(probe)
         if turns == 1:
-            shares = line.averages(t, h)[:, None]
-            places = np.zeros((count, 1), np.intp)
+            shares, places = line.averages(t, h)[:, None], np.zeros((count, 1), np.intp)
         else:
             shares, places = _by_turns(line, jumps, turns, t, h)
         strength[:, own] = np.multiply.outer(shares / 100, probe_force(probe, scene.sheet).force)
@@ -94,8 +81,9 @@ def loads_at(plan: Plan, t: Array) -> Schedule:
 
 def key_times(scene: Scene) -> Array:
     """List the times of all keys between 0 and the end [s]: only there the loads are not smooth."""
-    times = {float(time) for keys in _key_lists(scene) for time in keys}
-    return np.array(sorted(time for time in times if 0 < time < scene.time.duration))
+    loads = [[time for time, _ in probe.load] for probe in scene.probes]
+    times = np.unique(np.concatenate([[], *loads, *(control_points(probe, scene.sheet)[0] for probe in scene.probes)]))
+    return times[(times > 0) & (times < scene.time.duration)]
 
 
 class Envelope:
@@ -124,11 +112,9 @@ class Envelope:
 
 
 class _Line:
-    """A piecewise linear function of time that may jump at its keys; 0 before the first, constant after the last.
+    """A piecewise linear function of time [s] that jumps where two keys have one time; 0 before the first key.
 
-    Args:
-        times: of the keys [s], in order; two keys at one time are a jump.
-        values: at these keys.
+    After the last key it is constant.
     """
 
     def __init__(self, times: Array, values: Array) -> None:
@@ -193,11 +179,7 @@ class _Line:
 
 
 def _by_turns(line: _Line, jumps: Array, turns: int, t: Array, h: float) -> tuple[Array, NDArray[np.intp]]:
-    """Share the load of a probe whose control point jumps out among its slots.
-
-    Returns:
-        For every slot, its percent and the index of its segment at each step, both of shape (steps, slots).
-    """
+    """Share the load of a probe that jumps out among its slots: percent and index of the segment, (steps, slots)."""
     bounds = np.concatenate([[-math.inf], jumps, [math.inf]])
     first = jumps.searchsorted(t - h * (1 - EDGE), "right")
     last = jumps.searchsorted(t + h * (1 - EDGE), "left")
@@ -240,9 +222,3 @@ def _activity(plan: Plan) -> _Line:
         pressed = (line.after[after - 1] != 0) | ((line.before[following] != 0) & (after < len(line.times)))
         active[(after > 0) & pressed] = 1.0
     return _Line(np.repeat(times, 2)[1:], np.repeat(active, 2)[:-1])
-
-
-def _key_lists(scene: Scene) -> list[Array]:
-    """Collect the times of every list of keys [s]: of loads and of control points."""
-    loads = [np.array([time for time, _ in probe.load]) for probe in scene.probes]
-    return [*loads, *(control_points(probe, scene.sheet)[0] for probe in scene.probes)]

@@ -10,13 +10,15 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from taichi_msm.errors import Problem
 from taichi_msm.physics.lattice import spacing
-from taichi_msm.scene import MAX_POINTS, Scene, Sheet
+from taichi_msm.picture import file_sha256, read_rgb
+from taichi_msm.scene import MAX_POINTS, Scene, Sheet, StiffnessMap
 
 # Cells longer than this many times their width would need springs of negative stiffness.
 LONGEST_CELL = math.sqrt(3)
@@ -24,51 +26,65 @@ LONGEST_CELL = math.sqrt(3)
 Array = NDArray[np.float64]
 
 
+class MapImage(NamedTuple):
+    """The file of a map. It is read once, so that a whole run has one map even if the file changes meanwhile."""
+
+    grey: NDArray[np.uint8]  # 0 to 255, shape (height, width)
+    sha256: str  # of the file
+
+
 @dataclass(frozen=True, eq=False)
 class Material:
-    """The numbers of a sheet; with a map, those for a factor of 1.
+    """The numbers of a sheet; with a map, those for a factor of 1."""
 
-    Attributes:
-        mass: of a point [kg].
-        drag: C / m [1/s].
-        across, down, shear: stiffness k of springs along a row, along a column and along diagonals [N/m].
-        tension: e; a spring pulls at rest with this share of its stiffness times its length.
-        virtual: stiffness K of the virtual springs [N/m]; 0 if they never act.
-        always: whether the virtual springs always act; else only under a load.
-        bending: D dx dy [N m3].
-        by_area: whether points and springs at an edge get less than others, as in tissue.
-        factors: of the stiffness at the centre of every cell, shape (rows - 1, cols - 1); None without a map.
-    """
-
-    mass: float
-    drag: float
+    mass: float  # of a point [kg]
+    drag: float  # C / m [1/s]
+    # across, down, shear: stiffness k of springs along a row, along a column and along diagonals [N/m]
     across: float
     down: float
     shear: float
-    tension: float
-    virtual: float
-    always: bool
-    bending: float
-    by_area: bool
-    factors: Array | None
-
-    @property
-    def stiffness(self) -> tuple[float, float, float]:
-        """Stiffness less tension, k - tau, of springs along rows, along columns and of diagonals [N/m]."""
-        return self._times(1 - self.tension)
+    tension: float  # e; a spring pulls at rest with this share of its stiffness times its length
+    virtual: float  # stiffness K of the virtual springs [N/m]; 0 if they never act
+    always: bool  # whether the virtual springs always act; else only under a load
+    bending: float  # D dx dy [N m3]
+    by_area: bool  # whether points and springs at an edge get less than others, as in tissue
+    factors: Array | None  # of the stiffness of every cell, shape (rows - 1, cols - 1); None without a map
 
     @property
     def tensions(self) -> tuple[float, float, float]:
         """Tension per length, tau, of springs along rows, along columns and of diagonals [N/m]."""
-        return self._times(self.tension)
+        return self.across * self.tension, self.down * self.tension, self.shear * self.tension
 
-    def _times(self, factor: float) -> tuple[float, float, float]:
-        return self.across * factor, self.down * factor, self.shear * factor
 
-    @property
-    def has_springs(self) -> bool:
-        """Whether there are springs between points."""
-        return max(self.across, self.down, self.shear) > 0
+def read_map(stiffness_map: StiffnessMap) -> MapImage:
+    """Read the file of a map; PictureError: it cannot be used."""
+    sha256 = file_sha256(stiffness_map.image)
+    return MapImage(np.asarray(read_rgb(stiffness_map.image, (0, 0, 0), sha256).convert("L")), sha256)
+
+
+def map_factors(stiffness_map: StiffnessMap, image: MapImage, rows: int, cols: int) -> Array:
+    """Interpolate the factors at the centres of rows x cols cells: bilinearly between texels, constant beyond them."""
+    grey = image.grey.astype(float)
+    height, width = grey.shape
+    row = np.clip((np.arange(rows) + 0.5) / rows * height - 0.5, 0, height - 1)
+    column = np.clip((np.arange(cols) + 0.5) / cols * width - 0.5, 0, width - 1)
+    top, left = row.astype(int), column.astype(int)
+    bottom, right = np.minimum(top + 1, height - 1), np.minimum(left + 1, width - 1)
+    down, across = (row - top)[:, None], column - left
+    above = grey[np.ix_(top, left)] * (1 - across) + grey[np.ix_(top, right)] * across
+    below = grey[np.ix_(bottom, left)] * (1 - across) + grey[np.ix_(bottom, right)] * across
+    black, white = stiffness_map.range
+    return black + (white - black) / 255 * (above * (1 - down) + below * down)
+
+
+def largest_mean(factors: Array) -> float:
+    """Find the largest mean of the factors of the cells around a point."""
+    around, cells = np.pad(factors, 1), np.pad(np.ones_like(factors), 1)
+
+    def at_points(values: Array) -> Array:
+        return values[:-1, :-1] + values[:-1, 1:] + values[1:, :-1] + values[1:, 1:]
+
+    return float((at_points(around) / at_points(cells)).max())
 
 
 def area_shares(sheet: Sheet) -> Array:
@@ -115,13 +131,7 @@ def kind_problems(scene: Scene) -> Iterator[Problem]:
 
 
 def tissue_problems(scene: Scene, fixed: NDArray[np.bool_], factors: Array | None) -> Iterator[Problem]:
-    """Find tissue that is impossible.
-
-    Args:
-        scene: in which `kind_problems` finds nothing.
-        fixed: which points of its sheet are fixed, shape (rows, cols).
-        factors: of the stiffness of its cells; None: not known, or there is no map.
-    """
+    """Find tissue that is impossible, where `kind_problems` finds nothing; factors None: not known, or no map."""
     tissue, sheet = scene.tissue, scene.sheet
     if tissue is None:
         return

@@ -24,7 +24,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from contextlib import ExitStack, closing
 from dataclasses import dataclass
 from functools import partial
 from itertools import pairwise, product
@@ -35,13 +34,11 @@ from numpy.typing import NDArray
 
 from taichi_msm.errors import SceneError
 from taichi_msm.physics.error_control import longest
-from taichi_msm.physics.material import LONGEST_CELL, cell_ratio
+from taichi_msm.physics.material import LONGEST_CELL, MapImage, cell_ratio
 from taichi_msm.physics.plan import Plan
-from taichi_msm.physics.planning import on, try_plan
+from taichi_msm.physics.planning import on, stable_steps, try_plan
 from taichi_msm.physics.probe_force import sums
 from taichi_msm.physics.solver import Dynamics
-from taichi_msm.physics.stiffness_map import MapImage
-from taichi_msm.physics.timestep import stable_steps
 from taichi_msm.progress import Count, Pause
 from taichi_msm.scene import MAX_POINTS, Probe, Scene, Sheet
 from taichi_msm.system.runtime import Device
@@ -72,39 +69,31 @@ FEWEST = 7
 
 @dataclass(frozen=True)
 class MeshEstimate:
-    """What is known about the error that the number of points makes.
+    """What is known about the error that the number of points makes."""
 
-    Attributes:
-        error: largest error, as a fraction of the largest displacement; infinite: not known.
-        doubt: why it may be larger; empty: it is about that.
-    """
-
-    error: float
-    doubt: str = ""
+    error: float  # largest error, as a fraction of the largest displacement; infinite: not known
+    doubt: str = ""  # why it may be larger; empty: it is about that
 
 
 def coarser(plan: Plan) -> Plan | None:
-    """Plan the scene with half as many cells a side, and tools whose total force stays the same.
-
-    Returns:
-        None if there are too few points, or no tissue.
-    """
+    """Plan the scene with half as many cells a side and the same total forces; None: too few points, or no tissue."""
     scene = plan.scene
     if scene.tissue is None or min(scene.sheet.points) < FEWEST:
         return None
     # Halves are rounded up or down, so that cells do not get too long.
     ways = product(*({count // 2 + 1, (count - 1) // 2 + 1} for count in scene.sheet.points))
-    tried = [with_points(scene, (rows, cols)) for rows, cols in ways]
-    coarse = min(tried, key=lambda one: (cell_ratio(one.sheet) > LONGEST_CELL, one.sheet.points))
-    if cell_ratio(coarse.sheet) > LONGEST_CELL:
+    halves = [with_points(scene, (rows, cols)) for rows, cols in ways]
+    possible = [halved for halved in halves if cell_ratio(halved.sheet) <= LONGEST_CELL]
+    if not possible:
         return None
+    coarse = min(possible, key=lambda halved: halved.sheet.points)
     probes = tuple(_pressing_alike(probe, scene.sheet, coarse.sheet) for probe in scene.probes)
     return try_plan(coarse.model_copy(update={"probes": probes}), plan.image)[0]
 
 
 def _pressing_alike(probe: Probe, sheet: Sheet, other: Sheet) -> Probe:
     """Scale the total of a probe, by less than 2, so that its force on another sheet is that on this one."""
-    own, there = sums(probe, sheet).total, sums(probe, other).total
+    own, there = sums(probe, sheet)[0], sums(probe, other)[0]
     if probe.total is None or not 0.5 * there < own < 2 * there:
         return probe
     return probe.model_copy(update={"total": tuple(own / there * part for part in probe.total)})
@@ -116,7 +105,7 @@ def missing_force(scene: Scene) -> float:
     if finer < 2:
         return 0.0  # With so many points no tool is as narrow as a cell.
     probes = [probe for probe in scene.probes if probe.total is not None]
-    pairs = [(sums(probe, scene.sheet).total, sums(probe, scene.sheet, finer).total) for probe in probes]
+    pairs = [(sums(probe, scene.sheet)[0], sums(probe, scene.sheet, finer)[0]) for probe in probes]
     return max((abs(own / exact - 1) for own, exact in pairs if exact > 0), default=0.0)
 
 
@@ -126,8 +115,6 @@ class MeshPilot:
     Args:
         plan: of the run that it is compared with.
         coarse: what `coarser` returned for it.
-        device: what `runtime.start` returned.
-        cores: number of cores that stepping may use; None: all.
 
     Raises:
         DeviceError: when the device cannot run it in f64.
@@ -137,12 +124,10 @@ class MeshPilot:
         self._material, coarsest, steps = plan.material, coarser(coarse), plan.grid.steps_per_frame
         plans = [coarse] if coarsest is None else [coarse, coarsest]
         self._sheets = []
-        with ExitStack() as opened:
-            for sheet in plans:
-                steps = max(math.ceil(steps / 2), stable_steps(sheet))
-                exact = sheet.with_grid(precision="f64", steps_per_frame=steps)
-                self._sheets.append(opened.enter_context(closing(Dynamics(exact, device, cores=cores))))
-            self._open = opened.pop_all()
+        for sheet in plans:
+            steps = max(math.ceil(steps / 2), stable_steps(sheet))
+            exact = sheet.with_grid(precision="f64", steps_per_frame=steps)
+            self._sheets.append(Dynamics(exact, device, cores=cores))
         points = [sheet.scene.sheet.points for sheet in (plan, *plans)]
         self._samplings = [CubicSampling(after, before) for before, after in pairwise(points)]
         self._ratio = min((own - 1) / (other - 1) for own, other in zip(*points[:2], strict=True))
@@ -155,12 +140,7 @@ class MeshPilot:
         self._sheets[0].compile()
 
     def follow(self, displacement: NDArray[Any], pause: Pause) -> None:
-        """Step to the next frame, and compare.
-
-        Args:
-            displacement: of the run at that frame [m], shape (rows, cols, 3).
-            pause: called several times a second; after an exception from it the pilot cannot continue.
-        """
+        """Step to the next frame, and compare, as a `Pilot` does."""
         self._largest = max(self._largest, longest(displacement))
         finer = displacement
         for n, (sheet, sampling) in enumerate(zip(self._sheets, self._samplings, strict=True)):
@@ -175,28 +155,19 @@ class MeshPilot:
         """What the frames so far show."""
         if self._largest == 0:
             return MeshEstimate(0.0)
-        if not self._differences[0] / self._largest < math.inf:
+        first, *others = self._differences
+        if not first / self._largest < math.inf:
             return MeshEstimate(math.inf)
-        order, doubt = self.order, ""
+        order, doubt = None, ""
+        if others and first > 0:
+            order = math.log(others[0] / first) / math.log(self._ratio) if others[0] > 0 else -math.inf
         assumed = 1.0 if order is None else max(1.0, min(order, 2 - ABOVE * (order - 2)))
-        relative = self._differences[0] / (self._ratio**assumed - 1) / self._largest
+        relative = first / (self._ratio**assumed - 1) / self._largest
         if order is not None and not LOWEST_ORDER <= order <= HIGHEST_ORDER:
             doubt = "runs with fewer points do not converge"
         elif self._material.bending == 0 and self._shortest < 1 - self._material.tension - SLACK:
             doubt = "tissue without bending is pressed together, and with more points wrinkles more"
         return MeshEstimate((2 if doubt else 1) * relative + self._missing, doubt)
-
-    @property
-    def order(self) -> float | None:
-        """Order in the length of the cells that the frames so far show; None: there is no third run."""
-        first, *others = self._differences
-        if not others or first == 0:
-            return None
-        return math.log(others[0] / first) / math.log(self._ratio) if others[0] > 0 else -math.inf
-
-    def close(self) -> None:
-        """Free the memory."""
-        self._open.close()
 
 
 def with_points(scene: Scene, points: tuple[int, int]) -> Scene:
@@ -210,16 +181,10 @@ def choose_points(
     check: Callable[[Scene, MapImage | None], Plan],
     progress: Count = lambda done, total: None,
 ) -> tuple[Plan, MeshEstimate]:
-    """Find the fewest points, approximately, whose error is within the sheet's tolerance.
+    """Find the fewest points, approximately, whose error is within the sheet's tolerance, and this error.
 
-    Args:
-        plan: of a scene with such a tolerance. No fewer points than its own are tried; cells keep their shape.
-        device: what `runtime.start` returned.
-        check: plans a scene with other points and the same map; raises SceneError if it cannot be run.
-        progress: called with the frames done and the frames in all of each pilot run.
-
-    Returns:
-        The plan with these points, and its error.
+    No fewer points than the plan's are tried, and cells keep their shape. `check` plans a scene with other points and
+    the same map; progress counts the frames of each pilot run.
 
     Raises:
         SceneError: when even the largest possible number of points is too small, or cannot be run.
@@ -256,47 +221,33 @@ def _estimate(plan: Plan, device: Device, progress: Count) -> MeshEstimate:
     """Run a scene and its pilot in f64, and give the error that the pilot shows."""
     exact, coarse, grid = plan.with_grid(precision="f64"), coarser(plan), plan.grid
     assert coarse is not None
-    with closing(Dynamics(exact, device)) as own, closing(MeshPilot(exact, coarse, device)) as pilot:
-        for frame in range(grid.frames):
-            pause = partial(progress, frame, grid.frames)
-            pause()
-            own.advance(grid.steps_per_frame, pause)
-            pilot.follow(own.displacement(), pause)
-        return pilot.estimate
+    own, pilot = Dynamics(exact, device), MeshPilot(exact, coarse, device)
+    for frame in range(grid.frames):
+        pause = partial(progress, frame, grid.frames)
+        pause()
+        own.advance(grid.steps_per_frame, pause)
+        pilot.follow(own.displacement(), pause)
+    return pilot.estimate
 
 
 class CubicSampling:
-    """Interpolates displacements of one lattice at the points of another lattice of the same sheet, by cubics.
-
-    Args:
-        of: rows, columns of the points whose displacements are given; 4 or more each.
-        to: rows, columns of the points at which they are wanted.
-    """
+    """Interpolates displacements of a lattice of 4 x 4 points or more at the points of another, by cubics."""
 
     def __init__(self, of: tuple[int, int], to: tuple[int, int]) -> None:
-        self._rows, self._cols = (_Cubic(given - 1, asked - 1) for given, asked in zip(of, to, strict=True))
+        self._axes = [_cubics(given - 1, asked - 1) for given, asked in zip(of, to, strict=True)]
 
     def at(self, displacement: NDArray[Any]) -> NDArray[np.float64]:
         """Interpolate displacements, shape (rows, cols, 3)."""
-        return self._cols.at(self._rows.at(displacement).swapaxes(0, 1)).swapaxes(0, 1)
+        for first, weights in self._axes:
+            nodes = (weight[:, None, None] * displacement[first + n] for n, weight in enumerate(weights))
+            displacement = sum(nodes, start=np.zeros(())).swapaxes(0, 1)
+        return displacement
 
 
-class _Cubic:
-    """Interpolates values at the ends of `of` equal cells at the ends of `to` equal cells, along the first axis."""
-
-    def __init__(self, of: int, to: int) -> None:
-        place = np.arange(to + 1) * (of / to)
-        self._first = np.clip(np.floor(place).astype(int) - 1, 0, of - 3)
-        t = place - self._first
-        nodes = range(4)
-        self._weights = np.stack(
-            [math.prod((t - other) / (node - other) for other in nodes if other != node) for node in nodes]
-        )
-
-    def at(self, values: NDArray[Any]) -> NDArray[np.float64]:
-        """Interpolate an array."""
-        shape = (-1,) + (1,) * (values.ndim - 1)
-        return sum(
-            (weight.reshape(shape) * values[self._first + n] for n, weight in enumerate(self._weights)),
-            start=np.zeros(()),
-        )
+def _cubics(of: int, to: int) -> tuple[NDArray[np.intp], NDArray[np.float64]]:
+    """Give the first of four ends of `of` equal cells, and their weights, for each of the ends of `to` equal cells."""
+    place = np.arange(to + 1) * (of / to)
+    first = np.clip(np.floor(place).astype(int) - 1, 0, of - 3)
+    t, nodes = place - first, range(4)
+    weights = [math.prod((t - other) / (node - other) for other in nodes if other != node) for node in nodes]
+    return first, np.stack(weights)

@@ -10,7 +10,7 @@ import math
 from typing import NamedTuple
 
 from taichi_msm.physics.plan import Plan
-from taichi_msm.physics.timestep import stable_steps
+from taichi_msm.physics.planning import stable_steps
 from taichi_msm.physics.workload import affords_pilots
 
 # An error below this needs no finer pilot: nobody sees it, and twice as much or half of it would mean the same.
@@ -28,49 +28,30 @@ POINTS = 1 / 4 / 2 + 1 / 16 / 4
 
 
 class Pilots(NamedTuple):
-    """The pilots of a run.
+    """The pilots of a run."""
 
-    Attributes:
-        beside: steps per frame of the pilot that goes with the run; 0: there is none.
-        after: steps per frame of the one that follows where the first one shows too large an error; 0: there is none.
-        points: whether pilots with fewer points go with the run.
-        cost: of those that go with the run: their steps for each step of the run, counted in steps of the whole sheet.
-        reason: why there are none.
-    """
-
-    beside: int
-    after: int
-    points: bool
-    cost: float
-    reason: str = ""
+    beside: int = 0  # steps per frame of the pilot that goes with the run; 0: there is none
+    after: int = 0  # steps per frame of the one that follows if the first one shows too large an error; 0: none
+    points: bool = False  # whether pilots with fewer points go with the run
+    cost: float = 0.0  # of those that go with the run: for each of its steps theirs, in steps of the whole sheet
+    reason: str = ""  # why there are none
 
 
 def choose_pilots(plan: Plan, *, asked: bool = False) -> Pilots:
-    """Choose the pilots of a run.
-
-    Args:
-        plan: of the run.
-        asked: whether they are wanted whatever they cost.
-    """
-    scene, own = plan.scene, plan.grid.steps_per_frame
-    coarse, fine = coarse_steps(plan), fine_steps(plan)
-    points = POINTS if scene.tissue is not None else 0.0
+    """Choose the pilots of a run; asked: whatever they cost."""
+    own, coarse, fine = plan.grid.steps_per_frame, coarse_steps(plan), fine_steps(plan)
+    points = POINTS if plan.scene.tissue is not None else 0.0
     # Beside a run in f32 a fine pilot has another one with the run's own steps.
     fine_cost = fine / own + (plan.grid.precision == "f32")
     first = (1 + points) * coarse / own if coarse else fine_cost + points
     if not asked and not affords_pilots(plan, first):
-        return no_pilots("it would take more than two fifths of the run; to have it anyway, pass --estimate-error")
+        return Pilots(reason="it would take more than two fifths of the run; to have it anyway, pass --estimate-error")
     if not coarse:
         return Pilots(fine, 0, points > 0, first)
     # Where no positions are kept, the run is repeated beside the pilot that follows.
-    again = 0.0 if scene.output else 1.0
+    again = 0.0 if plan.scene.output else 1.0
     follows = asked or affords_pilots(plan, first + fine_cost + again)
     return Pilots(coarse, fine if follows else 0, points > 0, first)
-
-
-def no_pilots(reason: str) -> Pilots:
-    """Have no pilots, and say why."""
-    return Pilots(0, 0, False, 0.0, reason)
 
 
 def coarse_steps(plan: Plan) -> int:

@@ -4,39 +4,85 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from taichi_msm.physics.material import Material, has_fixed_border
-from taichi_msm.physics.slots import ProbeSlot, probe_slots
-from taichi_msm.physics.stiffness_map import MapImage
-from taichi_msm.scene import Probe, Scene
+from taichi_msm.physics.material import MapImage, Material, has_fixed_border
+from taichi_msm.physics.probe_force import control_points
+from taichi_msm.scene import Probe, Scene, Sheet
 from taichi_msm.timegrid import TimeGrid
+
+# A key closer than this to an end of the hat, as a fraction of its half-width, counts as outside: it would contribute
+# less than rounding does.
+EDGE = 1e-9
+
+Array = NDArray[np.float64]
+
+
+class ProbeSegment(NamedTuple):
+    """A control point between two jumps."""
+
+    times: Array  # of the keys [s], shape (n,)
+    points: Array  # control point at those times, x and y at rest [m], shape (n, 2); constant before and after them
+
+
+@dataclass(frozen=True)
+class ProbeSlot:
+    """A place where a probe acts; a probe whose control point jumps has several slots and uses them by turns.
+
+    If a jump falls within the hat, the probe acts in that step at the places before and after the jump. So the segments
+    of the control point are dealt out to two slots: the first, third, ... to one, the second, fourth, ... to the other.
+    If several jumps can fall within one hat, there are as many slots as it takes.
+    """
+
+    probe: int  # index of the probe in the scene
+    segments: tuple[ProbeSegment, ...]  # all segments of the control point, also those of the other slots
+    turn: int  # index of the slot's first segment
+    turns: int  # number of slots that the probe has; every `turns`-th segment from `turn` on is the slot's
+
+    @property
+    def moves(self) -> bool:
+        """Whether the control point moves."""
+        return len(self.segments) > 1 or len(self.segments[0].times) > 1
+
+    @property
+    def jumps(self) -> Array:
+        """Times at which the control point jumps [s]: the first key of every segment but the first."""
+        return np.array([segment.times[0] for segment in self.segments[1:]])
+
+
+def probe_slots(probes: Sequence[Probe], sheet: Sheet, h: float) -> tuple[ProbeSlot, ...]:
+    """List the slots of all probes.
+
+    h: half-width of the hat, which is the step [s]; 0 if loads are not averaged: every probe then has one slot.
+    """
+    slots = []
+    for index, probe in enumerate(probes):
+        times, points = control_points(probe, sheet)
+        jumps = np.flatnonzero((times[1:] == times[:-1]) & (points[1:] != points[:-1]).any(axis=1)) + 1
+        parts = zip(np.split(times, jumps), np.split(points, jumps), strict=True)
+        segments = tuple(ProbeSegment(*part) for part in parts)
+        # One more than the largest number of jumps in any hat.
+        jumped = times[jumps]
+        within = np.searchsorted(jumped, jumped + 2 * h * (1 - EDGE), "left") - np.arange(len(jumped))
+        turns = 1 + int(within.max(initial=0))
+        slots += [ProbeSlot(index, segments, turn, turns) for turn in range(turns)]
+    return tuple(slots)
 
 
 @dataclass(frozen=True, eq=False)
 class Plan:
-    """What a scene comes to; `planning.make_plan` makes it.
+    """What a scene comes to; `planning.make_plan` makes it."""
 
-    Attributes:
-        scene: as it was given.
-        image: of its map; None: it has none.
-        fixed: which points are fixed, shape (rows, cols).
-        material: what the sheet is made of, with the map as an array.
-        stable_step: the largest stable step [s]; infinite where nothing oscillates.
-        grid: the steps.
-        slots: the places where probes act.
-    """
-
-    scene: Scene
-    image: MapImage | None
-    fixed: NDArray[np.bool_]
-    material: Material
-    stable_step: float
-    grid: TimeGrid
-    slots: tuple[ProbeSlot, ...]
+    scene: Scene  # as it was given
+    image: MapImage | None  # of its map; None: it has none
+    fixed: NDArray[np.bool_]  # which points are fixed, shape (rows, cols)
+    material: Material  # what the sheet is made of, with the map as an array
+    stable_step: float  # the largest stable step [s]; infinite where nothing oscillates
+    grid: TimeGrid  # the steps
+    slots: tuple[ProbeSlot, ...]  # the places where probes act
 
     @property
     def open_edges(self) -> bool:
@@ -51,10 +97,6 @@ class Plan:
         return replace(self, grid=grid, slots=probe_slots(self.scene.probes, self.scene.sheet, grid.step))
 
     def with_probes(self, probes: Sequence[Probe | Mapping[str, Any]]) -> Plan:
-        """Replace the probes.
-
-        Raises:
-            SceneError: when one of them is not a probe.
-        """
+        """Replace the probes; SceneError: one of them is not a probe."""
         scene = self.scene.model_copy(update={"probes": tuple(probes)})
         return replace(self, scene=scene, slots=probe_slots(scene.probes, scene.sheet, self.grid.step))

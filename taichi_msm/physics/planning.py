@@ -1,28 +1,31 @@
-"""From a scene to its plan."""
+"""From a scene to its plan, and the choice of its steps and their precision."""
 
 from __future__ import annotations
 
+import math
+from collections.abc import Iterator
 from dataclasses import replace
+from typing import Any
 
 from taichi_msm.errors import Problem, SceneError
-from taichi_msm.physics import stiffness_map, timestep, workload
-from taichi_msm.physics.lattice import fixed_points
-from taichi_msm.physics.material import kind_problems, tissue_problems
-from taichi_msm.physics.plan import Plan
-from taichi_msm.physics.slots import probe_slots
-from taichi_msm.physics.stiffness_map import MapImage
-from taichi_msm.physics.terms import material_of
+from taichi_msm.physics import workload
+from taichi_msm.physics.lattice import fixed_points, spacing
+from taichi_msm.physics.material import MapImage, Material, kind_problems, read_map, tissue_problems
+from taichi_msm.physics.plan import Plan, probe_slots
+from taichi_msm.physics.terms import highest_frequency, material_of
 from taichi_msm.picture import PictureError
-from taichi_msm.scene import Scene
+from taichi_msm.scene import WHOLE, Scene, Sheet, Time
 from taichi_msm.timegrid import TimeGrid
+
+# Lengths [m] whose squares, and a few of their products, f32 holds.
+SMALLEST_SINGLE, LARGEST_SINGLE = 1e-15, 1e17
+
+# Keeps a frame that is exactly n limits long from being cut into n + 1 steps by rounding.
+SLACK = 1 - 1e-12
 
 
 def make_plan(scene: Scene, image: MapImage | None = None) -> Plan:
-    """Plan a scene for a CPU; arguments as for `try_plan`.
-
-    Raises:
-        SceneError: with all that makes its sheet or its steps impossible.
-    """
+    """Plan a scene for a CPU as `try_plan` does; SceneError: with all that makes its sheet or its steps impossible."""
     plan, problems = try_plan(scene, image)
     if plan is None or problems:
         raise SceneError([str(problem) for problem in problems])
@@ -30,15 +33,11 @@ def make_plan(scene: Scene, image: MapImage | None = None) -> Plan:
 
 
 def try_plan(scene: Scene, image: MapImage | None = None) -> tuple[Plan | None, list[Problem]]:
-    """Plan a scene for a CPU, or find what is wrong with what its sheet is material of, and with its steps.
+    """Plan a scene for a CPU, None where there can be no plan, and find what is wrong with its sheet and its steps.
 
     Args:
         scene: whose keys are valid each by itself.
-        image: of its map, from the plan of a scene with the same map: a run reads it once, and so has one map even if
-            its file changes meanwhile. None: it is read.
-
-    Returns:
-        The plan, or None where there can be none; and the problems.
+        image: of its map, from the plan of a scene with the same map; None: it is read.
     """
     problems = list(kind_problems(scene))
     if problems:
@@ -46,20 +45,18 @@ def try_plan(scene: Scene, image: MapImage | None = None) -> tuple[Plan | None, 
     fixed = fixed_points(scene.sheet)
     if scene.stiffness_map is not None and image is None:
         try:
-            image = stiffness_map.read(scene.stiffness_map)
+            image = read_map(scene.stiffness_map)
         except PictureError as error:
             problems.append(Problem((scene.kind, "map", "image"), str(error)))
     material = material_of(scene, image)
     problems += tissue_problems(scene, fixed, material.factors)
     if problems:
         return None, problems
-    limit = timestep.stable_step(material, scene.sheet, scene.time.damping_difference)
-    steps = timestep.steps_per_frame(scene.time, limit)
-    grid = TimeGrid(scene.time.frames_per_second, scene.time.frames, steps, "f64")
-    plan = on(
-        Plan(scene, image, fixed, material, limit, grid, probe_slots(scene.probes, scene.sheet, grid.step)), "cpu"
-    )
-    return plan, list(timestep.step_problems(plan))
+    limit = stable_step(material, scene.sheet, scene.time.damping_difference)
+    grid = TimeGrid(scene.time.frames_per_second, scene.time.frames, steps_per_frame(scene.time, limit), "f64")
+    slots = probe_slots(scene.probes, scene.sheet, grid.step)
+    plan = on(Plan(scene, image, fixed, material, limit, grid, slots), "cpu")
+    return plan, list(_step_problems(plan))
 
 
 def on(plan: Plan, arch: str) -> Plan:
@@ -69,6 +66,80 @@ def on(plan: Plan, arch: str) -> Plan:
     """
     time = plan.scene.time
     if time.precision != "auto":
-        return replace(plan, grid=replace(plan.grid, precision=time.precision))
+        return plan.with_grid(precision=time.precision)
     in_f64 = arch == "cpu" and (time.tolerance is not None or workload.is_small_in_f64(plan))
-    return replace(plan, grid=replace(plan.grid, precision="f64" if in_f64 else "f32"))
+    return plan.with_grid(precision="f64" if in_f64 else "f32")
+
+
+def stable_step(material: Material, sheet: Sheet, difference: str) -> float:
+    """Find the largest stable step [s]; infinite where nothing oscillates.
+
+    central: 2 / w. backward: (sqrt(g^2 + 4 w^2) - g) / w^2, written without its cancellation; g = C / m.
+    """
+    w = highest_frequency(material, sheet)
+    g = material.drag if difference == "backward" else 0.0
+    limit = math.hypot(g, 2 * w) + g
+    return 4 / limit if limit > 0 else math.inf
+
+
+def stable_steps(plan: Plan) -> int:
+    """Count the fewest stable steps of a frame."""
+    return max(1, math.ceil(1 / plan.grid.frames_per_second / plan.stable_step * SLACK))
+
+
+def steps_per_frame(time: Time, limit: float) -> int:
+    """Count the steps of one frame.
+
+    auto: the fewest whose step is at most half the stability limit. A given step is rounded to a fraction of a frame.
+    A tolerance may ask for more steps, which `error_control.choose_step` finds.
+    """
+    frame = 1 / time.frames_per_second
+    if time.step == "auto":
+        return max(1, math.ceil(2 * frame / limit * SLACK))
+    return max(1, round(frame / time.step))
+
+
+def with_time(scene: Scene, **changes: Any) -> Scene:
+    """Change keys of the scene's time."""
+    return scene.model_copy(update={"time": scene.time.model_copy(update=changes)})
+
+
+def with_chosen_grid(plan: Plan) -> Plan:
+    """Write the grid into the scene, so that every plan of it has the same grid, on any arch.
+
+    The precision is written, and a step in the place of a tolerance; a step that follows from the scene stays "auto".
+    """
+    changes: dict[str, Any] = {"precision": plan.grid.precision}
+    if plan.scene.time.tolerance is not None:
+        changes |= {"step": 1 / plan.grid.frames_per_second / plan.grid.steps_per_frame, "tolerance": None}
+    return replace(plan, scene=with_time(plan.scene, **changes))
+
+
+def _step_problems(plan: Plan) -> Iterator[Problem]:
+    """Find a given step that is unstable or does not divide a frame, and what would overflow or vanish in f32."""
+    given, limit, frame = plan.scene.time.step, plan.stable_step, 1 / plan.grid.frames_per_second
+    if given == "auto":
+        pass
+    elif given > limit * (1 + 1e-12):
+        below = frame / math.ceil(frame / limit)
+        said = f"{given:g} s is above the stability limit {limit:.6g} s; try {below:.9g}, or auto"
+        yield Problem(("time", "step"), said)
+    elif abs(frame / given - round(frame / given)) > WHOLE * max(1.0, frame / given):
+        said = f"{given:g} s does not divide a frame of {frame:.9g} s; try {frame / math.ceil(frame / given):.9g}"
+        yield Problem(("time", "step"), said)
+    if plan.grid.precision == "f64":
+        return
+    cells, size, step, mass = spacing(plan.scene.sheet), plan.scene.sheet.size, plan.grid.step, plan.material.mass
+    if min(cells) < SMALLEST_SINGLE or max(size) > LARGEST_SINGLE:
+        yield Problem(
+            ("sheet", "size"),
+            f"cells of {min(cells):g} m in a sheet of {max(size):g} m leave the range of f32, "
+            f"{SMALLEST_SINGLE:g} to {LARGEST_SINGLE:g} m; take time.precision: f64",
+        )
+    gain = step**2 / mass
+    if not SMALLEST_SINGLE**2 < gain < LARGEST_SINGLE**2:
+        yield Problem(
+            ("time", "precision"),
+            f"f32 cannot hold the {gain:g} m by which a step of {step:g} s moves a mass of "
+            f"{mass:g} kg for every newton; take f64",
+        )

@@ -37,21 +37,13 @@ LEAST_REACHING = 0.8
 
 
 class ProbeForce(NamedTuple):
-    """How a probe acts: force exp(-max(falloff d + shift, offset)) on a point at the distance d.
+    """How a probe acts: force exp(-max(falloff d + shift, offset)) on a point at the distance d."""
 
-    Attributes:
-        force: [N] at 100 %, before the decay.
-        falloff: [1/m].
-        shift: offset - falloff radius, so that the exponent is that of the flat end up to its rim.
-        offset: exponent on the flat end.
-        by_area: whether the force on a point is multiplied by its share of a cell's area.
-    """
-
-    force: tuple[float, float, float]
-    falloff: float
-    shift: float
-    offset: float
-    by_area: bool
+    force: tuple[float, float, float]  # [N] at 100 %, before the decay
+    falloff: float  # [1/m]
+    shift: float  # offset - falloff radius, so that the exponent is that of the flat end up to its rim
+    offset: float  # exponent on the flat end
+    by_area: bool  # whether the force on a point is multiplied by its share of a cell's area
 
     @property
     def size(self) -> float:
@@ -65,17 +57,14 @@ class ProbeForce(NamedTuple):
 
 def probe_force(probe: Probe, sheet: Sheet) -> ProbeForce:
     """Compute how a probe acts on a sheet."""
-    by_area = probe.total is not None
-    offset = 0.0 if by_area else probe.offset
-    shift = offset - probe.falloff * probe.radius
-    if not by_area:
+    flat = probe.falloff * probe.radius
+    if probe.total is None:
         assert probe.force is not None
-        return ProbeForce(probe.force, probe.falloff, shift, offset, by_area)
-    assert probe.total is not None
+        return ProbeForce(probe.force, probe.falloff, probe.offset - flat, probe.offset, by_area=False)
     dx, dy = spacing(sheet)
     share = dx * dy / spread(probe)
     x, y, z = probe.total
-    return ProbeForce((x * share, y * share, z * share), probe.falloff, shift, offset, by_area)
+    return ProbeForce((x * share, y * share, z * share), probe.falloff, 0.0 - flat, 0.0, by_area=True)
 
 
 def control_points(probe: Probe, sheet: Sheet) -> tuple[Array, Array]:
@@ -105,25 +94,13 @@ def spread(probe: Probe) -> float:
     return math.pi * (probe.radius * probe.radius + 2 * (probe.radius * reach + reach * reach))
 
 
-class Sums(NamedTuple):
-    """The forces of a probe on all points of a sheet at 100 %, at the first place of its control point.
+def sums(probe: Probe, sheet: Sheet, finer: int = 1) -> tuple[float, float]:
+    """Sum the forces of a probe at 100 % and at its first place on the points of a sheet.
 
-    Attributes:
-        total: sum of the forces [N].
-        pressure: largest force on a point per area that belongs to it [Pa].
-    """
+    finer: how many times shorter the cells are.
 
-    total: float
-    pressure: float
-
-
-def sums(probe: Probe, sheet: Sheet, finer: int = 1) -> Sums:
-    """Sum the forces of a probe on the points of a sheet.
-
-    Args:
-        probe: whose forces.
-        sheet: on which.
-        finer: sum over the points of a sheet whose cells are this many times shorter.
+    Returns:
+        The sum [N], and the largest force on a point per area that belongs to it [Pa].
     """
     acts, (at_x, at_y) = probe_force(probe, sheet), control_points(probe, sheet)[1][0]
     (rows, cols), (height, width) = ((count - 1) * finer for count in sheet.points), sheet.size
@@ -139,21 +116,15 @@ def sums(probe: Probe, sheet: Sheet, finer: int = 1) -> Sums:
         total += float((decay * share if acts.by_area else decay).sum())
         largest = max(largest, float((decay if acts.by_area else decay / share).max()))
     force, (dx, dy) = math.hypot(*acts.force), spacing(sheet)
-    return Sums(force * total / finer**2, force * largest / (dx * dy))
+    return force * total / finer**2, force * largest / (dx * dy)
 
 
 class ProbeRecord(TypedDict):
-    """The forces of a probe at 100 %, at the first place of its control point.
+    """The forces of a probe at 100 %, at the first place of its control point."""
 
-    Attributes:
-        total_force: sum over all points [N].
-        flat_end_force: the part of a `total` that acts under the tool's flat end, on a wide sheet [N].
-        largest_pressure: largest force on a point per area that belongs to it [Pa].
-    """
-
-    total_force: float
-    flat_end_force: float
-    largest_pressure: float
+    total_force: float  # sum over all points [N]
+    flat_end_force: float  # the part of a `total` that acts under the tool's flat end, on a wide sheet [N]
+    largest_pressure: float  # largest force on a point per area that belongs to it [Pa]
 
 
 def probe_records(scene: Scene) -> list[ProbeRecord]:
@@ -174,12 +145,7 @@ def in_words(record: ProbeRecord) -> str:
 
 
 def force_notes(scene: Scene, records: Sequence[ProbeRecord]) -> Iterator[str]:
-    """Note the probes whose forces do not add up to their total on this sheet.
-
-    Args:
-        scene: a checked scene.
-        records: of its probes.
-    """
+    """Note the probes of a checked scene whose forces do not add up to their total on this sheet."""
     across, down = spacing(scene.sheet)
     cell = f"a cell of {across:.3g} x {down:.3g} m"
     for index, (probe, record) in enumerate(zip(scene.probes, records, strict=True)):

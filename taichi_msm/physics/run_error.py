@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator
-from contextlib import ExitStack, closing
 from dataclasses import replace
 from functools import partial
 from typing import Any, NamedTuple
@@ -21,28 +20,18 @@ from taichi_msm.system.runtime import Device
 
 
 class Known(NamedTuple):
-    """What is known about the error of a run.
+    """What is known about the error of a run."""
 
-    Attributes:
-        estimate: the error due to the step and to rounding; None: not estimated.
-        reason: why it was not estimated.
-        mesh: the error due to the number of points; None: not estimated.
-    """
-
-    estimate: Estimate | None = None
-    reason: str = ""
-    mesh: MeshEstimate | None = None
+    estimate: Estimate | None = None  # the error due to the step and to rounding; None: not estimated
+    reason: str = ""  # why it was not estimated
+    mesh: MeshEstimate | None = None  # the error due to the number of points; None: not estimated
 
 
 class RunError:
     """The pilots of a run.
 
     Args:
-        plan: of the run.
-        pilots: what `choose_pilots` returned.
         known: what was found before the run, and is not estimated again.
-        device: what `runtime.start` returned.
-        cores: number of cores that stepping may use.
 
     Raises:
         DeviceError: when the device cannot run the scene in f64.
@@ -52,29 +41,19 @@ class RunError:
         self._plan, self._pilots, self._known = plan, pilots, known
         self._device, self._cores = device, cores
         self._coarse = known.estimate is None and 0 < pilots.beside < plan.grid.steps_per_frame
-        with ExitStack() as opened:
-            self._time = self._mesh = None
-            if known.estimate is None:
-                self._time = opened.enter_context(closing(Pilot(plan, pilots.beside, device, cores)))
-            coarse = coarser(plan) if pilots.points and known.mesh is None else None
-            if coarse is not None:
-                beside = plan.with_grid(steps_per_frame=pilots.beside) if self._coarse else plan
-                self._mesh = opened.enter_context(closing(MeshPilot(beside, coarse, device, cores)))
-            self._open = opened.pop_all()
+        self._time = Pilot(plan, pilots.beside, device, cores) if known.estimate is None else None
+        coarse = coarser(plan) if pilots.points and known.mesh is None else None
+        beside = plan.with_grid(steps_per_frame=pilots.beside) if self._coarse else plan
+        self._mesh = None if coarse is None else MeshPilot(beside, coarse, device, cores)
 
     def compile(self) -> None:
         """Compile now what the first frame would compile."""
-        for one in (self._time, self._mesh):
-            if one is not None:
-                one.compile()
+        for pilot in (self._time, self._mesh):
+            if pilot is not None:
+                pilot.compile()
 
     def follow(self, displacement: NDArray[Any], pause: Pause) -> None:
-        """Step to the next frame, and compare.
-
-        Args:
-            displacement: of the run at that frame [m], shape (rows, cols, 3).
-            pause: called several times a second; after an exception from it the pilots cannot continue.
-        """
+        """Step to the next frame, and compare, as a `Pilot` does."""
         if self._time is not None:
             self._time.follow(displacement, pause)
         if self._mesh is not None:
@@ -83,24 +62,22 @@ class RunError:
     def finish(self, displacements: Iterator[NDArray[Any]] | None, progress: Count) -> None:
         """After the last frame, take a finer pilot where the coarse one shows an error that matters.
 
-        Args:
-            displacements: of the run at all frames but the first [m]; None: not kept, and the run is repeated.
-            progress: called with the frames done and the frames in all.
+        displacements: of the run at all frames but the first [m]; None: not kept, and the run is repeated.
         """
         if self._time is None or not self._pilots.after or self._time.estimate.error < ENOUGH:
             return
         frames = self._plan.grid.frames
-        with closing(Pilot(self._plan, self._pilots.after, self._device, self._cores)) as fine:
-            for frame, displacement in enumerate(displacements or self._repeated(), 1):
-                fine.follow(displacement, partial(progress, frame, frames))
-            self._known = self._known._replace(estimate=fine.estimate)
+        fine = Pilot(self._plan, self._pilots.after, self._device, self._cores)
+        for frame, displacement in enumerate(displacements or self._repeated(), 1):
+            fine.follow(displacement, partial(progress, frame, frames))
+        self._known = self._known._replace(estimate=fine.estimate)
 
     def _repeated(self) -> Iterator[NDArray[Any]]:
         """Run the scene again; give the displacements of its frames."""
-        with closing(Dynamics(self._plan, self._device, cores=self._cores)) as own:
-            for _ in range(self._plan.grid.frames):
-                own.advance(self._plan.grid.steps_per_frame)
-                yield own.displacement()
+        own = Dynamics(self._plan, self._device, cores=self._cores)
+        for _ in range(self._plan.grid.frames):
+            own.advance(self._plan.grid.steps_per_frame)
+            yield own.displacement()
 
     @property
     def known(self) -> Known:
@@ -114,7 +91,3 @@ class RunError:
         if self._mesh is not None:
             known = known._replace(mesh=self._mesh.estimate)
         return known
-
-    def close(self) -> None:
-        """Free the memory."""
-        self._open.close()

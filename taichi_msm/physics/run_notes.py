@@ -12,7 +12,7 @@ from taichi_msm.physics.material import has_fixed_border
 from taichi_msm.physics.mesh_error import MeshEstimate
 from taichi_msm.physics.plan import Plan
 from taichi_msm.physics.probe_force import ProbeRecord
-from taichi_msm.physics.run_progress import RunProgress
+from taichi_msm.physics.state import RunProgress
 from taichi_msm.scene import MAX_POINTS
 
 # The stability limit holds while no spring is compressed below this share of its rest length (see
@@ -34,16 +34,7 @@ def run_notes(
     reason: str = "",
     mesh: MeshEstimate | None = None,
 ) -> Iterator[str]:
-    """Say what is remarkable about a run, each in a line.
-
-    Args:
-        plan: of the run.
-        probes: the forces of its probes.
-        progress: of the last frame.
-        estimate: of the error; None: there is none.
-        reason: why there is no estimate.
-        mesh: the error that the number of points makes; None: not estimated.
-    """
+    """Say what is remarkable about a run up to its last frame, each in a line; the last three are what is `Known`."""
     scene, grid = plan.scene, plan.grid
     if estimate is not None:
         yield error(estimate, mesh)
@@ -113,7 +104,7 @@ def _remedy(plan: Plan, estimate: Estimate) -> str:
     said = []
     if estimate.rounding > WRONG / 2:
         said.append("time.precision: f64")
-        if plan.material.has_springs:
+        if max(plan.material.across, plan.material.down, plan.material.shear) > 0:
             held = "tissue.pretension or bending" if has_fixed_border(plan.fixed) else "tissue.foundation"
             support = "springs.virtual" if plan.scene.tissue is None else held
             said.append(f"more {support}, where the sheet buckles")

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from taichi_msm.errors import ArgumentError, DeviceError, MsmError
-from taichi_msm.physics.kernel import BYTES, SheetLayout, SheetReading, Start, StepKernel
+from taichi_msm.physics.kernel import BYTES, SheetLayout, Start
 from taichi_msm.physics.kernel_cpu import Sweep
 from taichi_msm.physics.kernel_gpu import STEPS_PER_LAUNCH, Gather
 from taichi_msm.physics.lattice import axes, spacing
@@ -26,17 +26,7 @@ from taichi_msm.physics.terms import terms_of
 from taichi_msm.physics.terms.damping import coefficients
 from taichi_msm.physics.terms.probes import ProbeTerm, standing, standing_decays
 from taichi_msm.physics.terms.springs import LEAST, MOST, SpringTerm
-from taichi_msm.physics.terms.term import (
-    ACROSS,
-    AREA,
-    COLUMN_ROWS,
-    GAIN,
-    HAS_LEFT,
-    HAS_RIGHT,
-    MOTION,
-    MOVES,
-    StepCode,
-)
+from taichi_msm.physics.terms.term import ACROSS, AREA, COLUMN_ROWS, GAIN, HAS_LEFT, HAS_RIGHT, MOTION, MOVES, StepCode
 from taichi_msm.progress import Pause
 from taichi_msm.system.resources import available_threads
 from taichi_msm.system.runtime import Device, lanes
@@ -61,12 +51,7 @@ STEPS_PER_TABLE = 4096
 
 
 def layout_of(plan: Plan, device: Device, cores: int | None = None) -> SheetLayout:
-    """Choose how a sheet is laid out and shared out, and what is compiled for it: only the terms that the scene has.
-
-    Args:
-        plan: of the scene.
-        device: what `runtime.start` returned.
-        cores: number of cores that stepping may use; None: all.
+    """Choose how a sheet is laid out and shared out among cores, None: all, and what is compiled for it.
 
     Raises:
         DeviceError: when the device cannot do what the scene needs.
@@ -94,8 +79,6 @@ class Dynamics:
     """The sheet in motion.
 
     Args:
-        plan: of the scene.
-        device: what `runtime.start` returned.
         layout: in the place of the scene's own; for tests.
         cores: number of cores that stepping may use; None: all.
 
@@ -111,25 +94,24 @@ class Dynamics:
     def __init__(self, plan: Plan, device: Device, layout: SheetLayout | None = None, cores: int | None = None) -> None:
         self._device, self._layout, self._cores = device, layout, cores
         self.launches = 0
-        self._sheet: StepKernel | None = None
+        self._sheet: Sweep | Gather | None = None
         self.restart(plan)
 
     def restart(self, plan: Plan, state: State | None = None) -> None:
         """Begin again with the same scene or another; nothing is compiled if only numbers differ.
 
-        Args:
-            plan: of the scene.
-            state: what `state` returned for the same points and steps, to continue from; None: at rest.
+        state: what `state` returned for the same points and steps, to continue from; None: at rest.
         """
         self.plan = plan
         self.structure = self._layout or layout_of(plan, self._device, self._cores)
-        self._begin(state)
+        self._real = np.dtype(np.float32 if self.structure.code.precision == "f32" else np.float64)
+        self.steps_done, self.torn = 0 if state is None else state.steps, True
+        self._first_tabled, self._loads = self.steps_done, self._table(self.steps_done, STEPS_PER_TABLE)
+        self._place(state)
+        self.torn = False
 
     def steer(self, plan: Plan) -> None:
-        """Continue with other loads and the same steps.
-
-        Args:
-            plan: with other probes, each of which moves, jumps or stands as its predecessor did.
+        """Continue with other probes, each of which moves, jumps or stands as its predecessor did, and the same steps.
 
         Raises:
             ArgumentError: when the new probes need another kernel.
@@ -143,17 +125,15 @@ class Dynamics:
         if probes.by_area != before.by_area:
             raise ArgumentError("probes: one has total instead of force, or the reverse; restart with the new scene")
         if standing(plan) != standing(self.plan):
-            self._moving.set_decay(standing_decays(plan))
+            self._moving.arrays.set_decay(standing_decays(plan))
         self.plan = plan
         # A caller that steers will steer again in a frame, so no more loads than those of a frame are tabulated.
         self._first_tabled, self._loads = self.steps_done, self._table(self.steps_done, plan.grid.steps_per_frame)
 
     def advance(self, steps: int, pause: Pause = lambda: None) -> None:
-        """Take a number of steps.
+        """Take a number of steps, with a pause after every launch.
 
-        Args:
-            steps: how many.
-            pause: called after every launch. An exception from it stops the sheet there; another call continues.
+        An exception from it stops the sheet there; another call continues.
 
         Raises:
             MsmError: when the sheet is torn; so do `state` and `read`.
@@ -181,11 +161,7 @@ class Dynamics:
         self.displacement()
 
     def displacement(self) -> NDArray[Any]:
-        """Read the displacements.
-
-        Returns:
-            x - X [m], shape (rows, cols, 3), in the scene's precision.
-        """
+        """Read the displacements x - X [m], shape (rows, cols, 3), in the scene's precision."""
         return self.read().displacement
 
     def state(self) -> State:
@@ -214,7 +190,7 @@ class Dynamics:
         """Copy the displacements or the differences, and the measures of every row."""
         rows, cols, code = self.structure.rows, self.structure.cols, self.structure.code
         values, measures = np.empty((rows, cols, 3), self._real), np.empty((rows, code.first_measure(None)), self._real)
-        self._moving.read(SheetReading(differences, values, measures))
+        self._moving.read(differences, values, measures)
         return values, measures
 
     def _require_whole(self) -> None:
@@ -226,17 +202,9 @@ class Dynamics:
         self._sheet = None
 
     @property
-    def _moving(self) -> StepKernel:
+    def _moving(self) -> Sweep | Gather:
         assert self._sheet is not None, "it is closed"
         return self._sheet
-
-    def _begin(self, state: State | None) -> None:
-        """Prepare the sheet at rest or in a given state."""
-        self._real = np.dtype(np.float32 if self.structure.code.precision == "f32" else np.float64)
-        self.steps_done, self.torn = 0 if state is None else state.steps, True
-        self._first_tabled, self._loads = self.steps_done, self._table(self.steps_done, STEPS_PER_TABLE)
-        self._place(state)
-        self.torn = False
 
     def _next_loads(self, count: int) -> NDArray[Any]:
         """Give the table of the loads of the next steps, shape (count, columns)."""
@@ -250,10 +218,10 @@ class Dynamics:
     def _table(self, first: int, count: int) -> NDArray[Any]:
         """Tabulate the loads of steps first, ..., first + count - 1, shape (count, columns)."""
         plan, code, loads = self.plan, self.structure.code, schedule(self.plan, first, count)
-        table, verlet = np.empty((count, code.first_column(None))), coefficients(plan)
-        table[:, GAIN] = verlet.gain
+        table, (_, gain, first_gain) = np.empty((count, code.first_column(None))), coefficients(plan)
+        table[:, GAIN] = gain
         if first == 0:
-            table[0, GAIN] = verlet.first_gain
+            table[0, GAIN] = first_gain
         for term in code.terms:
             first_column = code.first_column(type(term))
             table[:, first_column : first_column + term.column_count] = term.columns(plan, loads)

@@ -30,20 +30,10 @@ def sweeping(code: StepCode) -> Callable[..., None]:
         sheet: ti.template(), carried: ti.template(), carried_row, line: ti.template(), here, next_row, exists, up,
         loads: ti.template(), n, moving,
     ):  # fmt: skip
-        """Sweep a row, and step it if `moving`.
+        """Sweep row `line`, in row `here` of u, and step it if `moving`.
 
-        Args:
-            sheet: the sheet.
-            carried: forces carried from row to row, three arrays.
-            carried_row: the row of them.
-            line: the row.
-            here: row of u that holds it.
-            next_row: row of u that holds the next row.
-            exists: 1 if there is a next row, else 0.
-            up: how far the next row is above this one [m].
-            loads: the table of loads.
-            n: its row.
-            moving: whether the row is stepped.
+        The other row, `next_row` of u, is `up` above this one [m]; exists: 0 if there is none, else 1. `carried_row` is
+        the row of the forces carried from row to row, and n that of the table of loads.
         """
         width, strip, i, kind = sheet.width, sheet.width - 2, line.i, line.kind
         diagonal = ti.sqrt(sheet.numbers[DX] * sheet.numbers[DX] + sheet.numbers[DY] * sheet.numbers[DY])
@@ -51,91 +41,79 @@ def sweeping(code: StepCode) -> Callable[..., None]:
         lower = i + ti.select(up < 0, 1, 0)
         # Where u has this row and the other one, and where the forces between them are carried; all from entry 0 on.
         row, other, carry = here * width, next_row * width, carried_row * width
-        # Force of the left neighbour.
-        left_x, left_y, left_z = vector(0), vector(0), vector(0)
-        # Forces carried to the other row: for the entry before this one, this one and the next one.
-        last_x, last_y, last_z = vector(0), vector(0), vector(0)
-        this_x, this_y, this_z = vector(0), vector(0), vector(0)
-        coming_x, coming_y, coming_z = vector(0), vector(0), vector(0)
+        # Force of the left neighbour, and forces carried to the other row: for the entry before this one, this one and
+        # the next one.
+        left, last = [vector(0) for _ in ti.static(range(3))], [vector(0) for _ in ti.static(range(3))]
+        this, coming = [vector(0) for _ in ti.static(range(3))], [vector(0) for _ in ti.static(range(3))]
         has_left, has_right = vector(1), vector(1)
         if ti.static(leaves_out):
             has_right = sheet.by_column[HAS_RIGHT * width + 0]
-        here_x, here_y, here_z = sheet.u[0][row], sheet.u[1][row], sheet.u[2][row]
+        u = [sheet.u[c][row] for c in ti.static(range(3))]
         if ti.static(structural):
-            left_x, left_y, left_z = along(sheet, row + 1, here_x, here_y, here_z, of_row(sheet, i, kind, 0), has_right)
+            first = along(sheet, row + 1, u, of_row(sheet, i, kind, 0), has_right)
+            for c in ti.static(range(3)):
+                left[c] = first[c]
         if ti.static(shear):
-            coming_x, coming_y, coming_z = to_other_row(
-                sheet, other + 1, 1, here_x, here_y, here_z, up, diagonal,
-                of_diagonal(sheet, lower, 0), has_right * exists,
-            )  # fmt: skip
+            first_right = to_other_row(
+                sheet, other + 1, 1, u, up, diagonal, of_diagonal(sheet, lower, 0), has_right * exists
+            )
+            for c in ti.static(range(3)):
+                coming[c] = first_right[c]
         # Read once, because the compiler must assume that stores to the arrays change the table.
         now = [loads[n, c] for c in ti.static(range(columns))]
         for b in range(1, strip + 1):
-            # Neighbours are read again for every entry: there are too few registers to keep them.
-            here_x, here_y, here_z = sheet.u[0][row + b], sheet.u[1][row + b], sheet.u[2][row + b]
             # Sum of the forces on the neighbours in the other row.
-            force_x, force_y, force_z = vector(0), vector(0), vector(0)
-            last_x, last_y, last_z = this_x, this_y, this_z
-            this_x, this_y, this_z = coming_x, coming_y, coming_z
+            force = [vector(0) for _ in ti.static(range(3))]
+            for c in ti.static(range(3)):
+                # Neighbours are read again for every entry: there are too few registers to keep them.
+                u[c] = sheet.u[c][row + b]
+                last[c] = this[c]
+                this[c] = coming[c]
             if ti.static(leaves_out):
                 has_left, has_right = sheet.by_column[HAS_LEFT * width + b], sheet.by_column[HAS_RIGHT * width + b]
             if ti.static(shear):
-                x, y, z = to_other_row(
-                    sheet, other + b - 1, -1, here_x, here_y, here_z, up, diagonal,
-                    of_diagonal(sheet, lower, b - 1), has_left * exists,
-                )  # fmt: skip
-                force_x, force_y, force_z = x, y, z
-                last_x += x
-                last_y += y
-                last_z += z
-            if ti.static(structural):
-                x, y, z = to_other_row(
-                    sheet, other + b, 0, here_x, here_y, here_z, up, ti.abs(up), of_column(sheet, lower, b), exists
+                to_left = to_other_row(
+                    sheet, other + b - 1, -1, u, up, diagonal, of_diagonal(sheet, lower, b - 1), has_left * exists
                 )
-                force_x += x
-                force_y += y
-                force_z += z
-                this_x += x
-                this_y += y
-                this_z += z
-            if ti.static(shear):
-                x, y, z = to_other_row(
-                    sheet, other + b + 1, 1, here_x, here_y, here_z, up, diagonal,
-                    of_diagonal(sheet, lower, b), has_right * exists,
-                )  # fmt: skip
-                force_x += x
-                force_y += y
-                force_z += z
-                coming_x, coming_y, coming_z = x, y, z
-            force_x = carried[0][carry + b] - force_x
-            force_y = carried[1][carry + b] - force_y
-            force_z = carried[2][carry + b] - force_z
+                for c in ti.static(range(3)):
+                    force[c] = to_left[c]
+                    last[c] += to_left[c]
             if ti.static(structural):
-                x, y, z = along(sheet, row + b + 1, here_x, here_y, here_z, of_row(sheet, i, kind, b), has_right)
-                force_x += left_x - x
-                force_y += left_y - y
-                force_z += left_z - z
-                left_x, left_y, left_z = x, y, z
-            # What was stored there was read for the entry before.
-            carried[0][carry + b - 1] = last_x
-            carried[1][carry + b - 1] = last_y
-            carried[2][carry + b - 1] = last_z
+                straight = to_other_row(sheet, other + b, 0, u, up, ti.abs(up), of_column(sheet, lower, b), exists)
+                for c in ti.static(range(3)):
+                    force[c] += straight[c]
+                    this[c] += straight[c]
+            if ti.static(shear):
+                to_right = to_other_row(
+                    sheet, other + b + 1, 1, u, up, diagonal, of_diagonal(sheet, lower, b), has_right * exists
+                )
+                for c in ti.static(range(3)):
+                    force[c] += to_right[c]
+                    coming[c] = to_right[c]
+            for c in ti.static(range(3)):
+                force[c] = carried[c][carry + b] - force[c]
+            if ti.static(structural):
+                right = along(sheet, row + b + 1, u, of_row(sheet, i, kind, b), has_right)
+                for c in ti.static(range(3)):
+                    force[c] += left[c] - right[c]
+                    left[c] = right[c]
+            for c in ti.static(range(3)):
+                # What was stored there was read for the entry before.
+                carried[c][carry + b - 1] = last[c]
             if moving:
-                entry = ti.static(Entry(line, b, here_x, here_y, here_z))
-                move(sheet, entry, here, force_x, force_y, force_z, now)
+                entry = ti.static(Entry(line, b, u))
+                move(sheet, entry, here, force, now)
         if ti.static(shear):
             if ti.static(leaves_out):
                 has_left = sheet.by_column[HAS_LEFT * width + strip + 1]
-            end = row + strip + 1
-            x, y, z = to_other_row(
-                sheet, other + strip, -1, sheet.u[0][end], sheet.u[1][end], sheet.u[2][end],
-                up, diagonal, of_diagonal(sheet, lower, strip), has_left * exists,
-            )  # fmt: skip
-            this_x += x
-            this_y += y
-            this_z += z
-        carried[0][carry + strip] = this_x
-        carried[1][carry + strip] = this_y
-        carried[2][carry + strip] = this_z
+            for c in ti.static(range(3)):
+                u[c] = sheet.u[c][row + strip + 1]
+            end = to_other_row(
+                sheet, other + strip, -1, u, up, diagonal, of_diagonal(sheet, lower, strip), has_left * exists
+            )
+            for c in ti.static(range(3)):
+                this[c] += end[c]
+        for c in ti.static(range(3)):
+            carried[c][carry + strip] = this[c]
 
     return sweep_row

@@ -32,28 +32,16 @@ MOST_FOR_PILOTS = 2 / 5
 
 
 class Work(NamedTuple):
-    """The work of the parts of a run.
+    """The work of the parts of a run."""
 
-    Attributes:
-        start: starting Python and Taichi, and compiling the kernels.
-        stepping: all steps.
-        pilots: those that go with the run.
-        pictures: drawing and encoding.
-    """
-
-    start: float
-    stepping: float
-    pilots: float
-    pictures: float
+    start: float  # starting Python and Taichi, and compiling the kernels
+    stepping: float  # all steps
+    pilots: float  # those that go with the run
+    pictures: float  # drawing and encoding
 
 
 def work(plan: Plan, pilots: float) -> Work:
-    """Count the work of a run.
-
-    Args:
-        plan: of the run.
-        pilots: their steps in f64 for each step of the run, counted in steps of the whole sheet.
-    """
+    """Count the work of a run; pilots: their steps in f64 for each step of it, counted in steps of the whole sheet."""
     steps = _steps(plan)
     stepping = DOUBLE * steps if plan.grid.precision == "f64" else steps
     return Work(START, stepping, DOUBLE * pilots * steps, _other(plan.scene) - START)

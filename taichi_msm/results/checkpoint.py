@@ -25,8 +25,7 @@ from numpy.typing import NDArray
 
 from taichi_msm.errors import DamagedError, FilesError, ForeignError
 from taichi_msm.outputs.npz import read_array, write_arrays
-from taichi_msm.physics.run_progress import RunProgress, Saved
-from taichi_msm.physics.state import State
+from taichi_msm.physics.state import RunProgress, Saved, State
 from taichi_msm.results.entries import FILE, FOLDER, clear, require
 from taichi_msm.results.publication import STAGING
 from taichi_msm.results.whole import DRAFT, create, replacing

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from taichi_msm.errors import writing
 from taichi_msm.outputs import table
 from taichi_msm.outputs.npz import Pieces, write_arrays
-from taichi_msm.physics.run_progress import Saved
+from taichi_msm.physics.state import Saved
 from taichi_msm.progress import Pause
 from taichi_msm.render.labels import Observed
 from taichi_msm.results.checkpoint import CHECKPOINT, PATTERNS, Checkpoint

@@ -11,14 +11,13 @@ from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 
-from taichi_msm.errors import Key, Problem, SceneError
+from taichi_msm.errors import Problem, SceneError
 from taichi_msm.outputs.table import OUTPUTS
 from taichi_msm.physics.pilots import choose_pilots
 from taichi_msm.physics.plan import Plan
 from taichi_msm.render import texture
 from taichi_msm.scene import Scene
 from taichi_msm.system.resources import available_memory
-from taichi_msm.timegrid import TimeGrid
 
 MAX_STEPS = 10**12
 
@@ -46,31 +45,19 @@ OUTPUT_NUMBERS = 15
 
 @dataclass(frozen=True)
 class Budget:
-    """What a scene needs.
+    """What a scene needs."""
 
-    Attributes:
-        points: number of mass points.
-        steps: number of time steps in all.
-        frames: number of frames in all, including that at rest.
-        simulation_bytes: memory for the state of the sheet and its output.
-        drawing_bytes: memory for a frame and the texture; 0 if nothing is drawn.
-        track_bytes: memory for the tracks, which are held until the run ends, and size of their file.
-        picture_bytes: size of the files with pictures and labels, at most.
-        trajectory_bytes: size of the trajectory.
-        record_bytes: size of the record and of the camera, at most.
-        working_bytes: additional disk space that is used until the run ends.
-    """
-
+    # points, steps, frames: numbers of mass points, of time steps, and of frames including that at rest
     points: int
     steps: int
     frames: int
-    simulation_bytes: int
-    drawing_bytes: int
-    track_bytes: int
-    picture_bytes: int
-    trajectory_bytes: int
-    record_bytes: int
-    working_bytes: int
+    simulation_bytes: int  # memory for the state of the sheet and its output
+    drawing_bytes: int  # memory for a frame and the texture; 0 if nothing is drawn
+    track_bytes: int  # memory for the tracks, which are held until the run ends, and size of their file
+    picture_bytes: int  # size of the files with pictures and labels, at most
+    trajectory_bytes: int  # size of the trajectory
+    record_bytes: int  # size of the record and of the camera, at most
+    working_bytes: int  # additional disk space that is used until the run ends
 
     @property
     def memory_bytes(self) -> int:
@@ -114,19 +101,33 @@ def estimate(plan: Plan) -> Budget:
 
 def size_problems(plan: Plan) -> Iterator[Problem]:
     """Find what makes a scene too large, with the numbers and the key to change."""
-    yield from _step_problems(plan.scene, plan.grid)
-    yield from _memory_problems(plan.scene, estimate(plan))
+    scene, grid, budget, available = plan.scene, plan.grid, estimate(plan), available_memory()
+    if grid.steps > MAX_STEPS:
+        count = f"{scene.time.duration:g} s in steps of {grid.step:.6g} s is {grid.steps:.3g} steps"
+        key, remedy = "step", "take a longer step or a shorter time"
+        if scene.time.step == "auto":
+            key, remedy = "duration", "take a shorter time, softer springs or more mass"
+        yield Problem(("time", key), f"{count}, more than the {MAX_STEPS:.0e} that can be taken; {remedy}")
+    if budget.memory_bytes <= available:
+        return
+    rows, cols = scene.sheet.points
+    (width, height), tracks = scene.render.size, scene.render.tracks
+    size, section, key, name = max(
+        (budget.simulation_bytes, "sheet", "points", f"{rows} x {cols} points"),
+        (budget.track_bytes, "render", "tracks", f"tracks of {tracks} x {tracks} points in {budget.frames} frames"),
+        (budget.drawing_bytes, "render", "size", f"frames of {width} x {height} pixels and their texture"),
+    )
+    yield Problem(
+        (section, key),
+        f"the scene needs {_in_words(budget.memory_bytes)} of memory, {_in_words(size)} of it for {name}, "
+        f"but {_in_words(available)} is free; reduce it",
+    )
 
 
 def require_disk(plan: Plan, directory: Path) -> None:
-    """Make sure that the disk has room for the results.
+    """Raise SceneError, with the numbers and the key to change, where the disk has too little room for the results.
 
-    Args:
-        plan: of the run.
-        directory: of the results; it need not exist yet.
-
-    Raises:
-        SceneError: when there is too little room; has the numbers and the key to change.
+    The directory need not exist yet.
     """
     scene, budget, free = plan.scene, estimate(plan), _free_disk(directory)
     needed = budget.disk_bytes + budget.working_bytes
@@ -134,12 +135,11 @@ def require_disk(plan: Plan, directory: Path) -> None:
         return
     rows, cols = scene.sheet.points
     (width, height), tracks = scene.render.size, scene.render.tracks
-    parts = [
+    size, key, name = max(
         (budget.trajectory_bytes + budget.working_bytes, "sheet.points", f"positions of {rows} x {cols} points"),
         (budget.track_bytes, "render.tracks", f"tracks of {tracks} x {tracks} points"),
         (budget.picture_bytes, "render.size", f"pictures of {width} x {height} pixels"),
-    ]
-    size, key, name = max(parts)
+    )
     said = (
         f"{budget.frames} frames may need {_in_words(needed)} on disk, {_in_words(size)} of it for {name}, but "
         f"{_in_words(free)} is free for {directory}; reduce it, time.frames_per_second or output, or choose "
@@ -159,37 +159,6 @@ def drawing_bytes(scene: Scene) -> int:
     samples = band_rows * width * factor * SAMPLE_BYTES
     pixel = PIXEL_BYTES + (LABEL_PIXEL_BYTES if scene.labels_pixels else 0)
     return rows * cols * POINT_BYTES + samples + width * height * pixel + picture * PICTURE_PIXEL_BYTES
-
-
-def _step_problems(scene: Scene, grid: TimeGrid) -> Iterator[Problem]:
-    if grid.steps <= MAX_STEPS:
-        return
-    count = f"{scene.time.duration:g} s in steps of {grid.step:.6g} s is {grid.steps:.3g} steps"
-    limit = f"more than the {MAX_STEPS:.0e} that can be taken"
-    if scene.time.step == "auto":
-        remedy = "take a shorter time, softer springs or more mass"
-        yield Problem(("time", "duration"), f"{count}, {limit}; {remedy}")
-    else:
-        yield Problem(("time", "step"), f"{count}, {limit}; take a longer step or a shorter time")
-
-
-def _memory_problems(scene: Scene, budget: Budget) -> Iterator[Problem]:
-    available = available_memory()
-    if budget.memory_bytes <= available:
-        return
-    rows, cols = scene.sheet.points
-    (width, height), tracks = scene.render.size, scene.render.tracks
-    parts: list[tuple[int, Key, str]] = [
-        (budget.simulation_bytes, ("sheet", "points"), f"{rows} x {cols} points"),
-        (budget.track_bytes, ("render", "tracks"), f"tracks of {tracks} x {tracks} points in {budget.frames} frames"),
-        (budget.drawing_bytes, ("render", "size"), f"frames of {width} x {height} pixels and their texture"),
-    ]
-    size, key, name = max(parts)
-    yield Problem(
-        key,
-        f"the scene needs {_in_words(budget.memory_bytes)} of memory, {_in_words(size)} of it for {name}, "
-        f"but {_in_words(available)} is free; reduce it",
-    )
 
 
 def _free_disk(directory: Path) -> int:

@@ -44,15 +44,10 @@ Kept = dict[str, tuple[float, float]]
 
 
 class Duration(NamedTuple):
-    """How long a run will take.
+    """How long a run will take."""
 
-    Attributes:
-        seconds: from start to end [s].
-        measured: whether that is known from earlier runs, and not only from the calibration.
-    """
-
-    seconds: float
-    measured: bool
+    seconds: float  # from start to end [s]
+    measured: bool  # whether that is known from earlier runs, and not only from the calibration
 
 
 def estimate(plan: Plan) -> Duration:
@@ -69,15 +64,10 @@ def estimate(plan: Plan) -> Duration:
 
 
 def learn(plan: Plan, record: Mapping[str, Any]) -> None:
-    """Keep what a run took for its work, if it was one that `estimate` means: complete, on a CPU with every core.
-
-    Args:
-        plan: of the run.
-        record: its run.json.
-    """
+    """Keep what a run took, by its run.json, if it is one that `estimate` means: complete, on a CPU with every core."""
     tolerances = plan.scene.sheet.tolerance, plan.scene.time.tolerance
     plain = record["arch"] == "cpu" and record["threads"] == resources.available_threads() and not record["resumed"]
-    if record["status"] != "complete" or not plain or any(one is not None for one in tolerances):
+    if record["status"] != "complete" or not plain or tolerances != (None, None):
         return
     times, kept = record["timings"], _read()
     took = {

@@ -8,7 +8,7 @@ from taichi_msm.physics import planning
 from taichi_msm.physics.error_control import Estimate, choose_step
 from taichi_msm.physics.mesh_error import MeshEstimate, choose_points
 from taichi_msm.physics.plan import Plan
-from taichi_msm.physics.timestep import with_chosen_grid
+from taichi_msm.physics.planning import with_chosen_grid
 from taichi_msm.progress import Count
 from taichi_msm.scenefile.validation import checked
 from taichi_msm.system.runtime import Device

@@ -9,9 +9,9 @@ from pydantic import ValidationError
 
 from taichi_msm import faults
 from taichi_msm.errors import ArgumentError, Problem, SceneError
+from taichi_msm.physics.material import MapImage
 from taichi_msm.physics.plan import Plan
 from taichi_msm.physics.planning import try_plan
-from taichi_msm.physics.stiffness_map import MapImage
 from taichi_msm.render.camera import camera_problems
 from taichi_msm.render.texture import image_problems
 from taichi_msm.scene import Scene, Section

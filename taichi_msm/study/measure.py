@@ -11,8 +11,7 @@ from typing import Any, NamedTuple
 from taichi_msm.errors import SceneError
 from taichi_msm.physics.lattice import rest_positions
 from taichi_msm.physics.plan import Plan
-from taichi_msm.physics.planning import make_plan, on
-from taichi_msm.physics.timestep import with_time
+from taichi_msm.physics.planning import make_plan, on, with_time
 from taichi_msm.progress import Progress
 from taichi_msm.render.texture import load_texture
 from taichi_msm.runner import versions

@@ -15,9 +15,8 @@ from taichi_msm.physics.divergence import farthest_displacement
 from taichi_msm.physics.error_control import longest
 from taichi_msm.physics.mesh_error import FEWEST, CubicSampling, MeshPilot, coarser, with_points
 from taichi_msm.physics.plan import Plan
-from taichi_msm.physics.planning import make_plan, try_plan
+from taichi_msm.physics.planning import make_plan, try_plan, with_time
 from taichi_msm.physics.solver import Dynamics
-from taichi_msm.physics.timestep import with_time
 from taichi_msm.progress import Count
 from taichi_msm.scene import MAX_POINTS
 from taichi_msm.scenefile import budget
@@ -106,11 +105,11 @@ class PointStudy:
         self._study.points.append(sheet.measured)
         self._tick()
         dynamics.compile()
-        with closing(MeshPilot(plan, coarse, self._device)) as pilot:
-            pilot.compile()
-            first = self._step_through(sheet, pilot)
-            estimate = pilot.estimate.error
-            sheet.measured.estimate = estimate if estimate < math.inf else None
+        pilot = MeshPilot(plan, coarse, self._device)
+        pilot.compile()
+        first = self._step_through(sheet, pilot)
+        estimate = pilot.estimate.error
+        sheet.measured.estimate = estimate if estimate < math.inf else None
         # The faster of two runs: what disturbs one may not disturb the other.
         return min(first, self._step_through(sheet))
 

@@ -14,9 +14,8 @@ from numpy.typing import NDArray
 from taichi_msm.physics.divergence import farthest_displacement
 from taichi_msm.physics.error_control import longest
 from taichi_msm.physics.plan import Plan
-from taichi_msm.physics.planning import make_plan
+from taichi_msm.physics.planning import make_plan, stable_steps, with_time
 from taichi_msm.physics.solver import Dynamics
-from taichi_msm.physics.timestep import stable_steps, with_time
 from taichi_msm.progress import Count
 from taichi_msm.study.result import Reference, Stepping, Study
 from taichi_msm.system.runtime import Device

@@ -10,9 +10,8 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from taichi_msm.physics import stiffness_map
 from taichi_msm.physics.lattice import spacing
-from taichi_msm.physics.stiffness_map import MapImage
+from taichi_msm.physics.material import MapImage, map_factors, read_map
 from taichi_msm.scene import Scene, StiffnessMap, Tissue
 
 Array = NDArray[np.float64]
@@ -66,12 +65,12 @@ def factors(scene: Scene) -> Array:
     if scene.stiffness_map is None:
         return np.ones((rows - 1, cols - 1))
     changed = Path(scene.stiffness_map.image).stat().st_mtime_ns
-    return stiffness_map.factors(scene.stiffness_map, _read(scene.stiffness_map, changed), rows - 1, cols - 1)
+    return map_factors(scene.stiffness_map, _read(scene.stiffness_map, changed), rows - 1, cols - 1)
 
 
 @lru_cache(maxsize=8)
 def _read(of: StiffnessMap, _changed: int) -> MapImage:
-    return stiffness_map.read(of)
+    return read_map(of)
 
 
 def sheet(scene: Scene) -> Sheet:

@@ -8,11 +8,9 @@ from __future__ import annotations
 import math
 from typing import Any
 
-from taichi_msm.physics import stiffness_map
 from taichi_msm.physics.lattice import spacing
-from taichi_msm.physics.material import Material
+from taichi_msm.physics.material import MapImage, Material, map_factors
 from taichi_msm.physics.plan import Plan
-from taichi_msm.physics.stiffness_map import MapImage
 from taichi_msm.physics.terms.bending import BendingTerm
 from taichi_msm.physics.terms.damping import DampingTerm
 from taichi_msm.physics.terms.foundation import FoundationTerm
@@ -26,16 +24,11 @@ TERMS: tuple[type[Term], ...] = (SpringTerm, FoundationTerm, DampingTerm, Bendin
 
 
 def material_of(scene: Scene, image: MapImage | None) -> Material:
-    """Find the numbers of a scene's sheet.
-
-    Args:
-        scene: in which `kind_problems` finds nothing.
-        image: of its map; None: it has none.
-    """
+    """Find the numbers of the sheet of a scene in which `kind_problems` finds nothing; image: of its map, if any."""
     (rows, cols), (dx, dy), mass, factors = scene.sheet.points, spacing(scene.sheet), scene.sheet.mass, None
     if image is not None:
         assert scene.stiffness_map is not None
-        factors = stiffness_map.factors(scene.stiffness_map, image, rows - 1, cols - 1)
+        factors = map_factors(scene.stiffness_map, image, rows - 1, cols - 1)
     if scene.tissue is not None:
         mass = scene.tissue.density * scene.tissue.thickness * (dx * dy)
     assert mass is not None

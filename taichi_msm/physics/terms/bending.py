@@ -87,14 +87,12 @@ class BendingTerm(Term):
         laplacian = five_point(code)
 
         @ti.func
-        def add(force_x, force_y, force_z, sheet: ti.template(), entry: ti.template(), _now: ti.template()):
-            width, b = sheet.width, entry.b
-            before, at, after = entry.row.before, entry.row.at, entry.row.after
+        def add(force: ti.template(), sheet: ti.template(), entry: ti.template(), _now: ti.template()):
+            row = ti.static(entry.row)
             across, down = 1 / (sheet.numbers[DX] * sheet.numbers[DX]), 1 / (sheet.numbers[DY] * sheet.numbers[DY])
-            force_x = force_x - laplacian(sheet.u[0], width, before, at, after, b, across, down)
-            force_y = force_y - laplacian(sheet.u[1], width, before, at, after, b, across, down)
-            force_z = force_z - laplacian(sheet.u[2], width, before, at, after, b, across, down)
-            return force_x, force_y, force_z
+            for c in ti.static(range(3)):
+                bent = laplacian(sheet.u[c], sheet.width, row.before, row.at, row.after, entry.b, across, down)
+                force[c] = force[c] - bent
 
         return (add,)
 

@@ -11,7 +11,7 @@ In a Verlet step, d_{n+1} = keep d_n + gain F_n and u_{n+1} = u_n + d_{n+1} (eq.
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Any, ClassVar, NamedTuple
+from typing import Any, ClassVar
 
 from typing_extensions import Self
 
@@ -20,32 +20,18 @@ from taichi_msm.physics.terms.term import StepCode, Term
 from taichi_msm.scene import Scene
 
 
-class Coefficients(NamedTuple):
-    """The coefficients of a step.
-
-    Attributes:
-        keep: factor by which the damping reduces the last difference.
-        gain: displacement per force in one step [m/N].
-        first_gain: the same for the first step, which starts at rest [m/N].
-    """
-
-    keep: float
-    gain: float
-    first_gain: float
-
-
-def coefficients(plan: Plan) -> Coefficients:
-    """Compute the coefficients of a step, with central or backward differences for the velocity."""
+def coefficients(plan: Plan) -> tuple[float, float, float]:
+    """Compute keep, gain and the gain of step 0 [m/N], for central or backward differences."""
     material, h = plan.material, plan.grid.step
     g, whole = material.drag, h * h / material.mass
     if plan.scene.time.damping_difference == "central":
-        return Coefficients((1 - g * h / 2) / (1 + g * h / 2), whole / (1 + g * h / 2), whole / 2)
-    return Coefficients(1 - g * h, whole, whole / 2)
+        return (1 - g * h / 2) / (1 + g * h / 2), whole / (1 + g * h / 2), whole / 2
+    return 1 - g * h, whole, whole / 2
 
 
 @dataclass(frozen=True)
 class DampingTerm(Term):
-    """Damping of every point. It adds no energy, and its limit on the step is in `timestep.stable_step`."""
+    """Damping of every point. It adds no energy, and its limit on the step is in `planning.stable_step`."""
 
     numbers_count: ClassVar[int] = 1
 
@@ -64,15 +50,15 @@ class DampingTerm(Term):
 
     def numbers(self, plan: Plan) -> tuple[float, ...]:
         """Give the factor `keep`."""
-        return (coefficients(plan).keep,)
+        return coefficients(plan)[:1]
 
     def reducing(self, code: StepCode) -> Sequence[Callable[..., Any]]:
         """Make the function that reduces the last difference."""
-        ti = code.ti
-        keep = code.first_number(DampingTerm)
+        ti, keep = code.ti, code.first_number(DampingTerm)
 
         @ti.func
-        def reduce(d_x, d_y, d_z, sheet: ti.template()):
-            return d_x * sheet.numbers[keep], d_y * sheet.numbers[keep], d_z * sheet.numbers[keep]
+        def reduce(d: ti.template(), sheet: ti.template()):
+            for c in ti.static(range(3)):
+                d[c] *= sheet.numbers[keep]
 
         return (reduce,)

@@ -23,13 +23,9 @@ from taichi_msm.scene import Scene, Sheet
 
 @dataclass(frozen=True)
 class FoundationTerm(Term):
-    """Virtual springs. Their energy is not measured: `divergence` bounds it.
+    """Virtual springs. Their energy is not measured: `divergence` bounds it."""
 
-    Attributes:
-        by_area: whether they are softer at an open edge, where less of the sheet's area belongs to a point.
-    """
-
-    by_area: bool
+    by_area: bool  # whether they are softer at an open edge, where less of the sheet's area belongs to a point
 
     @staticmethod
     def derive(scene: Scene) -> dict[str, Any]:
@@ -67,16 +63,13 @@ class FoundationTerm(Term):
         by_area, column = self.by_area, code.first_column(FoundationTerm)
 
         @ti.func
-        def add(force_x, force_y, force_z, sheet: ti.template(), entry: ti.template(), now: ti.template()):
+        def add(force: ti.template(), sheet: ti.template(), entry: ti.template(), now: ti.template()):
             if ti.static(by_area):
                 held = now[column] * sheet.by_column[(AREA + entry.row.kind) * sheet.width + entry.b]
-                force_x = force_x - held * entry.x
-                force_y = force_y - held * entry.y
-                force_z = force_z - held * entry.z
+                for c in ti.static(range(3)):
+                    force[c] = force[c] - held * entry.u[c]
             else:
-                force_x = force_x - now[column] * entry.x
-                force_y = force_y - now[column] * entry.y
-                force_z = force_z - now[column] * entry.z
-            return force_x, force_y, force_z
+                for c in ti.static(range(3)):
+                    force[c] = force[c] - now[column] * entry.u[c]
 
         return (add,)

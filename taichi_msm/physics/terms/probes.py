@@ -1,8 +1,7 @@
 """The loads: what probes exert on the points around their control points. Scene: `probes`.
 
-The force on a point at the distance d is F exp(-max(falloff d + shift, offset)) (see `probe_force`). It is
-tabulated for every step, in a few columns for each slot (see `slots`). Where a control point stands, its decay is an
-array.
+The force on a point at the distance d is F exp(-max(falloff d + shift, offset)) (see `probe_force`), tabulated for
+every step in a few columns for each `ProbeSlot`. Where a control point stands, its decay is an array.
 """
 
 # No `from __future__ import annotations` here: Taichi reads the annotations of a kernel.
@@ -18,9 +17,8 @@ from typing_extensions import Self
 
 from taichi_msm.physics.lattice import axes, spacing
 from taichi_msm.physics.loads import Schedule, decay
-from taichi_msm.physics.plan import Plan
+from taichi_msm.physics.plan import Plan, ProbeSlot
 from taichi_msm.physics.probe_force import probe_force
-from taichi_msm.physics.slots import ProbeSlot
 from taichi_msm.physics.terms.term import ACROSS, AREA, DY, TOP, StepCode, Term
 from taichi_msm.scene import Scene
 
@@ -30,15 +28,10 @@ FORCE, POINT, FALLOFF, SHIFT, OFFSET, SLOT_COLUMNS = 0, 3, 5, 6, 7, 8
 
 @dataclass(frozen=True)
 class ProbeTerm(Term):
-    """The loads.
+    """The loads."""
 
-    Attributes:
-        moves: for every slot, whether its control point moves.
-        by_area: for every slot, whether points at an open edge get less of its force.
-    """
-
-    moves: tuple[bool, ...]
-    by_area: tuple[bool, ...]
+    moves: tuple[bool, ...]  # for every slot, whether its control point moves
+    by_area: tuple[bool, ...]  # for every slot, whether points at an open edge get less of its force
 
     @classmethod
     def of(cls, plan: Plan) -> Self:
@@ -70,7 +63,7 @@ class ProbeTerm(Term):
         standing = [moves[:n].count(False) for n in range(len(moves))]
 
         @ti.func
-        def add(force_x, force_y, force_z, sheet: ti.template(), entry: ti.template(), now: ti.template()):
+        def add(force: ti.template(), sheet: ti.template(), entry: ti.template(), now: ti.template()):
             for n in ti.static(range(len(moves))):
                 column = ti.static(first + SLOT_COLUMNS * n)
                 share = vector(0)
@@ -84,10 +77,8 @@ class ProbeTerm(Term):
                         share *= sheet.by_column[(AREA + entry.row.kind) * sheet.width + entry.b]
                 else:
                     share = sheet.decay[(standing[n] * sheet.rows + entry.row.i) * sheet.width + entry.b]
-                force_x += now[column] * share
-                force_y += now[column + 1] * share
-                force_z += now[column + 2] * share
-            return force_x, force_y, force_z
+                for c in ti.static(range(3)):
+                    force[c] += now[column + c] * share
 
         return (add,)
 

@@ -35,9 +35,8 @@ from numpy.typing import NDArray
 from typing_extensions import Self
 
 from taichi_msm.physics.lattice import spacing
-from taichi_msm.physics.material import Material
+from taichi_msm.physics.material import Material, largest_mean
 from taichi_msm.physics.plan import Plan
-from taichi_msm.physics.stiffness_map import largest_mean
 from taichi_msm.physics.terms.term import AREA, DX, DY, HAS_LEFT, HAS_RIGHT, StepCode, Term
 from taichi_msm.scene import Scene, Sheet
 
@@ -54,22 +53,15 @@ TINY = 1e-36
 
 @dataclass(frozen=True)
 class SpringTerm(Term):
-    """Springs between neighbours.
+    """Springs between neighbours."""
 
-    Attributes:
-        structural, shear: whether there are springs along rows and columns, and along diagonals.
-        open_edges: whether a point at an edge moves, so that springs beyond the edge must be left out.
-        by_area: whether springs along such an edge are softer than others, because they belong to one cell.
-        mapped: whether the stiffness of every spring is read from an array; it is 0 where there is no spring.
-        tense: whether the sheet is under tension at rest.
-    """
-
+    # structural, shear: whether there are springs along rows and columns, and along diagonals
     structural: bool
     shear: bool
-    open_edges: bool
-    by_area: bool
-    mapped: bool
-    tense: bool
+    open_edges: bool  # whether a point at an edge moves, so that springs beyond the edge must be left out
+    by_area: bool  # whether springs along such an edge are softer than others, because they belong to one cell
+    mapped: bool  # whether the stiffness of every spring is read from an array; it is 0 where there is no spring
+    tense: bool  # whether the sheet is under tension at rest
 
     reach: ClassVar[int] = 1
     # k - tau, and then tau, of each family.
@@ -124,7 +116,9 @@ class SpringTerm(Term):
 
     def numbers(self, plan: Plan) -> tuple[float, ...]:
         """Give k - tau and tau of every family [N/m]."""
-        return *plan.material.stiffness, *plan.material.tensions
+        material = plan.material
+        less = 1 - material.tension
+        return material.across * less, material.down * less, material.shear * less, *material.tensions
 
     def energy(self, sums: NDArray[Any], plan: Plan) -> float:
         """Give twice the energy [J]."""
@@ -140,35 +134,32 @@ class SpringTerm(Term):
         first_tension = first + 3
 
         @ti.func
-        def pull(weighted, square, length, to_x, to_y, to_z, tension, x, y, z):
-            """Force along the deformed spring, from k (L^2 - L0^2) and L^2, plus tension times the difference."""
-            force = weighted / (square + length * ti.sqrt(square))
-            force_x, force_y, force_z = force * to_x, force * to_y, force * to_z
+        def pull(weighted, square, length, to: ti.template(), tension, q: ti.template()):
+            """Force along the deformed spring, from k (L^2 - L0^2) and L^2, plus tension times the difference q."""
+            share = weighted / (square + length * ti.sqrt(square))
+            force = [share * to[c] for c in ti.static(range(3))]
             if ti.static(tense):
-                force_x += tension * x
-                force_y += tension * y
-                force_z += tension * z
-            return force_x, force_y, force_z
+                for c in ti.static(range(3)):
+                    force[c] += tension * q[c]
+            return force
 
         @ti.func
-        def along(sheet: ti.template(), right, here_x, here_y, here_z, k, exists):
+        def along(sheet: ti.template(), right, here: ti.template(), k, exists):
             """Force of a point displaced by `here` on its right neighbour, in entry `right` of u; exists: 0 if none."""
             dx = sheet.numbers[DX]
-            x, y, z = here_x - sheet.u[0][right], here_y - sheet.u[1][right], here_z - sheet.u[2][right]
+            x, y, z = here[0] - sheet.u[0][right], here[1] - sheet.u[1][right], here[2] - sheet.u[2][right]
             to_x = x - dx
             rest = y * y + z * z
             weighted = k * (x * (to_x - dx) + rest)
             if ti.static(leaves_out):
                 weighted *= exists
             tension = sheet.numbers[first_tension + ALONG_ROW]
-            return pull(weighted, to_x * to_x + (rest + TINY), dx, to_x, y, z, tension, x, y, z)
+            return pull(weighted, to_x * to_x + (rest + TINY), dx, [to_x, y, z], tension, [x, y, z])
 
         @ti.func
-        def to_other_row(
-            sheet: ti.template(), entry, right: ti.template(), here_x, here_y, here_z, up, length, k, exists
-        ):
+        def to_other_row(sheet: ti.template(), entry, right: ti.template(), here: ti.template(), up, length, k, exists):
             """Force of a point displaced by `here` on that in `entry`, `right` columns on in the row above."""
-            x, y, z = here_x - sheet.u[0][entry], here_y - sheet.u[1][entry], here_z - sheet.u[2][entry]
+            x, y, z = here[0] - sheet.u[0][entry], here[1] - sheet.u[1][entry], here[2] - sheet.u[2][entry]
             to_x = x
             to_y = y - up
             rest = z * z
@@ -180,7 +171,8 @@ class SpringTerm(Term):
             if ti.static(leaves_out):
                 weighted *= exists
             tension = sheet.numbers[first_tension + ti.static(DIAGONAL if right else ALONG_COLUMN)]
-            return pull(weighted, to_x * to_x + to_y * to_y + (rest + TINY), length, to_x, to_y, z, tension, x, y, z)
+            square = to_x * to_x + to_y * to_y + (rest + TINY)
+            return pull(weighted, square, length, [to_x, to_y, z], tension, [x, y, z])
 
         @ti.func
         def of_row(sheet: ti.template(), i, kind, b):
@@ -279,14 +271,9 @@ class SpringTerm(Term):
 
 
 def stiffness(material: Material, factors: NDArray[Any]) -> tuple[NDArray[Any], NDArray[Any], NDArray[Any]]:
-    """Assemble the stiffness k of every spring from its cells [N/m].
+    """Assemble the stiffness k of every spring from the factors of its cells, shape (rows - 1, cols - 1) [N/m].
 
-    Args:
-        material: of the sheet.
-        factors: of every cell, shape (rows - 1, cols - 1).
-
-    Returns:
-        Along rows, shape (rows, cols - 1); along columns, shape (rows - 1, cols); along both diagonals of a cell.
+    Along rows, shape (rows, cols - 1); along columns, shape (rows - 1, cols); along both diagonals of a cell.
     """
     above_and_below, beside = np.pad(factors, ((1, 1), (0, 0))), np.pad(factors, ((0, 0), (1, 1)))
     across = material.across / 2 * (above_and_below[:-1] + above_and_below[1:])

@@ -33,16 +33,11 @@ class Term:
 
     The kernels know by name the terms that act between points, springs and bending; others need only the functions
     here.
-
-    Attributes:
-        reach: how many rows away a point may be that the force depends on.
-        numbers_count: how many of the sheet's numbers belong to the term.
-        reductions: how each of its measures is reduced to one number of a row: "min", "max" or "sum".
     """
 
-    reach: ClassVar[int] = 0
-    numbers_count: ClassVar[int] = 0
-    reductions: ClassVar[tuple[str, ...]] = ()
+    reach: ClassVar[int] = 0  # how many rows away a point may be that the force depends on
+    numbers_count: ClassVar[int] = 0  # how many of the sheet's numbers belong to the term
+    reductions: ClassVar[tuple[str, ...]] = ()  # how each of its measures becomes one of a row: "min", "max" or "sum"
 
     @classmethod
     def of(cls, plan: Plan) -> Self | None:
@@ -77,14 +72,14 @@ class Term:
         return 0.0
 
     def forces(self, code: StepCode) -> Sequence[Callable[..., Any]]:
-        """Make Taichi's functions force(force_x, force_y, force_z, sheet, entry, now) that add to the force on a point.
+        """Make Taichi's functions add(force, sheet, entry, now) that add to the force on a point, a list of x, y and z.
 
-        They return the new force; `now` is the row of the table of loads, a list of variables.
+        `now` is the row of the table of loads, a list of variables.
         """
         return ()
 
     def reducing(self, code: StepCode) -> Sequence[Callable[..., Any]]:
-        """Make Taichi's functions reduce(d_x, d_y, d_z, sheet) that change the last difference of a point."""
+        """Make Taichi's functions reduce(d, sheet) that change the last difference of a point, a list of x, y and z."""
         return ()
 
     def measuring(self, code: StepCode) -> Sequence[Callable[..., None]]:
@@ -97,19 +92,12 @@ AnyTerm = TypeVar("AnyTerm", bound=Term)
 
 @dataclass(frozen=True)
 class StepCode:
-    """What the kernels of a sheet are compiled for; everything else is an argument.
+    """What the kernels of a sheet are compiled for; everything else is an argument."""
 
-    Attributes:
-        precision: f32 or f64.
-        lanes: of a vector; columns are cut into as many strips.
-        by_area: whether points at an open edge have less mass than others, because they belong to fewer cells.
-        terms: those that the scene has, always with springs and probes; in the order of `terms.TERMS`.
-    """
-
-    precision: str
-    lanes: int
-    by_area: bool
-    terms: tuple[Term, ...]
+    precision: str  # f32 or f64
+    lanes: int  # of a vector; columns are cut into as many strips
+    by_area: bool  # whether points at an open edge have less mass than others, because they belong to fewer cells
+    terms: tuple[Term, ...]  # those that the scene has, always with springs and probes; in the order of `terms.TERMS`
 
     @property
     def reach(self) -> int:
@@ -166,47 +154,34 @@ class StepCode:
 
 
 class KernelSheet(NamedTuple):
-    """A sheet within a kernel; its arrays are those of `kernel`.
+    """A sheet within a kernel; its arrays are those of `kernel`."""
 
-    Attributes:
-        u, d: displacements, with bending also moments, and last differences; three arrays each, for x, y and z.
-        by_column, stiffness, decay: one array each.
-        numbers: of the sheet and of its terms, a list of variables.
-        rows: of points.
-        width: entries of a row.
-    """
-
+    # u, d: displacements, with bending also moments, and last differences; three arrays each, for x, y and z
     u: Any
     d: Any
+    # by_column, stiffness, decay: one array each
     by_column: Any
     stiffness: Any
     decay: Any
-    numbers: Any
-    rows: Any
-    width: Any
+    numbers: Any  # of the sheet and of its terms, a list of variables
+    rows: Any  # of points
+    width: Any  # entries of a row
 
 
 class KernelRow(NamedTuple):
-    """A row of the sheet within a kernel.
+    """A row of the sheet within a kernel."""
 
-    Attributes:
-        i: its number.
-        kind: 0 for the first row of the sheet, 2 for the last, else 1.
-        before, at, after: with bending, rows of u with the moments of the row before, of row i and of the row after.
-    """
-
-    i: Any
-    kind: Any
+    i: Any  # its number
+    kind: Any  # 0 for the first row of the sheet, 2 for the last, else 1
+    # before, at, after: with bending, rows of u with the moments of the row before, of row i and of the row after
     before: Any
     at: Any
     after: Any
 
 
 class Entry(NamedTuple):
-    """An entry b of a row within a kernel, which is a point in each lane, displaced by (x, y, z) [m]."""
+    """An entry b of a row within a kernel, which is a point in each lane; u: its displacement, a list of x, y and z."""
 
     row: KernelRow
     b: Any
-    x: Any
-    y: Any
-    z: Any
+    u: Any
