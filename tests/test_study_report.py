@@ -19,7 +19,7 @@ from PIL import Image
 from taichi_msm.errors import FilesError
 from taichi_msm.study.page import summary
 from taichi_msm.study.report import WITHOUT_MATPLOTLIB, as_record, write_report
-from taichi_msm.study.result import Drawn, Peer, Points, Reference, Stepping, Study, Term, Timing
+from taichi_msm.study.result import Drawn, Peer, Points, Reference, Stepping, Study, TimedTerm, Timing
 from taichi_msm.study.table import duration, number, timing
 from tests.scenes import scene
 
@@ -91,7 +91,7 @@ def realistic() -> Study:
         for refine in (0, 1, 2, 5)
     ]
     names = ("", "springs.structural", "springs.shear", "springs.virtual", "damping", "probes.0")
-    found.terms = [Term(name, samples=spread(23e-6 - 2e-6 * len(name) / 9, 9)) for name in names]
+    found.terms = [TimedTerm(name, samples=spread(23e-6 - 2e-6 * len(name) / 9, 9)) for name in names]
     found.notes = ["DOP853 takes more than 20 s at rtol 1e-08 and was stopped"]
     return found
 

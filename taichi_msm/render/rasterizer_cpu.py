@@ -17,7 +17,7 @@ from taichi_msm.render.geometry import POINT_NUMBERS, SEEN, project
 from taichi_msm.render.instrument_coverage import cover_with_rods
 from taichi_msm.render.labels import LABEL_NUMBERS
 from taichi_msm.render.samples import INFINITY, Band, Bytes, DrawingConfig, Floats, Integers, clear
-from taichi_msm.render.shading import Output, resolve
+from taichi_msm.render.shading import PixelArrays, resolve
 from taichi_msm.render.texture_filter import Appearance
 from taichi_msm.system.runtime import ITERATIONS_PER_THREAD, Memory, our_compilation, started, ti
 
@@ -149,7 +149,7 @@ def _kernel(config: DrawingConfig) -> Callable[..., None]:
                     Appearance(config, texels, sizes, texture_width, texture_height, numbers, rod_count)
                 )
                 pixels = width * height
-                output = ti.static(Output(colours, labels, pixels))
+                output = ti.static(PixelArrays(colours, labels, pixels))
                 samples_width, samples_height = width * factor, height * factor
                 # Bands are taken one by one: if another program delays a worker, the others take its bands.
                 taking = True

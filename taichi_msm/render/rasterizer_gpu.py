@@ -28,7 +28,7 @@ from taichi_msm.render.geometry import (
 from taichi_msm.render.instrument_coverage import cover_with_rods
 from taichi_msm.render.labels import LABEL_NUMBERS
 from taichi_msm.render.samples import INFINITY, Band, Bytes, DrawingConfig, Floats, Integers, clear
-from taichi_msm.render.shading import Output, resolve
+from taichi_msm.render.shading import PixelArrays, resolve
 from taichi_msm.render.texture_filter import Appearance
 from taichi_msm.system.launches import THREADS, Launches, end_thread
 from taichi_msm.system.runtime import our_compilation, ti
@@ -228,7 +228,7 @@ def _picture_kernels(config: DrawingConfig) -> tuple[Callable[..., None], Callab
                 Appearance(config, texels, sizes, sizes[uni.LEVELS + 1], sizes[uni.LEVELS + 2], numbers, rod_count)
             )
             pixels = width * height
-            output = ti.static(Output(colours, labels, pixels))
+            output = ti.static(PixelArrays(colours, labels, pixels))
             resolve(line, y, y + 1, x, x + 1, across, width, samples, appearance, output)
             end_thread(ended)
 

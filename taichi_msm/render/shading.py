@@ -11,7 +11,7 @@ from taichi_msm.render.texture_filter import filtered
 from taichi_msm.system.runtime import ti
 
 
-class Output(NamedTuple):
+class PixelArrays(NamedTuple):
     """What the kernel writes."""
 
     colours: Any  # of the pixels, as words or bytes

@@ -120,7 +120,7 @@ class Points(Measured):
 
 
 @dataclass
-class Term(Measured):
+class TimedTerm(Measured):
     """The cost of a step without one term of the model, timed for one step."""
 
     without: str  # key of the term that is left out; empty: none is
@@ -141,7 +141,7 @@ class Study:
     peers: list[Peer] = field(default_factory=list)
     drawing: list[Drawn] = field(default_factory=list)  # by supersample and refine; empty without a picture
     points: list[Points] = field(default_factory=list)  # from few to many; empty with springs
-    terms: list[Term] = field(default_factory=list)  # the first leaves nothing out
+    terms: list[TimedTerm] = field(default_factory=list)  # the first leaves nothing out
     notes: list[str] = field(default_factory=list)  # what a reader must know, such as parts left out and why
 
     def finish(self) -> None:

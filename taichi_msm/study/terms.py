@@ -11,7 +11,7 @@ from taichi_msm.physics.planning import make_plan
 from taichi_msm.physics.solver import Dynamics
 from taichi_msm.progress import Count
 from taichi_msm.scene import Scene
-from taichi_msm.study.result import Study, Term
+from taichi_msm.study.result import Study, TimedTerm
 from taichi_msm.system.runtime import Device
 
 ROUNDS = 9
@@ -29,7 +29,7 @@ def measure_terms(plan: Plan, device: Device, sample: float, study: Study, progr
     # All variants have the steps of the whole scene: without a spring the automatic step would be another.
     grid = {"steps_per_frame": plan.grid.steps_per_frame, "precision": plan.grid.precision}
     plans = {without: make_plan(scene, plan.image).with_grid(**grid) for without, scene in variants(plan.scene)}
-    study.terms += map(Term, plans)
+    study.terms += map(TimedTerm, plans)
     with ExitStack() as opened:
         sheets: list[Dynamics] = []
         for variant in plans.values():

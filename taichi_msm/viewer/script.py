@@ -43,7 +43,7 @@ PRESSABLE = tuple(name for name in KEYS if name != "q")
 _SCRIPT = Kind("script", "events")
 
 
-class Entry(Section):
+class ScriptEvent(Section):
     """One entry of a script."""
 
     t: Seconds = key(..., means="when, or when it begins [s]", expects=SECONDS)
@@ -61,7 +61,7 @@ class Entry(Section):
     seconds: Seconds = key(0.0, means="how long it takes [s]", expects=SECONDS)
 
     @model_validator(mode="after")
-    def _complete(self) -> Entry:
+    def _complete(self) -> ScriptEvent:
         for name in ("at", "by", "to", "name"):
             given, needed = getattr(self, name) is not None, NEEDS[self.do] == name
             if given != needed:
@@ -83,11 +83,13 @@ class Script(Section):
         means="width, height of the picture that the pixels are of [px]; others are scaled; default: the session's",
         expects=f"two whole numbers, 1 to {MAX_PIXELS}: [width, height] in pixels",
     )
-    events: tuple[Entry, ...] = key(..., means="what is done, in order", expects="a list of mappings with t and do")
+    events: tuple[ScriptEvent, ...] = key(
+        ..., means="what is done, in order", expects="a list of mappings with t and do"
+    )
 
     @field_validator("events", mode="after")
     @classmethod
-    def _in_order(cls, events: tuple[Entry, ...]) -> tuple[Entry, ...]:
+    def _in_order(cls, events: tuple[ScriptEvent, ...]) -> tuple[ScriptEvent, ...]:
         presses, end = False, 0.0
         for n, entry in enumerate(events):
             if entry.do in ("drag", "release") and not presses:
