@@ -22,7 +22,7 @@ wrong results; so unary minus, `-=`, abs, any and all are not used on vectors, a
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -129,6 +129,23 @@ class SheetArrays:
     def rows(self, count: int) -> Any:
         """Allocate an array of `count` rows; its content is arbitrary."""
         return self._memory.array(self._layout.code.precision, self._layout.code.lanes, count * self._layout.width)
+
+
+class StepKernel(Protocol):
+    """A form of kernel 1: the state of a sheet in the memory of a device."""
+
+    arrays: SheetArrays
+
+    def __init__(self, layout: SheetLayout, start: Start) -> None: ...
+
+    def advance(self, count: int, table: NDArray[Any]) -> None:
+        """Take a number of steps; table: of the loads, shape (count, columns)."""
+
+    def compile(self, table: NDArray[Any]) -> None:
+        """Compile everything that steps may need, without taking one."""
+
+    def read(self, differences: bool, values: NDArray[Any], measures: NDArray[Any]) -> None:
+        """Copy displacements or differences into values, shape (rows, cols, 3), and the measures of every row."""
 
 
 def point_step(code: StepCode) -> Callable[..., None]:

@@ -38,7 +38,7 @@ CROWDED = 0.2
 
 
 class Sweep:
-    """The state of a sheet in the memory of a CPU, and its kernels."""
+    """The state of a sheet in the memory of a CPU, and its kernels: a `StepKernel`."""
 
     def __init__(self, layout: SheetLayout, start: Start) -> None:
         self._layout = layout

@@ -24,7 +24,7 @@ STEPS_PER_LAUNCH = 8
 
 
 class Gather:
-    """The state of a sheet in the memory of a GPU, and its kernels, with the methods of `Sweep`."""
+    """The state of a sheet in the memory of a GPU, and its kernels: a `StepKernel`."""
 
     def __init__(self, layout: SheetLayout, start: Start) -> None:
         self._layout = layout

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from taichi_msm.errors import ArgumentError, DeviceError, MsmError
-from taichi_msm.physics.kernel import BYTES, SheetLayout, Start
+from taichi_msm.physics.kernel import BYTES, SheetLayout, Start, StepKernel
 from taichi_msm.physics.kernel_cpu import Sweep
 from taichi_msm.physics.kernel_gpu import STEPS_PER_LAUNCH, Gather
 from taichi_msm.physics.lattice import axes, spacing
@@ -94,7 +94,7 @@ class Dynamics:
     def __init__(self, plan: Plan, device: Device, layout: SheetLayout | None = None, cores: int | None = None) -> None:
         self._device, self._layout, self._cores = device, layout, cores
         self.launches = 0
-        self._sheet: Sweep | Gather | None = None
+        self._sheet: StepKernel | None = None
         self.restart(plan)
 
     def restart(self, plan: Plan, state: State | None = None) -> None:
@@ -202,7 +202,7 @@ class Dynamics:
         self._sheet = None
 
     @property
-    def _moving(self) -> Sweep | Gather:
+    def _moving(self) -> StepKernel:
         assert self._sheet is not None, "it is closed"
         return self._sheet
 
@@ -245,7 +245,7 @@ class Dynamics:
         numbers = *spacing(sheet), sheet.size[0] / 2, *(n for term in layout.code.terms for n in term.numbers(plan))
         stiffness = layout.code.require(SpringTerm).laid_out(plan)
         self._sheet = None  # Frees its memory before another sheet takes some.
-        kind = Sweep if layout.workers else Gather
+        kind: type[StepKernel] = Sweep if layout.workers else Gather
         self._sheet = kind(layout, Start(np.array(numbers), by_column, standing_decays(plan), stiffness, state))
 
 
