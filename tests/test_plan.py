@@ -12,8 +12,10 @@ import pytest
 
 import taichi_msm
 import taichi_msm.runner
+from taichi_msm import load_scene
 from taichi_msm.cli import main
 from taichi_msm.physics import lattice, material, plan, planning, terms
+from taichi_msm.physics.planning import make_plan
 
 DERIVED = [
     (terms, "material_of"),
@@ -65,3 +67,11 @@ def test_a_check_derives_everything_once(root: Path, calls: Counter[str], capsys
     assert main(["check", str(root / "scenes/tumour.yaml")]) == 0
     assert calls == dict.fromkeys((name for _, name in DERIVED), 1)
     assert "limit" in capsys.readouterr().out
+
+
+def test_a_scene_without_the_map_of_another_one_has_none(root: Path) -> None:
+    mapped = make_plan(load_scene(root / "scenes/tumour.yaml"))
+    assert mapped.scene.tissue is not None
+    tissue = mapped.scene.tissue.model_copy(update={"map": None})
+    plain = make_plan(mapped.scene.model_copy(update={"tissue": tissue}), mapped.image)
+    assert plain.material.factors is plain.image is None

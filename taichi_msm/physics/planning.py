@@ -43,7 +43,9 @@ def try_plan(scene: Scene, image: MapImage | None = None) -> tuple[Plan | None, 
     if problems:
         return None, problems
     fixed = fixed_points(scene.sheet)
-    if scene.stiffness_map is not None and image is None:
+    if scene.stiffness_map is None:
+        image = None
+    elif image is None:
         try:
             image = read_map(scene.stiffness_map)
         except PictureError as error:
