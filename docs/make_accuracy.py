@@ -72,7 +72,10 @@ def seconds_to(found: Record, method: str, error: float) -> float:
 
 def significant(value: float | None, digits: int = 2) -> str:
     """Write a number for a table."""
-    return "-" if value is None or math.isnan(value) else f"{value:.{digits}g}"
+    if value is None or math.isnan(value):
+        return "-"
+    text = f"{value:.{digits}g}"
+    return f"{float(text):g}" if 1 <= value < 1e5 else text
 
 
 def table(head: list[str], rows: list[list[str]]) -> str:
