@@ -142,8 +142,9 @@ def run(
         budget.require_disk(plan, folder)
     with writing(directory):
         here = str(Path.cwd())
-    made = tuple(overrides)
-    manifest = Manifest(given, plan.scene, made, estimate, mesh, estimate_error, here, arch, sha256, versions())
+    manifest = Manifest(
+        given, plan.scene, tuple(overrides), estimate, mesh, estimate_error, here, arch, sha256, versions()
+    )
     task = _Task(manifest, plan, texture, device, folder)
     if begun := _begun(manifest, folder):
         with suppress(DamagedError):

@@ -13,12 +13,13 @@ from PIL import Image
 
 from taichi_msm.errors import FilesError, SceneError
 from taichi_msm.physics.plan import Plan
+from taichi_msm.physics.planning import stable_steps
 from taichi_msm.playback import Playback
 from taichi_msm.results.finished_run import PUT_BACK, read_run
 from taichi_msm.results.manifest import digests
 from taichi_msm.results.record import RunRecord
 from taichi_msm.runner import resume, run
-from taichi_msm.scenefile.load import load_scene
+from taichi_msm.scenefile.load import load_plan, load_scene
 from taichi_msm.system.runtime import Device
 from tests.conftest import Program
 from tests.outputs import files, results
@@ -222,3 +223,15 @@ def test_another_run_is_noticed_while_results_are_read(results: Path) -> None:
         found.unchanged(),
     ):
         change(results, steps=3)
+
+
+def test_a_step_was_good_for_the_map_that_was_run(mapped: Path, device: Device) -> None:
+    """A stiffer map in its place would refuse it, but has no part in reading the positions."""
+    Image.new("L", (3, 3), 0).save("map.png")
+    steps = stable_steps(load_plan("small.yaml", [MAP, SHORT]))
+    scene = load_scene("small.yaml", [MAP, SHORT, f"time.step={0.1 / steps}"])
+    run(scene, "out", threads=device.threads, estimate_error=False)
+    Image.new("L", (3, 3), 255).save("map.png")
+    with pytest.raises(SceneError, match="above the stability limit"):
+        load_scene("small.yaml", [MAP, SHORT, f"time.step={0.1 / steps}"])
+    assert len(read_run("out").positions()) == scene.time.frames + 1

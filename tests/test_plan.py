@@ -15,7 +15,7 @@ import taichi_msm.runner
 from taichi_msm import load_scene
 from taichi_msm.cli import main
 from taichi_msm.physics import lattice, material, plan, planning, terms
-from taichi_msm.physics.planning import make_plan
+from taichi_msm.physics.planning import make_plan, variant
 
 DERIVED = [
     (terms, "material_of"),
@@ -73,5 +73,5 @@ def test_a_scene_without_the_map_of_another_one_has_none(root: Path) -> None:
     mapped = make_plan(load_scene(root / "scenes/tumour.yaml"))
     assert mapped.scene.tissue is not None
     tissue = mapped.scene.tissue.model_copy(update={"map": None})
-    plain = make_plan(mapped.scene.model_copy(update={"tissue": tissue}), mapped.image)
-    assert plain.material.factors is plain.image is None
+    plain = variant(mapped, mapped.scene.model_copy(update={"tissue": tissue}))
+    assert plain.material.factors is None

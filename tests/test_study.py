@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from PIL import Image
 from pydantic import BaseModel
 
 from taichi_msm.physics.lattice import rest_positions
@@ -458,3 +459,13 @@ def test_an_interruption_leaves_what_is_done(device: Device) -> None:
             measured.run()
         assert measured.study.reference is not None
         assert measured.study.stepping
+
+
+def test_without_a_term_a_given_step_may_be_unstable(device: Device, tmp_path: Path) -> None:
+    """A map of soft places, left out, makes the sheet stiffer than the step allows; it is timed all the same."""
+    Image.new("L", (3, 3), 0).save(tmp_path / "map.png")
+    soft = {"structural": 20, "map": {"image": str(tmp_path / "map.png"), "range": [0.01, 1]}}
+    plan = plan_of(scene(springs=soft, time={"step": 0.04 / 4}))
+    study = Study("press", scene().model_dump(), "complete", 1e-3, {})
+    measure_terms(plan, device, 0.0001, study, nothing)
+    assert [term.without for term in study.terms][-1] == "probes.0"

@@ -562,3 +562,21 @@ def test_a_run_whose_map_is_gone_says_so(load: Any, tmp_path: Path, device: Devi
         resume(tmp_path / "out", threads=device.threads)
     (tmp_path / "away.png").rename(tmp_path / "map.png")
     assert resume(tmp_path / "out", threads=device.threads)["status"] == "complete"
+
+
+def test_a_coarser_sheet_may_meet_a_darker_part_of_the_map(load: Any, tmp_path: Path) -> None:
+    """Where a pretension would be refused for it, it still tells the error of the points."""
+    grey = np.full((6, 7), 255, np.uint8)
+    grey[3, 3] = 0
+    Image.fromarray(grey).save(tmp_path / "map.png")
+    # A cell of the coarser sheet, of 6 x 7, is at the texel's centre; those of the sheet, of 12 x 14, are a quarter of
+    # a texel beside it, and have 3/4 of it in both directions. The tension is just below what these allow.
+    softest = 1 - (1 - 0.01) * (3 / 4) ** 2
+    most = 1.5 * 3e4 * 3e-3
+    override = f"tissue={{young: 3.0e4, thickness: 3.0e-3, density: 1050, pretension: {0.99 * most * softest}"
+    made = load(f"{override}, map: {{image: map.png, range: [0.01, 1]}}}}", "sheet.points=[13, 15]")
+    coarse = coarser(plan_of(made))
+    assert coarse is not None
+    assert coarse.scene.sheet.points == (7, 8)
+    assert coarse.material.factors is not None
+    assert coarse.material.factors.min() == pytest.approx(0.01)

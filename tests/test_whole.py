@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import errno
 import sys
 from pathlib import Path
 
@@ -36,6 +37,31 @@ def test_a_link_among_what_was_left_leads_nowhere(tmp_path: Path) -> None:
         pass
     assert (treasure / "lock").is_dir()
     assert not (treasure / "notes.txt").exists()
+
+
+def test_a_folder_with_files_of_the_user_stays(tmp_path: Path) -> None:
+    mine = tmp_path / f".partial-{16 * 'a'}"
+    mine.mkdir()
+    for name in (LOCK, "thesis.txt"):
+        (mine / name).touch()
+    with staged(tmp_path):
+        pass
+    assert (mine / "thesis.txt").exists()
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="no lock")
+def test_without_locks_nothing_is_taken_for_abandoned(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Such as a film that is still being recorded."""
+
+    def refuse(*_: object) -> None:
+        raise OSError(errno.ENOLCK, "no locks")
+
+    monkeypatch.setattr("fcntl.flock", refuse)
+    with staged(tmp_path) as film:
+        (film / "animation.gif").touch()
+        with staged(tmp_path):
+            pass
+        assert (film / "animation.gif").exists()
 
 
 def test_a_folder_made_for_nothing_goes(tmp_path: Path) -> None:

@@ -36,7 +36,7 @@ from taichi_msm.errors import SceneError
 from taichi_msm.physics.error_control import longest
 from taichi_msm.physics.material import LONGEST_CELL, MapImage, cell_ratio
 from taichi_msm.physics.plan import Plan
-from taichi_msm.physics.planning import on, stable_steps, try_plan
+from taichi_msm.physics.planning import on, stable_steps, variant
 from taichi_msm.physics.probe_force import sums
 from taichi_msm.physics.solver import Dynamics
 from taichi_msm.progress import Count, Pause
@@ -88,7 +88,7 @@ def coarser(plan: Plan) -> Plan | None:
         return None
     coarse = min(possible, key=lambda halved: halved.sheet.points)
     probes = tuple(_pressing_alike(probe, scene.sheet, coarse.sheet) for probe in scene.probes)
-    return try_plan(coarse.model_copy(update={"probes": probes}), plan.image)[0]
+    return variant(plan, coarse.model_copy(update={"probes": probes}))
 
 
 def _pressing_alike(probe: Probe, sheet: Sheet, other: Sheet) -> Probe:

@@ -7,6 +7,9 @@ from collections.abc import Iterator
 from dataclasses import replace
 from typing import Any
 
+import numpy as np
+from numpy.typing import NDArray
+
 from taichi_msm.errors import Problem, SceneError
 from taichi_msm.physics import workload
 from taichi_msm.physics.lattice import fixed_points, spacing
@@ -42,23 +45,33 @@ def try_plan(scene: Scene, image: MapImage | None = None) -> tuple[Plan | None, 
     problems = list(kind_problems(scene))
     if problems:
         return None, problems
-    fixed = fixed_points(scene.sheet)
-    if scene.stiffness_map is None:
-        image = None
-    elif image is None:
+    if scene.stiffness_map is not None and image is None:
         try:
             image = read_map(scene.stiffness_map)
         except PictureError as error:
             problems.append(Problem((scene.kind, "map", "image"), str(error)))
-    material = material_of(scene, image)
+    fixed, material = fixed_points(scene.sheet), _material(scene, image)
     problems += tissue_problems(scene, fixed, material.factors)
     if problems:
         return None, problems
+    plan = _plan(scene, image, fixed, material)
+    return plan, list(_step_problems(plan))
+
+
+def variant(plan: Plan, scene: Scene) -> Plan:
+    """Plan a scene that a valid one was turned into, with its map, without looking for what is wrong with it."""
+    return _plan(scene, plan.image, fixed_points(scene.sheet), _material(scene, plan.image))
+
+
+def _material(scene: Scene, image: MapImage | None) -> Material:
+    return material_of(scene, image if scene.stiffness_map is not None else None)
+
+
+def _plan(scene: Scene, image: MapImage | None, fixed: NDArray[np.bool_], material: Material) -> Plan:
     limit = stable_step(material, scene.sheet, scene.time.damping_difference)
     grid = TimeGrid(scene.time.frames_per_second, scene.time.frames, steps_per_frame(scene.time, limit), "f64")
     slots = probe_slots(scene.probes, scene.sheet, grid.step)
-    plan = on(Plan(scene, image, fixed, material, limit, grid, slots), "cpu")
-    return plan, list(_step_problems(plan))
+    return on(Plan(scene, image, fixed, material, limit, grid, slots), "cpu")
 
 
 def on(plan: Plan, arch: str) -> Plan:

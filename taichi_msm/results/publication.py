@@ -162,6 +162,8 @@ class Publication:
             return  # The record is moved last, so all is done, or nothing is to be done.
         try:
             is_new = self._listed(record)
+            if not is_new(record.name):
+                raise ValueError("no record of itself")
         except ValueError:
             raise DamagedError(f"{record} is damaged; remove {self.staging} and run the scene again") from None
         begun = kind(aside) is not None

@@ -12,7 +12,8 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import BinaryIO
 
-from taichi_msm.results.entries import FILE, FOLDER, kind
+from taichi_msm.errors import FilesError
+from taichi_msm.results.entries import FILE, FOLDER, files, kind
 
 if sys.platform == "win32":
     import msvcrt
@@ -20,6 +21,9 @@ else:
     import fcntl
 
 HIDDEN, LOCK, DRAFT = r"\.partial-[0-9a-f]{16}", "lock", "draft"
+
+# The files that are written in hidden folders.
+STAGED = (LOCK, "picture", "session", "copy", r"animation\.gif", r"study\.(?:png|md|json)")
 
 
 @contextmanager
@@ -56,11 +60,14 @@ def staged(folder: Path) -> Iterator[Path]:
 def _clear_abandoned(folder: Path) -> None:
     for hidden in list(folder.iterdir()):
         if re.fullmatch(HIDDEN, hidden.name) and kind(hidden) == FOLDER:
-            # One that is locked, or still being made, or of another user, stays.
-            with suppress(OSError):
+            # One that is locked, or still being made, or of another user, or has other files than ours, stays.
+            with suppress(OSError, FilesError):
+                list(files(hidden, STAGED, strict=True))
                 if kind(hidden / LOCK) == FILE:
-                    lock(hidden / LOCK).close()
-                    shutil.rmtree(hidden)
+                    with (hidden / LOCK).open("ab", 0) as file:
+                        is_abandoned = _try_lock(file)
+                    if is_abandoned:
+                        shutil.rmtree(hidden)
 
 
 @contextmanager
@@ -115,13 +122,22 @@ def lock(path: Path) -> BinaryIO:
     """
     file = path.open("ab", 0)
     try:
+        _try_lock(file)
+    except BlockingIOError:
+        file.close()
+        raise
+    return file
+
+
+def _try_lock(file: BinaryIO) -> bool:
+    """Lock an open file; False where the file system has no locks; BlockingIOError where another has the lock."""
+    try:
         if sys.platform == "win32":
             msvcrt.locking(file.fileno(), msvcrt.LK_NBLCK, 1)
         else:
             fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
     except (BlockingIOError, PermissionError) as error:  # the latter on Windows
-        file.close()
         raise BlockingIOError(*error.args) from None
     except OSError:
-        pass  # a file system without locks
-    return file
+        return False
+    return True

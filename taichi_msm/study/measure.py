@@ -11,7 +11,7 @@ from typing import Any, NamedTuple
 from taichi_msm.errors import SceneError
 from taichi_msm.physics.lattice import rest_positions
 from taichi_msm.physics.plan import Plan
-from taichi_msm.physics.planning import make_plan, on, with_time
+from taichi_msm.physics.planning import on, variant, with_time
 from taichi_msm.progress import Progress
 from taichi_msm.render.texture import load_texture
 from taichi_msm.runner import versions
@@ -82,7 +82,7 @@ def study(
     )
     effort = QUICK if quick else FULL
     # The study itself varies the step.
-    plan = on(make_plan(with_time(scene, tolerance=None), given.image), device.arch)
+    plan = on(variant(given, with_time(scene, tolerance=None)), device.arch)
     scene = plan.scene
     try:
         stepping = SteppingStudy(plan, device, effort.longest_run, results, partial(progress, "stepping"))

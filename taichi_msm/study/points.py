@@ -15,7 +15,7 @@ from taichi_msm.physics.divergence import farthest_displacement
 from taichi_msm.physics.error_control import longest
 from taichi_msm.physics.mesh_error import FEWEST, CubicSampling, MeshPilot, coarser, with_points
 from taichi_msm.physics.plan import Plan
-from taichi_msm.physics.planning import make_plan, try_plan, with_time
+from taichi_msm.physics.planning import try_plan, variant, with_time
 from taichi_msm.physics.solver import Dynamics
 from taichi_msm.progress import Count
 from taichi_msm.scene import MAX_POINTS
@@ -61,7 +61,7 @@ class PointStudy:
 
     def __init__(self, plan: Plan, device: Device, longest_run: float, study: Study, progress: Count) -> None:
         scene = with_time(plan.scene, step="auto", tolerance=None, precision="f64")
-        self._plan = make_plan(with_points(scene, scene.sheet.points), plan.image)
+        self._plan = variant(plan, with_points(scene, scene.sheet.points))
         self._device, self._longest_run, self._study, self._progress = device, longest_run, study, progress
         self._sheets: list[_Sheet] = []
         self._done = 0
@@ -122,7 +122,7 @@ class PointStudy:
         points = _scaled(plan, FINER)
         if max(points) > MAX_POINTS:
             return None
-        finer = make_plan(with_points(plan.scene, points), plan.image)
+        finer = variant(plan, with_points(plan.scene, points))
         work = [math.prod(one.scene.sheet.points) * one.grid.steps_per_frame for one in (plan, finer)]
         return None if seconds * work[1] / work[0] > longest_run or any(budget.size_problems(finer)) else finer
 

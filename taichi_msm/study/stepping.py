@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from taichi_msm.physics.divergence import farthest_displacement
 from taichi_msm.physics.error_control import longest
 from taichi_msm.physics.plan import Plan
-from taichi_msm.physics.planning import make_plan, stable_steps, with_time
+from taichi_msm.physics.planning import stable_steps, variant, with_time
 from taichi_msm.physics.solver import Dynamics
 from taichi_msm.progress import Count
 from taichi_msm.study.result import Reference, Stepping, Study
@@ -48,7 +48,7 @@ class SteppingStudy:
     def __init__(self, plan: Plan, device: Device, longest_run: float, study: Study, progress: Count) -> None:
         self.plan = plan
         self._plans = {
-            difference: make_plan(with_time(plan.scene, damping_difference=difference, step="auto"), plan.image)
+            difference: variant(plan, with_time(plan.scene, damping_difference=difference, step="auto"))
             for difference in DIFFERENCES
         }
         self.frames: Frames | None = None

@@ -7,7 +7,7 @@ from collections.abc import Iterator
 from contextlib import ExitStack, closing
 
 from taichi_msm.physics.plan import Plan
-from taichi_msm.physics.planning import make_plan
+from taichi_msm.physics.planning import variant
 from taichi_msm.physics.solver import Dynamics
 from taichi_msm.progress import Count
 from taichi_msm.scene import Scene
@@ -28,13 +28,13 @@ def measure_terms(plan: Plan, device: Device, sample: float, study: Study, progr
     """Measure the time of a step with each term left out in turn, in samples of about so many seconds."""
     # All variants have the steps of the whole scene: without a spring the automatic step would be another.
     grid = {"steps_per_frame": plan.grid.steps_per_frame, "precision": plan.grid.precision}
-    plans = {without: make_plan(scene, plan.image).with_grid(**grid) for without, scene in variants(plan.scene)}
+    plans = {without: variant(plan, scene).with_grid(**grid) for without, scene in variants(plan.scene)}
     study.terms += map(TimedTerm, plans)
     with ExitStack() as opened:
         sheets: list[Dynamics] = []
-        for variant in plans.values():
+        for without in plans.values():
             progress(0, len(plans))
-            sheets.append(opened.enter_context(closing(Dynamics(variant, device))))
+            sheets.append(opened.enter_context(closing(Dynamics(without, device))))
             sheets[-1].compile()
         frames = round(sample / (_step_seconds(sheets[0], 1) * plan.grid.steps_per_frame))
         frames = max(1, min(plan.grid.frames, frames))

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from taichi_msm.errors import DivergedError, FilesError, SceneError
 from taichi_msm.outputs.gif import Picture
 from taichi_msm.physics.plan import Plan
-from taichi_msm.physics.planning import make_plan, with_time
+from taichi_msm.physics.planning import variant, with_time
 from taichi_msm.physics.probe_force import probe_force
 from taichi_msm.render.surface import rod, rods, touched
 from taichi_msm.render.texture import load_texture
@@ -55,7 +55,7 @@ def with_live_frames(plan: Plan) -> tuple[Plan, int]:
         steps = plan.grid.steps_per_frame
         while steps % parts:
             parts -= 1
-    return make_plan(with_time(scene, frames_per_second=scene.time.frames_per_second * parts), plan.image), parts
+    return variant(plan, with_time(scene, frames_per_second=scene.time.frames_per_second * parts)), parts
 
 
 class Session:
