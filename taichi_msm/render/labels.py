@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from itertools import accumulate
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -32,20 +33,26 @@ class Labels(NamedTuple):
 class Label(NamedTuple):
     """How kernel 2 writes a label: one number or several for every pixel, row by row."""
 
-    first: int  # numbers per pixel of the labels before it
     planes: tuple[str, ...]  # where a tile of samples has the numbers (samples.py)
     nothing: float  # the number where nothing is seen
     of_sheet: bool  # whether it tells of the sheet alone; then it is `nothing` too where an instrument is seen
     dtype: type[np.generic]  # of its values
+    first: int = 0  # numbers per pixel of the labels before it
 
 
-# The fields of `Labels`, which the kernel writes one after the other, and the numbers that all of them take per pixel.
-LABELS = {
-    "coordinates": Label(0, ("across", "down"), math.nan, of_sheet=True, dtype=np.float32),
-    "depth": Label(2, ("depth",), 0.0, of_sheet=False, dtype=np.float32),
-    "instrument": Label(3, ("instrument",), 0.0, of_sheet=False, dtype=np.uint8),
-}
-LABEL_NUMBERS = 4
+def _in_turn(**labels: Label) -> dict[str, Label]:
+    """Let the kernel write the labels one after the other."""
+    taken = accumulate((len(label.planes) for label in labels.values()), initial=0)
+    return {name: label._replace(first=first) for (name, label), first in zip(labels.items(), taken, strict=False)}
+
+
+# The fields of `Labels`, and the numbers that all of them take per pixel.
+LABELS = _in_turn(
+    coordinates=Label(("across", "down"), math.nan, of_sheet=True, dtype=np.float32),
+    depth=Label(("depth",), 0.0, of_sheet=False, dtype=np.float32),
+    instrument=Label(("instrument",), 0.0, of_sheet=False, dtype=np.uint8),
+)
+LABEL_NUMBERS = sum(len(label.planes) for label in LABELS.values())
 
 
 def label_channels(plane: Any) -> list[tuple[int, int, int, Label]]:
@@ -63,12 +70,12 @@ def label_channels(plane: Any) -> list[tuple[int, int, int, Label]]:
 
 def labels_of(numbers: NDArray[np.float32], size: tuple[int, int]) -> Labels:
     """Split the numbers that the kernel wrote of a picture of this width and height [px]."""
-    (width, height), arrays = size, []
-    for label in LABELS.values():
+    (width, height), arrays = size, {}
+    for name, label in LABELS.items():
         count = len(label.planes)
         values = numbers.reshape(LABEL_NUMBERS, -1)[label.first : label.first + count]
-        arrays.append(values.reshape((height, width, count)[: 2 + (count > 1)]).astype(label.dtype, copy=False))
-    return Labels(*arrays)
+        arrays[name] = values.reshape((height, width, count)[: 2 + (count > 1)]).astype(label.dtype, copy=False)
+    return Labels(**arrays)
 
 
 class Flow(NamedTuple):

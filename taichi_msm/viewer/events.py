@@ -72,7 +72,7 @@ POINTER = {
 # Every key, and what it does.
 KEYS = {
     "up": f"press harder, by {NOTCH:g} %; so does +",
-    "down": f"press less hard, by {NOTCH:g} %; so does -",
+    "down": f"press more gently, by {NOTCH:g} %; so does -",
     "c": "the scene's own camera",
     "t": "look from the top",
     "o": "look from the side, from above",
@@ -80,7 +80,7 @@ KEYS = {
     "l": "light on and off",
     "space": "pause and go on",
     ".": "while paused: one frame further",
-    "r": "reset: put the tissue at rest, forget what was done",
+    "r": "reset: put the tissue at rest, forget the session so far",
     "p": "save the tissue as PNG",
     "g": "start and stop a film (GIF)",
     "w": "save what was done as a scene, which run repeats",
