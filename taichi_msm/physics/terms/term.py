@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any, ClassVar, NamedTuple, TypeVar
@@ -28,7 +29,7 @@ GAIN, STEP_COLUMNS = 0, 1
 MOTION, STEP_MEASURES = 0, 1
 
 
-class Term:
+class Term(ABC):
     """A term of the model as kernels are compiled for it: a frozen dataclass, without the numbers of a sheet.
 
     The kernels know by name the terms that act between points, springs and bending; others need only the functions
@@ -40,9 +41,9 @@ class Term:
     reductions: ClassVar[tuple[str, ...]] = ()  # how each of its measures becomes one of a row: "min", "max" or "sum"
 
     @classmethod
+    @abstractmethod
     def of(cls, plan: Plan) -> Self | None:
         """Choose what is compiled for a scene; None if it does not have the term."""
-        raise NotImplementedError
 
     @staticmethod
     def derive(scene: Scene) -> dict[str, Any]:
