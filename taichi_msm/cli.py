@@ -22,7 +22,16 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from taichi_msm import __version__
-from taichi_msm.errors import DeviceError, FilesError, NotInstalledError, SceneError, did_you_mean, printable
+from taichi_msm.errors import (
+    DeviceError,
+    ExecutorError,
+    FilesError,
+    LostExecutorError,
+    NotInstalledError,
+    SceneError,
+    did_you_mean,
+    printable,
+)
 from taichi_msm.export.formats import FORMATS
 from taichi_msm.system.signals import Interruption
 from taichi_msm.system.streams import mute, tell
@@ -459,6 +468,7 @@ def export(directory: str, name: str, out: str | None, quiet: bool, as_json: boo
     metavar="N",
     help="Processes that take the runs.  [default: one for each core, as far as memory goes]",
 )
+@click.option("--dask", metavar="ADDRESS", help="Let the workers of a dask scheduler take the runs.")
 @click.option("--shard", type=Shard(), metavar="I/N", help="Take only part I of N of the runs; write no table.")
 @click.option("--dry-run", is_flag=True, help="Print the values of all runs, and what they take; run nothing.")
 @click.option("--yes", is_flag=True, help=f"Take more than {MANY_RUNS} runs, or longer than a day.")
@@ -467,6 +477,7 @@ def sweep(
     file: str,
     out: str | None,
     workers: int | None,
+    dask: str | None,
     shard: tuple[int, int] | None,
     dry_run: bool,
     yes: bool,
@@ -482,13 +493,15 @@ def sweep(
     from taichi_msm.sweeps.sweepfile import cell, load_sweep
     from taichi_msm.sweeps.table import csv_line
 
+    if workers is not None and dask is not None:
+        raise click.UsageError("--workers are processes here, and --dask has its own; leave out one of them")
     described = load_sweep(file)
     directory = result_directory(out, Path(file).stem)
     settings = described.settings
     values = values_of_runs(settings.vary, settings.samples, settings.seed)
     cost = estimate(described, values)
     chosen = choose_workers(cost, len(values))
-    said = cost_line(len(values), cost, chosen)
+    said = cost_line(len(values), cost, chosen if dask is None else None)
     if dry_run and as_json:
         print_json({"keys": described.keys, "values": values, **cost._asdict(), "workers": workers or chosen.number})
     elif dry_run:
@@ -508,21 +521,29 @@ def sweep(
     files: list[str] = []
     notes: list[str] = []
     try:
-        with Progress(quiet=as_json) as bar, opened(None, workers or chosen.number) as executor:
+        with Progress(quiet=as_json) as bar:
             progress = interruptible(bar, interruption)
-            for outcome in run_all(described, values, directory, executor, progress, shard or (1, 1)):
-                outcomes.append(outcome)
+            with opened(dask, workers or chosen.number, described, directory, progress) as executor:
+                for outcome in run_all(described, values, directory, executor, progress, shard or (1, 1)):
+                    outcomes.append(outcome)
             if shard is None:
                 files, notes = finish(described, values, directory, outcomes)
     except KeyboardInterrupt:
-        so_far = f"interrupted; {len(outcomes)} of {len(values)} runs have ended; the same command goes on"
-        return interrupted(interruption, as_json, so_far)
+        return interrupted(interruption, as_json, f"interrupted; {_so_far(outcomes, values)}")
+    except LostExecutorError as error:
+        report("error", [f"{error}; {_so_far(outcomes, values)}"], as_json)
+        return FILES
     counts = Counter(outcome.status for outcome in outcomes)
     if as_json:
         print_json({"directory": str(directory), "runs": len(outcomes), **counts, "outputs": files, "notes": notes})
     else:
         click.echo("\n".join(map(printable, summary_lines(directory, outcomes, shard, files, notes))))
     return DONE
+
+
+def _so_far(outcomes: Sequence[Outcome], values: Sequence[Any]) -> str:
+    """Say how much of a sweep is done, and how to go on."""
+    return f"{len(outcomes)} of {len(values)} runs have ended; the same command goes on"
 
 
 def require_alone(context: click.Context, does: str, allowed: Sequence[str]) -> None:
@@ -658,7 +679,7 @@ def _run(words: list[str]) -> tuple[int, Sequence[str]]:
         raise BrokenPipeError from None
     except SceneError as error:
         return WRONG_INPUT, error.lines
-    except (DeviceError, NotInstalledError) as error:
+    except (DeviceError, ExecutorError, NotInstalledError) as error:
         return WRONG_INPUT, [str(error)]
     except FilesError as error:
         return FILES, [str(error)]

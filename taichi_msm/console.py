@@ -31,6 +31,7 @@ STAGES = {
     "write": "writing",
     "film": "filming",
     "export": "exporting",
+    "workers": "waiting for a worker of the cluster",
     "runs": "running",
 }
 

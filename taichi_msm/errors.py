@@ -54,6 +54,14 @@ class NotInstalledError(MsmError):
     """A package that the request needs is not installed; the message says how to install it."""
 
 
+class ExecutorError(MsmError):
+    """What should take the runs of a sweep cannot be reached, or is not fit for them."""
+
+
+class LostExecutorError(ExecutorError):
+    """What takes the runs of a sweep takes no more."""
+
+
 class ArgumentError(MsmError, ValueError):
     """An argument of a call is wrong; the message names it, its value, and which values are allowed."""
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import hashlib
 import stat
 import warnings
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from mmap import ACCESS_READ, mmap
 from pathlib import Path
@@ -34,8 +34,23 @@ _ORIENTATION = 0x0112
 _LYING = (5, 6, 7, 8)
 
 
+# Where pictures are read instead of at the paths by which they are known.
+_copies: Mapping[str, Path] = {}
+
+
 class PictureError(Exception):
     """The file cannot be used as a picture; the message says why and what to do."""
+
+
+@contextmanager
+def copied(copies: Mapping[str, Path]) -> Iterator[None]:
+    """In a block, read copies of some pictures, by the paths by which they are known."""
+    global _copies
+    around, _copies = _copies, copies
+    try:
+        yield
+    finally:
+        _copies = around
 
 
 def read_rgb(path: str, background: tuple[int, int, int], sha256: str | None = None) -> Image.Image:
@@ -72,7 +87,7 @@ def file_sha256(path: str) -> str:
     """Compute the SHA-256 of a picture's file, in hexadecimal."""
     _require_file(path)
     try:
-        with Path(path).open("rb") as file:
+        with _place(path).open("rb") as file:
             return _sha256(file)
     except OSError as error:
         raise _unreadable(path, error) from None
@@ -121,7 +136,7 @@ def _open(path: str, sha256: str | None = None) -> Iterator[Image.Image]:
 @contextmanager
 def _file(path: str, sha256: str | None) -> Iterator[BinaryIO]:
     """Open a file, which must have a SHA-256 if one is given; raises PictureError."""
-    with Path(path).open("rb") as file:
+    with _place(path).open("rb") as file:
         if sha256 is not None:
             if _sha256(file) != sha256:
                 raise PictureError(f"{path} is not the file that was run, as its SHA-256 tells; put that one back")
@@ -158,9 +173,13 @@ def irregular(path: Path) -> str:
     return "a directory" if stat.S_ISDIR(mode) else "not a regular file"
 
 
+def _place(path: str) -> Path:
+    return _copies.get(path) or Path(path)
+
+
 def _require_file(path: str) -> None:
     try:
-        kind = irregular(Path(path))
+        kind = irregular(_place(path))
     except ValueError:
         raise PictureError(f"{path} is not a path; name a picture") from None
     except OSError as error:

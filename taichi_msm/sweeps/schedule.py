@@ -7,9 +7,10 @@ from concurrent.futures import BrokenExecutor, CancelledError, Executor, Future
 from itertools import islice
 from queue import Empty, SimpleQueue
 
-from taichi_msm.errors import MsmError
+from taichi_msm.errors import ExecutorError, LostExecutorError
 from taichi_msm.progress import Pause
 from taichi_msm.sweeps.outcome import Outcome
+from taichi_msm.sweeps.pool import DiedError
 from taichi_msm.sweeps.task import Task, take
 
 # The most runs that an executor is given at a time.
@@ -20,12 +21,12 @@ PATIENCE = 0.1
 
 
 def outcomes(tasks: Iterable[Task], executor: Executor, pause: Pause) -> Iterator[Outcome]:
-    """Take runs; one whose worker ended before it was done is taken once more.
+    """Take runs; one whose process in our own pool ended before it was done is taken once more.
 
     `pause` is called some times a second; what it raises ends the sweep.
 
     Raises:
-        MsmError: when the executor takes no more runs.
+        LostExecutorError: when the executor takes no more runs.
     """
     done: SimpleQueue[Future[Outcome]] = SimpleQueue()
     waiting: dict[Future[Outcome], Task] = {}
@@ -48,15 +49,20 @@ def outcomes(tasks: Iterable[Task], executor: Executor, pause: Pause) -> Iterato
         task = waiting.pop(future)
         try:
             outcome = future.result()
+        except ExecutorError as error:
+            raise LostExecutorError(str(error)) from error
         except (BrokenExecutor, CancelledError) as error:
-            raise MsmError(f"{type(executor).__name__} takes no more runs: {error}; start the sweep again") from error
-        except Exception as error:
-            # `take` raises nothing, so this is its worker's end.
+            said = str(error) or "it cancelled one"
+            raise LostExecutorError(f"{type(executor).__name__} takes no more runs: {said}") from error
+        except DiedError as error:
             if task.run not in died:
                 died.add(task.run)
                 submit(task)
                 continue
             outcome = Outcome(task.run, "died", f"{error}, twice")
+        except Exception as error:
+            # `take` raises nothing, so this is its worker's end; other executors try as often as they were told.
+            outcome = Outcome(task.run, "died", " ".join(str(error).split()))
         yield outcome
         for following in islice(rest, 1):
             submit(following)

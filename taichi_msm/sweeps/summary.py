@@ -11,16 +11,18 @@ from taichi_msm.sweeps.cost import Cost, Workers
 from taichi_msm.sweeps.outcome import Outcome
 
 
-def cost_line(runs: int, cost: Cost, workers: Workers) -> str:
-    """Say what a sweep takes."""
+def cost_line(runs: int, cost: Cost, workers: Workers | None) -> str:
+    """Say what a sweep takes; None: its workers are elsewhere."""
     if cost.refused:
         return f"{runs} runs; all that were looked at are refused: {cost.refused}"
     guess = "" if cost.measured else " (a guess, as no run has been timed here yet)"
-    processes = f"{workers.number} {'process' if workers.number == 1 else 'processes'}"
-    return (
-        f"{runs} runs: about {rough_time(cost.seconds)}{guess} in {processes} "
-        f"({workers.cores} cores; memory for {workers.fitting}), at most {cost.disk_bytes / 2**20:.1f} MiB on disk"
-    )
+    if workers is None:
+        where = "if they were run here"
+    else:
+        processes = f"{workers.number} {'process' if workers.number == 1 else 'processes'}"
+        where = f"in {processes} ({workers.cores} cores; memory for {workers.fitting})"
+    disk = f"at most {cost.disk_bytes / 2**20:.1f} MiB on disk"
+    return f"{runs} runs: about {rough_time(cost.seconds)}{guess} {where}, {disk}"
 
 
 def summary_lines(

@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from taichi_msm.arguments import require_path
+from taichi_msm.errors import NotInstalledError
 from taichi_msm.progress import Progress
 from taichi_msm.sweeps.cost import choose_workers, estimate
 from taichi_msm.sweeps.folder import ended, values_in
@@ -29,7 +30,7 @@ def sweep(
     samples: int | None = None,
     seed: int = 1,
     overrides: Mapping[str, Any] | None = None,
-    executor: Executor | None = None,
+    executor: Executor | str | None = None,
     workers: int | None = None,
     progress: Progress = lambda stage, done, total: None,
 ) -> Iterator[Outcome]:
@@ -46,7 +47,8 @@ def sweep(
         samples: number of runs; None: every combination of the keys' grids.
         seed: what the samples are chosen by.
         overrides: values of keys in all runs, by their dotted paths.
-        executor: takes the runs; each of its workers must be a process, of one thread. None: processes here.
+        executor: takes the runs; each of its workers must be a process, of one thread, that finds scene and directory
+            where they are here. The address of a scheduler of dask.distributed: its workers. None: processes here.
         workers: how many of these; None: one for each core, as far as memory goes.
         progress: called often, with the stage, the runs done and the runs in all; what it raises stops the sweep there.
 
@@ -57,7 +59,8 @@ def sweep(
         ArgumentError: when the directory cannot be a path.
         SceneError: with everything that is wrong with the arguments; when the directory holds another sweep.
         FilesError: when the directory cannot be written.
-        MsmError: while iterating, when the executor takes no more runs.
+        NotInstalledError: while iterating, when dask.distributed is needed and not installed.
+        MsmError: while iterating, when there is no such scheduler, or the executor takes no more runs.
 
     Example:
         >>> from taichi_msm import sweep
@@ -77,12 +80,12 @@ def _go_through(
     described: Sweep,
     values: list[list[Any]],
     directory: Path,
-    executor: Executor | None,
+    executor: Executor | str | None,
     workers: int | None,
     progress: Progress,
 ) -> Iterator[Outcome]:
     count = workers or choose_workers(estimate(described, values), len(values)).number
-    with opened(executor, count) as taking:
+    with opened(executor, count, described, directory, progress) as taking:
         rows = []
         with closing(run_all(described, values, directory, taking, progress)) as coming:
             for row in coming:
@@ -92,8 +95,19 @@ def _go_through(
 
 
 @contextmanager
-def opened(executor: Executor | None, workers: int) -> Iterator[Executor]:
-    """Use an executor, or else a pool of processes here, which end with the block, at once if it raises."""
+def opened(
+    executor: Executor | str | None, workers: int, described: Sweep, directory: Path, progress: Progress
+) -> Iterator[Executor]:
+    """Use an executor, a cluster, or else a pool of processes here, which end with the block, at once if it raises."""
+    if isinstance(executor, str):
+        try:
+            from taichi_msm.sweeps.cluster import connected
+        except ImportError:
+            said = "a cluster needs dask.distributed, which is not installed; pip install distributed"
+            raise NotInstalledError(said) from None
+        with connected(executor, described, directory, progress) as cluster:
+            yield cluster
+        return
     if executor is not None:
         yield executor
         return

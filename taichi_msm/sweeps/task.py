@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 from taichi_msm.errors import MsmError, SceneError
+from taichi_msm.progress import Progress
 from taichi_msm.scenefile.load import File, plan_file
 from taichi_msm.sweeps.outcome import Outcome, Status, outcome_of
 
@@ -28,8 +29,11 @@ class Task(NamedTuple):
         return self.folder / RUNS / f"{self.run:06}"
 
 
-def take(task: Task) -> Outcome:
-    """Run a scene with its overrides on one thread, as `run --set` does; whatever fails is in the outcome."""
+def take(task: Task, progress: Progress = lambda stage, done, total: None) -> Outcome:
+    """Run a scene with its overrides on one thread, as `run --set` does; whatever fails is in the outcome.
+
+    `progress` is called some times a second; it may raise a KeyboardInterrupt, as from `runner.run`.
+    """
     try:
         plan = plan_file(task.scene, task.overrides)
     except SceneError as error:
@@ -38,7 +42,9 @@ def take(task: Task) -> Outcome:
     from taichi_msm import runner
 
     try:
-        record = runner.run(plan, task.directory, threads=1, overrides=task.overrides, started=time.perf_counter())
+        record = runner.run(
+            plan, task.directory, threads=1, overrides=task.overrides, started=time.perf_counter(), progress=progress
+        )
     except MsmError as error:
         return _without_results(task, "failed", str(error))
     except Exception as error:
@@ -47,6 +53,7 @@ def take(task: Task) -> Outcome:
 
 
 def _without_results(task: Task, status: Status, reason: str) -> Outcome:
-    """Make the outcome of a run without results; its reason does not name the folder of the sweep."""
+    """Make the outcome of a run without results; its reason names neither the folder of the sweep nor the scene's."""
     said = " ".join(reason.split()).replace(str(task.directory), task.directory.name)
-    return Outcome(task.run, status, said)
+    # The path of a picture follows a blank.
+    return Outcome(task.run, status, said.replace(f" {task.scene.folder / '_'}"[:-1], " "))

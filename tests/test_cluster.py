@@ -1,0 +1,211 @@
+"""Sweeps on workers of dask.distributed: real schedulers and workers, in processes of their own."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from tests.conftest import Program
+
+pytest.importorskip("distributed", reason="needs dask.distributed: pip install distributed")
+
+SWEEP = """\
+scene: small.yaml
+samples: 6
+vary: {damping: {uniform: [0.005, 0.02]}}
+set: {sheet.points: [5, 5], time.duration: 0.1}
+"""
+
+# Until something happens that must [s].
+SOON = 60.0
+
+
+class Machines:
+    """A scheduler and its workers, whose logs are kept."""
+
+    def __init__(self, folder: Path) -> None:
+        self._folder = folder
+        self._started: list[subprocess.Popen[bytes]] = []
+
+    def schedule(self, **settings: str) -> str:
+        """Start a scheduler; returns its address."""
+        file = self._folder / f"scheduler-{len(self._started)}.json"
+        words = ["--host", "127.0.0.1", "--port", "0", "--scheduler-file", str(file)]
+        self.scheduler = self._start("dask_scheduler", *words, **settings)
+        wait_for(file.exists)
+        return str(json.loads(file.read_text())["address"])
+
+    def work(self, address: str, *words: str) -> subprocess.Popen[bytes]:
+        """Start a worker of one thread, unless told otherwise."""
+        return self._start("dask_worker", address, *(words or ("--nthreads", "1", "--no-nanny")))
+
+    def log(self, process: subprocess.Popen[bytes]) -> str:
+        """Read what a process has said so far."""
+        return (self._folder / f"{self._started.index(process)}.log").read_text()
+
+    def stop(self) -> None:
+        """End all processes."""
+        for process in self._started:
+            os.killpg(process.pid, signal.SIGKILL)
+            process.wait()
+
+    def _start(self, program: str, *words: str, **settings: str) -> subprocess.Popen[bytes]:
+        command = [sys.executable, "-m", f"distributed.cli.{program}", "--no-dashboard", *words]
+        environment = {**os.environ, "DASK_TEMPORARY_DIRECTORY": str(self._folder), **settings}
+        with (self._folder / f"{len(self._started)}.log").open("wb") as log:
+            process = subprocess.Popen(
+                command, cwd=self._folder, env=environment, stdout=log, stderr=log, start_new_session=True
+            )
+        self._started.append(process)
+        return process
+
+
+@pytest.fixture
+def machines(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Machines]:
+    started = Machines(tmp_path_factory.mktemp("machines"))
+    yield started
+    started.stop()
+
+
+@pytest.fixture
+def lab(small: Path) -> Path:
+    """A directory to work in, with a scene, its picture and a sweep in the folder `here`."""
+    (small / "here").mkdir()
+    for name in ("small.yaml", "speckle.png"):
+        (small / name).rename(small / "here" / name)
+    (small / "here" / "sweep.yaml").write_text(SWEEP)
+    return small
+
+
+def wait_for(happened: Callable[[], Any]) -> None:
+    ends = time.monotonic() + SOON
+    while not happened():
+        assert time.monotonic() < ends
+        time.sleep(0.02)
+
+
+def start_sweep(out: str, *words: str) -> subprocess.Popen[str]:
+    command = [sys.executable, "-m", "taichi_msm", "sweep", "here/sweep.yaml", "--out", out, *words]
+    return subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+
+
+def rows(out: str) -> list[str]:
+    """The table but for the seconds."""
+    return [line.rpartition(",")[0] for line in Path(out, "table.csv").read_text().splitlines()]
+
+
+def files(run: Path) -> dict[str, bytes]:
+    paths = (path for path in run.rglob("*") if path.is_file() and path.name != "run.json")
+    return {str(path.relative_to(run)): path.read_bytes() for path in paths}
+
+
+def test_workers_need_no_inputs_and_one_may_die(lab: Path, machines: Machines, program: Program) -> None:
+    address = machines.schedule()
+    sweep = start_sweep("far", "--json", "--dask", address)
+    wait_for(lambda: "plugin taichi-msm" in machines.log(machines.scheduler))
+    # Before there is any worker, all is gone that one could read besides what it is sent.
+    (lab / "here").rename(lab / "away")
+    alone = machines.work(address)
+    machines.work(address, "--nthreads", "1")
+    wait_for(lambda: list(lab.glob("far/runs/*/run.json")))
+    alone.kill()
+    printed, said = sweep.communicate(timeout=SOON)
+    assert (sweep.returncode, json.loads(printed)["complete"], said) == (0, 6, "")
+
+    (lab / "away").rename(lab / "here")
+    assert program("sweep", "here/sweep.yaml", "--out", "near").returncode == 0
+    assert rows("far") == rows("near")
+    for run in sorted(lab.glob("near/runs/*")):
+        assert files(run) == files(lab / "far" / "runs" / run.name)
+    assert program("run", "--again", "far/runs/000003", "--out", "again", "--quiet").returncode == 0
+    assert files(lab / "again") == files(lab / "near" / "runs" / "000003")
+
+
+def test_the_same_command_goes_on_after_the_scheduler_was_lost(lab: Path, machines: Machines) -> None:
+    address = machines.schedule()
+    machines.work(address)
+    sweep = start_sweep("far", "--json", "--dask", address)
+    wait_for(lambda: list(lab.glob("far/runs/*/run.json")))
+    machines.scheduler.kill()
+    printed, _ = sweep.communicate(timeout=SOON)
+    (error,) = json.loads(printed)["errors"]
+    ended = int(error.split("; ")[1].split()[0])
+    assert error == f"lost the scheduler at {address}; {ended} of 6 runs have ended; the same command goes on"
+    assert sweep.returncode == 4
+
+    earlier = {path: path.stat().st_mtime_ns for path in sorted(lab.glob("far/runs/*/run.json"))[:ended]}
+    address = machines.schedule()
+    machines.work(address)
+    assert json.loads(start_sweep("far", "--json", "--dask", address).communicate(timeout=SOON)[0])["complete"] == 6
+    assert earlier == {path: path.stat().st_mtime_ns for path in earlier}
+
+
+def test_a_run_whose_workers_die_is_a_row(lab: Path, machines: Machines) -> None:
+    address = machines.schedule(DASK_DISTRIBUTED__SCHEDULER__ALLOWED_FAILURES="0")
+    doomed = machines.work(address)
+    sweep = start_sweep("far", "--json", "--dask", address)
+    wait_for(lambda: list(lab.glob("far/runs/*/.partial")))
+    doomed.kill()
+    wait_for(lambda: "Remove worker" in machines.log(machines.scheduler))
+    machines.work(address)
+    printed = json.loads(sweep.communicate(timeout=SOON)[0])
+    # Dask cannot tell a run under way from one that the worker was given besides.
+    assert printed["died"] in (1, 2)
+    assert printed["died"] + printed["complete"] == 6
+    (died, *_) = [line for line in rows("far") if ",died," in line]
+    assert "its workers died, 1 one after another" in died
+
+
+def test_ctrl_c_while_there_is_no_worker_and_a_worker_of_two_threads(lab: Path, machines: Machines) -> None:
+    address = machines.schedule()
+    sweep = start_sweep("far", "--dask", address)
+    wait_for(lambda: "plugin taichi-msm" in machines.log(machines.scheduler))
+    time.sleep(0.5)
+    sweep.send_signal(signal.SIGINT)
+    _, said = sweep.communicate(timeout=SOON)
+    assert said.splitlines()[1:] == ["interrupted; 0 of 6 runs have ended; the same command goes on"]
+    assert sweep.returncode == 130
+
+    worker = machines.work(address, "--nthreads", "2", "--no-nanny")
+    wait_for(lambda: "Registered to" in machines.log(worker))
+    sweep = start_sweep("far", "--dask", address)
+    _, said = sweep.communicate(timeout=SOON)
+    assert said.endswith(" has 2 threads; start it with one: dask worker --nthreads 1\n")
+    assert len(said.splitlines()) == 2
+    assert sweep.returncode == 2
+
+
+def test_no_scheduler(lab: Path, program: Program, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("taichi_msm.sweeps.cluster.PATIENCE", 0.5)
+    tried = program("sweep", "here/sweep.yaml", "--out", "far", "--json", "--dask", "tcp://127.0.0.1:1")
+    assert tried.returncode == 2
+    assert json.loads(tried.stdout)["errors"] == [
+        "tcp://127.0.0.1:1: no dask scheduler answers; give the address that `dask scheduler` prints, such as "
+        "tcp://10.0.0.1:8786"
+    ]
+    tried = program("sweep", "here/sweep.yaml", "--out", "far", "--dask", "nowhere")
+    assert tried.returncode == 2
+    assert "nowhere: missing port number" in tried.stderr
+
+
+def test_workers_are_here_or_there(lab: Path, program: Program) -> None:
+    tried = program("sweep", "here/sweep.yaml", "--workers", "2", "--dask", "tcp://127.0.0.1:1")
+    assert tried.returncode == 2
+    assert "--dask has its own; leave out one of them" in tried.stderr
+
+
+def test_without_distributed(lab: Path, program: Program, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.delitem(sys.modules, "taichi_msm.sweeps.cluster", raising=False)
+    monkeypatch.setitem(sys.modules, "distributed", None)
+    tried = program("sweep", "here/sweep.yaml", "--dask", "tcp://127.0.0.1:1")
+    assert tried.returncode == 2
+    assert tried.stderr.endswith("not installed; pip install distributed\n")
