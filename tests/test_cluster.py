@@ -165,16 +165,26 @@ def test_a_run_whose_workers_die_is_a_row(lab: Path, machines: Machines) -> None
     assert "its workers died, 1 one after another" in died
 
 
-def test_ctrl_c_while_there_is_no_worker_and_a_worker_of_two_threads(lab: Path, machines: Machines) -> None:
+def test_ctrl_c_frees_the_workers(lab: Path, machines: Machines) -> None:
     address = machines.schedule()
-    sweep = start_sweep("far", "--dask", address)
-    wait_for(lambda: "plugin taichi-msm" in machines.log(machines.scheduler))
-    time.sleep(0.5)
+    machines.work(address)
+    # A run of minutes.
+    (lab / "here" / "sweep.yaml").write_text(
+        SWEEP.replace("[5, 5], time.duration: 0.1", "[99, 99], time.duration: 900")
+    )
+    sweep = start_sweep("long", "--dask", address)
+    wait_for(lambda: list(lab.glob("long/runs/*/.partial")))
     sweep.send_signal(signal.SIGINT)
     _, said = sweep.communicate(timeout=SOON)
     assert said.splitlines()[1:] == ["interrupted; 0 of 6 runs have ended; the same command goes on"]
     assert sweep.returncode == 130
 
+    (lab / "here" / "sweep.yaml").write_text(SWEEP)
+    assert json.loads(start_sweep("far", "--json", "--dask", address).communicate(timeout=SOON)[0])["complete"] == 6
+
+
+def test_a_worker_of_two_threads_is_refused(lab: Path, machines: Machines) -> None:
+    address = machines.schedule()
     worker = machines.work(address, "--nthreads", "2", "--no-nanny")
     wait_for(lambda: "Registered to" in machines.log(worker))
     sweep = start_sweep("far", "--dask", address)

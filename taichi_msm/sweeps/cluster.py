@@ -119,7 +119,9 @@ def _pass_on(answer: Future[Any], given: Future[Any]) -> None:
 
 def _call(name: str, function: Callable[..., Any], run: int, overrides: tuple[str, ...]) -> Any:
     """Call a function with a task in a worker."""
-    inputs = get_worker().plugins[name]
+    inputs = get_worker().plugins.get(name)
+    if inputs is None:
+        raise ExecutorError("another command for the same folder has ended meanwhile")
     if inputs.fault:
         raise ExecutorError(inputs.fault)
     with copied(inputs.copies), suppress(KeyboardInterrupt):

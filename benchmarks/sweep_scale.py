@@ -1,0 +1,151 @@
+"""What a run of a sweep costs besides its stepping: seconds, bytes and files a run, here and by dask.
+
+    python -m benchmarks.sweep_scale [RUNS]
+
+The runs are tiny, and write only a record and a trajectory. Dask's scheduler and workers are started on this machine,
+as many workers as the sweep takes processes. Nothing else should run meanwhile.
+"""
+
+from __future__ import annotations
+
+import json
+import shutil
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import psutil
+from distributed import Client
+
+from benchmarks.process import OUTPUT
+from taichi_msm.sweeps.folder import values_in
+from taichi_msm.sweeps.sweep import finish, opened, run_all
+from taichi_msm.sweeps.sweepfile import Sweep, load_sweep
+from taichi_msm.system.resources import available_threads
+
+FOLDER = OUTPUT / "sweep_scale"
+
+SCENE = """\
+sheet: {points: [5, 5], size: [0.3, 0.4], mass: 1.0e-3}
+springs: {structural: 20, shear: 10, virtual: 0.5}
+damping: 0.01
+probes: [{force: [0, 300, -1000], load: [[0, 0], [0.1, 100]]}]
+time: {duration: 0.1, frames_per_second: 10}
+output: [trajectory]
+"""
+
+SWEEP = """\
+scene: scene.yaml
+samples: {runs}
+vary:
+  damping: {{uniform: [0.005, 0.02]}}
+  springs.shear: {{uniform: [5, 20]}}
+  sheet.mass: {{uniform: [1.0e-3, 2.0e-3]}}
+"""
+
+
+class Clock:
+    """Seconds, of the wall and of this process's processor, since it was last asked."""
+
+    def __init__(self) -> None:
+        self._last = time.perf_counter(), time.process_time()
+
+    def seconds(self) -> dict[str, float]:
+        """Give those seconds."""
+        before, self._last = self._last, (time.perf_counter(), time.process_time())
+        return {"wall": self._last[0] - before[0], "cpu": self._last[1] - before[1]}
+
+
+def measure(described: Sweep, directory: Path, executor: str | None) -> dict[str, Any]:
+    """Take all runs; then go on with the sweep, of which nothing is missing."""
+    clock, taken = Clock(), dict[str, Any]()
+    values = values_in(directory, described)
+    taken["begin"] = clock.seconds()
+    for name in ("run", "scan"):
+        with opened(executor, available_threads(), described, directory, _ignore) as taking:
+            clock.seconds()
+            rows = list(run_all(described, values, directory, taking, _ignore))
+            taken[name] = clock.seconds()
+        assert all(row.status == "complete" for row in rows), rows[0]
+    clock.seconds()
+    finish(described, values, directory, rows)
+    taken["finish"] = clock.seconds()
+    return taken
+
+
+def sizes(directory: Path, runs: int) -> dict[str, float]:
+    """Count what lies in the folder of a sweep; files and folders, their bytes and what they take of the disk."""
+    entries = list((directory / "runs").rglob("*"))
+    files = [path.stat() for path in entries if path.is_file()]
+    return {
+        "files": len(files) / runs,
+        "folders": (len(entries) - len(files)) / runs,
+        "bytes": sum(stat.st_size for stat in files) / runs,
+        "disk": sum(path.stat().st_blocks * 512 for path in entries) / runs,
+        "sweep.json": (directory / "sweep.json").stat().st_size / runs,
+        "table.csv": (directory / "table.csv").stat().st_size / runs,
+    }
+
+
+@contextmanager
+def cluster(workers: int) -> Iterator[tuple[str, psutil.Process]]:
+    """Start a scheduler, of which the address and the process are given, and its workers."""
+    file = FOLDER / "scheduler.json"
+    started = [_dask("dask_scheduler", "--host", "127.0.0.1", "--port", "0", "--scheduler-file", str(file))]
+    try:
+        while not file.exists():
+            time.sleep(0.1)
+        address = json.loads(file.read_text())["address"]
+        started += [_dask("dask_worker", address, "--nthreads", "1", "--no-nanny") for _ in range(workers)]
+        with Client(address) as client:
+            client.wait_for_workers(workers)
+        yield address, psutil.Process(started[0].pid)
+    finally:
+        for process in started:
+            process.kill()
+            process.wait()
+
+
+def _dask(program: str, *words: str) -> subprocess.Popen[bytes]:
+    command = [sys.executable, "-m", f"distributed.cli.{program}", "--no-dashboard", *words]
+    return subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+
+
+def _ignore(_stage: str, _done: int, _total: int) -> None:
+    pass
+
+
+def main() -> None:
+    """Measure, and print for every run what was found."""
+    runs = int(sys.argv[1]) if sys.argv[1:] else 1000
+    shutil.rmtree(FOLDER, ignore_errors=True)
+    FOLDER.mkdir(parents=True)
+    (FOLDER / "scene.yaml").write_text(SCENE)
+    (FOLDER / "sweep.yaml").write_text(SWEEP.format(runs=runs))
+    described = load_sweep(FOLDER / "sweep.yaml")
+    command = psutil.Process()
+    began = command.memory_info().rss
+    results = {"here": measure(described, FOLDER / "here", None)}
+    grew = command.memory_info().rss - began
+    with cluster(available_threads()) as (address, scheduler):
+        before, idle = scheduler.memory_info().rss, scheduler.cpu_times()
+        results["dask"] = measure(described, FOLDER / "dask", address)
+        after, busy = scheduler.memory_info().rss, scheduler.cpu_times()
+    print(f"{runs} runs, {available_threads()} workers; for each run:")
+    for where, taken in results.items():
+        for name, seconds in taken.items():
+            wall, cpu = (seconds[kind] / runs * 1e3 for kind in ("wall", "cpu"))
+            print(f"{where:>5} {name:>6}: {wall:8.2f} ms, {cpu:7.2f} ms of the processor")
+    cpu = busy.user + busy.system - idle.user - idle.system
+    print(f"scheduler: {cpu / runs * 1e3:.2f} ms of the processor; it grew by {(after - before) / 2**20:.0f} MiB")
+    print(f"the command grew by {grew / runs / 1024:.1f} KiB")
+    for name, number in sizes(FOLDER / "here", runs).items():
+        print(f"{name:>10}: {number:.1f}")
+
+
+if __name__ == "__main__":
+    main()
