@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import time
 from pathlib import Path
 from typing import NamedTuple
@@ -21,6 +22,7 @@ class Task(NamedTuple):
     scene: File
     overrides: tuple[str, ...]
     folder: Path  # of the sweep
+    home: Path  # from which its paths start
 
     @property
     def directory(self) -> Path:
@@ -30,6 +32,7 @@ class Task(NamedTuple):
 
 def take(task: Task) -> Outcome:
     """Run a scene with its overrides on one thread, as `run --set` does; whatever fails is in the outcome."""
+    os.chdir(task.home)
     try:
         plan = plan_file(task.scene, task.overrides)
     except SceneError as error:
