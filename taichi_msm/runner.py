@@ -99,7 +99,7 @@ def run(
         scene: what `load_scene` returned, or the same as a mapping.
         directory: where frames/, animation.gif, trajectory.npz and run.json go.
         arch: cpu, cuda or vulkan.
-        threads: number of CPU threads; None takes every core.
+        threads: number of CPU threads; None takes every core. With 1, pictures are encoded in this process too.
         overrides: the overrides that made the scene, for the record.
         estimate_error: whether to estimate the error of the run, by pilots; None: if they take at most two fifths of
             the run. For a tolerance in the scene it is estimated in any case.
@@ -238,9 +238,11 @@ class _Run:
         self._frames = plan.grid.frames + 1
         progress("compile", 0, self._frames)
         cores = free_cores(plan)
+        # With one thread there is no core for an encoder beside the simulation.
+        beside = device.threads > 1
         # In this order, so that the encoder starts up while kernels are compiled.
         self._writer = opened.enter_context(
-            ResultWriter(task.directory, plan.scene, plan.grid, manifest.as_json(), resumes=resumes)
+            ResultWriter(task.directory, plan.scene, plan.grid, manifest.as_json(), resumes=resumes, beside=beside)
         )
         self._simulation = opened.enter_context(Simulation(plan, device.arch, device.threads, task.texture, cores))
         self._resumed = self._writer.stored
