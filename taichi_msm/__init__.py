@@ -36,6 +36,8 @@ if TYPE_CHECKING:
     )
     from taichi_msm.scenefile.load import load_scene
     from taichi_msm.simulation import Simulation
+    from taichi_msm.sweeps.outcome import Outcome
+    from taichi_msm.sweeps.sweep import sweep
 
 __version__ = "0.1.0"
 
@@ -46,7 +48,9 @@ _HOMES = {
     "Playback": "playback",
     "Simulation": "simulation",
     "Surface": "render.surface",
+    "Outcome": "sweeps.outcome",
     "load_scene": "scenefile.load",
+    "sweep": "sweeps.sweep",
 }
 
 __all__ = [
@@ -61,6 +65,7 @@ __all__ = [
     "Light",
     "MsmError",
     "NotInstalledError",
+    "Outcome",
     "Playback",
     "Probe",
     "Render",
@@ -77,6 +82,7 @@ __all__ = [
     "load_scene",
     "resume",
     "run",
+    "sweep",
 ]
 
 
