@@ -21,7 +21,7 @@ import click
 
 from taichi_msm import __version__
 from taichi_msm.errors import DeviceError, FilesError, NotInstalledError, SceneError, did_you_mean, printable
-from taichi_msm.export.formats import FORMATS
+from taichi_msm.exports.formats import FORMATS
 from taichi_msm.system.signals import Interruption
 from taichi_msm.system.streams import mute, tell
 
@@ -413,7 +413,7 @@ def export(directory: str, name: str, out: str | None, quiet: bool, as_json: boo
     folder = without_link(run / f"export-{name}", "--out") if out is None else result_directory(out)
 
     from taichi_msm.console import Progress
-    from taichi_msm.export.convert import convert
+    from taichi_msm.exports.convert import convert
 
     interruption = Interruption()
     try:

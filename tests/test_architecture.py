@@ -22,7 +22,7 @@ LAYERS = [
     {"scenefile"},
     {"simulation", "results"},
     {"runner", "playback", "console"},
-    {"export", "study", "viewer"},
+    {"exports", "study", "viewer"},
     {"cli"},
     {"__main__", "__init__"},
 ]

@@ -21,7 +21,7 @@ from PIL import Image
 
 import taichi_msm
 from taichi_msm import cli, scene
-from taichi_msm.export.formats import FORMATS
+from taichi_msm.exports.formats import FORMATS
 from taichi_msm.outputs.table import OUTPUTS
 from taichi_msm.results.record import ErrorRecord, RunRecord
 from taichi_msm.runner import run

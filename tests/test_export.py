@@ -16,9 +16,9 @@ from PIL import Image
 
 from taichi_msm import console
 from taichi_msm.errors import FilesError, ForeignError
-from taichi_msm.export import obj
-from taichi_msm.export.convert import convert
-from taichi_msm.export.formats import FORMATS
+from taichi_msm.exports import obj
+from taichi_msm.exports.convert import convert
+from taichi_msm.exports.formats import FORMATS
 from taichi_msm.results import entries
 from taichi_msm.results.finished_run import PUT_BACK, read_run
 from taichi_msm.runner import run
@@ -36,7 +36,7 @@ def exported(results: Path, out: Path) -> list[str]:
 
 def test_every_format_has_its_module() -> None:
     for name in FORMATS:
-        assert callable(import_module(f"taichi_msm.export.{name}").write)
+        assert callable(import_module(f"taichi_msm.exports.{name}").write)
 
 
 def test_files_go_beside_the_results(results: Path, program: Program, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -169,7 +169,7 @@ def test_two_exports_do_not_write_into_one_folder(results: Path) -> None:
 KILLED = """
 import os, signal, sys
 from pathlib import Path
-from taichi_msm.export.convert import convert
+from taichi_msm.exports.convert import convert
 
 def progress(done, total):
     if done == 3:

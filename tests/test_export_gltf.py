@@ -15,10 +15,10 @@ import pytest
 from numpy.typing import NDArray
 from PIL import Image
 
-from taichi_msm.export import gltf
-from taichi_msm.export.convert import convert
-from taichi_msm.export.gltf import key_frames
-from taichi_msm.export.mesh import unit_normals
+from taichi_msm.exports import gltf
+from taichi_msm.exports.convert import convert
+from taichi_msm.exports.gltf import key_frames
+from taichi_msm.exports.mesh import unit_normals
 from tests.scenes import speckle
 
 Array = NDArray[Any]

@@ -16,8 +16,8 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from taichi_msm.errors import FilesError
-from taichi_msm.export.convert import convert
-from taichi_msm.export.kitti import encode, png16
+from taichi_msm.exports.convert import convert
+from taichi_msm.exports.kitti import encode, png16
 from taichi_msm.outputs.flo import read_flo
 from taichi_msm.results.finished_run import reading
 from tests.outputs import files

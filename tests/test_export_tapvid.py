@@ -12,8 +12,8 @@ import pytest
 from PIL import Image
 
 from taichi_msm.errors import FilesError
-from taichi_msm.export import tapvid
-from taichi_msm.export.convert import convert
+from taichi_msm.exports import tapvid
+from taichi_msm.exports.convert import convert
 
 WIDTH, HEIGHT, FRAMES, TRACKS = 40, 30, 5, 6
 

@@ -11,8 +11,8 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from taichi_msm.export.convert import convert
-from taichi_msm.export.vtk import speed
+from taichi_msm.exports.convert import convert
+from taichi_msm.exports.vtk import speed
 from taichi_msm.physics.lattice import rest_positions
 from taichi_msm.physics.material import area_shares
 from taichi_msm.results.finished_run import read_run

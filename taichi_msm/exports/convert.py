@@ -11,7 +11,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from taichi_msm.errors import FilesError, SceneError, writing
-from taichi_msm.export.formats import FORMATS
+from taichi_msm.exports.formats import FORMATS
 from taichi_msm.progress import Count
 from taichi_msm.results.entries import files
 from taichi_msm.results.finished_run import PUT_BACK, read_run
@@ -50,7 +50,7 @@ def convert(run: Path, name: str, directory: Path, progress: Count = lambda done
     """
     finished, wanted = read_run(run), FORMATS[name]
     # Writes the files of a run into an empty folder, and returns what the user should know about them.
-    write = import_module(f"taichi_msm.export.{name}").write
+    write = import_module(f"taichi_msm.exports.{name}").write
     progress(0, finished.frames)
     try:
         with writing(directory), Publication(directory, EXPORT) as publication:

@@ -22,7 +22,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from taichi_msm.errors import NotInstalledError
-from taichi_msm.export.mesh import PICTURE, REFINE, picture_png
+from taichi_msm.exports.mesh import PICTURE, REFINE, picture_png
 from taichi_msm.physics.elasticity import energy_density
 from taichi_msm.physics.lattice import rest_positions
 from taichi_msm.physics.planning import make_plan

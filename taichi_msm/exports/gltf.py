@@ -26,7 +26,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from taichi_msm import __version__
-from taichi_msm.export.mesh import REFINE, picture_png, unit_normals
+from taichi_msm.exports.mesh import REFINE, picture_png, unit_normals
 from taichi_msm.progress import Count
 from taichi_msm.render.surface import surface
 from taichi_msm.results.finished_run import FinishedRun
