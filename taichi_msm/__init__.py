@@ -17,6 +17,7 @@ if TYPE_CHECKING:
         NotInstalledError,
         SceneError,
     )
+    from taichi_msm.exports.convert import export
     from taichi_msm.playback import Playback
     from taichi_msm.render.labels import Flow, Labels, Sight
     from taichi_msm.render.surface import Surface
@@ -46,6 +47,7 @@ _HOMES = {
     "Playback": "playback",
     "Simulation": "simulation",
     "Surface": "render.surface",
+    "export": "exports.convert",
     "load_scene": "scenefile.load",
 }
 
@@ -74,6 +76,7 @@ __all__ = [
     "Surface",
     "Time",
     "Tissue",
+    "export",
     "load_scene",
     "resume",
     "run",

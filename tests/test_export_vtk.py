@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from taichi_msm.exports.convert import convert
+from taichi_msm.exports.convert import export
 from taichi_msm.exports.vtk import speed
 from taichi_msm.physics.lattice import rest_positions
 from taichi_msm.physics.material import area_shares
@@ -24,7 +24,7 @@ from tests.conftest import Program
 def out(ran: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     pytest.importorskip("vtkmodules")
     out = tmp_path_factory.mktemp("vtk")
-    convert(ran, "vtk", out)
+    export(ran, "vtk", out)
     return out
 
 
