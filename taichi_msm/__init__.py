@@ -37,6 +37,8 @@ if TYPE_CHECKING:
     )
     from taichi_msm.scenefile.load import load_scene
     from taichi_msm.simulation import Simulation
+    from taichi_msm.sweeps.outcome import Outcome
+    from taichi_msm.sweeps.sweep import sweep
 
 __version__ = "0.1.0"
 
@@ -47,8 +49,10 @@ _HOMES = {
     "Playback": "playback",
     "Simulation": "simulation",
     "Surface": "render.surface",
+    "Outcome": "sweeps.outcome",
     "export": "exports.convert",
     "load_scene": "scenefile.load",
+    "sweep": "sweeps.sweep",
 }
 
 __all__ = [
@@ -63,6 +67,7 @@ __all__ = [
     "Light",
     "MsmError",
     "NotInstalledError",
+    "Outcome",
     "Playback",
     "Probe",
     "Render",
@@ -80,6 +85,7 @@ __all__ = [
     "load_scene",
     "resume",
     "run",
+    "sweep",
 ]
 
 

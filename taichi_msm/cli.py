@@ -9,8 +9,10 @@ STARTED = time.perf_counter()
 import json
 import math
 import os
+import re
 import shlex
 import sys
+from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from functools import partial
@@ -29,14 +31,17 @@ from taichi_msm.system.streams import mute, tell
 if TYPE_CHECKING:
     from taichi_msm.console import Progress
     from taichi_msm.physics.plan import Plan
+    from taichi_msm.sweeps.outcome import Outcome
 
 DONE, BUG, WRONG_INPUT, DIVERGED, FILES = 0, 1, 2, 3, 4
 # What may be given together with --resume, and with --again.
 RESUMABLE = ("resume", "threads", "quiet", "as_json")
 REPEATABLE = ("again", "out", "arch", "threads", "estimate_error", "quiet", "as_json")
 
-# So many files are named at the end; more are counted.
+# So many files of an export are named at the end; more are counted.
 FEW = 2
+# Sweeps of more runs, or of more seconds, must be meant.
+MANY_RUNS, LONG = 10_000, 86400
 
 EXIT_CODES = {"complete": DONE, "diverged": DIVERGED}
 
@@ -51,6 +56,19 @@ class Choice(click.Choice):  # type: ignore[type-arg]  # before click 8.2 it tak
         except click.BadParameter as error:
             said = error.message.rstrip(".") + did_you_mean(str(value), [str(word) for word in self.choices])
             raise click.BadParameter(said, ctx, param) from None
+
+
+class Shard(click.ParamType):  # type: ignore[type-arg]  # as above
+    """A part of some work, I/N: part I of N, from 1."""
+
+    name = "I/N"
+
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> tuple[int, int]:
+        """Read the two numbers."""
+        numbers = re.fullmatch("([0-9]{1,9})/([0-9]{1,9})", value)
+        if numbers is None or not 1 <= int(numbers[1]) <= int(numbers[2]):
+            self.fail(f"{value} is no part; take I/N with 1 <= I <= N, such as 3/8", param, ctx)
+        return int(numbers[1]), int(numbers[2])
 
 
 scene_argument = click.argument("scene", metavar="SCENE")
@@ -436,6 +454,81 @@ def export(directories: tuple[str, ...], name: str, out: str | None, quiet: bool
         click.echo(printable(f"{done.directory}: {files}"))
         for note in done.notes:
             click.echo(printable(note))
+    return DONE
+
+
+@program.command()
+@click.argument("file", metavar="SWEEP")
+@click.option("--out", metavar="DIR", help="Directory for the runs.  [default: output/<name of the sweep file>]")
+@click.option(
+    "--workers",
+    type=click.IntRange(1, 1024),
+    metavar="N",
+    help="Processes that take the runs.  [default: one for each core, as far as memory goes]",
+)
+@click.option("--shard", type=Shard(), metavar="I/N", help="Take only part I of N of the runs; write no table.")
+@click.option("--dry-run", is_flag=True, help="Print the values of all runs, and what they take; run nothing.")
+@click.option("--yes", is_flag=True, help=f"Take more than {MANY_RUNS} runs, or longer than a day.")
+@json_option
+def sweep(
+    file: str,
+    out: str | None,
+    workers: int | None,
+    shard: tuple[int, int] | None,
+    dry_run: bool,
+    yes: bool,
+    as_json: bool,
+) -> int:
+    """Run a scene many times with varied values, as SWEEP says, and write a table of the results."""
+    from taichi_msm.console import Progress
+    from taichi_msm.sweeps.cost import choose_workers, estimate
+    from taichi_msm.sweeps.folder import values_in
+    from taichi_msm.sweeps.samples import values_of_runs
+    from taichi_msm.sweeps.summary import cost_line, summary_lines
+    from taichi_msm.sweeps.sweep import finish, opened, run_all
+    from taichi_msm.sweeps.sweepfile import cell, load_sweep
+    from taichi_msm.sweeps.table import csv_line
+
+    described = load_sweep(file)
+    directory = result_directory(out, Path(file).stem)
+    settings = described.settings
+    values = values_of_runs(settings.vary, settings.samples, settings.seed)
+    cost = estimate(described, values)
+    chosen = choose_workers(cost, len(values))
+    said = cost_line(len(values), cost, chosen)
+    if dry_run and as_json:
+        print_json({"keys": described.keys, "values": values, **cost._asdict(), "workers": workers or chosen.number})
+    elif dry_run:
+        click.echo(csv_line(["run", *described.keys]))
+        for run, row in enumerate(values):
+            click.echo(printable(csv_line([run, *map(cell, row)])))
+        click.echo(said)
+    if dry_run:
+        return DONE
+    if not yes and (len(values) > MANY_RUNS or cost.seconds > LONG):
+        raise click.UsageError(f"{said}; add --yes if that is meant")
+    values = values_in(directory, described)
+    if not as_json:
+        tell([said])
+    interruption = Interruption()
+    outcomes: list[Outcome] = []
+    files: list[str] = []
+    notes: list[str] = []
+    try:
+        with Progress(quiet=as_json) as bar, opened(None, workers or chosen.number) as executor:
+            progress = interruptible(bar, interruption)
+            for outcome in run_all(described, values, directory, executor, progress, shard or (1, 1)):
+                outcomes.append(outcome)
+            if shard is None:
+                files, notes = finish(described, values, directory, outcomes)
+    except KeyboardInterrupt:
+        so_far = f"interrupted; {len(outcomes)} of {len(values)} runs have ended; the same command goes on"
+        return interrupted(interruption, as_json, so_far)
+    counts = Counter(outcome.status for outcome in outcomes)
+    if as_json:
+        print_json({"directory": str(directory), "runs": len(outcomes), **counts, "outputs": files, "notes": notes})
+    else:
+        click.echo("\n".join(map(printable, summary_lines(directory, outcomes, shard, files, notes))))
     return DONE
 
 

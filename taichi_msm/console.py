@@ -31,6 +31,7 @@ STAGES = {
     "write": "writing",
     "film": "filming",
     "export": "exporting",
+    "runs": "running",
 }
 
 # Time between two lines when stderr is not a terminal [s].

@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import math
-import platform
-import sys
 import time
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager, suppress
@@ -15,10 +13,8 @@ from pathlib import Path
 from typing import Any, NamedTuple, cast
 
 import numpy as np
-import PIL
 from numpy.typing import NDArray
 
-from taichi_msm import __version__
 from taichi_msm.arguments import require_path
 from taichi_msm.errors import DamagedError, DeviceError, DivergedError, FilesError, SceneError, writing
 from taichi_msm.physics.error_control import Estimate
@@ -44,8 +40,8 @@ from taichi_msm.scenefile.resolve import resolve
 from taichi_msm.scenefile.validation import checked
 from taichi_msm.simulation import Simulation
 from taichi_msm.system import resources, runtime
-from taichi_msm.system.compiler import chosen
 from taichi_msm.system.runtime import Device
+from taichi_msm.system.versions import versions
 
 
 class Stopwatch:
@@ -429,15 +425,3 @@ def error_record(estimate: Estimate, mesh: MeshEstimate | None = None) -> dict[s
     if mesh is not None:
         fields |= {"mesh_error": mesh.error, "mesh_doubt": mesh.doubt}
     return {key: None if value == math.inf else value for key, value in fields.items()}
-
-
-def versions() -> dict[str, str]:
-    """Name the versions that the results depend on."""
-    return {
-        "taichi-msm": __version__,
-        "python": platform.python_version(),
-        chosen().name: chosen().version,
-        "numpy": np.__version__,
-        "pillow": PIL.__version__,
-        "platform": f"{sys.platform} {platform.machine()}",
-    }

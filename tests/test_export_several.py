@@ -166,7 +166,7 @@ def sweep(pair: list[str]) -> Path:
     for number, (run, status) in enumerate([("a", "diverged"), ("a", "complete"), ("a", "interrupted")]):
         change(Path(shutil.copytree(run, f"sweep/runs/{number:06}")), status=status)
     shutil.copytree("b", "sweep/runs/1000000")
-    Path("sweep", "sweep.json").write_text('{"runs": 5}')
+    Path("sweep", "sweep.json").write_text('{"values": [[], [], [], [], []]}')
     return Path("sweep")
 
 
@@ -201,7 +201,7 @@ def test_what_a_sweep_lacks_is_named_with_the_remedy(sweep: Path, program: Progr
     done = program("export", "sweep", "--format", "kitti")
     assert (done.returncode, done.stderr.count("\n")) == (4, 1)
     assert done.stderr.startswith("sweep/sweep.json: damaged")
-    Path("sweep", "sweep.json").write_text("{}")
+    Path("sweep", "sweep.json").write_text('{"values": [[]]}')
     for folder in ("000001", "1000000"):
         shutil.rmtree(sweep / "runs" / folder)
     done = program("export", "sweep", "--format", "obj")

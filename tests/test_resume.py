@@ -27,6 +27,7 @@ from taichi_msm.scene import Scene
 from taichi_msm.scenefile.load import load_scene
 from taichi_msm.system.compiler import COMPILERS, chosen
 from taichi_msm.system.runtime import Device
+from taichi_msm.system.versions import versions
 from tests.outputs import files, results
 from tests.scenes import speckle
 
@@ -225,7 +226,7 @@ def test_what_is_damaged_is_not_gone_on_with(
 def test_a_run_begins_anew_unless_its_compiler_has_the_same_bits(
     small: Path, device: Device, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    made, mine = dragged("time.duration=0.2", "output=[trajectory]"), runner.versions()
+    made, mine = dragged("time.duration=0.2", "output=[trajectory]"), versions()
     other = next(one for one in COMPILERS.values() if one is not chosen())
     rest = {name: version for name, version in mine.items() if name != chosen().name}
     for there, goes_on in (({other.name: other.tested}, True), ({chosen().name: "0.0.1"}, False)):
@@ -242,7 +243,7 @@ def test_another_picture_or_version_is_not_gone_on_with(
 ) -> None:
     interrupted(dragged("time.duration=0.2"), "parts", device)
     before = files(small / "parts")
-    others = {**runner.versions(), chosen().name: "1.7.99"}
+    others = {**versions(), chosen().name: "1.7.99"}
     with monkeypatch.context() as patch:
         patch.setattr(runner, "versions", lambda: others)
         with pytest.raises(

@@ -18,7 +18,7 @@ from PIL import Image
 from taichi_msm.errors import SceneError
 from taichi_msm.scene import MAX_PROBES, Scene
 from taichi_msm.scenefile import yaml_reader
-from taichi_msm.scenefile.load import MAX_LINES, _parse_text, load_scene, schema
+from taichi_msm.scenefile.load import MAX_LINES, load_scene, parse_override, schema
 
 GOOD = """\
 sheet:
@@ -577,13 +577,13 @@ def test_a_large_wrong_file_is_answered_soon_and_in_short(load: Load, text: str)
     ],
 )
 def test_scalars_follow_yaml_1_2(written: str, meant: object) -> None:
-    value = _parse_text(f"k={written}").value
+    value = parse_override(f"k={written}").value
     assert value == meant
     assert type(value) is type(meant)
 
 
 def test_not_a_number_is_read() -> None:
-    assert math.isnan(_parse_text("k=.NaN").value)
+    assert math.isnan(parse_override("k=.NaN").value)
 
 
 @pytest.mark.parametrize("name", ["photo.jpg", "PHOTO.PNG"])
@@ -796,11 +796,11 @@ def test_errors_below_a_later_override_are_its_own(load: Load) -> None:
 
 
 def test_an_override_is_split_at_its_first_equals_sign() -> None:
-    assert _parse_text("a.b=3")[1:3] == (("a", "b"), 3)
-    assert _parse_text("probes.0.load=[[0, 1e2]]")[1:3] == (("probes", 0, "load"), [[0, 100.0]])
-    assert _parse_text("image=a=b.png")[1:3] == (("image",), "a=b.png")
+    assert parse_override("a.b=3")[1:3] == (("a", "b"), 3)
+    assert parse_override("probes.0.load=[[0, 1e2]]")[1:3] == (("probes", 0, "load"), [[0, 100.0]])
+    assert parse_override("image=a=b.png")[1:3] == (("image",), "a=b.png")
     # Python refuses to read integers of so many digits.
-    assert _parse_text(f"{'9' * 5000}=1")[1:3] == (("9" * 5000,), 1)
+    assert parse_override(f"{'9' * 5000}=1")[1:3] == (("9" * 5000,), 1)
 
 
 def test_an_override_that_is_not_yaml(load: Load) -> None:
@@ -1010,11 +1010,11 @@ def test_the_schema_accepts_what_the_loader_accepts(load: Load, validator: jsons
         validator.validate(data)
     for text in (GOOD, GOOD + PROBE, GOOD + "image:\nregion: null\nrender: {}\n"):
         load(text)
-        validator.validate(_parse_text(f"scene={text}").value)
+        validator.validate(parse_override(f"scene={text}").value)
 
 
 def test_the_schema_rejects_what_is_wrong(validator: jsonschema.Draft202012Validator) -> None:
-    good = _parse_text(f"scene={GOOD}").value
+    good = parse_override(f"scene={GOOD}").value
     assert validator.is_valid(good)
     wrong: dict[str, Any]
     for wrong in (

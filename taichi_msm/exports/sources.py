@@ -60,7 +60,7 @@ def read_runs(directories: Sequence[str | Path]) -> tuple[list[FinishedRun], int
         with reading(record):
             names = files(directory, (rf"{RUNS}/{NUMBERED}/{RECORD}",), strict=False)
             folders = sorted(((directory / name).parent for name in names), key=lambda folder: int(folder.name))
-            count = int(json.loads(record.read_bytes()).get("runs", len(folders)))
+            count = len(json.loads(record.read_bytes())["values"])
         complete = [run for run in map(read_run, folders) if run.status == "complete"]
         left_out += count - len(complete)
         runs += complete

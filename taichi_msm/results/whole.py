@@ -23,7 +23,7 @@ else:
 HIDDEN, LOCK, DRAFT = r"\.partial-[0-9a-f]{16}", "lock", "draft"
 
 # The files that are written in hidden folders.
-STAGED = (LOCK, "picture", "session", "copy", r"animation\.gif", r"study\.(?:png|md|json)")
+STAGED = (LOCK, "picture", "session", "copy", r"animation\.gif", r"study\.(?:png|md|json)", r"sweep\.json")
 
 
 @contextmanager
@@ -87,12 +87,12 @@ def replacing(path: Path) -> Iterator[BinaryIO]:
 def place(draft: Path, folder: Path, stem: str, suffix: str) -> Path:
     """Move a file to the first free name of stem-1, stem-2 and so on; replaces none, and returns where it is."""
     number = 1
-    while os.path.lexists(path := folder / f"{stem}-{number}{suffix}") or not _named(draft, path):
+    while os.path.lexists(path := folder / f"{stem}-{number}{suffix}") or not give_name(draft, path):
         number += 1
     return path
 
 
-def _named(draft: Path, path: Path) -> bool:
+def give_name(draft: Path, path: Path) -> bool:
     """Give a file a name, unless another has taken it meanwhile."""
     try:
         # Unlike a rename, a link does not replace another file.

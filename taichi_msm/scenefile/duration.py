@@ -47,6 +47,7 @@ class Duration(NamedTuple):
     """How long a run will take."""
 
     seconds: float  # from start to end [s]
+    start: float  # the part of it before the first step [s]
     measured: bool  # whether that is known from earlier runs, and not only from the calibration
 
 
@@ -59,8 +60,8 @@ def estimate(plan: Plan) -> Duration:
             kept["calibration"] = _calibrate(), CALIBRATION / UNIT
             _write(kept)
         kept |= dict.fromkeys(missing, kept["calibration"])
-    seconds = sum(amount * (kept[name][0] / kept[name][1]) for name, amount in parts.items())
-    return Duration(seconds, "start" not in missing)
+    seconds = {name: amount * (kept[name][0] / kept[name][1]) for name, amount in parts.items()}
+    return Duration(sum(seconds.values()), seconds["start"], "start" not in missing)
 
 
 def learn(plan: Plan, record: Mapping[str, Any]) -> None:

@@ -6,6 +6,7 @@ import codecs
 import json
 import re
 from collections.abc import Iterable, Mapping, Sequence
+from copy import deepcopy
 from itertools import chain, starmap
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -36,7 +37,15 @@ class Kind(NamedTuple):
     needs: str  # the keys that it must have
 
 
-_SCENE = Kind("scene", "sheet, tissue or springs, and time")
+class File(NamedTuple):
+    """A YAML file that was read, whose keys are not checked."""
+
+    name: str  # in messages
+    folder: Path  # where it is
+    document: Document
+
+
+SCENE = Kind("scene", "sheet, tissue or springs, and time")
 
 _NO_KEY = Problem((), "expected KEY=VALUE, such as sheet.points=[61,61]")
 _NO_PATH = Problem((), "expected a key such as sheet.points")
@@ -76,16 +85,23 @@ def load_plan(
     path: str | Path, overrides: Sequence[str] | Mapping[str, Any] = (), image: str | Path | None = None
 ) -> Plan:
     """Read and check a scene as `load_scene` does, and plan it for a CPU."""
+    return plan_file(read_file(str(path), SCENE), overrides, image)
+
+
+def plan_file(file: File, overrides: Sequence[str] | Mapping[str, Any] = (), image: str | Path | None = None) -> Plan:
+    """Check a scene file that was read before, and plan its scene; as `load_plan`."""
     if isinstance(overrides, str) or not (
         isinstance(overrides, (Sequence, Mapping)) and all(isinstance(one, str) for one in overrides)
     ):
         raise ArgumentError(f'overrides: {overrides!r}; take ["sheet.points=[61,61]"] or {{"sheet.points": [61, 61]}}')
-    draft = Draft(str(path), _SCENE)
-    parsed = starmap(_parse_value, overrides.items()) if isinstance(overrides, Mapping) else map(_parse_text, overrides)
+    draft = Draft(file)
+    parsed = (
+        starmap(_parse_value, overrides.items()) if isinstance(overrides, Mapping) else map(parse_override, overrides)
+    )
     for override in parsed:
         draft.override(override)
     for key in PICTURES if image is None else MAPS:
-        draft.find_picture(key, Path(path).parent)
+        draft.find_picture(key, file.folder)
     if image is not None:
         draft.override(_Override(f"--image {cut(str(image))}", IMAGE, str(image)))
     plan, problems = validate(draft.data)
@@ -109,10 +125,11 @@ class _Override(NamedTuple):
     problems: Sequence[Problem] = ()
 
 
-def _parse_text(text: str) -> _Override:
+def parse_override(text: str) -> _Override:
+    """Read "KEY=VALUE"."""
     key, equals, value = text.partition("=")
     name = f"--set {cut(key)}{equals}{cut(value)}"
-    path = _parse_key(key.strip())
+    path = parse_key(key.strip())
     if not equals or not path:
         return _Override(name, (), problems=[_NO_KEY])
     try:
@@ -124,7 +141,7 @@ def _parse_text(text: str) -> _Override:
 
 
 def _parse_value(key: str, value: Any) -> _Override:
-    path = _parse_key(key)
+    path = parse_key(key)
     name = f"override {cut(key)}"
     if not path:
         return _Override(name, (), problems=[_NO_PATH])
@@ -136,7 +153,7 @@ def _parse_value(key: str, value: Any) -> _Override:
     return _Override(f"{name}={flow(plain)}", path, plain)
 
 
-def _parse_key(key: str) -> Key:
+def parse_key(key: str) -> Key:
     """Split a dotted key; returns an empty key if it is not valid."""
     parts = key.split(".")
     if len(parts) > MAX_DEPTH or not all(part and part.isprintable() for part in parts):
@@ -158,17 +175,14 @@ class Draft:
     Attributes:
         data: its content, with the overrides applied so far.
         problems: found so far, each with its place.
-
-    Raises:
-        SceneError: when the file contains no mapping, or cannot be read.
     """
 
-    def __init__(self, name: str, kind: Kind) -> None:
-        document = _read_file(name, kind)
-        self._name, self._marks = name, document.marks
+    def __init__(self, file: File) -> None:
+        document = file.document
+        self._name, self._marks = file.name, document.marks
         self._overrides = 0
         self._overridden: dict[Key, _Place] = {}
-        self.data: dict[str, Any] = document.data
+        self.data: dict[str, Any] = deepcopy(document.data)
         self.problems = [(self._in_file(mark), problem) for mark, problem in document.faults]
 
     def override(self, override: _Override) -> None:
@@ -191,7 +205,7 @@ class Draft:
         holder[key[-1]] = str(folder / image)
         # A scene may come from anybody, so it may only read files that came with it.
         given = any(key[:n] in self._overridden for n in range(1, len(key) + 1))
-        if not given and not _is_below(folder / image, folder):
+        if not given and not is_below(folder / image, folder):
             remedy = ", or name it with --image" if key == IMAGE else ""
             said = f"{image} is not below the scene's folder; put the picture there{remedy}"
             self.problems.append((self._place(key), Problem(key, said)))
@@ -249,7 +263,7 @@ class Draft:
         return None
 
 
-def _is_below(path: Path, folder: Path) -> bool:
+def is_below(path: Path, folder: Path) -> bool:
     """Tell whether a path is in a folder or below it, with symbolic links resolved."""
     try:
         return path.resolve().is_relative_to(folder.resolve())
@@ -258,7 +272,8 @@ def _is_below(path: Path, folder: Path) -> bool:
         return True
 
 
-def _read_file(name: str, kind: Kind) -> Document:
+def read_file(name: str, kind: Kind) -> File:
+    """Read a file that should be of a kind; SceneError: it contains no mapping, or cannot be read."""
     try:
         document = read(_read_text(name, kind))
     except UnreadableError as error:
@@ -268,7 +283,7 @@ def _read_file(name: str, kind: Kind) -> Document:
     if not isinstance(document.data, dict):
         said = f"{flow(document.data)} is not a {kind.name}; expected keys such as {kind.needs}"
         raise SceneError([f"{name}:1:1: {said}"])
-    return document
+    return File(name, Path(name).parent, document)
 
 
 def _read_text(name: str, kind: Kind) -> str:
@@ -288,7 +303,7 @@ def _read_text(name: str, kind: Kind) -> str:
         return raw.decode()
     except UnicodeDecodeError as error:
         if path.suffix.lower() in SUFFIXES:
-            by = ", and the picture by --image" if kind is _SCENE else ""
+            by = ", and the picture by --image" if kind is SCENE else ""
             raise SceneError([f"{name}: a picture; name a {kind.name}{by}"]) from None
         before = raw[: error.start].decode()
         mark = mark_at(before, len(before))

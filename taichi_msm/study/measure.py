@@ -14,7 +14,6 @@ from taichi_msm.physics.plan import Plan
 from taichi_msm.physics.planning import on, variant, with_time
 from taichi_msm.progress import Progress
 from taichi_msm.render.texture import load_texture
-from taichi_msm.runner import versions
 from taichi_msm.scene import Scene
 from taichi_msm.scenefile.validation import checked
 from taichi_msm.study.peer import FailedError, TooSlowError, solve
@@ -25,6 +24,7 @@ from taichi_msm.study.stepping import SteppingStudy
 from taichi_msm.study.terms import measure_terms
 from taichi_msm.system import resources, runtime
 from taichi_msm.system.runtime import Device
+from taichi_msm.system.versions import versions
 
 TOLERANCE = 1e-3
 

@@ -14,7 +14,7 @@ from pydantic_core import PydanticCustomError
 from taichi_msm.errors import FilesError, Problem, SceneError, writing
 from taichi_msm.faults import REFUSED
 from taichi_msm.scene import MAX_PIXELS, NotNegative, Number, Pixels, Section, key
-from taichi_msm.scenefile.load import Draft, Kind
+from taichi_msm.scenefile.load import Draft, Kind, read_file
 from taichi_msm.scenefile.validation import parse
 from taichi_msm.viewer.captures import Film
 from taichi_msm.viewer.events import KEYS, Drag, Event, Key, Percent, Press, Release, Turn
@@ -108,7 +108,7 @@ def _refused(key: str | int, message: str, **values: str) -> PydanticCustomError
 
 def load_script(path: str | Path, size: tuple[int, int]) -> Script:
     """Read a script for a picture of a width and height [px]; raises a SceneError with all faults, in their order."""
-    draft = Draft(str(path), _SCRIPT)
+    draft = Draft(read_file(str(path), _SCRIPT))
     script, problems = parse(Script, draft.data)
     draft.report(problems)
     draft.report(_outside(script, script.size or size) if script is not None else ())

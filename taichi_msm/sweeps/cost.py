@@ -1,0 +1,65 @@
+"""What a sweep will take, from some of its runs, and how many processes to share it among."""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+from taichi_msm.errors import SceneError
+from taichi_msm.physics.plan import Plan
+from taichi_msm.scenefile import budget, duration
+from taichi_msm.scenefile.load import plan_file
+from taichi_msm.sweeps.sweepfile import Sweep
+from taichi_msm.system.resources import available_memory, available_threads
+
+# The runs that are looked at, evenly spread over all; each takes milliseconds.
+LOOKED_AT = 16
+
+# Memory of a process besides that of its run: Python, the compiler, kernels [bytes].
+PROCESS_BYTES = 400 << 20
+
+
+class Cost(NamedTuple):
+    """What all runs take, about."""
+
+    seconds: float  # on this machine, with every core
+    measured: bool  # whether that follows from earlier runs here, and not only from a calibration
+    disk_bytes: int  # at most
+    memory_bytes: int  # of one process
+    refused: str  # why the runs that were looked at are refused, if all are
+
+
+class Workers(NamedTuple):
+    """How many processes take runs."""
+
+    number: int
+    cores: int  # that this program may use
+    fitting: int  # processes whose memory is free
+
+
+def estimate(sweep: Sweep, values: list[list[Any]]) -> Cost:
+    """Estimate what the runs with these values take."""
+    plans: list[Plan] = []
+    refused = ""
+    for run in sorted({(2 * n + 1) * len(values) // (2 * LOOKED_AT) for n in range(LOOKED_AT)}):
+        try:
+            plans.append(plan_file(sweep.scene, sweep.overrides(values[run])))
+        except SceneError as error:
+            refused = refused or error.lines[0]
+    if not plans:
+        return Cost(0.0, False, 0, PROCESS_BYTES, refused)
+    times, needs = list(map(duration.estimate, plans)), list(map(budget.estimate, plans))
+    share = len(values) / len(plans)
+    return Cost(
+        # A process starts once, for many runs.
+        seconds=max(one.start for one in times) + share * sum(one.seconds - one.start for one in times),
+        measured=all(one.measured for one in times),
+        disk_bytes=round(share * sum(need.disk_bytes for need in needs)),
+        memory_bytes=PROCESS_BYTES + max(need.memory_bytes for need in needs),
+        refused="",
+    )
+
+
+def choose_workers(cost: Cost, runs: int) -> Workers:
+    """Choose a process for each core, as far as the free memory goes."""
+    cores, fitting = available_threads(), available_memory() // cost.memory_bytes
+    return Workers(max(1, min(cores, fitting, runs)), cores, fitting)

@@ -1,0 +1,69 @@
+"""The folder of a sweep: what it is of, and which of its runs are done."""
+
+from __future__ import annotations
+
+import json
+from contextlib import suppress
+from pathlib import Path
+from typing import Any
+
+from taichi_msm.errors import FilesError, ForeignError, SceneError, writing
+from taichi_msm.outputs.table import RECORD, RUNS, SWEEP
+from taichi_msm.results.whole import give_name, staged
+from taichi_msm.sweeps.outcome import Outcome, outcome_of
+from taichi_msm.sweeps.samples import values_of_runs
+from taichi_msm.sweeps.sweepfile import Sweep
+from taichi_msm.sweeps.task import Task
+from taichi_msm.system.compiler import what_decides_bits
+from taichi_msm.system.versions import versions
+
+TABLE = "table.csv"
+
+# Runs that ended so need not be taken again.
+ENDED = ("complete", "diverged")
+
+
+def values_in(directory: Path, sweep: Sweep) -> list[list[Any]]:
+    """Give the values of all runs: those that the folder has of this sweep, else new ones, which are kept there.
+
+    Raises:
+        SceneError: when the folder holds another sweep, or the same of versions that give other bits.
+        FilesError: when it cannot be read or written, or something is in the way.
+    """
+    record = directory / SWEEP
+    description = sweep.description()
+    if not record.exists():
+        for name in (RUNS, TABLE):
+            if (directory / name).exists():
+                raise ForeignError.at(directory / name, "something")
+        settings = sweep.settings
+        values = values_of_runs(settings.vary, settings.samples, settings.seed)
+        content = {"scene": settings.scene, **description, "keys": sweep.keys, "versions": versions(), "values": values}
+        with writing(directory), staged(directory) as hidden:
+            (hidden / SWEEP).write_text(json.dumps(content) + "\n", encoding="utf-8", errors="backslashreplace")
+            give_name(hidden / SWEEP, record)  # unless another shard has just done so
+    try:
+        kept = json.loads(record.read_bytes())
+        earlier = {name: kept.get(name) for name in description}
+        values, began = kept["values"], what_decides_bits(kept["versions"], "cpu")
+    except OSError as error:
+        raise FilesError(f"{record}: {(error.strerror or str(error)).lower()}") from None
+    except (ValueError, KeyError, AttributeError):
+        raise FilesError(f"{record}: damaged; choose another --out") from None
+    if other := [name for name, value in json.loads(json.dumps(description)).items() if value != earlier[name]]:
+        what = {"digest": "the scene file", "pictures": "a picture"}.get(other[0], other[0])
+        raise SceneError([f"{directory}: holds the runs of another sweep: {what} differs; choose another --out"])
+    here = what_decides_bits(versions(), "cpu")
+    if others := [f"{name} {version}" for name, version in began.items() if version != here.get(name)]:
+        raise SceneError([f"{directory}: the sweep began with {', '.join(others)}; use these, or choose another --out"])
+    return values
+
+
+def ended(task: Task) -> Outcome | None:
+    """Find the outcome of a run that has ended; None: it is missing, or was interrupted."""
+    # A record that no run has written is as none.
+    with suppress(OSError, ValueError, KeyError, TypeError, AttributeError):
+        record = json.loads((task.directory / RECORD).read_bytes())
+        if record["status"] in ENDED and record["overrides"] == list(task.overrides):
+            return outcome_of(task.run, record)
+    return None

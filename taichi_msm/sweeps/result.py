@@ -1,0 +1,25 @@
+"""A sweep whose runs have ended."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from taichi_msm.outputs.table import RUNS, numbered
+from taichi_msm.sweeps.outcome import Outcome
+from taichi_msm.sweeps.sweepfile import Sweep
+
+
+@dataclass(frozen=True)
+class SweepResult:
+    """What came out of all runs of a sweep."""
+
+    directory: Path
+    sweep: Sweep
+    values: list[list[Any]]  # of the varied keys, for each run
+    outcomes: list[Outcome]  # one for each run, in the order of their numbers
+
+    def run_directory(self, run: int) -> Path:
+        """Name the folder of a run."""
+        return self.directory / RUNS / numbered(run)

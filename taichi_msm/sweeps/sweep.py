@@ -1,0 +1,138 @@
+"""Run a scene many times with varied values, on all cores or on any executor."""
+
+from __future__ import annotations
+
+from collections.abc import Generator, Iterable, Iterator, Mapping
+from concurrent.futures import Executor
+from contextlib import closing, contextmanager
+from pathlib import Path
+from typing import Any
+
+from taichi_msm.arguments import require_path
+from taichi_msm.progress import Progress
+from taichi_msm.sweeps.cost import choose_workers, estimate
+from taichi_msm.sweeps.folder import ended, values_in
+from taichi_msm.sweeps.outcome import Outcome
+from taichi_msm.sweeps.pool import Pool
+from taichi_msm.sweeps.reports import write_reports
+from taichi_msm.sweeps.result import SweepResult
+from taichi_msm.sweeps.schedule import outcomes
+from taichi_msm.sweeps.sweepfile import Sweep, make_sweep
+from taichi_msm.sweeps.task import Task
+
+
+def sweep(
+    scene: str | Path,
+    vary: Mapping[str, Mapping[str, Any]],
+    directory: str | Path,
+    *,
+    samples: int | None = None,
+    seed: int = 1,
+    overrides: Mapping[str, Any] | None = None,
+    executor: Executor | None = None,
+    workers: int | None = None,
+    progress: Progress = lambda stage, done, total: None,
+) -> Iterator[Outcome]:
+    """Run a scene many times with varied values.
+
+    Runs are taken while the outcomes are iterated over, which come in the order in which runs end; after the last one
+    the table and the other files of the sweep are written. The same call goes on with the runs that are missing.
+
+    Args:
+        scene: the scene file.
+        vary: keys of the scene by their dotted paths, and how each varies, as in a sweep file. Pictures are relative
+            to the scene file, and below its folder.
+        directory: where runs/, table.csv and the other files go.
+        samples: number of runs; None: every combination of the keys' grids.
+        seed: what the samples are chosen by.
+        overrides: values of keys in all runs, by their dotted paths.
+        executor: takes the runs; each of its workers must be a process, of one thread. None: processes here.
+        workers: how many of these; None: one for each core, as far as memory goes.
+        progress: called often, with the stage, the runs done and the runs in all; what it raises stops the sweep there.
+
+    Returns:
+        An iterator over the outcomes of all runs.
+
+    Raises:
+        ArgumentError: when the directory cannot be a path.
+        SceneError: with everything that is wrong with the arguments; when the directory holds another sweep.
+        FilesError: when the directory cannot be written.
+        MsmError: while iterating, when the executor takes no more runs.
+
+    Example:
+        >>> from taichi_msm import sweep
+        >>> young = {"tissue.young": {"log_uniform": [5e3, 8e4]}}
+        >>> rows = list(sweep("scenes/press.yaml", young, "output/young", samples=8, overrides={"output": []}))
+        >>> len(rows), {row.status for row in rows}
+        (8, {'complete'})
+    """
+    require_path(directory)
+    settings = {"vary": vary, "seed": seed, "set": overrides or {}} | ({} if samples is None else {"samples": samples})
+    described = make_sweep(scene, settings)
+    values = values_in(Path(directory), described)
+    return _go_through(described, values, Path(directory), executor, workers, progress)
+
+
+def _go_through(
+    described: Sweep,
+    values: list[list[Any]],
+    directory: Path,
+    executor: Executor | None,
+    workers: int | None,
+    progress: Progress,
+) -> Iterator[Outcome]:
+    count = workers or choose_workers(estimate(described, values), len(values)).number
+    with opened(executor, count) as taking:
+        rows = []
+        with closing(run_all(described, values, directory, taking, progress)) as coming:
+            for row in coming:
+                rows.append(row)
+                yield row
+        finish(described, values, directory, rows)
+
+
+@contextmanager
+def opened(executor: Executor | None, workers: int) -> Iterator[Executor]:
+    """Use an executor, or else a pool of processes here, which end with the block, at once if it raises."""
+    if executor is not None:
+        yield executor
+        return
+    pool = Pool(workers)
+    try:
+        yield pool
+    except BaseException:
+        pool.shutdown(cancel_futures=True)
+        raise
+    pool.shutdown()
+
+
+def run_all(
+    described: Sweep,
+    values: list[list[Any]],
+    directory: Path,
+    executor: Executor,
+    progress: Progress,
+    shard: tuple[int, int] = (1, 1),
+) -> Generator[Outcome, None, None]:
+    """Give the outcomes of all runs of a shard, first those that have ended before."""
+    part, parts = shard
+    numbers = range(part - 1, len(values), parts)
+    done, missing = [], []
+    for run in numbers:
+        task = Task(run, described.scene, described.overrides(values[run]), directory)
+        if outcome := ended(task):
+            done.append(outcome)
+        else:
+            missing.append(task)
+    yield from done
+    for outcome in outcomes(missing, executor, lambda: progress("runs", len(done), len(numbers))):
+        done.append(outcome)
+        yield outcome
+
+
+def finish(
+    described: Sweep, values: list[list[Any]], directory: Path, rows: Iterable[Outcome]
+) -> tuple[list[str], list[str]]:
+    """Write the table and the other files of a sweep; gives their names, and what the user should know."""
+    result = SweepResult(directory, described, values, sorted(rows, key=lambda row: row.run))
+    return write_reports(result)

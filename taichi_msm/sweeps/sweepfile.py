@@ -1,0 +1,231 @@
+"""Sweep file -> Sweep, with file, line and column in every error."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import suppress
+from dataclasses import dataclass
+from functools import cached_property
+from glob import glob
+from pathlib import Path
+from typing import Annotated, Any
+
+from pydantic import Field, field_validator, model_validator
+from typing_extensions import Self
+
+from taichi_msm.errors import ArgumentError, Key, Problem, SceneError
+from taichi_msm.faults import flow, refused
+from taichi_msm.picture import PictureError, file_sha256
+from taichi_msm.scene import MAX_PATH, FilePath, Scene, Section, Whole, key
+from taichi_msm.scenefile.load import PICTURES, SCENE, Draft, File, Kind, is_below, parse_key, parse_override, read_file
+from taichi_msm.scenefile.validation import parse
+from taichi_msm.scenefile.yaml_reader import UnreadableError, read
+from taichi_msm.sweeps.distribution import Distribution
+from taichi_msm.sweeps.samples import count_runs, values_of_runs
+
+MAX_RUNS = 10**7
+
+SWEEP = Kind("sweep", "scene and vary")
+
+
+class SweepSettings(Section):
+    """The content of a sweep file."""
+
+    scene: FilePath = key(..., "the scene file; relative to the sweep file", "the path of a scene file")
+    samples: Annotated[Whole, Field(ge=1, le=MAX_RUNS)] | None = key(
+        None,
+        "number of runs, whose values are taken from a scrambled Sobol sequence; not with grids",
+        f"a whole number, 1 to {MAX_RUNS}",
+    )
+    seed: Annotated[Whole, Field(ge=0)] = key(
+        1, "what the samples, and the parts of a data set, are chosen by", "a whole number, 0 or more"
+    )
+    vary: dict[str, Distribution] = key(
+        ..., "keys of the scene by their dotted paths, and how each varies", "keys of the scene, such as tissue.young"
+    )
+    set: dict[str, Any] = key({}, "keys of the scene by their dotted paths, and their values in all runs", "a mapping")
+
+    @field_validator("vary")
+    @classmethod
+    def _has_keys(cls, vary: dict[str, Distribution]) -> dict[str, Distribution]:
+        if not vary:
+            raise refused("no keys; name at least one, such as tissue.young: {uniform: [1e4, 3e4]}")
+        return vary
+
+    @model_validator(mode="after")
+    def _fits(self) -> Self:
+        grids = [name for name, one in self.vary.items() if one.kind == "grid"]
+        if self.samples is not None and grids:
+            raise refused(
+                f"{grids[0]} is a grid, which gives every combination; take choice, or leave out samples", "samples"
+            )
+        if self.samples is None and len(grids) < len(self.vary):
+            raise refused("missing; expected the number of runs, as not every key is a grid", "samples")
+        if (runs := count_runs(self.vary, self.samples)) > MAX_RUNS:
+            raise refused(f"{runs} combinations, more than the {MAX_RUNS} that can be run; take smaller grids", "vary")
+        if both := [name for name in self.set if name in self.vary]:
+            raise refused(f"{both[0]} is in vary too; keep one", "set")
+        return self
+
+
+@dataclass(frozen=True)
+class Sweep:
+    """A scene file and how it is varied. Paths of pictures in its values are relative to the scene file."""
+
+    scene: File
+    settings: SweepSettings
+
+    @property
+    def keys(self) -> list[str]:
+        """The keys that vary."""
+        return list(self.settings.vary)
+
+    @property
+    def runs(self) -> int:
+        """The number of runs."""
+        return count_runs(self.settings.vary, self.settings.samples)
+
+    def overrides(self, values: list[Any]) -> tuple[str, ...]:
+        """Give what `run --set` takes for the run with these values."""
+        pairs = [*self.settings.set.items(), *zip(self.keys, values, strict=True)]
+        return tuple(f"{name}={cell(value)}" for name, value in pairs)
+
+    @cached_property
+    def pictures(self) -> dict[str, str]:
+        """The SHA-256 of every picture that the runs may need, by its path; without those that cannot be read."""
+        names: list[str] = []
+
+        def noted(text: str) -> str:
+            names.append(text)
+            return text
+
+        listed = [(name, one.values) for name, one in self.settings.vary.items() if one.kind in ("choice", "grid")]
+        pairs = [(name, value) for name, values in listed for value in values]
+        for name, value in [("", self.scene.document.data), *self.settings.set.items(), *pairs]:
+            _with_pictures(_as_key(name), value, noted)
+        digests = {}
+        for path in dict.fromkeys(str(self.scene.folder / name) for name in names):
+            with suppress(PictureError):  # The run that needs it says why.
+                digests[path] = file_sha256(path)
+        return digests
+
+    def description(self) -> dict[str, Any]:
+        """Give all that its results follow from, for JSON; two sweeps that are described equally are one."""
+        settings = self.settings.model_dump(mode="json", exclude={"scene", "vary"})
+        vary = {name: {one.kind: one.values} for name, one in self.settings.vary.items()}
+        scene = json.dumps(self.scene.document.data).encode()
+        pictures = {os.path.relpath(path, self.scene.folder): digest for path, digest in self.pictures.items()}
+        return {**settings, "vary": vary, "digest": hashlib.sha256(scene).hexdigest(), "pictures": pictures}
+
+
+def load_sweep(path: str | Path) -> Sweep:
+    """Read a sweep file and check it; SceneError: with all its faults, one line each, in their order."""
+    draft = Draft(read_file(str(path), SWEEP))
+    folder, scene = Path(path).parent, draft.data.get("scene")
+    if isinstance(scene, str) and scene:
+        draft.report(_relocate(draft.data, folder, (folder / scene).parent))
+    settings, problems = parse(SweepSettings, draft.data)
+    draft.report(problems)
+    if settings is None or draft.problems:
+        raise SceneError(draft.lines())
+    sweep = _sweep_of(folder / settings.scene, settings)
+    draft.report(_unknown_keys(sweep))
+    if draft.problems:
+        raise SceneError(draft.lines())
+    return sweep
+
+
+def make_sweep(scene: str | Path, settings: Mapping[str, Any]) -> Sweep:
+    """Make a sweep without a file; its pictures are relative to the scene file. SceneError: with all its faults."""
+    try:
+        data = json.loads(json.dumps({**settings, "scene": str(scene)}))
+    except (TypeError, ValueError) as error:
+        raise ArgumentError(f"vary, overrides: {error}; use numbers, text, lists, dicts") from None
+    problems = list(_relocate(data, Path(scene).parent, Path(scene).parent))
+    sweep = _sweep_of(Path(scene), SweepSettings(**data))
+    if problems := [*problems, *_unknown_keys(sweep)]:
+        raise SceneError([str(problem) for problem in problems])
+    return sweep
+
+
+def _sweep_of(path: Path, settings: SweepSettings) -> Sweep:
+    """Read the scene file; it is named without its folder in the errors of runs, wherever the sweep is started."""
+    scene = read_file(os.path.normpath(path), SCENE)
+    return Sweep(scene._replace(name=path.name), settings)
+
+
+def cell(value: Any) -> str:
+    """Write a value as `--set` takes it."""
+    if isinstance(value, str):
+        with suppress(UnreadableError):
+            document = read(value)
+            if document.data == value and not document.faults:
+                return value
+    return json.dumps(value, ensure_ascii=False)
+
+
+def _relocate(data: dict[str, Any], folder: Path, home: Path) -> Iterator[Problem]:
+    """Make paths of pictures, given relative to a folder, relative to the scene's, its home; expand patterns."""
+    vary, fixed = (part if isinstance(part, dict) else {} for part in (data.get("vary"), data.get("set")))
+    for name, ways in vary.items():
+        for way in {"choice", "grid"} & set(ways if isinstance(ways, dict) else ()):
+            path: Key = ("vary", name, way)
+            if isinstance(pattern := ways[way], str) and _as_key(name) in PICTURES:
+                ways[way] = sorted(glob(pattern, root_dir=folder))  # noqa: PTH207  # Path.glob refuses absolute patterns
+                if not ways[way]:
+                    yield Problem(path, f"{flow(pattern)} matches no file; give a pattern relative to the sweep file")
+            if isinstance(ways[way], list):
+                for index, value in enumerate(ways[way]):
+                    ways[way][index], faults = _relocated(name, value, folder, home)
+                    yield from (Problem((*path, index), fault) for fault in faults)
+    for name, value in fixed.items():
+        fixed[name], faults = _relocated(name, value, folder, home)
+        yield from (Problem(("set", name), fault) for fault in faults)
+
+
+def _relocated(name: str, value: Any, folder: Path, home: Path) -> tuple[Any, list[str]]:
+    """Relocate the pictures in the value of a key; returns it, and what is wrong with them."""
+    faults = []
+
+    def relocated(text: str) -> str:
+        path = folder / text
+        if not (is_below(path, folder) or is_below(path, home)):
+            faults.append(
+                f"{text} is neither below the sweep file's folder nor below the scene's; put the picture there"
+            )
+        elif not path.is_file():
+            faults.append(f"{text}: no such file; name a picture relative to the sweep file")
+        return Path(os.path.relpath(path, home)).as_posix()
+
+    return _with_pictures(_as_key(name), value, relocated), faults
+
+
+def _with_pictures(path: Key, value: Any, change: Callable[[str], str]) -> Any:
+    """Change the paths of pictures in the value of a key."""
+    if path in PICTURES:
+        return change(value) if isinstance(value, str) and 0 < len(value) <= MAX_PATH else value
+    if isinstance(value, dict):
+        return {name: _with_pictures((*path, name), one, change) for name, one in value.items()}
+    return value
+
+
+def _as_key(name: str) -> Key:
+    return parse_key(name) if name else ()
+
+
+def _unknown_keys(sweep: Sweep) -> Iterator[Problem]:
+    """Find the keys that no scene has, by trying the values of the first run."""
+    draft, values = Draft(sweep.scene), values_of_runs(sweep.settings.vary, sweep.settings.samples, sweep.settings.seed)
+    places = [*(("set", name) for name in sweep.settings.set), *(("vary", name) for name in sweep.keys)]
+    for place, text in zip(places, sweep.overrides(values[0]), strict=True):
+        known = len(draft.problems)
+        draft.override(parse_override(text))
+        yield from (Problem(place, problem.message) for _, problem in draft.problems[known:])
+    for problem in parse(Scene, draft.data)[1]:
+        around = [place for place in places if problem.path[: len(_as_key(place[1]))] == _as_key(place[1])]
+        if around and problem.message.startswith("unknown key"):
+            where = f"{problem.key}: " if problem.key != around[-1][1] else ""
+            yield Problem(around[-1], f"{where}{problem.message}")
