@@ -22,7 +22,8 @@ import click
 
 from taichi_msm import __version__
 from taichi_msm.errors import DeviceError, FilesError, NotInstalledError, SceneError, did_you_mean, printable
-from taichi_msm.export.formats import FORMATS
+from taichi_msm.exports.formats import FORMATS
+from taichi_msm.results.entries import without_link
 from taichi_msm.system.signals import Interruption
 from taichi_msm.system.streams import mute, tell
 
@@ -35,6 +36,8 @@ DONE, BUG, WRONG_INPUT, DIVERGED, FILES = 0, 1, 2, 3, 4
 RESUMABLE = ("resume", "threads", "quiet", "as_json")
 REPEATABLE = ("again", "out", "arch", "threads", "estimate_error", "quiet", "as_json")
 
+# So many files of an export are named at the end; more are counted.
+FEW = 2
 # Sweeps of more runs, or of more seconds, must be meant.
 MANY_RUNS, LONG = 10_000, 86400
 
@@ -412,7 +415,7 @@ def view(
 
 
 @program.command()
-@click.argument("directory", metavar="DIR")
+@click.argument("directories", metavar="DIR ...", nargs=-1, required=True)
 @click.option(
     "--format",
     "name",
@@ -421,28 +424,32 @@ def view(
     required=True,
     help="; ".join(f"{name}: {row.means}" for name, row in FORMATS.items()) + ".",
 )
-@click.option("--out", metavar="DIR2", help="Directory for the files.  [default: DIR/export-FORMAT]")
+@click.option(
+    "--out",
+    metavar="DIR2",
+    help="Directory for the files.  [default: DIR/export-FORMAT; of several DIR, output/export-FORMAT]",
+)
 @click.option("--quiet", is_flag=True, help="Print no progress and no summary.")
 @json_option
-def export(directory: str, name: str, out: str | None, quiet: bool, as_json: bool) -> int:
-    """Convert the results of a run, in DIR, to the formats of other programs."""
-    run = result_directory(directory, option="DIR")
-    folder = without_link(run / f"export-{name}", "--out") if out is None else result_directory(out)
+def export(directories: tuple[str, ...], name: str, out: str | None, quiet: bool, as_json: bool) -> int:
+    """Convert the results of runs and sweeps, each in a DIR, to the formats of other programs."""
+    runs = [result_directory(directory, option="DIR") for directory in directories]
+    folder = None if out is None else result_directory(out)
 
     from taichi_msm.console import Progress
-    from taichi_msm.export.convert import convert
+    from taichi_msm.exports import convert
 
     interruption = Interruption()
     try:
         with Progress(quiet=quiet or as_json) as bar:
-            done = convert(run, name, folder, partial(interruptible(bar, interruption), "export"))
+            done = convert.export(runs, name, folder, partial(interruptible(bar, interruption), "export"))
     except KeyboardInterrupt:
         return interrupted(interruption, as_json)
     if as_json:
-        print_json({"directory": str(folder), "format": name, **done._asdict()})
+        print_json({"directory": str(done.directory), "format": name, "files": done.files, "notes": done.notes})
     elif not quiet:
-        files = done.files[0] if len(done.files) == 1 else f"{len(done.files)} files"
-        click.echo(printable(f"{folder}: {files}"))
+        files = ", ".join(done.files) if len(done.files) <= FEW else f"{len(done.files)} files"
+        click.echo(printable(f"{done.directory}: {files}"))
         for note in done.notes:
             click.echo(printable(note))
     return DONE
@@ -552,17 +559,6 @@ def result_directory(out: str | None, default: str = "", option: str = "--out") 
     if default in (".", ".."):
         raise click.BadParameter(f"the scene's name gives the folder output/{default}; name another", param_hint=option)
     return without_link(without_link(Path("output"), option) / default, option)
-
-
-def without_link(folder: Path, option: str) -> Path:
-    """Make sure that a folder which the user did not name is no symbolic link: it may have come with the scene."""
-    try:
-        is_link = folder.is_symlink()
-    except OSError as error:
-        raise FilesError(f"{folder}: {(error.strerror or str(error)).lower()}") from None
-    if is_link:
-        raise FilesError(f"{folder}: a symbolic link; name the folder it leads to with {option}")
-    return folder
 
 
 def going_on(directory: Path) -> str:

@@ -21,7 +21,7 @@ from PIL import Image
 
 import taichi_msm
 from taichi_msm import cli, scene
-from taichi_msm.export.formats import FORMATS
+from taichi_msm.exports.formats import FORMATS
 from taichi_msm.outputs.table import OUTPUTS
 from taichi_msm.results.record import ErrorRecord, RunRecord
 from taichi_msm.runner import run
@@ -243,11 +243,15 @@ def test_the_python_shown_runs(tmp_path: Path) -> None:
     (tmp_path / "example.py").write_text(labels)
     done = subprocess.run([sys.executable, "example.py"], cwd=tmp_path, check=True, capture_output=True, text=True)
     assert done.stdout == "(512, 512, 2) (512, 512) (512, 512, 2) (512, 512)\n"
+    (tmp_path / "example.py").write_text(blocks(DOCS / "export.md", "python")[0])
+    done = subprocess.run([sys.executable, "example.py"], cwd=tmp_path, check=True, capture_output=True, text=True)
+    written = ["000000/surface.glb", "000001/surface.glb", "index.csv"]
+    assert done.stdout == f"{Path('output', 'export-gltf')} {written}\n"
     assert (tmp_path / "output" / "from-python" / "animation.gif").exists()
 
 
-# Those whose examples stand in their docstrings. The example of Playback reads what that of run writes.
-WITH_EXAMPLES = ["run", "Playback", "load_scene", "Scene", "Simulation"]
+# Those whose examples stand in their docstrings. Those of Playback and export read what that of run writes.
+WITH_EXAMPLES = ["run", "Playback", "export", "load_scene", "Scene", "Simulation"]
 
 
 @pytest.mark.parametrize("name", WITH_EXAMPLES)

@@ -8,15 +8,15 @@ from pathlib import Path
 from typing import Any
 
 from taichi_msm.errors import FilesError, ForeignError, SceneError, writing
-from taichi_msm.outputs.table import RECORD
+from taichi_msm.outputs.table import RECORD, RUNS, SWEEP
 from taichi_msm.results.whole import give_name, staged
 from taichi_msm.sweeps.outcome import Outcome, outcome_of
 from taichi_msm.sweeps.sweepfile import Sweep
-from taichi_msm.sweeps.task import RUNS, Task
+from taichi_msm.sweeps.task import Task
 from taichi_msm.system.compiler import what_decides_bits
 from taichi_msm.system.versions import versions
 
-SWEEP, TABLE = "sweep.json", "table.csv"
+TABLE = "table.csv"
 
 # Runs that ended so need not be taken again.
 ENDED = ("complete", "diverged")

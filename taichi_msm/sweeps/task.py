@@ -8,11 +8,9 @@ from pathlib import Path
 from typing import NamedTuple
 
 from taichi_msm.errors import MsmError, SceneError
+from taichi_msm.outputs.table import RUNS, numbered
 from taichi_msm.scenefile.load import File, plan_file
 from taichi_msm.sweeps.outcome import Outcome, Status, outcome_of
-
-# The folder of the runs in that of a sweep.
-RUNS = "runs"
 
 
 class Task(NamedTuple):
@@ -27,7 +25,7 @@ class Task(NamedTuple):
     @property
     def directory(self) -> Path:
         """Where its results go."""
-        return self.folder / RUNS / f"{self.run:06}"
+        return self.folder / RUNS / numbered(self.run)
 
 
 def take(task: Task) -> Outcome:
