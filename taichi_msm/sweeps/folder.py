@@ -32,7 +32,7 @@ def values_in(directory: Path, sweep: Sweep) -> list[list[Any]]:
     record = directory / SWEEP
     description = sweep.description()
     if not record.exists():
-        for name in (RUNS, TABLE):
+        for name in (RUNS, TABLE, RECORD):
             if (directory / name).exists():
                 raise ForeignError.at(directory / name, "something")
         content = {
