@@ -22,8 +22,9 @@ import psutil
 from distributed import Client
 
 from benchmarks.process import OUTPUT
-from taichi_msm.sweeps.folder import values_in
-from taichi_msm.sweeps.sweep import finish, opened, run_all
+from taichi_msm.sweeps.folder import sort_out, values_in
+from taichi_msm.sweeps.schedule import outcomes
+from taichi_msm.sweeps.sweep import finish, opened
 from taichi_msm.sweeps.sweepfile import Sweep, load_sweep
 from taichi_msm.system.resources import available_threads
 
@@ -61,17 +62,19 @@ class Clock:
 
 
 def measure(described: Sweep, directory: Path, executor: str | None) -> dict[str, Any]:
-    """Take all runs; then go on with the sweep, of which nothing is missing."""
+    """Take all runs, and look for them again as the next command would."""
     clock, taken = Clock(), dict[str, Any]()
     values = values_in(directory, described)
     taken["begin"] = clock.seconds()
-    for name in ("run", "scan"):
-        with opened(executor, available_threads(), described, directory, _ignore) as taking:
-            clock.seconds()
-            rows = list(run_all(described, values, directory, taking, _ignore))
-            taken[name] = clock.seconds()
-        assert all(row.status == "complete" for row in rows), rows[0]
+    _, missing = sort_out(described, values, directory)
+    with opened(executor, available_threads(), described, directory, _ignore) as taking:
+        clock.seconds()
+        for row in outcomes(missing, taking, lambda: None):
+            assert row.status == "complete", row
+        taken["run"] = clock.seconds()
     clock.seconds()
+    rows, _ = sort_out(described, values, directory)
+    taken["scan"] = clock.seconds()
     finish(described, values, directory, rows)
     taken["finish"] = clock.seconds()
     return taken
@@ -127,10 +130,7 @@ def main() -> None:
     (FOLDER / "scene.yaml").write_text(SCENE)
     (FOLDER / "sweep.yaml").write_text(SWEEP.format(runs=runs))
     described = load_sweep(FOLDER / "sweep.yaml")
-    command = psutil.Process()
-    began = command.memory_info().rss
     results = {"here": measure(described, FOLDER / "here", None)}
-    grew = command.memory_info().rss - began
     with cluster(available_threads()) as (address, scheduler):
         before, idle = scheduler.memory_info().rss, scheduler.cpu_times()
         results["dask"] = measure(described, FOLDER / "dask", address)
@@ -142,7 +142,6 @@ def main() -> None:
             print(f"{where:>5} {name:>6}: {wall:8.2f} ms, {cpu:7.2f} ms of the processor")
     cpu = busy.user + busy.system - idle.user - idle.system
     print(f"scheduler: {cpu / runs * 1e3:.2f} ms of the processor; it grew by {(after - before) / 2**20:.0f} MiB")
-    print(f"the command grew by {grew / runs / 1024:.1f} KiB")
     for name, number in sizes(FOLDER / "here", runs).items():
         print(f"{name:>10}: {number:.1f}")
 

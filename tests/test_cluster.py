@@ -118,6 +118,7 @@ def test_workers_need_no_inputs_and_one_may_die(lab: Path, machines: Machines, p
     machines.work(address, "--nthreads", "1")
     wait_for(lambda: list(lab.glob("far/runs/*/run.json")))
     alone.kill()
+    assert len(list(lab.glob("far/runs/*/run.json"))) < 6
     printed, said = sweep.communicate(timeout=SOON)
     assert (sweep.returncode, json.loads(printed)["complete"], said) == (0, 6, "")
 
@@ -168,10 +169,8 @@ def test_a_run_whose_workers_die_is_a_row(lab: Path, machines: Machines) -> None
 def test_ctrl_c_frees_the_workers(lab: Path, machines: Machines) -> None:
     address = machines.schedule()
     machines.work(address)
-    # A run of minutes.
-    (lab / "here" / "sweep.yaml").write_text(
-        SWEEP.replace("[5, 5], time.duration: 0.1", "[99, 99], time.duration: 900")
-    )
+    takes_minutes = SWEEP.replace("[5, 5], time.duration: 0.1", "[99, 99], time.duration: 900")
+    (lab / "here" / "sweep.yaml").write_text(takes_minutes)
     sweep = start_sweep("long", "--dask", address)
     wait_for(lambda: list(lab.glob("long/runs/*/.partial")))
     sweep.send_signal(signal.SIGINT)

@@ -20,6 +20,7 @@ from pathlib import Path
 from typing import Any
 
 from distributed import Client, KilledWorker, Reschedule, Security, WorkerPlugin, get_worker
+from distributed.client import ClosedClientError
 from distributed.comm import connect
 from distributed.utils import LoopRunner, silence_logging_cmgr
 
@@ -43,8 +44,9 @@ class Inputs(WorkerPlugin):  # type: ignore[misc]  # that package has no types
 
     def __init__(self, described: Sweep, directory: Path) -> None:
         scene = described.scene
-        # Absolute, as workers have other current directories.
+        # Absolute, as there may be no such current directory where a worker is.
         self.scene, self.directory = scene._replace(folder=scene.folder.absolute()), directory.absolute()
+        self.home = Path.cwd()
         self.versions = what_decides_bits(versions(), "cpu")
         self._digests = {str(Path(path).absolute()): digest for path, digest in described.pictures.items()}
         self._contents = {digest: Path(path).read_bytes() for path, digest in self._digests.items()}
@@ -58,6 +60,8 @@ class Inputs(WorkerPlugin):  # type: ignore[misc]  # that package has no types
         self.fault = self._fault(worker)
         if self.fault:
             raise ExecutorError(self.fault)
+        if not self.home.is_dir():
+            self.home = Path.cwd()
         self._folder = Path(tempfile.mkdtemp(dir=worker.local_directory))
         for digest, content in self._contents.items():
             (self._folder / digest).write_bytes(content)
@@ -95,8 +99,12 @@ class Cluster(Executor):
         """Call a function with a task, and a function by which it can be interrupted, in a worker that is free."""
         (task,) = arguments
         answer: Future[Any] = Future()
-        given = self._executor.submit(_call, self._name, function, task.run, task.overrides)
-        given.add_done_callback(partial(_pass_on, answer))
+        try:
+            given = self._executor.submit(_call, self._name, function, task.run, task.overrides)
+        except ClosedClientError:
+            _cancel(answer)
+        else:
+            given.add_done_callback(partial(_pass_on, answer))
         return answer
 
     def shutdown(self, wait: bool = True, *, cancel_futures: bool = False) -> None:
@@ -107,14 +115,18 @@ class Cluster(Executor):
 def _pass_on(answer: Future[Any], given: Future[Any]) -> None:
     """Pass on the end of a call; what dask says of workers that died would differ from time to time."""
     if given.cancelled():
-        answer.cancel()
-        answer.set_running_or_notify_cancel()
+        _cancel(answer)
     elif isinstance(error := given.exception(), KilledWorker):
         answer.set_exception(MsmError(f"its workers died, {error.allowed_failures + 1} one after another"))
     elif error is not None:
         answer.set_exception(error)
     else:
         answer.set_result(given.result())
+
+
+def _cancel(answer: Future[Any]) -> None:
+    answer.cancel()
+    answer.set_running_or_notify_cancel()
 
 
 def _call(name: str, function: Callable[..., Any], run: int, overrides: tuple[str, ...]) -> Any:
@@ -125,7 +137,7 @@ def _call(name: str, function: Callable[..., Any], run: int, overrides: tuple[st
     if inputs.fault:
         raise ExecutorError(inputs.fault)
     with copied(inputs.copies), suppress(KeyboardInterrupt):
-        outcome = function(Task(run, inputs.scene, overrides, inputs.directory), inputs.pause)
+        outcome = function(Task(run, inputs.scene, overrides, inputs.directory, inputs.home), inputs.pause)
         inputs.pause("", 0, 0)
         return outcome
     # Where the sweep has not ended, the worker is.

@@ -6,9 +6,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from taichi_msm.outputs.table import RUNS, numbered
 from taichi_msm.sweeps.outcome import Outcome
 from taichi_msm.sweeps.sweepfile import Sweep
-from taichi_msm.sweeps.task import RUNS
 
 
 @dataclass(frozen=True)
@@ -22,4 +22,4 @@ class SweepResult:
 
     def run_directory(self, run: int) -> Path:
         """Name the folder of a run."""
-        return self.directory / RUNS / f"{run:06}"
+        return self.directory / RUNS / numbered(run)

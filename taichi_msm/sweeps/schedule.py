@@ -33,7 +33,10 @@ def outcomes(tasks: Iterable[Task], executor: Executor, pause: Pause) -> Iterato
     died: set[int] = set()
 
     def submit(task: Task) -> None:
-        future = executor.submit(take, task)
+        try:
+            future = executor.submit(take, task)
+        except RuntimeError as error:  # such as that of a broken executor
+            raise _ended(executor, error) from error
         waiting[future] = task
         future.add_done_callback(done.put)
 
@@ -52,8 +55,7 @@ def outcomes(tasks: Iterable[Task], executor: Executor, pause: Pause) -> Iterato
         except ExecutorError as error:
             raise LostExecutorError(str(error)) from error
         except (BrokenExecutor, CancelledError) as error:
-            said = str(error) or "it cancelled one"
-            raise LostExecutorError(f"{type(executor).__name__} takes no more runs: {said}") from error
+            raise _ended(executor, error) from error
         except DiedError as error:
             if task.run not in died:
                 died.add(task.run)
@@ -66,3 +68,8 @@ def outcomes(tasks: Iterable[Task], executor: Executor, pause: Pause) -> Iterato
         yield outcome
         for following in islice(rest, 1):
             submit(following)
+
+
+def _ended(executor: Executor, error: Exception) -> LostExecutorError:
+    """Make the error for an executor that takes no more runs."""
+    return LostExecutorError(f"{type(executor).__name__} takes no more runs: {error}; start the sweep again")
