@@ -513,7 +513,7 @@ def sweep(
             for outcome in run_all(described, values, directory, executor, progress, shard or (1, 1)):
                 outcomes.append(outcome)
             if shard is None:
-                files, notes = finish(described, values, directory, outcomes)
+                files, notes = finish(described, values, directory, outcomes, executor, progress)
     except KeyboardInterrupt:
         so_far = f"interrupted; {len(outcomes)} of {len(values)} runs have ended; the same command goes on"
         return interrupted(interruption, as_json, so_far)

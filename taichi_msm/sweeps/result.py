@@ -23,3 +23,8 @@ class SweepResult:
     def run_directory(self, run: int) -> Path:
         """Name the folder of a run."""
         return self.directory / RUNS / f"{run:06}"
+
+    def some(self, most: int) -> list[int]:
+        """Give the numbers of at most so many runs, evenly spread over all."""
+        total, count = len(self.outcomes), min(len(self.outcomes), most)
+        return [(2 * n + 1) * total // (2 * count) for n in range(count)]

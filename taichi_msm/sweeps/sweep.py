@@ -88,7 +88,7 @@ def _go_through(
             for row in coming:
                 rows.append(row)
                 yield row
-        finish(described, values, directory, rows)
+        finish(described, values, directory, rows, taking, progress)
 
 
 @contextmanager
@@ -131,8 +131,13 @@ def run_all(
 
 
 def finish(
-    described: Sweep, values: list[list[Any]], directory: Path, rows: Iterable[Outcome]
+    described: Sweep,
+    values: list[list[Any]],
+    directory: Path,
+    rows: Iterable[Outcome],
+    executor: Executor,
+    progress: Progress,
 ) -> tuple[list[str], list[str]]:
     """Write the table and the other files of a sweep; gives their names, and what the user should know."""
     result = SweepResult(directory, described, values, sorted(rows, key=lambda row: row.run))
-    return write_reports(result)
+    return write_reports(result, executor, progress)
