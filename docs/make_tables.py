@@ -14,7 +14,10 @@ from typing import Any
 
 import taichi_msm
 from taichi_msm.outputs.table import OUTPUTS
+from taichi_msm.scene import Section
 from taichi_msm.scenefile.load import schema
+from taichi_msm.sweeps.distribution import Distribution
+from taichi_msm.sweeps.sweepfile import SweepSettings
 from taichi_msm.viewer.events import KEYS, POINTER
 
 DOCS = Path(__file__).parent
@@ -70,11 +73,24 @@ def names() -> str:
     return "| name | what it is |\n|---|---|\n" + "\n".join(lines) + "\n"
 
 
+def model_keys(model: type[Section], *titles: str) -> str:
+    """Give the table of the keys of a section that has none below it."""
+    lines = []
+    for name, field in model.model_fields.items():
+        assert isinstance(field.json_schema_extra, dict)
+        default = "**required**" if field.is_required() else "" if field.default in (None, {}) else f"`{field.default}`"
+        cells = [f"`{name}`", field.description, field.json_schema_extra["expects"], default][: len(titles)]
+        lines.append(f"| {' | '.join(map(str, cells))} |")
+    return f"| {' | '.join(titles)} |\n|{'---|' * len(titles)}\n" + "\n".join(lines) + "\n"
+
+
 # What makes each table, by its page and its name there.
 TABLES: dict[tuple[str, str], Callable[[], str]] = {
     ("scene", "keys"): scene_keys,
     ("view", "hands"): window_keys,
     ("python", "names"): names,
+    ("sweep", "sweep keys"): partial(model_keys, SweepSettings, "key", "meaning", "value", "default"),
+    ("sweep", "distributions"): partial(model_keys, Distribution, "way", "how the key varies", "value"),
     ("command-line", "outputs"): partial(outputs, "picture", "positions"),
     ("labels", "labels"): partial(outputs, "labels", "flow", "tracks"),
 }

@@ -17,6 +17,7 @@ if TYPE_CHECKING:
         NotInstalledError,
         SceneError,
     )
+    from taichi_msm.exports.convert import export
     from taichi_msm.playback import Playback
     from taichi_msm.render.labels import Flow, Labels, Sight
     from taichi_msm.render.surface import Surface
@@ -49,6 +50,7 @@ _HOMES = {
     "Simulation": "simulation",
     "Surface": "render.surface",
     "Outcome": "sweeps.outcome",
+    "export": "exports.convert",
     "load_scene": "scenefile.load",
     "sweep": "sweeps.sweep",
 }
@@ -79,6 +81,7 @@ __all__ = [
     "Surface",
     "Time",
     "Tissue",
+    "export",
     "load_scene",
     "resume",
     "run",

@@ -12,7 +12,6 @@ import os
 import re
 import shlex
 import sys
-from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from functools import partial
@@ -23,20 +22,22 @@ import click
 
 from taichi_msm import __version__
 from taichi_msm.errors import DeviceError, FilesError, NotInstalledError, SceneError, did_you_mean, printable
-from taichi_msm.export.formats import FORMATS
+from taichi_msm.exports.formats import FORMATS
+from taichi_msm.results.entries import without_link
 from taichi_msm.system.signals import Interruption
 from taichi_msm.system.streams import mute, tell
 
 if TYPE_CHECKING:
     from taichi_msm.console import Progress
     from taichi_msm.physics.plan import Plan
-    from taichi_msm.sweeps.outcome import Outcome
 
 DONE, BUG, WRONG_INPUT, DIVERGED, FILES = 0, 1, 2, 3, 4
 # What may be given together with --resume, and with --again.
 RESUMABLE = ("resume", "threads", "quiet", "as_json")
 REPEATABLE = ("again", "out", "arch", "threads", "estimate_error", "quiet", "as_json")
 
+# So many files of an export are named at the end; more are counted.
+FEW = 2
 # Sweeps of more runs, or of more seconds, must be meant.
 MANY_RUNS, LONG = 10_000, 86400
 
@@ -414,7 +415,7 @@ def view(
 
 
 @program.command()
-@click.argument("directory", metavar="DIR")
+@click.argument("directories", metavar="DIR ...", nargs=-1, required=True)
 @click.option(
     "--format",
     "name",
@@ -423,28 +424,32 @@ def view(
     required=True,
     help="; ".join(f"{name}: {row.means}" for name, row in FORMATS.items()) + ".",
 )
-@click.option("--out", metavar="DIR2", help="Directory for the files.  [default: DIR/export-FORMAT]")
+@click.option(
+    "--out",
+    metavar="DIR2",
+    help="Directory for the files.  [default: DIR/export-FORMAT; of several DIR, output/export-FORMAT]",
+)
 @click.option("--quiet", is_flag=True, help="Print no progress and no summary.")
 @json_option
-def export(directory: str, name: str, out: str | None, quiet: bool, as_json: bool) -> int:
-    """Convert the results of a run, in DIR, to the formats of other programs."""
-    run = result_directory(directory, option="DIR")
-    folder = without_link(run / f"export-{name}", "--out") if out is None else result_directory(out)
+def export(directories: tuple[str, ...], name: str, out: str | None, quiet: bool, as_json: bool) -> int:
+    """Convert the results of runs and sweeps, each in a DIR, to the formats of other programs."""
+    runs = [result_directory(directory, option="DIR") for directory in directories]
+    folder = None if out is None else result_directory(out)
 
     from taichi_msm.console import Progress
-    from taichi_msm.export.convert import convert
+    from taichi_msm.exports import convert
 
     interruption = Interruption()
     try:
         with Progress(quiet=quiet or as_json) as bar:
-            done = convert(run, name, folder, partial(interruptible(bar, interruption), "export"))
+            done = convert.export(runs, name, folder, partial(interruptible(bar, interruption), "export"))
     except KeyboardInterrupt:
         return interrupted(interruption, as_json)
     if as_json:
-        print_json({"directory": str(folder), "format": name, **done._asdict()})
+        print_json({"directory": str(done.directory), "format": name, "files": done.files, "notes": done.notes})
     elif not quiet:
-        files = done.files[0] if len(done.files) == 1 else f"{len(done.files)} files"
-        click.echo(printable(f"{folder}: {files}"))
+        files = ", ".join(done.files) if len(done.files) <= FEW else f"{len(done.files)} files"
+        click.echo(printable(f"{done.directory}: {files}"))
         for note in done.notes:
             click.echo(printable(note))
     return DONE
@@ -475,50 +480,51 @@ def sweep(
     """Run a scene many times with varied values, as SWEEP says, and write a table of the results."""
     from taichi_msm.console import Progress
     from taichi_msm.sweeps.cost import choose_workers, estimate
-    from taichi_msm.sweeps.folder import values_in
-    from taichi_msm.sweeps.samples import values_of_runs
-    from taichi_msm.sweeps.summary import cost_line, summary_lines
-    from taichi_msm.sweeps.sweep import finish, opened, run_all
+    from taichi_msm.sweeps.folder import sort_out, values_in
+    from taichi_msm.sweeps.schedule import outcomes as take_all
+    from taichi_msm.sweeps.summary import cost_line, count, summary_lines
+    from taichi_msm.sweeps.sweep import finish, opened
     from taichi_msm.sweeps.sweepfile import cell, load_sweep
     from taichi_msm.sweeps.table import csv_line
 
     described = load_sweep(file)
     directory = result_directory(out, Path(file).stem)
-    settings = described.settings
-    values = values_of_runs(settings.vary, settings.samples, settings.seed)
-    cost = estimate(described, values)
-    chosen = choose_workers(cost, len(values))
-    said = cost_line(len(values), cost, chosen)
-    if dry_run and as_json:
-        print_json({"keys": described.keys, "values": values, **cost._asdict(), "workers": workers or chosen.number})
-    elif dry_run:
+    cost = estimate(described)
+    if dry_run:
+        values, chosen = described.values(), choose_workers(cost, described.runs)
+        if as_json:
+            facts = {**cost._asdict(), "workers": workers or chosen.number}
+            print_json({"keys": described.keys, "values": values, **facts})
+            return DONE
         click.echo(csv_line(["run", *described.keys]))
         for run, row in enumerate(values):
             click.echo(printable(csv_line([run, *map(cell, row)])))
-        click.echo(said)
-    if dry_run:
+        click.echo(cost_line(described.runs, cost, chosen))
         return DONE
-    if not yes and (len(values) > MANY_RUNS or cost.seconds > LONG):
+    if not yes and (described.runs > MANY_RUNS or cost.seconds > LONG):
+        said = cost_line(described.runs, cost, choose_workers(cost, described.runs))
         raise click.UsageError(f"{said}; add --yes if that is meant")
     values = values_in(directory, described)
+    outcomes, missing = sort_out(described, values, directory, shard or (1, 1))
+    total, chosen = len(outcomes) + len(missing), choose_workers(cost, len(missing))
     if not as_json:
-        tell([said])
+        tell([f"{len(outcomes)} of {total} runs have ended before"] if outcomes else [])
+        tell([cost_line(len(missing), cost.of(len(missing) / described.runs), chosen)] if missing else [])
     interruption = Interruption()
-    outcomes: list[Outcome] = []
     files: list[str] = []
     notes: list[str] = []
     try:
         with Progress(quiet=as_json) as bar, opened(None, workers or chosen.number) as executor:
             progress = interruptible(bar, interruption)
-            for outcome in run_all(described, values, directory, executor, progress, shard or (1, 1)):
+            for outcome in take_all(missing, executor, lambda: progress("runs", len(outcomes), total)):
                 outcomes.append(outcome)
             if shard is None:
                 files, notes = finish(described, values, directory, outcomes, executor, progress)
     except KeyboardInterrupt:
-        so_far = f"interrupted; {len(outcomes)} of {len(values)} runs have ended; the same command goes on"
+        so_far = f"interrupted; {len(outcomes)} of {total} runs have ended; the same command goes on"
         return interrupted(interruption, as_json, so_far)
-    counts = Counter(outcome.status for outcome in outcomes)
     if as_json:
+        counts = count(outcomes)
         print_json({"directory": str(directory), "runs": len(outcomes), **counts, "outputs": files, "notes": notes})
     else:
         click.echo("\n".join(map(printable, summary_lines(directory, outcomes, shard, files, notes))))
@@ -553,17 +559,6 @@ def result_directory(out: str | None, default: str = "", option: str = "--out") 
     if default in (".", ".."):
         raise click.BadParameter(f"the scene's name gives the folder output/{default}; name another", param_hint=option)
     return without_link(without_link(Path("output"), option) / default, option)
-
-
-def without_link(folder: Path, option: str) -> Path:
-    """Make sure that a folder which the user did not name is no symbolic link: it may have come with the scene."""
-    try:
-        is_link = folder.is_symlink()
-    except OSError as error:
-        raise FilesError(f"{folder}: {(error.strerror or str(error)).lower()}") from None
-    if is_link:
-        raise FilesError(f"{folder}: a symbolic link; name the folder it leads to with {option}")
-    return folder
 
 
 def going_on(directory: Path) -> str:

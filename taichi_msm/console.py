@@ -115,12 +115,13 @@ def summary(record: Mapping[str, Any], directory: Path) -> str:
     """Say in a few lines what a run did, how large its error is, and how long it took."""
     times, (rows, cols) = record["timings"], record["points"]
     stages = ", ".join(f"{stage} {seconds:.2f}" for stage, seconds in times.items() if stage != "total")
+    beside = times["encode"] > 0 and record["threads"] > 1
     lines = [
         f"{printable(str(directory))}: {record['frames']} frames, {record['steps']} steps of {record['step']:.4g} s in "
         f"{record['precision']}, {rows} x {cols} points, largest displacement {record['max_displacement']:.4g} m",
         *([f"the first {record['resumed']} frames were simulated by an earlier run"] if record["resumed"] else []),
         *(f"probes.{index}: {in_words(probe)}" for index, probe in enumerate(record["probes"])),
         *record["notes"],
-        f"{times['total']:.2f} s: {stages}{' (encoding runs in parallel)' if times['encode'] > 0 else ''}",
+        f"{times['total']:.2f} s: {stages}{' (encoding runs in parallel)' if beside else ''}",
     ]
     return "\n".join(lines)

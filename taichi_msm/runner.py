@@ -89,13 +89,14 @@ def run(
 ) -> RunRecord:
     """Simulate a scene and write its results, whole or not at all.
 
-    An unfinished run of the same scene in the same directory is continued: the results have the same bits.
+    An unfinished run of the same scene in the same directory is continued: the results have the same bits. Without any
+    output, and with an estimate of the error, it begins anew, as the estimate needs the frames that were not kept.
 
     Args:
         scene: what `load_scene` returned, or the same as a mapping.
         directory: where frames/, animation.gif, trajectory.npz and run.json go.
         arch: cpu, cuda or vulkan.
-        threads: number of CPU threads; None takes every core.
+        threads: number of CPU threads; None takes every core. With 1, pictures are encoded in this process too.
         overrides: the overrides that made the scene, for the record.
         estimate_error: whether to estimate the error of the run, by pilots; None: if they take at most two fifths of
             the run. For a tolerance in the scene it is estimated in any case.
@@ -142,7 +143,7 @@ def run(
         given, plan.scene, tuple(overrides), estimate, mesh, estimate_error, here, arch, sha256, versions()
     )
     task = _Task(manifest, plan, texture, device, folder)
-    if begun := _begun(manifest, folder):
+    if begun := _begun(task):
         with suppress(DamagedError):
             return _carry_out(task._replace(manifest=_with_versions(begun)), watch, progress, resumes=True)
     return _carry_out(task, watch, progress, resumes=False)
@@ -184,13 +185,16 @@ def resume(
     return _carry_out(task, watch, progress, resumes=True)
 
 
-def _begun(manifest: Manifest, directory: Path) -> Manifest | None:
-    """Find the unfinished run in a directory whose results have the same bits as those of this one."""
+def _begun(task: _Task) -> Manifest | None:
+    """Find the unfinished run in the directory that leads to the same bits, and to the same estimate of their error."""
+    manifest = task.manifest
     try:
-        unfinished, _ = read_manifest(directory)
+        unfinished, _ = read_manifest(task.directory)
     except (FilesError, SceneError):
         return None
-    return replace(manifest, versions=unfinished.versions) if manifest.gives_the_bits_of(unfinished) else None
+    if not manifest.gives_the_bits_of(unfinished) or _pilots(task, resumed=True) != _pilots(task, resumed=False):
+        return None
+    return replace(manifest, versions=unfinished.versions)
 
 
 def _with_versions(begun: Manifest) -> Manifest:
@@ -234,13 +238,15 @@ class _Run:
         self._frames = plan.grid.frames + 1
         progress("compile", 0, self._frames)
         cores = free_cores(plan)
+        # With one thread there is no core for an encoder beside the simulation.
+        beside = device.threads > 1
         # In this order, so that the encoder starts up while kernels are compiled.
         self._writer = opened.enter_context(
-            ResultWriter(task.directory, plan.scene, plan.grid, manifest.as_json(), resumes=resumes)
+            ResultWriter(task.directory, plan.scene, plan.grid, manifest.as_json(), resumes=resumes, beside=beside)
         )
         self._simulation = opened.enter_context(Simulation(plan, device.arch, device.threads, task.texture, cores))
         self._resumed = self._writer.stored
-        pilots = _pilots(manifest, plan, device, resumed=self._resumed > 0)
+        pilots = _pilots(task, resumed=self._resumed > 0)
         self._error: RunError | None = None
         self._known = Known(manifest.estimate, pilots.reason, manifest.mesh)
         if not pilots.reason:
@@ -361,16 +367,17 @@ class _Run:
                 self._writer.save(self._simulation.save())
 
 
-def _pilots(manifest: Manifest, plan: Plan, device: Device, *, resumed: bool) -> Pilots:
+def _pilots(task: _Task, *, resumed: bool) -> Pilots:
     """Choose the pilots of a run, or say why there are none."""
-    asked = manifest.asks_estimate
+    asked = task.manifest.asks_estimate
     if asked is False:
         return Pilots(reason="not asked for")
-    if asked is None and device.arch != "cpu":
+    if asked is None and task.device.arch != "cpu":
         return Pilots(reason="on a GPU, this needs --estimate-error")
-    if resumed and not plan.scene.output:
+    pilots = choose_pilots(task.plan, asked=asked is True)
+    if not pilots.reason and resumed and not task.plan.scene.output:
         return Pilots(reason="the frames before the interruption were not kept")
-    return choose_pilots(plan, asked=asked is True)
+    return pilots
 
 
 def _facts(task: _Task, progress: RunProgress, known: Known) -> dict[str, Any]:

@@ -22,7 +22,7 @@ LAYERS = [
     {"scenefile"},
     {"simulation", "results"},
     {"runner", "playback", "console"},
-    {"export", "study", "sweeps", "viewer"},
+    {"exports", "study", "sweeps", "viewer"},
     {"cli"},
     {"__main__", "__init__"},
 ]

@@ -251,14 +251,23 @@ def test_a_simulation_that_runs_away_stops_with_3(small: Path, program: Program)
 
 
 @pytest.mark.parametrize(
-    ("number", "code", "stopped"),
-    [(signal.SIGINT, 130, False), (signal.SIGTERM, 143, False), (signal.SIGTERM, 143, True)],
+    ("number", "code", "threads", "stopped"),
+    [
+        (signal.SIGINT, 130, "1", False),
+        (signal.SIGINT, 130, "2", False),
+        (signal.SIGTERM, 143, "2", False),
+        (signal.SIGTERM, 143, "2", True),
+    ],
 )
-def test_a_signal_keeps_the_frames_so_far(number: signal.Signals, code: int, stopped: bool, small: Path) -> None:
-    """Also while the encoder, stopped by somebody, takes no more pictures."""
+def test_a_signal_keeps_the_frames_so_far(
+    number: signal.Signals, code: int, threads: str, stopped: bool, small: Path
+) -> None:
+    """Also while the encoder, stopped by somebody, takes no more pictures; with one thread there is no encoder."""
     settings = ["--set", "time.duration=2000", "--set", "render.size=[400,300]", "--set", "output=[png, trajectory]"]
-    with Telling("run", "small.yaml", "--out", "long", *settings, stderr=subprocess.PIPE) as process:
+    command = ["run", "small.yaml", "--out", "long", "--threads", threads, *settings]
+    with Telling(*command, stderr=subprocess.PIPE) as process:
         process.until("frames", 9)
+        assert len(children(process.pid)) == (threads != "1")
         if stopped:
             for child in children(process.pid):
                 os.kill(child, signal.SIGSTOP)

@@ -21,7 +21,7 @@ from PIL import Image
 
 import taichi_msm
 from taichi_msm import cli, scene
-from taichi_msm.export.formats import FORMATS
+from taichi_msm.exports.formats import FORMATS
 from taichi_msm.outputs.table import OUTPUTS
 from taichi_msm.results.record import ErrorRecord, RunRecord
 from taichi_msm.runner import run
@@ -37,7 +37,10 @@ README = ROOT / "README.md"
 DOCS = ROOT / "docs"
 PAGES = [README, ROOT / "CONTRIBUTING.md", ROOT / "CHANGELOG.md", *sorted(DOCS.glob("**/*.md"))]
 # Those with commands, in an order in which each finds the results that it reads.
-WITH_COMMANDS = [README, *(DOCS / f"{name}.md" for name in ("scene", "labels", "export", "error", "view", "study"))]
+WITH_COMMANDS = [
+    README,
+    *(DOCS / f"{name}.md" for name in ("scene", "labels", "sweep", "export", "error", "view", "study")),
+]
 SCENES = sorted(path.stem for path in (ROOT / "scenes").glob("*.yaml"))
 
 README_LINES = 200
@@ -47,6 +50,7 @@ SMALLER = {
     r"points: \[\d+, \d+\]": "points: [13, 13]",
     r"size: \[\d+, \d+\]": "size: [48, 48]",
     r"duration: \S+": "duration: 0.2",
+    r"samples: \d+": "samples: 4",
 }
 
 
@@ -105,11 +109,12 @@ def small_scenes(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     folder.mkdir()
     for name in ("textures", "scripts"):
         shutil.copytree(ROOT / "scenes" / name, folder / name)
-    for name in SCENES:
-        text = read(ROOT / "scenes" / f"{name}.yaml")
+    shutil.copytree(ROOT / "scenes" / "sweeps", folder / "sweeps")
+    for path in [*(ROOT / "scenes").glob("*.yaml"), *(ROOT / "scenes" / "sweeps").glob("*.yaml")]:
+        text = read(path)
         for pattern, smaller in SMALLER.items():
             text = re.sub(pattern, smaller, text)
-        (folder / f"{name}.yaml").write_text(text, encoding="utf-8")
+        (folder / path.relative_to(ROOT / "scenes")).write_text(text, encoding="utf-8")
     Image.fromarray(speckle(90, 120)).save(tmp_path / "photo.jpg")
     monkeypatch.chdir(tmp_path)
     return tmp_path
@@ -137,6 +142,7 @@ def test_every_link_leads_somewhere(page: Path) -> None:
 
 def test_what_is_shown_is_what_is_shipped() -> None:
     assert blocks(DOCS / "scene.md", "yaml") == [read(ROOT / "scenes" / "press.yaml")]
+    assert blocks(DOCS / "sweep.md", "yaml") == [read(ROOT / "scenes" / "sweeps" / "stiffness.yaml")]
     assert blocks(DOCS / "view.md", "yaml") == [read(ROOT / "scenes" / "scripts" / "press.yaml")]
 
 
@@ -243,11 +249,15 @@ def test_the_python_shown_runs(tmp_path: Path) -> None:
     (tmp_path / "example.py").write_text(labels)
     done = subprocess.run([sys.executable, "example.py"], cwd=tmp_path, check=True, capture_output=True, text=True)
     assert done.stdout == "(512, 512, 2) (512, 512) (512, 512, 2) (512, 512)\n"
+    (tmp_path / "example.py").write_text(blocks(DOCS / "export.md", "python")[0])
+    done = subprocess.run([sys.executable, "example.py"], cwd=tmp_path, check=True, capture_output=True, text=True)
+    written = ["000000/surface.glb", "000001/surface.glb", "index.csv"]
+    assert done.stdout == f"{Path('output', 'export-gltf')} {written}\n"
     assert (tmp_path / "output" / "from-python" / "animation.gif").exists()
 
 
-# Those whose examples stand in their docstrings. The example of Playback reads what that of run writes.
-WITH_EXAMPLES = ["run", "Playback", "load_scene", "Scene", "Simulation"]
+# Those whose examples stand in their docstrings. Those of Playback and export read what that of run writes.
+WITH_EXAMPLES = ["run", "Playback", "export", "load_scene", "Scene", "Simulation"]
 
 
 @pytest.mark.parametrize("name", WITH_EXAMPLES)

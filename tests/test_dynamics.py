@@ -491,8 +491,8 @@ def test_rests_grow_while_workers_give_up_and_are_forgotten_when_they_do_not(
     device: Device, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     made = scene(sheet={**SHEET, "points": [21, 19]}, time={"precision": "f32"})
-    sweep = dynamics_of(made, device, replace(structure_of(made, device), workers=2))._moving
-    assert isinstance(sweep, kernel_cpu.Sweep)
+    scatter = dynamics_of(made, device, replace(structure_of(made, device), workers=2))._moving
+    assert isinstance(scatter, kernel_cpu.Scatter)
     now, taken, patient = 0.0, [0, 0], False
 
     def alone(done: int, end: int, *_: object) -> None:
@@ -512,17 +512,17 @@ def test_rests_grow_while_workers_give_up_and_are_forgotten_when_they_do_not(
         waited += 1
         return waited
 
-    monkeypatch.setattr(sweep, "_advance_alone", alone)
-    monkeypatch.setattr(sweep, "_launch_together", together)
+    monkeypatch.setattr(scatter, "_advance_alone", alone)
+    monkeypatch.setattr(scatter, "_launch_together", together)
     monkeypatch.setattr("time.perf_counter", lambda: now)
     monkeypatch.setattr("time.process_time", lambda: next(had))
     # As long as nobody wants our cores, a worker that gives up is an accident, and rests stay the shortest.
     monkeypatch.setattr(resources, "waited_for_cores", lambda: 0.0)
-    sweep.advance(10_000, np.empty(0))
+    scatter.advance(10_000, np.empty(0))
     assert taken[1] > 1000
     taken = [0, 0]
     monkeypatch.setattr(resources, "waited_for_cores", wait_as_long_as_we_run)
-    sweep.advance(10_000, np.empty(0))
+    scatter.advance(10_000, np.empty(0))
     assert sum(taken) == 10_000
     assert taken[1] < 100
     # During a rest nobody waits, which makes the next one no shorter.
@@ -530,13 +530,13 @@ def test_rests_grow_while_workers_give_up_and_are_forgotten_when_they_do_not(
     with monkeypatch.context() as patch:
         patch.setattr("time.process_time", lambda: now)
         patch.setattr(resources, "waited_for_cores", lambda: 0.001 * taken[1])
-        sweep.advance(10_000, np.empty(0))
+        scatter.advance(10_000, np.empty(0))
     assert taken[1] < 200
     # Undisturbed for minutes, and then disturbed once: the rest is the shortest again.
     patient = True
-    sweep.advance(1_000_000, np.empty(0))
+    scatter.advance(1_000_000, np.empty(0))
     patient, taken = False, [0, 0]
-    sweep.advance(5, np.empty(0))
+    scatter.advance(5, np.empty(0))
     # One step in each launch of all; the rest of 2 ms takes pieces of one and two steps.
     assert taken == [3, 2]
 
@@ -545,11 +545,11 @@ def test_giving_up_in_the_last_pass_of_a_launch_counts(device: Device, monkeypat
     made = scene(sheet={**SHEET, "points": [101, 101]}, time={"precision": "f32"})
     monkeypatch.setattr(kernel_cpu, "PATIENCE", 0)
     dynamics = dynamics_of(made, device, replace(structure_of(made, device), workers=2, depth=8))
-    sweep = dynamics._moving
-    assert isinstance(sweep, kernel_cpu.Sweep)
+    scatter = dynamics._moving
+    assert isinstance(scatter, kernel_cpu.Scatter)
     for _ in range(200):
         dynamics.advance(8)
-    assert sweep._rests_until > 0
+    assert scatter._rests_until > 0
 
 
 def test_a_sheet_that_was_interrupted_while_stepping_is_not_used(

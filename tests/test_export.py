@@ -6,6 +6,7 @@ import errno
 import json
 import subprocess
 import sys
+from collections.abc import Iterator
 from importlib import import_module
 from pathlib import Path
 
@@ -16,9 +17,9 @@ from PIL import Image
 
 from taichi_msm import console
 from taichi_msm.errors import FilesError, ForeignError
-from taichi_msm.export import obj
-from taichi_msm.export.convert import convert
-from taichi_msm.export.formats import FORMATS
+from taichi_msm.exports import obj
+from taichi_msm.exports.convert import export
+from taichi_msm.exports.formats import FORMATS
 from taichi_msm.results import entries
 from taichi_msm.results.finished_run import PUT_BACK, read_run
 from taichi_msm.runner import run
@@ -31,19 +32,19 @@ from tests.test_finished_run import RUN_AGAIN, change, change_scene, rewrite
 
 def exported(results: Path, out: Path) -> list[str]:
     """Export as OBJ, which takes nothing but a trajectory, to a folder."""
-    return convert(results, "obj", out).files
+    return export(results, "obj", out).files
 
 
 def test_every_format_has_its_module() -> None:
     for name in FORMATS:
-        assert callable(import_module(f"taichi_msm.export.{name}").write)
+        assert callable(import_module(f"taichi_msm.exports.{name}").write)
 
 
 def test_files_go_beside_the_results(results: Path, program: Program, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(results.parent)
     before = files(results)
     done = program("export", "results", "--format", "obj")
-    assert (done.returncode, done.stdout, done.stderr) == (0, "results/export-obj: 7 files\n", "")
+    assert (done.returncode, done.stdout, done.stderr) == (0, "results/export-obj: 8 files\n", "")
     names = [f"export-obj/{name}" for name in ("0000.obj", "0004.obj", "picture.png", "surface.mtl")]
     written = files(results)
     assert set(names) < set(written)
@@ -54,9 +55,11 @@ def test_json_is_all_there_is_on_stdout(results: Path, program: Program) -> None
     done = program("export", str(results), "--format", "gltf", "--out", str(results / "here"), "--json")
     assert (done.returncode, done.stderr) == (0, "")
     here = str(results / "here")
-    assert json.loads(done.stdout) == {"directory": here, "format": "gltf", "files": ["surface.glb"], "notes": []}
+    names = ["index.csv", "surface.glb"]
+    assert json.loads(done.stdout) == {"directory": here, "format": "gltf", "files": names, "notes": []}
     assert program("export", str(results), "--format", "gltf", "--quiet").stdout == ""
-    assert program("export", str(results), "--format", "gltf").stdout == f"{results}/export-gltf: surface.glb\n"
+    done = program("export", str(results), "--format", "gltf")
+    assert done.stdout == f"{results}/export-gltf: index.csv, surface.glb\n"
 
 
 def test_another_process_gives_the_same_bytes(results: Path) -> None:
@@ -90,7 +93,7 @@ def test_another_process_gives_the_same_bytes(results: Path) -> None:
         ),
         (["results"], 2, "taichi-msm: Missing option '--format'."),
         (["results", "--format", "fbx"], 2, "taichi-msm: Invalid value for '--format': 'fbx' is not one of"),
-        (["--format", "obj"], 2, "taichi-msm: Missing argument 'DIR'."),
+        (["--format", "obj"], 2, "taichi-msm: Missing argument 'DIR ...'."),
     ],
 )
 def test_what_is_wrong_is_one_line(
@@ -161,7 +164,7 @@ def test_two_exports_do_not_write_into_one_folder(results: Path) -> None:
                 exported(results, out)
             refused.append(str(caught.value))
 
-    names = convert(results, "obj", out, second).files
+    names = export(results, "obj", out, second).files
     assert refused == [f"{out}: another export is writing there; choose another --out"]
     assert set(files(out)) == {*names, "export.json"}
 
@@ -169,13 +172,13 @@ def test_two_exports_do_not_write_into_one_folder(results: Path) -> None:
 KILLED = """
 import os, signal, sys
 from pathlib import Path
-from taichi_msm.export.convert import convert
+from taichi_msm.exports.convert import export
 
 def progress(done, total):
     if done == 3:
         os.kill(os.getpid(), signal.SIGKILL)
 
-convert(Path(sys.argv[1]), "obj", Path(sys.argv[2]), progress)
+export(Path(sys.argv[1]), "obj", Path(sys.argv[2]), progress)
 """
 
 
@@ -191,7 +194,7 @@ def test_an_export_that_is_killed_is_known_to_the_next_one(name: str, results: P
     left = {path: data for path, data in files(out).items() if not path.startswith(".")}
     assert left == before
     assert set(files(out)) > set(before), "it had begun"
-    names = convert(results, name, out).files
+    names = export(results, name, out).files
     assert {path.name for path in out.iterdir()} == {*names, "export.json"}
 
 
@@ -233,7 +236,7 @@ def test_many_files_are_compared_in_time_proportional_to_their_number(
         return kind(path)
 
     monkeypatch.setattr(entries, "kind", counted)
-    assert len(exported(results, out)) == 7
+    assert len(exported(results, out)) == 8
     # A name is looked up some times, and never beside each of the others.
     assert count < len(calls) < 10 * count < count**2
 
@@ -260,7 +263,7 @@ def test_a_run_that_publishes_meanwhile_is_noticed(moment: int, results: Path, d
 
     begun = (results / "trajectory.npz").stat().st_mtime_ns
     with pytest.raises(FilesError) as caught:
-        convert(results, "obj", out, publish)
+        export(results, "obj", out, publish)
     assert str(caught.value) == f"{results}: another run replaced these results while they were read; try again"
     assert files(out) == before
 
@@ -271,7 +274,7 @@ def test_results_that_go_meanwhile_are_no_fault_of_the_files(results: Path) -> N
         (results / "trajectory.npz").unlink(missing_ok=True)
 
     with pytest.raises(FilesError, match="another run replaced these results"):
-        convert(results, "obj", results / "here", take_away)
+        export(results, "obj", results / "here", take_away)
 
 
 def secret(results: Path) -> str:
@@ -328,8 +331,8 @@ def test_positions_that_no_run_reaches_are_damage(name: str, results: Path, prog
 
 
 def test_numbers_that_a_format_cannot_hold_are_one_line(results: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    def overflow(*_: object) -> list[str]:
-        return [str(np.float32(1) * np.array([1e300]).astype(np.float32))]
+    def overflow(*_: object) -> Iterator[list[str]]:
+        yield [str(np.float32(1) * np.array([1e300]).astype(np.float32))]
 
     monkeypatch.setattr(obj, "write", overflow)
     with pytest.raises(FilesError, match="its numbers are too large for obj; run the scene again"):
@@ -366,7 +369,7 @@ def test_what_no_export_has_written_is_not_touched(name: str, results: Path, pro
     (out / name).write_text("mine")
     calls = []
     with pytest.raises(ForeignError) as refused:
-        convert(results, "obj", out, lambda done, total: calls.append(done))
+        export(results, "obj", out, lambda done, total: calls.append(done))
     assert calls == [0], "before anything is made"
     assert str(refused.value).startswith(f"{out / name.partition('/')[0]}: a f")
     assert files(out) == {name: b"mine"}
@@ -411,7 +414,7 @@ def test_a_full_disk_leaves_the_earlier_files(results: Path, monkeypatch: pytest
 def test_an_interrupted_export_changes_nothing(name: str, results: Path) -> None:
     pytest.importorskip("vtkmodules" if name == "vtk" else "numpy")
     out = results / "here"
-    convert(results, name, out)
+    export(results, name, out)
     before, calls = files(out), []
 
     def interrupt(done: int, total: int) -> None:
@@ -420,7 +423,7 @@ def test_an_interrupted_export_changes_nothing(name: str, results: Path) -> None
             raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):
-        convert(results, name, out, interrupt)
+        export(results, name, out, interrupt)
     assert calls[0] == (0, 5)
     assert [done for done, _ in calls[1:]] == [0, 1, 2, 3], "it says how far it is, frame by frame"
     assert files(out) == before

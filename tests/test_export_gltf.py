@@ -15,10 +15,10 @@ import pytest
 from numpy.typing import NDArray
 from PIL import Image
 
-from taichi_msm.export import gltf
-from taichi_msm.export.convert import convert
-from taichi_msm.export.gltf import key_frames
-from taichi_msm.export.mesh import unit_normals
+from taichi_msm.exports import gltf
+from taichi_msm.exports.convert import export
+from taichi_msm.exports.gltf import key_frames
+from taichi_msm.exports.mesh import unit_normals
 from tests.scenes import speckle
 
 Array = NDArray[Any]
@@ -86,7 +86,7 @@ def read_glb(path: Path) -> Glb:
 @pytest.fixture(scope="module")
 def glb(ran: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     out = tmp_path_factory.mktemp("gltf")
-    assert convert(ran, "gltf", out).notes == []
+    assert export(ran, "gltf", out).notes == []
     return out / "surface.glb"
 
 
@@ -159,7 +159,7 @@ def changed(results: Path, **sections: Any) -> None:
 
 def test_the_part_of_the_picture_that_the_sheet_has(results: Path) -> None:
     changed(results, scene={"region": [5, 7, 20, 10]})
-    convert(results, "gltf", results / "out")
+    export(results, "gltf", results / "out")
     found = read_glb(results / "out" / "surface.glb")
     (image,) = found.document["images"]
     picture = np.asarray(Image.open(io.BytesIO(found.view(image["bufferView"]))))
@@ -168,7 +168,7 @@ def test_the_part_of_the_picture_that_the_sheet_has(results: Path) -> None:
 
 def without_picture(results: Path) -> Path:
     changed(results, scene={"image": None, "output": ["trajectory"]})
-    convert(results, "gltf", results / "bare")
+    export(results, "gltf", results / "bare")
     return results / "bare" / "surface.glb"
 
 
@@ -176,7 +176,7 @@ def with_one_frame(results: Path) -> Path:
     first = positions(results)[:1]
     np.savez(results / "trajectory.npz", time=np.zeros(1), position=first)
     changed(results, frames=1)
-    convert(results, "gltf", results / "still")
+    export(results, "gltf", results / "still")
     return results / "still" / "surface.glb"
 
 
@@ -277,7 +277,7 @@ def test_more_key_frames_than_are_needed_are_not_taken() -> None:
 
 def test_a_run_of_many_frames_is_told_by_key_frames(ran: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(gltf, "MOST_TARGETS", 2)
-    done = convert(ran, "gltf", tmp_path)
+    done = export(ran, "gltf", tmp_path)
     found, expected = read_glb(tmp_path / "surface.glb"), positions(ran)
     keys = key_frames(expected, 3)
     assert len(found.primitive["targets"]) == 2
@@ -292,6 +292,6 @@ def test_a_sheet_of_many_points_has_fewer_key_frames(
 ) -> None:
     """So that a file stays of a size that browsers load."""
     monkeypatch.setattr(gltf, "MOST_BYTES", 3 * 99 * 24)
-    convert(ran, "gltf", tmp_path)
+    export(ran, "gltf", tmp_path)
     targets = read_glb(tmp_path / "surface.glb").primitive["targets"]
     assert len(targets) == 3

@@ -16,8 +16,8 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from taichi_msm.errors import FilesError
-from taichi_msm.export.convert import convert
-from taichi_msm.export.kitti import encode, png16
+from taichi_msm.exports.convert import export
+from taichi_msm.exports.kitti import encode, png16
 from taichi_msm.outputs.flo import read_flo
 from taichi_msm.results.finished_run import reading
 from tests.outputs import files
@@ -68,7 +68,7 @@ def decode(colours: NDArray[np.uint16]) -> tuple[NDArray[np.float64], NDArray[np
 
 
 def test_flow_comes_back(labelled: Path) -> None:
-    done = convert(labelled, "kitti", labelled / "out")
+    done = export(labelled, "kitti", labelled / "out")
     training = labelled / "out" / "training"
     assert done.notes == []
     for pair in range(PAIRS):
@@ -85,7 +85,7 @@ def test_flow_comes_back(labelled: Path) -> None:
 
 
 def test_every_pair_has_its_two_pictures(labelled: Path) -> None:
-    convert(labelled, "kitti", labelled / "out")
+    export(labelled, "kitti", labelled / "out")
     written = files(labelled / "out" / "training")
     kinds = ["flow_noc/{}_10.png", "flow_occ/{}_10.png", "image_2/{}_10.png", "image_2/{}_11.png"]
     assert sorted(written) == sorted(kind.format(f"{pair:06}") for pair in range(PAIRS) for kind in kinds)
@@ -129,7 +129,7 @@ def test_a_picture_of_16_bits_comes_back(shape: tuple[int, int], tmp_path: Path)
 def test_what_is_not_there_is_left_out_and_said(labelled: Path) -> None:
     shutil.rmtree(labelled / "occlusion")
     shutil.rmtree(labelled / "frames")
-    done = convert(labelled, "kitti", labelled / "out")
+    done = export(labelled, "kitti", labelled / "out")
     assert [path.name for path in (labelled / "out" / "training").iterdir()] == ["flow_occ"]
     again = "is not among the results; run the scene again with --set"
     assert done.notes == [
@@ -142,7 +142,7 @@ def test_one_frame_has_no_flow(labelled: Path) -> None:
     record = json.loads((labelled / "run.json").read_text())
     (labelled / "run.json").write_text(json.dumps(record | {"frames": 1}))
     with pytest.raises(FilesError) as caught:
-        convert(labelled, "kitti", labelled / "out")
+        export(labelled, "kitti", labelled / "out")
     said = "has only one frame, and flow needs two; run the scene to its end"
     assert str(caught.value) == f"{labelled}: {said}"
 
@@ -189,7 +189,7 @@ def test_damaged_flow_is_one_line(data: bytes, tmp_path: Path) -> None:
 def test_a_damaged_file_is_named_and_nothing_is_written(name: str, change: Any, said: str, labelled: Path) -> None:
     change(labelled / name)
     with pytest.raises(FilesError) as caught:
-        convert(labelled, "kitti", labelled / "out")
+        export(labelled, "kitti", labelled / "out")
     assert str(caught.value).startswith(str(labelled / name))
     assert said in str(caught.value)
     assert "run the scene again" in str(caught.value)

@@ -9,15 +9,15 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from taichi_msm.export.convert import convert
-from taichi_msm.export.mesh import unit_normals
+from taichi_msm.exports.convert import export
+from taichi_msm.exports.mesh import unit_normals
 from tests.scenes import speckle
 
 
 @pytest.fixture(scope="module")
 def out(ran: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     out = tmp_path_factory.mktemp("obj")
-    convert(ran, "obj", out)
+    export(ran, "obj", out)
     return out
 
 
@@ -61,5 +61,5 @@ def test_a_run_without_a_picture(results: Path) -> None:
     record = json.loads((results / "run.json").read_text())
     record["scene"] |= {"image": None, "output": ["trajectory"]}
     (results / "run.json").write_text(json.dumps(record))
-    assert "picture.png" not in convert(results, "obj", results / "out").files
+    assert "picture.png" not in export(results, "obj", results / "out").files
     assert rows(results / "out" / "surface.mtl", "map_Kd") == []

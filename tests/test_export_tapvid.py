@@ -12,8 +12,8 @@ import pytest
 from PIL import Image
 
 from taichi_msm.errors import FilesError
-from taichi_msm.export import tapvid
-from taichi_msm.export.convert import convert
+from taichi_msm.exports import tapvid
+from taichi_msm.exports.convert import export
 
 WIDTH, HEIGHT, FRAMES, TRACKS = 40, 30, 5, 6
 
@@ -35,8 +35,8 @@ def tracked(results: Path) -> Path:
 
 
 def test_tracks_come_back(tracked: Path) -> None:
-    done = convert(tracked, "tapvid", tracked / "out")
-    assert (done.files, done.notes) == (["tapvid.pkl"], [])
+    done = export(tracked, "tapvid", tracked / "out")
+    assert (done.files, done.notes) == (["index.csv", "tapvid.pkl"], [])
     with (tracked / "out" / "tapvid.pkl").open("rb") as file:
         data = pickle.load(file)
     assert list(data) == ["results"]
@@ -60,7 +60,7 @@ def test_a_point_at_the_corner_of_the_picture_is_at_1(tracked: Path) -> None:
     points = np.zeros((2, FRAMES, 2), np.float32)
     points[0], points[1] = (0.5, 0.5), (WIDTH, HEIGHT)
     np.savez(tracked / "tracks.npz", points=points, occluded=np.zeros((2, FRAMES), bool))
-    convert(tracked, "tapvid", tracked / "out")
+    export(tracked, "tapvid", tracked / "out")
     with (tracked / "out" / "tapvid.pkl").open("rb") as file:
         found = pickle.load(file)["results"]["points"]
     np.testing.assert_array_equal(found[:, 0], np.array([[0.5 / WIDTH, 0.5 / HEIGHT], [1, 1]], np.float32))
@@ -68,7 +68,7 @@ def test_a_point_at_the_corner_of_the_picture_is_at_1(tracked: Path) -> None:
 
 def test_any_numpy_reads_the_pickle(tracked: Path) -> None:
     """It names nothing but what all versions have, and its arrays can be changed."""
-    convert(tracked, "tapvid", tracked / "out")
+    export(tracked, "tapvid", tracked / "out")
     data = (tracked / "out" / "tapvid.pkl").read_bytes()
     named = [text for operation, text, _ in pickletools.genops(data) if operation.name == "SHORT_BINUNICODE"]
     of_numpy = {"numpy", "ndarray", "dtype", "u1", "f4", "b1", "|", "<"}
@@ -97,7 +97,7 @@ def altered(**arrays: Any) -> dict[str, Any]:
 def test_damaged_tracks_are_one_line(arrays: dict[str, Any], tracked: Path) -> None:
     np.savez(tracked / "tracks.npz", **arrays)
     with pytest.raises(FilesError) as caught:
-        convert(tracked, "tapvid", tracked / "out")
+        export(tracked, "tapvid", tracked / "out")
     assert str(caught.value) == f"{tracked / 'tracks.npz'}: damaged, or not of this run; run the scene again"
     assert not (tracked / "out").exists()
 
@@ -106,20 +106,20 @@ def test_compressed_tracks_are_refused(tracked: Path) -> None:
     """What is compressed may be of any size, whatever the file says."""
     np.savez_compressed(tracked / "tracks.npz", **made_up())
     with pytest.raises(FilesError, match="damaged"):
-        convert(tracked, "tapvid", tracked / "out")
+        export(tracked, "tapvid", tracked / "out")
 
 
 def test_a_video_that_does_not_fit_is_told_of(tracked: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(tapvid, "available_memory", lambda: 6 * FRAMES * WIDTH * HEIGHT - 1)
     with pytest.raises(FilesError, match=r"its video takes 0\.0 GiB of memory.*a smaller render\.size or fewer frames"):
-        convert(tracked, "tapvid", tracked / "out")
+        export(tracked, "tapvid", tracked / "out")
     monkeypatch.setattr(tapvid, "available_memory", lambda: 6 * FRAMES * WIDTH * HEIGHT)
-    convert(tracked, "tapvid", tracked / "out")
+    export(tracked, "tapvid", tracked / "out")
 
 
 def test_frames_are_needed(tracked: Path) -> None:
     (tracked / "frames").rename(tracked / "elsewhere")
     with pytest.raises(FilesError) as caught:
-        convert(tracked, "tapvid", tracked / "out")
+        export(tracked, "tapvid", tracked / "out")
     again = 'run the scene again with --set "output=[png,gif,trajectory,tracks]"'
     assert str(caught.value) == f"{tracked}: tapvid needs png; {again}"

@@ -11,8 +11,8 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from taichi_msm.export.convert import convert
-from taichi_msm.export.vtk import speed
+from taichi_msm.exports.convert import export
+from taichi_msm.exports.vtk import speed
 from taichi_msm.physics.lattice import rest_positions
 from taichi_msm.physics.material import area_shares
 from taichi_msm.results.finished_run import read_run
@@ -24,7 +24,7 @@ from tests.conftest import Program
 def out(ran: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     pytest.importorskip("vtkmodules")
     out = tmp_path_factory.mktemp("vtk")
-    convert(ran, "vtk", out)
+    export(ran, "vtk", out)
     return out
 
 

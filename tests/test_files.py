@@ -8,7 +8,9 @@ import shutil
 import signal
 import subprocess
 import sys
+import time
 import zipfile
+from _thread import interrupt_main
 from collections.abc import Callable
 from pathlib import Path
 from threading import Event
@@ -20,8 +22,10 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from taichi_msm.errors import FilesError
+from taichi_msm.outputs import gif
 from taichi_msm.render.labels import Observed
-from taichi_msm.results.encoder import Encoder, Job, encode
+from taichi_msm.results.encoder import Encoder, encode
+from taichi_msm.results.pictures import Job
 from taichi_msm.results.writer import ResultWriter
 from taichi_msm.scene import Scene
 from tests.outputs import files
@@ -66,8 +70,8 @@ def picture(frame: int) -> NDArray[np.uint8]:
     return speckle(HEIGHT, WIDTH, frame)
 
 
-def write(directory: Path, frames: int, scene: Scene) -> list[str]:
-    with ResultWriter(directory, *scene_and_grid(scene)) as writer:
+def write(directory: Path, frames: int, scene: Scene, *, beside: bool = True) -> list[str]:
+    with ResultWriter(directory, *scene_and_grid(scene), beside=beside) as writer:
         for frame in range(frames):
             writer.add(position(frame), Observed(picture(frame) if scene.draws else None))
         names: list[str] = writer.publish({})["outputs"]
@@ -90,9 +94,10 @@ def test_all_results_of_a_run(tmp_path: Path) -> None:
     assert json.loads(found["run.json"]) == {"frames": 11, "outputs": names}
 
 
-def test_equal_runs_write_equal_bytes(tmp_path: Path) -> None:
-    for name in ("first", "second"):
-        write(tmp_path / name, 7, small_scene())
+@pytest.mark.parametrize("beside", [True, False])
+def test_equal_runs_write_equal_bytes(beside: bool, tmp_path: Path) -> None:
+    for name, other in (("first", True), ("second", beside)):
+        write(tmp_path / name, 7, small_scene(), beside=other)
     assert files(tmp_path / "first") == files(tmp_path / "second")
 
 
@@ -158,11 +163,12 @@ def test_the_animation_is_like_its_frames(tmp_path: Path, light: float) -> None:
     assert np.abs(shown - later).max() <= 28
 
 
-def test_leaving_without_publishing_leaves_what_was_there(tmp_path: Path) -> None:
+@pytest.mark.parametrize("beside", [True, False])
+def test_leaving_without_publishing_leaves_what_was_there(beside: bool, tmp_path: Path) -> None:
     write(tmp_path / "out", 3, small_scene())
     before = files(tmp_path / "out")
     for directory in (tmp_path / "out", tmp_path / "fresh"):
-        with ResultWriter(directory, *scene_and_grid(small_scene())) as writer:
+        with ResultWriter(directory, *scene_and_grid(small_scene()), beside=beside) as writer:
             writer.add(position(9), Observed(picture(9)))
     assert files(tmp_path / "out") == before
     assert not (tmp_path / "fresh").exists()
@@ -194,21 +200,54 @@ def test_an_interrupted_hand_over_leaves_whole_frames(
     assert files(tmp_path / "interrupted") == files(tmp_path / "whole")
 
 
-def test_an_encoder_in_a_hurry_takes_no_more_pictures(tmp_path: Path) -> None:
+def finish_after_another(writer: ResultWriter) -> None:
+    writer.add(position(1), Observed(picture(1)))
+    writer.finish()
+
+
+@pytest.mark.parametrize(
+    ("owner", "part"), [(Image.Image, "save"), (gif.Palette, "indices"), (gif.GifWriter, "_write_last")]
+)
+def test_an_interruption_while_a_picture_is_encoded_here_leaves_whole_frames(
+    owner: type, part: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Ctrl-C may come in the middle of a still, of a frame of the film, and of its end."""
+    original = getattr(owner, part)
+
+    def interrupted(*arguments: Any, **keywords: Any) -> Any:
+        interrupt_main()
+        time.sleep(0.3)  # until the main thread has heard of it
+        return original(*arguments, **keywords)
+
+    with ResultWriter(tmp_path / "interrupted", *scene_and_grid(small_scene()), beside=False) as writer:
+        writer.add(position(0), Observed(picture(0)))
+        with monkeypatch.context() as patch:
+            patch.setattr(owner, part, interrupted)
+            with pytest.raises(KeyboardInterrupt):
+                finish_after_another(writer)
+        writer.finish(hurry=True)
+        writer.publish({})
+        frames = writer.frames
+    write(tmp_path / "whole", frames, small_scene())
+    assert files(tmp_path / "interrupted") == files(tmp_path / "whole")
+
+
+@pytest.mark.parametrize("taken", [1, 4])
+def test_an_encoder_in_a_hurry_takes_no_more_pictures(taken: int, tmp_path: Path) -> None:
     hurry, shown = Event(), [speckle(20, 30, frame) for frame in range(7)]
 
     class Pictures(io.BytesIO):
-        """The pictures; while the fourth is read, there comes a hurry."""
+        """The pictures; while one of them is read, there comes a hurry."""
 
         def read(self, size: int | None = -1) -> bytes:
             data = super().read(size)
-            if self.tell() == 4 * shown[0].nbytes:
+            if self.tell() == taken * shown[0].nbytes:
                 hurry.set()
             return data
 
     job = Job(tmp_path, (30, 20), 25.0, png=True, gif=True, background=(0, 0, 0))
     frames = encode(job, Pictures(b"".join(one.tobytes() for one in shown)), hurry).frames
-    assert frames <= 4
+    assert 1 <= frames <= taken
     assert sorted(path.name for path in (tmp_path / "frames").glob("*")) == [f"000{n}.png" for n in range(frames)]
 
 
@@ -237,7 +276,7 @@ def test_in_a_hurry_frames_are_given_up_and_those_left_are_whole(tmp_path: Path)
 @pytest.mark.skipif(sys.platform == "win32", reason="no sessions")
 def test_ctrl_c_does_not_reach_the_encoder(tmp_path: Path) -> None:
     with ResultWriter(tmp_path, *scene_and_grid(small_scene())) as writer:
-        assert writer._encoder
+        assert isinstance(writer._encoder, Encoder)
         assert os.getsid(writer._encoder._process.pid) != os.getsid(0)
 
 
@@ -249,7 +288,7 @@ def test_who_waits_for_a_stopped_encoder_can_stop_waiting(tmp_path: Path) -> Non
         raise KeyboardInterrupt
 
     with ResultWriter(tmp_path, *scene_and_grid(small_scene())) as writer:
-        assert writer._encoder
+        assert isinstance(writer._encoder, Encoder)
         os.kill(writer._encoder._process.pid, signal.SIGSTOP)
         for frame in range(3):
             writer.add(position(frame), Observed(picture(frame)))
@@ -260,8 +299,9 @@ def test_who_waits_for_a_stopped_encoder_can_stop_waiting(tmp_path: Path) -> Non
         assert writer.frames <= 3
 
 
-def test_the_time_spent_encoding_is_told(tmp_path: Path) -> None:
-    with ResultWriter(tmp_path, *scene_and_grid(small_scene())) as writer:
+@pytest.mark.parametrize("beside", [True, False])
+def test_the_time_spent_encoding_is_told(beside: bool, tmp_path: Path) -> None:
+    with ResultWriter(tmp_path, *scene_and_grid(small_scene()), beside=beside) as writer:
         writer.add(position(0), Observed(picture(0)))
         writer.finish()
         assert 0 < writer.encode_seconds < 60
@@ -339,11 +379,11 @@ def test_positions_that_cannot_be_written(tmp_path: Path, points: int, limit: in
     assert list(tmp_path.iterdir()) == []
 
 
-def refused(directory: Path, meanwhile: Callable[[ResultWriter], None] = lambda _: None) -> str:
+def refused(directory: Path, meanwhile: Callable[[ResultWriter], None] = lambda _: None, *, beside: bool = True) -> str:
     """The error of a run of many frames in whose course something happens."""
 
     def run() -> None:
-        with ResultWriter(directory, *scene_and_grid(small_scene())) as writer:
+        with ResultWriter(directory, *scene_and_grid(small_scene()), beside=beside) as writer:
             meanwhile(writer)
             for frame in range(1000):
                 writer.add(position(frame), Observed(picture(frame)))
@@ -365,17 +405,18 @@ def test_a_directory_that_cannot_be_written(tmp_path: Path) -> None:
     assert "Permission denied; choose another --out" in refused(tmp_path / "out")
 
 
-def test_what_stops_the_encoder_is_told(tmp_path: Path) -> None:
+@pytest.mark.parametrize("beside", [True, False])
+def test_what_stops_the_encoder_is_told(beside: bool, tmp_path: Path) -> None:
     def block(_: ResultWriter) -> None:
         (tmp_path / ".partial" / "new" / "frames").write_text("in the way")
 
-    assert refused(tmp_path, block) == f"{tmp_path}: cannot write: File exists; choose another --out"
+    assert refused(tmp_path, block, beside=beside) == f"{tmp_path}: cannot write: File exists; choose another --out"
     assert (tmp_path / ".partial" / "new" / "frames").read_text() == "in the way"
 
 
 def test_an_encoder_that_is_killed_is_told(tmp_path: Path) -> None:
     def kill(writer: ResultWriter) -> None:
-        assert writer._encoder
+        assert isinstance(writer._encoder, Encoder)
         writer._encoder._process.kill()
 
     assert "cannot write: the encoder ended with exit code" in refused(tmp_path, kill)

@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from taichi_msm import FilesError, resume, run, runner
-from taichi_msm.physics import solver
+from taichi_msm.physics import solver, workload
 from taichi_msm.results.checkpoint import MANIFEST, POSITIONS, STATE, Checkpoint
 from taichi_msm.results.record import RunRecord
 from taichi_msm.scene import Scene
@@ -185,6 +185,29 @@ def test_another_run_begins_anew_and_keeps_what_was_there_until_it_has_a_frame(
     assert files(small / "parts") == before
     assert run(other, "parts", threads=device.threads)["resumed"] == 0
     assert not (small / "parts" / ".partial").exists()
+
+
+@pytest.mark.parametrize("asked", [True, None, False])
+def test_a_run_that_kept_no_positions_goes_on_where_no_pilot_needs_them(
+    asked: bool | None, small: Path, device: Device, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Else it begins anew, so that what is known of its error does not depend on the interruption."""
+    monkeypatch.setattr(workload, "MOST_FOR_PILOTS", 0.0)
+    made = dragged("time.duration=0.2", "output=[]")
+    whole = run(made, "whole", threads=device.threads, estimate_error=asked)
+    assert (whole["error_estimate"] is None) == (not asked)
+    interrupted(made, "parts", device)
+    again = run(made, "parts", threads=device.threads, estimate_error=asked)
+    assert (again["resumed"] > 0) == (not asked)
+    differ = dict.fromkeys(("timings", "resumed"))
+    assert {**again, **differ} == {**whole, **differ}
+
+
+def test_a_run_that_kept_no_positions_is_resumed_without_pilots(small: Path, device: Device) -> None:
+    interrupted(dragged("time.duration=0.2", "output=[]"), "parts", device)
+    record = resume("parts", threads=device.threads)
+    assert record["resumed"] > 0
+    assert record["error_estimate_reason"] == "the frames before the interruption were not kept"
 
 
 def array() -> bytes:

@@ -17,15 +17,17 @@ from PIL import Image
 from scipy.stats import qmc
 
 from taichi_msm import sweep
+from taichi_msm.errors import ForeignError
 from taichi_msm.plot_style import STYLE
 from taichi_msm.sweeps.captions import short_names, short_value
-from taichi_msm.sweeps.contact import CONTACT, WITHOUT_PICTURES
+from taichi_msm.sweeps.contact import WITHOUT_PICTURES
 from taichi_msm.sweeps.dataset import split
+from taichi_msm.sweeps.folder import values_in
 from taichi_msm.sweeps.outcome import Outcome
 from taichi_msm.sweeps.parameters import parameters, results
 from taichi_msm.sweeps.pool import Pool
 from taichi_msm.sweeps.reports import WITHOUT_MATPLOTLIB, WITHOUT_SALIB, write_reports
-from taichi_msm.sweeps.result import SweepResult
+from taichi_msm.sweeps.result import CONTACT, SweepResult
 from taichi_msm.sweeps.samples import values_of_runs
 from taichi_msm.sweeps.sensitivity import first_order, sensitivity
 from taichi_msm.sweeps.sweepfile import make_sweep
@@ -294,3 +296,13 @@ def test_runs_of_a_data_set_have_their_own_size(small: Path) -> None:
     assert {path.name for path in Path("out").iterdir()} == {
         *("runs", "sweep.json", "table.csv", "table.parquet", "dataset.json", CONTACT),
     }
+
+
+@pytest.mark.parametrize("name", FILES)
+def test_what_is_no_file_of_a_sweep_stays(make: Make, name: str) -> None:
+    result = make()
+    shutil.rmtree(result.directory / "runs")
+    (result.directory / name).write_text("mine")
+    with pytest.raises(ForeignError, match=name):
+        values_in(result.directory, result.sweep)
+    assert (result.directory / name).read_text() == "mine"

@@ -9,6 +9,10 @@ from typing import Literal, NamedTuple
 # Of a run's files these two belong to no entry of `output`: the record, and the matrices of the camera.
 RECORD, CAMERA = "run.json", "camera.json"
 
+# In the folder of a sweep: its record, and the folder with a folder for each run, as `run` writes it, by its number.
+SWEEP, RUNS = "sweep.json", "runs"
+NUMBERED = r"[0-9]{6,}"
+
 # The number in the name of a frame's file.
 FIRST, NUMBER = "0000", r"(?:[0-9]{4}|[1-9][0-9]{4,14})"
 
@@ -89,6 +93,11 @@ def _rows() -> Iterator[Output]:
         "`points` (N, frames, 2) [px] from the picture's upper left corner, NaN behind the eye, `occluded` (N, frames)"
     )
     yield Output("tracks", "tracks.npz", "tracks", means, needs_camera=True)
+
+
+def numbered(number: int) -> str:
+    """Name a run by its number in a sweep or an export, or a pair of frames by its number in an export."""
+    return f"{number:06}"
 
 
 OUTPUTS = {output.name: output for output in _rows()}

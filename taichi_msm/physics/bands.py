@@ -4,10 +4,10 @@ Passes. The second step can follow the first with a distance of one row, the thi
 takes `depth` steps while the rows are in the cache. Round k of a pass takes row k from step n to n + 1, row k - 1 from
 n + 1 to n + 2, and so on.
 
-Bands. Neighbouring workers sweep away from their common border or toward it, so that they arrive there at the same
+Bands. Neighbouring workers go away from their common border or toward it, so that they arrive there at the same
 time. Each needs the other's row at the border as it was before the step: after every step each copies its row, into one
 of two buffers by turns, and waits for the other's copy. The order in which forces are added does not depend on the
-direction of a sweep, so the bits of a result do not depend on the number of workers.
+direction of a pass, so the bits of a result do not depend on the number of workers.
 
 Bending. A moment is the Laplacian of the displacements, and the force on a row is the Laplacian of the moments. So
 before a row is stepped, the moments of the row ahead are computed, which depend on one row more. A pass is then one
@@ -22,7 +22,7 @@ records its place and ends, which frees its own core. Further launches continue 
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
-from taichi_msm.physics.sweep import sweeping
+from taichi_msm.physics.row import row_passing
 from taichi_msm.physics.terms.bending import BendingTerm
 from taichi_msm.physics.terms.term import DY, KernelRow, KernelSheet, StepCode
 from taichi_msm.system.runtime import ITERATIONS_PER_THREAD, ti
@@ -54,7 +54,7 @@ class RowBand(NamedTuple):
     # low, high: its first row, and the row after its last
     low: Any
     high: Any
-    way: Any  # 1 if its worker sweeps down, -1 if up
+    way: Any  # 1 if its worker goes down, -1 if up
     rows: Any  # of the sheet
     patience: Any  # as in the sizes
     progress: Any  # of all workers
@@ -63,7 +63,7 @@ class RowBand(NamedTuple):
 def stepping_row(code: StepCode, *, parallel: bool) -> Callable[..., Any]:
     """Make the function that takes a step of a row of a band, as soon as the neighbours' rows allow it."""
     vector, lanes, bending, copied = code.vector, code.lanes, code.get(BendingTerm), code.reach
-    sweep_row, storing = sweeping(code), [bending.storing(code)] if bending else []
+    pass_row, storing = row_passing(code), [bending.storing(code)] if bending else []
 
     @ti.func
     def copy_row(rows, worker, border, n, behind):
@@ -158,7 +158,7 @@ def stepping_row(code: StepCode, *, parallel: bool) -> Callable[..., Any]:
                 before, middle = moments + (row + 2) % MOMENTS, moments + row % MOMENTS
                 after = moments + (row + 1) % MOMENTS
                 line = ti.static(KernelRow(i, kind, before, middle, after))
-                sweep_row(sheet, carried, carry, line, here, other, exists, up, loads, n, row >= 0)
+                pass_row(sheet, carried, carry, line, here, other, exists, up, loads, n, row >= 0)
             else:
                 for b in range(1, sheet.width - 1):
                     for c in ti.static(range(3)):

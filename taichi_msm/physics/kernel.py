@@ -43,7 +43,7 @@ class SheetLayout:
     rows: int
     cols: int
     workers: int  # number of bands of rows that are stepped in parallel; 0 on a GPU, where all points are
-    depth: int  # number of steps that a band takes in one sweep
+    depth: int  # number of steps that a band takes in one pass
     fixed_rows: tuple[bool, bool]  # whether all points of the first row are fixed, and all of the last
     code: StepCode  # what the kernels are compiled for
 

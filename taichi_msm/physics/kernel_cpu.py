@@ -37,7 +37,7 @@ SHORTEST_REST, LONGEST_REST, HALF_LIFE = 0.002, 0.2, 0.02
 CROWDED = 0.2
 
 
-class Sweep:
+class Scatter:
     """The state of a sheet in the memory of a CPU, and its kernels: a `StepKernel`."""
 
     def __init__(self, layout: SheetLayout, start: Start) -> None:

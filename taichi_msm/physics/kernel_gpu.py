@@ -68,7 +68,7 @@ def _gathering(code: StepCode) -> Callable[..., None]:
 
     @ti.func
     def by_row(sheet: ti.template(), p, q, lower, b, row_exists, up):
-        """Force of entry b of row p on row q, which is `up` above; summed in the order of a sweep."""
+        """Force of entry b of row p on row q, which is `up` above; summed in the order of a pass on a CPU."""
         u, dx = [sheet.u[c][p * sheet.width + b] for c in ti.static(range(3))], sheet.numbers[DX]
         force = [vector(0) for _ in ti.static(range(3))]
         for right in ti.static((-1, 0, 1)):

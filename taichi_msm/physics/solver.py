@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from taichi_msm.errors import ArgumentError, DeviceError, MsmError
 from taichi_msm.physics.kernel import BYTES, SheetLayout, Start, StepKernel
-from taichi_msm.physics.kernel_cpu import Sweep
+from taichi_msm.physics.kernel_cpu import Scatter
 from taichi_msm.physics.kernel_gpu import STEPS_PER_LAUNCH, Gather
 from taichi_msm.physics.lattice import axes, spacing
 from taichi_msm.physics.loads import schedule
@@ -34,11 +34,11 @@ from taichi_msm.system.runtime import Device, lanes
 # With fewer points per worker, one worker more costs more time in waiting than it saves in work.
 POINTS_PER_WORKER = 450
 
-# If a band takes more than CACHE bytes, its sweeps take DEPTH steps each.
+# If a band takes more than CACHE bytes, its passes take DEPTH steps each.
 CACHE = 3 << 17
 DEPTH = 8
 
-# Numbers that a sweep keeps per point: displacement, difference and the force carried to the next row, as vectors.
+# Numbers that a pass keeps per point: displacement, difference and the force carried to the next row, as vectors.
 NUMBERS_PER_POINT = 9
 
 # A launch takes no more steps than this, so that Ctrl-C is noticed soon: steps times points, about 0.1 s of one core;
@@ -245,7 +245,7 @@ class Dynamics:
         numbers = *spacing(sheet), sheet.size[0] / 2, *(n for term in layout.code.terms for n in term.numbers(plan))
         stiffness = layout.code.require(SpringTerm).laid_out(plan)
         self._sheet = None  # Frees its memory before another sheet takes some.
-        kind: type[StepKernel] = Sweep if layout.workers else Gather
+        kind: type[StepKernel] = Scatter if layout.workers else Gather
         self._sheet = kind(layout, Start(np.array(numbers), by_column, standing_decays(plan), stiffness, state))
 
 

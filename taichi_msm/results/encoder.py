@@ -13,61 +13,25 @@ import select
 import signal
 import subprocess
 import sys
-import time
-import zlib
-from collections import deque
-from collections.abc import Callable, Iterator
-from concurrent.futures import CancelledError, Future, ThreadPoolExecutor
+from collections.abc import Iterator
 from contextlib import contextmanager, suppress
-from pathlib import Path
 from threading import Event
-from typing import BinaryIO, NamedTuple
+from typing import BinaryIO
 
 import numpy as np
-from PIL import Image
 
 from taichi_msm.errors import FilesError
-from taichi_msm.outputs.gif import GifWriter, Palette, Picture, shades
-from taichi_msm.outputs.table import OUTPUTS
+from taichi_msm.outputs.gif import Picture
 from taichi_msm.progress import Pause
-from taichi_msm.results.whole import create
-
-# Of 512 x 512 pixels of shaded tissue Pillow's default takes 93 ms, its level 1 takes 17 ms and 348 kB. With a search
-# for runs of equal bytes alone it takes 16 ms and 314 kB: tissue has no other repetitions, and a background has these.
-COMPRESSION = {"compress_level": 1, "compress_type": zlib.Z_RLE}
+from taichi_msm.results.pictures import PATIENCE, Job, PictureWriter, Report
 
 # The most pictures that wait in memory: by number, and by bytes.
 WAITING = 4
 WAITING_BYTES = 256 << 20
 
-# While a caller waits for the encoder, this is how long until its `pause` is called again [s].
-PATIENCE = 0.1
-
 # The child gets our path, so that it finds this package where we did. It must not run the caller's main module, as
 # multiprocessing would: a script that calls us then needs no guard against its own import.
 _CHILD = "import sys; sys.path[:] = {path!r}; from taichi_msm.results.encoder import main; main()"
-
-
-class Job(NamedTuple):
-    """What to encode: as `frames/0000.png` and so on, as `animation.gif`, or as both."""
-
-    folder: Path  # where the files go
-    size: tuple[int, int]  # width, height of the pictures [px]
-    rate: float  # frames per second
-    png: bool
-    gif: bool
-    background: tuple[int, int, int]  # a colour that the animation keeps exactly
-
-    def still(self, number: int) -> Path:
-        """Name the PNG of a frame."""
-        return self.folder / OUTPUTS["png"].path(number)
-
-
-class Report(NamedTuple):
-    """How many pictures were encoded completely, and the processor time that was spent [s]."""
-
-    frames: int
-    seconds: float
 
 
 class Encoder:
@@ -193,51 +157,18 @@ def main() -> None:
 def encode(job: Job, source: BinaryIO, hurry: Event) -> Report:
     """Encode the pictures of a stream of bytes until it ends; in a hurry those are given up that are not begun."""
     width, height = job.size
-    depth = max(1, min(WAITING, WAITING_BYTES // (3 * width * height)))
     parent = os.getppid()
-    frames = begun = 0
-    seconds = 0.0
-    pending: deque[Future[float]] = deque()
-    gif: GifWriter | None = None
-
-    def film(picture: Picture) -> None:
-        nonlocal gif
-        if gif is None:  # The first frame shows the colours that the animation needs.
-            file, palette = create(job.folder / OUTPUTS["gif"].path()), Palette(shades(picture), job.background)
-            gif = GifWriter(file, job.size, job.rate, palette)
-        gif.add(picture)
-
-    def shoot(picture: Picture, still: Future[float] | None) -> float:
-        """Complete a frame: first its still, then its place in the film, which so has no frame without a still."""
-        spent = still.result() if still else 0.0
-        return spent + (_seconds(film, picture) if job.gif else 0.0)
-
-    with ThreadPoolExecutor(min(depth, os.cpu_count() or 1)) as stills, ThreadPoolExecutor(1) as reel:
+    writer = PictureWriter(job, max(1, min(WAITING, WAITING_BYTES // (3 * width * height))), hurry)
+    try:
         for picture in _pictures(source, job.size):
-            if job.png and begun == 0:
-                job.still(0).parent.mkdir()
-            still = stills.submit(_seconds, _write_png, picture, job.still(begun)) if job.png else None
-            begun += 1
-            pending.append(reel.submit(shoot, picture, still))
-            while len(pending) > depth and not hurry.is_set():
-                seconds += pending.popleft().result()
-                frames += 1
+            writer.add(picture)
             if hurry.is_set():
                 break
             _leave_orphaned(parent)
         _leave_orphaned(parent)
-        if hurry.is_set():
-            stills.shutdown(cancel_futures=True)
-            reel.shutdown(cancel_futures=True)
-        with suppress(CancelledError):
-            for task in pending:
-                seconds += task.result()
-                frames += 1
-    for number in range(frames, begun) if job.png else ():
-        job.still(number).unlink(missing_ok=True)
-    if gif is not None:
-        seconds += _seconds(gif.close)
-    return Report(frames, seconds)
+        return writer.finish()
+    finally:
+        writer.abort()
 
 
 def _leave_orphaned(parent: int) -> None:
@@ -254,15 +185,3 @@ def _pictures(source: BinaryIO, size: tuple[int, int]) -> Iterator[Picture]:
         if len(data) < 3 * width * height:
             return
         yield np.frombuffer(data, np.uint8).reshape(height, width, 3)
-
-
-def _write_png(picture: Picture, path: Path) -> None:
-    with create(path) as file:
-        Image.fromarray(picture).save(file, "PNG", **COMPRESSION)
-
-
-def _seconds(work: Callable[..., None], *args: object) -> float:
-    """Do some work; returns its processor time [s], which does not grow while the simulation occupies the cores."""
-    start = time.thread_time()
-    work(*args)
-    return time.thread_time() - start

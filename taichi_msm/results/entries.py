@@ -11,7 +11,7 @@ import stat
 from collections.abc import Collection, Iterable, Iterator
 from pathlib import Path
 
-from taichi_msm.errors import ForeignError
+from taichi_msm.errors import FilesError, ForeignError
 
 FILE, FOLDER = "a file", "a folder"
 
@@ -36,20 +36,31 @@ def require(path: Path, wanted: str) -> Path:
     return path
 
 
+def without_link(folder: Path, option: str) -> Path:
+    """Make sure that a folder which the user did not name is no symbolic link: it may have come with the scene."""
+    try:
+        is_link = folder.is_symlink()
+    except OSError as error:
+        raise FilesError(f"{folder}: {(error.strerror or str(error)).lower()}") from None
+    if is_link:
+        raise FilesError(f"{folder}: a symbolic link; name the folder it leads to with {option}")
+    return folder
+
+
 def files(top: Path, patterns: Collection[str], *, strict: bool, besides: Collection[str] = ()) -> Iterator[str]:
     """List the files in a folder and below whose names, with slashes, match a pattern; no link is followed.
 
-    Patterns are regular expressions in their last part, and names of folders before it. If `strict`, the first other
-    entry is a ForeignError, but for those `besides`.
+    Patterns are regular expressions for whole names, and those for the folders are what is before their last slash. If
+    `strict`, the first other entry is a ForeignError, but for those `besides`.
     """
-    allowed, folders = re.compile("|".join(patterns)), parents(patterns)
+    allowed, folders = re.compile("|".join(patterns)), re.compile("|".join(parents(patterns)))
 
     def look(folder: Path, prefix: str) -> Iterator[str]:
         for path in folder.iterdir():
             actual, name = kind(path), prefix + path.name
             if actual is None or name in besides:
                 continue
-            if actual == FOLDER and name in folders:
+            if actual == FOLDER and folders.fullmatch(name):
                 yield from look(path, f"{name}/")
             elif actual == FILE and allowed.fullmatch(name):
                 yield name

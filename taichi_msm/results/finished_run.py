@@ -17,7 +17,7 @@ from pydantic import TypeAdapter
 from taichi_msm.arguments import require_path
 from taichi_msm.errors import FilesError, MsmError, SceneError
 from taichi_msm.outputs.npz import map_array
-from taichi_msm.outputs.table import OUTPUTS, RECORD
+from taichi_msm.outputs.table import OUTPUTS, RECORD, SWEEP
 from taichi_msm.physics.lattice import rest_positions
 from taichi_msm.physics.planning import try_plan
 from taichi_msm.picture import PictureError, file_sha256, read_rgb
@@ -42,6 +42,7 @@ class FinishedRun:
     """
 
     directory: Path  # where its results are
+    status: str  # how it ended, as in `RunRecord`
     scene: Scene
     frames: int  # how many were simulated
     sha256: Mapping[str, str]  # of the files of its pictures, by the keys that name them
@@ -125,6 +126,8 @@ class FinishedRun:
     def remedy(self, *keys: str) -> str:
         """Say how to get the results of further entries of a scene's `output`."""
         outputs = ",".join(dict.fromkeys([*self.scene.output, *keys]))
+        if (self.directory / ".." / ".." / SWEEP).is_file():
+            return f"run the sweep into a new folder with `set: {{output: [{outputs}]}}` in its file"
         return f'run the scene again with --set "output=[{outputs}]"'
 
     def result(self, key: str, frame: int = 0) -> Path:
@@ -163,7 +166,7 @@ def read_run(directory: str | Path) -> FinishedRun:
         chosen = scene.time.precision != "auto" and scene.sheet.tolerance is scene.time.tolerance is None
         if not isinstance(frames, int) or not 1 <= frames <= scene.time.frames + 1 or not chosen:
             raise damaged(path)
-    return FinishedRun(path.parent, scene, frames, sha256, overrides, data)
+    return FinishedRun(path.parent, record["status"], scene, frames, sha256, overrides, data)
 
 
 @contextmanager

@@ -18,8 +18,9 @@ from taichi_msm.physics.state import Saved
 from taichi_msm.progress import Pause
 from taichi_msm.render.labels import Observed
 from taichi_msm.results.checkpoint import CHECKPOINT, PATTERNS, Checkpoint
-from taichi_msm.results.encoder import Encoder, Job
+from taichi_msm.results.encoder import Encoder
 from taichi_msm.results.labels import LabelWriter
+from taichi_msm.results.pictures import Job, PictureWriter
 from taichi_msm.results.publication import Contents, Listed, Publication
 from taichi_msm.results.whole import add, create
 from taichi_msm.scene import Scene
@@ -47,7 +48,8 @@ class ResultWriter:
 
     Within the with statement the files grow in a hidden folder. Leaving it without `publish` removes them. But once a
     run with a manifest has a frame, its checkpoint replaces any earlier one, and stays until results are published as
-    complete. A run that `resumes` continues from its checkpoint. Files that no run has written stay.
+    complete. A run that `resumes` continues from its checkpoint. Files that no run has written stay. Pictures are
+    encoded `beside` the simulation, in a process of their own, or else in this one, each before `add` returns.
 
     Raises:
         FilesError: on entering and in every method, when the directory cannot be written, another run writes there,
@@ -56,8 +58,7 @@ class ResultWriter:
     Attributes:
         saved: the state from which the run continues; None: from rest.
         frames: in the results; after an interruption their number is known only after `finish`.
-        encode_seconds: processor time spent encoding pictures, in parallel with the simulation [s]; known after
-            `finish`.
+        encode_seconds: processor time spent encoding pictures [s]; known after `finish`.
     """
 
     def __init__(
@@ -68,6 +69,7 @@ class ResultWriter:
         manifest: Mapping[str, Any] | None = None,
         *,
         resumes: bool = False,
+        beside: bool = True,
     ) -> None:
         self.saved: Saved | None = None
         self.frames = 0
@@ -76,12 +78,13 @@ class ResultWriter:
         self._scene = scene
         self._manifest = manifest
         self._resumes = resumes
+        self._beside = beside
         names = table.file_names(table.results(scene.output), scene.time.frames + 1)
         self._publication = Publication(directory, RUN, names)
         folder = self._publication.staging / CHECKPOINT
         self._checkpoint = Checkpoint(folder, grid, scene.sheet.points, keeps_positions=bool(scene.output))
         self._labels = LabelWriter(self._publication.staged, scene)
-        self._encoder: Encoder | None = None
+        self._encoder: Encoder | PictureWriter | None = None
         self._open = ExitStack()
         self._finished = False
 
@@ -180,7 +183,8 @@ class ResultWriter:
                     gif="gif" in scene.output,
                     background=scene.render.background,
                 )
-                self._encoder = Encoder(job, inherit=self._publication.lock_descriptors)
+                locks = self._publication.lock_descriptors
+                self._encoder = Encoder(job, locks) if self._beside else PictureWriter(job)
                 opened.callback(self._encoder.abort)
             opened.callback(self._checkpoint.close)
             if self._resumes:

@@ -19,10 +19,8 @@ from taichi_msm.progress import Progress
 from taichi_msm.results.finished_run import read_run, reading
 from taichi_msm.results.whole import replacing
 from taichi_msm.sweeps.captions import short_names, short_value
-from taichi_msm.sweeps.result import SweepResult
+from taichi_msm.sweeps.result import CONTACT, SweepResult
 from taichi_msm.sweeps.schedule import PATIENCE
-
-CONTACT = "contact.jpg"
 
 WITHOUT_PICTURES = f"{CONTACT} needs pictures of the runs; take set: {{output: [png]}}, or trajectory, and an image"
 
@@ -95,7 +93,7 @@ def _last_frames(
             elif finished.has("gif"):
                 frames[run] = _last_of(finished.result("gif"))
             elif finished.has("trajectory") and finished.scene.image is not None:
-                drawn[run] = executor.submit(draw_last, directory)
+                drawn[run] = executor.submit(draw_last, directory.absolute())
         except FilesError as error:
             errors.append(str(error))
     rest = set(drawn.values())

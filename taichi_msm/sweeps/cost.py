@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 from taichi_msm.errors import SceneError
 from taichi_msm.physics.plan import Plan
@@ -27,6 +27,10 @@ class Cost(NamedTuple):
     memory_bytes: int  # of one process
     refused: str  # why the runs that were looked at are refused, if all are
 
+    def of(self, share: float) -> Cost:
+        """Give the cost of a share of the runs."""
+        return self._replace(seconds=share * self.seconds, disk_bytes=round(share * self.disk_bytes))
+
 
 class Workers(NamedTuple):
     """How many processes take runs."""
@@ -36,19 +40,19 @@ class Workers(NamedTuple):
     fitting: int  # processes whose memory is free
 
 
-def estimate(sweep: Sweep, values: list[list[Any]]) -> Cost:
-    """Estimate what the runs with these values take."""
+def estimate(sweep: Sweep) -> Cost:
+    """Estimate what the runs of a sweep take."""
     plans: list[Plan] = []
     refused = ""
-    for run in sorted({(2 * n + 1) * len(values) // (2 * LOOKED_AT) for n in range(LOOKED_AT)}):
+    for values in sweep.some_values(LOOKED_AT):
         try:
-            plans.append(plan_file(sweep.scene, sweep.overrides(values[run])))
+            plans.append(plan_file(sweep.scene, sweep.overrides(values)))
         except SceneError as error:
             refused = refused or error.lines[0]
     if not plans:
         return Cost(0.0, False, 0, PROCESS_BYTES, refused)
     times, needs = list(map(duration.estimate, plans)), list(map(budget.estimate, plans))
-    share = len(values) / len(plans)
+    share = sweep.runs / len(plans)
     return Cost(
         # A process starts once, for many runs.
         seconds=max(one.start for one in times) + share * sum(one.seconds - one.start for one in times),

@@ -14,10 +14,8 @@ from typing import Any
 
 from taichi_msm.outputs.table import RECORD
 from taichi_msm.results.whole import replacing
-from taichi_msm.sweeps.result import SweepResult
+from taichi_msm.sweeps.result import DATASET, SweepResult
 from taichi_msm.system.versions import versions
-
-DATASET = "dataset.json"
 
 # Where the keys of a scene are that decide what a run writes.
 DECIDING = ("output", "render", "time")

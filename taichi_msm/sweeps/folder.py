@@ -8,16 +8,14 @@ from pathlib import Path
 from typing import Any
 
 from taichi_msm.errors import FilesError, ForeignError, SceneError, writing
-from taichi_msm.outputs.table import RECORD
+from taichi_msm.outputs.table import RECORD, RUNS, SWEEP
 from taichi_msm.results.whole import give_name, staged
 from taichi_msm.sweeps.outcome import Outcome, outcome_of
-from taichi_msm.sweeps.samples import values_of_runs
+from taichi_msm.sweeps.result import FILES
 from taichi_msm.sweeps.sweepfile import Sweep
-from taichi_msm.sweeps.task import RUNS, Task
+from taichi_msm.sweeps.task import Task
 from taichi_msm.system.compiler import what_decides_bits
 from taichi_msm.system.versions import versions
-
-SWEEP, TABLE = "sweep.json", "table.csv"
 
 # Runs that ended so need not be taken again.
 ENDED = ("complete", "diverged")
@@ -33,12 +31,16 @@ def values_in(directory: Path, sweep: Sweep) -> list[list[Any]]:
     record = directory / SWEEP
     description = sweep.description()
     if not record.exists():
-        for name in (RUNS, TABLE):
+        for name in (RUNS, *FILES, RECORD):
             if (directory / name).exists():
                 raise ForeignError.at(directory / name, "something")
-        settings = sweep.settings
-        values = values_of_runs(settings.vary, settings.samples, settings.seed)
-        content = {"scene": settings.scene, **description, "keys": sweep.keys, "versions": versions(), "values": values}
+        content = {
+            "scene": sweep.settings.scene,
+            **description,
+            "keys": sweep.keys,
+            "versions": versions(),
+            "values": sweep.values(),
+        }
         with writing(directory), staged(directory) as hidden:
             (hidden / SWEEP).write_text(json.dumps(content) + "\n", encoding="utf-8", errors="backslashreplace")
             give_name(hidden / SWEEP, record)  # unless another shard has just done so
@@ -59,7 +61,23 @@ def values_in(directory: Path, sweep: Sweep) -> list[list[Any]]:
     return values
 
 
-def ended(task: Task) -> Outcome | None:
+def sort_out(
+    sweep: Sweep, values: list[list[Any]], directory: Path, shard: tuple[int, int] = (1, 1)
+) -> tuple[list[Outcome], list[Task]]:
+    """Give the outcomes of the runs of a shard that have ended before, and the tasks of those that are missing."""
+    part, parts = shard
+    home = Path.cwd()
+    done, missing = [], []
+    for run in range(part - 1, len(values), parts):
+        task = Task(run, sweep.scene, sweep.overrides(values[run]), directory, home)
+        if outcome := _ended(task):
+            done.append(outcome)
+        else:
+            missing.append(task)
+    return done, missing
+
+
+def _ended(task: Task) -> Outcome | None:
     """Find the outcome of a run that has ended; None: it is missing, or was interrupted."""
     # A record that no run has written is as none.
     with suppress(OSError, ValueError, KeyError, TypeError, AttributeError):

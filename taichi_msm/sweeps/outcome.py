@@ -4,9 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import Any, Literal
+from typing import Any, Literal, get_args
 
+# How a run ended. Refused: its values are not valid; failed: by an error; died: its process ended twice before it did.
 Status = Literal["complete", "diverged", "refused", "failed", "died"]
+STATUSES: tuple[Status, ...] = get_args(Status)
 
 
 @dataclass(frozen=True)
@@ -14,7 +16,7 @@ class Outcome:
     """How a run of a sweep ended, and its results; None: it has none."""
 
     run: int  # its number, from 0
-    status: Status  # refused: its values are not valid; failed: an error; died: its process ended twice
+    status: Status
     error: str = ""  # why, if it is not complete
     max_displacement: float | None = None  # [m]
     shortest_spring: float | None = None  # smallest ratio of a spring's length to its rest length

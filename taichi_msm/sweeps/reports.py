@@ -11,14 +11,12 @@ import numpy as np
 from taichi_msm.errors import writing
 from taichi_msm.progress import Progress
 from taichi_msm.results.whole import replacing
-from taichi_msm.sweeps.contact import CONTACT, write_contact
-from taichi_msm.sweeps.dataset import DATASET, write_dataset
+from taichi_msm.sweeps.contact import write_contact
+from taichi_msm.sweeps.dataset import write_dataset
 from taichi_msm.sweeps.parameters import parameters, results
-from taichi_msm.sweeps.result import SweepResult
+from taichi_msm.sweeps.result import CONTACT, DATASET, FILES, PARQUET, PLOT, SENSITIVITY, TABLE, SweepResult
 from taichi_msm.sweeps.sensitivity import sensitivity
-from taichi_msm.sweeps.table import CSV, PARQUET, csv_line, write_parquet, write_table
-
-PLOT, SENSITIVITY = "sweep.png", "sensitivity.csv"
+from taichi_msm.sweeps.table import csv_line, write_parquet, write_table
 
 WITHOUT_MATPLOTLIB = f"{PLOT} needs matplotlib: pip install matplotlib"
 WITHOUT_SALIB = f"{SENSITIVITY} needs SALib: pip install SALib"
@@ -46,7 +44,7 @@ def write_reports(result: SweepResult, executor: Executor, progress: Progress) -
     }
     with writing(result.directory):
         write_table(result)
-        names, notes = [CSV], list[str]()
+        names, notes = [TABLE], list[str]()
         for name, write in writers.items():
             try:
                 more, said = write(result)
@@ -55,9 +53,8 @@ def write_reports(result: SweepResult, executor: Executor, progress: Progress) -
                 more, said = [], [f"{name} could not be made: {type(error).__name__}: {error}"]
             names += more
             notes += said
-        for name in (*writers, SENSITIVITY):
-            if name not in names:
-                (result.directory / name).unlink(missing_ok=True)
+        for name in set(FILES).difference(names):
+            (result.directory / name).unlink(missing_ok=True)
     return names, notes
 
 
@@ -84,7 +81,9 @@ def _write_plots(result: SweepResult) -> Written:
         from taichi_msm.sweeps.plot import Content, plot
     except ImportError:
         return names, [*notes, WITHOUT_MATPLOTLIB]
-    count = f"{np.count_nonzero(~failed)} complete runs" + (f" of {len(failed)}" if failed.any() else "")
+    complete = sum(outcome.status == "complete" for outcome in result.outcomes)
+    some = f", {len(runs)} of them shown" if len(runs) < len(result.outcomes) else ""
+    title = f"{result.sweep.settings.scene}: {complete} of {len(result.outcomes)} runs complete{some}"
     with replacing(result.directory / PLOT) as file:
-        plot(Content(f"{result.sweep.settings.scene}: {count}", varied, columns, failed, indices), file)
+        plot(Content(title, varied, columns, failed, indices), file)
     return [*names, PLOT], notes

@@ -6,9 +6,19 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from taichi_msm.outputs.table import RUNS, numbered
 from taichi_msm.sweeps.outcome import Outcome
 from taichi_msm.sweeps.sweepfile import Sweep
-from taichi_msm.sweeps.task import RUNS
+
+# The files that a sweep ends with.
+FILES = TABLE, PARQUET, DATASET, CONTACT, PLOT, SENSITIVITY = (
+    "table.csv",
+    "table.parquet",
+    "dataset.json",
+    "contact.jpg",
+    "sweep.png",
+    "sensitivity.csv",
+)
 
 
 @dataclass(frozen=True)
@@ -22,7 +32,7 @@ class SweepResult:
 
     def run_directory(self, run: int) -> Path:
         """Name the folder of a run."""
-        return self.directory / RUNS / f"{run:06}"
+        return self.directory / RUNS / numbered(run)
 
     def some(self, most: int) -> list[int]:
         """Give the numbers of at most so many runs, evenly spread over all."""

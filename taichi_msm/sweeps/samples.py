@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import itertools
 import math
 from collections.abc import Mapping
 from typing import Any
@@ -19,7 +18,7 @@ def values_of_runs(vary: Mapping[str, Distribution], samples: int | None, seed: 
     Source: Owen, "Randomly permuted (t,m,s)-nets and (t,s)-sequences", 1995; SciPy's `qmc.Sobol`.
     """
     if samples is None:
-        return [list(values) for values in itertools.product(*(one.values for one in vary.values()))]
+        return [_combination(vary, run) for run in range(count_runs(vary, None))]
     import numpy as np
     from scipy.stats import qmc
 
@@ -33,6 +32,24 @@ def values_of_runs(vary: Mapping[str, Distribution], samples: int | None, seed: 
     return [list(values) for values in zip(*columns, strict=True)]
 
 
+def values_of_some(vary: Mapping[str, Distribution], samples: int | None, seed: int, most: int) -> list[list[Any]]:
+    """Give the values of at most so many runs, spread over all, without making those of the others."""
+    if samples is not None:
+        # The first points of the sequence are spread over all.
+        return values_of_runs(vary, min(samples, most), seed)
+    total = count_runs(vary, None)
+    return [_combination(vary, run) for run in sorted({(2 * n + 1) * total // (2 * most) for n in range(most)})]
+
+
 def count_runs(vary: Mapping[str, Distribution], samples: int | None) -> int:
     """Count the runs without making their values."""
     return math.prod(len(one.values) for one in vary.values()) if samples is None else samples
+
+
+def _combination(vary: Mapping[str, Distribution], run: int) -> list[Any]:
+    """Give the combination of the grids with a number."""
+    values = []
+    for one in reversed(list(vary.values())):
+        run, index = divmod(run, len(one.values))
+        values.append(one.values[index])
+    return values[::-1]

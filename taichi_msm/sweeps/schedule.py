@@ -32,7 +32,10 @@ def outcomes(tasks: Iterable[Task], executor: Executor, pause: Pause) -> Iterato
     died: set[int] = set()
 
     def submit(task: Task) -> None:
-        future = executor.submit(take, task)
+        try:
+            future = executor.submit(take, task)
+        except RuntimeError as error:  # such as that of a broken executor
+            raise _ended(executor, error) from error
         waiting[future] = task
         future.add_done_callback(done.put)
 
@@ -49,7 +52,7 @@ def outcomes(tasks: Iterable[Task], executor: Executor, pause: Pause) -> Iterato
         try:
             outcome = future.result()
         except (BrokenExecutor, CancelledError) as error:
-            raise MsmError(f"{type(executor).__name__} takes no more runs: {error}; start the sweep again") from error
+            raise _ended(executor, error) from error
         except Exception as error:
             # `take` raises nothing, so this is its worker's end.
             if task.run not in died:
@@ -60,3 +63,8 @@ def outcomes(tasks: Iterable[Task], executor: Executor, pause: Pause) -> Iterato
         yield outcome
         for following in islice(rest, 1):
             submit(following)
+
+
+def _ended(executor: Executor, error: Exception) -> MsmError:
+    """Make the error for an executor that takes no more runs."""
+    return MsmError(f"{type(executor).__name__} takes no more runs: {error}; start the sweep again")

@@ -8,7 +8,7 @@ from pathlib import Path
 
 from taichi_msm.console import rough_time
 from taichi_msm.sweeps.cost import Cost, Workers
-from taichi_msm.sweeps.outcome import Outcome
+from taichi_msm.sweeps.outcome import STATUSES, Outcome
 
 
 def cost_line(runs: int, cost: Cost, workers: Workers) -> str:
@@ -27,11 +27,18 @@ def summary_lines(
     directory: Path, outcomes: Sequence[Outcome], shard: tuple[int, int] | None, files: list[str], notes: list[str]
 ) -> list[str]:
     """Say in some lines how the runs of a sweep ended, with an example of each failure, and what was written."""
-    counts = Counter(outcome.status for outcome in outcomes)
     of = f" of part {shard[0]} of {shard[1]}" if shard else ""
-    lines = [f"{directory}: {len(outcomes)} runs{of}: {', '.join(f'{count} {name}' for name, count in counts.items())}"]
-    for status in counts:
-        example = next(outcome for outcome in outcomes if outcome.status == status)
-        if example.error:
+    counts = count(outcomes)
+    said = ", ".join(f"{number} {status}" for status, number in counts.items() if number)
+    lines = [f"{directory}: {len(outcomes)} runs{of}: {said}"]
+    for status in STATUSES:
+        example = next((outcome for outcome in outcomes if outcome.status == status), None)
+        if example and example.error:
             lines.append(f"{status}, for example run {example.run:06}: {example.error}")
     return [*lines, "without --shard, the same command writes the table" if shard else ", ".join(files), *notes]
+
+
+def count(outcomes: Sequence[Outcome]) -> dict[str, int]:
+    """Count the runs that ended in each way."""
+    counts = Counter(outcome.status for outcome in outcomes)
+    return {status: counts[status] for status in STATUSES}

@@ -2,23 +2,22 @@
 
 from __future__ import annotations
 
-from collections.abc import Generator, Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from concurrent.futures import Executor
-from contextlib import closing, contextmanager
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
 from taichi_msm.arguments import require_path
 from taichi_msm.progress import Progress
 from taichi_msm.sweeps.cost import choose_workers, estimate
-from taichi_msm.sweeps.folder import ended, values_in
+from taichi_msm.sweeps.folder import sort_out, values_in
 from taichi_msm.sweeps.outcome import Outcome
 from taichi_msm.sweeps.pool import Pool
 from taichi_msm.sweeps.reports import write_reports
 from taichi_msm.sweeps.result import SweepResult
 from taichi_msm.sweeps.schedule import outcomes
 from taichi_msm.sweeps.sweepfile import Sweep, make_sweep
-from taichi_msm.sweeps.task import Task
 
 
 def sweep(
@@ -81,14 +80,14 @@ def _go_through(
     workers: int | None,
     progress: Progress,
 ) -> Iterator[Outcome]:
-    count = workers or choose_workers(estimate(described, values), len(values)).number
-    with opened(executor, count) as taking:
-        rows = []
-        with closing(run_all(described, values, directory, taking, progress)) as coming:
-            for row in coming:
-                rows.append(row)
-                yield row
-        finish(described, values, directory, rows, taking, progress)
+    done, missing = sort_out(described, values, directory)
+    total = len(values)
+    with opened(executor, workers or choose_workers(estimate(described), len(missing)).number) as taking:
+        yield from list(done)
+        for row in outcomes(missing, taking, lambda: progress("runs", len(done), total)):
+            done.append(row)
+            yield row
+        finish(described, values, directory, done, taking, progress)
 
 
 @contextmanager
@@ -104,30 +103,6 @@ def opened(executor: Executor | None, workers: int) -> Iterator[Executor]:
         pool.shutdown(cancel_futures=True)
         raise
     pool.shutdown()
-
-
-def run_all(
-    described: Sweep,
-    values: list[list[Any]],
-    directory: Path,
-    executor: Executor,
-    progress: Progress,
-    shard: tuple[int, int] = (1, 1),
-) -> Generator[Outcome, None, None]:
-    """Give the outcomes of all runs of a shard, first those that have ended before."""
-    part, parts = shard
-    numbers = range(part - 1, len(values), parts)
-    done, missing = [], []
-    for run in numbers:
-        task = Task(run, described.scene, described.overrides(values[run]), directory)
-        if outcome := ended(task):
-            done.append(outcome)
-        else:
-            missing.append(task)
-    yield from done
-    for outcome in outcomes(missing, executor, lambda: progress("runs", len(done), len(numbers))):
-        done.append(outcome)
-        yield outcome
 
 
 def finish(

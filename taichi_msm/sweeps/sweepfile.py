@@ -24,7 +24,7 @@ from taichi_msm.scenefile.load import PICTURES, SCENE, Draft, File, Kind, is_bel
 from taichi_msm.scenefile.validation import parse
 from taichi_msm.scenefile.yaml_reader import UnreadableError, read
 from taichi_msm.sweeps.distribution import Distribution
-from taichi_msm.sweeps.samples import count_runs, values_of_runs
+from taichi_msm.sweeps.samples import count_runs, values_of_runs, values_of_some
 
 MAX_RUNS = 10**7
 
@@ -88,6 +88,14 @@ class Sweep:
         """The number of runs."""
         return count_runs(self.settings.vary, self.settings.samples)
 
+    def values(self) -> list[list[Any]]:
+        """Give the values of the keys that vary, for every run."""
+        return values_of_runs(self.settings.vary, self.settings.samples, self.settings.seed)
+
+    def some_values(self, most: int) -> list[list[Any]]:
+        """Give those of at most so many runs, spread over all."""
+        return values_of_some(self.settings.vary, self.settings.samples, self.settings.seed, most)
+
     def overrides(self, values: list[Any]) -> tuple[str, ...]:
         """Give what `run --set` takes for the run with these values."""
         pairs = [*self.settings.set.items(), *zip(self.keys, values, strict=True)]
@@ -131,8 +139,11 @@ def load_sweep(path: str | Path) -> Sweep:
     draft.report(problems)
     if settings is None or draft.problems:
         raise SceneError(draft.lines())
-    sweep = _sweep_of(folder / settings.scene, settings)
-    draft.report(_unknown_keys(sweep))
+    try:
+        sweep = _sweep_of(folder / settings.scene, settings)
+        draft.report(_unknown_keys(sweep))
+    except SceneError as error:
+        draft.report([Problem(("scene",), error.lines[0])])
     if draft.problems:
         raise SceneError(draft.lines())
     return sweep
@@ -218,9 +229,9 @@ def _as_key(name: str) -> Key:
 
 def _unknown_keys(sweep: Sweep) -> Iterator[Problem]:
     """Find the keys that no scene has, by trying the values of the first run."""
-    draft, values = Draft(sweep.scene), values_of_runs(sweep.settings.vary, sweep.settings.samples, sweep.settings.seed)
+    draft, first = Draft(sweep.scene), sweep.some_values(1)[0]
     places = [*(("set", name) for name in sweep.settings.set), *(("vary", name) for name in sweep.keys)]
-    for place, text in zip(places, sweep.overrides(values[0]), strict=True):
+    for place, text in zip(places, sweep.overrides(first), strict=True):
         known = len(draft.problems)
         draft.override(parse_override(text))
         yield from (Problem(place, problem.message) for _, problem in draft.problems[known:])

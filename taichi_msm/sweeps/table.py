@@ -9,15 +9,13 @@ from typing import Any
 
 from taichi_msm.results.whole import replacing
 from taichi_msm.sweeps.outcome import COLUMNS
-from taichi_msm.sweeps.result import SweepResult
+from taichi_msm.sweeps.result import PARQUET, TABLE, SweepResult
 from taichi_msm.sweeps.sweepfile import cell
-
-CSV, PARQUET = "table.csv", "table.parquet"
 
 
 def write_table(result: SweepResult) -> None:
     """Write table.csv."""
-    with replacing(result.directory / CSV) as file:
+    with replacing(result.directory / TABLE) as file:
         for row in [_names(result), *_rows(result, cell)]:
             file.write(f"{csv_line(row)}\n".encode("utf-8", "backslashreplace"))
 

@@ -2,16 +2,15 @@
 
 from __future__ import annotations
 
+import os
 import time
 from pathlib import Path
 from typing import NamedTuple
 
 from taichi_msm.errors import MsmError, SceneError
+from taichi_msm.outputs.table import RUNS, numbered
 from taichi_msm.scenefile.load import File, plan_file
 from taichi_msm.sweeps.outcome import Outcome, Status, outcome_of
-
-# The folder of the runs in that of a sweep.
-RUNS = "runs"
 
 
 class Task(NamedTuple):
@@ -21,15 +20,17 @@ class Task(NamedTuple):
     scene: File
     overrides: tuple[str, ...]
     folder: Path  # of the sweep
+    home: Path  # from which its paths start
 
     @property
     def directory(self) -> Path:
         """Where its results go."""
-        return self.folder / RUNS / f"{self.run:06}"
+        return self.folder / RUNS / numbered(self.run)
 
 
 def take(task: Task) -> Outcome:
     """Run a scene with its overrides on one thread, as `run --set` does; whatever fails is in the outcome."""
+    os.chdir(task.home)
     try:
         plan = plan_file(task.scene, task.overrides)
     except SceneError as error:

@@ -16,7 +16,8 @@ from taichi_msm.errors import FilesError, printable, writing
 from taichi_msm.outputs.gif import Picture
 from taichi_msm.outputs.table import OUTPUTS
 from taichi_msm.progress import Pause
-from taichi_msm.results.encoder import Encoder, Job
+from taichi_msm.results.encoder import Encoder
+from taichi_msm.results.pictures import Job
 from taichi_msm.results.whole import place, staged
 from taichi_msm.scene import Render, Scene
 from taichi_msm.scenefile.load import MAX_BYTES

@@ -26,7 +26,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from taichi_msm import __version__
-from taichi_msm.export.mesh import REFINE, picture_png, unit_normals
+from taichi_msm.exports.mesh import REFINE, picture_png, unit_normals
+from taichi_msm.exports.sources import in_folders
 from taichi_msm.progress import Count
 from taichi_msm.render.surface import surface
 from taichi_msm.results.finished_run import FinishedRun
@@ -55,6 +56,7 @@ VERTICES, INDICES = 34962, 34963
 ALIGNMENT = 4
 
 
+@in_folders
 def write(run: FinishedRun, folder: Path, progress: Count) -> list[str]:
     """Write the surface of a run, with its picture; raises what `FinishedRun.positions` and `picture_png` do."""
     positions, picture, binary = run.positions(), picture_png(run), Binary()

@@ -1,6 +1,6 @@
 """Tracks of points in the format of TAP-Vid.
 
-One pickle like that of TAP-Vid-DAVIS: a dictionary from the video's name to a dictionary of
+One pickle like that of TAP-Vid-DAVIS: a dictionary from the name of each video, one a run, to a dictionary of
 
     video      frames, uint8, shape (frames, height, width, 3)
     points     where each point is, float32, shape (tracks, frames, 2): x / width and y / height, 0 at the left and the
@@ -14,8 +14,10 @@ Source: google-deepmind/tapnet, tapnet/tapvid/README.md, evaluation_datasets.py 
 
 from __future__ import annotations
 
+import math
 import pickle
 import zipfile
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -23,6 +25,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from taichi_msm.errors import FilesError
+from taichi_msm.exports.sources import Source
 from taichi_msm.outputs.npz import read_rows
 from taichi_msm.progress import Count
 from taichi_msm.results.finished_run import FinishedRun, damaged, reading
@@ -42,26 +45,37 @@ class _Pickler(pickle.Pickler):
         return NotImplemented
 
 
-def write(run: FinishedRun, folder: Path, progress: Count) -> list[str]:
-    """Write the tracks of a run and its frames; raises a FilesError when the video does not fit into memory."""
+def write(sources: Sequence[Source], folder: Path) -> Iterator[list[str]]:
+    """Write the tracks of runs and their frames; raises a FilesError when the videos do not fit into memory."""
+    _require_memory([source.run for source in sources])
+    videos = {}
+    for run, name, progress in sources:
+        videos[name or run.directory.resolve().name] = _video(run, progress)
+        yield []
+    with create(folder / "tapvid.pkl") as file:
+        _Pickler(file, PROTOCOL).dump(videos)
+
+
+def _require_memory(runs: Sequence[FinishedRun]) -> None:
+    # Readers hold all videos in memory; writing them takes twice that.
+    need, free = 2 * 3 * sum(run.frames * math.prod(run.scene.render.size) for run in runs), available_memory()
+    if need > free:
+        whose, remedy = f"the videos of {len(runs)} runs take", "export fewer runs at a time"
+        if len(runs) == 1:
+            whose = f"{runs[0].directory}: its video takes"
+            remedy = "run the scene with a smaller render.size or fewer frames"
+        raise FilesError(f"{whose} {need / 2**30:.1f} GiB of memory, and {free / 2**30:.1f} are free; {remedy}")
+
+
+def _video(run: FinishedRun, progress: Count) -> dict[str, NDArray[Any]]:
+    """Read the frames and tracks of a run."""
     width, height = run.scene.render.size
     points, occluded = read_tracks(run)
-    # Readers hold the whole video in memory; writing it takes twice that.
-    need, free = 2 * 3 * run.frames * height * width, available_memory()
-    if need > free:
-        raise FilesError(
-            f"{run.directory}: its video takes {need / 2**30:.1f} GiB of memory, and {free / 2**30:.1f} are free; "
-            f"run the scene with a smaller render.size or fewer frames"
-        )
     video = np.empty((run.frames, height, width, 3), np.uint8)
     for frame in range(run.frames):
         progress(frame, run.frames)
         video[frame] = run.picture("png", frame)
-    scaled = (points / (width, height)).astype(np.float32)
-    with create(folder / "tapvid.pkl") as file:
-        name = run.directory.resolve().name
-        _Pickler(file, PROTOCOL).dump({name: {"video": video, "points": scaled, "occluded": occluded}})
-    return []
+    return {"video": video, "points": (points / (width, height)).astype(np.float32), "occluded": occluded}
 
 
 def read_tracks(run: FinishedRun) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:

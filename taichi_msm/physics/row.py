@@ -1,4 +1,4 @@
-"""The sweep of a row on a CPU: the forces of its springs, each evaluated once for both ends, and then its step.
+"""A row in a pass on a CPU: the forces of its springs, each evaluated once for both ends, and then its step.
 
 Lane l of entry b of a row is column b - 1 of strip l, so the neighbours of an entry are the entries beside it, and
 every operation is one vector instruction. The first and the last entry of a row are a halo: the entries at the other
@@ -17,8 +17,8 @@ from taichi_msm.physics.terms.term import DX, DY, HAS_LEFT, HAS_RIGHT, Entry, St
 from taichi_msm.system.runtime import ti
 
 
-def sweeping(code: StepCode) -> Callable[..., None]:
-    """Make the function that sweeps a row."""
+def row_passing(code: StepCode) -> Callable[..., None]:
+    """Make the function that goes through a row and steps it."""
     vector, columns, springs = code.vector, code.first_column(None), code.require(SpringTerm)
     structural, shear = springs.structural, springs.shear
     leaves_out = springs.open_edges and not springs.mapped
@@ -26,11 +26,11 @@ def sweeping(code: StepCode) -> Callable[..., None]:
     move = point_step(code)
 
     @ti.func
-    def sweep_row(
+    def pass_row(
         sheet: ti.template(), carried: ti.template(), carried_row, line: ti.template(), here, next_row, exists, up,
         loads: ti.template(), n, moving,
     ):  # fmt: skip
-        """Sweep row `line`, in row `here` of u, and step it if `moving`.
+        """Go through row `line`, in row `here` of u, and step it if `moving`.
 
         The other row, `next_row` of u, is `up` above this one [m]; exists: 0 if there is none, else 1. `carried_row` is
         the row of the forces carried from row to row, and n that of the table of loads.
@@ -116,4 +116,4 @@ def sweeping(code: StepCode) -> Callable[..., None]:
         for c in ti.static(range(3)):
             carried[c][carry + strip] = this[c]
 
-    return sweep_row
+    return pass_row

@@ -15,7 +15,8 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from taichi_msm.export.mesh import PICTURE, REFINE, picture_png, unit_normals
+from taichi_msm.exports.mesh import PICTURE, REFINE, picture_png, unit_normals
+from taichi_msm.exports.sources import in_folders
 from taichi_msm.progress import Count
 from taichi_msm.render.surface import surface
 from taichi_msm.results.finished_run import FinishedRun
@@ -27,6 +28,7 @@ MATERIAL = "surface.mtl"
 EXACT = "%.9g"
 
 
+@in_folders
 def write(run: FinishedRun, folder: Path, progress: Count) -> list[str]:
     """Write the surface of every frame, its material and the picture; raises as `gltf.write` does."""
     positions, picture = run.positions(), picture_png(run)

@@ -22,7 +22,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from taichi_msm.errors import NotInstalledError
-from taichi_msm.export.mesh import PICTURE, REFINE, picture_png
+from taichi_msm.exports.mesh import PICTURE, REFINE, picture_png
+from taichi_msm.exports.sources import in_folders
 from taichi_msm.physics.elasticity import energy_density
 from taichi_msm.physics.lattice import rest_positions
 from taichi_msm.physics.planning import make_plan
@@ -39,6 +40,7 @@ UNITS = {DISPLACEMENT: "m", SPEED: "m/s", ENERGY: "J/m2"}
 Array = NDArray[np.floating]
 
 
+@in_folders
 def write(run: FinishedRun, folder: Path, progress: Count) -> list[str]:
     """Write the surface of every frame, their times and the picture.
 

@@ -2,8 +2,8 @@
 
 Every pair of frames f and f + 1 is a scene of KITTI: `image_2/NNNNNN_10.png` and `_11.png`, and its flow in
 `flow_occ/NNNNNN_10.png`, valid wherever the sheet is, and `flow_noc/NNNNNN_10.png`, valid only where what is seen in f
-is seen in f + 1 too. All are in a folder `training`, as loaders of KITTI look for it. A flow (u, v) [px] is a PNG of 16
-bits a channel,
+is seen in f + 1 too. Pairs are numbered through over all runs. All are in a folder `training`, as loaders of KITTI look
+for it. A flow (u, v) [px] is a PNG of 16 bits a channel,
 
     red = 64 u + 2^15,   green = 64 v + 2^15,   blue = 1: valid,
 
@@ -17,15 +17,16 @@ from __future__ import annotations
 
 import struct
 import zlib
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
 from taichi_msm.errors import FilesError
+from taichi_msm.exports.sources import Source
 from taichi_msm.outputs.flo import read_flo
-from taichi_msm.outputs.table import OUTPUTS
+from taichi_msm.outputs.table import OUTPUTS, numbered
 from taichi_msm.progress import Count
 from taichi_msm.results.finished_run import FinishedRun, reading
 from taichi_msm.results.whole import add
@@ -43,29 +44,40 @@ UP = 2
 COMPRESS_LEVEL = 1
 
 
-def write(run: FinishedRun, folder: Path, progress: Count) -> list[str]:
-    """Write the flow of a run, and its frames and occlusion if it has them."""
+# The folders, each with the entry of `output` that it is made from.
+MADE_FROM = {"flow_occ": "flow", "flow_noc": "occlusion", "image_2": "png"}
+
+
+def write(sources: Sequence[Source], folder: Path) -> Iterator[list[str]]:
+    """Write the flow of runs, and the frames and occlusion of those that have them."""
+    training, first = folder / "training", 0
+    for name in MADE_FROM:
+        (training / name).mkdir(parents=True)
+    for source in sources:
+        yield _write_run(source.run, training, first, source.progress)
+        first += source.run.frames - 1
+
+
+def _write_run(run: FinishedRun, training: Path, first: int, progress: Count) -> list[str]:
+    """Write the pairs of a run, numbered from the first on."""
     pairs = run.frames - 1
     if pairs == 0:
         raise FilesError(f"{run.directory}: has only one frame, and flow needs two; run the scene to its end")
-    made_from = {"flow_occ": "flow", "flow_noc": "occlusion", "image_2": "png"}
-    flow_occ, flow_noc, image_2 = (folder / "training" / name for name in made_from)
-    for path in (flow_occ, flow_noc, image_2):
-        path.mkdir(parents=True)
+    flow_occ, flow_noc, image_2 = (training / name for name in MADE_FROM)
     for pair in range(pairs):
         progress(pair, pairs)
-        source, name = run.result("flow", pair), f"{pair:06}_10.png"
+        source, name = run.result("flow", pair), numbered(first + pair)
         with reading(source):
             flow = read_flo(source, run.scene.render.size)
-        add(flow_occ / name, png16(encode(flow)))
+        add(flow_occ / f"{name}_10.png", png16(encode(flow)))
         if run.has("occlusion"):
-            add(flow_noc / name, png16(encode(flow, ~(run.picture("occlusion", pair)[..., 0] > 0))))
+            add(flow_noc / f"{name}_10.png", png16(encode(flow, ~(run.picture("occlusion", pair)[..., 0] > 0))))
         for number in (0, 1) if run.has("png") else ():
-            _copy(run, pair + number, image_2 / f"{pair:06}_1{number}.png")
+            _copy(run, pair + number, image_2 / f"{name}_1{number}.png")
     remedy = run.remedy("occlusion", "png")
     return [
         f"{name} is left out: {OUTPUTS[key].result} is not among the results; {remedy}"
-        for name, key in made_from.items()
+        for name, key in MADE_FROM.items()
         if not run.has(key)
     ]
 

@@ -1,0 +1,172 @@
+"""Convert the folders of runs to a folder with another program's files."""
+
+from __future__ import annotations
+
+import csv
+import io
+import json
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from functools import partial
+from importlib import import_module
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from taichi_msm.arguments import require_path
+from taichi_msm.errors import ArgumentError, FilesError, SceneError, did_you_mean, writing
+from taichi_msm.exports.formats import FORMATS
+from taichi_msm.exports.sources import Source, Write, read_runs
+from taichi_msm.outputs.table import numbered
+from taichi_msm.progress import Count
+from taichi_msm.results.entries import files, without_link
+from taichi_msm.results.finished_run import PUT_BACK, FinishedRun
+from taichi_msm.results.publication import Contents, Listed, Publication
+from taichi_msm.results.whole import add, create
+
+# The file that lists the others, and that which leads from numbers to runs.
+RECORD, INDEX = "export.json", "index.csv"
+
+
+def _listed(record: Mapping[str, Any]) -> Listed:
+    return {RECORD, *record["files"]}.__contains__
+
+
+# The files of all formats: any of them may have been exported to a folder before, or been about to be. A folder with
+# anything else in it is refused, as nobody would find it again among so many files.
+PATTERNS = (
+    r"export\.json",
+    r"index\.csv",
+    *dict.fromkeys(pattern for row in FORMATS.values() for pattern in row.files),
+)
+EXPORT = Contents("export", RECORD, PATTERNS, _listed, alone=True)
+
+
+class Exported(NamedTuple):
+    """What was written."""
+
+    directory: Path
+    files: list[str]  # names in the directory, with slashes
+    notes: list[str]  # what the user should know about them
+
+
+def export(
+    runs: str | Path | Sequence[str | Path],
+    format: str,  # noqa: A002
+    out: str | Path | None = None,
+    progress: Count = lambda done, total: None,
+) -> Exported:
+    """Convert the results of runs for another program, whole or not at all.
+
+    Runs are numbered in their order; index.csv leads from the numbers to the runs. The files replace those of an
+    earlier export.
+
+    Args:
+        runs: the folder of a run, or that of a sweep, of which all complete runs are taken; or several of them.
+        format: kitti, tapvid, vtk, gltf or obj.
+        out: where the files go; None: into export-FORMAT, in the folder if it is one, in output if they are several.
+        progress: called often, with the frames done and the frames in all; what it raises stops the export, and no file
+            changes.
+
+    Returns:
+        The `directory` where the files are; the names of the `files` in it; and `notes`, a line each, on what is left
+        out or only near.
+
+    Raises:
+        ArgumentError: when an argument is not what it must be.
+        FilesError: when a file that is needed is missing or damaged, or the files cannot be written.
+        NotInstalledError: when a package that writes the format is not installed.
+
+    Example:
+        >>> from taichi_msm import export
+        >>> done = export("output/press", "obj")
+        >>> done.directory.name, len(done.files), done.files[-1], done.notes
+        ('export-obj', 34, 'surface.mtl', [])
+    """
+    directories = list(runs) if isinstance(runs, Sequence) and not isinstance(runs, str) else [runs]
+    for path in [*directories, *([] if out is None else [out])]:
+        require_path(path)
+    if not directories:
+        raise ArgumentError("runs: []; take the folder of a run or of a sweep, or several")
+    if format not in list(FORMATS):
+        raise ArgumentError(f"format: {format!r}; take one of {', '.join(FORMATS)}{did_you_mean(str(format), FORMATS)}")
+    directory = _default(directories, format) if out is None else Path(out)
+    finished, left_out = read_runs(directories)
+    exported = _convert(finished, format, directory, progress)
+    if left_out:
+        of_all = f"{left_out} of {left_out + len(finished)} runs"
+        exported.notes.insert(0, f"left out, as not complete: {of_all}; table.csv of the sweep tells why")
+    return exported
+
+
+def _default(directories: Sequence[str | Path], name: str) -> Path:
+    folder = Path(directories[0]) if len(directories) == 1 else without_link(Path("output"), "--out")
+    return without_link(folder / f"export-{name}", "--out")
+
+
+def _convert(runs: Sequence[FinishedRun], name: str, directory: Path, progress: Count) -> Exported:
+    """Convert runs, one or more."""
+    wanted, total, done = FORMATS[name], sum(run.frames for run in runs), 0
+    write: Write = import_module(f"taichi_msm.exports.{name}").write
+    sources = []
+    for number, run in enumerate(runs):
+        own = partial(_count, progress, done, run.frames, total)
+        sources.append(Source(run, numbered(number) if len(runs) > 1 else "", own))
+        done += run.frames
+    progress(0, total)
+    notes: dict[str, list[Path]] = {}
+    with writing(directory), Publication(directory, EXPORT) as publication:
+        for run in runs:
+            with run.unchanged():
+                if missing := [key for key in wanted.needs if not run.has(key)]:
+                    remedy = run.remedy(*wanted.needs, *wanted.uses)
+                    raise FilesError(f"{run.directory}: {name} needs {' and '.join(missing)}; {remedy}")
+        writer = write(sources, publication.staged)
+        for run in runs:
+            with _naming(run, name), run.unchanged():
+                for note in next(writer):
+                    notes.setdefault(note, []).append(run.directory)
+        next(writer, None)
+        _write_index(runs, wanted.pairs, publication.staged / INDEX)
+        written = sorted(files(publication.staged, PATTERNS, strict=True))
+        add(publication.staged / RECORD, (json.dumps({"files": written}, indent=1) + "\n").encode())
+        publication.publish([*written, RECORD])
+    return Exported(directory, written, [*(_told(note, of) if len(runs) > 1 else note for note, of in notes.items())])
+
+
+def _count(progress: Count, before: int, frames: int, total: int, done: int, parts: int) -> None:
+    """Report the progress of a run as that of all runs."""
+    progress(before + frames * done // parts, total)
+
+
+@contextmanager
+def _naming(run: FinishedRun, name: str) -> Iterator[None]:
+    """Say of which run a fault is that its scene or its numbers have."""
+    try:
+        with np.errstate(over="raise", divide="raise", invalid="raise"):
+            yield
+    except SceneError as error:
+        # The fault names what the scene is to change; here the picture itself must be put back.
+        fault = error.lines[0].partition(";")[0]
+        raise FilesError(f"{run.directory}: {fault}; {PUT_BACK}") from None
+    except FloatingPointError:
+        said = f"its numbers are too large for {name}; run the scene again"
+        raise FilesError(f"{run.directory}: {said}") from None
+
+
+def _told(note: str, runs: Sequence[Path]) -> str:
+    """Say of which runs a note is."""
+    return f"{runs[0]}{f' and {len(runs) - 1} more' if len(runs) > 1 else ''}: {note}"
+
+
+def _write_index(runs: Sequence[FinishedRun], pairs: bool, path: Path) -> None:
+    """Write which run, or which pair of frames of it, has which number."""
+    rows: list[tuple[str | int, ...]] = []
+    for run in runs:
+        name = run.directory.as_posix()
+        rows += [(name, frame) for frame in range(run.frames - 1)] if pairs else [(name,)]
+    with io.TextIOWrapper(create(path), "utf-8", "surrogateescape", newline="") as file:
+        writer = csv.writer(file, lineterminator="\n")
+        writer.writerow(["number", "run", *(["frame"] if pairs else [])])
+        writer.writerows([numbered(number), *row] for number, row in enumerate(rows))

@@ -1,0 +1,155 @@
+"""Write pictures as PNG and GIF."""
+
+from __future__ import annotations
+
+import os
+import time
+import zlib
+from collections import deque
+from collections.abc import Callable
+from concurrent.futures import CancelledError, Future, ThreadPoolExecutor, wait
+from contextlib import ExitStack, suppress
+from pathlib import Path
+from threading import Event
+from typing import NamedTuple
+
+from PIL import Image
+
+from taichi_msm.outputs.gif import GifWriter, Palette, Picture, shades
+from taichi_msm.outputs.table import OUTPUTS
+from taichi_msm.progress import Pause
+from taichi_msm.results.whole import create
+
+# Of 512 x 512 pixels of shaded tissue Pillow's default takes 93 ms, its level 1 takes 17 ms and 348 kB. With a search
+# for runs of equal bytes alone it takes 16 ms and 314 kB: tissue has no other repetitions, and a background has these.
+COMPRESSION = {"compress_level": 1, "compress_type": zlib.Z_RLE}
+
+# While a caller waits for pictures to be encoded, this is how long until its `pause` is called again [s].
+PATIENCE = 0.1
+
+
+class Job(NamedTuple):
+    """What to encode: as `frames/0000.png` and so on, as `animation.gif`, or as both."""
+
+    folder: Path  # where the files go
+    size: tuple[int, int]  # width, height of the pictures [px]
+    rate: float  # frames per second
+    png: bool
+    gif: bool
+    background: tuple[int, int, int]  # a colour that the animation keeps exactly
+
+    def still(self, number: int) -> Path:
+        """Name the PNG of a frame."""
+        return self.folder / OUTPUTS["png"].path(number)
+
+
+class Report(NamedTuple):
+    """How many pictures were encoded completely, and the processor time that was spent [s]."""
+
+    frames: int
+    seconds: float
+
+
+class PictureWriter:
+    """Encodes pictures in threads of this process, where no KeyboardInterrupt leaves half a file.
+
+    An OSError, in any method and at the latest in `finish`, says that a file cannot be written.
+
+    Args:
+        job: what to encode.
+        waiting: how many pictures may wait while others are encoded; 0: `add` returns when its picture is encoded.
+        hurry: when it is set, pictures are given up that are not being encoded yet, except the first.
+    """
+
+    def __init__(self, job: Job, waiting: int = 0, hurry: Event | None = None) -> None:
+        self._job, self._waiting, self._hurry = job, waiting, hurry or Event()
+        self._frames = self._begun = 0
+        self._seconds = 0.0
+        self._gif: GifWriter | None = None
+        self._files = ExitStack()
+        self._pending: deque[Future[None]] = deque()
+        self._stills = ThreadPoolExecutor(max(1, min(waiting, os.cpu_count() or 1)))
+        self._reel = ThreadPoolExecutor(1)
+
+    def add(self, picture: Picture, pause: Pause = lambda: None) -> None:
+        """Encode the next picture, shape (height, width, 3), which must not change; `pause`: as for `Encoder.add`."""
+        number = self._begun
+        self._begun += 1
+        if self._job.png and number == 0:
+            self._job.still(0).parent.mkdir()
+        still = self._stills.submit(self._shoot, picture, number) if self._job.png else None
+        self._pending.append(self._reel.submit(self._complete, picture, number, still))
+        while len(self._pending) > self._waiting and not self._hurry.is_set():
+            with suppress(CancelledError):
+                _await(self._pending[0], pause)
+            self._pending.popleft()
+
+    def finish(self, pause: Pause = lambda: None, *, hurry: bool = False) -> Report:
+        """Wait until all pictures are encoded; arguments as for `Encoder.finish`."""
+        if hurry:
+            self._hurry.set()
+        with suppress(CancelledError):  # and so are those after it
+            for task in self._pending:
+                _await(task, pause)
+        self._stills.shutdown()
+        _await(self._reel.submit(self._close), pause)
+        for number in range(self._frames, self._begun) if self._job.png else ():
+            self._job.still(number).unlink(missing_ok=True)
+        return Report(self._frames, self._seconds)
+
+    def abort(self) -> None:
+        """End the threads, and close the files as they are."""
+        self._hurry.set()
+        self._stills.shutdown()
+        self._reel.shutdown()
+        with suppress(OSError):
+            self._files.close()
+
+    def _shoot(self, picture: Picture, number: int) -> float:
+        """Write a PNG; returns the processor time [s]."""
+        self._give_up_in_a_hurry(number)
+        return _seconds(_write_png, picture, self._job.still(number))
+
+    def _complete(self, picture: Picture, number: int, still: Future[float] | None) -> None:
+        """Complete a frame: first its still, then its place in the film, which so has no frame without a still."""
+        self._give_up_in_a_hurry(number)
+        spent = still.result() if still else 0.0
+        self._seconds += spent + (_seconds(self._film, picture) if self._job.gif else 0.0)
+        self._frames += 1
+
+    def _give_up_in_a_hurry(self, number: int) -> None:
+        """Raise CancelledError in a hurry, but for the first frame: a run that was interrupted early keeps one."""
+        if self._hurry.is_set() and number > 0:
+            raise CancelledError
+
+    def _film(self, picture: Picture) -> None:
+        job = self._job
+        if self._gif is None:  # The first frame shows the colours that the animation needs.
+            file = self._files.enter_context(create(job.folder / OUTPUTS["gif"].path()))
+            self._gif = GifWriter(file, job.size, job.rate, Palette(shades(picture), job.background))
+        self._gif.add(picture)
+
+    def _close(self) -> None:
+        """Complete the film, once."""
+        if self._gif is not None:
+            self._seconds += _seconds(self._gif.close)
+            self._gif = None
+
+
+def _await(task: Future[None], pause: Pause) -> None:
+    """Wait for a task, and raise its error."""
+    while not wait([task], PATIENCE).done:
+        pause()
+    task.result()
+
+
+def _write_png(picture: Picture, path: Path) -> None:
+    with create(path) as file:
+        Image.fromarray(picture).save(file, "PNG", **COMPRESSION)
+
+
+def _seconds(work: Callable[..., None], *args: object) -> float:
+    """Do some work; returns its processor time [s], which does not grow while the simulation occupies the cores."""
+    start = time.thread_time()
+    work(*args)
+    return time.thread_time() - start

@@ -1,0 +1,303 @@
+"""Sweeps: the runs, the table, and what no kill, order, shard or number of workers may change."""
+
+from __future__ import annotations
+
+import csv
+import io
+import json
+import os
+import shutil
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterator
+from concurrent.futures import Executor, Future, ProcessPoolExecutor
+from multiprocessing import get_context
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from taichi_msm import sweep
+from taichi_msm.errors import MsmError, SceneError
+from taichi_msm.sweeps import cost
+from taichi_msm.sweeps.folder import sort_out, values_in
+from taichi_msm.sweeps.outcome import Outcome
+from taichi_msm.sweeps.pool import ORPHANED, DiedError, Pool
+from taichi_msm.sweeps.schedule import outcomes
+from taichi_msm.sweeps.sweep import finish
+from taichi_msm.sweeps.sweepfile import load_sweep
+from taichi_msm.sweeps.task import Task
+from tests.conftest import Program
+from tests.outputs import files, results
+from tests.scenes import SMALL
+from tests.telling import Telling
+
+# The step of 0.01 s is above the stability limit, so some runs are refused.
+SWEEP = """\
+scene: small.yaml
+samples: 4
+seed: 1
+vary:
+  springs.structural: {log_uniform: [5, 50]}
+  probes.0.at: {uniform: [[0.3, 0.3], [0.7, 0.7]]}
+  time.step: {choice: [0.01, auto]}
+set: {output: [png, gif, trajectory, depth], time.duration: 0.2}
+"""
+
+
+@pytest.fixture
+def many(small: Path) -> Path:
+    """`small` with a sweep of four runs, some of which are refused."""
+    (small / "many.yaml").write_text(SWEEP)
+    return small
+
+
+def table(directory: Path | str) -> list[dict[str, str]]:
+    """The rows of a table, without the seconds."""
+    rows = list(csv.DictReader(io.StringIO((Path(directory) / "table.csv").read_text())))
+    return [{name: value for name, value in row.items() if name != "seconds"} for row in rows]
+
+
+def runs(directory: Path | str) -> dict[str, bytes]:
+    """What the runs wrote but for their records, which tell the time."""
+    return {name: data for name, data in files(Path(directory) / "runs").items() if not name.endswith("run.json")}
+
+
+@pytest.fixture(scope="module")
+def pool() -> Iterator[Pool]:
+    """A process that has started once for many sweeps."""
+    pool = Pool(1)
+    yield pool
+    pool.shutdown()
+
+
+def go(executor: Executor, directory: str, part: tuple[int, int] = (1, 1)) -> None:
+    """Take the runs of many.yaml, as the command does."""
+    described = load_sweep("many.yaml")
+    values = values_in(Path(directory), described)
+    done, missing = sort_out(described, values, Path(directory), part)
+    rows = [*done, *outcomes(missing, executor, lambda: None)]
+    if part == (1, 1):
+        finish(described, values, Path(directory), rows, executor, lambda stage, done, total: None)
+
+
+def test_each_run_is_that_of_run_with_its_cells(many: Path, program: Program) -> None:
+    done = program("sweep", "many.yaml", "--out", "out")
+    assert done.returncode == 0, done.stderr
+    rows = table("out")
+    assert list(rows[0]) == [
+        *("run", "springs.structural", "probes.0.at", "time.step", "status", "error"),
+        *("max_displacement", "shortest_spring", "error_estimate", "mesh_error"),
+    ]
+    statuses = [row["status"] for row in rows]
+    assert sorted(set(statuses)) == ["complete", "refused"]
+    refused = rows[statuses.index("refused")]
+    assert refused["error"].startswith("--set time.step=0.01: time.step: 0.01 s is above the stability limit")
+    assert f"4 runs: {statuses.count('complete')} complete, {statuses.count('refused')} refused" in done.stdout
+    for row in rows:
+        here = Path("out/runs") / f"{int(row['run']):06}"
+        if row["status"] == "refused":
+            assert not here.exists()
+            continue
+        keys = ("springs.structural", "probes.0.at", "time.step")
+        settings = ["output=[png, gif, trajectory, depth]", "time.duration=0.2", *(f"{key}={row[key]}" for key in keys)]
+        typed = [word for setting in settings for word in ("--set", setting)]
+        assert program("run", "small.yaml", "--out", "single", *typed).returncode == 0
+        assert results(here) == results(Path("single"))
+        one, other = (json.loads((folder / "run.json").read_text()) for folder in (here, Path("single")))
+        assert row["max_displacement"] == repr(one["max_displacement"])
+        assert row["error_estimate"] == repr(one["error_estimate"]["error"])
+        for key in ("status", "scene", "step", "max_displacement", "error_estimate", "sha256", "notes", "outputs"):
+            assert one[key] == other[key]
+
+
+def test_it_goes_on_with_what_is_missing(many: Path, pool: Pool) -> None:
+    go(pool, "out")
+    before, rows = runs("out"), table("out")
+    first, second = [Path("out/runs") / f"{int(row['run']):06}" for row in rows if row["status"] == "complete"]
+    shutil.rmtree(first)
+    record = (second / "run.json").read_bytes()
+    go(pool, "out")
+    assert (table("out"), runs("out")) == (rows, before)
+    assert (second / "run.json").read_bytes() == record, "it was run again"
+
+
+def test_shards_change_nothing(many: Path, pool: Pool) -> None:
+    go(pool, "whole")
+    for part in (2, 1, 3):
+        go(pool, "parts", (part, 3))
+    assert runs("parts") == runs("whole")
+    assert not Path("parts/table.csv").exists()
+    go(pool, "parts")
+    assert (table("parts"), runs("parts")) == (table("whole"), runs("whole"))
+
+
+def test_a_shard_of_the_command_writes_no_table(many: Path, program: Program) -> None:
+    done = program("sweep", "many.yaml", "--shard", "2/4", "--out", "out")
+    assert done.returncode == 0
+    assert done.stdout == (
+        "out: 1 runs of part 2 of 4: 1 complete\nwithout --shard, the same command writes the table\n"
+    )
+    assert sorted(str(path.relative_to("out")) for path in Path("out").glob("*/*")) == ["runs/000001"]
+    assert [path.name for path in Path("out").glob("*.*")] == ["sweep.json"]
+
+
+def test_a_kill_changes_nothing(many: Path, pool: Pool) -> None:
+    go(pool, "whole")
+    with Telling("sweep", "many.yaml", "--workers", "1", "--out", "killed", stderr=subprocess.DEVNULL) as process:
+        process.until("runs", 2)
+        process.kill()
+    # Its worker, which is in the middle of the last run, ends by itself.
+    time.sleep(2 * ORPHANED)
+    assert not Path("killed/runs/000003/run.json").exists()
+    go(pool, "killed")
+    assert (table("killed"), runs("killed")) == (table("whole"), runs("whole"))
+
+
+def test_a_signal_ends_it_and_says_how_to_go_on(many: Path) -> None:
+    with Telling("sweep", "many.yaml", "--workers", "1", "--out", "out", stderr=subprocess.PIPE) as process:
+        process.until("runs", 2)
+        process.send_signal(signal.SIGINT)
+        _, told = process.communicate()
+    assert process.returncode == 130
+    assert "of 4 runs have ended; the same command goes on" in told
+    assert not Path("out/table.csv").exists()
+
+
+def test_another_sweep_in_the_folder_is_refused(many: Path, program: Program) -> None:
+    values_in(Path("out"), load_sweep("many.yaml"))
+    before = files(Path("out"))
+
+    def refusal() -> str:
+        done = program("sweep", "many.yaml", "--out", "out")
+        assert done.returncode == 2
+        return done.stderr
+
+    (many / "many.yaml").write_text(SWEEP.replace("seed: 1", "seed: 2"))
+    assert refusal() == "out: holds the runs of another sweep: seed differs; choose another --out\n"
+    (many / "many.yaml").write_text(SWEEP)
+    (many / "small.yaml").write_text(SMALL.replace("falloff: 20", "falloff: 21"))
+    assert "the scene file differs" in refusal()
+    (many / "small.yaml").write_text(SMALL)
+    (many / "speckle.png").write_bytes((many / "speckle.png").read_bytes() + b"0")
+    assert "a picture differs" in refusal()
+    assert files(Path("out")) == before
+
+
+def test_a_dry_run_writes_nothing(many: Path, program: Program) -> None:
+    done = program("sweep", "many.yaml", "--dry-run")
+    lines = done.stdout.splitlines()
+    assert lines[0] == "run,springs.structural,probes.0.at,time.step"
+    assert [line.split(",")[0] for line in lines[1:5]] == ["0", "1", "2", "3"]
+    assert lines[5].startswith("4 runs: about ")
+    assert not Path("output").exists()
+    answer = json.loads(program("sweep", "many.yaml", "--dry-run", "--json").stdout)
+    assert (answer["keys"], len(answer["values"])) == (["springs.structural", "probes.0.at", "time.step"], 4)
+
+
+def test_many_runs_must_be_meant(many: Path, program: Program) -> None:
+    (many / "many.yaml").write_text(SWEEP.replace("samples: 4", "samples: 1000000"))
+    done = program("sweep", "many.yaml")
+    assert done.returncode == 2
+    assert done.stderr.startswith("taichi-msm: 1000000 runs: about ")
+    assert "MiB on disk; add --yes if that is meant" in done.stderr
+    assert not Path("output").exists()
+
+
+@pytest.mark.parametrize("part", ["0/3", "4/3", "3", "a/b", "1/0"])
+def test_a_shard_is_a_part_of_the_runs(many: Path, program: Program, part: str) -> None:
+    done = program("sweep", "many.yaml", "--shard", part)
+    assert done.returncode == 2
+    assert f"{part} is no part; take I/N with 1 <= I <= N, such as 3/8" in done.stderr
+
+
+def test_it_is_started_from_python_with_any_executor(many: Path, pool: Pool) -> None:
+    vary = {"damping": {"grid": [0.01, 0.02]}}
+    with ProcessPoolExecutor(1, get_context("spawn")) as executor:
+        rows = sorted(sweep("small.yaml", vary, "out", overrides={"output": []}, executor=executor), key=number)
+    assert [(row.run, row.status) for row in rows] == [(0, "complete"), (1, "complete")]
+    assert [row["damping"] for row in table("out")] == ["0.01", "0.02"]
+    # By its own processes, to the same.
+    assert sorted(sweep("small.yaml", vary, "other", overrides={"output": []}), key=number) == rows
+    with pytest.raises(SceneError, match=r"^vary\.dampign: unknown key; did you mean 'damping'\?$"):
+        sweep("small.yaml", {"dampign": {"grid": [1]}}, "wrong")
+
+
+def number(row: Outcome) -> int:
+    return row.run
+
+
+def end_at_once() -> None:
+    os.kill(os.getpid(), signal.SIGKILL)
+
+
+def test_a_pool_replaces_a_process_that_was_killed() -> None:
+    pool = Pool(2)
+    try:
+        with pytest.raises(DiedError, match=r"^its process was ended by SIGKILL, as the system does when memory"):
+            pool.submit(end_at_once).result()
+        first, second = (pool.submit(os.getpid).result() for _ in range(2))
+        assert os.getpid() not in (first, second)
+        with pytest.raises(ValueError, match="invalid literal"):
+            pool.submit(int, "a").result()
+    finally:
+        pool.shutdown()
+
+
+def test_the_processes_of_a_pool_end_with_it(tmp_path: Path) -> None:
+    code = (
+        "import os, time; from taichi_msm.sweeps.pool import Pool; pool = Pool(1); "
+        "print(pool.submit(os.getpid).result(), flush=True); pool.submit(time.sleep, 60); time.sleep(60)"
+    )
+    with subprocess.Popen([sys.executable, "-c", code], stdout=subprocess.PIPE, text=True) as owner:
+        assert owner.stdout
+        worker = int(owner.stdout.readline())
+        owner.kill()
+    for _ in range(100):
+        if not Path(f"/proc/{worker}").exists():
+            return
+        time.sleep(0.1)
+    raise AssertionError("it is still there")
+
+
+class Dying(Executor):
+    """An executor whose workers die of run 1 so many times."""
+
+    def __init__(self, times: int) -> None:
+        self.times = times
+
+    def submit(self, function: Callable[..., Any], /, *arguments: Any, **named: Any) -> Future[Any]:
+        future: Future[Any] = Future()
+        (task,) = arguments
+        if task.run == 1 and self.times:
+            self.times -= 1
+            future.set_exception(DiedError("its process was ended by SIGKILL"))
+        else:
+            future.set_result(Outcome(task.run, "complete"))
+        return future
+
+
+@pytest.mark.parametrize(("times", "status"), [(1, "complete"), (2, "died")])
+def test_a_run_whose_worker_died_is_taken_once_more(times: int, status: str) -> None:
+    tasks = [Task(run, None, (), Path(), Path()) for run in range(3)]  # type: ignore[arg-type]
+    ends = {row.run: row for row in outcomes(tasks, Dying(times), lambda: None)}
+    assert [ends[run].status for run in range(3)] == ["complete", status, "complete"]
+    assert ends[1].error == ("its process was ended by SIGKILL, twice" if times == 2 else "")
+
+
+def test_an_executor_that_takes_no_more_runs_is_an_error() -> None:
+    executor = ProcessPoolExecutor(1, get_context("spawn"))
+    with pytest.raises(Exception, match="terminated abruptly"):
+        executor.submit(end_at_once).result()
+    with pytest.raises(MsmError, match=r"^ProcessPoolExecutor takes no more runs: .*; start the sweep again$"):
+        list(outcomes([Task(0, None, (), Path(), Path())], executor, lambda: None))  # type: ignore[arg-type]
+
+
+def test_there_is_a_process_for_each_core_as_far_as_memory_goes(monkeypatch: pytest.MonkeyPatch) -> None:
+    need = cost.Cost(1.0, True, 0, 1 << 30, "")
+    monkeypatch.setattr(cost, "available_threads", lambda: 8)
+    for free, runs_, number in ((100 << 30, 1000, 8), (3 << 30, 1000, 3), (1 << 20, 1000, 1), (100 << 30, 5, 5)):
+        monkeypatch.setattr(cost, "available_memory", lambda free=free: free)
+        assert cost.choose_workers(need, runs_).number == number

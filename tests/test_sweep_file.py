@@ -1,0 +1,226 @@
+"""Sweep files: what they mean, and every fault of one."""
+
+from __future__ import annotations
+
+import json
+import math
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from PIL import Image
+from scipy.special import ndtri
+from scipy.stats import qmc
+
+from taichi_msm.errors import SceneError
+from taichi_msm.scenefile.load import load_plan
+from taichi_msm.sweeps.distribution import Distribution
+from taichi_msm.sweeps.samples import values_of_runs, values_of_some
+from taichi_msm.sweeps.sweepfile import cell, load_sweep
+from tests.scenes import speckle
+
+
+def shares(dimensions: int, samples: int, seed: int) -> Any:
+    """Points of SciPy's scrambled Sobol sequence, without its warning about other numbers than powers of two."""
+    return qmc.Sobol(dimensions, scramble=True, seed=np.random.default_rng(seed)).random(
+        2 ** math.ceil(math.log2(samples))
+    )
+
+
+def values(samples: int | None, **vary: dict[str, Any]) -> list[list[Any]]:
+    return values_of_runs({name: Distribution(**one) for name, one in vary.items()}, samples, 3)
+
+
+def test_every_number_and_every_choice_takes_a_dimension_in_the_order_of_the_keys() -> None:
+    made = values(
+        5,
+        a={"uniform": [2, 3]},
+        b={"log_uniform": [[1, 10], [100, 10]]},
+        c={"choice": ["x", "y", "z"]},
+        d={"normal": [1, 0.5]},
+    )
+    assert len(made) == 5
+    for row, u in zip(made, shares(5, 5, 3)[:5], strict=True):
+        # Rounding: a few operations on numbers near these.
+        assert row[0] == pytest.approx(2 + u[0], rel=1e-15)
+        assert row[1] == pytest.approx([100 ** u[1], 10.0], rel=1e-14)
+        assert row[2] == "xyz"[int(3 * u[3])]
+        assert row[3] == pytest.approx(1 + 0.5 * ndtri(u[4]), rel=1e-14)
+
+
+def test_more_samples_begin_with_the_same_ones() -> None:
+    vary = {"a": {"uniform": [0, 1]}, "b": {"normal": [0, 1]}}
+    assert values(1000, **vary)[:3] == values(3, **vary)
+    assert values(1, **vary) == values(3, **vary)[:1]
+
+
+def test_a_normal_distribution_has_a_value_for_the_share_0() -> None:
+    assert math.isfinite(Distribution(normal=[0, 1]).value([0.0]))
+
+
+def test_a_lists_numbers_keep_their_shape() -> None:
+    low, high = [[0, 0], [0.2, 100]], [[0, 0], [0.4, 100]]
+    (row,) = values(1, load={"uniform": [low, high]})
+    assert row[0][0] == [0, 0]
+    assert 0.2 <= row[0][1][0] <= 0.4
+    assert row[0][1][1] == 100
+
+
+def test_some_runs_are_spread_over_all() -> None:
+    vary = {"a": Distribution(grid=list(range(10))), "b": Distribution(grid=list(range(1000)))}
+    every = values_of_runs(vary, None, 3)
+    assert every[1234] == [1, 234]
+    assert [every.index(row) for row in values_of_some(vary, None, 3, 4)] == [1250, 3750, 6250, 8750]
+    assert values_of_some({"a": vary["a"]}, None, 3, 100) == [[n] for n in range(10)]
+
+
+def test_grids_give_every_combination_the_last_key_fastest() -> None:
+    assert values(None, a={"grid": [1, 2]}, b={"grid": ["x", [3, 4]]}) == [[1, "x"], [1, [3, 4]], [2, "x"], [2, [3, 4]]]
+
+
+@pytest.mark.parametrize(
+    "value",
+    [
+        0.1,
+        1e-7,
+        1 / 3,
+        5,
+        -2.5e300,
+        True,
+        None,
+        "none",
+        "a b, c",
+        "1e3",
+        "true",
+        "#a",
+        "ü",
+        "",
+        [0.1, [2, "x"]],
+        {"a": [1]},
+    ],
+)
+def test_a_cell_is_what_set_takes(value: Any) -> None:
+    from taichi_msm.scenefile.load import parse_override
+
+    assert parse_override(f"key={cell(value)}").value == value
+
+
+@pytest.fixture
+def folder(small: Path) -> Path:
+    """`small` with a folder of pictures, and a scene below another folder."""
+    (small / "textures").mkdir()
+    for name in ("b", "a"):
+        Image.fromarray(speckle(30, 40, ord(name))).save(small / "textures" / f"{name}.png")
+    (small / "textures" / "notes.txt").write_text("no picture")
+    return small
+
+
+def test_pictures_are_found_from_the_sweep_file_and_given_from_the_scene(folder: Path) -> None:
+    (folder / "scenes").mkdir()
+    for name in ("small.yaml", "speckle.png"):
+        (folder / name).rename(folder / "scenes" / name)
+    (folder / "many.yaml").write_text(
+        "scene: scenes/small.yaml\nsamples: 4\nvary:\n"
+        '  image: {choice: "textures/*.png"}\n  springs.structural: {uniform: [10, 20]}\n'
+        "set: {springs.map: {image: textures/a.png, range: [1, 2]}}\n"
+    )
+    sweep = load_sweep("many.yaml")
+    assert sweep.settings.vary["image"].values == ["../textures/a.png", "../textures/b.png"]
+    overrides = sweep.overrides(["../textures/b.png", 12.5])
+    assert overrides == (
+        'springs.map={"image": "../textures/a.png", "range": [1, 2]}',
+        "image=../textures/b.png",
+        "springs.structural=12.5",
+    )
+    scene = load_plan("scenes/small.yaml", overrides).scene
+    assert scene.pictures == {"image": "scenes/../textures/b.png", "springs.map.image": "scenes/../textures/a.png"}
+    assert {Path(path).name for path in sweep.pictures} == {"a.png", "b.png", "speckle.png"}
+
+
+GOOD = {"scene": "small.yaml", "samples": 2, "vary": {"damping": {"uniform": [0.01, 0.02]}}}
+FAULTS: list[tuple[dict[str, Any], str]] = [
+    ({"sampels": 3}, "sampels: unknown key; did you mean 'samples'?"),
+    ({"scene": "none.yaml"}, "scene: none.yaml: no such file or directory"),
+    ({"samples": 0}, "samples: 0 is not allowed; expected a whole number, 1 to 10000000"),
+    ({"samples": None}, "samples: missing; expected the number of runs, as not every key is a grid"),
+    ({"vary": {}}, "vary: no keys; name at least one, such as tissue.young: {uniform: [1e4, 3e4]}"),
+    (
+        {"vary": {"damping": {"grid": [1]}}},
+        "samples: damping is a grid, which gives every combination; take choice, or leave out samples",
+    ),
+    ({"vary": {"damping": {"uniform": [3, 2]}}}, "vary.damping.uniform: 3 is above 2; give the lower number first"),
+    (
+        {"vary": {"damping": {"log_uniform": [0, 2]}}},
+        "vary.damping.log_uniform: 0 has no logarithm; take numbers above 0, or uniform",
+    ),
+    (
+        {"vary": {"damping": {"normal": [0, -2]}}},
+        "vary.damping.normal: a standard deviation of -2 is not possible; take 0 or more",
+    ),
+    (
+        {"vary": {"damping": {"uniform": [[1, 2], [3]]}}},
+        "vary.damping.uniform: [1, 2] and [3] differ in shape; give both as many numbers",
+    ),
+    (
+        {"vary": {"damping": {"uniform": ["a", "b"]}}},
+        'vary.damping.uniform: ["a", "b"] is not allowed; expected two numbers, or two lists of numbers of one shape',
+    ),
+    (
+        {"vary": {"damping": {"choice": []}}},
+        "vary.damping.choice: [] is not allowed; expected a list of values that is not empty",
+    ),
+    ({"vary": {"damping": {"unifrom": [1, 2]}}}, "vary.damping.unifrom: unknown key; did you mean 'uniform'?"),
+    (
+        {"vary": {"damping": {"uniform": [1, 2], "choice": [1]}}},
+        "vary.damping: expected one of uniform, log_uniform, normal, choice, grid",
+    ),
+    ({"vary": {"dampign": {"uniform": [1, 2]}}}, "vary.dampign: unknown key; did you mean 'damping'?"),
+    ({"set": {"sheet.pionts": [3, 3]}}, "set.sheet.pionts: unknown key; did you mean 'points'?"),
+    (
+        {"set": {"probes.3.falloff": 5}},
+        "set.probes.3.falloff: no such item; the list has 1, numbered from 0, as in probes.0.falloff",
+    ),
+    ({"set": {"damping": 1}}, "set: damping is in vary too; keep one"),
+    (
+        {"vary": {"image": {"choice": ["textures/c.png"]}}},
+        "vary.image.choice.0: textures/c.png: no such file; name a picture relative to the sweep file",
+    ),
+    (
+        {"vary": {"image": {"choice": "textures/*.jpg"}}},
+        'vary.image.choice: "textures/*.jpg" matches no file; give a pattern relative to the sweep file',
+    ),
+    (
+        {"vary": {"image": {"choice": ["/etc/hostname"]}}},
+        "vary.image.choice.0: /etc/hostname is neither below the sweep file's folder nor below the scene's; "
+        "put the picture there",
+    ),
+    (
+        {"samples": None, "vary": {"a": {"grid": list(range(4000))}, "b": {"grid": list(range(4000))}}},
+        "vary: 16000000 combinations, more than the 10000000 that can be run; take smaller grids",
+    ),
+]
+
+
+@pytest.mark.parametrize(("change", "message"), FAULTS, ids=[message[:50] for _, message in FAULTS])
+def test_a_fault_of_a_sweep_file_is_told_at_its_key(folder: Path, change: dict[str, Any], message: str) -> None:
+    data = {key: value for key, value in {**GOOD, **change}.items() if value is not None}
+    # JSON is YAML.
+    (folder / "many.yaml").write_text(json.dumps(data))
+    with pytest.raises(SceneError) as raised:
+        load_sweep("many.yaml")
+    (line,) = raised.value.lines
+    assert line.startswith("many.yaml:1:")
+    assert line.endswith(f": {message}")
+
+
+def test_all_faults_are_told_at_once_in_their_order(folder: Path) -> None:
+    (folder / "many.yaml").write_text(
+        "scene: small.yaml\nseed: -1\nvary:\n  damping: {uniform: [2, 1]}\n"
+        "  image: {choice: [c.png, speckle.png, d.png]}\n"
+    )
+    with pytest.raises(SceneError) as raised:
+        load_sweep("many.yaml")
+    assert [line.split(": ")[0] for line in raised.value.lines] == [
+        f"many.yaml:{at}" for at in ("2:1", "4:13", "5:20", "5:40")
+    ]
