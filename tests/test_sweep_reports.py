@@ -27,7 +27,7 @@ from taichi_msm.sweeps.outcome import Outcome
 from taichi_msm.sweeps.parameters import parameters, results
 from taichi_msm.sweeps.pool import Pool
 from taichi_msm.sweeps.reports import WITHOUT_MATPLOTLIB, WITHOUT_SALIB, write_reports
-from taichi_msm.sweeps.result import CONTACT, SweepResult
+from taichi_msm.sweeps.result import CONTACT, FILES, SweepResult
 from taichi_msm.sweeps.samples import values_of_runs
 from taichi_msm.sweeps.sensitivity import first_order, sensitivity
 from taichi_msm.sweeps.sweepfile import make_sweep
