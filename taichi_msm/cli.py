@@ -519,7 +519,7 @@ def sweep(
             for outcome in take_all(missing, executor, lambda: progress("runs", len(outcomes), total)):
                 outcomes.append(outcome)
             if shard is None:
-                files, notes = finish(described, values, directory, outcomes)
+                files, notes = finish(described, values, directory, outcomes, executor, progress)
     except KeyboardInterrupt:
         so_far = f"interrupted; {len(outcomes)} of {total} runs have ended; the same command goes on"
         return interrupted(interruption, as_json, so_far)

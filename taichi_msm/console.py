@@ -32,6 +32,7 @@ STAGES = {
     "film": "filming",
     "export": "exporting",
     "runs": "running",
+    "contact": "drawing the last frames",
 }
 
 # Time between two lines when stderr is not a terminal [s].
