@@ -14,7 +14,7 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import FixedLocator, FuncFormatter, LogLocator, NullFormatter, NullLocator
 
 from benchmarks.drawing.problem import POINTS
-from taichi_msm.study.plot import BLUE, DPI, GREEN, GREY, INK, NARROW, ORANGE, PURPLE, STYLE, VERMILION, WIDE
+from taichi_msm.plot_style import BLUE, DPI, GREEN, GREY, INK, NARROW, ORANGE, PURPLE, STYLE, VERMILION, WIDE
 from taichi_msm.study.result import Timing
 
 COLOURS = {"taichi_msm": BLUE, "C++, OpenMP": VERMILION, "Numba": GREEN}

@@ -17,7 +17,7 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.patches import FancyArrowPatch, FancyBboxPatch
 
-from taichi_msm.study.plot import BLUE, DPI, GREY, INK
+from taichi_msm.plot_style import BLUE, DPI, GREY, INK
 
 ROOT = Path(__file__).parent.parent
 sys.path.insert(0, str(ROOT))

@@ -27,7 +27,7 @@ from taichi_msm.physics.plan import Plan
 from taichi_msm.physics.planning import make_plan
 from taichi_msm.physics.solver import Dynamics
 from taichi_msm.physics.state import State
-from taichi_msm.study.plot import BLUE, DPI, GREY, STYLE, VERMILION, WIDE
+from taichi_msm.plot_style import BLUE, DPI, GREY, STYLE, VERMILION, WIDE
 from taichi_msm.study.table import markdown
 from taichi_msm.system import runtime
 from taichi_msm.timegrid import Precision

@@ -535,7 +535,7 @@ def sweep(
                 for outcome in take_all(missing, executor, lambda: progress("runs", len(outcomes), total)):
                     outcomes.append(outcome)
             if shard is None:
-                files, notes = finish(described, values, directory, outcomes)
+                files, notes = finish(described, values, directory, outcomes, executor, progress)
     except KeyboardInterrupt:
         return interrupted(interruption, as_json, f"interrupted; {so_far(len(outcomes), total)}")
     except LostExecutorError as error:

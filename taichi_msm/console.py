@@ -33,6 +33,7 @@ STAGES = {
     "export": "exporting",
     "workers": "waiting for a worker of the cluster",
     "runs": "running",
+    "contact": "drawing the last frames",
 }
 
 # Time between two lines when stderr is not a terminal [s].

@@ -13,7 +13,7 @@ PACKAGE = Path(__file__).parent.parent / "taichi_msm"
 
 # A module or a package imports from earlier lines, and a package from itself.
 LAYERS = [
-    {"errors", "outputs", "progress", "timegrid"},
+    {"errors", "outputs", "plot_style", "progress", "timegrid"},
     {"arguments", "faults", "notebook", "system"},
     {"picture"},
     {"scene"},

@@ -297,7 +297,8 @@ def test_points_are_reported_beside_their_estimates(tmp_path: Path) -> None:
 def test_nothing_in_the_picture_covers_anything_else() -> None:
     """Legends are below their panels and within the picture; every sheet and every refinement is in one."""
     style = pytest.importorskip("matplotlib.style")
-    from taichi_msm.study.plot import STYLE, _figure
+    from taichi_msm.plot_style import STYLE
+    from taichi_msm.study.plot import _figure
 
     with style.context(STYLE, after_reset=True):
         figure = _figure(of_tissue())

@@ -20,13 +20,24 @@ from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
 from matplotlib.transforms import offset_copy
 
 from taichi_msm.errors import printable
+from taichi_msm.plot_style import (
+    BLUE,
+    DPI,
+    GREEN,
+    GREY,
+    INK,
+    NARROW,
+    ORANGE,
+    PURPLE,
+    SILVER,
+    SKY,
+    STYLE,
+    VERMILION,
+    WIDE,
+)
 from taichi_msm.study.result import Drawn, Peer, Points, Stepping, Study
 from taichi_msm.study.table import mostly_rounding, number, unit, where
 from taichi_msm.system.compiler import named
-
-# The colours of Okabe and Ito, which the colour-blind can tell apart too.
-BLUE, VERMILION, GREEN, ORANGE, PURPLE, SKY = "#0072B2", "#D55E00", "#009E73", "#E69F00", "#CC79A7", "#56B4E9"
-INK, GREY, SILVER, PALE = "#222222", "#767676", "#A0A0A0", "#E6E6E6"
 
 # Colour shows the damping difference, dashes and markers the precision.
 DIFFERENCE_COLOURS = {"central": BLUE, "backward": VERMILION}
@@ -42,35 +53,6 @@ HALF: dict[str, Any] = {"fillstyle": "bottom", "markerfacecoloralt": "white"}
 DOT: dict[str, Any] = {"linestyle": "none", "marker": "o", "color": GREY}
 SUPERSAMPLE_COLOURS = (SKY, BLUE, GREEN, ORANGE, PURPLE, VERMILION)
 MARKERS = "osD^vPX"
-
-STYLE = {
-    "font.size": 8,
-    "text.color": INK,
-    "figure.titlesize": 11,
-    "figure.titleweight": "bold",
-    "axes.titlesize": 9,
-    "axes.titleweight": "bold",
-    "axes.titlelocation": "left",
-    "axes.titlepad": 8,
-    "axes.labelcolor": INK,
-    "axes.edgecolor": GREY,
-    "axes.linewidth": 0.6,
-    "axes.axisbelow": True,
-    "axes.grid": True,
-    **dict.fromkeys(("axes.spines.top", "axes.spines.right"), False),
-    "grid.color": PALE,
-    "grid.linewidth": 0.5,
-    **dict.fromkeys(("xtick.color", "ytick.color"), GREY),
-    **dict.fromkeys(("xtick.labelcolor", "ytick.labelcolor"), INK),
-    **dict.fromkeys(("xtick.minor.width", "ytick.minor.width"), 0.4),
-    "lines.linewidth": 1.2,
-    "lines.markersize": 4.5,
-    "legend.frameon": False,
-    **dict.fromkeys(("legend.fontsize", "legend.title_fontsize"), 7.5),
-}
-
-DPI = 200
-WIDE, NARROW = 9.0, 6.0  # [in]: with two columns, with one
 
 # Where the panels are, by their number; the first of three is as high as the others together.
 LAYOUTS = {1: "A", 2: "AB", 3: "AB;AC", 4: "AB;CD"}

@@ -11,12 +11,11 @@ from taichi_msm.errors import FilesError, ForeignError, SceneError, writing
 from taichi_msm.outputs.table import RECORD, RUNS, SWEEP
 from taichi_msm.results.whole import give_name, staged
 from taichi_msm.sweeps.outcome import Outcome, outcome_of
+from taichi_msm.sweeps.result import FILES
 from taichi_msm.sweeps.sweepfile import Sweep
 from taichi_msm.sweeps.task import Task
 from taichi_msm.system.compiler import what_decides_bits
 from taichi_msm.system.versions import versions
-
-TABLE = "table.csv"
 
 # Runs that ended so need not be taken again.
 ENDED = ("complete", "diverged")
@@ -32,7 +31,7 @@ def values_in(directory: Path, sweep: Sweep) -> list[list[Any]]:
     record = directory / SWEEP
     description = sweep.description()
     if not record.exists():
-        for name in (RUNS, TABLE, RECORD):
+        for name in (RUNS, *FILES, RECORD):
             if (directory / name).exists():
                 raise ForeignError.at(directory / name, "something")
         content = {

@@ -10,6 +10,16 @@ from taichi_msm.outputs.table import RUNS, numbered
 from taichi_msm.sweeps.outcome import Outcome
 from taichi_msm.sweeps.sweepfile import Sweep
 
+# The files that a sweep ends with.
+FILES = TABLE, PARQUET, DATASET, CONTACT, PLOT, SENSITIVITY = (
+    "table.csv",
+    "table.parquet",
+    "dataset.json",
+    "contact.jpg",
+    "sweep.png",
+    "sensitivity.csv",
+)
+
 
 @dataclass(frozen=True)
 class SweepResult:
@@ -23,3 +33,8 @@ class SweepResult:
     def run_directory(self, run: int) -> Path:
         """Name the folder of a run."""
         return self.directory / RUNS / numbered(run)
+
+    def some(self, most: int) -> list[int]:
+        """Give the numbers of at most so many runs, evenly spread over all."""
+        total, count = len(self.outcomes), min(len(self.outcomes), most)
+        return [(2 * n + 1) * total // (2 * count) for n in range(count)]

@@ -90,7 +90,7 @@ def _go_through(
         for row in outcomes(missing, taking, lambda: progress("runs", len(done), total)):
             done.append(row)
             yield row
-        finish(described, values, directory, done)
+        finish(described, values, directory, done, taking, progress)
 
 
 @contextmanager
@@ -120,8 +120,13 @@ def opened(
 
 
 def finish(
-    described: Sweep, values: list[list[Any]], directory: Path, rows: Iterable[Outcome]
+    described: Sweep,
+    values: list[list[Any]],
+    directory: Path,
+    rows: Iterable[Outcome],
+    executor: Executor,
+    progress: Progress,
 ) -> tuple[list[str], list[str]]:
     """Write the table and the other files of a sweep; gives their names, and what the user should know."""
     result = SweepResult(directory, described, values, sorted(rows, key=lambda row: row.run))
-    return write_reports(result)
+    return write_reports(result, executor, progress)

@@ -1,0 +1,308 @@
+"""The files that a sweep ends with say what came out of it, and are there whatever came out."""
+
+from __future__ import annotations
+
+import itertools
+import json
+import shutil
+import sys
+from collections.abc import Callable
+from concurrent.futures import Executor, ThreadPoolExecutor
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from PIL import Image
+from scipy.stats import qmc
+
+from taichi_msm import sweep
+from taichi_msm.errors import ForeignError
+from taichi_msm.plot_style import STYLE
+from taichi_msm.sweeps.captions import short_names, short_value
+from taichi_msm.sweeps.contact import WITHOUT_PICTURES
+from taichi_msm.sweeps.dataset import split
+from taichi_msm.sweeps.folder import values_in
+from taichi_msm.sweeps.outcome import Outcome
+from taichi_msm.sweeps.parameters import parameters, results
+from taichi_msm.sweeps.pool import Pool
+from taichi_msm.sweeps.reports import WITHOUT_MATPLOTLIB, WITHOUT_SALIB, write_reports
+from taichi_msm.sweeps.result import CONTACT, FILES, SweepResult
+from taichi_msm.sweeps.samples import values_of_runs
+from taichi_msm.sweeps.sensitivity import first_order, sensitivity
+from taichi_msm.sweeps.sweepfile import make_sweep
+
+VARY = {
+    "damping": {"log_uniform": [1e-3, 1e-1]},
+    "probes.0.at": {"uniform": [[0.3, 0.5], [0.7, 0.5]]},
+    "image": {"choice": ["speckle.png", "other.png"]},
+}
+Make = Callable[..., SweepResult]
+
+
+@pytest.fixture
+def make(small: Path, ran: Path) -> Make:
+    """A sweep of small.yaml with records of runs, and made-up outcomes.
+
+    The displacement follows from the damping; run 3 and every seventh after it diverged.
+    """
+    shutil.copy("speckle.png", "other.png")
+
+    def made(samples: int = 8, vary: dict[str, Any] = VARY, **settings: Any) -> SweepResult:
+        described = make_sweep("small.yaml", {"vary": vary, "samples": samples, "seed": 1, **settings})
+        values = values_of_runs(described.settings.vary, samples, 1)
+        outcomes = [
+            Outcome(run, "diverged", "why") if run % 7 == 3 else Outcome(run, "complete", "", np.log(row[0]), 0.9, None)
+            for run, row in enumerate(values)
+        ]
+        result = SweepResult(small / "out", described, values, outcomes)
+        for run in range(samples):
+            result.run_directory(run).mkdir(parents=True, exist_ok=True)
+            shutil.copy(ran / "run.json", result.run_directory(run))
+        return result
+
+    return made
+
+
+def write(result: SweepResult, executor: Executor | None = None) -> tuple[list[str], list[str]]:
+    """Write the reports without progress."""
+    return write_reports(result, executor or ThreadPoolExecutor(1), lambda stage, done, total: None)
+
+
+def copy_runs(ran: Path, result: SweepResult) -> None:
+    """Give every complete run the results of one."""
+    for outcome in result.outcomes:
+        if outcome.status == "complete":
+            shutil.copytree(ran, result.run_directory(outcome.run), dirs_exist_ok=True)
+
+
+def test_captions_are_short() -> None:
+    keys = ["tissue.young", "probes.0.at", "probes.1.at", "probes.0.total.2", "render.light", "light"]
+    assert short_names(keys) == ["young", "probes.0.at", "probes.1.at", "total.2", "render.light", "light"]
+    values = [23412.5, 1.2345e-5, 7, "textures/a.png", [0.51234, [1, 2.0]], {"eye": [0.1]}, True, None]
+    written = ["23400", "1.23e-05", "7", "a.png", "[0.512, [1, 2]]", "eye [0.1]", "true", "null"]
+    assert list(map(short_value, values)) == written
+
+
+def test_the_split_follows_from_seed_and_number_alone() -> None:
+    # Pinned: data sets must keep their parts for ever.
+    assert [run for run, part in enumerate(split(20, 1)) if part == "test"] == [1, 16]
+    assert [run for run, part in enumerate(split(20, 1)) if part == "val"] == [11, 19]
+    for runs, tenth in ((64, 6), (65, 7), (100, 10), (4, 0), (5, 1)):
+        parts = split(runs, 1)
+        assert [parts.count(part) for part in ("train", "val", "test")] == [runs - 2 * tenth, tenth, tenth]
+    assert split(64, 1) != split(64, 2)
+
+
+def test_parameters_are_the_numbers_that_vary(make: Make) -> None:
+    result = make()
+    damping, place, image = parameters(result, range(8))
+    assert (damping.name, damping.is_logarithmic) == ("damping", True)
+    # The second component does not vary.
+    assert (place.name, place.numbers.tolist()) == ("at[0]", [row[1][0] for row in result.values])
+    assert (image.name, image.labels) == ("image", ["speckle.png", "other.png"])
+    assert image.numbers.tolist() == [float(row[2] == "other.png") for row in result.values]
+    columns = results(result, range(8))
+    assert list(columns) == ["max_displacement"]
+    assert np.isnan(columns["max_displacement"]).tolist() == [run == 3 for run in range(8)]
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_sensitivity_of_a_linear_function(seed: int) -> None:
+    # The variances of 3 x and y are as 9 to 1. The largest error with the first 40 seeds is 0.09.
+    points = qmc.Sobol(2, seed=np.random.default_rng(seed)).random(64)
+    for column, share in enumerate((0.9, 0.1)):
+        index, confidence = first_order(points[:, column], 3 * points[:, 0] + points[:, 1])
+        assert index == pytest.approx(share, abs=0.12)
+        assert abs(index - share) < confidence
+
+
+def test_sensitivity_in_a_grid() -> None:
+    # The runs of a grid go through one key for each value of the other.
+    grid = np.array(list(itertools.product(range(8), range(8))), dtype=float)
+    indices = [first_order(column, 3 * grid[:, 0] + grid[:, 1])[0] for column in grid.T]
+    assert indices == pytest.approx([0.9, 0.1], abs=0.1)
+
+
+def test_sensitivity_is_written_from_64_complete_runs_on(make: Make) -> None:
+    assert write(make(64))[0] == ["table.csv", "table.parquet", "dataset.json", "sweep.png"]
+    result = make(128)
+    assert "sensitivity.csv" in write(result)[0]
+    lines = (result.directory / "sensitivity.csv").read_text().splitlines()
+    assert lines[0] == "result,parameter,first_order,confidence"
+    assert [line.split(",")[:2] for line in lines[1:]] == [
+        ["max_displacement", name] for name in ("damping", "at[0]", "image")
+    ]
+    shares = [float(line.split(",")[2]) for line in lines[1:]]
+    assert shares == pytest.approx([1, 0, 0], abs=0.1)
+
+
+def test_the_picture_shows_every_run(make: Make, ran: Path) -> None:
+    result = make()
+    copy_runs(ran, result)
+    names, notes = write(result)
+    assert names == ["table.csv", "table.parquet", "dataset.json", CONTACT, "sweep.png"]
+    assert notes == []
+    with Image.open(result.directory / CONTACT) as picture:
+        pixels = np.asarray(picture).astype(int)
+    # Two rows of four frames of 40 x 30, made larger, with 20 pixels between them, and captions of some lines below.
+    width, height, above = 330, 248, 43
+    rows = np.split(pixels[above : above + (len(pixels) - 63) // 2 * 2], 2)
+    assert pixels.shape[1] == 20 + 4 * (width + 20)
+    tiles = [row[:height, 20 + (width + 20) * column :][:, :width] for row in rows for column in range(4)]
+    with Image.open(ran / "frames" / "0004.png") as frame:
+        shown = np.asarray(frame.resize((width, height), Image.Resampling.LANCZOS)).astype(int)
+    assert all(np.abs(tile - shown).mean() < 5 for run, tile in enumerate(tiles) if run != 3)
+    # A grey field, with a word.
+    assert 0.97 < (np.abs(tiles[3] - 0xE6) <= 2).all(axis=2).mean() < 1
+
+
+def test_the_same_results_give_the_same_bytes(make: Make, ran: Path) -> None:
+    result = make(128)
+    copy_runs(ran, result)
+    written = []
+    for _ in range(2):
+        names, _ = write(result)
+        written.append({name: (result.directory / name).read_bytes() for name in names})
+    assert written[0] == written[1]
+    assert len(written[0]) == 6
+
+
+def test_a_damaged_picture_is_no_end(make: Make, ran: Path) -> None:
+    result = make()
+    copy_runs(ran, result)
+    damaged = result.run_directory(1) / "frames" / "0004.png"
+    damaged.write_bytes(damaged.read_bytes()[:100])
+    names, (note,) = write(result)
+    assert CONTACT in names
+    assert note.startswith(f"{CONTACT} lacks the frames of 1 runs, for example: {damaged} cannot be decoded")
+
+
+@pytest.mark.parametrize(("kept", "difference"), [("frames", 0), ("animation.gif", 10), ("trajectory.npz", 0)])
+def test_the_last_frame_comes_from_any_output(make: Make, ran: Path, kept: str, difference: float) -> None:
+    """An animation has fewer colours; what is drawn again is the same."""
+    result = make(2)
+    copy_runs(ran, result)
+    with Pool(1) as pool:
+        write(result, pool)
+        first = np.asarray(Image.open(result.directory / CONTACT)).astype(int)
+        for run, name in itertools.product(range(2), {"frames", "animation.gif", "trajectory.npz"} - {kept}):
+            path = result.run_directory(run) / name
+            shutil.rmtree(path) if path.is_dir() else path.unlink()
+        assert write(result, pool)[1] == []
+    assert np.abs(np.asarray(Image.open(result.directory / CONTACT)) - first).mean() <= difference
+
+
+def test_without_pictures_there_is_a_note_and_no_earlier_picture(make: Make) -> None:
+    result = make()
+    (result.directory / CONTACT).touch()
+    names, notes = write(result)
+    assert notes == [WITHOUT_PICTURES]
+    assert CONTACT not in names
+    assert not (result.directory / CONTACT).exists()
+
+
+def test_without_libraries_there_are_notes(make: Make, monkeypatch: pytest.MonkeyPatch) -> None:
+    for name in ("matplotlib", "SALib", "SALib.analyze", "pyarrow"):
+        monkeypatch.setitem(sys.modules, name, None)
+    monkeypatch.delitem(sys.modules, "taichi_msm.sweeps.plot", raising=False)
+    names, notes = write(make(128))
+    assert names == ["table.csv", "dataset.json"]
+    assert notes == [WITHOUT_PICTURES, WITHOUT_SALIB, WITHOUT_MATPLOTLIB]
+
+
+def test_of_many_parameters_those_of_largest_sensitivity_are_plotted(make: Make) -> None:
+    style = pytest.importorskip("matplotlib.style")
+    from taichi_msm.sweeps.plot import Content, _figure
+
+    keys = ["springs.shear", "springs.structural", "springs.virtual", "sheet.mass", "probes.0.falloff"]
+    vary = {key: {"uniform": [1, 2]} for key in keys} | {"probes.0.force": {"uniform": [[0, 0, 1], [1, 1, 2]]}}
+    result = make(128, {"damping": {"uniform": [0.1, 1]}, **vary})
+    varied, columns = parameters(result, range(128)), results(result, range(128))
+    indices = sensitivity(varied, columns)
+    failed = np.isnan(columns["max_displacement"])
+    with style.context(STYLE, after_reset=True):
+        figure = _figure(Content("title", varied, columns, failed, indices))
+    names = [axes.get_xlabel() for axes in figure.axes]
+    assert len(varied) == 9
+    assert len(names) == 8
+    assert names[0] == "damping"
+    (left_out,) = {one.name for one in varied} - set(names)
+    assert min(indices, key=lambda index: index.first_order).parameter == left_out
+    assert f"Not shown, as less sensitive: {left_out}." in figure.get_supxlabel().replace("\n", " ")
+    # A cross for every run that failed, at the bottom edge.
+    crosses = np.asarray(figure.axes[0].collections[1].get_offsets())
+    assert crosses.tolist() == [[number, 0] for number in varied[0].numbers[failed]]
+
+
+def test_a_table_of_parquet_has_numbers_and_lists(make: Make) -> None:
+    parquet = pytest.importorskip("pyarrow.parquet")
+    result = make(8, {**VARY, "render.camera": {"choice": ["top", {"eye": [0, 0, 1], "target": [0, 0, 0]}]}})
+    write(result)
+    table = parquet.read_table(result.directory / "table.parquet")
+    kinds = {field.name: str(field.type) for field in table.schema}
+    assert kinds == {
+        "run": "int64",
+        "damping": "double",
+        "probes.0.at": "list<element: double>",
+        "image": "string",
+        # Values of two types are text, as --set takes it.
+        "render.camera": "string",
+        "status": "string",
+        "error": "string",
+        **dict.fromkeys(["max_displacement", "shortest_spring", "error_estimate", "mesh_error", "seconds"], "double"),
+    }
+    columns = table.to_pydict()
+    assert columns["damping"] == [row[0] for row in result.values]
+    assert columns["probes.0.at"] == [row[1] for row in result.values]
+    assert set(columns["render.camera"]) == {"top", '{"eye": [0, 0, 1], "target": [0, 0, 0]}'}
+    assert columns["max_displacement"] == [one.max_displacement for one in result.outcomes]
+
+
+def test_a_data_set_names_its_complete_runs(make: Make) -> None:
+    result = make(20)
+    write(result)
+    described = json.loads((result.directory / "dataset.json").read_text())
+    rows = described.pop("runs")
+    assert [row["run"] for row in rows] == [run for run in range(20) if run not in (3, 10, 17)]
+    assert {row["run"]: row["part"] for row in rows if row["part"] != "train"} == {
+        1: "test",
+        11: "val",
+        16: "test",
+        19: "val",
+    }
+    assert rows[3] == {
+        "run": 4,
+        "folder": "runs/000004",
+        "part": "train",
+        "values": dict(zip(VARY, result.values[4], strict=True)),
+    }
+    assert described["vary"] == VARY
+    assert described["seed"] == 1
+    assert described["outputs"] == ["frames", "animation.gif", "trajectory.npz", "run.json"]
+    assert (described["frames"], described["size"], described["frames_per_second"]) == (5, [40, 30], 10)
+    assert "numpy" in described["versions"]
+
+
+def test_runs_of_a_data_set_have_their_own_size(small: Path) -> None:
+    sizes = [[16, 12], [12, 16]]
+    vary = {"render.size": {"grid": sizes}}
+    outcomes = list(sweep("small.yaml", vary, "out", workers=1, overrides={"time.duration": 0.1, "output": ["png"]}))
+    assert {outcome.status for outcome in outcomes} == {"complete"}
+    rows = json.loads(Path("out/dataset.json").read_text())["runs"]
+    assert [row["size"] for row in rows] == sizes
+    with Image.open(rows[1]["folder"].join(["out/", "/frames/0001.png"])) as frame:
+        assert list(frame.size) == sizes[1]
+    assert {path.name for path in Path("out").iterdir()} == {
+        *("runs", "sweep.json", "table.csv", "table.parquet", "dataset.json", CONTACT),
+    }
+
+
+@pytest.mark.parametrize("name", FILES)
+def test_what_is_no_file_of_a_sweep_stays(make: Make, name: str) -> None:
+    result = make()
+    shutil.rmtree(result.directory / "runs")
+    (result.directory / name).write_text("mine")
+    with pytest.raises(ForeignError, match=name):
+        values_in(result.directory, result.sweep)
+    assert (result.directory / name).read_text() == "mine"
