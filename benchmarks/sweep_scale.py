@@ -72,11 +72,10 @@ def measure(described: Sweep, directory: Path, executor: str | None) -> dict[str
         for row in outcomes(missing, taking, lambda: None):
             assert row.status == "complete", row
         taken["run"] = clock.seconds()
-    clock.seconds()
-    rows, _ = sort_out(described, values, directory)
-    taken["scan"] = clock.seconds()
-    finish(described, values, directory, rows)
-    taken["finish"] = clock.seconds()
+        rows, _ = sort_out(described, values, directory)
+        taken["scan"] = clock.seconds()
+        finish(described, values, directory, rows, taking, _ignore)
+        taken["finish"] = clock.seconds()
     return taken
 
 

@@ -530,12 +530,12 @@ def sweep(
     try:
         with Progress(quiet=as_json) as bar:
             progress = interruptible(bar, interruption)
-            where = dask if missing else None
+            where = dask if missing else None  # Nothing else needs a cluster.
             with opened(where, workers or chosen.number, described, directory, progress) as executor:
                 for outcome in take_all(missing, executor, lambda: progress("runs", len(outcomes), total)):
                     outcomes.append(outcome)
-            if shard is None:
-                files, notes = finish(described, values, directory, outcomes, executor, progress)
+                if shard is None:
+                    files, notes = finish(described, values, directory, outcomes, executor, progress)
     except KeyboardInterrupt:
         return interrupted(interruption, as_json, f"interrupted; {so_far(len(outcomes), total)}")
     except LostExecutorError as error:

@@ -22,7 +22,7 @@ SWEEP = """\
 scene: small.yaml
 samples: 6
 vary: {damping: {uniform: [0.005, 0.02]}}
-set: {sheet.points: [5, 5], time.duration: 0.1}
+set: {sheet.points: [5, 5], time.duration: 0.1, output: [trajectory]}
 """
 
 # Until something happens that must [s].
@@ -125,6 +125,8 @@ def test_workers_need_no_inputs_and_one_may_die(lab: Path, machines: Machines, p
     (lab / "away").rename(lab / "here")
     assert program("sweep", "here/sweep.yaml", "--out", "near").returncode == 0
     assert rows("far") == rows("near")
+    # Drawn by the workers, from the trajectories.
+    assert (lab / "far" / "contact.jpg").read_bytes() == (lab / "near" / "contact.jpg").read_bytes()
     for run in sorted(lab.glob("near/runs/*")):
         assert files(run) == files(lab / "far" / "runs" / run.name)
     assert program("run", "--again", "far/runs/000003", "--out", "again", "--quiet").returncode == 0

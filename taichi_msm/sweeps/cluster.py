@@ -27,8 +27,9 @@ from distributed.utils import LoopRunner, silence_logging_cmgr
 from taichi_msm.errors import ExecutorError, LostExecutorError, MsmError
 from taichi_msm.picture import copied
 from taichi_msm.progress import Progress
+from taichi_msm.sweeps.outcome import Outcome
 from taichi_msm.sweeps.sweepfile import Sweep
-from taichi_msm.sweeps.task import Task
+from taichi_msm.sweeps.task import Task, take
 from taichi_msm.system.compiler import what_decides_bits
 from taichi_msm.system.versions import versions
 
@@ -90,17 +91,20 @@ class Inputs(WorkerPlugin):  # type: ignore[misc]  # that package has no types
 
 
 class Cluster(Executor):
-    """The workers of a scheduler; they take tasks whose scene and folder are those of a plugin."""
+    """The workers of a scheduler; of the tasks of a sweep they are sent only what differs."""
 
     def __init__(self, client: Any, name: str) -> None:
         self._executor, self._name = client.get_executor(pure=False), name
 
     def submit(self, function: Callable[..., Any], /, *arguments: Any, **_: Any) -> Future[Any]:
-        """Call a function with a task, and a function by which it can be interrupted, in a worker that is free."""
-        (task,) = arguments
+        """Call a function, which must be importable, in a worker that is free."""
         answer: Future[Any] = Future()
         try:
-            given = self._executor.submit(_call, self._name, function, task.run, task.overrides)
+            if function is take:
+                (task,) = arguments
+                given = self._executor.submit(_take, self._name, task.run, task.overrides)
+            else:
+                given = self._executor.submit(_call, self._name, function, *arguments)
         except ClosedClientError:
             _cancel(answer)
         else:
@@ -129,19 +133,32 @@ def _cancel(answer: Future[Any]) -> None:
     answer.set_running_or_notify_cancel()
 
 
-def _call(name: str, function: Callable[..., Any], run: int, overrides: tuple[str, ...]) -> Any:
-    """Call a function with a task in a worker."""
-    inputs = get_worker().plugins.get(name)
+def _call(name: str, function: Callable[..., Any], *arguments: Any) -> Any:
+    """Call a function in a worker, where the pictures are those that it was sent."""
+    with copied(_inputs(name).copies):
+        return function(*arguments)
+
+
+def _take(name: str, run: int, overrides: tuple[str, ...]) -> Outcome:
+    """Take a run in a worker."""
+    inputs = _inputs(name)
+    with suppress(KeyboardInterrupt):
+        task = Task(run, inputs.scene, overrides, inputs.directory, inputs.home)
+        outcome: Outcome = _call(name, take, task, inputs.pause)
+        inputs.pause("", 0, 0)
+        return outcome
+    # Where the sweep has not ended, the worker is about to.
+    raise Reschedule
+
+
+def _inputs(name: str) -> Inputs:
+    """Find in a worker what it was sent."""
+    inputs: Inputs | None = get_worker().plugins.get(name)
     if inputs is None:
         raise ExecutorError("another command for the same folder has ended meanwhile")
     if inputs.fault:
         raise ExecutorError(inputs.fault)
-    with copied(inputs.copies), suppress(KeyboardInterrupt):
-        outcome = function(Task(run, inputs.scene, overrides, inputs.directory, inputs.home), inputs.pause)
-        inputs.pause("", 0, 0)
-        return outcome
-    # Where the sweep has not ended, the worker is.
-    raise Reschedule
+    return inputs
 
 
 @contextmanager

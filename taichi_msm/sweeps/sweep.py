@@ -85,7 +85,7 @@ def _go_through(
 ) -> Iterator[Outcome]:
     done, missing = sort_out(described, values, directory)
     total, count = len(values), workers or choose_workers(estimate(described), len(missing)).number
-    with opened(executor if missing else None, count, described, directory, progress) as taking:
+    with opened(executor, count, described, directory, progress) as taking:
         yield from list(done)
         for row in outcomes(missing, taking, lambda: progress("runs", len(done), total)):
             done.append(row)
