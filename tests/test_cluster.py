@@ -10,10 +10,14 @@ import sys
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
 
+from taichi_msm import sweep
+from taichi_msm.errors import MsmError
+from taichi_msm.sweeps.sweepfile import load_sweep
 from tests.conftest import Program
 
 pytest.importorskip("distributed", reason="needs dask.distributed: pip install distributed")
@@ -110,7 +114,7 @@ def files(run: Path) -> dict[str, bytes]:
 
 def test_workers_need_no_inputs_and_one_may_die(lab: Path, machines: Machines, program: Program) -> None:
     address = machines.schedule()
-    sweep = start_sweep("far", "--json", "--dask", address)
+    command = start_sweep("far", "--json", "--dask", address)
     wait_for(lambda: "plugin taichi-msm" in machines.log(machines.scheduler))
     # Before there is any worker, all is gone that one could read besides what it is sent.
     (lab / "here").rename(lab / "away")
@@ -119,8 +123,8 @@ def test_workers_need_no_inputs_and_one_may_die(lab: Path, machines: Machines, p
     wait_for(lambda: list(lab.glob("far/runs/*/run.json")))
     alone.kill()
     assert len(list(lab.glob("far/runs/*/run.json"))) < 6
-    printed, said = sweep.communicate(timeout=SOON)
-    assert (sweep.returncode, json.loads(printed)["complete"], said) == (0, 6, "")
+    printed, said = command.communicate(timeout=SOON)
+    assert (command.returncode, json.loads(printed)["complete"], said) == (0, 6, "")
 
     (lab / "away").rename(lab / "here")
     assert program("sweep", "here/sweep.yaml", "--out", "near").returncode == 0
@@ -136,14 +140,14 @@ def test_workers_need_no_inputs_and_one_may_die(lab: Path, machines: Machines, p
 def test_the_same_command_goes_on_after_the_scheduler_was_lost(lab: Path, machines: Machines) -> None:
     address = machines.schedule()
     machines.work(address)
-    sweep = start_sweep("far", "--json", "--dask", address)
+    command = start_sweep("far", "--json", "--dask", address)
     wait_for(lambda: list(lab.glob("far/runs/*/run.json")))
     machines.scheduler.kill()
-    printed, _ = sweep.communicate(timeout=SOON)
+    printed, _ = command.communicate(timeout=SOON)
     (error,) = json.loads(printed)["errors"]
     ended = int(error.split("; ")[1].split()[0])
     assert error == f"lost the scheduler at {address}; {ended} of 6 runs have ended; the same command goes on"
-    assert sweep.returncode == 4
+    assert command.returncode == 4
 
     earlier = {path: path.stat().st_mtime_ns for path in sorted(lab.glob("far/runs/*/run.json"))[:ended]}
     address = machines.schedule()
@@ -155,12 +159,12 @@ def test_the_same_command_goes_on_after_the_scheduler_was_lost(lab: Path, machin
 def test_a_run_whose_workers_die_is_a_row(lab: Path, machines: Machines) -> None:
     address = machines.schedule(DASK_DISTRIBUTED__SCHEDULER__ALLOWED_FAILURES="0")
     doomed = machines.work(address)
-    sweep = start_sweep("far", "--json", "--dask", address)
+    command = start_sweep("far", "--json", "--dask", address)
     wait_for(lambda: list(lab.glob("far/runs/*/.partial")))
     doomed.kill()
     wait_for(lambda: "Remove worker" in machines.log(machines.scheduler))
     machines.work(address)
-    printed = json.loads(sweep.communicate(timeout=SOON)[0])
+    printed = json.loads(command.communicate(timeout=SOON)[0])
     # Dask cannot tell a run under way from one that the worker was given besides.
     assert printed["died"] in (1, 2)
     assert printed["died"] + printed["complete"] == 6
@@ -173,26 +177,43 @@ def test_ctrl_c_frees_the_workers(lab: Path, machines: Machines) -> None:
     machines.work(address)
     takes_minutes = SWEEP.replace("[5, 5], time.duration: 0.1", "[99, 99], time.duration: 900")
     (lab / "here" / "sweep.yaml").write_text(takes_minutes)
-    sweep = start_sweep("long", "--dask", address)
+    command = start_sweep("long", "--dask", address)
     wait_for(lambda: list(lab.glob("long/runs/*/.partial")))
-    sweep.send_signal(signal.SIGINT)
-    _, said = sweep.communicate(timeout=SOON)
+    command.send_signal(signal.SIGINT)
+    _, said = command.communicate(timeout=SOON)
     assert said.splitlines()[1:] == ["interrupted; 0 of 6 runs have ended; the same command goes on"]
-    assert sweep.returncode == 130
+    assert command.returncode == 130
 
     (lab / "here" / "sweep.yaml").write_text(SWEEP)
     assert json.loads(start_sweep("far", "--json", "--dask", address).communicate(timeout=SOON)[0])["complete"] == 6
 
 
-def test_a_worker_of_two_threads_is_refused(lab: Path, machines: Machines) -> None:
+def test_a_worker_of_two_threads_is_refused(lab: Path, machines: Machines, program: Program) -> None:
     address = machines.schedule()
     worker = machines.work(address, "--nthreads", "2", "--no-nanny")
     wait_for(lambda: "Registered to" in machines.log(worker))
-    sweep = start_sweep("far", "--dask", address)
-    _, said = sweep.communicate(timeout=SOON)
-    assert said.endswith(" has 2 threads; start it with one: dask worker --nthreads 1\n")
-    assert len(said.splitlines()) == 2
-    assert sweep.returncode == 2
+    said = "has 2 threads; start it with one: dask worker --nthreads 1"
+    tried = program("sweep", "here/sweep.yaml", "--out", "far", "--dask", address)
+    assert tried.returncode == 2
+    assert tried.stderr.endswith(f" {said}\n")
+    assert len(tried.stderr.splitlines()) == 2
+    runs = sweep("here/small.yaml", {"damping": {"grid": [0.01, 0.02]}}, "near", executor=address)
+    with pytest.raises(MsmError, match=said):
+        next(runs)
+
+
+def test_a_worker_that_would_lose_results_or_change_them_is_refused(lab: Path) -> None:
+    from taichi_msm.sweeps.cluster import Inputs
+
+    worker = SimpleNamespace(address="tcp://far", state=SimpleNamespace(nthreads=1), local_directory=str(lab))
+    inputs = Inputs(load_sweep("here/sweep.yaml"), lab / "out")
+    with pytest.raises(MsmError, match=r"^worker tcp://far does not see .*/out; choose an --out that all"):
+        inputs.setup(worker)
+    (lab / "out").mkdir()
+    (lab / "out" / "sweep.json").touch()
+    inputs.versions |= {"numpy": "0.1"}
+    with pytest.raises(MsmError, match=r"^worker tcp://far has other versions; install there numpy 0\.1$"):
+        inputs.setup(worker)
 
 
 def test_no_scheduler(lab: Path, program: Program, monkeypatch: pytest.MonkeyPatch) -> None:

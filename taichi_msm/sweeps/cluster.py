@@ -25,6 +25,7 @@ from distributed.comm import connect
 from distributed.utils import LoopRunner, silence_logging_cmgr
 
 from taichi_msm.errors import ExecutorError, LostExecutorError, MsmError
+from taichi_msm.outputs.table import SWEEP
 from taichi_msm.picture import copied
 from taichi_msm.progress import Progress
 from taichi_msm.sweeps.outcome import Outcome
@@ -84,6 +85,9 @@ class Inputs(WorkerPlugin):  # type: ignore[misc]  # that package has no types
         """Say why a worker cannot take runs, if so."""
         if (threads := worker.state.nthreads) != 1:
             return f"worker {worker.address} has {threads} threads; start it with one: dask worker --nthreads 1"
+        # What a worker wrote into a folder of its own would be lost.
+        if not (self.directory / SWEEP).is_file():
+            return f"worker {worker.address} does not see {self.directory}; choose an --out that all machines share"
         here = versions()
         if others := [f"{name} {version}" for name, version in self.versions.items() if here.get(name) != version]:
             return f"worker {worker.address} has other versions; install there {', '.join(others)}"
@@ -185,8 +189,8 @@ def connected(address: str, described: Sweep, directory: Path, progress: Progres
             raise
         finally:
             if not lost:
-                cluster.shutdown(cancel_futures=True)
                 with suppress(OSError):  # lost just now
+                    cluster.shutdown(cancel_futures=True)
                     client.unregister_worker_plugin(name)
             client.close()
 
