@@ -91,7 +91,7 @@ def _last_frames(
             if finished.has("png"):
                 frames[run] = Image.fromarray(finished.picture("png", finished.frames - 1))
             elif finished.has("gif"):
-                frames[run] = _last_of(finished.result("gif"))
+                frames[run] = last_picture(finished.result("gif"))
             elif finished.has("trajectory") and finished.scene.image is not None:
                 drawn[run] = executor.submit(draw_last, directory.absolute())
         except FilesError as error:
@@ -108,7 +108,7 @@ def _last_frames(
     return frames, errors
 
 
-def _last_of(path: Path) -> Image.Image:
+def last_picture(path: Path) -> Image.Image:
     """Read the last picture of an animation."""
     with reading(path), Image.open(path, formats=["GIF"]) as film:
         film.seek(film.n_frames - 1)
