@@ -1,10 +1,10 @@
-"""Paint ``mucosa.png``: a seeded, procedural endoscopic picture of moist mucosa.
+"""Paint ``mucosa.png``, and those of the data set: seeded, procedural endoscopic pictures of moist mucosa.
 
 The colours follow from optics rather than from a palette: pale tissue is darkened by blood according to the
 Beer-Lambert law, and blood lies in branching vessels, in the capillaries round the crypts and, diffusely, in
 redder patches and valleys. A soft height field of folds, bumps, crypts and bulging vessels is then lit.
 
-Usage: ``python make_mucosa.py [OUT.png]``
+Usage: ``python make_mucosa.py [FOLDER]``
 """
 
 import bisect
@@ -22,13 +22,11 @@ from PIL import Image, ImageDraw
 
 Field: TypeAlias = npt.NDArray[np.float64]
 
-SEED = 55
-SIZE = 768  # pixels of the finished, square picture
+SIZE = 768  # pixels of the square picture as it is painted
 MARGIN = 64  # painted round it and cut off, because the Fourier blur wraps round at the borders
 CANVAS = SIZE + 2 * MARGIN
 SUPERSAMPLING = 3  # vessels are drawn this much larger, which anti-aliases them
 
-TISSUE = np.array([238.0, 195.0, 171.0])  # RGB of bloodless mucosa
 HAEMOGLOBIN = np.array([0.10, 0.62, 0.56])  # absorbance per unit of blood: red passes, green and blue do not
 FAT = np.array([0.0, 0.05, 0.13])  # absorbance of the yellowish patches
 LAMP = 0.5, 0.85  # the way (x, y) along which the surface must rise to face the light
@@ -42,11 +40,35 @@ LAYERS = (
     (3.2, 2.0, np.array([0.27, 0.52, 0.34])),
     (6.0, 4.5, np.array([0.24, 0.34, 0.18])),
 )
-TRUNKS, THICKEST, FINEST = 8, 4.8, 0.3  # number of vessels that enter, greatest and least radius
+THICKEST, FINEST = 4.8, 0.3  # greatest and least radius
 STEP = 2.0  # pixels between the points of a vessel
 PROBE = 24  # pixels that a growing vessel looks ahead to keep clear of others
 CELL = 5  # pixels of a cell of the grid that records where vessels run
 MAX_CROWD = 9  # cells taken round a fine vessel at which it dies out instead of branching
+
+
+class Look(NamedTuple):
+    """What one picture differs in from others."""
+
+    seed: int
+    size: int = 576  # pixels as it is saved, in 256 colours if smaller than SIZE, which keeps the repository small
+    tissue: tuple[float, float, float] = (238.0, 195.0, 171.0)  # RGB of bloodless mucosa
+    blood: float = 0.42  # that is everywhere
+    patches: float = 0.19  # how much more or less there is in places
+    crypts: float = 0.11  # how much there is round the crypts
+    trunks: int = 8  # number of vessels that enter
+    folds: float = 30.0  # height [px]
+
+
+FOLDER = Path(__file__).parent
+PICTURES = {
+    "mucosa.png": Look(55, SIZE),
+    "../sweeps/textures/pale.png": Look(2, tissue=(244, 214, 190), blood=0.2, patches=0.12, trunks=12, folds=18),
+    "../sweeps/textures/red.png": Look(3, blood=0.72, patches=0.3, trunks=5),
+    "../sweeps/textures/smooth.png": Look(4, tissue=(240, 190, 178), blood=0.34, crypts=0.04, trunks=16, folds=8),
+    "../sweeps/textures/folded.png": Look(5, tissue=(232, 186, 150), blood=0.5, crypts=0.16, trunks=6, folds=42),
+    "../sweeps/textures/patchy.png": Look(6, tissue=(238, 200, 172), patches=0.28, crypts=0.2, trunks=9, folds=24),
+}
 
 
 class Point(NamedTuple):
@@ -109,9 +131,9 @@ def honeycomb(rng: np.random.Generator, cell: float) -> Field:
     return walls
 
 
-def trunks(rng: np.random.Generator) -> Iterator[Point]:
+def trunks(rng: np.random.Generator, number: int) -> Iterator[Point]:
     """Yield where vessels enter, spread round the border and headed roughly for the middle."""
-    for angle in 2 * math.pi * (np.arange(TRUNKS) + rng.uniform(-0.4, 0.4, TRUNKS)) / TRUNKS:
+    for angle in 2 * math.pi * (np.arange(number) + rng.uniform(-0.4, 0.4, number)) / number:
         middle = Point(CANVAS / 2, CANVAS / 2, 0, THICKEST * rng.uniform(0.3, 1))
         border = middle.ahead(0.499 * CANVAS / max(abs(math.cos(angle)), abs(math.sin(angle))), angle)
         yield border._replace(heading=angle + math.pi + rng.uniform(-0.6, 0.6))
@@ -146,11 +168,11 @@ def creep(rng: np.random.Generator, start: Point, radius: float, taken: Field) -
     return path, False
 
 
-def grow(rng: np.random.Generator) -> Iterator[list[Point]]:
+def grow(rng: np.random.Generator, entering: int) -> Iterator[list[Point]]:
     """Yield the vessels of the tree, which branches by Murray's law: the cubes of the radii add up."""
     taken = np.zeros(((CANVAS + 4 * PROBE) // CELL + 1,) * 2)
     thickness = attrgetter("radius")
-    tips = sorted(trunks(rng), key=thickness)
+    tips = sorted(trunks(rng, entering), key=thickness)
     while tips:
         tip = tips.pop()  # the thickest first, so that finer ones fill the room left between them
         share = 0.01 + 0.49 * rng.uniform() ** 2  # mostly small: a vessel gives off twigs on its way
@@ -192,36 +214,40 @@ def gloss(rng: np.random.Generator, height: Field) -> Field:
     return shine
 
 
-def paint(rng: np.random.Generator) -> npt.NDArray[np.uint8]:
+def paint(look: Look) -> Image.Image:
     """Return the picture."""
+    rng = np.random.default_rng(look.seed)
     crypts = honeycomb(rng, 8)
-    relief = 30 * folds(rng)
+    relief = look.folds * folds(rng)
     valleys = np.clip(blur(relief, 30) - relief, 0, None)
     patches = 0.6 * noise(rng, 90) + 0.4 * noise(rng, 30) + 0.25 * noise(rng, 9) + 0.15 * noise(rng, 3)
     crypts *= 1 + 0.4 * patches  # they stand out where there is much blood, and fade elsewhere
     # Light that bounces about in valleys passes more blood on its way, so these are redder, not just darker.
-    blood = 0.42 + 0.19 * patches + 0.11 * crypts + 0.03 * valleys
+    blood = look.blood + look.patches * patches + look.crypts * crypts + 0.03 * valleys
     absorbance = np.multiply.outer(blood, HAEMOGLOBIN) + np.multiply.outer(1 + 0.6 * noise(rng, 70), FAT)
     height = relief + 2.8 * noise(rng, 16) + 0.5 * noise(rng, 6) + 0.5 * crypts
-    vessels = list(grow(rng))
+    vessels = list(grow(rng, look.trunks))
     for layer, (_, depth, colour) in enumerate(LAYERS):
         seen = blur(draw(vessels, layer), depth)
         absorbance += np.multiply.outer(seen, colour)
         height += 0.8 * seen  # vessels bulge a little
     slope_y, slope_x = np.gradient(blur(height, 0.8))
     light = 1 + 0.15 * np.tanh(1.1 * (LAMP[0] * slope_x + LAMP[1] * slope_y)) - 0.008 * valleys
-    picture = TISSUE * np.exp(-absorbance) * light[..., None]
+    picture = np.array(look.tissue) * np.exp(-absorbance) * light[..., None]
     picture += (255 - picture) * gloss(rng, height)[..., None]
     inside = slice(MARGIN, MARGIN + SIZE)
-    pixels: npt.NDArray[np.uint8] = np.clip(np.rint(picture[inside, inside]), 0, 255).astype(np.uint8)
-    return pixels
+    painted = Image.fromarray(np.clip(np.rint(picture[inside, inside]), 0, 255).astype(np.uint8))
+    if look.size == SIZE:
+        return painted
+    return painted.resize((look.size, look.size)).quantize(dither=Image.Dither.NONE)
 
 
 def main() -> None:
-    """Write the picture to the given path, by default beside this script."""
-    out = Path(sys.argv[1]) if len(sys.argv) > 1 else Path(__file__).with_name("mucosa.png")
-    Image.fromarray(paint(np.random.default_rng(SEED))).save(out, optimize=True)
-    print(f"{out}: {out.stat().st_size / 1024:.0f} KiB")
+    """Write the pictures, into the given folder or, by default, where they belong."""
+    for name, look in PICTURES.items():
+        path = Path(sys.argv[1], Path(name).name) if len(sys.argv) > 1 else FOLDER / name
+        paint(look).save(path, optimize=True)
+        print(f"{path}: {path.stat().st_size / 1024:.0f} KiB")
 
 
 if __name__ == "__main__":

@@ -1,0 +1,37 @@
+"""The sweep files in scenes/sweeps/, and the pictures that they choose from."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from scenes.textures.make_mucosa import FOLDER, PICTURES, paint
+from taichi_msm.scenefile.load import plan_file
+from taichi_msm.sweeps.samples import values_of_runs
+from taichi_msm.sweeps.sweepfile import load_sweep
+
+
+def test_no_run_of_the_data_set_is_refused(root: Path) -> None:
+    sweep = load_sweep(root / "scenes/sweeps/tracking.yaml")
+    runs = values_of_runs(sweep.settings.vary, sweep.settings.samples, sweep.settings.seed)
+    plans = [plan_file(sweep.scene, sweep.overrides(values)) for values in runs]
+    assert len(plans) == 64
+    assert {plan.scene.time.frames for plan in plans} == {30}
+    assert {Path(str(plan.scene.image)).name for plan in plans} | {"mucosa.png"} == {
+        Path(name).name for name in PICTURES
+    }
+
+
+# All are painted by one function.
+@pytest.mark.parametrize(
+    "name", [pytest.param(name, marks=() if "pale" in name else pytest.mark.slow) for name in PICTURES]
+)
+def test_shipped_pictures_are_painted_by_their_script(name: str) -> None:
+    painted, shipped = (
+        np.asarray(image.convert("RGB"), dtype=float) for image in (paint(PICTURES[name]), Image.open(FOLDER / name))
+    )
+    # Rounding elsewhere may move a colour by one, and with it the choice of 256 colours.
+    assert np.abs(painted - shipped).mean() < 1
