@@ -62,7 +62,7 @@ def write_contact(result: SweepResult, executor: Executor, progress: Progress) -
         values = [f"{name} = {short_value(value)}" for name, value in zip(names, result.values[run], strict=True)]
         tiles.append(Tile(frames.get(run), result.outcomes[run].status, [f"run {run}", *map(printable, values)]))
     some = "" if len(runs) == len(result.outcomes) else f"{len(runs)} of "
-    head = printable(f"{result.sweep.settings.scene}: the last frames of {some}{len(result.outcomes)} runs")
+    head = printable(f"{result.sweep.scene.name}: the last frames of {some}{len(result.outcomes)} runs")
     picture = _grid(tiles, _columns(result, len(runs)), head)
     with replacing(result.directory / CONTACT) as file:
         picture.save(file, "JPEG", quality=90)
