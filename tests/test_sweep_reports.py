@@ -20,7 +20,7 @@ from taichi_msm import sweep
 from taichi_msm.errors import ForeignError
 from taichi_msm.plot_style import STYLE
 from taichi_msm.sweeps.captions import short_names, short_value
-from taichi_msm.sweeps.contact import WITHOUT_PICTURES
+from taichi_msm.sweeps.contact import WITHOUT_PICTURES, last_picture
 from taichi_msm.sweeps.dataset import split
 from taichi_msm.sweeps.folder import values_in
 from taichi_msm.sweeps.outcome import Outcome
@@ -52,7 +52,9 @@ def make(small: Path, ran: Path) -> Make:
         described = make_sweep("small.yaml", {"vary": vary, "samples": samples, "seed": 1, **settings})
         values = values_of_runs(described.settings.vary, samples, 1)
         outcomes = [
-            Outcome(run, "diverged", "why") if run % 7 == 3 else Outcome(run, "complete", "", np.log(row[0]), 0.9, None)
+            Outcome(run, "diverged", "why", 9.0)
+            if run % 7 == 3
+            else Outcome(run, "complete", "", np.log(row[0]), 0.9, None)
             for run, row in enumerate(values)
         ]
         result = SweepResult(small / "out", described, values, outcomes)
@@ -191,6 +193,12 @@ def test_the_last_frame_comes_from_any_output(make: Make, ran: Path, kept: str, 
             shutil.rmtree(path) if path.is_dir() else path.unlink()
         assert write(result, pool)[1] == []
     assert np.abs(np.asarray(Image.open(result.directory / CONTACT)) - first).mean() <= difference
+
+
+def test_of_an_animation_the_last_picture_is_taken(tmp_path: Path) -> None:
+    red, blue = (Image.new("RGB", (40, 30), colour) for colour in ("red", "blue"))
+    red.save(tmp_path / "a.gif", save_all=True, append_images=[blue])
+    assert last_picture(tmp_path / "a.gif").getcolors() == [(40 * 30, (0, 0, 255))]
 
 
 def test_without_pictures_there_is_a_note_and_no_earlier_picture(make: Make) -> None:

@@ -62,7 +62,7 @@ def write_contact(result: SweepResult, executor: Executor, progress: Progress) -
         values = [f"{name} = {short_value(value)}" for name, value in zip(names, result.values[run], strict=True)]
         tiles.append(Tile(frames.get(run), result.outcomes[run].status, [f"run {run}", *map(printable, values)]))
     some = "" if len(runs) == len(result.outcomes) else f"{len(runs)} of "
-    head = printable(f"{result.sweep.settings.scene}: the last frames of {some}{len(result.outcomes)} runs")
+    head = printable(f"{result.sweep.scene.name}: the last frames of {some}{len(result.outcomes)} runs")
     picture = _grid(tiles, _columns(result, len(runs)), head)
     with replacing(result.directory / CONTACT) as file:
         picture.save(file, "JPEG", quality=90)
@@ -91,7 +91,7 @@ def _last_frames(
             if finished.has("png"):
                 frames[run] = Image.fromarray(finished.picture("png", finished.frames - 1))
             elif finished.has("gif"):
-                frames[run] = _last_of(finished.result("gif"))
+                frames[run] = last_picture(finished.result("gif"))
             elif finished.has("trajectory") and finished.scene.image is not None:
                 drawn[run] = executor.submit(draw_last, directory.absolute())
         except FilesError as error:
@@ -108,7 +108,7 @@ def _last_frames(
     return frames, errors
 
 
-def _last_of(path: Path) -> Image.Image:
+def last_picture(path: Path) -> Image.Image:
     """Read the last picture of an animation."""
     with reading(path), Image.open(path, formats=["GIF"]) as film:
         film.seek(film.n_frames - 1)

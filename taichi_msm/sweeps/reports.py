@@ -83,7 +83,7 @@ def _write_plots(result: SweepResult) -> Written:
         return names, [*notes, WITHOUT_MATPLOTLIB]
     complete = sum(outcome.status == "complete" for outcome in result.outcomes)
     some = f", {len(runs)} of them shown" if len(runs) < len(result.outcomes) else ""
-    title = f"{result.sweep.settings.scene}: {complete} of {len(result.outcomes)} runs complete{some}"
+    title = f"{result.sweep.scene.name}: {complete} of {len(result.outcomes)} runs complete{some}"
     with replacing(result.directory / PLOT) as file:
         plot(Content(title, varied, columns, failed, indices), file)
     return [*names, PLOT], notes
