@@ -27,7 +27,7 @@ from taichi_msm.sweeps.outcome import Outcome
 from taichi_msm.sweeps.pool import ORPHANED, DiedError, Pool
 from taichi_msm.sweeps.schedule import outcomes
 from taichi_msm.sweeps.sweep import finish
-from taichi_msm.sweeps.sweepfile import load_sweep
+from taichi_msm.sweeps.sweepfile import load_sweep, make_sweep
 from taichi_msm.sweeps.task import Task
 from tests.conftest import Program
 from tests.outputs import files, results
@@ -227,6 +227,29 @@ def test_it_is_started_from_python_with_any_executor(many: Path, pool: Pool) -> 
 
 def number(row: Outcome) -> int:
     return row.run
+
+
+def test_a_run_that_cannot_be_is_refused_and_one_that_fails_is_tried_again(many: Path, pool: Pool) -> None:
+    whole = (many / "speckle.png").read_bytes()
+    (many / "torn.png").write_bytes(whole[: len(whole) // 2])
+    (many / "out/runs/000000").mkdir(parents=True)
+    (many / "out/runs/000000/frames").write_text("in the way")
+    settings = {"vary": {"image": {"grid": ["speckle.png", "torn.png"]}}, "set": {"time.duration": 0.1}}
+    described = make_sweep("small.yaml", settings)
+
+    def take_all() -> list[Outcome]:
+        done, missing = sort_out(described, described.values(), Path("out"))
+        return sorted([*done, *outcomes(missing, pool, lambda: None)], key=number)
+
+    first, second = take_all()
+    assert (first.status, first.error) == (
+        "failed",
+        "000000/frames: a file that no run has put there; move it away or choose another folder",
+    )
+    assert second.status == "refused"
+    assert second.error.startswith("image: torn.png cannot be decoded")
+    (many / "out/runs/000000/frames").unlink()
+    assert [row.status for row in take_all()] == ["complete", "refused"]
 
 
 def end_at_once() -> None:

@@ -41,11 +41,18 @@ def take(task: Task, progress: Progress = lambda stage, done, total: None) -> Ou
         return _without_results(task, "refused", "; ".join(error.lines))
 
     from taichi_msm import runner
+    from taichi_msm.scenefile import budget
 
+    try:
+        budget.require_disk(plan, task.directory)
+    except SceneError as error:
+        return _without_results(task, "failed", str(error))
     try:
         record = runner.run(
             plan, task.directory, threads=1, overrides=task.overrides, started=time.perf_counter(), progress=progress
         )
+    except SceneError as error:  # found only now, such as a picture that cannot be decoded
+        return _without_results(task, "refused", "; ".join(error.lines))
     except MsmError as error:
         return _without_results(task, "failed", str(error))
     except Exception as error:
