@@ -9,10 +9,12 @@ from __future__ import annotations
 
 import json
 import os
+import shutil
 import statistics
 import tempfile
 import time
 from pathlib import Path
+from typing import NamedTuple
 
 import yaml
 
@@ -27,7 +29,7 @@ RUNS, SINGLE = 40, 8
 
 DATA_SET = ROOT / "scenes" / "sweeps" / "tracking.yaml"
 FILMED = {"output": ["png", "flow", "occlusion", "depth", "tracks"]}
-FILMS, FILM_ROUNDS = 50, 3
+FILMS, FILM_ROUNDS = 50, 2
 
 PAGE = ROOT / "docs" / "sweep.md"
 START, END = "<!-- speed: made by benchmarks/sweeps.py -->\n", "<!-- end of speed -->\n"
@@ -52,12 +54,22 @@ def short_runs(folder: Path, cache: str) -> tuple[list[float], list[float]]:
     return sweeps, singles
 
 
-def data_set(folder: Path, cache: str, number: int) -> tuple[float, float, float, int]:
-    """Make a data set; gives its time, the processor time, that of drawing, labels and encoding [s], and the frames."""
+class Made(NamedTuple):
+    """How a data set was made; times in seconds."""
+
+    seconds: float
+    busy: float  # processor time
+    pictures: float  # drawing, labels and encoding, in all processes
+    stepping: float  # and the estimates of its error, in all processes
+    frames: int
+
+
+def data_set(folder: Path, cache: str, number: int, films: int) -> Made:
+    """Make a data set of so many films."""
     content = yaml.safe_load(DATA_SET.read_text())
     # In the folder of the shipped one, as it names files beside it.
     file, out = DATA_SET.with_name(f"benchmark-{os.getpid()}.yaml"), folder / f"films-{number}"
-    file.write_text(yaml.safe_dump({**content, "samples": FILMS, "set": {**content.get("set", {}), **FILMED}}))
+    file.write_text(yaml.safe_dump({**content, "samples": films, "set": {**content.get("set", {}), **FILMED}}))
     try:
         before = os.times()
         seconds = command("sweep", str(file), "--out", str(out), cache=cache)[0]
@@ -66,31 +78,35 @@ def data_set(folder: Path, cache: str, number: int) -> tuple[float, float, float
         file.unlink()
     busy = after.children_user + after.children_system - before.children_user - before.children_system
     records = [json.loads(path.read_text()) for path in out.glob("runs/*/run.json")]
-    assert [record["status"] for record in records] == ["complete"] * FILMS
-    others = ("startup", "pilot", "compile", "simulate")
+    assert [record["status"] for record in records] == ["complete"] * films
     times = [record["timings"] for record in records]
-    pictures = sum(one["total"] - sum(one.get(stage, 0.0) for stage in others) for one in times)
-    return seconds, busy, pictures, sum(record["frames"] for record in records)
+    stepping = sum(one["simulate"] + one.get("pilot", 0.0) for one in times)
+    pictures = sum(one["total"] - one["startup"] - one["compile"] for one in times) - stepping
+    shutil.rmtree(out)
+    return Made(seconds, busy, pictures, stepping, sum(record["frames"] for record in records))
 
 
 def main() -> None:
     """Measure, and write the page."""
     cores = resources.available_threads()
     with tempfile.TemporaryDirectory() as directory:
-        cache = f"{directory}/cache"
-        sweeps, singles = short_runs(Path(directory), cache)
-        films = [data_set(Path(directory), cache, number) for number in range(-1, FILM_ROUNDS)][1:]
+        folder, cache = Path(directory), f"{directory}/cache"
+        sweeps, singles = short_runs(folder, cache)
+        data_set(folder, cache, -1, films=2)  # compiles its kernels
+        films = [data_set(folder, cache, number, FILMS) for number in range(FILM_ROUNDS)]
     ratio = statistics.median(one / other for one, other in zip(sweeps, singles, strict=True))
-    seconds, busy, pictures, frames = (statistics.median(column) for column in zip(*films, strict=True))
+    made = Made(*(statistics.median(column) for column in zip(*films, strict=True)))
+    all_cores = cores * made.seconds
     text = (
-        f"On {cores} cores of an {resources.processor()}, vectors of {vector_bits()} bits, medians of {ROUNDS} and "
-        f"{FILM_ROUNDS} rounds with compiled kernels:\n\n"
+        f"On {cores} cores of an {resources.processor()} with vectors of {vector_bits()} bits, medians of {ROUNDS} and "
+        f"{FILM_ROUNDS} rounds, kernels compiled before:\n\n"
         f"- {RUNS} runs of `press.yaml` with 31 × 31 points and without pictures take "
-        f"{statistics.median(sweeps):.1f} s, {SINGLE} of them as single commands "
-        f"{statistics.median(singles):.1f} s: {ratio:.2f} of that for {RUNS // SINGLE} times the runs.\n"
-        f"- {FILMS} runs of `tracking.yaml` with pictures, flow, occlusion, depth and tracks take {seconds:.0f} s, "
-        f"{frames / seconds:.0f} frames a second. The cores are busy for {busy / cores / seconds:.0%} of it. It is "
-        f"{seconds * cores / pictures:.2f} times what drawing, labels and encoding alone take on these cores.\n"
+        f"{statistics.median(sweeps):.1f} s; {SINGLE} of them as single commands take "
+        f"{statistics.median(singles):.1f} s. That is {ratio:.2f} of the time for {RUNS // SINGLE} times the runs.\n"
+        f"- {FILMS} runs of `tracking.yaml` with pictures, flow, occlusion, depth and tracks take "
+        f"{made.seconds:.0f} s: {made.frames / made.seconds:.0f} frames a second. The cores are busy for {made.busy / all_cores:.0%} of it: "
+        f"{made.pictures / all_cores:.0%} of the time of all cores goes to drawing, labels and encoding, "
+        f"{made.stepping / all_cores:.0%} to stepping and the estimates of its error.\n"
     )
     before, rest = PAGE.read_text(encoding="utf-8").split(START)
     PAGE.write_text(before + START + text + END + rest.split(END)[1], encoding="utf-8")

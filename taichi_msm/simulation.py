@@ -33,6 +33,10 @@ if TYPE_CHECKING:
     from taichi_msm.notebook import Player
 
 
+# The kernels for drawing that were compiled in this process; to compile them by drawing takes as long as two frames.
+_compiled: set[tuple[object, ...]] = set()
+
+
 class Simulation:
     """A sheet that moves by frames and can be drawn. Usable in a with statement, which frees its memory.
 
@@ -342,9 +346,10 @@ class Simulation:
         self._require_open()
         self._dynamics.compile()
         pause()
-        if self.scene.renders:
+        if self.scene.renders and (kernels := self.renderer.kernels()) not in _compiled:
             first = self.observe(None, self._position, self.time)
             self.observe(first.labels, self._position, self.time)
+            _compiled.add(kernels)
 
     def close(self) -> None:
         """Free the memory. `positions` still gives the last frame."""

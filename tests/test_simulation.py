@@ -30,6 +30,20 @@ def test_frames_positions_and_pictures(device: Device) -> None:
     assert simulation.progress.max_displacement == pytest.approx(np.linalg.norm(twin[:4] - twin[0], axis=-1).max())
 
 
+def test_kernels_are_compiled_once_in_a_process(device: Device, monkeypatch: pytest.MonkeyPatch) -> None:
+    observed = []
+    monkeypatch.setattr(
+        Simulation, "observe", lambda self, *given, own=Simulation.observe: observed.append(given) or own(self, *given)
+    )
+    for refine, drawn in ((3, 2), (2, 2), (0, 4)):  # Only whether the sheet is refined is compiled.
+        made = scene(render={"size": [40, 30], "refine": refine}, image="any.png", output=["png"])
+        with Simulation(made, threads=device.threads, texture=speckle(30, 40)) as simulation:
+            if refine == 3:
+                monkeypatch.setattr("taichi_msm.simulation._compiled", set())
+            simulation.compile()
+        assert len(observed) == drawn
+
+
 def test_positions_of_a_frame_stay_as_they_were(device: Device) -> None:
     with Simulation(scene(), threads=device.threads) as simulation:
         simulation.advance()

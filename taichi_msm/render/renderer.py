@@ -73,6 +73,12 @@ class Renderer:
         """Tell whether a picture in a style, as for `draw`, has been drawn before."""
         return self._key(style, picture=True, labels=False) in self._drawings
 
+    def kernels(self) -> tuple[object, ...]:
+        """Give all that the kernels of `observe` are compiled for."""
+        from taichi_msm.render.rasterizer import drawing_config
+
+        return drawing_config(self.scene, picture=self.scene.draws, labels=self.scene.labels_pixels), self.scene.output
+
     def labels(self, shot: Shot) -> Labels:
         """Give what each pixel shows at its centre."""
         labels = self._drawing(picture=False, labels=True).look(*shot).labels
