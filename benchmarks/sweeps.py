@@ -104,7 +104,8 @@ def main() -> None:
         f"{statistics.median(sweeps):.1f} s; {SINGLE} of them as single commands take "
         f"{statistics.median(singles):.1f} s. That is {ratio:.2f} of the time for {RUNS // SINGLE} times the runs.\n"
         f"- {FILMS} runs of `tracking.yaml` with pictures, flow, occlusion, depth and tracks take "
-        f"{made.seconds:.0f} s: {made.frames / made.seconds:.0f} frames a second. The cores are busy for {made.busy / all_cores:.0%} of it: "
+        f"{made.seconds:.0f} s: {made.frames / made.seconds:.0f} frames a second. The cores are busy for "
+        f"{made.busy / all_cores:.0%} of it: "
         f"{made.pictures / all_cores:.0%} of the time of all cores goes to drawing, labels and encoding, "
         f"{made.stepping / all_cores:.0%} to stepping and the estimates of its error.\n"
     )

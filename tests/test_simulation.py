@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 import pytest
 
 import taichi_msm
 from taichi_msm import DivergedError, Simulation, runner
+from taichi_msm.render.labels import Observed
 from taichi_msm.system import resources
 from taichi_msm.system.compiler import chosen
 from taichi_msm.system.runtime import Device
@@ -31,10 +34,13 @@ def test_frames_positions_and_pictures(device: Device) -> None:
 
 
 def test_kernels_are_compiled_once_in_a_process(device: Device, monkeypatch: pytest.MonkeyPatch) -> None:
-    observed = []
-    monkeypatch.setattr(
-        Simulation, "observe", lambda self, *given, own=Simulation.observe: observed.append(given) or own(self, *given)
-    )
+    observed, own = [], Simulation.observe
+
+    def observe(simulation: Simulation, *given: Any) -> Observed:
+        observed.append(given)
+        return own(simulation, *given)
+
+    monkeypatch.setattr(Simulation, "observe", observe)
     for refine, drawn in ((3, 2), (2, 2), (0, 4)):  # Only whether the sheet is refined is compiled.
         made = scene(render={"size": [40, 30], "refine": refine}, image="any.png", output=["png"])
         with Simulation(made, threads=device.threads, texture=speckle(30, 40)) as simulation:
