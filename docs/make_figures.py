@@ -1,8 +1,8 @@
-"""Make the pictures of the README and of the pages on scenes and live sessions, from the shipped scenes.
+"""Make the pictures of the README and of the pages on scenes, sweeps and live sessions, from what is shipped.
 
     python docs/make_figures.py
 
-Needs the extra `test`, for the photograph. Takes about a minute.
+Needs the extras `test` and `bench`, for the plots and the photograph. Takes about two minutes.
 """
 
 from __future__ import annotations
@@ -16,6 +16,9 @@ import skimage
 from PIL import Image
 
 from taichi_msm import Simulation, load_scene, run
+from taichi_msm.cli import main as main_of_program
+from taichi_msm.scenefile.load import plan_file
+from taichi_msm.sweeps.sweepfile import load_sweep
 from taichi_msm.viewer.captures import Captures
 from taichi_msm.viewer.script import film, load_script, timed
 from taichi_msm.viewer.session import Session
@@ -64,6 +67,30 @@ def live(name: str, size: int, rate: float, seconds: float) -> None:
         film(session, IMAGES / f"{name}.gif", seconds, timed(script, session.rate, scene.render.size))
 
 
+def sweep() -> None:
+    """Keep the pictures that the sweep stiffness ends with, smaller."""
+    with tempfile.TemporaryDirectory() as directory:
+        if main_of_program(["sweep", str(SCENES / "sweeps" / "stiffness.yaml"), "--out", directory]) != 0:
+            raise SystemExit("the sweep failed")
+        # Of the contact sheet two rows.
+        for name, share, kept in (("contact.jpg", 0.34, "sweep-contact.jpg"), ("sweep.png", 1, "sweep-plot.png")):
+            with Image.open(Path(directory) / name) as picture:
+                part = picture.convert("RGB").crop((0, 0, picture.width, round(share * picture.height)))
+            part.resize((1400, round(1400 * part.height / part.width))).save(IMAGES / kept, quality=88)
+
+
+def data_set(runs: int, moment: float, size: int) -> list[Image.Image]:
+    """Draw the first runs of the sweep tracking at a moment [s]."""
+    described = load_sweep(SCENES / "sweeps" / "tracking.yaml")
+    pictures = []
+    for values in described.some_values(runs):
+        plan = plan_file(described.scene, (*described.overrides(values), f"render.size=[{size},{size}]"))
+        with Simulation(plan) as simulation:
+            simulation.advance(round(moment * plan.scene.time.frames_per_second))
+            pictures.append(Image.fromarray(simulation.draw()))
+    return pictures
+
+
 def grid(pictures: list[Image.Image], columns: int, gap: int = 6) -> Image.Image:
     """Put pictures side by side on white, so many in a row."""
     width, height = pictures[0].size
@@ -87,6 +114,8 @@ def main() -> None:
     stiffness = Image.open(SCENES / "textures" / "tumour.png").convert("RGB").resize((400, 400))
     palpation = frames(SCENES / "tumour.yaml", (0.0, PALPATION), (400, 400))
     grid([*palpation, stiffness], 3).save(IMAGES / "tumour.jpg", quality=90)
+    grid(data_set(8, moment=0.72, size=300), 4).save(IMAGES / "data-set.jpg", quality=88)
+    sweep()
     for path in sorted(IMAGES.iterdir()):
         print(f"{path.relative_to(ROOT)}  {path.stat().st_size / 1024:.0f} KiB  {np.array(Image.open(path)).shape}")
 
