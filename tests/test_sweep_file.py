@@ -176,6 +176,14 @@ FAULTS: list[tuple[dict[str, Any], str]] = [
         "vary.damping: expected one of uniform, log_uniform, normal, choice, grid",
     ),
     ({"vary": {"dampign": {"uniform": [1, 2]}}}, "vary.dampign: unknown key; did you mean 'damping'?"),
+    (
+        {"vary": {"damping": [0.01, 0.02]}},
+        "vary.damping: [0.01, 0.02] is no way to vary; take one, such as {uniform: [1, 2]} or {choice: [1, 2]}",
+    ),
+    (
+        {"vary": {"springs": {"shear": {"uniform": [1, 2]}}}},
+        "vary.springs: give each key by its dotted path, such as tissue.young: {uniform: [1e4, 3e4]}",
+    ),
     ({"set": {"sheet.pionts": [3, 3]}}, "set.sheet.pionts: unknown key; did you mean 'points'?"),
     (
         {"set": {"probes.3.falloff": 5}},
@@ -196,7 +204,7 @@ FAULTS: list[tuple[dict[str, Any], str]] = [
         "put the picture there",
     ),
     (
-        {"samples": None, "vary": {"a": {"grid": list(range(4000))}, "b": {"grid": list(range(4000))}}},
+        {"samples": None, "vary": {name: {"grid": list(range(4000))} for name in ("damping", "springs.shear")}},
         "vary: 16000000 combinations, more than the 10000000 that can be run; take smaller grids",
     ),
 ]
@@ -217,10 +225,18 @@ def test_a_fault_of_a_sweep_file_is_told_at_its_key(folder: Path, change: dict[s
 def test_all_faults_are_told_at_once_in_their_order(folder: Path) -> None:
     (folder / "many.yaml").write_text(
         "scene: small.yaml\nseed: -1\nvary:\n  damping: {uniform: [2, 1]}\n"
-        "  image: {choice: [c.png, speckle.png, d.png]}\n"
+        "  image: {choice: [c.png, speckle.png, d.png]}\n  spring.shear: {grid: [1]}\n"
     )
     with pytest.raises(SceneError) as raised:
         load_sweep("many.yaml")
     assert [line.split(": ")[0] for line in raised.value.lines] == [
-        f"many.yaml:{at}" for at in ("2:1", "4:13", "5:20", "5:40")
+        f"many.yaml:{at}" for at in ("2:1", "4:13", "5:20", "5:40", "6:3")
     ]
+
+
+def test_a_scene_and_a_sweep_are_told_apart(folder: Path) -> None:
+    with pytest.raises(SceneError, match=r"^small.yaml:1:1: a scene; use `taichi-msm run`, or name it by `scene:` in"):
+        load_sweep("small.yaml")
+    (folder / "many.yaml").write_text(json.dumps(GOOD))
+    with pytest.raises(SceneError, match=r"^many.yaml:1:1: a sweep; use `taichi-msm sweep`$"):
+        load_plan("many.yaml")

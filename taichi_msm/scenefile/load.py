@@ -95,6 +95,8 @@ def plan_file(file: File, overrides: Sequence[str] | Mapping[str, Any] = (), ima
     ):
         raise ArgumentError(f'overrides: {overrides!r}; take ["sheet.points=[61,61]"] or {{"sheet.points": [61, 61]}}')
     draft = Draft(file)
+    if {"scene", "vary"} <= draft.data.keys():
+        raise SceneError([f"{file.name}:1:1: a sweep; use `taichi-msm sweep`"])
     parsed = (
         starmap(_parse_value, overrides.items()) if isinstance(overrides, Mapping) else map(parse_override, overrides)
     )

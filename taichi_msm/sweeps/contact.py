@@ -60,9 +60,13 @@ def write_contact(result: SweepResult, executor: Executor, progress: Progress) -
     tiles = []
     for run in runs:
         values = [f"{name} = {short_value(value)}" for name, value in zip(names, result.values[run], strict=True)]
-        tiles.append(Tile(frames.get(run), result.outcomes[run].status, [f"run {run}", *map(printable, values)]))
-    some = "" if len(runs) == len(result.outcomes) else f"{len(runs)} of "
-    head = printable(f"{result.sweep.scene.name}: the last frames of {some}{len(result.outcomes)} runs")
+        outcome = result.outcomes[run]
+        largest = outcome.max_displacement
+        moved = [] if largest is None else [f"max_displacement = {short_value(largest)}"]
+        tiles.append(Tile(frames.get(run), outcome.status, [f"run {run}", *moved, *map(printable, values)]))
+    total = len(result.outcomes)
+    which = f"{total} runs" if len(runs) == total else f"{len(runs)} of {total} runs, evenly spread"
+    head = printable(f"{result.sweep.scene.name}: the last frames of {which}")
     picture = _grid(tiles, _columns(result, len(runs)), head)
     with replacing(result.directory / CONTACT) as file:
         picture.save(file, "JPEG", quality=90)

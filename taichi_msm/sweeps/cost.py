@@ -12,7 +12,7 @@ from taichi_msm.sweeps.sweepfile import Sweep
 from taichi_msm.system.resources import available_memory, available_threads
 
 # The runs that are looked at, evenly spread over all; each takes milliseconds.
-LOOKED_AT = 16
+LOOKED_AT = 64
 
 # Memory of a process besides that of its run: Python, the compiler, kernels [bytes].
 PROCESS_BYTES = 400 << 20
@@ -25,7 +25,9 @@ class Cost(NamedTuple):
     measured: bool  # whether that follows from earlier runs here, and not only from a calibration
     disk_bytes: int  # at most
     memory_bytes: int  # of one process
-    refused: str  # why the runs that were looked at are refused, if all are
+    looked_at: int  # how many runs this follows from
+    refused: int  # how many of them are
+    example: str  # why one of them is
 
     def of(self, share: float) -> Cost:
         """Give the cost of a share of the runs."""
@@ -43,23 +45,24 @@ class Workers(NamedTuple):
 def estimate(sweep: Sweep) -> Cost:
     """Estimate what the runs of a sweep take."""
     plans: list[Plan] = []
-    refused = ""
+    reasons: list[str] = []
     for values in sweep.some_values(LOOKED_AT):
         try:
             plans.append(plan_file(sweep.scene, sweep.overrides(values)))
         except SceneError as error:
-            refused = refused or error.lines[0]
-    if not plans:
-        return Cost(0.0, False, 0, PROCESS_BYTES, refused)
+            reasons.append(error.lines[0])
     times, needs = list(map(duration.estimate, plans)), list(map(budget.estimate, plans))
-    share = sweep.runs / len(plans)
+    looked_at = len(plans) + len(reasons)
+    share = sweep.runs / looked_at
     return Cost(
         # A process starts once, for many runs.
-        seconds=max(one.start for one in times) + share * sum(one.seconds - one.start for one in times),
+        seconds=max((one.start for one in times), default=0.0) + share * sum(one.seconds - one.start for one in times),
         measured=all(one.measured for one in times),
         disk_bytes=round(share * sum(need.disk_bytes for need in needs)),
-        memory_bytes=PROCESS_BYTES + max(need.memory_bytes for need in needs),
-        refused="",
+        memory_bytes=PROCESS_BYTES + max((need.memory_bytes for need in needs), default=0),
+        looked_at=looked_at,
+        refused=len(reasons),
+        example=next(iter(reasons), ""),
     )
 
 

@@ -31,6 +31,17 @@ class Distribution(Section):
     choice: Any = key(None, "one of some values, all equally likely; of a picture also a pattern of files", LIST)
     grid: Any = key(None, "every one of some values, with every combination of the other keys'", LIST)
 
+    @model_validator(mode="before")
+    @classmethod
+    def _is_flat(cls, data: Any) -> Any:
+        if not isinstance(data, dict):
+            raise refused(
+                f"{flow(data)} is no way to vary; take one, such as {{uniform: [1, 2]}} or {{choice: [1, 2]}}"
+            )
+        if data.keys().isdisjoint(cls.model_fields) and any(isinstance(value, dict) for value in data.values()):
+            raise refused("give each key by its dotted path, such as tissue.young: {uniform: [1e4, 3e4]}")
+        return data
+
     @field_validator("uniform", "log_uniform", "normal")
     @classmethod
     def _is_pair(cls, value: Any) -> Any:

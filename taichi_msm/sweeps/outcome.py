@@ -22,6 +22,7 @@ class Outcome:
     shortest_spring: float | None = None  # smallest ratio of a spring's length to its rest length
     error_estimate: float | None = None  # as a fraction of the largest displacement
     mesh_error: float | None = None  # likewise
+    notes: tuple[str, ...] = ()  # what to know before trusting the results, besides the errors
     seconds: float | None = field(default=None, compare=False)  # the time that it took [s]
 
 
@@ -40,5 +41,6 @@ def outcome_of(run: int, record: Mapping[str, Any]) -> Outcome:
         record["shortest_spring"],
         estimate.get("error"),
         estimate.get("mesh_error"),
+        tuple(record["notes"][1:]),  # The first one is of the errors.
         record["timings"]["total"],
     )

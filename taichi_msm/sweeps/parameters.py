@@ -16,7 +16,7 @@ from taichi_msm.sweeps.result import SweepResult
 
 RESULTS = tuple(name for name in COLUMNS if name not in ("status", "error", "seconds"))
 
-# Of so many values at most, each has a place and a label, even if they are numbers.
+# Of so many values at most that are no numbers, each has a label.
 MOST_LABELS = 8
 
 # Numbers that span a larger ratio than this are compared by their logarithms.
@@ -67,12 +67,13 @@ def _parameters(name: str, one: Distribution, values: list[Any]) -> Iterator[Par
         for suffix, *components in zip(_suffixes(values[0]), *map(_flat, values), strict=True):
             yield Parameter(name + suffix, np.array(components, dtype=np.float64), is_logarithmic)
         return
+    if all(type(value) in (int, float) for value in one.values):
+        numbers = np.array(values, dtype=np.float64)
+        yield Parameter(name, numbers, is_wide(numbers))
+        return
     places = {text: place for place, text in enumerate(dict.fromkeys(map(json.dumps, one.values)))}
     if len(places) <= MOST_LABELS:
         yield Parameter(name, _placed(places, values), labels=[short_value(json.loads(text)) for text in places])
-    elif all(type(value) in (int, float) for value in one.values):
-        numbers = np.array(values, dtype=np.float64)
-        yield Parameter(name, numbers, is_wide(numbers))
     else:
         yield Parameter(f"{name} ({len(places)} values)", _placed(places, values))
 

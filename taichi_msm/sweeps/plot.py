@@ -31,7 +31,10 @@ WIDTH, HEIGHT, BESIDE, AROUND = 1.75, 1.55, 0.9, 1.3
 LETTERS, LABEL, ROOM = 17, 12, 20
 
 # Of the dots: all their areas together [pt²], and how wide those at one label spread.
-AREAS, SPREAD = 900, 0.5
+AREAS, SPREAD = 900, 0.3
+
+# Beside the dots, as a share of the axis.
+MARGIN = 0.05
 
 UNITS = {"max_displacement": " [m]"}
 
@@ -136,14 +139,25 @@ def _scale(axes: Axes, parameter: Parameter) -> None:
             {"rotation": 30, "ha": "right", "rotation_mode": "anchor"} if sum(map(len, labels)) > ROOM else {}
         )
         axes.set_xticks(range(len(labels)), labels, parse_math=False, **turned)
-    elif parameter.is_logarithmic:
+        return
+    if parameter.is_logarithmic:
         axes.set_xscale("log")
         axes.xaxis.set_major_locator(LogLocator(subs=(1, 2, 5), numticks=5))
         axes.xaxis.set_minor_formatter(NullFormatter())
     else:
         axes.xaxis.set_major_locator(MaxNLocator(3))
-    if not parameter.labels:
-        axes.xaxis.set_major_formatter(FuncFormatter(_write))
+    axes.xaxis.set_major_formatter(FuncFormatter(_write))
+    # All runs, as those that failed may lie beyond the others.
+    axes.set_xlim(*_with_margin(parameter))
+
+
+def _with_margin(parameter: Parameter) -> tuple[float, float]:
+    """Give the ends of an axis that has all numbers of a parameter well inside."""
+    low, high = float(parameter.numbers.min()), float(parameter.numbers.max())
+    if parameter.is_logarithmic:
+        factor = (high / low) ** MARGIN
+        return low / factor, high * factor
+    return low - MARGIN * (high - low), high + MARGIN * (high - low)
 
 
 def _write(number: float, _: int) -> str:

@@ -65,7 +65,7 @@ def _write_plots(result: SweepResult) -> Written:
     names: list[str] = []
     notes: list[str] = []
     if not (varied and columns):
-        return names, notes
+        return names, [f"no {PLOT}: it needs complete runs with results that differ"]
     failed = np.array([result.outcomes[run].status != "complete" for run in runs])
     try:
         indices = sensitivity(varied, columns)

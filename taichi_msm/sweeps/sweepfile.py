@@ -44,7 +44,9 @@ class SweepSettings(Section):
         1, "what the samples, and the parts of a data set, are chosen by", "a whole number, 0 or more"
     )
     vary: dict[str, Distribution] = key(
-        ..., "keys of the scene by their dotted paths, and how each varies", "keys of the scene, such as tissue.young"
+        ...,
+        "keys of the scene by their dotted paths, and how each varies",
+        "a mapping, such as tissue.young: {uniform: [1e4, 3e4]}",
     )
     set: dict[str, Any] = key({}, "keys of the scene by their dotted paths, and their values in all runs", "a mapping")
 
@@ -132,19 +134,11 @@ class Sweep:
 def load_sweep(path: str | Path) -> Sweep:
     """Read a sweep file and check it; SceneError: with all its faults, one line each, in their order."""
     draft = Draft(read_file(str(path), SWEEP))
-    folder, scene = Path(path).parent, draft.data.get("scene")
-    if isinstance(scene, str) and scene:
-        draft.report(_relocate(draft.data, folder, (folder / scene).parent))
-    settings, problems = parse(SweepSettings, draft.data)
+    if "sheet" in draft.data and "vary" not in draft.data:
+        raise SceneError([f"{path}:1:1: a scene; use `taichi-msm run`, or name it by `scene:` in a sweep file"])
+    sweep, problems = _checked(draft.data, Path(path).parent)
     draft.report(problems)
-    if settings is None or draft.problems:
-        raise SceneError(draft.lines())
-    try:
-        sweep = _sweep_of(folder / settings.scene, settings)
-        draft.report(_unknown_keys(sweep))
-    except SceneError as error:
-        draft.report([Problem(("scene",), error.lines[0])])
-    if draft.problems:
+    if sweep is None or draft.problems:
         raise SceneError(draft.lines())
     return sweep
 
@@ -152,20 +146,30 @@ def load_sweep(path: str | Path) -> Sweep:
 def make_sweep(scene: str | Path, settings: Mapping[str, Any]) -> Sweep:
     """Make a sweep without a file; its pictures are relative to the scene file. SceneError: with all its faults."""
     try:
-        data = json.loads(json.dumps({**settings, "scene": str(scene)}))
+        data = json.loads(json.dumps({**settings, "scene": Path(scene).name}))
     except (TypeError, ValueError) as error:
         raise ArgumentError(f"vary, overrides: {error}; use numbers, text, lists, dicts") from None
-    problems = list(_relocate(data, Path(scene).parent, Path(scene).parent))
-    sweep = _sweep_of(Path(scene), SweepSettings(**data))
-    if problems := [*problems, *_unknown_keys(sweep)]:
+    sweep, problems = _checked(data, Path(scene).parent)
+    if sweep is None or problems:
         raise SceneError([str(problem) for problem in problems])
     return sweep
 
 
-def _sweep_of(path: Path, settings: SweepSettings) -> Sweep:
-    """Read the scene file; it is named without its folder in the errors of runs, wherever the sweep is started."""
-    scene = read_file(os.path.normpath(path), SCENE)
-    return Sweep(scene._replace(name=path.name), settings)
+def _checked(data: dict[str, Any], folder: Path) -> tuple[Sweep | None, list[Problem]]:
+    """Check the content of a sweep file in a folder, and read its scene; gives all that is wrong."""
+    problems: list[Problem] = []
+    file, name = None, data.get("scene")
+    if isinstance(name, str) and name:
+        path = folder / name
+        problems += _relocate(data, folder, path.parent)
+        try:
+            # In the errors of runs it is named without its folder, wherever the sweep is started.
+            file = read_file(os.path.normpath(path), SCENE)._replace(name=path.name)
+            problems += _unknown_keys(file, data)
+        except SceneError as error:
+            problems.append(Problem(("scene",), error.lines[0]))
+    settings, wrong = parse(SweepSettings, data)
+    return (None if settings is None or file is None else Sweep(file, settings)), [*problems, *wrong]
 
 
 def cell(value: Any) -> str:
@@ -180,7 +184,7 @@ def cell(value: Any) -> str:
 
 def _relocate(data: dict[str, Any], folder: Path, home: Path) -> Iterator[Problem]:
     """Make paths of pictures, given relative to a folder, relative to the scene's, its home; expand patterns."""
-    vary, fixed = (part if isinstance(part, dict) else {} for part in (data.get("vary"), data.get("set")))
+    vary, fixed = _mappings(data)
     for name, ways in vary.items():
         for way in {"choice", "grid"} & set(ways if isinstance(ways, dict) else ()):
             path: Key = ("vary", name, way)
@@ -227,16 +231,29 @@ def _as_key(name: str) -> Key:
     return parse_key(name) if name else ()
 
 
-def _unknown_keys(sweep: Sweep) -> Iterator[Problem]:
-    """Find the keys that no scene has, by trying the values of the first run."""
-    draft, first = Draft(sweep.scene), sweep.some_values(1)[0]
-    places = [*(("set", name) for name in sweep.settings.set), *(("vary", name) for name in sweep.keys)]
-    for place, text in zip(places, sweep.overrides(first), strict=True):
+def _unknown_keys(scene: File, data: dict[str, Any]) -> Iterator[Problem]:
+    """Find the keys that no scene has, by trying one value of each."""
+    vary, fixed = _mappings(data)
+    tried: dict[Key, Any] = {("set", name): value for name, value in fixed.items()}
+    for name, ways in vary.items():
+        values = next(iter(ways.values()), None) if isinstance(ways, dict) else None
+        tried["vary", name] = values[0] if isinstance(values, list) and values else None
+    draft = Draft(scene)
+    for place, value in tried.items():
         known = len(draft.problems)
-        draft.override(parse_override(text))
+        draft.override(parse_override(f"{place[1]}={cell(value)}"))
         yield from (Problem(place, problem.message) for _, problem in draft.problems[known:])
     for problem in parse(Scene, draft.data)[1]:
-        around = [place for place in places if problem.path[: len(_as_key(place[1]))] == _as_key(place[1])]
-        if around and problem.message.startswith("unknown key"):
-            where = f"{problem.key}: " if problem.key != around[-1][1] else ""
-            yield Problem(around[-1], f"{where}{problem.message}")
+        if problem.message.startswith("unknown key"):
+            for place in tried:
+                path = _as_key(str(place[1]))
+                # The fault may be above the key or, in a section that is given as a whole, below it.
+                if all(part == other for part, other in zip(path, problem.path, strict=False)):
+                    where = f"{problem.key}: " if problem.path != path else ""
+                    yield Problem(place, f"{where}{problem.message}")
+
+
+def _mappings(data: dict[str, Any]) -> tuple[dict[str, Any], dict[str, Any]]:
+    """Give what varies and what is set, each empty where it is no mapping."""
+    vary, fixed = (data.get(name) for name in ("vary", "set"))
+    return vary if isinstance(vary, dict) else {}, fixed if isinstance(fixed, dict) else {}
