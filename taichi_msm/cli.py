@@ -503,11 +503,11 @@ def sweep(
     described = load_sweep(file)
     directory = result_directory(out, Path(file).stem)
     cost = estimate(described)
+    chosen = choose_workers(cost, described.runs, workers)
     if dry_run:
-        values, chosen = described.values(), choose_workers(cost, described.runs)
+        values = described.values()
         if as_json:
-            facts = {**cost._asdict(), "workers": workers or chosen.number}
-            print_json({"keys": described.keys, "values": values, **facts})
+            print_json({"keys": described.keys, "values": values, **cost._asdict(), "workers": chosen.number})
             return DONE
         click.echo(csv_line(["run", *described.keys]))
         for run, row in enumerate(values):
@@ -515,11 +515,10 @@ def sweep(
         click.echo(cost_line(described.runs, cost, chosen))
         return DONE
     if not yes and (described.runs > MANY_RUNS or cost.seconds > LONG):
-        said = cost_line(described.runs, cost, choose_workers(cost, described.runs))
-        raise click.UsageError(f"{said}; add --yes if that is meant")
+        raise click.UsageError(f"{cost_line(described.runs, cost, chosen)}; add --yes if that is meant")
     values = values_in(directory, described)
     outcomes, missing = sort_out(described, values, directory, shard or (1, 1))
-    total, chosen = len(outcomes) + len(missing), choose_workers(cost, len(missing))
+    total, chosen = len(outcomes) + len(missing), choose_workers(cost, len(missing), workers)
     if not as_json:
         tell([f"{len(outcomes)} of {total} runs have ended before"] if outcomes else [])
         here = chosen if dask is None else None
@@ -531,7 +530,7 @@ def sweep(
         with Progress(quiet=as_json) as bar:
             progress = interruptible(bar, interruption)
             where = dask if missing else None  # Nothing else needs a cluster.
-            with opened(where, workers or chosen.number, described, directory, progress) as executor:
+            with opened(where, chosen.number, described, directory, progress) as executor:
                 for outcome in take_all(missing, executor, lambda: progress("runs", len(outcomes), total)):
                     outcomes.append(outcome)
                 if shard is None:

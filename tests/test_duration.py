@@ -44,7 +44,8 @@ def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 
 def estimate(made: Scene) -> Any:
-    return tuple(duration.estimate(plan_of(made)))
+    found = duration.estimate(plan_of(made))
+    return found.seconds, found.measured
 
 
 def record(**other: Any) -> dict[str, Any]:

@@ -20,7 +20,7 @@ from typing import Any
 import pytest
 
 from taichi_msm import sweep
-from taichi_msm.errors import MsmError, SceneError
+from taichi_msm.errors import ArgumentError, MsmError, SceneError
 from taichi_msm.sweeps import cost
 from taichi_msm.sweeps.folder import sort_out, values_in
 from taichi_msm.sweeps.outcome import Outcome
@@ -187,6 +187,36 @@ def test_another_sweep_in_the_folder_is_refused(many: Path, program: Program) ->
     assert files(Path("out")) == before
 
 
+@pytest.mark.parametrize("values", [3, [], [[1]] * 4, {"a": 1}, [3] * 4])
+def test_a_damaged_record_is_told(many: Path, program: Program, values: Any) -> None:
+    values_in(Path("out"), load_sweep("many.yaml"))
+    record = json.loads(Path("out/sweep.json").read_text())
+    Path("out/sweep.json").write_text(json.dumps({**record, "values": values}))
+    done = program("sweep", "many.yaml", "--out", "out")
+    assert (done.returncode, done.stderr) == (4, "out/sweep.json: damaged; choose another --out\n")
+
+
+def test_a_run_that_diverged_is_not_taken_again(many: Path) -> None:
+    record = {"status": "diverged", "error": "at 0.1 s", "max_displacement": 1.0, "shortest_spring": 0.5}
+    rest: dict[str, Any] = {"error_estimate": None, "notes": ["not known"], "timings": {"total": 2.0}}
+    Path("out/runs/000002").mkdir(parents=True)
+    Path("out/runs/000002/run.json").write_text(json.dumps({**record, **rest}))
+    described = load_sweep("many.yaml")
+    done, missing = sort_out(described, described.values(), Path("out"))
+    assert done == [Outcome(2, "diverged", "at 0.1 s", 1.0, 0.5)]
+    assert [task.run for task in missing] == [0, 1, 3]
+
+
+def test_two_commands_for_a_folder_leave_one_table(many: Path, pool: Pool) -> None:
+    go(pool, "whole")
+    command = [sys.executable, "-m", "taichi_msm", "sweep", "many.yaml", "--workers", "1", "--out", "both", "--json"]
+    processes = [subprocess.Popen(command, stdout=subprocess.PIPE) for _ in range(2)]
+    answers = [json.loads(process.communicate()[0]) for process in processes]
+    assert not [note for answer in answers for note in answer["notes"] if "could not be made" in note]
+    # The later of both has seen all runs.
+    assert (table("both"), runs("both")) == (table("whole"), runs("whole"))
+
+
 def test_a_dry_run_writes_nothing(many: Path, program: Program) -> None:
     done = program("sweep", "many.yaml", "--dry-run")
     lines = done.stdout.splitlines()
@@ -225,6 +255,14 @@ def test_it_is_started_from_python_with_any_executor(many: Path, pool: Pool) -> 
     assert sorted(sweep("small.yaml", vary, "other", overrides={"output": []}), key=number) == rows
     with pytest.raises(SceneError, match=r"^vary\.dampign: unknown key; did you mean 'damping'\?$"):
         sweep("small.yaml", {"dampign": {"grid": [1]}}, "wrong")
+    for arguments, named, message in (
+        ((3, vary, "wrong"), {}, "^scene: 3; take the path of a scene file$"),
+        (("small.yaml", vary, "wrong"), {"workers": 0}, "^workers: 0; take a whole number, 1 or more, or None$"),
+        (("small.yaml", {"damping": 1j}, "wrong"), {}, "^vary, overrides: Object of type complex"),
+    ):
+        with pytest.raises(ArgumentError, match=message):
+            sweep(*arguments, **named)  # type: ignore[arg-type]
+    assert not Path("wrong").exists()
 
 
 def number(row: Outcome) -> int:
@@ -268,7 +306,11 @@ def test_a_pool_replaces_a_process_that_was_killed() -> None:
         with pytest.raises(ValueError, match="invalid literal"):
             pool.submit(int, "a").result()
     finally:
-        pool.shutdown()
+        begun = time.monotonic()
+        waiting = [pool.submit(time.sleep, 30) for _ in range(3)]
+        pool.shutdown(cancel_futures=True)
+    assert waiting[2].cancelled()
+    assert time.monotonic() - begun < 20, "it waited for a call"
 
 
 def test_the_processes_of_a_pool_end_with_it(tmp_path: Path) -> None:
@@ -326,3 +368,18 @@ def test_there_is_a_process_for_each_core_as_far_as_memory_goes(monkeypatch: pyt
     for free, runs_, number in ((100 << 30, 1000, 8), (3 << 30, 1000, 3), (1 << 20, 1000, 1), (100 << 30, 5, 5)):
         monkeypatch.setattr(cost, "available_memory", lambda free=free: free)
         assert cost.choose_workers(need, runs_).number == number
+    assert cost.choose_workers(need, 1, asked=7).number == 7
+
+
+def test_the_cost_is_that_of_all_runs(many: Path) -> None:
+    text = SWEEP.replace("[0.01, auto]", "[auto]")
+    costs = []
+    for samples in (64, 128, 6400):
+        (many / "many.yaml").write_text(text.replace("samples: 4", f"samples: {samples}"))
+        costs.append(cost.estimate(load_sweep("many.yaml")))
+    few, twice, many_ = costs
+    assert many_.disk_bytes == pytest.approx(100 * few.disk_bytes, rel=1e-3)
+    # The start is paid once.
+    assert many_.seconds - few.seconds == pytest.approx(99 * (twice.seconds - few.seconds), rel=1e-6)
+    assert 0 < twice.seconds - few.seconds < few.seconds
+    assert few.looked_at == 64

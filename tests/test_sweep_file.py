@@ -189,14 +189,36 @@ FAULTS: list[tuple[dict[str, Any], str]] = [
         {"set": {"probes.3.falloff": 5}},
         "set.probes.3.falloff: no such item; the list has 1, numbered from 0, as in probes.0.falloff",
     ),
-    ({"set": {"damping": 1}}, "set: damping is in vary too; keep one"),
+    ({"set": {"damping": 1}}, "vary: damping replaces damping, which comes before it; keep one, or give damping first"),
+    (
+        {"set": {"springs.shear": 3}, "vary": {"springs": {"choice": [{"shear": 1}]}}},
+        "vary: springs replaces springs.shear, which comes before it; keep one, or give springs first",
+    ),
+    ({"set": {"damping=1": 1}}, "set.damping=1: not a key; expected a dotted path such as sheet.points"),
+    ({"set": {"sprigns.shear": 1}}, "set.sprigns.shear: sprigns: unknown key; did you mean 'springs'?"),
+    (
+        {"vary": {"damping": {"choice": [math.nan]}}},
+        "vary.damping.choice: [NaN] has a number that is not finite; take others",
+    ),
+    (
+        {"vary": {"damping": {"uniform": [0, 1e31]}}},
+        "vary.damping.uniform: [0, 1e+31] is not allowed; expected two numbers, or two lists of numbers of one shape",
+    ),
+    (
+        {"vary": {"damping": {"uniform": [[0] * 21202, [1] * 21202]}}},
+        "vary: 21202 numbers, more than the 21201 that can vary; take fewer",
+    ),
+    (
+        {"vary": {"image": {"choice": ["a" * 300]}}},
+        f"vary.image.choice.0: {'a' * 60}...: no such file; name a picture relative to the sweep file",
+    ),
     (
         {"vary": {"image": {"choice": ["textures/c.png"]}}},
         "vary.image.choice.0: textures/c.png: no such file; name a picture relative to the sweep file",
     ),
     (
         {"vary": {"image": {"choice": "textures/*.jpg"}}},
-        'vary.image.choice: "textures/*.jpg" matches no file; give a pattern relative to the sweep file',
+        'vary.image.choice: "textures/*.jpg" matches no picture; give a pattern relative to the sweep file',
     ),
     (
         {"vary": {"image": {"choice": ["/etc/hostname"]}}},
@@ -214,7 +236,7 @@ FAULTS: list[tuple[dict[str, Any], str]] = [
 def test_a_fault_of_a_sweep_file_is_told_at_its_key(folder: Path, change: dict[str, Any], message: str) -> None:
     data = {key: value for key, value in {**GOOD, **change}.items() if value is not None}
     # JSON is YAML.
-    (folder / "many.yaml").write_text(json.dumps(data))
+    (folder / "many.yaml").write_text(json.dumps(data).replace("NaN", ".nan"))
     with pytest.raises(SceneError) as raised:
         load_sweep("many.yaml")
     (line,) = raised.value.lines
@@ -240,3 +262,30 @@ def test_a_scene_and_a_sweep_are_told_apart(folder: Path) -> None:
     (folder / "many.yaml").write_text(json.dumps(GOOD))
     with pytest.raises(SceneError, match=r"^many.yaml:1:1: a sweep; use `taichi-msm sweep`$"):
         load_plan("many.yaml")
+
+
+def test_a_fault_of_the_scene_is_told_before_anything_runs(folder: Path) -> None:
+    (folder / "small.yaml").write_text((folder / "small.yaml").read_text() + "dampign: 1\n")
+    (folder / "many.yaml").write_text(json.dumps(GOOD))
+    with pytest.raises(SceneError, match=r"^many.yaml:1:\d+: scene: dampign: unknown key; did you mean 'damping'\?$"):
+        load_sweep("many.yaml")
+
+
+def test_folders_may_be_links(folder: Path) -> None:
+    (folder / "real" / "scenes").mkdir(parents=True)
+    (folder / "pictures").mkdir()
+    (folder / "textures" / "a.png").rename(folder / "pictures" / "a.png")
+    for name in ("small.yaml", "speckle.png"):
+        (folder / name).rename(folder / "real" / "scenes" / name)
+    (folder / "link").symlink_to(folder / "real" / "scenes")
+    (folder / "many.yaml").write_text(
+        json.dumps({**GOOD, "scene": "link/small.yaml", "set": {"image": "pictures/a.png"}})
+    )
+    sweep = load_sweep("many.yaml")
+    (override, _) = sweep.overrides([0.01])
+    # Beside the link there is no such folder.
+    assert (sweep.scene.folder / override.removeprefix("image=")).samefile("pictures/a.png")
+    (folder / "far").mkdir()
+    (folder / "far" / "sweeps").symlink_to(folder / "real" / "scenes")
+    (folder / "real" / "scenes" / "here.yaml").write_text(json.dumps({**GOOD, "scene": "../scenes/small.yaml"}))
+    assert load_sweep("far/sweeps/here.yaml").keys == ["damping"]

@@ -10,7 +10,7 @@ from typing import Any
 from pydantic import ConfigDict, field_validator, model_validator
 from typing_extensions import Self
 
-from taichi_msm.faults import flow, refused
+from taichi_msm.faults import LARGEST, flow, refused
 from taichi_msm.scene import Section, key
 
 # Sobol points are multiples of 2^-30, 0 among them, where a normal distribution has no value.
@@ -45,7 +45,7 @@ class Distribution(Section):
     @field_validator("uniform", "log_uniform", "normal")
     @classmethod
     def _is_pair(cls, value: Any) -> Any:
-        if not (isinstance(value, list) and len(value) == 2 and _numbers(value[0])):
+        if not (isinstance(value, list) and len(value) == 2 and all(map(_numbers, value))):
             raise refused(f"{flow(value)} is not allowed; expected two numbers, or two lists of numbers of one shape")
         if _shape(value[0]) != _shape(value[1]):
             raise refused(f"{flow(value[0])} and {flow(value[1])} differ in shape; give both as many numbers")
@@ -78,6 +78,8 @@ class Distribution(Section):
     def _is_list(cls, value: Any) -> Any:
         if not isinstance(value, list) or not value:
             raise refused(f"{flow(value)} is not allowed; expected {LIST}")
+        if not _is_finite(value):
+            raise refused(f"{flow(value)} has a number that is not finite; take others")
         return value
 
     @model_validator(mode="after")
@@ -145,8 +147,14 @@ def _numbers(value: Any) -> list[float]:
     if isinstance(value, list):
         parts = [_numbers(item) for item in value]
         return [number for part in parts for number in part] if all(parts) else []
-    is_number = isinstance(value, (int, float)) and not isinstance(value, bool) and math.isfinite(value)
+    is_number = isinstance(value, (int, float)) and not isinstance(value, bool) and abs(value) <= LARGEST
     return [value] if is_number else []
+
+
+def _is_finite(value: Any) -> bool:
+    if isinstance(value, (list, dict)):
+        return all(map(_is_finite, value.values() if isinstance(value, dict) else value))
+    return not isinstance(value, float) or math.isfinite(value)
 
 
 def _shape(value: Any) -> Any:

@@ -3,13 +3,16 @@
 from __future__ import annotations
 
 import json
-from contextlib import suppress
+import time
+from collections.abc import Iterator
+from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
 from taichi_msm.errors import FilesError, ForeignError, SceneError, writing
 from taichi_msm.outputs.table import RECORD, RUNS, SWEEP
-from taichi_msm.results.whole import give_name, staged
+from taichi_msm.progress import Pause
+from taichi_msm.results.whole import give_name, lock, staged
 from taichi_msm.sweeps.outcome import Outcome, outcome_of
 from taichi_msm.sweeps.result import FILES
 from taichi_msm.sweeps.sweepfile import Sweep
@@ -19,6 +22,9 @@ from taichi_msm.system.versions import versions
 
 # Runs that ended so need not be taken again.
 ENDED = ("complete", "diverged")
+
+# How often a folder that another command has is tried again [s].
+PATIENCE = 0.1
 
 
 def values_in(directory: Path, sweep: Sweep) -> list[list[Any]]:
@@ -48,13 +54,17 @@ def values_in(directory: Path, sweep: Sweep) -> list[list[Any]]:
         kept = json.loads(record.read_bytes())
         earlier = {name: kept.get(name) for name in description}
         values, began = kept["values"], what_decides_bits(kept["versions"], "cpu")
+        if [len(row) for row in values] != [len(sweep.keys)] * len(values):
+            raise ValueError("not the values of a sweep")
     except OSError as error:
         raise FilesError(f"{record}: {(error.strerror or str(error)).lower()}") from None
-    except (ValueError, KeyError, AttributeError):
+    except (ValueError, KeyError, TypeError, AttributeError):
         raise FilesError(f"{record}: damaged; choose another --out") from None
     if other := [name for name, value in json.loads(json.dumps(description)).items() if value != earlier[name]]:
         what = {"digest": "the scene file", "pictures": "a picture"}.get(other[0], other[0])
         raise SceneError([f"{directory}: holds the runs of another sweep: {what} differs; choose another --out"])
+    if len(values) != sweep.runs:
+        raise FilesError(f"{record}: damaged; choose another --out")
     here = what_decides_bits(versions(), "cpu")
     if others := [f"{name} {version}" for name, version in began.items() if version != here.get(name)]:
         raise SceneError([f"{directory}: the sweep began with {', '.join(others)}; use these, or choose another --out"])
@@ -70,18 +80,32 @@ def sort_out(
     done, missing = [], []
     for run in range(part - 1, len(values), parts):
         task = Task(run, sweep.scene, sweep.overrides(values[run]), directory, home)
-        if outcome := _ended(task):
+        if outcome := ended(run, task.directory):
             done.append(outcome)
         else:
             missing.append(task)
     return done, missing
 
 
-def _ended(task: Task) -> Outcome | None:
+def ended(run: int, directory: Path) -> Outcome | None:
     """Find the outcome of a run that has ended; None: it is missing, or was interrupted."""
     # A record that no run has written is as none.
     with suppress(OSError, ValueError, KeyError, TypeError, AttributeError):
-        record = json.loads((task.directory / RECORD).read_bytes())
-        if record["status"] in ENDED and record["overrides"] == list(task.overrides):
-            return outcome_of(task.run, record)
+        record = json.loads((directory / RECORD).read_bytes())
+        if record["status"] in ENDED:
+            return outcome_of(run, record)
     return None
+
+
+@contextmanager
+def alone(directory: Path, pause: Pause) -> Iterator[None]:
+    """Wait until no other command writes the files that a sweep ends with; `pause` is called meanwhile."""
+    with ExitStack() as opened:
+        while True:
+            try:
+                opened.enter_context(lock(directory / SWEEP))
+                break
+            except BlockingIOError:
+                pause()
+                time.sleep(PATIENCE)
+        yield

@@ -125,6 +125,7 @@ def _in_words(code: int | None) -> str:
 
 def serve() -> None:
     """Run as a process of the pool, until the other end closes the pipe or is killed."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
     Thread(target=_leave_orphaned, args=[os.getppid()], daemon=True).start()
     answers = os.fdopen(os.dup(1), "wb")
     # Whatever is printed must not get among the answers.

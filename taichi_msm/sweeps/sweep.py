@@ -5,14 +5,15 @@ from __future__ import annotations
 from collections.abc import Iterable, Iterator, Mapping
 from concurrent.futures import Executor
 from contextlib import contextmanager
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 from taichi_msm.arguments import require_path
-from taichi_msm.errors import NotInstalledError
+from taichi_msm.errors import ArgumentError, NotInstalledError, writing
 from taichi_msm.progress import Progress
 from taichi_msm.sweeps.cost import choose_workers, estimate
-from taichi_msm.sweeps.folder import sort_out, values_in
+from taichi_msm.sweeps.folder import ENDED, alone, ended, sort_out, values_in
 from taichi_msm.sweeps.outcome import Outcome
 from taichi_msm.sweeps.pool import Pool
 from taichi_msm.sweeps.reports import write_reports
@@ -69,28 +70,27 @@ def sweep(
         (8, {'complete'})
     """
     require_path(directory)
+    if not isinstance(scene, (str, Path)):
+        raise ArgumentError(f"scene: {scene!r}; take the path of a scene file")
+    if workers is not None and not (type(workers) is int and workers > 0):
+        raise ArgumentError(f"workers: {workers!r}; take a whole number, 1 or more, or None")
     settings = {"vary": vary, "seed": seed, "set": overrides or {}} | ({} if samples is None else {"samples": samples})
     described = make_sweep(scene, settings)
-    values = values_in(Path(directory), described)
-    return _go_through(described, values, Path(directory), executor, workers, progress)
+    # The caller may change the current directory meanwhile.
+    folder = Path(directory).absolute()
+    values = values_in(folder, described)
+    done, missing = sort_out(described, values, folder)
+    count = choose_workers(estimate(described), len(missing), workers).number
 
+    def go_through() -> Iterator[Outcome]:
+        with opened(executor, count, described, folder, progress) as taking:
+            yield from list(done)
+            for row in outcomes(missing, taking, lambda: progress("runs", len(done), len(values))):
+                done.append(row)
+                yield row
+            finish(described, values, folder, done, taking, progress)
 
-def _go_through(
-    described: Sweep,
-    values: list[list[Any]],
-    directory: Path,
-    executor: Executor | str | None,
-    workers: int | None,
-    progress: Progress,
-) -> Iterator[Outcome]:
-    done, missing = sort_out(described, values, directory)
-    total, count = len(values), workers or choose_workers(estimate(described), len(missing)).number
-    with opened(executor, count, described, directory, progress) as taking:
-        yield from list(done)
-        for row in outcomes(missing, taking, lambda: progress("runs", len(done), total)):
-            done.append(row)
-            yield row
-        finish(described, values, directory, done, taking, progress)
+    return go_through()
 
 
 @contextmanager
@@ -128,5 +128,11 @@ def finish(
     progress: Progress,
 ) -> tuple[list[str], list[str]]:
     """Write the table and the other files of a sweep; gives their names, and what the user should know."""
-    result = SweepResult(directory, described, values, sorted(rows, key=lambda row: row.run))
-    return write_reports(result, executor, progress)
+    ordered = sorted(rows, key=lambda row: row.run)
+    with writing(directory), alone(directory, lambda: progress("runs", len(ordered), len(ordered))):
+        # Another command may have taken a run that it kept from us.
+        result = SweepResult(directory, described, values, ordered)
+        again = [
+            (None if row.status in ENDED else ended(row.run, result.run_directory(row.run))) or row for row in ordered
+        ]
+        return write_reports(replace(result, outcomes=again), executor, progress)

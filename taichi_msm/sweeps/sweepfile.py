@@ -17,8 +17,8 @@ from pydantic import Field, field_validator, model_validator
 from typing_extensions import Self
 
 from taichi_msm.errors import ArgumentError, Key, Problem, SceneError
-from taichi_msm.faults import flow, refused
-from taichi_msm.picture import PictureError, file_sha256
+from taichi_msm.faults import cut, flow, refused
+from taichi_msm.picture import SUFFIXES, PictureError, file_sha256
 from taichi_msm.scene import MAX_PATH, FilePath, Scene, Section, Whole, key
 from taichi_msm.scenefile.load import PICTURES, SCENE, Draft, File, Kind, is_below, parse_key, parse_override, read_file
 from taichi_msm.scenefile.validation import parse
@@ -27,6 +27,9 @@ from taichi_msm.sweeps.distribution import Distribution
 from taichi_msm.sweeps.samples import count_runs, values_of_runs, values_of_some
 
 MAX_RUNS = 10**7
+
+# SciPy has no Sobol sequence of more dimensions.
+MAX_NUMBERS = 21201
 
 SWEEP = Kind("sweep", "scene and vary")
 
@@ -68,8 +71,14 @@ class SweepSettings(Section):
             raise refused("missing; expected the number of runs, as not every key is a grid", "samples")
         if (runs := count_runs(self.vary, self.samples)) > MAX_RUNS:
             raise refused(f"{runs} combinations, more than the {MAX_RUNS} that can be run; take smaller grids", "vary")
-        if both := [name for name in self.set if name in self.vary]:
-            raise refused(f"{both[0]} is in vary too; keep one", "set")
+        if (numbers := sum(one.dimensions for one in self.vary.values())) > MAX_NUMBERS:
+            raise refused(f"{numbers} numbers, more than the {MAX_NUMBERS} that can vary; take fewer", "vary")
+        keys = [_as_key(name) for name in (*self.set, *self.vary)]
+        for number, later in enumerate(keys):
+            if hidden := [earlier for earlier in keys[:number] if earlier[: len(later)] == later]:
+                name, other = (".".join(map(str, one)) for one in (later, hidden[0]))
+                where = "vary" if number >= len(self.set) else "set"
+                raise refused(f"{name} replaces {other}, which comes before it; keep one, or give {name} first", where)
         return self
 
 
@@ -114,7 +123,8 @@ class Sweep:
 
         listed = [(name, one.values) for name, one in self.settings.vary.items() if one.kind in ("choice", "grid")]
         pairs = [(name, value) for name, values in listed for value in values]
-        for name, value in [("", self.scene.document.data), *self.settings.set.items(), *pairs]:
+        _with_pictures((), self.scene.document.data, noted)
+        for name, value in [*self.settings.set.items(), *pairs]:
             _with_pictures(_as_key(name), value, noted)
         digests = {}
         for path in dict.fromkeys(str(self.scene.folder / name) for name in names):
@@ -164,12 +174,21 @@ def _checked(data: dict[str, Any], folder: Path) -> tuple[Sweep | None, list[Pro
         problems += _relocate(data, folder, path.parent)
         try:
             # In the errors of runs it is named without its folder, wherever the sweep is started.
-            file = read_file(os.path.normpath(path), SCENE)._replace(name=path.name)
+            file = read_file(_short(path), SCENE)._replace(name=path.name)
             problems += _unknown_keys(file, data)
         except SceneError as error:
             problems.append(Problem(("scene",), error.lines[0]))
     settings, wrong = parse(SweepSettings, data)
     return (None if settings is None or file is None else Sweep(file, settings)), [*problems, *wrong]
+
+
+def _short(path: Path) -> str:
+    """Leave .. out of a path, if that leads to the same file, as it may not where folders are links."""
+    short = Path(os.path.normpath(path))
+    try:
+        return str(short if short.samefile(path) else path)
+    except (OSError, ValueError):
+        return str(path)
 
 
 def cell(value: Any) -> str:
@@ -189,9 +208,11 @@ def _relocate(data: dict[str, Any], folder: Path, home: Path) -> Iterator[Proble
         for way in {"choice", "grid"} & set(ways if isinstance(ways, dict) else ()):
             path: Key = ("vary", name, way)
             if isinstance(pattern := ways[way], str) and _as_key(name) in PICTURES:
-                ways[way] = sorted(glob(pattern, root_dir=folder))  # noqa: PTH207  # Path.glob refuses absolute patterns
+                names = sorted(glob(pattern, root_dir=folder))  # noqa: PTH207  # Path.glob refuses absolute patterns
+                ways[way] = [text for text in names if text.lower().endswith(SUFFIXES) and (folder / text).is_file()]
                 if not ways[way]:
-                    yield Problem(path, f"{flow(pattern)} matches no file; give a pattern relative to the sweep file")
+                    said = f"{flow(pattern)} matches no picture; give a pattern relative to the sweep file"
+                    yield Problem(path, said)
             if isinstance(ways[way], list):
                 for index, value in enumerate(ways[way]):
                     ways[way][index], faults = _relocated(name, value, folder, home)
@@ -207,13 +228,18 @@ def _relocated(name: str, value: Any, folder: Path, home: Path) -> tuple[Any, li
 
     def relocated(text: str) -> str:
         path = folder / text
+        try:
+            is_file = path.is_file()
+        except (OSError, ValueError):
+            is_file = False
         if not (is_below(path, folder) or is_below(path, home)):
             faults.append(
                 f"{text} is neither below the sweep file's folder nor below the scene's; put the picture there"
             )
-        elif not path.is_file():
-            faults.append(f"{text}: no such file; name a picture relative to the sweep file")
-        return Path(os.path.relpath(path, home)).as_posix()
+        elif not is_file:
+            faults.append(f"{cut(text)}: no such file; name a picture relative to the sweep file")
+        # A folder may be a link, from which .. leads elsewhere.
+        return Path(os.path.relpath(path.parent.resolve() / path.name, home.resolve())).as_posix()
 
     return _with_pictures(_as_key(name), value, relocated), faults
 
@@ -228,7 +254,8 @@ def _with_pictures(path: Key, value: Any, change: Callable[[str], str]) -> Any:
 
 
 def _as_key(name: str) -> Key:
-    return parse_key(name) if name else ()
+    """Split a dotted key; empty: it is none that `--set` takes."""
+    return parse_key(name.strip()) if "=" not in name else ()
 
 
 def _unknown_keys(scene: File, data: dict[str, Any]) -> Iterator[Problem]:
@@ -239,18 +266,26 @@ def _unknown_keys(scene: File, data: dict[str, Any]) -> Iterator[Problem]:
         values = next(iter(ways.values()), None) if isinstance(ways, dict) else None
         tried["vary", name] = values[0] if isinstance(values, list) and values else None
     draft = Draft(scene)
+    for place in [place for place in tried if not _as_key(str(place[1]))]:
+        yield Problem(place, "not a key; expected a dotted path such as sheet.points")
+        del tried[place]
     for place, value in tried.items():
         known = len(draft.problems)
         draft.override(parse_override(f"{place[1]}={cell(value)}"))
         yield from (Problem(place, problem.message) for _, problem in draft.problems[known:])
     for problem in parse(Scene, draft.data)[1]:
-        if problem.message.startswith("unknown key"):
-            for place in tried:
-                path = _as_key(str(place[1]))
-                # The fault may be above the key or, in a section that is given as a whole, below it.
-                if all(part == other for part, other in zip(path, problem.path, strict=False)):
-                    where = f"{problem.key}: " if problem.path != path else ""
-                    yield Problem(place, f"{where}{problem.message}")
+        if not problem.message.startswith("unknown key"):
+            continue
+        # The fault may be above a key or, in a section that is given as a whole, below it; or in the scene itself.
+        around = [place for place in tried if _on_one_way(_as_key(str(place[1])), problem.path)]
+        for place in around or [("scene",)]:
+            told = f"{problem.key}: " if problem.path != _as_key(str(place[-1])) else ""
+            yield Problem(place, f"{told}{problem.message}")
+
+
+def _on_one_way(key: Key, other: Key) -> bool:
+    """Tell whether one of two keys leads to the other."""
+    return all(part == also for part, also in zip(key, other, strict=False))
 
 
 def _mappings(data: dict[str, Any]) -> tuple[dict[str, Any], dict[str, Any]]:
