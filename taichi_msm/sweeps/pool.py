@@ -49,11 +49,12 @@ class Pool(Executor):
 
     def shutdown(self, wait: bool = True, *, cancel_futures: bool = False) -> None:
         """End the processes: after all calls, or at once if those that wait are cancelled."""
+        self._threads.shutdown(wait=False, cancel_futures=cancel_futures)
         if cancel_futures:
             self._closed = True
             for process in list(self._live):
                 process.kill()
-        self._threads.shutdown(wait, cancel_futures=cancel_futures)
+        self._threads.shutdown(wait)
         for process in list(self._live):
             process.close()
 
