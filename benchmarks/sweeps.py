@@ -101,7 +101,7 @@ def main() -> None:
         f"On {cores} cores of an {resources.processor()} with vectors of {vector_bits()} bits, medians of {ROUNDS} and "
         f"{FILM_ROUNDS} rounds, kernels compiled before:\n\n"
         f"- {RUNS} runs of `press.yaml` with 31 × 31 points and without pictures take "
-        f"{statistics.median(sweeps):.1f} s; {SINGLE} of them as single commands take "
+        f"{statistics.median(sweeps):.1f} s; {SINGLE} of them as single commands, one after another, take "
         f"{statistics.median(singles):.1f} s. That is {ratio:.2f} of the time for {RUNS // SINGLE} times the runs.\n"
         f"- {FILMS} runs of `tracking.yaml` with pictures, flow, occlusion, depth and tracks take "
         f"{made.seconds:.0f} s: {made.frames / made.seconds:.0f} frames a second. The cores are busy for "

@@ -140,7 +140,7 @@ def test_shards_change_nothing(many: Path, pool: Pool) -> None:
 def test_a_shard_of_the_command_writes_no_table(many: Path, program: Program) -> None:
     done = program("sweep", "many.yaml", "--shard", "2/4", "--out", "out")
     assert done.returncode == 0
-    assert done.stdout.startswith("out: 1 runs of part 2 of 4: 1 complete\n")
+    assert done.stdout.startswith("out: 1 run of part 2 of 4: 1 complete\n")
     assert done.stdout.endswith("\nwithout --shard, the same command writes the table\n")
     assert sorted(str(path.relative_to("out")) for path in Path("out").glob("*/*")) == ["runs/000001"]
     assert [path.name for path in Path("out").glob("*.*")] == ["sweep.json"]
@@ -234,7 +234,7 @@ def test_many_runs_must_be_meant(many: Path, program: Program) -> None:
     done = program("sweep", "many.yaml")
     assert done.returncode == 2
     assert done.stderr.startswith("taichi-msm: 1000000 runs: about ")
-    assert "MiB on disk; of 64 that were looked at, " in done.stderr
+    assert "MiB on disk; of 64 that were checked, " in done.stderr
     assert "; add --yes if that is meant" in done.stderr
     assert not Path("output").exists()
 

@@ -189,7 +189,7 @@ FAULTS: list[tuple[dict[str, Any], str]] = [
         {"set": {"probes.3.falloff": 5}},
         "set.probes.3.falloff: no such item; the list has 1, numbered from 0, as in probes.0.falloff",
     ),
-    ({"set": {"damping": 1}}, "vary: damping replaces damping, which comes before it; keep one, or give damping first"),
+    ({"set": {"damping": 1}}, "vary: damping replaces damping, which comes before it; keep one"),
     (
         {"set": {"springs.shear": 3}, "vary": {"springs": {"choice": [{"shear": 1}]}}},
         "vary: springs replaces springs.shear, which comes before it; keep one, or give springs first",

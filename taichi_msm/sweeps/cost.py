@@ -11,7 +11,7 @@ from taichi_msm.scenefile.load import plan_file
 from taichi_msm.sweeps.sweepfile import Sweep
 from taichi_msm.system.resources import available_memory, available_threads
 
-# The runs that are looked at, evenly spread over all; each takes milliseconds.
+# The runs that are planned for the estimate, evenly spread over all; each takes milliseconds.
 LOOKED_AT = 64
 
 # Memory of a process besides that of its run: Python, the compiler, kernels [bytes].

@@ -28,8 +28,8 @@ def cost_line(runs: int, cost: Cost, workers: Workers | None) -> str:
         processes = f"{workers.number} {'process' if workers.number == 1 else 'processes'}"
         where = f"in {processes} ({workers.cores} cores; memory for {workers.fitting})"
     disk = f"at most {cost.disk_bytes / 2**20:.1f} MiB on disk"
-    refused = f"; of {cost.looked_at} that were looked at, {cost.refused} are refused, for example: {cost.example}"
-    return f"{runs} runs: about {rough_time(cost.seconds)}{guess} {where}, {disk}{refused if cost.refused else ''}"
+    refused = f"; of {cost.looked_at} that were checked, {cost.refused} will be refused, for example: {cost.example}"
+    return f"{_runs(runs)}: about {rough_time(cost.seconds)}{guess} {where}, {disk}{refused if cost.refused else ''}"
 
 
 def summary_lines(
@@ -39,7 +39,7 @@ def summary_lines(
     of = f" of part {shard[0]} of {shard[1]}" if shard else ""
     counts = count(outcomes)
     said = ", ".join(f"{number} {status}" for status, number in counts.items() if number)
-    lines = [f"{directory}: {len(outcomes)} runs{of}: {said}"]
+    lines = [f"{directory}: {_runs(len(outcomes))}{of}: {said}"]
     for status in STATUSES:
         example = next((outcome for outcome in outcomes if outcome.status == status), None)
         if example and example.error:
@@ -61,7 +61,11 @@ def _noted(outcomes: Sequence[Outcome]) -> Iterator[str]:
         for note in outcome.notes:
             alike.setdefault(re.sub(r"[0-9.e+-]+", "", note), []).append(f"run {outcome.run:06}: {note}")
     for notes in sorted(alike.values(), key=len, reverse=True)[:MOST_NOTES]:
-        yield f"{len(notes)} runs are noted, for example {notes[0]}"
+        yield f"{_runs(len(notes))} with a note, for example {notes[0]}"
+
+
+def _runs(number: int) -> str:
+    return "1 run" if number == 1 else f"{number} runs"
 
 
 def count(outcomes: Sequence[Outcome]) -> dict[str, int]:

@@ -77,8 +77,9 @@ class SweepSettings(Section):
         for number, later in enumerate(keys):
             if hidden := [earlier for earlier in keys[:number] if earlier[: len(later)] == later]:
                 name, other = (".".join(map(str, one)) for one in (later, hidden[0]))
+                remedy = "keep one" if later == hidden[0] else f"keep one, or give {name} first"
                 where = "vary" if number >= len(self.set) else "set"
-                raise refused(f"{name} replaces {other}, which comes before it; keep one, or give {name} first", where)
+                raise refused(f"{name} replaces {other}, which comes before it; {remedy}", where)
         return self
 
 
