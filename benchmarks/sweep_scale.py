@@ -22,9 +22,8 @@ import psutil
 from distributed import Client
 
 from benchmarks.process import OUTPUT
-from taichi_msm.sweeps.folder import sort_out, values_in
-from taichi_msm.sweeps.schedule import outcomes
-from taichi_msm.sweeps.sweep import finish, opened
+from taichi_msm.sweeps.folder import begin_sweep
+from taichi_msm.sweeps.sweep import finish, go_on, opened
 from taichi_msm.sweeps.sweepfile import Sweep, load_sweep
 from taichi_msm.system.resources import available_threads
 
@@ -64,17 +63,16 @@ class Clock:
 def measure(described: Sweep, directory: Path, executor: str | None) -> dict[str, Any]:
     """Take all runs, and look for them again as the next command would."""
     clock, taken = Clock(), dict[str, Any]()
-    values = values_in(directory, described)
+    under_way = begin_sweep(described, directory)
     taken["begin"] = clock.seconds()
-    _, missing = sort_out(described, values, directory)
-    with opened(executor, available_threads(), described, directory, _ignore) as taking:
+    with opened(executor, available_threads(), under_way, _ignore) as taking:
         clock.seconds()
-        for row in outcomes(missing, taking, lambda: None):
+        for row in go_on(under_way, taking, _ignore):
             assert row.status == "complete", row
         taken["run"] = clock.seconds()
-        rows, _ = sort_out(described, values, directory)
+        again = begin_sweep(described, directory)
         taken["scan"] = clock.seconds()
-        finish(described, values, directory, rows, taking, _ignore)
+        finish(again, taking, _ignore)
         taken["finish"] = clock.seconds()
     return taken
 

@@ -491,10 +491,9 @@ def sweep(
     """Run a scene many times with varied values, as SWEEP says, and write a table of the results."""
     from taichi_msm.console import Progress
     from taichi_msm.sweeps.cost import choose_workers, estimate
-    from taichi_msm.sweeps.folder import sort_out, values_in
-    from taichi_msm.sweeps.schedule import outcomes as take_all
+    from taichi_msm.sweeps.folder import begin_sweep
     from taichi_msm.sweeps.summary import cost_line, count, summary_lines
-    from taichi_msm.sweeps.sweep import finish, opened
+    from taichi_msm.sweeps.sweep import finish, go_on, opened
     from taichi_msm.sweeps.sweepfile import cell, load_sweep
     from taichi_msm.sweeps.table import csv_line
 
@@ -516,13 +515,13 @@ def sweep(
         return DONE
     if not yes and (described.runs > MANY_RUNS or cost.seconds > LONG):
         raise click.UsageError(f"{cost_line(described.runs, cost, chosen)}; add --yes if that is meant")
-    values = values_in(directory, described)
-    outcomes, missing = sort_out(described, values, directory, shard or (1, 1))
-    total, chosen = len(outcomes) + len(missing), choose_workers(cost, len(missing), workers)
+    under_way = begin_sweep(described, directory, shard or (1, 1))
+    outcomes, missing, total = under_way.done, len(under_way.missing), under_way.total
+    chosen = choose_workers(cost, missing, workers)
     if not as_json:
         tell([f"{len(outcomes)} of {total} runs have ended before"] if outcomes else [])
         here = chosen if dask is None else None
-        tell([cost_line(len(missing), cost.of(len(missing) / described.runs), here)] if missing else [])
+        tell([cost_line(missing, cost.of(missing / described.runs), here)] if missing else [])
     interruption = Interruption()
     files: list[str] = []
     notes: list[str] = []
@@ -530,11 +529,11 @@ def sweep(
         with Progress(quiet=as_json) as bar:
             progress = interruptible(bar, interruption)
             where = dask if missing else None  # Nothing else needs a cluster.
-            with opened(where, chosen.number, described, directory, progress) as executor:
-                for outcome in take_all(missing, executor, lambda: progress("runs", len(outcomes), total)):
-                    outcomes.append(outcome)
+            with opened(where, chosen.number, under_way, progress) as executor:
+                for _ in go_on(under_way, executor, progress):
+                    pass
                 if shard is None:
-                    files, notes = finish(described, values, directory, outcomes, executor, progress)
+                    files, notes = finish(under_way, executor, progress)
     except KeyboardInterrupt:
         return interrupted(interruption, as_json, f"interrupted; {so_far(len(outcomes), total)}")
     except LostExecutorError as error:

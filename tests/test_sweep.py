@@ -23,11 +23,11 @@ from taichi_msm import sweep
 from taichi_msm.errors import ArgumentError, MsmError, SceneError
 from taichi_msm.scenefile import duration
 from taichi_msm.sweeps import cost
-from taichi_msm.sweeps.folder import sort_out, values_in
+from taichi_msm.sweeps.folder import begin_sweep, values_in
 from taichi_msm.sweeps.outcome import Outcome
 from taichi_msm.sweeps.pool import ORPHANED, DiedError, Pool
 from taichi_msm.sweeps.schedule import outcomes
-from taichi_msm.sweeps.sweep import finish
+from taichi_msm.sweeps.sweep import finish, go_on
 from taichi_msm.sweeps.sweepfile import load_sweep, make_sweep
 from taichi_msm.sweeps.task import Task
 from tests.conftest import Program
@@ -76,12 +76,14 @@ def pool() -> Iterator[Pool]:
 
 def go(executor: Executor, directory: str, part: tuple[int, int] = (1, 1)) -> None:
     """Take the runs of many.yaml, as the command does."""
-    described = load_sweep("many.yaml")
-    values = values_in(Path(directory), described)
-    done, missing = sort_out(described, values, Path(directory), part)
-    rows = [*done, *outcomes(missing, executor, lambda: None)]
+    under_way = begin_sweep(load_sweep("many.yaml"), Path(directory), part)
+    assert len(list(go_on(under_way, executor, quiet))) == len(under_way.missing)
     if part == (1, 1):
-        finish(described, values, Path(directory), rows, executor, lambda stage, done, total: None)
+        finish(under_way, executor, quiet)
+
+
+def quiet(stage: str, done: int, total: int) -> None:
+    """Report nothing."""
 
 
 def test_each_run_is_that_of_run_with_its_cells(many: Path, program: Program) -> None:
@@ -147,6 +149,8 @@ def test_a_shard_of_the_command_writes_no_table(many: Path, program: Program) ->
 
 
 def test_a_kill_changes_nothing(many: Path, pool: Pool) -> None:
+    # Runs long enough to be killed in the middle.
+    (many / "many.yaml").write_text(SWEEP.replace("time.duration: 0.2", "time.duration: 4"))
     go(pool, "whole")
     with Telling("sweep", "many.yaml", "--workers", "1", "--out", "killed", stderr=subprocess.DEVNULL) as process:
         process.until("runs", 2)
@@ -200,12 +204,13 @@ def test_a_damaged_record_is_told(many: Path, program: Program, values: Any) -> 
 def test_a_run_that_diverged_is_not_taken_again(many: Path) -> None:
     record = {"status": "diverged", "error": "at 0.1 s", "max_displacement": 1.0, "shortest_spring": 0.5}
     rest: dict[str, Any] = {"error_estimate": None, "notes": ["not known"], "timings": {"total": 2.0}}
+    values_in(Path("out"), load_sweep("many.yaml"))
     Path("out/runs/000002").mkdir(parents=True)
     Path("out/runs/000002/run.json").write_text(json.dumps({**record, **rest}))
-    described = load_sweep("many.yaml")
-    done, missing = sort_out(described, described.values(), Path("out"))
-    assert done == [Outcome(2, "diverged", "at 0.1 s", 1.0, 0.5)]
-    assert [task.run for task in missing] == [0, 1, 3]
+    under_way = begin_sweep(load_sweep("many.yaml"), Path("out"))
+    assert under_way.done == [Outcome(2, "diverged", "at 0.1 s", 1.0, 0.5)]
+    assert [task.run for task in under_way.missing] == [0, 1, 3]
+    assert under_way.total == 4
 
 
 def test_two_commands_for_a_folder_leave_one_table(many: Path, pool: Pool) -> None:
@@ -273,14 +278,16 @@ def number(row: Outcome) -> int:
 def test_a_run_that_cannot_be_is_refused_and_one_that_fails_is_tried_again(many: Path, pool: Pool) -> None:
     whole = (many / "speckle.png").read_bytes()
     (many / "torn.png").write_bytes(whole[: len(whole) // 2])
-    (many / "out/runs/000000").mkdir(parents=True)
-    (many / "out/runs/000000/frames").write_text("in the way")
     settings = {"vary": {"image": {"grid": ["speckle.png", "torn.png"]}}, "set": {"time.duration": 0.1}}
     described = make_sweep("small.yaml", settings)
+    values_in(Path("out"), described)
+    (many / "out/runs/000000").mkdir(parents=True)
+    (many / "out/runs/000000/frames").write_text("in the way")
 
     def take_all() -> list[Outcome]:
-        done, missing = sort_out(described, described.values(), Path("out"))
-        return sorted([*done, *outcomes(missing, pool, lambda: None)], key=number)
+        under_way = begin_sweep(described, Path("out"))
+        list(go_on(under_way, pool, quiet))
+        return sorted(under_way.done, key=number)
 
     first, second = take_all()
     assert (first.status, first.error) == (

@@ -6,6 +6,7 @@ import json
 import time
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager, suppress
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -71,10 +72,21 @@ def values_in(directory: Path, sweep: Sweep) -> list[list[Any]]:
     return values
 
 
-def sort_out(
-    sweep: Sweep, values: list[list[Any]], directory: Path, shard: tuple[int, int] = (1, 1)
-) -> tuple[list[Outcome], list[Task]]:
-    """Give the outcomes of the runs of a shard that have ended before, and the tasks of those that are missing."""
+@dataclass
+class UnderWay:
+    """A sweep in its folder, of which some runs may have ended."""
+
+    directory: Path
+    sweep: Sweep
+    values: list[list[Any]]  # of the varied keys, for each run
+    done: list[Outcome]  # of the runs that have ended, which grows
+    missing: list[Task]  # those that had not when it began
+    total: int  # of runs, of all or of a shard
+
+
+def begin_sweep(sweep: Sweep, directory: Path, shard: tuple[int, int] = (1, 1)) -> UnderWay:
+    """Begin a sweep in a folder, or a shard of it, or go on; errors as for `values_in`."""
+    values = values_in(directory, sweep)
     part, parts = shard
     home = Path.cwd()
     done, missing = [], []
@@ -84,7 +96,7 @@ def sort_out(
             done.append(outcome)
         else:
             missing.append(task)
-    return done, missing
+    return UnderWay(directory, sweep, values, done, missing, len(done) + len(missing))
 
 
 def ended(run: int, directory: Path) -> Outcome | None:

@@ -2,24 +2,24 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from concurrent.futures import Executor
 from contextlib import contextmanager
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 from taichi_msm.arguments import require_path
 from taichi_msm.errors import ArgumentError, NotInstalledError, writing
+from taichi_msm.outputs.table import RUNS, numbered
 from taichi_msm.progress import Progress
 from taichi_msm.sweeps.cost import choose_workers, estimate
-from taichi_msm.sweeps.folder import ENDED, alone, ended, sort_out, values_in
+from taichi_msm.sweeps.folder import ENDED, UnderWay, alone, begin_sweep, ended
 from taichi_msm.sweeps.outcome import Outcome
 from taichi_msm.sweeps.pool import Pool
 from taichi_msm.sweeps.reports import write_reports
 from taichi_msm.sweeps.result import SweepResult
 from taichi_msm.sweeps.schedule import outcomes
-from taichi_msm.sweeps.sweepfile import Sweep, make_sweep
+from taichi_msm.sweeps.sweepfile import make_sweep
 
 
 def sweep(
@@ -78,24 +78,21 @@ def sweep(
     described = make_sweep(scene, settings)
     # The caller may change the current directory meanwhile.
     folder = Path(directory).absolute()
-    values = values_in(folder, described)
-    done, missing = sort_out(described, values, folder)
-    count = choose_workers(estimate(described), len(missing), workers).number
+    under_way = begin_sweep(described, folder)
+    count = choose_workers(estimate(described), len(under_way.missing), workers).number
 
     def go_through() -> Iterator[Outcome]:
-        with opened(executor, count, described, folder, progress) as taking:
-            yield from list(done)
-            for row in outcomes(missing, taking, lambda: progress("runs", len(done), len(values))):
-                done.append(row)
-                yield row
-            finish(described, values, folder, done, taking, progress)
+        with opened(executor, count, under_way, progress) as taking:
+            yield from list(under_way.done)
+            yield from go_on(under_way, taking, progress)
+            finish(under_way, taking, progress)
 
     return go_through()
 
 
 @contextmanager
 def opened(
-    executor: Executor | str | None, workers: int, described: Sweep, directory: Path, progress: Progress
+    executor: Executor | str | None, workers: int, under_way: UnderWay, progress: Progress
 ) -> Iterator[Executor]:
     """Use an executor, a cluster, or else a pool of processes here, which end with the block, at once if it raises."""
     if isinstance(executor, str):
@@ -104,7 +101,7 @@ def opened(
         except ImportError:
             said = "a cluster needs dask.distributed, which is not installed; pip install distributed"
             raise NotInstalledError(said) from None
-        with connected(executor, described, directory, progress) as cluster:
+        with connected(executor, under_way.sweep, under_way.directory, progress) as cluster:
             yield cluster
         return
     if executor is not None:
@@ -119,20 +116,21 @@ def opened(
     pool.shutdown()
 
 
-def finish(
-    described: Sweep,
-    values: list[list[Any]],
-    directory: Path,
-    rows: Iterable[Outcome],
-    executor: Executor,
-    progress: Progress,
-) -> tuple[list[str], list[str]]:
+def go_on(under_way: UnderWay, executor: Executor, progress: Progress) -> Iterator[Outcome]:
+    """Take the runs that are missing, and give their outcomes as they come; errors as for `outcomes`."""
+    done = under_way.done
+    for outcome in outcomes(under_way.missing, executor, lambda: progress("runs", len(done), under_way.total)):
+        done.append(outcome)
+        yield outcome
+
+
+def finish(under_way: UnderWay, executor: Executor, progress: Progress) -> tuple[list[str], list[str]]:
     """Write the table and the other files of a sweep; gives their names, and what the user should know."""
-    ordered = sorted(rows, key=lambda row: row.run)
-    with writing(directory), alone(directory, lambda: progress("runs", len(ordered), len(ordered))):
+    directory, total = under_way.directory, under_way.total
+    with writing(directory), alone(directory, lambda: progress("runs", total, total)):
         # Another command may have taken a run that it kept from us.
-        result = SweepResult(directory, described, values, ordered)
-        again = [
-            (None if row.status in ENDED else ended(row.run, result.run_directory(row.run))) or row for row in ordered
+        rows = [
+            (None if row.status in ENDED else ended(row.run, directory / RUNS / numbered(row.run))) or row
+            for row in sorted(under_way.done, key=lambda row: row.run)
         ]
-        return write_reports(replace(result, outcomes=again), executor, progress)
+        return write_reports(SweepResult(directory, under_way.sweep, under_way.values, rows), executor, progress)
