@@ -47,6 +47,9 @@ vary:
 set: {output: [png, gif, trajectory, depth], time.duration: 0.2}
 """
 
+# Runs that are long enough to be ended in the middle.
+LONG = SWEEP.replace("time.duration: 0.2", "time.duration: 8")
+
 
 @pytest.fixture
 def many(small: Path) -> Path:
@@ -149,8 +152,7 @@ def test_a_shard_of_the_command_writes_no_table(many: Path, program: Program) ->
 
 
 def test_a_kill_changes_nothing(many: Path, pool: Pool) -> None:
-    # Runs long enough to be killed in the middle.
-    (many / "many.yaml").write_text(SWEEP.replace("time.duration: 0.2", "time.duration: 4"))
+    (many / "many.yaml").write_text(LONG)
     go(pool, "whole")
     with Telling("sweep", "many.yaml", "--workers", "1", "--out", "killed", stderr=subprocess.DEVNULL) as process:
         process.until("runs", 2)
@@ -163,6 +165,7 @@ def test_a_kill_changes_nothing(many: Path, pool: Pool) -> None:
 
 
 def test_a_signal_ends_it_and_says_how_to_go_on(many: Path) -> None:
+    (many / "many.yaml").write_text(LONG)
     with Telling("sweep", "many.yaml", "--workers", "1", "--out", "out", stderr=subprocess.PIPE) as process:
         process.until("runs", 2)
         process.send_signal(signal.SIGINT)
