@@ -45,7 +45,8 @@ class Machines:
         file = self._folder / f"scheduler-{len(self._started)}.json"
         words = ["--host", "127.0.0.1", "--port", "0", "--scheduler-file", str(file)]
         self.scheduler = self._start("dask_scheduler", *words, **settings)
-        wait_for(file.exists)
+        # It exists a moment before it holds anything.
+        wait_for(lambda: file.exists() and file.read_text().endswith("}"))
         return str(json.loads(file.read_text())["address"])
 
     def work(self, address: str, *words: str) -> subprocess.Popen[bytes]:
