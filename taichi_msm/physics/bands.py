@@ -227,7 +227,7 @@ def advancing(code: StepCode, *, parallel: bool) -> Callable[..., None]:
         u_x: vectors, u_y: vectors, u_z: vectors,
         d_x: vectors, d_y: vectors, d_z: vectors,
         numbers_of: ti.types.ndarray(dtype=vector, ndim=1),
-        by_column: vectors, stiffness: vectors, decay: vectors,
+        by_column: vectors, stiffness: vectors, fields: vectors,
     ):  # fmt: skip
         ti.loop_config(serialize=not parallel)
         for index in range(ti.cast(sizes[WORKERS], ti.i32) * ITERATIONS_PER_THREAD):
@@ -236,7 +236,7 @@ def advancing(code: StepCode, *, parallel: bool) -> Callable[..., None]:
                 rows, width = ti.cast(sizes[ROWS], ti.i32), ti.cast(sizes[STRIP], ti.i32) + 2
                 numbers = [numbers_of[n][0] for n in ti.static(range(count_of_numbers))]
                 sheet = ti.static(
-                    KernelSheet((u_x, u_y, u_z), (d_x, d_y, d_z), by_column, stiffness, decay, numbers, rows, width)
+                    KernelSheet((u_x, u_y, u_z), (d_x, d_y, d_z), by_column, stiffness, fields, numbers, rows, width)
                 )
                 worker, workers = index // ITERATIONS_PER_THREAD, ti.cast(sizes[WORKERS], ti.i32)
                 first_row, end_row = ti.cast(sizes[FIRST_ROW], ti.i32), ti.cast(sizes[END_ROW], ti.i32)

@@ -137,7 +137,7 @@ def _advancing(code: StepCode) -> Callable[..., None]:
         u_x: vectors, u_y: vectors, u_z: vectors,
         d_x: vectors, d_y: vectors, d_z: vectors,
         numbers_of: ti.types.ndarray(dtype=vector, ndim=1),
-        by_column: vectors, stiffness: vectors, decay: vectors,
+        by_column: vectors, stiffness: vectors, fields: vectors,
     ):  # fmt: skip
         for n in ti.static(range(STEPS_PER_LAUNCH)):
             for store_moment in ti.static(storing):
@@ -145,14 +145,14 @@ def _advancing(code: StepCode) -> Callable[..., None]:
                     if n < count:
                         numbers = [numbers_of[m][0] for m in ti.static(range(count_of_numbers))]
                         u, d = ti.static((u_x, u_y, u_z), (d_x, d_y, d_z))
-                        sheet = ti.static(KernelSheet(u, d, by_column, stiffness, decay, numbers, rows, cols + 2))
+                        sheet = ti.static(KernelSheet(u, d, by_column, stiffness, fields, numbers, rows, cols + 2))
                         p = (now + n) % 2 * (rows + 2) + i + 1
                         store_moment(sheet, i, p - 1, p, p + 1, b, 2 * (rows + 2) + i + 1)
             for i, b in ti.ndrange(rows, (1, cols + 1)):
                 if n < count:
                     numbers = [numbers_of[m][0] for m in ti.static(range(count_of_numbers))]
                     u, d = ti.static((u_x, u_y, u_z), (d_x, d_y, d_z))
-                    sheet = ti.static(KernelSheet(u, d, by_column, stiffness, decay, numbers, rows, cols + 2))
+                    sheet = ti.static(KernelSheet(u, d, by_column, stiffness, fields, numbers, rows, cols + 2))
                     step(sheet, loads, (now + n) % 2, i, b, n)
 
     return advance

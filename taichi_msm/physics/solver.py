@@ -24,7 +24,7 @@ from taichi_msm.physics.plan import Plan
 from taichi_msm.physics.state import Reading, State
 from taichi_msm.physics.terms import terms_of
 from taichi_msm.physics.terms.damping import coefficients
-from taichi_msm.physics.terms.probes import ProbeTerm, standing, standing_decays
+from taichi_msm.physics.terms.probes import ProbeTerm, standing
 from taichi_msm.physics.terms.springs import LEAST, MOST, SpringTerm
 from taichi_msm.physics.terms.term import ACROSS, AREA, COLUMN_ROWS, GAIN, HAS_LEFT, HAS_RIGHT, MOTION, MOVES, StepCode
 from taichi_msm.progress import Pause
@@ -125,7 +125,7 @@ class Dynamics:
         if probes.by_area != before.by_area:
             raise ArgumentError("probes: one has total instead of force, or the reverse; restart with the new scene")
         if standing(plan) != standing(self.plan):
-            self._moving.arrays.set_decay(standing_decays(plan))
+            self._moving.arrays.set_fields(self.structure.code.first_field(ProbeTerm), probes.fields(plan))
         self.plan = plan
         # A caller that steers will steer again in a frame, so no more loads than those of a frame are tabulated.
         self._first_tabled, self._loads = self.steps_done, self._table(self.steps_done, plan.grid.steps_per_frame)
@@ -243,10 +243,11 @@ class Dynamics:
         by_column[HAS_LEFT] = column > 0
         by_column[HAS_RIGHT] = column < layout.cols - 1
         numbers = *spacing(sheet), sheet.size[0] / 2, *(n for term in layout.code.terms for n in term.numbers(plan))
+        fields = np.concatenate([term.fields(plan) for term in layout.code.terms])
         stiffness = layout.code.require(SpringTerm).laid_out(plan)
         self._sheet = None  # Frees its memory before another sheet takes some.
         kind: type[StepKernel] = Scatter if layout.workers else Gather
-        self._sheet = kind(layout, Start(np.array(numbers), by_column, standing_decays(plan), stiffness, state))
+        self._sheet = kind(layout, Start(np.array(numbers), by_column, fields, stiffness, state))
 
 
 def _in_words(moves: tuple[bool, ...]) -> str:
