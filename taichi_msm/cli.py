@@ -221,14 +221,19 @@ def check(scene: str, image: str | None, overrides: tuple[str, ...], as_json: bo
     with naming(scene):
         budget.require_disk(plan, Path("output"))
     loaded, grid, limit = plan.scene, plan.grid, plan.stable_step
-    need, takes = budget.estimate(plan), duration.estimate(plan)
-    facts: dict[str, Any] = {
-        "scene": loaded.model_dump(mode="json"),
+    steps = {
         "step": grid.step,
         "stable_step": limit if limit < float("inf") else None,
         "steps_per_frame": grid.steps_per_frame,
         "precision": grid.precision,
-        "steps": need.steps,
+        "steps": plan.grid.steps,
+    }
+    if loaded.time.at_rest:
+        steps |= dict.fromkeys(("step", "stable_step", "steps_per_frame", "steps"))
+    need, takes = budget.estimate(plan), duration.estimate(plan)
+    facts: dict[str, Any] = {
+        "scene": loaded.model_dump(mode="json"),
+        **steps,
         "frames": need.frames,
         "estimated_seconds": takes.seconds,
         "memory": need.memory_bytes,
@@ -248,9 +253,14 @@ def check(scene: str, image: str | None, overrides: tuple[str, ...], as_json: bo
     asking = [f"{name}.tolerance" for name in ("sheet", "time") if getattr(loaded, name).tolerance is not None]
     more, longer = (", or more", f", or longer, as {' and '.join(asking)} may ask for more") if asking else ("", "")
     click.echo(yaml.safe_dump(facts["scene"], sort_keys=False, default_flow_style=None), nl=False)
+    stepped = (
+        f"each at rest{more}, in {grid.precision}"
+        if loaded.time.at_rest
+        else f"{need.steps} steps of {grid.step:.6g} s (limit {limit:.6g} s), {grid.steps_per_frame} a frame{more}, in "
+        f"{grid.precision}"
+    )
     click.echo(
-        f"\n{need.points} points, {need.frames} frames, {need.steps} steps of {facts['step']:.6g} s "
-        f"(limit {limit:.6g} s), {facts['steps_per_frame']} a frame{more}, in {facts['precision']}\n"
+        f"\n{need.points} points, {need.frames} frames, {stepped}\n"
         f"about {rough_time(takes.seconds)} to run{longer} ({source})\n"
         f"about {need.memory_bytes / 2**20:.0f} MiB of memory, at most {need.disk_bytes / 2**20:.1f} MiB on disk, "
         f"{need.working_bytes / 2**20:.1f} MiB more while it runs"

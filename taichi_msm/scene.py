@@ -118,7 +118,11 @@ class Sheet(Section):
     size: tuple[Positive, Positive] = key(
         ..., "height, width of the sheet at rest [m]", "two numbers above 0: [height, width] in metres"
     )
-    mass: Positive | None = key(None, "mass of one point [kg]; required with springs", "a number above 0, in kg")
+    mass: Positive | None = key(
+        None,
+        "mass of one point [kg]; required with springs unless motion is quasistatic",
+        "a number above 0, in kg",
+    )
     fixed: Literal["border", "corners", "none"] | tuple[Side, ...] = key(
         "border", "the points that never move", "border, corners, none, or a list of top, bottom, left, right"
     )
@@ -164,7 +168,9 @@ class Tissue(Section):
 
     young: Positive = key(..., "Young's modulus E [Pa]", "a number above 0, in Pa")
     thickness: Positive = key(..., "thickness t of the sheet [m]", "a number above 0, in metres")
-    density: Positive = key(..., "density [kg/m3]", "a number above 0, in kg/m3")
+    density: Positive | None = key(
+        None, "density [kg/m3]; required unless motion is quasistatic", "a number above 0, in kg/m3"
+    )
     foundation: NotNegative = key(
         0.0,
         "stiffness of the tissue underneath, as virtual springs: force per area and displacement [N/m3]",
@@ -289,6 +295,12 @@ class Time(Section):
         ..., "simulated time [s]; duration x frames_per_second is a whole number", "a number above 0, in seconds"
     )
     frames_per_second: Positive = key(25.0, "frames per simulated second", "a number above 0")
+    motion: Literal["dynamic", "quasistatic"] = key(
+        "dynamic",
+        "dynamic: the sheet moves; quasistatic: every frame is the sheet at rest under its loads, and mass, density, "
+        "damping and step do not matter",
+        "dynamic or quasistatic",
+    )
     step: Literal["auto"] | Positive = key(
         "auto",
         "time step [s], a whole fraction of a frame; auto: half the stability limit or less",
@@ -313,6 +325,11 @@ class Time(Section):
     )
 
     @property
+    def at_rest(self) -> bool:
+        """Whether every frame is the sheet at rest."""
+        return self.motion == "quasistatic"
+
+    @property
     def frames(self) -> int:
         """F, the number of frame intervals; F + 1 frames are drawn."""
         return round(self.duration * self.frames_per_second)
@@ -334,6 +351,14 @@ class Time(Section):
         if self.tolerance is not None and self.step != "auto":
             said = f"a tolerance chooses the step, but step is {self.step:.12g}"
             raise refused(f"{said}; set step: auto or remove the tolerance", "tolerance")
+        return self
+
+    @model_validator(mode="after")
+    def _fits_rest(self) -> Time:
+        if self.at_rest and self.tolerance is not None:
+            raise refused("is for the time step, and motion: quasistatic takes none; remove the tolerance", "tolerance")
+        if self.at_rest and self.precision == "f32":
+            raise refused("f32 is too coarse for motion: quasistatic; take auto or f64", "precision")
         return self
 
 

@@ -16,7 +16,7 @@ from taichi_msm.physics.diagnosis import Diagnosis, diagnose
 from taichi_msm.physics.divergence import Watch, farthest
 from taichi_msm.physics.lattice import axes
 from taichi_msm.physics.plan import Plan
-from taichi_msm.physics.solver import Dynamics
+from taichi_msm.physics.rest import sheet_of
 from taichi_msm.physics.state import Reading, RunProgress, Saved
 from taichi_msm.progress import Pause
 from taichi_msm.render.labels import Flow, Labels, Observed, Sight
@@ -81,9 +81,11 @@ class Simulation:
         self.device = runtime.start(arch, threads)
         self._plan = resolve(plan, self.device).plan
         self._watch = Watch(self._plan)
-        self._closed = self._diverged = False
-        self._dynamics = Dynamics(self._plan, self.device, cores=cores)
-        self._position = self._place(self._dynamics.displacement())
+        self._closed = False
+        self._divergence: DivergedError | None = None
+        self._cores = cores
+        self._dynamics = sheet_of(self._plan, self.device, cores=cores)
+        self._placed = self._first_position()
         self.renderer = Renderer(self.scene, texture)
 
     @property
@@ -130,22 +132,20 @@ class Simulation:
         """Simulate a number of frames, with the loads of the scene's keys.
 
         Args:
-            frames: how many, 0 or more.
+            frames: how many, 0 or more; 0 finds the shape of the first frame, where that is at rest under a load.
             pause: called some times a second, between steps; what it raises stops the simulation there, and the next
                 call goes on from there.
 
         Raises:
-            DivergedError: when the simulation diverges: a position is no longer finite, or exceeds every bound.
-                `positions` and `draw` then give the last good frame.
+            DivergedError: when the simulation diverges: a position is no longer finite, or exceeds every bound; or no
+                shape is found in which the forces balance. `positions` and `draw` then give the last good frame.
         """
         require_frame_count(frames)
         self._require_open()
+        if self._placed is None:
+            self._go_to(0, pause)
         for _ in range(frames):
-            end = (self.frame + 1) * self._plan.grid.steps_per_frame
-            self._dynamics.advance(end - self.steps, pause)
-            reading = self._dynamics.read()
-            self._require_good(reading, self._watch.follow(reading))
-            self._position = self._place(reading.displacement)
+            self._go_to(self.frame + 1, pause)
 
     def steer(self, probes: Sequence[Probe | Mapping[str, Any]]) -> None:
         """Replace the loads from here on.
@@ -176,13 +176,18 @@ class Simulation:
             SceneError: as for `Simulation`.
         """
         self._require_open()
+        motion = self.scene.time.motion
         if scene is not None:
             self._plan = resolve(checked(scene), self.device).plan
             self.renderer.restart(self.scene)
         self._watch = Watch(self._plan)
-        self._diverged = False
-        self._dynamics.restart(self._plan)
-        self._position = self._place(self._dynamics.displacement())
+        self._divergence = None
+        if self.scene.time.motion == motion:
+            self._dynamics.restart(self._plan)
+        else:
+            self._dynamics.close()
+            self._dynamics = sheet_of(self._plan, self.device, cores=self._cores)
+        self._placed = self._first_position()
 
     def save(self) -> Saved:
         """Save all that another simulation needs to continue from here.
@@ -191,6 +196,8 @@ class Simulation:
             DivergedError: as for `advance`.
         """
         self._require_open()
+        if self._placed is None:
+            self.advance(0)
         reading = self._dynamics.read()
         self._require_good(reading, self._watch.judge(reading))
         return Saved(self._dynamics.state(), self.progress)
@@ -206,15 +213,16 @@ class Simulation:
             raise ArgumentError(f"{type(saved).__name__} is not what `save` returns")
         state, per_frame = saved.state, self._plan.grid.steps_per_frame
         since = state.steps - saved.progress.frame * per_frame
-        alike = (state.displacement.shape, state.displacement.dtype) == (self._position.shape, self._position.dtype)
+        here = self._dynamics.displacement()
+        alike = (state.displacement.shape, state.displacement.dtype) == (here.shape, here.dtype)
         if not (alike and 0 <= since <= per_frame):
             raise ArgumentError(
                 f"saved at step {state.steps}, frame {saved.progress.frame}, {state.displacement.dtype} of shape "
                 f"{state.displacement.shape}; take what was saved with this scene's points, precision and step"
             )
-        self._diverged = False
+        self._divergence = None
         self._dynamics.restart(self._plan, saved.state)
-        self._position = self._place(self._dynamics.displacement())
+        self._placed = self._place(self._dynamics.displacement())
         self._watch.progress = saved.progress
 
     def positions(self) -> Array:
@@ -249,8 +257,11 @@ class Simulation:
             MsmError: when the simulation has not diverged.
         """
         self._require_open()
-        if not self._diverged:
+        if self._divergence is None:
             raise MsmError("this simulation has not diverged; there is nothing to find out")
+        if self.scene.time.at_rest:
+            good = None if self._placed is None else Saved(self._dynamics.state(), self.progress)
+            return Diagnosis(str(self._divergence), good)
         return diagnose(self._dynamics, start, pause)
 
     def draw(
@@ -347,8 +358,9 @@ class Simulation:
         self._dynamics.compile()
         pause()
         if self.scene.renders and (kernels := self.renderer.kernels()) not in _compiled:
-            first = self.observe(None, self._position, self.time)
-            self.observe(first.labels, self._position, self.time)
+            position = self._place(self._dynamics.displacement())
+            first = self.observe(None, position, self.time)
+            self.observe(first.labels, position, self.time)
             _compiled.add(kernels)
 
     def close(self) -> None:
@@ -367,6 +379,29 @@ class Simulation:
     def __reduce__(self) -> Any:
         remedy = "keep its `scene` and what `save` returns, and `restore` that in a new one"
         raise MsmError(f"a Simulation cannot be pickled or copied; {remedy}")
+
+    @property
+    def _position(self) -> Array:
+        """Positions of the last frame [m], which is found first where it is at rest under a load."""
+        if self._placed is None:
+            self.advance(0)
+        assert self._placed is not None
+        return self._placed
+
+    def _first_position(self) -> Array | None:
+        """Give the positions at the start; None: the sheet is at rest, and its first frame is yet to be found."""
+        return None if self.scene.time.at_rest else self._place(self._dynamics.displacement())
+
+    def _go_to(self, frame: int, pause: Pause) -> None:
+        """Simulate up to a frame."""
+        try:
+            self._dynamics.advance(frame * self._plan.grid.steps_per_frame - self.steps, pause)
+        except DivergedError as error:
+            self._divergence = error
+            raise
+        reading = self._dynamics.read()
+        self._require_good(reading, self._watch.follow(reading))
+        self._placed = self._place(reading.displacement)
 
     def _require_open(self) -> None:
         # The kernels would write to memory that was freed.
@@ -394,10 +429,10 @@ class Simulation:
     def _require_good(self, reading: Reading, fault: str) -> None:
         """Raise the error of a divergence, if there is a fault."""
         if fault:
-            self._diverged = True
             steps, time = reading.steps, self._plan.grid.time(reading.steps)
             point = farthest(reading.displacement)[:2]
-            raise DivergedError(divergence.message(time, steps, fault, exact=False), steps, time, point)
+            self._divergence = DivergedError(divergence.message(time, steps, fault, exact=False), steps, time, point)
+            raise self._divergence
 
     def _place(self, displacement: Array) -> Array:
         """Turn displacements into positions."""

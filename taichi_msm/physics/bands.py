@@ -22,6 +22,7 @@ records its place and ends, which frees its own core. Further launches continue 
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
+from taichi_msm.physics.kernel import point_step
 from taichi_msm.physics.row import row_passing
 from taichi_msm.physics.terms.bending import BendingTerm
 from taichi_msm.physics.terms.term import DY, KernelRow, KernelSheet, StepCode
@@ -60,10 +61,29 @@ class RowBand(NamedTuple):
     progress: Any  # of all workers
 
 
-def stepping_row(code: StepCode, *, parallel: bool) -> Callable[..., Any]:
-    """Make the function that takes a step of a row of a band, as soon as the neighbours' rows allow it."""
-    vector, lanes, bending, copied = code.vector, code.lanes, code.get(BendingTerm), code.reach
-    pass_row, storing = row_passing(code), [bending.storing(code)] if bending else []
+def joining(code: StepCode) -> Callable[..., None]:
+    """Make the function that fills the halo of a row."""
+    vector, lanes = code.vector, code.lanes
+
+    @ti.func
+    def join_strips(u: ti.template(), p, width):
+        """Fill the halo of row p: before the first column of a strip comes the last one of the strip before."""
+        for c in ti.static(range(3)):
+            last = u[c][p * width + width - 2]
+            first = u[c][p * width + 1]
+            u[c][p * width + 0] = vector([last[(lane - 1) % lanes] for lane in ti.static(range(lanes))])
+            u[c][p * width + width - 1] = vector([first[(lane + 1) % lanes] for lane in ti.static(range(lanes))])
+
+    return join_strips
+
+
+def stepping_row(code: StepCode, move: Callable[..., None], *, parallel: bool) -> Callable[..., Any]:
+    """Make the function that takes a step of a row of a band, as soon as the neighbours' rows allow it.
+
+    move: as for `row_passing`.
+    """
+    vector, bending, copied, join_strips = code.vector, code.get(BendingTerm), code.reach, joining(code)
+    pass_row, storing = row_passing(code, move), [bending.storing(code)] if bending else []
 
     @ti.func
     def copy_row(rows, worker, border, n, behind):
@@ -101,15 +121,6 @@ def stepping_row(code: StepCode, *, parallel: bool) -> Callable[..., Any]:
                 for c in ti.static(range(3)):
                     sheet.u[c][copy * sheet.width + b] = sheet.u[c][(i + behind * inward) * sheet.width + b]
         ti.atomic_add(band.progress[WORKER_STRIDE * band.worker + COUNTER_STRIDE * border], 1)
-
-    @ti.func
-    def join_strips(u: ti.template(), p, width):
-        """Fill the halo of row p: before the first column of a strip comes the last one of the strip before."""
-        for c in ti.static(range(3)):
-            last = u[c][p * width + width - 2]
-            first = u[c][p * width + 1]
-            u[c][p * width + 0] = vector([last[(lane - 1) % lanes] for lane in ti.static(range(lanes))])
-            u[c][p * width + width - 1] = vector([first[(lane + 1) % lanes] for lane in ti.static(range(lanes))])
 
     @ti.func
     def store_moments(sheet: ti.template(), band: ti.template(), row, moments, n):
@@ -179,7 +190,7 @@ def stepping_row(code: StepCode, *, parallel: bool) -> Callable[..., Any]:
 def advancing(code: StepCode, *, parallel: bool) -> Callable[..., None]:
     """Make the kernel that takes steps, with one worker or several."""
     real, vector, vectors, lanes = code.real, code.vector, code.vectors, code.lanes
-    count_of_numbers, step_row = code.first_number(None), stepping_row(code, parallel=parallel)
+    count_of_numbers, step_row = code.first_number(None), stepping_row(code, point_step(code), parallel=parallel)
 
     @ti.func
     def work(

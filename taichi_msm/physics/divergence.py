@@ -76,13 +76,15 @@ class Watch:
         wrong = self._fault(reading, where)
         if not wrong:
             self.progress = RunProgress(
-                frame=progress.frame + 1,
+                frame=reading.steps // self._grid.steps_per_frame,
                 max_displacement=max(progress.max_displacement, where.distance),
                 shortest_spring=min(progress.shortest_spring, reading.shortest_spring),
                 longest_spring=max(progress.longest_spring, reading.longest_spring),
                 energy=reading.energy,
                 reach=where.reach,
                 peak=max(progress.peak, reading.energy),
+                residual=max(progress.residual, reading.residual),
+                evaluations=reading.evaluations,
             )
         return wrong
 
@@ -91,6 +93,8 @@ class Watch:
         return self._fault(reading, farthest(reading.displacement))
 
     def _fault(self, reading: Reading, where: Farthest) -> str:
+        if self._plan.scene.time.at_rest:
+            return ""  # Where the forces balance, nothing has grown without bound.
         begin, end = self.progress.frame / self._grid.frames_per_second, self._grid.time(reading.steps)
         point, distance, energy = f"point ({where.row}, {where.column})", where.distance, reading.energy
         # Written so that NaN is found too: no comparison with it is true.

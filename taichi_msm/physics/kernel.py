@@ -150,14 +150,19 @@ class StepKernel(Protocol):
         """Copy displacements or differences into values, shape (rows, cols, 3), and the measures of every row."""
 
 
+def point_forces(code: StepCode) -> list[Callable[..., Any]]:
+    """List the functions that add the forces of terms on points to those of springs."""
+    # Terms that reach far come first. The last bits depend on the order.
+    ordered = sorted(code.terms, key=lambda term: -term.reach)
+    return [force for term in ordered for force in term.forces(code)]
+
+
 def point_step(code: StepCode) -> Callable[..., None]:
     """Make the function that adds the forces of terms on points to those of springs, and steps.
 
     d_{n+1} = keep d_n + gain F_n,    u_{n+1} = u_n + d_{n+1}                                  (eq. 6 to 9)
     """
-    # Terms that reach far come first. The last bits depend on the order.
-    ordered = sorted(code.terms, key=lambda term: -term.reach)
-    forces = [force for term in ordered for force in term.forces(code)]
+    forces = point_forces(code)
     reducing = [reduce for term in code.terms for reduce in term.reducing(code)]
 
     @ti.func

@@ -21,7 +21,7 @@ from taichi_msm.physics.lattice import axes
 from taichi_msm.physics.material import area_shares
 from taichi_msm.physics.plan import EDGE, Plan, ProbeSegment, ProbeSlot, probe_slots
 from taichi_msm.physics.probe_force import control_points, probe_force
-from taichi_msm.scene import Probe, Scene, Sheet
+from taichi_msm.scene import WHOLE, Probe, Scene, Sheet
 
 # A time before all others [s].
 LONG_AGO = -1e300
@@ -79,11 +79,29 @@ def loads_at(plan: Plan, t: Array) -> Schedule:
     return Schedule(parts, strength, point, _activity(plan).values(t))
 
 
+def frame_loads(plan: Plan, frame: int) -> Schedule:
+    """Evaluate the loads at a frame; at a jump the later value counts, and a key within WHOLE of a frame is at it.
+
+    Foundations that are `loaded` act where the percent of any probe is not 0.
+    """
+    scene, rate = plan.scene, plan.grid.frames_per_second
+    time = frame / rate
+    near = [key for key in _every_key(scene) if abs(key - time) <= WHOLE / rate]
+    t = np.array([max(near, default=time)])
+    loads = loads_at(plan, t)
+    loaded = any(_load(probe).values(t)[0] != 0 for probe in scene.probes)
+    return loads._replace(active=np.array([float(plan.material.always or loaded)]))
+
+
 def key_times(scene: Scene) -> Array:
     """List the times of all keys between 0 and the end [s]: only there the loads are not smooth."""
-    loads = [[time for time, _ in probe.load] for probe in scene.probes]
-    times = np.unique(np.concatenate([[], *loads, *(control_points(probe, scene.sheet)[0] for probe in scene.probes)]))
+    times = _every_key(scene)
     return times[(times > 0) & (times < scene.time.duration)]
+
+
+def _every_key(scene: Scene) -> Array:
+    loads = [[time for time, _ in probe.load] for probe in scene.probes]
+    return np.unique(np.concatenate([[], *loads, *(control_points(probe, scene.sheet)[0] for probe in scene.probes)]))
 
 
 class Envelope:

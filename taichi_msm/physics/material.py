@@ -112,12 +112,14 @@ def kind_problems(scene: Scene) -> Iterator[Problem]:
         if scene.springs is None:
             said = "missing; expected a mapping with young, thickness and density, or springs in its place"
             yield Problem(("tissue",), said)
-        elif sheet.mass is None:
+        elif sheet.mass is None and not scene.time.at_rest:
             yield Problem(("sheet", "mass"), "missing; with springs expected a number above 0, in kg")
         if sheet.tolerance is not None:
             said = f"{sheet.tolerance:g} needs tissue: with springs other points make another sheet; remove tolerance"
             yield Problem(("sheet", "tolerance"), said)
         return
+    if scene.tissue.density is None and not scene.time.at_rest:
+        yield Problem(("tissue", "density"), "missing; expected a number above 0, in kg/m3")
     if scene.springs is not None:
         yield Problem(("springs",), "tissue already gives the stiffness of the sheet; remove springs or tissue")
     if sheet.mass is not None:

@@ -32,13 +32,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from taichi_msm.errors import SceneError
+from taichi_msm.errors import DivergedError, SceneError
 from taichi_msm.physics.error_control import longest
 from taichi_msm.physics.material import LONGEST_CELL, MapImage, cell_ratio
 from taichi_msm.physics.plan import Plan
 from taichi_msm.physics.planning import on, stable_steps, variant
 from taichi_msm.physics.probe_force import sums
-from taichi_msm.physics.solver import Dynamics
+from taichi_msm.physics.rest import sheet_of
 from taichi_msm.progress import Count, Pause
 from taichi_msm.scene import MAX_POINTS, Probe, Scene, Sheet
 from taichi_msm.system.runtime import Device
@@ -125,9 +125,9 @@ class MeshPilot:
         plans = [coarse] if coarsest is None else [coarse, coarsest]
         self._sheets = []
         for sheet in plans:
-            steps = max(math.ceil(steps / 2), stable_steps(sheet))
+            steps = 1 if plan.scene.time.at_rest else max(math.ceil(steps / 2), stable_steps(sheet))
             exact = sheet.with_grid(precision="f64", steps_per_frame=steps)
-            self._sheets.append(Dynamics(exact, device, cores=cores))
+            self._sheets.append(sheet_of(exact, device, cores=cores))
         points = [sheet.scene.sheet.points for sheet in (plan, *plans)]
         self._samplings = [CubicSampling(after, before) for before, after in pairwise(points)]
         self._ratio = min((own - 1) / (other - 1) for own, other in zip(*points[:2], strict=True))
@@ -144,7 +144,11 @@ class MeshPilot:
         self._largest = max(self._largest, longest(displacement))
         finer = displacement
         for n, (sheet, sampling) in enumerate(zip(self._sheets, self._samplings, strict=True)):
-            sheet.advance(sheet.plan.grid.steps_per_frame, pause)
+            try:
+                sheet.advance(sheet.plan.grid.steps_per_frame, pause)
+            except DivergedError:  # At rest; then the error is not known.
+                self._differences[n] = math.inf
+                return
             reading = sheet.read()
             with np.errstate(all="ignore"):
                 self._differences[n] = max(self._differences[n], longest(finer - sampling.at(reading.displacement)))
@@ -221,7 +225,7 @@ def _estimate(plan: Plan, device: Device, progress: Count) -> MeshEstimate:
     """Run a scene and its pilot in f64, and give the error that the pilot shows."""
     exact, coarse, grid = plan.with_grid(precision="f64"), coarser(plan), plan.grid
     assert coarse is not None
-    own, pilot = Dynamics(exact, device), MeshPilot(exact, coarse, device)
+    own, pilot = sheet_of(exact, device), MeshPilot(exact, coarse, device)
     for frame in range(grid.frames):
         pause = partial(progress, frame, grid.frames)
         pause()

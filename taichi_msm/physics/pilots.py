@@ -27,6 +27,10 @@ FINEST = 64
 POINTS = 1 / 4 / 2 + 1 / 16 / 4
 
 
+# Why there is no error of the step where the sheet is at rest.
+AT_REST = "quasistatic"
+
+
 class Pilots(NamedTuple):
     """The pilots of a run."""
 
@@ -34,11 +38,19 @@ class Pilots(NamedTuple):
     after: int = 0  # steps per frame of the one that follows if the first one shows too large an error; 0: none
     points: bool = False  # whether pilots with fewer points go with the run
     cost: float = 0.0  # of those that go with the run: for each of its steps theirs, in steps of the whole sheet
-    reason: str = ""  # why there are none
+    reason: str = ""  # why there are none for the step
+
+    @property
+    def some(self) -> bool:
+        """Whether there are any."""
+        return self.points or not self.reason
 
 
 def choose_pilots(plan: Plan, *, asked: bool = False) -> Pilots:
-    """Choose the pilots of a run; asked: whatever they cost."""
+    """Choose the pilots of a run; asked: whatever they cost. At rest there are none for a step."""
+    if plan.scene.time.at_rest:
+        tells = plan.scene.tissue is not None and (asked or affords_pilots(plan, POINTS))
+        return Pilots(points=tells, cost=POINTS if tells else 0.0, reason=AT_REST)
     own, coarse, fine = plan.grid.steps_per_frame, coarse_steps(plan), fine_steps(plan)
     points = POINTS if plan.scene.tissue is not None else 0.0
     # Beside a run in f32 a fine pilot has another one with the run's own steps.

@@ -72,6 +72,11 @@ def probe_slots(probes: Sequence[Probe], sheet: Sheet, h: float) -> tuple[ProbeS
     return tuple(slots)
 
 
+def slots_of(scene: Scene, grid: TimeGrid) -> tuple[ProbeSlot, ...]:
+    """List the slots of a scene's probes; at rest loads are not averaged."""
+    return probe_slots(scene.probes, scene.sheet, 0.0 if scene.time.at_rest else grid.step)
+
+
 @dataclass(frozen=True, eq=False)
 class Plan:
     """What a scene comes to; `planning.make_plan` makes it."""
@@ -94,9 +99,9 @@ class Plan:
         grid = replace(self.grid, **changes)
         if grid.step == self.grid.step:
             return replace(self, grid=grid)
-        return replace(self, grid=grid, slots=probe_slots(self.scene.probes, self.scene.sheet, grid.step))
+        return replace(self, grid=grid, slots=slots_of(self.scene, grid))
 
     def with_probes(self, probes: Sequence[Probe | Mapping[str, Any]]) -> Plan:
         """Replace the probes; SceneError: one of them is not a probe."""
         scene = self.scene.model_copy(update={"probes": tuple(probes)})
-        return replace(self, scene=scene, slots=probe_slots(scene.probes, scene.sheet, self.grid.step))
+        return replace(self, scene=scene, slots=slots_of(scene, self.grid))

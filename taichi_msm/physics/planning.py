@@ -14,7 +14,7 @@ from taichi_msm.errors import Problem, SceneError
 from taichi_msm.physics import workload
 from taichi_msm.physics.lattice import fixed_points, spacing
 from taichi_msm.physics.material import MapImage, Material, kind_problems, read_map, tissue_problems
-from taichi_msm.physics.plan import Plan, probe_slots
+from taichi_msm.physics.plan import Plan, slots_of
 from taichi_msm.physics.terms import highest_frequency, material_of
 from taichi_msm.picture import PictureError
 from taichi_msm.scene import WHOLE, Scene, Sheet, Time
@@ -70,16 +70,18 @@ def _material(scene: Scene, image: MapImage | None) -> Material:
 def _plan(scene: Scene, image: MapImage | None, fixed: NDArray[np.bool_], material: Material) -> Plan:
     limit = stable_step(material, scene.sheet, scene.time.damping_difference)
     grid = TimeGrid(scene.time.frames_per_second, scene.time.frames, steps_per_frame(scene.time, limit), "f64")
-    slots = probe_slots(scene.probes, scene.sheet, grid.step)
-    return on(Plan(scene, image, fixed, material, limit, grid, slots), "cpu")
+    return on(Plan(scene, image, fixed, material, limit, grid, slots_of(scene, grid)), "cpu")
 
 
 def on(plan: Plan, arch: str) -> Plan:
     """Choose the precision for an arch, unless the scene gives it.
 
-    A tolerance asks for f64; so does `auto` where it is a small part of the run. On a GPU f64 is slow or missing.
+    A tolerance asks for f64; so does `auto` where it is a small part of the run. On a GPU f64 is slow or missing. At
+    rest it is always f64.
     """
     time = plan.scene.time
+    if time.at_rest:
+        return plan.with_grid(precision="f64")
     if time.precision != "auto":
         return plan.with_grid(precision=time.precision)
     in_f64 = arch == "cpu" and (time.tolerance is not None or workload.is_small_in_f64(plan))
@@ -106,8 +108,10 @@ def steps_per_frame(time: Time, limit: float) -> int:
     """Count the steps of one frame.
 
     auto: the fewest whose step is at most half the stability limit. A given step is rounded to a fraction of a frame.
-    A tolerance may ask for more steps, which `error_control.choose_step` finds.
+    A tolerance may ask for more steps, which `error_control.choose_step` finds. At rest a frame counts as a step.
     """
+    if time.at_rest:
+        return 1
     frame = 1 / time.frames_per_second
     if time.step == "auto":
         return max(1, math.ceil(2 * frame / limit * SLACK))
@@ -132,6 +136,8 @@ def with_chosen_grid(plan: Plan) -> Plan:
 
 def _step_problems(plan: Plan) -> Iterator[Problem]:
     """Find a given step that is unstable or does not divide a frame, and what would overflow or vanish in f32."""
+    if plan.scene.time.at_rest:
+        return
     given, limit, frame = plan.scene.time.step, plan.stable_step, 1 / plan.grid.frames_per_second
     if given == "auto":
         pass

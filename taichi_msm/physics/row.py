@@ -11,26 +11,27 @@ depends on the old displacements of this row, so it is stepped in place.
 
 from collections.abc import Callable
 
-from taichi_msm.physics.kernel import point_step
 from taichi_msm.physics.terms.springs import SpringTerm
 from taichi_msm.physics.terms.term import DX, DY, HAS_LEFT, HAS_RIGHT, Entry, StepCode
 from taichi_msm.system.runtime import ti
 
 
-def row_passing(code: StepCode) -> Callable[..., None]:
-    """Make the function that goes through a row and steps it."""
+def row_passing(code: StepCode, move: Callable[..., None]) -> Callable[..., None]:
+    """Make the function that goes through a row and moves it.
+
+    move(sheet, entry, target, force, now) does so with an entry, given the force of its springs: see `point_step`.
+    """
     vector, columns, springs = code.vector, code.first_column(None), code.require(SpringTerm)
     structural, shear = springs.structural, springs.shear
     leaves_out = springs.open_edges and not springs.mapped
     along, to_other_row, of_row, of_column, of_diagonal = springs.between(code)
-    move = point_step(code)
 
     @ti.func
     def pass_row(
         sheet: ti.template(), carried: ti.template(), carried_row, line: ti.template(), here, next_row, exists, up,
         loads: ti.template(), n, moving,
     ):  # fmt: skip
-        """Go through row `line`, in row `here` of u, and step it if `moving`.
+        """Go through row `line`, in row `here` of u, and move it if `moving`.
 
         The other row, `next_row` of u, is `up` above this one [m]; exists: 0 if there is none, else 1. `carried_row` is
         the row of the forces carried from row to row, and n that of the table of loads.

@@ -41,7 +41,8 @@ class RunError:
         self._plan, self._pilots, self._known = plan, pilots, known
         self._device, self._cores = device, cores
         self._coarse = known.estimate is None and 0 < pilots.beside < plan.grid.steps_per_frame
-        self._time = Pilot(plan, pilots.beside, device, cores) if known.estimate is None else None
+        tells_time = known.estimate is None and not pilots.reason
+        self._time = Pilot(plan, pilots.beside, device, cores) if tells_time else None
         coarse = coarser(plan) if pilots.points and known.mesh is None else None
         beside = plan.with_grid(steps_per_frame=pilots.beside) if self._coarse else plan
         self._mesh = None if coarse is None else MeshPilot(beside, coarse, device, cores)

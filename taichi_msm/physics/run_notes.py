@@ -10,6 +10,7 @@ from taichi_msm.physics import probe_force
 from taichi_msm.physics.error_control import Estimate
 from taichi_msm.physics.material import has_fixed_border
 from taichi_msm.physics.mesh_error import MeshEstimate
+from taichi_msm.physics.pilots import AT_REST
 from taichi_msm.physics.plan import Plan
 from taichi_msm.physics.probe_force import ProbeRecord
 from taichi_msm.physics.state import RunProgress
@@ -42,6 +43,9 @@ def run_notes(
             wrong = float(f"{100 * estimate.error:.2g}")
             bound = "about" if estimate.parted else "up to"
             yield f"the run is {bound} {wrong:g} % wrong; {_remedy(plan, estimate)}"
+    elif reason == AT_REST:
+        points = f", {_size(mesh)} of the largest displacement due to the number of points" if mesh is not None else ""
+        yield f"error: none due to a time step, as the sheet is at rest{points}"
     elif reason:
         if mesh is None:
             yield f"error not estimated: {reason}"

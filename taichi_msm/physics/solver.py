@@ -18,7 +18,7 @@ from taichi_msm.physics.kernel import BYTES, SheetLayout, Start, StepKernel
 from taichi_msm.physics.kernel_cpu import Scatter
 from taichi_msm.physics.kernel_gpu import STEPS_PER_LAUNCH, Gather
 from taichi_msm.physics.lattice import axes, spacing
-from taichi_msm.physics.loads import schedule
+from taichi_msm.physics.loads import Schedule, schedule
 from taichi_msm.physics.material import area_shares
 from taichi_msm.physics.plan import Plan
 from taichi_msm.physics.state import Reading, State
@@ -58,7 +58,11 @@ def layout_of(plan: Plan, device: Device, cores: int | None = None) -> SheetLayo
     """
     (rows, cols), fixed, precision = plan.scene.sheet.points, plan.fixed, plan.grid.precision
     fixed_rows = bool(fixed[0].all()), bool(fixed[-1].all())
-    if device.arch == "cpu":
+    if plan.scene.time.at_rest:
+        if device.arch != "cpu":
+            raise DeviceError(f"--arch {device.arch}: time.motion: quasistatic runs on a CPU only; take --arch cpu")
+        workers = 1
+    elif device.arch == "cpu":
         # Workers wait by spinning, so more workers than cores would only hold each other up.
         cores = min(device.threads, available_threads() if cores is None else cores)
         workers = max(1, min(cores, rows * cols // POINTS_PER_WORKER, (rows - sum(fixed_rows)) // 2))
@@ -106,7 +110,7 @@ class Dynamics:
         self.structure = self._layout or layout_of(plan, self._device, self._cores)
         self._real = np.dtype(np.float32 if self.structure.code.precision == "f32" else np.float64)
         self.steps_done, self.torn = 0 if state is None else state.steps, True
-        self._first_tabled, self._loads = self.steps_done, self._table(self.steps_done, STEPS_PER_TABLE)
+        self._tabulate(STEPS_PER_TABLE)
         self._place(state)
         self.torn = False
 
@@ -128,7 +132,7 @@ class Dynamics:
             self._moving.arrays.set_fields(self.structure.code.first_field(ProbeTerm), probes.fields(plan))
         self.plan = plan
         # A caller that steers will steer again in a frame, so no more loads than those of a frame are tabulated.
-        self._first_tabled, self._loads = self.steps_done, self._table(self.steps_done, plan.grid.steps_per_frame)
+        self._tabulate(plan.grid.steps_per_frame)
 
     def advance(self, steps: int, pause: Pause = lambda: None) -> None:
         """Take a number of steps, with a pause after every launch.
@@ -180,11 +184,15 @@ class Dynamics:
             math.sqrt(max(0.0, 1.0 + float(extreme))) for extreme in (springs[:, LEAST].min(), springs[:, MOST].max())
         )
         sums = measures.sum(axis=0, dtype=np.float64)
-        energy = plan.material.mass * float(sums[MOTION]) / plan.grid.step**2
+        energy = self._of_motion(sums)
         for term in code.terms:
             first = code.first_measure(type(term))
             energy += term.energy(sums[first : first + len(term.reductions)], plan)
         return Reading(self.steps_done, displacement, shortest, longest, energy / 2)
+
+    def _of_motion(self, sums: NDArray[Any]) -> float:
+        """Give twice the energy of motion [J], from the measures summed up."""
+        return self.plan.material.mass * float(sums[MOTION]) / self.plan.grid.step**2
 
     def _copy(self, *, differences: bool) -> tuple[NDArray[Any], NDArray[Any]]:
         """Copy the displacements or the differences, and the measures of every row."""
@@ -211,20 +219,29 @@ class Dynamics:
         done = self.steps_done - self._first_tabled
         if done + count > len(self._loads):
             done = 0
-            self._first_tabled = self.steps_done
-            self._loads = self._table(self.steps_done, max(count, STEPS_PER_TABLE))
+            self._tabulate(max(count, STEPS_PER_TABLE))
         return self._loads[done : done + count]
+
+    def _tabulate(self, count: int) -> None:
+        """Tabulate the loads of the next steps."""
+        self._first_tabled, self._loads = self.steps_done, self._table(self.steps_done, count)
 
     def _table(self, first: int, count: int) -> NDArray[Any]:
         """Tabulate the loads of steps first, ..., first + count - 1, shape (count, columns)."""
-        plan, code, loads = self.plan, self.structure.code, schedule(self.plan, first, count)
-        table, (_, gain, first_gain) = np.empty((count, code.first_column(None))), coefficients(plan)
+        _, gain, first_gain = coefficients(self.plan)
+        table = self._columns(schedule(self.plan, first, count))
         table[:, GAIN] = gain
         if first == 0:
             table[0, GAIN] = first_gain
+        return table
+
+    def _columns(self, loads: Schedule) -> NDArray[Any]:
+        """Tabulate loads, shape (their number, columns), without a gain."""
+        code = self.structure.code
+        table = np.zeros((len(loads.active), code.first_column(None)))
         for term in code.terms:
             first_column = code.first_column(type(term))
-            table[:, first_column : first_column + term.column_count] = term.columns(plan, loads)
+            table[:, first_column : first_column + term.column_count] = term.columns(self.plan, loads)
         # Loads too large for f32 become infinite; the next reading of the sheet shows it.
         with np.errstate(over="ignore"):
             return table.astype(self._real)
@@ -246,8 +263,12 @@ class Dynamics:
         fields = np.concatenate([term.fields(plan) for term in layout.code.terms])
         stiffness = layout.code.require(SpringTerm).laid_out(plan)
         self._sheet = None  # Frees its memory before another sheet takes some.
-        kind: type[StepKernel] = Scatter if layout.workers else Gather
-        self._sheet = kind(layout, Start(np.array(numbers), by_column, fields, stiffness, state))
+        self._sheet = self._started(Start(np.array(numbers), by_column, fields, stiffness, state))
+
+    def _started(self, start: Start) -> StepKernel:
+        """Make the form of the kernel that the device takes."""
+        kind: type[StepKernel] = Scatter if self.structure.workers else Gather
+        return kind(self.structure, start)
 
 
 def _in_words(moves: tuple[bool, ...]) -> str:

@@ -25,6 +25,9 @@ class Reading(NamedTuple):
     shortest_spring: float
     longest_spring: float
     energy: float  # kinetic energy and that of springs and bending, without the virtual springs [J]
+    # At rest: the largest force left on a point, as a share of the largest force; evaluations of the forces so far.
+    residual: float = 0.0
+    evaluations: int = 0
 
 
 @dataclass(frozen=True)
@@ -39,6 +42,9 @@ class RunProgress:
     energy: float = 0.0  # as in a `Reading`, at this frame [J]
     reach: float = 0.0  # root of the sum of all squared displacements at this frame [m]
     peak: float = 0.0  # largest energy at any frame so far [J]
+    # residual, evaluations: as in a `Reading`; the residual is the largest of any frame so far
+    residual: float = 0.0
+    evaluations: int = 0
 
 
 class Saved(NamedTuple):

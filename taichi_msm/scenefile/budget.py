@@ -82,7 +82,7 @@ def estimate(plan: Plan) -> Budget:
     tracks = scene.render.tracks**2 * (frames * TRACK_BYTES + 16) + FILE_BYTES if "tracks" in scene.output else 0
     numbers = STATE_NUMBERS + OUTPUT_NUMBERS + len(scene.probes) + (MAP_NUMBERS if scene.stiffness_map else 0)
     # Pilots are up to two more sheets in f64; with tissue also two smaller ones.
-    pilot = scene.time.tolerance is not None or not choose_pilots(plan).reason
+    pilot = scene.time.tolerance is not None or choose_pilots(plan).some
     sheets = number_bytes + (8 * (2 + (scene.tissue is not None) * 5 / 16) if pilot else 0)
     return Budget(
         points=points,

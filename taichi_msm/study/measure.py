@@ -71,6 +71,8 @@ def study(
     """
     given, device = checked(scene), runtime.start(arch, threads)
     scene = given.scene
+    if scene.time.at_rest:
+        raise SceneError(["time.motion: quasistatic takes no steps, which a study compares; set time.motion: dynamic"])
     _require_memory(scene)
     texture = load_texture(scene) if scene.image is not None else None
     results = Study(

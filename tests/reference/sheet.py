@@ -79,7 +79,6 @@ def sheet(scene: Scene) -> Sheet:
     if scene.tissue is not None:
         return _of_tissue(scene, scene.tissue)
     assert scene.springs is not None
-    assert scene.sheet.mass is not None
     factor = factors(scene)
     cells = np.ones_like(factor)
     structural, shear = scene.springs.structural, scene.springs.shear
@@ -91,7 +90,7 @@ def sheet(scene: Scene) -> Sheet:
     }
     every = np.ones((rows, cols))
     springs = tuple(_springs(scene, ahead, k, 0 * k) for ahead, k in stiffness.items())
-    return Sheet(springs, scene.sheet.mass * every, scene.damping * every, scene.springs.virtual * every, 0.0)
+    return Sheet(springs, (scene.sheet.mass or 0.0) * every, scene.damping * every, scene.springs.virtual * every, 0.0)
 
 
 def _of_tissue(scene: Scene, tissue: Tissue) -> Sheet:
@@ -109,7 +108,7 @@ def _of_tissue(scene: Scene, tissue: Tissue) -> Sheet:
         _springs(scene, TO_LEFT, diagonal * factor, stretch * diagonal * cells),
     )
     quarters = _rows_of(_columns_of(cells))
-    mass = tissue.density * tissue.thickness * dx * dy / 4 * quarters
+    mass = (tissue.density or 0.0) * tissue.thickness * dx * dy / 4 * quarters
     plate = tissue.young * tissue.thickness**3 / 12 / (1 - 1 / 9)
     bending = plate if tissue.bending == "plate" else float(tissue.bending)
     virtual = tissue.foundation * dx * dy / 4 * quarters

@@ -8,6 +8,9 @@ from __future__ import annotations
 import math
 from typing import Any
 
+import numpy as np
+from numpy.typing import NDArray
+
 from taichi_msm.physics.lattice import spacing
 from taichi_msm.physics.material import MapImage, Material, map_factors
 from taichi_msm.physics.plan import Plan
@@ -30,7 +33,9 @@ def material_of(scene: Scene, image: MapImage | None) -> Material:
         assert scene.stiffness_map is not None
         factors = map_factors(scene.stiffness_map, image, rows - 1, cols - 1)
     if scene.tissue is not None:
-        mass = scene.tissue.density * scene.tissue.thickness * (dx * dy)
+        mass = (scene.tissue.density or 0.0) * scene.tissue.thickness * (dx * dy)
+    if scene.time.at_rest:
+        mass = 1.0  # Any will do.
     assert mass is not None
     derived: dict[str, Any] = {name: value for term in TERMS for name, value in term.derive(scene).items()}
     return Material(mass=mass, by_area=scene.tissue is not None, factors=factors, **derived)
@@ -39,6 +44,11 @@ def material_of(scene: Scene, image: MapImage | None) -> Material:
 def terms_of(plan: Plan) -> tuple[Term, ...]:
     """List the terms that a scene has."""
     return tuple(term for kind in TERMS if (term := kind.of(plan)) is not None)
+
+
+def inertia(plan: Plan) -> NDArray[np.float64]:
+    """Give every point a mass with which no frequency is above 1 [N/m]: so much stiffness it feels, (rows, cols)."""
+    return np.sum([np.broadcast_to(term.bounds(plan), plan.fixed.shape) for term in TERMS], axis=0)
 
 
 def highest_frequency(material: Material, sheet: Sheet) -> float:

@@ -55,6 +55,11 @@ class Term(ABC):
         """Bound the part of m w^2 that the term has in any motion [N/m]."""
         return 0.0
 
+    @classmethod
+    def bounds(cls, plan: Plan) -> NDArray[Any] | float:
+        """Bound the stiffness that each point feels, as `bound` does; shape (rows, cols), or one for all [N/m]."""
+        return cls.bound(plan.material, plan.scene.sheet)
+
     def numbers(self, plan: Plan) -> tuple[float, ...]:
         """Give its numbers."""
         return ()
