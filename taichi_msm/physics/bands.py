@@ -23,8 +23,9 @@ from collections.abc import Callable
 from typing import Any, NamedTuple
 
 from taichi_msm.physics.kernel import point_step
-from taichi_msm.physics.row import row_passing
+from taichi_msm.physics.row import row_passing, row_touching
 from taichi_msm.physics.terms.bending import BendingTerm
+from taichi_msm.physics.terms.contact import ContactTerm
 from taichi_msm.physics.terms.term import DY, KernelRow, KernelSheet, StepCode
 from taichi_msm.system.runtime import ITERATIONS_PER_THREAD, ti
 
@@ -77,13 +78,19 @@ def joining(code: StepCode) -> Callable[..., None]:
     return join_strips
 
 
-def stepping_row(code: StepCode, move: Callable[..., None], *, parallel: bool) -> Callable[..., Any]:
+def stepping_row(code: StepCode, move: Callable[..., None], *, touches: bool, parallel: bool) -> Callable[..., Any]:
     """Make the function that takes a step of a row of a band, as soon as the neighbours' rows allow it.
 
-    move: as for `row_passing`.
+    Args:
+        code: of the sheet.
+        move: what it does with an entry, as for `row_passing`.
+        touches: whether tools then push the points of the row out.
+        parallel: whether there are neighbours.
     """
     vector, bending, copied, join_strips = code.vector, code.get(BendingTerm), code.reach, joining(code)
     pass_row, storing = row_passing(code, move), [bending.storing(code)] if bending else []
+    contact = code.get(ContactTerm) if touches else None
+    touching = [row_touching(code, contact)] if contact else []
 
     @ti.func
     def copy_row(rows, worker, border, n, behind):
@@ -170,6 +177,9 @@ def stepping_row(code: StepCode, move: Callable[..., None], *, parallel: bool) -
                 after = moments + (row + 1) % MOMENTS
                 line = ti.static(KernelRow(i, kind, before, middle, after))
                 pass_row(sheet, carried, carry, line, here, other, exists, up, loads, n, row >= 0)
+                if row >= 0:
+                    for touch_row in ti.static(touching):
+                        touch_row(sheet, i, kind, loads, n)
             else:
                 for b in range(1, sheet.width - 1):
                     for c in ti.static(range(3)):
@@ -190,7 +200,10 @@ def stepping_row(code: StepCode, move: Callable[..., None], *, parallel: bool) -
 def advancing(code: StepCode, *, parallel: bool) -> Callable[..., None]:
     """Make the kernel that takes steps, with one worker or several."""
     real, vector, vectors, lanes = code.real, code.vector, code.vectors, code.lanes
-    count_of_numbers, step_row = code.first_number(None), stepping_row(code, point_step(code), parallel=parallel)
+    count_of_numbers, step_row = (
+        code.first_number(None),
+        stepping_row(code, point_step(code), touches=True, parallel=parallel),
+    )
 
     @ti.func
     def work(

@@ -10,6 +10,9 @@ turns their velocities v toward the forces; where these no longer do work, it st
 with norms over all points, weighted with M. M bounds the stiffness that a point feels, so that no frequency is above 1,
 and dt = 1 is stable and the largest step (`rest`). Stored is the momentum q = M v.
 
+Tools that are moved take their part of the forces off, and points that have moved are pushed out of them
+(`terms.contact_rest`): each point that presses on a tool also goes by F / M into it, so that it stays in touch.
+
 One evaluation of the forces goes through the rows as a step does; a second loop moves the points. Sums over points are
 taken along columns first, and then over the columns in their order, so that their bits do not depend on lanes.
 """
@@ -26,15 +29,19 @@ from numpy.typing import NDArray
 from taichi_msm.physics.bands import MOMENTS, RowBand, joining, stepping_row
 from taichi_msm.physics.kernel import SheetArrays, SheetLayout, Start, in_lanes, point_forces, reading
 from taichi_msm.physics.terms.bending import BendingTerm
+from taichi_msm.physics.terms.contact import ContactTerm
+from taichi_msm.physics.terms.contact_rest import bearing, keeping_out
 from taichi_msm.physics.terms.springs import SpringTerm
 from taichi_msm.physics.terms.term import MOVES, Entry, KernelRow, KernelSheet, StepCode
 from taichi_msm.system.runtime import our_compilation, ti, write
 
 # The numbers of a launch. It is given: rows of the sheet; columns of a strip; the first row that moves, and the row
-# after the last; how many evaluations it may take, and the square of the largest force with which it ends [N^2]. FIRE
+# after the last; how many evaluations it may take, the square of the largest force with which it ends [N^2], and
+# whether tools or points have been put elsewhere since the last launch. FIRE
 # keeps: the step, the share a, how many times in turn the forces have done work. It gives: the number of evaluations;
 # and of the last one the square of the largest force on a point [N^2], and the sum of F^2 / M, which tells NaN.
-ROWS, STRIP, FIRST_ROW, END_ROW, COUNT, ENOUGH, STEP, SHARE, WORKED, EVALUATIONS, LARGEST, SLOPE, NUMBERS = range(13)
+ROWS, STRIP, FIRST_ROW, END_ROW, COUNT, ENOUGH, PLACED, STEP, SHARE, WORKED = range(10)
+EVALUATIONS, LARGEST, SLOPE, NUMBERS = range(10, 14)
 
 # Sums over points of an evaluation: of F q / M, of F^2 / M and of q^2 / M; and the square of the largest force.
 POWER, STEEP, MOTION, SQUARE, SUMS = range(5)
@@ -52,7 +59,7 @@ class RestSheet(NamedTuple):
     """A `KernelSheet` with what FIRE needs besides."""
 
     u: Any
-    d: Any  # here the forces
+    d: Any  # here the forces, of all but the tools that are moved
     by_column: Any
     stiffness: Any
     fields: Any
@@ -88,11 +95,12 @@ class Relaxation:
         """Let the points stand still, and begin again with FIRE's first step."""
         for q in self._q:
             write(q, np.zeros((0, self._layout.code.lanes)))
-        self._fire[[STEP, SHARE, WORKED]] = LARGEST_STEP, FIRST_SHARE, 0
+        self._fire[[STEP, SHARE, WORKED, PLACED]] = LARGEST_STEP, FIRST_SHARE, 0, 1
 
     def place(self, displacement: NDArray[Any]) -> None:
         """Put the points where they have these displacements [m], shape (rows, cols, 3)."""
         held = (self._stored >= 0)[:, None]
+        self._fire[PLACED] = 1
         for c in range(3):
             write(self.arrays.u[c], in_lanes(self._layout, np.where(held, displacement[self._stored, :, c], 0)))
 
@@ -136,7 +144,8 @@ def _kernels(code: StepCode) -> tuple[Callable[..., None], Callable[..., None], 
 
 def _storing(code: StepCode) -> Callable[..., None]:
     """Make the function that stores the force on an entry, and adds what FIRE needs of it to the sums."""
-    vector, forces = code.vector, point_forces(code)
+    vector, forces, contact = code.vector, point_forces(code), code.get(ContactTerm)
+    bearings = [bearing(code, contact)] if contact else []
 
     @ti.func
     def store(sheet: ti.template(), entry: ti.template(), _target, force: ti.template(), now: ti.template()):
@@ -147,11 +156,14 @@ def _storing(code: StepCode) -> Callable[..., None]:
         inverse = sheet.work[at]
         power, square, motion = vector(0), vector(0), vector(0)
         for c in ti.static(range(3)):
-            held = ti.select(moves, force[c], vector(0))
+            force[c] = ti.select(moves, force[c], vector(0))
+            sheet.d[c][at] = force[c]
+        for bear in ti.static(bearings):
+            bear(force, sheet, at)
+        for c in ti.static(range(3)):
             q = sheet.q[c][at]
-            sheet.d[c][at] = held
-            power += held * q
-            square += held * held
+            power += force[c] * q
+            square += force[c] * force[c]
             motion += q * q
         for n, term in ti.static(((POWER, power), (STEEP, square), (MOTION, motion))):
             # To an array, += would be atomic.
@@ -167,8 +179,10 @@ def _relaxing(code: StepCode) -> Callable[..., None]:
     """Make the kernel that moves the points."""
     real, vector, vectors, lanes = code.real, code.vector, code.vectors, code.lanes
     count_of_numbers, join_strips = code.first_number(None), joining(code)
-    pass_row = stepping_row(code, _storing(code), parallel=False)
+    pass_row = stepping_row(code, _storing(code), touches=False, parallel=False)
     moments = 0 if code.get(BendingTerm) is None else MOMENTS
+    columns, contact = code.first_column(None), code.get(ContactTerm)
+    bearings, keepings = ([bearing(code, contact)], [keeping_out(code, contact)]) if contact else ([], [])
 
     @ti.func
     def add_up(sheet: ti.template(), n: ti.template()):
@@ -188,17 +202,35 @@ def _relaxing(code: StepCode) -> Callable[..., None]:
             pass_row(sheet, sheet.u, row, band, line, 0, 0, sheet.rows + moments, sheet.rows)
 
     @ti.func
-    def move_points(sheet: ti.template(), band: ti.template(), keep, gain, dt, back):
+    def move_points(sheet: ti.template(), row: ti.template(), band: ti.template(), keep, gain, dt, back):
         """Turn the momenta, q = keep q + gain F, and move the points by dt q / M, less `back` times their old q / M."""
         for i in range(band.low, band.high):
             for b in range(1, sheet.width - 1):
                 at = i * sheet.width + b
+                every = [sheet.d[c][at] for c in ti.static(range(3))]
+                force = [every[c] for c in ti.static(range(3))]
+                for bear in ti.static(bearings):
+                    bear(force, sheet, at)
                 for c in ti.static(range(3)):
                     before = sheet.q[c][at]
-                    q = keep * before + gain * sheet.d[c][at]
+                    q = keep * before + gain * force[c]
                     sheet.q[c][at] = q
-                    sheet.u[c][at] = sheet.u[c][at] + (dt * q - back * before) * sheet.work[at]
-            join_strips(sheet.u, i, sheet.width)
+                    moved = dt * q - back * before
+                    if ti.static(len(bearings) > 0):
+                        moved += every[c] - force[c]
+                    sheet.u[c][at] = sheet.u[c][at] + moved * sheet.work[at]
+            settle_row(sheet, row, i)
+
+    @ti.func
+    def settle_row(sheet: ti.template(), row: ti.template(), i):
+        """Keep a row that has moved out of the tools, and fill its halo."""
+        kind = ti.select(i == sheet.rows - 1, 2, ti.select(i == 0, 0, 1))
+        if ti.static(len(keepings) > 0):
+            now = [row[0, c] for c in ti.static(range(columns))]
+            for b in range(1, sheet.width - 1):
+                for keep_out in ti.static(keepings):
+                    keep_out(sheet, i, kind, b, now)
+        join_strips(sheet.u, i, sheet.width)
 
     @ti.kernel
     def relax(
@@ -220,6 +252,10 @@ def _relaxing(code: StepCode) -> Callable[..., None]:
             u, forces, q = ti.static((u_x, u_y, u_z), (d_x, d_y, d_z), (q_x, q_y, q_z))
             sheet = ti.static(RestSheet(u, forces, by_column, stiffness, fields, numbers, rows, width, q, work))
             band = ti.static(RowBand(0, 1, low, high, 1, rows, 0, fire))
+            if fire[PLACED] > 0:
+                for i in range(low, high):
+                    settle_row(sheet, row, i)
+                fire[PLACED] = 0
             evaluations = 0
             goes = True
             while goes and evaluations < count:
@@ -253,7 +289,7 @@ def _relaxing(code: StepCode) -> Callable[..., None]:
                         # |q + dt F| and |F|, weighted with 1 / M.
                         turned = ti.sqrt((motion + 2 * dt * power + dt * dt * slope) / slope)
                         gain = keep * dt + fire[SHARE] * turned
-                    move_points(sheet, band, keep, gain, dt, back)
+                    move_points(sheet, row, band, keep, gain, dt, back)
             fire[EVALUATIONS] = evaluations
 
     return relax

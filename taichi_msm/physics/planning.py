@@ -14,6 +14,7 @@ from taichi_msm.errors import Problem, SceneError
 from taichi_msm.physics import workload
 from taichi_msm.physics.lattice import fixed_points, spacing
 from taichi_msm.physics.material import MapImage, Material, kind_problems, read_map, tissue_problems
+from taichi_msm.physics.paths import path_problems, tools_of
 from taichi_msm.physics.plan import Plan, slots_of
 from taichi_msm.physics.terms import highest_frequency, material_of
 from taichi_msm.picture import PictureError
@@ -55,7 +56,7 @@ def try_plan(scene: Scene, image: MapImage | None = None) -> tuple[Plan | None, 
     if problems:
         return None, problems
     plan = _plan(scene, image, fixed, material)
-    return plan, list(_step_problems(plan))
+    return plan, [*_step_problems(plan), *path_problems(scene, plan.tools, plan.grid)]
 
 
 def variant(plan: Plan, scene: Scene) -> Plan:
@@ -70,7 +71,8 @@ def _material(scene: Scene, image: MapImage | None) -> Material:
 def _plan(scene: Scene, image: MapImage | None, fixed: NDArray[np.bool_], material: Material) -> Plan:
     limit = stable_step(material, scene.sheet, scene.time.damping_difference)
     grid = TimeGrid(scene.time.frames_per_second, scene.time.frames, steps_per_frame(scene.time, limit), "f64")
-    return on(Plan(scene, image, fixed, material, limit, grid, slots_of(scene, grid)), "cpu")
+    tools = tools_of(scene.probes, scene.sheet)
+    return on(Plan(scene, image, fixed, material, limit, grid, slots_of(scene, grid), tools), "cpu")
 
 
 def on(plan: Plan, arch: str) -> Plan:

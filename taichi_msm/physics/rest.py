@@ -1,18 +1,24 @@
-"""The sheet at rest: every frame is the equilibrium under its loads, found from the frame before.
+"""The sheet at rest: every frame is the equilibrium under its loads and tools, found from the frame before.
 
 A frame is done when the largest force that is left on a point is at most ENOUGH of the largest force of a spring, a
 load or the foundation. FIRE (`kernel_rest`) follows the forces down from the frame before, with masses of its own, so
-that a sheet that has buckled goes on as it has begun.
+that a sheet that has buckled goes on as it has begun. Tools that are moved come by at most half a radius between
+shapes, of which those between two frames are found less closely.
 
 A balance need not be stable: a flat sheet that is pressed together in its plane stays flat as long as nothing disturbs
 it. So every frame is disturbed once, when only the share DISTURBED of the forces is left: each point is moved at
 random, by no more than these forces would move it. Where the balance is stable this dies out with the rest of the
 motion. Where it is not it grows, about as fast as a mode dies out that is as stiff, and FIRE goes on to where the sheet
 buckles. So an instability that is much weaker than the softest mode of the sheet may go unnoticed.
+
+Where nothing presses on the flat sheet, that is the shape: without tension it has no stiffness out of its plane, so
+that the forces would never tell the way back.
 """
 
 from __future__ import annotations
 
+import math
+from collections.abc import Iterator
 from typing import Any
 
 import numpy as np
@@ -23,22 +29,28 @@ from taichi_msm.faults import SMALLEST
 from taichi_msm.physics.divergence import farthest
 from taichi_msm.physics.kernel import SheetLayout, Start
 from taichi_msm.physics.kernel_rest import Relaxation
+from taichi_msm.physics.lattice import rest_positions
 from taichi_msm.physics.loads import frame_loads
+from taichi_msm.physics.paths import GRASP, Tool
 from taichi_msm.physics.plan import Plan
 from taichi_msm.physics.solver import Dynamics
 from taichi_msm.physics.state import Reading, State
 from taichi_msm.physics.terms import inertia
+from taichi_msm.physics.terms.contact import AFTER, COLUMNS, HELD, PUSHES, SINCE, TAKEN, TOOL_COLUMNS, ContactTerm
 from taichi_msm.progress import Pause
+from taichi_msm.scene import WHOLE
 from taichi_msm.system.runtime import Device
 
 # A frame is done when the forces left are this share of the largest; it is disturbed when they are that share.
 ENOUGH, DISTURBED = 1e-7, 1e-3
 
-# A frame takes at most so many evaluations for each point of the longer side; one that buckles takes up to 200.
+# A shape takes at most so many evaluations for each point of the longer side; one that buckles takes up to 200.
 MOST_EVALUATIONS = 2000
 
 # A launch evaluates the forces at most so many times, and of so many points in all, about 0.1 s of a core.
 PER_LAUNCH, POINTS_PER_LAUNCH = 64, 40_000_000
+
+Array = NDArray[np.float64]
 
 
 class Rest(Dynamics):
@@ -52,7 +64,7 @@ class Rest(Dynamics):
     def restart(self, plan: Plan, state: State | None = None) -> None:
         """Begin again, as `Dynamics` does; without a state the first frame is yet to be found."""
         self.evaluations, self.residual = 0, 0.0
-        self._settled = None if state is None else state.displacement
+        self._settled = state
         super().restart(plan, state)
 
     def advance(self, steps: int, pause: Pause = lambda: None) -> None:
@@ -61,7 +73,7 @@ class Rest(Dynamics):
         After an exception from a pause another call begins anew from the last frame that was found.
 
         Raises:
-            DivergedError: when there is no shape in which the forces balance, or it was not found.
+            DivergedError: when no shape was found in which the forces balance.
         """
         self._require_whole()
         end = self.steps_done + steps
@@ -69,26 +81,40 @@ class Rest(Dynamics):
             frame = self.steps_done + (self._settled is not None)
             self._settle(frame, pause)
             self.steps_done = frame
+            displacement = self._copy(differences=False)[0]
+            self._settled = State(frame, displacement, np.zeros_like(displacement), self._contact())
 
     def compile(self) -> None:
         """Compile everything without moving anything."""
-        row = self._columns(frame_loads(self.plan, 0))
+        row = self._columns(frame_loads(self.plan, 0), 0)
         self._relaxation.relax(0, 0.0, row)
         self._relaxation.scale(row)
         self.displacement()
 
     def state(self) -> State:
-        """Read everything that the next frames depend on."""
-        displacement = self._copy(differences=False)[0] if self._settled is None else self._settled
-        return State(self.steps_done, displacement, np.zeros_like(displacement))
+        """Read everything that the next frames depend on: the last frame that was found."""
+        return self._before
 
     def read(self) -> Reading:
         """Read the displacements and measure the sheet; its energy is that of springs and bending."""
         reading = super().read()
         return reading._replace(residual=self.residual, evaluations=self.evaluations)
 
+    def tool_forces(self) -> Array:
+        """Give the force of each tool that is moved on the sheet [N], shape (tools, 3).
+
+        It is minus the sum of all other forces on the points that the tool touches or holds.
+        """
+        code, tools = self.structure.code, len(self.plan.tools)
+        forces, contact = self._copy(differences=True)[0], self._contact()
+        normals = contact[: PUSHES * tools].reshape(tools, PUSHES, *forces.shape[:2])
+        shares = (normals != 0).any(axis=1)
+        if code.require(ContactTerm).grips:
+            shares |= contact[PUSHES * tools + HELD] == np.arange(1, tools + 1)[:, None, None]
+        return -np.einsum("tij,ijk->tk", shares.astype(float), forces)
+
     def _started(self, start: Start) -> Any:
-        self._astray = self._settled is None
+        self._astray = False
         # A point without any stiffness has no place to rest either.
         self._masses = np.maximum(inertia(self.plan), SMALLEST)
         return Relaxation(self.structure, start, self._masses)
@@ -98,6 +124,15 @@ class Rest(Dynamics):
         assert isinstance(self._sheet, Relaxation), "it is closed"
         return self._sheet
 
+    @property
+    def _before(self) -> State:
+        """The last frame that was found; before the first one, the flat sheet."""
+        if self._settled is not None:
+            return self._settled
+        shape, contact = (self.structure.rows, self.structure.cols), self.structure.code.get(ContactTerm)
+        none = np.zeros((0 if contact is None else contact.field_count, *shape))
+        return State(0, np.zeros((*shape, 3)), np.zeros((*shape, 3)), none)
+
     def _tabulate(self, count: int) -> None:
         """Leave it: the loads of a frame are found when it is its turn."""
 
@@ -105,38 +140,100 @@ class Rest(Dynamics):
         return 0.0
 
     def _settle(self, frame: int, pause: Pause) -> None:
-        """Find the shape of a frame, and keep it."""
-        relaxation, loads = self._relaxation, frame_loads(self.plan, frame)
-        row, points = self._columns(loads), self.structure.rows * self.structure.cols
-        # Where nothing presses, the sheet comes back; without tension a flat sheet has no stiffness that would say how.
-        if self._settled is None or not loads.strength.any():
-            relaxation.place(np.zeros((self.structure.rows, self.structure.cols, 3)))
-        elif self._astray:
-            relaxation.place(self._settled)
-        relaxation.stop()
+        """Find the shape of a frame."""
+        relaxation, before, loads = self._relaxation, self._before, frame_loads(self.plan, frame)
+        contact = self._gripping(frame, before)
+        holds = len(contact) > PUSHES * len(self.plan.tools) and contact[PUSHES * len(self.plan.tools) + HELD].any()
+        if len(contact):
+            relaxation.arrays.set_fields(self.structure.code.first_field(ContactTerm), contact)
+        *ways, last = (self._at(time, frame, self._columns(loads, frame)) for time in self._times(frame))
+        if not loads.strength.any() and not holds:
+            relaxation.place(np.zeros_like(before.displacement))
+            self._astray = True
+            done, left = relaxation.relax(1, 0.0, last)
+            self.evaluations += done
+            if left == 0:
+                self._astray, self.residual = False, 0.0
+                return
+        if self._astray:
+            relaxation.place(before.displacement)
         self._astray = True
-        per_launch = max(1, min(PER_LAUNCH, POINTS_PER_LAUNCH // points))
-        most = MOST_EVALUATIONS * max(self.structure.rows, self.structure.cols)
-        evaluations, disturbed, scale = 0, False, relaxation.scale(row)
+        for row in ways:
+            self._relax(frame, row, DISTURBED, pause)
+        self.residual = self._relax(frame, last, ENOUGH, pause)
+        self._astray = False
+
+    def _times(self, frame: int) -> list[float]:
+        """List the times of the shapes on the way to a frame, and that of the frame itself."""
+        rate = self.plan.grid.frames_per_second
+        begin, end = max(0, frame - 1) / rate, frame / rate
+        return sorted({end, *(float(time) for tool in self.plan.tools for time in tool.strides(begin, end))})
+
+    def _at(self, time: float, frame: int, row: NDArray[Any]) -> NDArray[Any]:
+        """Put the tools in a row of the table of loads where they are at a time on the way to a frame."""
+        for n, tool in enumerate(self.plan.tools):
+            own = self.structure.code.first_column(ContactTerm) + COLUMNS + TOOL_COLUMNS * n
+            middle = tool.middle(np.array([time]))[0]
+            row[0, own + AFTER : own + AFTER + 3] = middle
+            for taken, _ in self._held(tool, frame):
+                row[0, own + SINCE : own + SINCE + 3] = middle - self._taken_at(tool, taken)
+        return row
+
+    def _held(self, tool: Tool, frame: int) -> Iterator[tuple[int, int]]:
+        """Give the grip of a tool at a frame, if any: the frame when it begins, and that when it ends."""
+        rate = self.plan.grid.frames_per_second
+        for grip in tool.grips:
+            # The first frames at or after these times, but for rounding.
+            begin, end = (max(0, math.ceil(time * rate - WHOLE)) for time in grip)
+            if begin <= frame < end:
+                yield begin, end
+
+    def _taken_at(self, tool: Tool, frame: int) -> Array:
+        """Tell where a tool was when it took hold at a frame: with the points as they were the frame before."""
+        return tool.middle(np.array([max(0, frame - 1) / self.plan.grid.frames_per_second]))[0]
+
+    def _gripping(self, frame: int, before: State) -> NDArray[Any]:
+        """Give the fields of contact at the start of a frame: grips that end let go, and others take hold."""
+        tools, contact = self.plan.tools, before.contact.copy()
+        if len(contact) == PUSHES * len(tools):
+            return contact
+        held, taken = contact[PUSHES * len(tools) + HELD], contact[PUSHES * len(tools) + TAKEN :]
+        place = rest_positions(self.plan.scene.sheet) + before.displacement
+        begun = [any(begin == frame for begin, _ in self._held(tool, frame)) for tool in tools]
+        for n, tool in enumerate(tools):
+            if begun[n] or not any(self._held(tool, frame)):
+                held[held == n + 1] = 0
+        for n, tool in enumerate(tools):
+            if begun[n]:
+                near = np.linalg.norm(place - self._taken_at(tool, frame), axis=-1) <= GRASP * tool.radius
+                takes = near & ~self.plan.fixed & (held == 0)
+                held[takes] = n + 1
+                taken[:, takes] = before.displacement[takes].T
+        return contact
+
+    def _relax(self, frame: int, row: NDArray[Any], wanted: float, pause: Pause) -> float:
+        """Let the points go to where at most a share of the forces is left; returns that share."""
+        relaxation, longer = self._relaxation, max(self.structure.rows, self.structure.cols)
+        relaxation.stop()
+        per_launch = max(1, min(PER_LAUNCH, POINTS_PER_LAUNCH // (self.structure.rows * self.structure.cols)))
+        most, evaluations, disturbed = MOST_EVALUATIONS * longer, 0, wanted >= DISTURBED
+        scale = relaxation.scale(row)
         while True:
             # The first evaluation tells whether there is anything to do.
             first = evaluations == 0
-            enough = (ENOUGH if first or disturbed else DISTURBED) * scale
+            enough = (wanted if first or disturbed else DISTURBED) * scale
             done, left = relaxation.relax(1 if first else min(per_launch, most - evaluations), enough, row)
             evaluations += done
             scale = relaxation.scale(row)
-            if left <= min(enough, ENOUGH * scale):
-                break
+            if left <= min(enough, wanted * scale):
+                self.evaluations += evaluations
+                return left / scale if scale > 0 else 0.0
             if not (left < np.inf and scale < np.inf) or evaluations >= most:
                 raise self._diverged(frame, left / scale, evaluations)
             if left <= enough and not disturbed:
                 self._disturb(left)
                 disturbed = True
             pause()
-        self._astray = False
-        self._settled = self._copy(differences=False)[0]
-        self.evaluations += evaluations
-        self.residual = left / scale if scale > 0 else 0.0
 
     def _disturb(self, force: float) -> None:
         """Move every point at random, by at most what a force [N] moves it; always in the same way."""
