@@ -88,7 +88,7 @@ class Watch:
                 reach=where.reach,
                 peak=max(progress.peak, reading.energy),
                 residual=max(progress.residual, reading.residual),
-                evaluations=reading.evaluations,
+                evaluations=progress.evaluations + reading.evaluations,
             )
         return wrong
 

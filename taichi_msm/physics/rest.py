@@ -57,7 +57,7 @@ class Rest(Dynamics):
     """The sheet at rest, in the place of the sheet in motion: a frame is a step.
 
     Attributes:
-        evaluations: of the forces so far.
+        evaluations: how often the forces were evaluated for the last frame.
         residual: of the last frame: the largest force left, as a share of the largest force.
     """
 
@@ -141,6 +141,7 @@ class Rest(Dynamics):
 
     def _settle(self, frame: int, pause: Pause) -> None:
         """Find the shape of a frame."""
+        self.evaluations = 0
         relaxation, before, loads = self._relaxation, self._before, frame_loads(self.plan, frame)
         contact = self._gripping(frame, before)
         holds = len(contact) > PUSHES * len(self.plan.tools) and contact[PUSHES * len(self.plan.tools) + HELD].any()

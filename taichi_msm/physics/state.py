@@ -27,7 +27,7 @@ class Reading(NamedTuple):
     shortest_spring: float
     longest_spring: float
     energy: float  # kinetic energy and that of springs and bending, without the virtual springs [J]
-    # At rest: the largest force left on a point, as a share of the largest force; evaluations of the forces so far.
+    # At rest: the largest force left on a point, as a share of the largest force; evaluations of the forces for it.
     residual: float = 0.0
     evaluations: int = 0
 
@@ -44,7 +44,7 @@ class RunProgress:
     energy: float = 0.0  # as in a `Reading`, at this frame [J]
     reach: float = 0.0  # root of the sum of all squared displacements at this frame [m]
     peak: float = 0.0  # largest energy at any frame so far [J]
-    # residual, evaluations: as in a `Reading`; the residual is the largest of any frame so far
+    # residual, evaluations: as in a `Reading`; the largest residual of any frame so far, and all evaluations
     residual: float = 0.0
     evaluations: int = 0
 

@@ -92,6 +92,9 @@ def _spare(data: dict[str, Any], problems: list[Problem]) -> dict[str, Any]:
     spared = {name: value for name, value in data.items() if name not in faulty} | {
         name: value for name, value in _STAND_INS.items() if name in faulty
     }
+    time = data.get("time")
+    if "time" in faulty and isinstance(time, Mapping) and time.get("motion", "dynamic") != "dynamic":
+        spared["time"] = {**spared["time"], "motion": "quasistatic"}
     if "sheet" in faulty and "tissue" not in spared:
         spared["sheet"] = {**spared["sheet"], "mass": 1}
     return spared
