@@ -22,7 +22,7 @@ from taichi_msm.study.measure import study
 from taichi_msm.system.runtime import Device
 from tests.conftest import Program
 from tests.scenes import plan_of
-from tests.test_rest import NEVER, PRESSED, PUSH, SHEET, TISSUE, at_rest
+from tests.test_rest import NEVER, PRESSED, PUSH, TISSUE, at_rest
 
 LOADED = {**PUSH, "load": [[0, 50], [2, 100]]}
 FRAMES = 4

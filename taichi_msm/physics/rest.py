@@ -105,13 +105,16 @@ class Rest(Dynamics):
 
         It is minus the sum of all other forces on the points that the tool touches or holds.
         """
-        code, tools = self.structure.code, len(self.plan.tools)
-        forces, contact = self._copy(differences=True)[0], self._contact()
-        normals = contact[: PUSHES * tools].reshape(tools, PUSHES, *forces.shape[:2])
-        shares = (normals != 0).any(axis=1)
-        if code.require(ContactTerm).grips:
-            shares |= contact[PUSHES * tools + HELD] == np.arange(1, tools + 1)[:, None, None]
-        return -np.einsum("tij,ijk->tk", shares.astype(float), forces)
+        return -np.einsum("tij,ijk->tk", self._touched().astype(float), self._copy(differences=True)[0])
+
+    def _touched(self) -> NDArray[np.bool_]:
+        """Tell which points each tool touches or holds, shape (tools, rows, cols)."""
+        tools, contact = len(self.plan.tools), self._contact()
+        normals = contact[: PUSHES * tools].reshape(tools, PUSHES, self.structure.rows, self.structure.cols)
+        touched = (normals != 0).any(axis=1)
+        if len(contact) > PUSHES * tools:
+            touched |= contact[PUSHES * tools + HELD] == np.arange(1, tools + 1)[:, None, None]
+        return np.asarray(touched)
 
     def _started(self, start: Start) -> Any:
         self._astray = False
@@ -248,13 +251,13 @@ class Rest(Dynamics):
         """Say that no shape was found, how far the forces were from balance, and what may help."""
         plan, time = self.plan, frame / self.plan.grid.frames_per_second
         row, column, *_ = farthest(self._copy(differences=True)[0])
-        held = plan.fixed.any() or plan.material.virtual > 0
         remedy = (
-            "the sheet may fold or wrinkle without end; take a weaker load, tissue.bending or pretension, or "
-            "time.motion: dynamic"
-            if held
-            else "nothing holds the sheet; fix a side, or give it a foundation"
+            "the sheet may hang slack, fold or wrinkle; give it a foundation, pretension or bending, or take less load"
         )
+        if not (plan.fixed.any() or plan.material.virtual > 0):
+            remedy = "nothing holds the sheet; fix a side, or give it a foundation"
+        elif (self._touched().sum(axis=0) > 1).any():
+            remedy = "two tools press on one point; keep them apart"
         said = (
             f"diverged at {time:.6g} s, frame {frame}: no shape was found in which the forces balance: after "
             f"{evaluations} evaluations, {left:.2g} of the largest force is left at point ({row}, {column}), and "
