@@ -196,6 +196,20 @@ def test_a_flat_sheet_that_is_pressed_together_buckles(device: Device) -> None:
     assert softest(plan, in_plane, 1) < 0 < softest(plan, u, 1)
 
 
+# With a force of CRITICAL the softest mode of the flat sheet loses its stiffness; found by bisection with `softest`.
+CRITICAL = [({"foundation": 3e3}, 2.0314), ({"foundation": 100, "bending": "plate"}, 0.24046)]
+
+
+@pytest.mark.parametrize(("keys", "critical"), CRITICAL)
+def test_it_buckles_near_the_critical_load(keys: dict[str, Any], critical: float, device: Device) -> None:
+    for share, buckles in ((0.99, False), (1.03, True)):
+        squeeze = {**SQUEEZE, "total": [share * critical, 0, 0]}
+        plan = plan_of(tissue(squeeze, foundation_active="always", **keys))
+        u = shape_of(plan, device)
+        assert (np.abs(u[..., 2]).max() > 1e-3) == buckles
+        assert softest(plan, u, 1) > 0
+
+
 def softest(plan: Plan, u: Array, frame: int) -> float:
     """The smallest eigenvalue of the stiffness of the points that move [N/m]."""
     free, loads = ~plan.fixed, frame_loads(plan, frame)
