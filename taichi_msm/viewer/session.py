@@ -24,7 +24,8 @@ from taichi_msm.simulation import Simulation
 from taichi_msm.system import runtime
 from taichi_msm.viewer import events, hud
 from taichi_msm.viewer.captures import Captures, Film, probe_values
-from taichi_msm.viewer.held_tool import Controller, HeldTool, Place
+from taichi_msm.viewer.controller import Controller
+from taichi_msm.viewer.held_tool import HeldTool, Place
 from taichi_msm.viewer.viewport import Viewport
 
 # A session has at most this many frames per second, what a screen shows; each is a whole part of a frame of the scene.
