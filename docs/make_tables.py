@@ -91,7 +91,7 @@ TABLES: dict[tuple[str, str], Callable[[], str]] = {
     ("python", "names"): names,
     ("sweep", "sweep keys"): partial(model_keys, SweepSettings, "key", "meaning", "value", "default"),
     ("sweep", "distributions"): partial(model_keys, Distribution, "way", "how the key varies", "value"),
-    ("command-line", "outputs"): partial(outputs, "picture", "positions"),
+    ("command-line", "outputs"): partial(outputs, "picture", "positions", "forces"),
     ("labels", "labels"): partial(outputs, "labels", "flow", "tracks"),
 }
 

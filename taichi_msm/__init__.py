@@ -18,6 +18,7 @@ if TYPE_CHECKING:
         SceneError,
     )
     from taichi_msm.exports.convert import export
+    from taichi_msm.physics.state import TipForce
     from taichi_msm.playback import Playback
     from taichi_msm.render.labels import Flow, Labels, Sight
     from taichi_msm.render.surface import Surface
@@ -47,6 +48,7 @@ _HOMES = {
     **dict.fromkeys(("Flow", "Labels", "Sight"), "render.labels"),
     **dict.fromkeys(("resume", "run"), "runner"),
     "Playback": "playback",
+    "TipForce": "physics.state",
     "Simulation": "simulation",
     "Surface": "render.surface",
     "Outcome": "sweeps.outcome",
@@ -80,6 +82,7 @@ __all__ = [
     "StiffnessMap",
     "Surface",
     "Time",
+    "TipForce",
     "Tissue",
     "export",
     "load_scene",

@@ -293,7 +293,7 @@ class _Run:
             position = writer.position(frame) if frame < self._resumed else simulation.positions()
             with stage("render"):
                 observed = simulation.observe(observed.labels, position, frame / scene.time.frames_per_second)
-            writer.add(position, observed, told)
+            writer.add(position, observed, simulation.forces(), told)
             if self._error and frame > 0:
                 with stage("pilot"):
                     self._error.follow(position - rest, told)

@@ -10,7 +10,7 @@ import shutil
 import subprocess
 import sys
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -21,6 +21,7 @@ from PIL import Image
 
 from taichi_msm import FilesError, resume, run, runner
 from taichi_msm.physics import solver, workload
+from taichi_msm.physics.state import TipForce
 from taichi_msm.results.checkpoint import MANIFEST, POSITIONS, STATE, Checkpoint
 from taichi_msm.results.record import RunRecord
 from taichi_msm.scene import Scene
@@ -141,13 +142,12 @@ def test_a_run_that_finds_the_disk_full_goes_on_when_it_is_not(
     earlier = files(small / "parts")
     add = Checkpoint.add
 
-    def full(checkpoint: Checkpoint, position: NDArray[Any]) -> None:
+    def full(checkpoint: Checkpoint, position: NDArray[Any], forces: Sequence[TipForce]) -> None:
         if checkpoint.frames == 6:
             # Half of the positions fit.
-            assert checkpoint._positions
-            checkpoint._positions.write(position.tobytes()[:500])
+            checkpoint._positions._file.write(position.tobytes()[:500])
             raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
-        add(checkpoint, position)
+        add(checkpoint, position, forces)
 
     with monkeypatch.context() as patch:
         patch.setattr(Checkpoint, "add", full)

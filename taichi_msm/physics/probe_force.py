@@ -78,7 +78,11 @@ def control_points(probe: Probe, sheet: Sheet) -> tuple[Array, Array]:
 
 def control_point(probe: Probe, sheet: Sheet, time: float) -> Array:
     """Give a probe's control point at a time, x and y at rest [m], shape (2,); where it jumps, the one it jumps to."""
-    times, points = control_points(probe, sheet)
+    return point_at(*control_points(probe, sheet), time)
+
+
+def point_at(times: Array, points: Array, time: float) -> Array:
+    """Give the control point with these keys at a time [s], as `control_point` does."""
     # Times of frames are rounded.
     after = int(np.searchsorted(times, time + SAME_TIME * max(1.0, abs(time)), side="right"))
     if after in (0, len(times)):

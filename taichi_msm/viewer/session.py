@@ -11,10 +11,11 @@ from numpy.typing import NDArray
 
 from taichi_msm.errors import DivergedError, FilesError, SceneError
 from taichi_msm.outputs.gif import Picture
+from taichi_msm.physics.deformed import touched
 from taichi_msm.physics.plan import Plan
 from taichi_msm.physics.planning import variant, with_time
 from taichi_msm.physics.probe_force import probe_force
-from taichi_msm.render.surface import rod, rods, touched
+from taichi_msm.render.surface import rod, rods
 from taichi_msm.render.texture import load_texture
 from taichi_msm.scene import MAX_PROBES, Scene
 from taichi_msm.scenefile.resolve import resolve

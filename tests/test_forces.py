@@ -1,0 +1,132 @@
+"""The forces of probes on the sheet: against the twin, and against what must hold of any force."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from taichi_msm import Simulation
+from taichi_msm.physics.deformed import touched
+from taichi_msm.physics.kernel import SheetLayout
+from taichi_msm.physics.lattice import rest_positions
+from taichi_msm.physics.probe_force import control_point, probe_records
+from taichi_msm.scene import Scene
+from taichi_msm.system.runtime import Device
+from tests import reference
+from tests.motion import dynamics_of, structure_of
+from tests.scenes import plan_of, scene
+from tests.test_contact import CASES, PRESSED, touching
+from tests.test_dynamics import as_on_a_gpu, with_lanes
+
+Array = NDArray[np.float64]
+
+
+def expected_forces(made: Scene) -> Array:
+    """The twin's mean force of every probe at every frame but the first [N], shape (frames, probes, 3)."""
+    plan = plan_of(made)
+    per_frame, found = plan.grid.steps_per_frame, []
+    for n, (_, contact) in enumerate(reference.steps(plan)):
+        if n > 0:
+            found.append(contact.force.sum(axis=(1, 2)))
+    return np.array(found).reshape(-1, per_frame, len(made.probes), 3).mean(axis=1)
+
+
+@pytest.mark.parametrize(("precision", "error"), [("f32", 2e-3), ("f64", 1e-13)])
+@pytest.mark.parametrize("difference", ["central", "backward"])
+def test_the_force_of_a_tool_is_that_of_the_twin(precision: str, error: float, difference: str, device: Device) -> None:
+    """In f32, positions of 0.1 m are rounded by 4e-9 m, and pushes are 1e-5 m."""
+    made = touching(CASES["together"], time={"precision": precision, "damping_difference": difference})
+    forces, expected = [], expected_forces(made)
+    with Simulation(made, threads=device.threads) as simulation:
+        assert all(one.force == (0, 0, 0) for one in simulation.forces())
+        for frame, each in enumerate(expected):
+            simulation.advance()
+            forces.append([one.force for one in simulation.forces()])
+            lowest = [tool.lowest((frame + 1) / 25) for tool in plan_of(made).tools]
+            assert [one.tip for one in simulation.forces()] == lowest
+            assert np.abs(np.array(forces[-1]) - each).max() < error * np.abs(expected).max()
+        norms = np.linalg.norm(forces, axis=2)
+        for index, peak in enumerate(simulation.felt.greatest):
+            greatest = int(norms[:, index].argmax())
+            assert (peak.time, peak.force) == ((greatest + 1) / 25, forces[greatest][index])
+
+
+def test_lanes_and_workers_do_not_change_the_bits_of_forces(device: Device) -> None:
+    def forces(layout: SheetLayout) -> list[bytes]:
+        dynamics, found = dynamics_of(made, device, layout), []
+        for _ in range(plan.grid.frames):
+            dynamics.advance(plan.grid.steps_per_frame)
+            found.append(dynamics.tool_forces().tobytes())
+        dynamics.close()
+        return found
+
+    sheet = {"points": [17, 21], "size": [0.3, 0.4], "fixed": ["left"]}
+    made = touching(CASES["together"], sheet=sheet, time={"precision": "f32"})
+    plan, layout = plan_of(made), structure_of(made, device)
+    plain = forces(layout)
+    assert len(set(plain)) == plan.grid.frames
+    for lanes, workers in ((layout.code.lanes, 2), (4, 1), (1, 2)):
+        assert forces(replace(with_lanes(layout, lanes), workers=workers)) == plain
+    assert forces(as_on_a_gpu(layout)) == plain
+
+
+# Jumps up at a frame, down between two, and to another place at a third.
+JUMPING: dict[str, Any] = {
+    "at": [[0, 0.4, 0.5], [0.2, 0.6, 0.5], [0.2, 0.3, 0.5]],
+    "load": [[0, 0], [0.08, 50], [0.08, 100], [0.17, 100], [0.17, 0], [0.2, 0], [0.3, 80]],
+    "falloff": 40,
+    "force": [1, 0, -3],
+    "offset": 0,
+}
+
+
+def test_the_force_of_a_load_is_that_at_the_frame(device: Device) -> None:
+    made = scene(probes=[JUMPING])
+    rate = made.time.frames_per_second
+    percents = {0: 0, 1: 25, 2: 100, 3: 100, 4: 100, 5: 0, 6: 80 * 0.4, 7: 80 * 0.8, 8: 80}
+    rest, free = rest_positions(made.sheet), ~plan_of(made).fixed
+    with Simulation(made, threads=device.threads) as simulation:
+        for frame, percent in percents.items():
+            (felt,) = simulation.forces()
+            at = control_point(made.probes[0], made.sheet, frame / rate)
+            distance = np.hypot(*(rest[..., :2] - at).T).T
+            total = np.exp(-40 * distance)[free].sum() * percent / 100
+            np.testing.assert_allclose(felt.force, np.array([1, 0, -3]) * total, rtol=1e-13, atol=0)
+            assert felt.tip == tuple(touched(simulation.positions(), made.render.refine, made.sheet, at)[0])
+            assert felt.tip[2] < 0 or frame == 0
+            simulation.advance()
+
+
+def test_a_tool_far_from_what_is_fixed_has_the_force_that_is_told(device: Device) -> None:
+    probe = {"total": [1, 0, -2], "radius": 0.01, "falloff": 500, "load": [[0, 100]]}
+    made = touching([probe], sheet={"points": [17, 21], "size": [0.3, 0.4], "fixed": "none"})
+    (record,) = probe_records(made)
+    with Simulation(made, threads=device.threads) as simulation:
+        (felt,) = simulation.forces()
+    assert record is not None
+    assert np.linalg.norm(felt.force) == pytest.approx(record["total_force"], rel=1e-14)
+
+
+def test_forces_go_on_where_they_were_saved(device: Device) -> None:
+    made = touching([PRESSED, {"total": [0, 0, -1], "at": [0.2, 0.2], "load": [[0, 0], [0.2, 100], [0.4, 0]]}])
+    with Simulation(made, threads=device.threads) as simulation:
+        first = simulation.forces()
+        simulation.advance(6)
+        saved, felt = simulation.save(), simulation.forces()
+        simulation.advance(4)
+        end = simulation.felt
+        assert end.forces[0] != felt[0]
+        simulation.restore(saved)
+        assert simulation.forces() == felt
+        simulation.advance(4)
+        assert simulation.felt == end
+        simulation.restart()
+        assert simulation.forces() == first
+        simulation.advance(10)
+        assert simulation.felt == end
+        with pytest.raises(Exception, match=r"saved at step .* probes"):
+            simulation.restore(saved._replace(felt=saved.felt._replace(forces=())))
