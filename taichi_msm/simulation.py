@@ -178,7 +178,7 @@ class Simulation:
         self._gauge = Gauge(plan)
         self._plan, self.renderer.scene = plan, plan.scene
 
-    def restart(self, scene: Scene | Mapping[str, Any] | None = None) -> None:
+    def restart(self, scene: Plan | Scene | Mapping[str, Any] | None = None) -> None:
         """Begin again at rest. Nothing is compiled if the terms of the model and the precision stay the same.
 
         Args:

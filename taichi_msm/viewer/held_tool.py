@@ -35,11 +35,12 @@ class HeldTool:
         strength: the percentage of the full force that a press goes up to.
         percent: the percentage of the full force that acts now, below 0 when pulling.
         place: the control point now, as fractions of the sheet.
+        probe: whose tool it is.
     """
 
     def __init__(self, probe: Probe, rate: float) -> None:
         self.strength = 100.0
-        self._probe = probe
+        self.probe = probe
         self._rate = rate
         self.rest()
 
@@ -65,6 +66,10 @@ class HeldTool:
     def held(self) -> bool:
         """Whether the tool presses, or will press, unless it is released."""
         return self._asked[-1] is not None if self._asked else self._pressing != 0
+
+    def ask(self, strength: float) -> None:
+        """Ask for another strength."""
+        self.strength = min(100.0, max(0.0, strength))
 
     def press(self, place: Place, direction: int) -> None:
         """Press (1) or pull (-1) at a place; the tool lets go of any other place."""
@@ -134,7 +139,7 @@ class HeldTool:
         """Make a probe whose control point has at least two keys, as the kernel is compiled for one that moves."""
         if len(at) == 1:
             at = [*at, (max(end, 1 / self._rate), *at[0][1:])]
-        return self._probe.model_copy(update={"load": tuple(load), "at": tuple(at)})
+        return self.probe.model_copy(update={"load": tuple(load), "at": tuple(at)})
 
 
 def extend(keys: list[Any], key: tuple[float, ...]) -> None:
