@@ -212,6 +212,7 @@ def run(
 def check(scene: str, image: str | None, overrides: tuple[str, ...], as_json: bool) -> int:
     """Validate SCENE and print the steps, time, memory and disk space it needs; compute nothing."""
     from taichi_msm.physics import probe_force
+    from taichi_msm.physics.paths import path_notes
     from taichi_msm.physics.probe_force import in_words, probe_records
     from taichi_msm.render.drawing_notes import drawing_notes
     from taichi_msm.scenefile import budget, duration
@@ -235,7 +236,7 @@ def check(scene: str, image: str | None, overrides: tuple[str, ...], as_json: bo
         "disk": need.disk_bytes,
         "disk_while_running": need.disk_bytes + need.working_bytes,
         "probes": (records := probe_records(loaded)),
-        "notes": [*probe_force.force_notes(loaded, records), *drawing_notes(loaded)],
+        "notes": [*probe_force.force_notes(loaded, records), *path_notes(loaded, plan.tools), *drawing_notes(loaded)],
     }
     if as_json:
         print_json(facts)
@@ -256,7 +257,8 @@ def check(scene: str, image: str | None, overrides: tuple[str, ...], as_json: bo
         f"{need.working_bytes / 2**20:.1f} MiB more while it runs"
     )
     for index, probe in enumerate(facts["probes"]):
-        click.echo(f"probes.{index}: {in_words(probe)}")
+        if probe is not None:
+            click.echo(f"probes.{index}: {in_words(probe)}")
     for note in facts["notes"]:
         click.echo(note)
     return DONE

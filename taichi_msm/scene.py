@@ -9,10 +9,12 @@ from pydantic import (
     BaseModel,
     ConfigDict,
     Field,
+    SerializerFunctionWrapHandler,
     StrictBool,
     ValidationError,
     ValidationInfo,
     field_validator,
+    model_serializer,
     model_validator,
 )
 from typing_extensions import Self
@@ -103,7 +105,7 @@ class Section(BaseModel, metaclass=_Checked):
         del deep  # The values are immutable, so a shallow copy is as good.
         if not (update is None or (isinstance(update, Mapping) and all(isinstance(name, str) for name in update))):
             raise ArgumentError(f"update: {update!r}; take a mapping from keys to values")
-        return type(self)(**{**{name: getattr(self, name) for name in type(self).model_fields}, **(update or {})})
+        return type(self)(**{**{name: getattr(self, name) for name in self.model_fields_set}, **(update or {})})
 
     def __setattr__(self, name: str, value: object) -> None:
         raise SceneError([f"{name}: a scene cannot be changed; use model_copy(update={{{name!r}: ...}})"])
@@ -217,11 +219,26 @@ class Instrument(Section):
         return shaft
 
 
+# The keys of a probe that only a tool with a force has, and only one with a path.
+_OF_FORCE = {"at", "total", "force", "load", "falloff", "radius", "offset"}
+_OF_PATH = {"friction", "grip"}
+
+
 class Probe(Section):
-    """A tool: where it acts, how hard, and when (eq. 5)."""
+    """A tool: a force and where and when it acts (eq. 5), or the path of a rod that touches the sheet."""
 
-    model_config = ConfigDict(json_schema_extra={"oneOf": [{"required": ["total"]}, {"required": ["force"]}]})
+    model_config = ConfigDict(
+        json_schema_extra={
+            "oneOf": [{"required": list(names)} for names in (("total",), ("force",), ("path", "instrument"))]
+        }
+    )
 
+    path: Annotated[tuple[tuple[Number, Fraction, Fraction, Number], ...], Field(min_length=1)] | None = key(
+        None,
+        "in place of a force: where the instrument is; keys [[t, across, down, height], ...], linear between, held "
+        "outside; height: of the lowest point of its round tip above the sheet at rest [m]",
+        "keys [[t, across, down, height], ...], t in seconds, height in metres",
+    )
     at: tuple[Fraction, Fraction] | Annotated[tuple[tuple[Number, Fraction, Fraction], ...], Field(min_length=1)] = key(
         (0.5, 0.5),
         "control point: fraction of the width from the left, of the height from the top; "
@@ -256,8 +273,23 @@ class Probe(Section):
         "a number, -50 to 1000",
     )
     instrument: Instrument | None = key(
-        None, "the rod that is drawn for the tool", "a mapping with radius, shaft and length"
+        None,
+        "the rod that is drawn for the tool; with path it is what touches the sheet, and required",
+        "a mapping with radius, shaft and length",
     )
+    friction: NotNegative = key(
+        0.0, "with path: Coulomb's coefficient between the instrument and the sheet", "a number, 0 or more"
+    )
+    grip: tuple[tuple[Number, Number], ...] = key(
+        (),
+        "with path: times [[from, to], ...] [s] between which the tip holds the tissue that it is at",
+        "pairs of times [[from, to], ...], in seconds",
+    )
+
+    @property
+    def moved(self) -> bool:
+        """Whether the tool is moved along a path; else it exerts a force."""
+        return self.path is not None
 
     @field_validator("force", mode="after")
     @classmethod
@@ -265,9 +297,10 @@ class Probe(Section):
         if "total" not in info.data:
             return force  # A fault of its own.
         total = info.data["total"]
-        if force is None and total is None:
+        if force is None and total is None and info.data.get("path") is None:
             raise refused(
-                "missing; expected total (whole tool) or, with springs, force (one point): [x, y, z] in newtons"
+                "missing; expected total (whole tool) or, with springs, force (one point): [x, y, z] in newtons; or "
+                "path, for a tool that is moved"
             )
         if force is not None and total is not None:
             raise refused("is given together with total; remove one of them")
@@ -297,6 +330,49 @@ class Probe(Section):
                     f"third key at {times[n]:g} s; a jump is two keys at one time, so remove the middle one", n
                 )
         return keys
+
+    @field_validator("path", mode="after")
+    @classmethod
+    def _goes_forward(cls, path: tuple[tuple[float, ...], ...] | None) -> tuple[tuple[float, ...], ...] | None:
+        for n in range(1, len(path or ())):
+            assert path is not None
+            before, now = path[n - 1][0], path[n][0]
+            if now <= before:
+                raise refused(
+                    f"is at {now:g} s, after one at {before:g} s; a tool cannot jump: give it a later time", n
+                )
+        return path
+
+    @field_validator("grip", mode="after")
+    @classmethod
+    def _one_grip_at_a_time(cls, grip: tuple[tuple[float, float], ...]) -> tuple[tuple[float, float], ...]:
+        for n, (begin, end) in enumerate(grip):
+            if end <= begin:
+                raise refused(f"ends at {end:g} s, and begins at {begin:g} s; give [from, to] in this order", n)
+            if n and begin < grip[n - 1][1]:
+                raise refused(f"begins at {begin:g} s, before the grip before it ends; sort them, without overlap", n)
+        return grip
+
+    @model_validator(mode="after")
+    def _one_kind(self) -> Self:
+        given = self.model_fields_set
+        if self.path is None:
+            for name in _OF_PATH & given:
+                if getattr(self, name):
+                    raise refused("goes with path; a tool with a force has none", name)
+            return self
+        for name in sorted(_OF_FORCE & given):
+            if getattr(self, name) is not None:
+                raise refused("goes with a force, and path gives the place; remove one of them", name)
+        if self.instrument is None:
+            raise refused("missing; with path expected a mapping with radius, shaft and length", "instrument")
+        return self
+
+    @model_serializer(mode="wrap")
+    def _own_keys(self, dump: SerializerFunctionWrapHandler) -> dict[str, Any]:
+        """Leave out the keys of the other kind of tool, which would be refused when they are read again."""
+        others = (_OF_PATH | {"path"}) if self.path is None else _OF_FORCE
+        return {name: value for name, value in dump(self).items() if name not in others}
 
 
 class Time(Section):
@@ -443,7 +519,9 @@ class Scene(Section):
     springs: Springs | None = key(None, "instead of tissue: the springs", "a mapping with structural, shear, virtual")
     damping: NotNegative = key(0.0, "with springs: C, force per velocity [N s/m]", "a number, 0 or more, in N s/m")
     probes: Annotated[tuple[Probe, ...], Field(max_length=MAX_PROBES)] = key(
-        (), "the tools", f"a list of at most {MAX_PROBES} mappings with at, total or force, load"
+        (),
+        "the tools",
+        f"a list of at most {MAX_PROBES} mappings with at, total or force, load, or with path and instrument",
     )
     time: Time = key(..., "time span, frames and steps", "a mapping with at least duration")
     render: Render = key(Render(), "how a frame is drawn", "a mapping")

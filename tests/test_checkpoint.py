@@ -29,7 +29,7 @@ def small_scene() -> Scene:
 
 def checkpoint_in(directory: Path) -> Checkpoint:
     made, grid = scene_and_grid(small_scene())
-    return Checkpoint(directory / ".partial" / "checkpoint", grid, made.sheet.points, keeps_positions=True)
+    return Checkpoint(directory / ".partial" / "checkpoint", made, grid)
 
 
 def position(frame: int) -> Any:
@@ -43,7 +43,8 @@ def manifest() -> Manifest:
 
 def state(**changes: Any) -> Saved:
     """The state of a run at its third frame."""
-    steps = {"steps": EVERY * (FRAMES - 1), "displacement": position(8), "difference": position(9)}
+    steps: dict[str, Any] = {"steps": EVERY * (FRAMES - 1), "displacement": position(8), "difference": position(9)}
+    steps["contact"] = np.empty((0, 2, 3))
     progress = RunProgress(frame=FRAMES - 1, energy=1.0, peak=2.0, reach=3.0)
     kept = {key: changes.pop(key) for key in list(changes) if key in steps}
     return Saved(State(**{**steps, **kept}), RunProgress(**{**vars(progress), **changes}))

@@ -463,6 +463,7 @@ def test_tissue_that_wrinkles_has_an_error_of_at_least_what_is_told(load: Any, d
 def test_a_run_says_what_its_tool_and_its_points_do(load: Any, device: Device, tmp_path: Path) -> None:
     record = run(load(), tmp_path / "out", threads=device.threads)
     (probe,) = record["probes"]
+    assert probe is not None
     assert probe["total_force"] == pytest.approx(2, rel=0.05)
     # Whole pressure acts on the flat end.
     assert probe["largest_pressure"] == pytest.approx(

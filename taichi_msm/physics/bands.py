@@ -22,8 +22,9 @@ records its place and ends, which frees its own core. Further launches continue 
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
-from taichi_msm.physics.row import row_passing
+from taichi_msm.physics.row import row_passing, row_touching
 from taichi_msm.physics.terms.bending import BendingTerm
+from taichi_msm.physics.terms.contact import ContactTerm
 from taichi_msm.physics.terms.term import DY, KernelRow, KernelSheet, StepCode
 from taichi_msm.system.runtime import ITERATIONS_PER_THREAD, ti
 
@@ -64,6 +65,8 @@ def stepping_row(code: StepCode, *, parallel: bool) -> Callable[..., Any]:
     """Make the function that takes a step of a row of a band, as soon as the neighbours' rows allow it."""
     vector, lanes, bending, copied = code.vector, code.lanes, code.get(BendingTerm), code.reach
     pass_row, storing = row_passing(code), [bending.storing(code)] if bending else []
+    contact = code.get(ContactTerm)
+    touching = [row_touching(code, contact)] if contact else []
 
     @ti.func
     def copy_row(rows, worker, border, n, behind):
@@ -159,6 +162,9 @@ def stepping_row(code: StepCode, *, parallel: bool) -> Callable[..., Any]:
                 after = moments + (row + 1) % MOMENTS
                 line = ti.static(KernelRow(i, kind, before, middle, after))
                 pass_row(sheet, carried, carry, line, here, other, exists, up, loads, n, row >= 0)
+                if row >= 0:
+                    for touch_row in ti.static(touching):
+                        touch_row(sheet, i, kind, loads, n)
             else:
                 for b in range(1, sheet.width - 1):
                     for c in ti.static(range(3)):

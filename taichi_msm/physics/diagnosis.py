@@ -78,6 +78,10 @@ def _cause(dynamics: Dynamics, bad: int, point: tuple[int, int], pause: Pause) -
         if _goes_well(dynamics, finer, frames, pause):
             return f"likely cause: time.step, {grid.step:.6g} s; with {finer.grid.step:.9g} s it does not diverge here"
         tried = finer.grid.step
+    if not plan.slots:
+        tool = max(plan.tools, key=lambda tool: tool.speed)
+        said = f"likely cause: probes.{tool.probe}.path, at up to {tool.speed:.3g} m/s"
+        return f"{said}; move the tool more slowly, or less far"
     index, force = _strongest_probe(plan.scene, point)
     name = "force" if plan.scene.probes[index].total is None else "total"
     said = f"likely cause: probes.{index}.{name}, which reaches {force:.3g} N at this point"
@@ -108,5 +112,5 @@ def _strongest_probe(scene: Scene, point: tuple[int, int]) -> tuple[int, float]:
         acts, most = probe_force(probe, scene.sheet), max(abs(percent) for _, percent in probe.load) / 100
         return most * math.hypot(*acts.force) * float(acts.decay(nearest))
 
-    strongest = max(range(len(scene.probes)), key=force)
+    strongest = max((index for index, probe in enumerate(scene.probes) if not probe.moved), key=force)
     return strongest, force(strongest)

@@ -39,6 +39,7 @@ def farthest_displacement(plan: Plan, time: float, acceleration: float | None = 
     if plan.material.virtual > 0 and not plan.material.always:
         # The virtual springs may accelerate a point from far away, and let go of it when it is fast.
         return math.inf
+    most += sum(tool.speed for tool in plan.tools) * time
     return most + (free_acceleration(plan) if acceleration is None else acceleration) * time * time / 2
 
 
@@ -50,6 +51,7 @@ class Watch:
 
         E(b)^(1/2) <= E(a)^(1/2) + (2 m)^(-1/2) integral of |F| from a to b
 
+    Tools that are moved add at most what it takes to displace every point as far as they come, at their speed.
     The virtual springs hold at most another K / 2 |u|^2, with K of the stiffest; when they begin to act, it is added
     for the displacements then.
 
@@ -62,6 +64,7 @@ class Watch:
         self._plan, self._grid = plan, plan.grid
         self._loads = Envelope(plan)
         self._acceleration = free_acceleration(plan)
+        self._moved = _most_moved(plan)
         self._shares = np.array([norm(slot, plan.scene) for slot in plan.slots])
         self._swing = SWING / max(1e-9, 1 - (plan.grid.step / plan.stable_step) ** 2)
         self._least = _underflow(plan)
@@ -71,6 +74,7 @@ class Watch:
         self._plan = plan
         self._loads = Envelope(plan)
         self._acceleration = max(self._acceleration, free_acceleration(plan))
+        self._moved = max(self._moved, _most_moved(plan))
 
     def follow(self, reading: Reading) -> str:
         """Judge the next frame, as `judge` does, and record its progress if it is sound."""
@@ -121,7 +125,7 @@ class Watch:
         for _ in range(activations):
             root = math.sqrt(root * root + virtual * reach * reach)
             reach += (end - begin) * root * math.sqrt(2 / mass)
-        return self._swing * root * root + ROUNDING * progress.peak + self._least
+        return self._swing * (root * root + self._moved) + ROUNDING * progress.peak + self._least
 
 
 def message(time: float, step: int, wrong: str, *, exact: bool) -> str:
@@ -147,6 +151,15 @@ def farthest(displacement: NDArray[np.floating]) -> Farthest:
         row, column = (int(index) for index in np.unravel_index(square.argmax(), square.shape))
         distance = float(np.linalg.norm(displacement[row, column].astype(float)))
         return Farthest(row, column, distance, math.sqrt(square.sum()))
+
+
+def _most_moved(plan: Plan) -> float:
+    """Bound the energy that the tools which are moved can have given to the points [J]."""
+    material, count = plan.material, math.prod(plan.scene.sheet.points)
+    stiffness = sum(term.bound(material, plan.scene.sheet) for term in TERMS)
+    return sum(
+        count * (stiffness * tool.way * tool.way + material.mass * tool.speed * tool.speed) / 2 for tool in plan.tools
+    )
 
 
 def _underflow(plan: Plan) -> float:

@@ -117,6 +117,16 @@ class SheetArrays:
         """All arrays, in the order in which kernels take them."""
         return *self.u, *self.d, self.numbers, self.by_column, self.stiffness, self.fields
 
+    def get_fields(self, first: int, count: int) -> NDArray[Any]:
+        """Read so many fields from the first one on, shape (count, rows, cols)."""
+        layout = self._layout
+        rows, entry = count * layout.rows, first * layout.rows * layout.width
+        laid = self.fields.to_numpy()[entry : entry + rows * layout.width].reshape(
+            rows, layout.width, layout.code.lanes
+        )
+        values = laid[:, 1:-1].transpose(0, 2, 1).reshape(count, layout.rows, -1)
+        return np.ascontiguousarray(values[..., : layout.cols])
+
     def set_fields(self, first: int, values: NDArray[Any]) -> None:
         """Replace fields from the first one on, shape (fields, rows, cols); the others stay."""
         entries, laid = self.fields.to_numpy(), in_lanes(self._layout, values)

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from taichi_msm.physics.kernel import SheetArrays, SheetLayout, Start, point_step, reading
 from taichi_msm.physics.terms.bending import BendingTerm
+from taichi_msm.physics.terms.contact import ContactTerm
 from taichi_msm.physics.terms.springs import SpringTerm
 from taichi_msm.physics.terms.term import DX, DY, HAS_LEFT, HAS_RIGHT, Entry, KernelRow, KernelSheet, StepCode
 from taichi_msm.system.runtime import our_compilation, ti
@@ -64,7 +65,8 @@ def _gathering(code: StepCode) -> Callable[..., None]:
     structural, shear = springs.structural, springs.shear
     leaves_out = springs.open_edges and not springs.mapped
     along, to_other_row, of_row, of_column, of_diagonal = springs.between(code)
-    move = point_step(code)
+    move, contact = point_step(code), code.get(ContactTerm)
+    resolving = [contact.resolving(code)] if contact else []
 
     @ti.func
     def by_row(sheet: ti.template(), p, q, lower, b, row_exists, up):
@@ -116,7 +118,10 @@ def _gathering(code: StepCode) -> Callable[..., None]:
         before, at, after = 2 * (rows + 2) + i, 2 * (rows + 2) + i + 1, 2 * (rows + 2) + i + 2
         line = ti.static(KernelRow(i, kind, before, at, after))
         entry = ti.static(Entry(line, b, u))
-        move(sheet, entry, (1 - now) * (rows + 2) + i + 1, force, row)
+        target = (1 - now) * (rows + 2) + i + 1
+        move(sheet, entry, target, force, row)
+        for resolve in ti.static(resolving):
+            resolve(sheet, i, kind, target, b, row)
 
     return step
 

@@ -12,7 +12,8 @@ averaged in the same way.
 from __future__ import annotations
 
 import math
-from typing import NamedTuple
+from collections.abc import Sequence
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -51,8 +52,8 @@ def schedule(plan: Plan, first: int, count: int) -> Schedule:
     scene, parts = plan.scene, plan.slots
     t, h = np.arange(first, first + count) / plan.grid.steps_per_second, plan.grid.step
     strength, point = np.zeros((count, len(parts), 3)), np.zeros((count, len(parts), 2))
-    for index, probe in enumerate(scene.probes):
-        own = [n for n, part in enumerate(parts) if part.probe == index]
+    for index in sorted({part.probe for part in parts}):
+        probe, own = scene.probes[index], [n for n, part in enumerate(parts) if part.probe == index]
         turns, segments, jumps = len(own), parts[own[0]].segments, parts[own[0]].jumps
         line = _load(probe)
         if turns == 1:
@@ -71,7 +72,8 @@ def loads_at(plan: Plan, t: Array) -> Schedule:
     """Evaluate the loads themselves, not their averages, with one slot a probe, at times that are no keys [s]."""
     scene, parts = plan.scene, probe_slots(plan.scene.probes, plan.scene.sheet, 0.0)
     strength, point = np.zeros((len(t), len(parts), 3)), np.zeros((len(t), len(parts), 2))
-    for n, (part, probe) in enumerate(zip(parts, scene.probes, strict=True)):
+    for n, part in enumerate(parts):
+        probe = scene.probes[part.probe]
         strength[:, n] = np.multiply.outer(_load(probe).values(t) / 100, probe_force(probe, scene.sheet).force)
         number = part.jumps.searchsorted(t, "right")
         for segment in np.unique(number):
@@ -81,8 +83,13 @@ def loads_at(plan: Plan, t: Array) -> Schedule:
 
 def key_times(scene: Scene) -> Array:
     """List the times of all keys between 0 and the end [s]: only there the loads are not smooth."""
-    loads = [[time for time, _ in probe.load] for probe in scene.probes]
-    times = np.unique(np.concatenate([[], *loads, *(control_points(probe, scene.sheet)[0] for probe in scene.probes)]))
+    keys: list[Any] = [[]]
+    for probe in scene.probes:
+        if probe.path is None:
+            keys += [time for time, _ in probe.load], control_points(probe, scene.sheet)[0]
+        else:
+            keys += [time for time, *_ in probe.path], np.ravel(probe.grip)
+    times = np.unique(np.concatenate(keys))
     return times[(times > 0) & (times < scene.time.duration)]
 
 
@@ -91,9 +98,9 @@ class Envelope:
 
     def __init__(self, plan: Plan) -> None:
         scene, self._h = plan.scene, plan.grid.step
-        self._lines = [_load(probe) for probe in scene.probes]
-        self._forces = [math.hypot(*probe_force(probe, scene.sheet).force) / 100 for probe in scene.probes]
-        self._probes = [slot.probe for slot in plan.slots]
+        probes = [scene.probes[slot.probe] for slot in plan.slots]
+        self._lines = [_load(probe) for probe in probes]
+        self._forces = [math.hypot(*probe_force(probe, scene.sheet).force) / 100 for probe in probes]
         self._activity = _activity(plan)
         self._begins = self._activity.times[self._activity.before < self._activity.after]
 
@@ -108,7 +115,7 @@ class Envelope:
         begin, end = begin - self._h, end + self._h
         most = [force * line.largest(begin, end) for force, line in zip(self._forces, self._lines, strict=True)]
         begun = self._begins.searchsorted(end, "right") - self._begins.searchsorted(begin, "left")
-        return np.array([most[probe] for probe in self._probes]), self._activity.largest(begin, end) > 0, int(begun)
+        return np.array(most), self._activity.largest(begin, end) > 0, int(begun)
 
 
 class _Line:
@@ -204,19 +211,28 @@ def _load(probe: Probe) -> _Line:
     return _Line(*np.array(probe.load, dtype=float).T)
 
 
+def _presses(probe: Probe) -> Sequence[tuple[float, float]]:
+    """Give keys of a function that is not 0 while a probe presses; a path does so from its first key to its last."""
+    if probe.path is None:
+        return probe.load
+    begin, end = probe.path[0][0], probe.path[-1][0]
+    return (begin, 1.0), (end, 1.0), (end, 0.0)
+
+
 def _activity(plan: Plan) -> _Line:
-    """Tell when the virtual springs act: 1 always or while the percent of any probe is not 0, else 0."""
+    """Tell when the virtual springs act: 1 always or while any probe presses, else 0."""
     scene = plan.scene
     if plan.material.always:
         return _Line(np.array([LONG_AGO]), np.array([1.0]))
-    times = np.unique([time for probe in scene.probes for time, _ in probe.load])
+    presses = [_presses(probe) for probe in scene.probes]
+    times = np.unique([time for keys in presses for time, _ in keys])
     if not times.size:
         return _Line(np.zeros(1), np.zeros(1))
     # A time between each two keys, and one after the last.
     middles = np.append((times[:-1] + times[1:]) / 2, times[-1] + 1)
     active = np.zeros(len(times))
-    for probe in scene.probes:
-        line = _load(probe)
+    for keys in presses:
+        line = _Line(*np.array(keys, dtype=float).T)
         after = line.times.searchsorted(middles, "right")
         following = np.minimum(after, len(line.times) - 1)
         pressed = (line.after[after - 1] != 0) | ((line.before[following] != 0) & (after < len(line.times)))

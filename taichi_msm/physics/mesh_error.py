@@ -93,8 +93,10 @@ def coarser(plan: Plan) -> Plan | None:
 
 def _pressing_alike(probe: Probe, sheet: Sheet, other: Sheet) -> Probe:
     """Scale the total of a probe, by less than 2, so that its force on another sheet is that on this one."""
+    if probe.total is None:
+        return probe
     own, there = sums(probe, sheet)[0], sums(probe, other)[0]
-    if probe.total is None or not 0.5 * there < own < 2 * there:
+    if not 0.5 * there < own < 2 * there:
         return probe
     return probe.model_copy(update={"total": tuple(own / there * part for part in probe.total)})
 

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from taichi_msm.physics.material import Maps, Material, has_fixed_border
+from taichi_msm.physics.paths import Tool, tools_of
 from taichi_msm.physics.probe_force import control_points
 from taichi_msm.scene import Probe, Scene, Sheet
 from taichi_msm.timegrid import TimeGrid
@@ -54,12 +55,14 @@ class ProbeSlot:
 
 
 def probe_slots(probes: Sequence[Probe], sheet: Sheet, h: float) -> tuple[ProbeSlot, ...]:
-    """List the slots of all probes.
+    """List the slots of all probes that exert a force.
 
     h: half-width of the hat, which is the step [s]; 0 if loads are not averaged: every probe then has one slot.
     """
     slots = []
     for index, probe in enumerate(probes):
+        if probe.moved:
+            continue
         times, points = control_points(probe, sheet)
         jumps = np.flatnonzero((times[1:] == times[:-1]) & (points[1:] != points[:-1]).any(axis=1)) + 1
         parts = zip(np.split(times, jumps), np.split(points, jumps), strict=True)
@@ -82,7 +85,8 @@ class Plan:
     material: Material  # what the sheet is made of, with its maps as arrays
     stable_step: float  # the largest stable step [s]; infinite where nothing oscillates
     grid: TimeGrid  # the steps
-    slots: tuple[ProbeSlot, ...]  # the places where probes act
+    slots: tuple[ProbeSlot, ...]  # the places where probes act with a force
+    tools: tuple[Tool, ...]  # the probes that are moved
 
     @property
     def open_edges(self) -> bool:
@@ -99,4 +103,5 @@ class Plan:
     def with_probes(self, probes: Sequence[Probe | Mapping[str, Any]]) -> Plan:
         """Replace the probes; SceneError: one of them is not a probe."""
         scene = self.scene.model_copy(update={"probes": tuple(probes)})
-        return replace(self, scene=scene, slots=probe_slots(scene.probes, scene.sheet, self.grid.step))
+        slots = probe_slots(scene.probes, scene.sheet, self.grid.step)
+        return replace(self, scene=scene, slots=slots, tools=tools_of(scene.probes, scene.sheet))

@@ -14,6 +14,7 @@ from taichi_msm.errors import Problem, SceneError
 from taichi_msm.physics import workload
 from taichi_msm.physics.lattice import fixed_points, spacing
 from taichi_msm.physics.material import MapImage, Maps, Material, kind_problems, read_map, tissue_problems
+from taichi_msm.physics.paths import path_problems, tools_of
 from taichi_msm.physics.plan import Plan, probe_slots
 from taichi_msm.physics.terms import highest_frequency, material_of
 from taichi_msm.picture import PictureError
@@ -53,7 +54,7 @@ def try_plan(scene: Scene, maps: Maps | None = None) -> tuple[Plan | None, list[
     if problems:
         return None, problems
     plan = _plan(scene, maps, fixed, material)
-    return plan, list(_step_problems(plan))
+    return plan, [*_step_problems(plan), *path_problems(scene, plan.tools, plan.grid)]
 
 
 def variant(plan: Plan, scene: Scene) -> Plan:
@@ -76,7 +77,8 @@ def _plan(scene: Scene, maps: Maps, fixed: NDArray[np.bool_], material: Material
     limit = stable_step(material, scene.sheet, scene.time.damping_difference)
     grid = TimeGrid(scene.time.frames_per_second, scene.time.frames, steps_per_frame(scene.time, limit), "f64")
     slots = probe_slots(scene.probes, scene.sheet, grid.step)
-    return on(Plan(scene, maps, fixed, material, limit, grid, slots), "cpu")
+    tools = tools_of(scene.probes, scene.sheet)
+    return on(Plan(scene, maps, fixed, material, limit, grid, slots, tools), "cpu")
 
 
 def on(plan: Plan, arch: str) -> Plan:

@@ -127,10 +127,13 @@ class ProbeRecord(TypedDict):
     largest_pressure: float  # largest force on a point per area that belongs to it [Pa]
 
 
-def probe_records(scene: Scene) -> list[ProbeRecord]:
-    """Sum the forces of every probe of a scene."""
-    records = []
+def probe_records(scene: Scene) -> list[ProbeRecord | None]:
+    """Sum the forces of every probe of a scene; None: it is moved."""
+    records: list[ProbeRecord | None] = []
     for probe in scene.probes:
+        if probe.moved:
+            records.append(None)
+            continue
         flat, (total, pressure) = 0.0, sums(probe, scene.sheet)
         if probe.total is not None:
             flat = math.hypot(*probe.total) * math.pi * probe.radius * probe.radius / spread(probe)
@@ -144,11 +147,13 @@ def in_words(record: ProbeRecord) -> str:
     return f"{record['total_force']:.3g} N in all{flat}, at most {record['largest_pressure'] / 1000:.3g} kPa"
 
 
-def force_notes(scene: Scene, records: Sequence[ProbeRecord]) -> Iterator[str]:
+def force_notes(scene: Scene, records: Sequence[ProbeRecord | None]) -> Iterator[str]:
     """Note the probes of a checked scene whose forces do not add up to their total on this sheet."""
     across, down = spacing(scene.sheet)
     cell = f"a cell of {across:.3g} x {down:.3g} m"
     for index, (probe, record) in enumerate(zip(scene.probes, records, strict=True)):
+        if record is None:
+            continue
         asked, reaching = math.hypot(*probe.total) if probe.total is not None else 0.0, record["total_force"]
         if asked > 0 and reaching <= LEAST_REACHING * asked:
             yield (

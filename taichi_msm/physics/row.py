@@ -5,6 +5,8 @@ every operation is one vector instruction. The first and the last entry of a row
 end of the strips, shifted by one lane. The force of a spring between this row and the next one is added to this row at
 once and carried to the next; the force of a spring along the row is carried to the next entry. After that no other row
 depends on the old displacements of this row, so it is stepped in place.
+
+Tools that are moved then push the points out of their rods, in the rows that they reach.
 """
 
 # No `from __future__ import annotations` here: Taichi reads the annotations of a kernel.
@@ -12,6 +14,7 @@ depends on the old displacements of this row, so it is stepped in place.
 from collections.abc import Callable
 
 from taichi_msm.physics.kernel import point_step
+from taichi_msm.physics.terms.contact import ContactTerm
 from taichi_msm.physics.terms.springs import SpringTerm
 from taichi_msm.physics.terms.term import DX, DY, HAS_LEFT, HAS_RIGHT, Entry, StepCode
 from taichi_msm.system.runtime import ti
@@ -117,3 +120,26 @@ def row_passing(code: StepCode) -> Callable[..., None]:
             carried[c][carry + strip] = this[c]
 
     return pass_row
+
+
+def row_touching(code: StepCode, contact: ContactTerm) -> Callable[..., None]:
+    """Make the function that resolves the contact of a row with all tools, if one reaches it."""
+    columns, resolve, reaches = code.first_column(None), contact.resolving(code), contact.reaching(code)
+
+    @ti.func
+    def touch_row(sheet: ti.template(), i, kind, loads: ti.template(), n):
+        """Resolve the contact of row i after step n of the launch."""
+        now = [loads[n, c] for c in ti.static(range(columns))]
+        at = i * sheet.width
+        # Smallest and largest displacements along y and z.
+        least, most = [[sheet.u[c][at + 1] for c in ti.static((1, 2))] for _ in ti.static(range(2))]
+        for b in range(2, sheet.width - 1):
+            for n in ti.static(range(2)):
+                value = sheet.u[n + 1][at + b]
+                least[n], most[n] = ti.min(least[n], value), ti.max(most[n], value)
+        low, high = [least[0].min(), least[1].min()], [most[0].max(), most[1].max()]
+        if reaches(sheet, i, low, high, now):
+            for b in range(1, sheet.width - 1):
+                resolve(sheet, i, kind, i, b, now)
+
+    return touch_row

@@ -10,6 +10,7 @@ from taichi_msm.physics import probe_force
 from taichi_msm.physics.error_control import Estimate
 from taichi_msm.physics.material import has_fixed_border
 from taichi_msm.physics.mesh_error import MeshEstimate
+from taichi_msm.physics.paths import path_notes
 from taichi_msm.physics.plan import Plan
 from taichi_msm.physics.probe_force import ProbeRecord
 from taichi_msm.physics.state import RunProgress
@@ -31,7 +32,7 @@ WRONG = 0.01
 
 def run_notes(
     plan: Plan,
-    probes: Sequence[ProbeRecord],
+    probes: Sequence[ProbeRecord | None],
     progress: RunProgress,
     estimate: Estimate | None,
     reason: str = "",
@@ -51,6 +52,7 @@ def run_notes(
         else:
             yield f"error {_size(mesh)} due to the number of points; due to the time step not estimated: {reason}"
     yield from probe_force.force_notes(scene, probes)
+    yield from path_notes(scene, plan.tools)
     if mesh is not None and mesh.doubt:
         yield f"the error due to the number of points may be larger: {mesh.doubt}"
     if mesh is not None and WRONG < mesh.error < math.inf:

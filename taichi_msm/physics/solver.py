@@ -23,6 +23,7 @@ from taichi_msm.physics.material import area_shares
 from taichi_msm.physics.plan import Plan
 from taichi_msm.physics.state import Reading, State
 from taichi_msm.physics.terms import terms_of
+from taichi_msm.physics.terms.contact import PUSHES, ContactTerm
 from taichi_msm.physics.terms.damping import coefficients
 from taichi_msm.physics.terms.probes import ProbeTerm, standing
 from taichi_msm.physics.terms.springs import LEAST, MOST, SpringTerm
@@ -167,7 +168,8 @@ class Dynamics:
     def state(self) -> State:
         """Read everything that the next steps depend on."""
         self._require_whole()
-        return State(self.steps_done, self._copy(differences=False)[0], self._copy(differences=True)[0])
+        u, d = self._copy(differences=False)[0], self._copy(differences=True)[0]
+        return State(self.steps_done, u, d, self._contact())
 
     def read(self) -> Reading:
         """Read the displacements and measure the sheet, in the scene's precision."""
@@ -192,6 +194,24 @@ class Dynamics:
         values, measures = np.empty((rows, cols, 3), self._real), np.empty((rows, code.first_measure(None)), self._real)
         self._moving.read(differences, values, measures)
         return values, measures
+
+    def take_pushes(self) -> NDArray[np.float64]:
+        """Read by how much each tool has moved each point since this was asked last [m], (tools, rows, cols, 3)."""
+        contact, rows, cols = self.structure.code.get(ContactTerm), self.structure.rows, self.structure.cols
+        tools = 0 if contact is None else contact.tools
+        pushes = self._contact()[: PUSHES * tools]
+        if tools:
+            first = self.structure.code.first_field(ContactTerm)
+            self._moving.arrays.set_fields(first, np.zeros_like(pushes))
+        return pushes.reshape(tools, PUSHES, rows, cols).transpose(0, 2, 3, 1).astype(np.float64)
+
+    def _contact(self) -> NDArray[Any]:
+        """Read the fields of contact, shape (fields, rows, cols)."""
+        code = self.structure.code
+        contact = code.get(ContactTerm)
+        if contact is None:
+            return np.empty((0, self.structure.rows, self.structure.cols), self._real)
+        return self._moving.arrays.get_fields(code.first_field(ContactTerm), contact.field_count)
 
     def _require_whole(self) -> None:
         if self.torn:
@@ -224,7 +244,7 @@ class Dynamics:
             table[0, GAIN] = first_gain
         for term in code.terms:
             first_column = code.first_column(type(term))
-            table[:, first_column : first_column + term.column_count] = term.columns(plan, loads)
+            table[:, first_column : first_column + term.column_count] = term.columns(plan, loads, first)
         # Loads too large for f32 become infinite; the next reading of the sheet shows it.
         with np.errstate(over="ignore"):
             return table.astype(self._real)
@@ -244,6 +264,9 @@ class Dynamics:
         by_column[HAS_RIGHT] = column < layout.cols - 1
         numbers = *spacing(sheet), sheet.size[0] / 2, *(n for term in layout.code.terms for n in term.numbers(plan))
         fields = np.concatenate([term.fields(plan) for term in layout.code.terms])
+        if state is not None and len(state.contact):
+            first = layout.code.first_field(ContactTerm)
+            fields[first : first + len(state.contact)] = state.contact
         stiffness = layout.code.require(SpringTerm).laid_out(plan)
         self._sheet = None  # Frees its memory before another sheet takes some.
         kind: type[StepKernel] = Scatter if layout.workers else Gather

@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
+import numpy as np
 from numpy.typing import NDArray
 
 
@@ -14,6 +15,7 @@ class State(NamedTuple):
     steps: int  # number of steps taken, n
     displacement: NDArray[Any]  # u_n [m], shape (rows, cols, 3)
     difference: NDArray[Any]  # d_n = u_n - u_{n-1} [m], shape (rows, cols, 3)
+    contact: NDArray[Any] = np.empty((0, 0, 0))  # fields of `terms.contact`, shape (fields, rows, cols)
 
 
 class Reading(NamedTuple):

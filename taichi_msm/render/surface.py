@@ -7,6 +7,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from taichi_msm.physics.paths import tools_of, unit
 from taichi_msm.physics.probe_force import control_point
 from taichi_msm.scene import Instrument, Scene, Sheet
 
@@ -83,17 +84,20 @@ def touched(position: NDArray[np.floating], refine: int, sheet: Sheet, rest: Arr
 
 def rods(scene: Scene, position: NDArray[np.floating], time: float) -> list[Rod]:
     """Place the instruments of a scene at a time [s]; the mass points are at `position` [m], shape (rows, cols, 3)."""
-    return [
-        rod(probe.instrument, scene, position, control_point(probe, scene.sheet, time))
-        for probe in scene.probes
-        if probe.instrument is not None
-    ]
+    moved = {tool.probe: tool for tool in tools_of(scene.probes, scene.sheet)}
+    placed = []
+    for index, probe in enumerate(scene.probes):
+        if index in moved:
+            tool = moved[index]
+            placed.append(Rod(tool.middle(np.array([time]))[0], tool.axis, tool.length, tool.radius))
+        elif probe.instrument is not None:
+            placed.append(rod(probe.instrument, scene, position, control_point(probe, scene.sheet, time)))
+    return placed
 
 
 def rod(instrument: Instrument, scene: Scene, position: NDArray[np.floating], rest: Array) -> Rod:
     """Place an instrument; `rest` is the rest position of the point that it touches, x and y [m], shape (2,)."""
-    shaft = np.array(instrument.shaft) / max(map(abs, instrument.shaft))
-    axis = shaft / np.linalg.norm(shaft)
+    axis = unit(instrument.shaft)
     point, normal = touched(position, scene.render.refine, scene.sheet, rest)
     outward = normal if normal @ axis >= 0 else -normal
     return Rod(point + instrument.radius * outward, axis, instrument.length, instrument.radius)

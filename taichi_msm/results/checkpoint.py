@@ -26,9 +26,11 @@ from numpy.typing import NDArray
 from taichi_msm.errors import DamagedError, FilesError, ForeignError
 from taichi_msm.outputs.npz import read_array, write_arrays
 from taichi_msm.physics.state import RunProgress, Saved, State
+from taichi_msm.physics.terms.contact import contact_fields
 from taichi_msm.results.entries import FILE, FOLDER, clear, require
 from taichi_msm.results.publication import STAGING
 from taichi_msm.results.whole import DRAFT, create, replacing
+from taichi_msm.scene import Scene
 from taichi_msm.timegrid import TimeGrid
 
 # A folder is a checkpoint if it has a run's manifest. Beside it are the positions of the frames and the last state.
@@ -51,14 +53,15 @@ class Checkpoint:
         precision: type of the positions.
     """
 
-    def __init__(self, folder: Path, grid: TimeGrid, points: tuple[int, int], *, keeps_positions: bool) -> None:
+    def __init__(self, folder: Path, scene: Scene, grid: TimeGrid) -> None:
         self.frames = 0
         self._folder = folder
         self._grid = grid
-        self._shape = (*points, 3)
+        self._shape = (*scene.sheet.points, 3)
+        self._contact_shape = (contact_fields(scene.probes), *scene.sheet.points)
         self.precision = np.dtype(np.float32 if grid.precision == "f32" else np.float64)
         self._frame_bytes = math.prod(self._shape) * self.precision.itemsize
-        self._record_bytes = (DIGEST_BYTES + self._frame_bytes) if keeps_positions else 0
+        self._record_bytes = (DIGEST_BYTES + self._frame_bytes) if scene.output else 0
         self._due = 0.0
         self._open = ExitStack()
         # The digest of the manifest, to which all parts of a checkpoint are tied.
@@ -147,8 +150,9 @@ class Checkpoint:
     def load(self) -> Saved | None:
         """Read the state that was saved last; None: none was."""
         like = self._arrays(Saved(State(0, np.empty(0), np.empty(0)), RunProgress()))
-        sheet = self.precision, self._shape
-        kinds = {name: sheet if array.size == 0 else (array.dtype, array.shape) for name, array in like.items()}
+        kinds = {name: (array.dtype, array.shape) for name, array in like.items()}
+        kinds |= dict.fromkeys(("displacement", "difference"), (self.precision, self._shape))
+        kinds["contact"] = self.precision, self._contact_shape
         try:
             with (self._folder / STATE).open("rb") as file, zipfile.ZipFile(file) as archive:
                 arrays = {name: read_array(archive, name, *kind) for name, kind in kinds.items()}
@@ -158,7 +162,9 @@ class Checkpoint:
         except Exception:
             raise self._damaged(STATE) from None
         progress = RunProgress(**{field.name: arrays[field.name].item() for field in fields(RunProgress)})
-        saved = Saved(State(int(arrays["steps"]), arrays["displacement"], arrays["difference"]), progress)
+        saved = Saved(
+            State(int(arrays["steps"]), arrays["displacement"], arrays["difference"], arrays["contact"]), progress
+        )
         every = self._grid.steps_per_frame
         if not (
             progress.frame <= self._grid.frames

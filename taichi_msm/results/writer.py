@@ -82,7 +82,7 @@ class ResultWriter:
         names = table.file_names(table.results(scene.output), scene.time.frames + 1)
         self._publication = Publication(directory, RUN, names)
         folder = self._publication.staging / CHECKPOINT
-        self._checkpoint = Checkpoint(folder, grid, scene.sheet.points, keeps_positions=bool(scene.output))
+        self._checkpoint = Checkpoint(folder, scene, grid)
         self._labels = LabelWriter(self._publication.staged, scene)
         self._encoder: Encoder | PictureWriter | None = None
         self._open = ExitStack()

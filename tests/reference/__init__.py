@@ -13,6 +13,7 @@ from tests.reference.dynamics import (
     longest_spring,
     shortest_spring,
     simulate,
+    steps,
     surgical_force,
 )
 from tests.reference.sheet import sheet
@@ -29,5 +30,6 @@ __all__ = [
     "sheet",
     "shortest_spring",
     "simulate",
+    "steps",
     "surgical_force",
 ]

@@ -12,6 +12,7 @@ from taichi_msm.physics.lattice import spacing
 from taichi_msm.physics.material import Maps, Material, cell_factors, point_factors
 from taichi_msm.physics.plan import Plan
 from taichi_msm.physics.terms.bending import BendingTerm
+from taichi_msm.physics.terms.contact import ContactTerm
 from taichi_msm.physics.terms.damping import DampingTerm
 from taichi_msm.physics.terms.foundation import FoundationTerm
 from taichi_msm.physics.terms.probes import ProbeTerm
@@ -20,7 +21,7 @@ from taichi_msm.physics.terms.term import Term
 from taichi_msm.scene import Scene, Sheet
 
 # All terms. What they contribute is added up in this order, on which the last bits depend.
-TERMS: tuple[type[Term], ...] = (SpringTerm, FoundationTerm, DampingTerm, BendingTerm, ProbeTerm)
+TERMS: tuple[type[Term], ...] = (SpringTerm, FoundationTerm, DampingTerm, BendingTerm, ProbeTerm, ContactTerm)
 
 
 def material_of(scene: Scene, maps: Maps) -> Material:

@@ -59,7 +59,7 @@ class FoundationTerm(Term):
         """One column: K, times the share of it that acts."""
         return 1
 
-    def columns(self, plan: Plan, loads: Schedule) -> NDArray[Any]:
+    def columns(self, plan: Plan, loads: Schedule, first: int) -> NDArray[Any]:
         """Give K at every step [N/m]."""
         return plan.material.virtual * loads.active[:, None]
 

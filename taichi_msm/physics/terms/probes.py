@@ -45,7 +45,7 @@ class ProbeTerm(Term):
         """A few columns for each slot."""
         return SLOT_COLUMNS * len(self.moves)
 
-    def columns(self, plan: Plan, loads: Schedule) -> NDArray[Any]:
+    def columns(self, plan: Plan, loads: Schedule, first: int) -> NDArray[Any]:
         """Give forces and places of every slot."""
         slots = np.empty((len(loads.active), len(self.moves), SLOT_COLUMNS))
         slots[..., FORCE:POINT] = loads.strength
@@ -106,6 +106,7 @@ def free_acceleration(plan: Plan) -> float:
     forces = (
         probe_force(probe, plan.scene.sheet).size * max(abs(percent) for _, percent in probe.load) / 100
         for probe in plan.scene.probes
+        if not probe.moved
     )
     return sum(forces) / plan.material.mass
 

@@ -69,8 +69,8 @@ class Term(ABC):
         """How many fields belong to the term."""
         return 0
 
-    def columns(self, plan: Plan, loads: Schedule) -> NDArray[Any]:
-        """Give its columns of the table of loads, shape (steps, column_count)."""
+    def columns(self, plan: Plan, loads: Schedule, first: int) -> NDArray[Any]:
+        """Give its columns of the table of loads, from step `first` on, shape (steps, column_count)."""
         return np.empty((len(loads.active), 0))
 
     def fields(self, plan: Plan) -> NDArray[Any]:

@@ -1,0 +1,125 @@
+"""Tools that are moved: the rods that touch the sheet, where they are, and when they hold it. Scene: `probes`, `path`.
+
+A rod is all that is within `radius` of its middle line, c(t) + s a with 0 <= s <= length, where c is the middle of its
+round tip and a the unit vector along its shaft.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from taichi_msm.errors import Problem
+from taichi_msm.physics.lattice import spacing
+from taichi_msm.scene import Probe, Scene, Sheet
+from taichi_msm.timegrid import TimeGrid
+
+# A tool may move by this share of its radius in a step, and be this much larger than the distance between points
+# before a note is made.
+LARGEST_STRIDE = WIDEST_CELL = 0.5
+
+# A tip holds the points within this many times its radius of its middle.
+GRASP = 1.5
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True, eq=False)
+class Tool:
+    """A probe with a path."""
+
+    probe: int  # index of the probe in the scene
+    times: Array  # of the keys [s], shape (n,)
+    middles: Array  # of the round tip at those times, c [m], shape (n, 3)
+    axis: Array  # a, shape (3,)
+    length: float  # of the middle line [m]
+    radius: float  # [m]
+    friction: float  # Coulomb's coefficient
+    grips: tuple[tuple[float, float], ...]  # from, to [s]
+
+    @property
+    def way(self) -> float:
+        """How far the tool goes in all [m]."""
+        return float(np.linalg.norm(np.diff(self.middles, axis=0), axis=1).sum())
+
+    @property
+    def speed(self) -> float:
+        """The largest speed of the tool [m/s]."""
+        return float(self._speeds.max(initial=0.0))
+
+    @property
+    def _speeds(self) -> Array:
+        """The speed between the keys [m/s]."""
+        return np.asarray(np.linalg.norm(np.diff(self.middles, axis=0), axis=1) / np.diff(self.times))
+
+    def middle(self, t: Array) -> Array:
+        """Give the middle of the tip at times [s], linear between the keys and held outside, shape (times, 3)."""
+        return np.stack([np.interp(t, self.times, self.middles[:, axis]) for axis in range(3)], axis=-1)
+
+
+def tools_of(probes: Sequence[Probe], sheet: Sheet) -> tuple[Tool, ...]:
+    """List the probes that have a path."""
+    height, width = sheet.size
+    tools = []
+    for index, probe in enumerate(probes):
+        if probe.path is None:
+            continue
+        assert probe.instrument is not None
+        rod, (time, across, down, lowest) = probe.instrument, np.array(probe.path, dtype=float).T
+        middles = np.stack([(across - 0.5) * width, (0.5 - down) * height, lowest + rod.radius], axis=1)
+        tools.append(Tool(index, time, middles, unit(rod.shaft), rod.length, rod.radius, probe.friction, probe.grip))
+    return tuple(tools)
+
+
+def unit(shaft: Sequence[float]) -> Array:
+    """Give a direction the length 1; the largest number is divided by first, so that no square overflows."""
+    axis = np.array(shaft) / max(map(abs, shaft))
+    return np.asarray(axis / np.linalg.norm(axis))
+
+
+def path_problems(scene: Scene, tools: Sequence[Tool], grid: TimeGrid) -> Iterator[Problem]:
+    """Find tools that are in the sheet from the start, and such that move too far in a step."""
+    for tool in tools:
+        where = ("probes", tool.probe, "path")
+        depth = tool.radius - _distance(tool, scene.sheet)
+        if depth > 1e-9 * tool.radius:
+            said = f"the instrument is {depth:.3g} m in the sheet at rest at 0 s; begin above it, at a greater height"
+            yield Problem(where, said)
+        if tool.speed * grid.step > LARGEST_STRIDE * tool.radius * (1 + 1e-9):
+            yield Problem(
+                (*where, int(tool._speeds.argmax()) + 1),
+                f"moves {tool.speed * grid.step:.3g} m in a step of {grid.step:.3g} s, over half the radius of its "
+                f"instrument; move at most {LARGEST_STRIDE * tool.radius / grid.step:.3g} m/s, or take a smaller step",
+            )
+
+
+def path_notes(scene: Scene, tools: Sequence[Tool]) -> Iterator[str]:
+    """Note the tools that are too thin for the points."""
+    apart = max(spacing(scene.sheet))
+    for tool in tools:
+        if apart > WIDEST_CELL * tool.radius:
+            (height, width), most = scene.sheet.size, WIDEST_CELL * tool.radius
+            points = [int(np.ceil(side / most)) + 1 for side in (height, width)]
+            yield (
+                f"probes.{tool.probe}: the points are {apart:.3g} m apart, more than half the radius of the "
+                f"instrument, {tool.radius:.3g} m, which touches few of them; try sheet.points: {points}"
+            )
+
+
+def _distance(tool: Tool, sheet: Sheet) -> float:
+    """Give the distance of the middle line at 0 s from the sheet at rest [m]."""
+    start, half = tool.middle(np.zeros(1))[0], np.array([sheet.size[1] / 2, sheet.size[0] / 2, 0.0])
+
+    def distance(s: float) -> float:
+        place = start + s * tool.axis
+        return float(np.linalg.norm(place - np.clip(place, -half, half)))
+
+    # It is a convex function of s.
+    low, high = 0.0, tool.length
+    for _ in range(200):
+        left, right = low + (high - low) / 3, high - (high - low) / 3
+        low, high = (low, right) if distance(left) <= distance(right) else (left, high)
+    return distance(low)
