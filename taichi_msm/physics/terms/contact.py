@@ -221,7 +221,8 @@ class ContactTerm(Term):
                     u[c] += push[c]
                     d[c] += push[c]
                     pushes = (first_field + PUSHES * tool + c) * row * sheet.width + here
-                    sheet.fields[pushes] += push[c] * now[first + WEIGHT]
+                    # Not `+=`, which would be atomic, and of vectors that does not compile.
+                    sheet.fields[pushes] = sheet.fields[pushes] + push[c] * now[first + WEIGHT]
             for c in ti.static(range(3)):
                 sheet.u[c][entry] = u[c]
                 sheet.d[c][here] = d[c]
