@@ -25,6 +25,7 @@ if TYPE_CHECKING:
     from taichi_msm.runner import resume, run
     from taichi_msm.scene import (
         Camera,
+        Foundation,
         Instrument,
         Light,
         Probe,
@@ -64,6 +65,7 @@ __all__ = [
     "DivergedError",
     "FilesError",
     "Flow",
+    "Foundation",
     "Instrument",
     "Labels",
     "Light",

@@ -13,6 +13,7 @@ from taichi_msm.physics.loads import Envelope
 from taichi_msm.physics.plan import Plan
 from taichi_msm.physics.state import Reading, RunProgress
 from taichi_msm.physics.terms import TERMS
+from taichi_msm.physics.terms.foundation import FoundationTerm
 from taichi_msm.physics.terms.probes import free_acceleration, norm
 
 # No deformation displaces a point by more than this many sheet sizes; a sheet that nothing holds may also fly away.
@@ -55,7 +56,8 @@ class Watch:
         E(b)^(1/2) <= E(a)^(1/2) + (2 m)^(-1/2) integral of |F| from a to b
 
     Tools that are moved add at most what it takes to displace every point as far as they come, at their speed.
-    The virtual springs hold another K / 2 |u|^2; when they begin to act, it is added for the displacements then.
+    The virtual springs hold at most another K / 2 |u|^2, with K of the stiffest; when they begin to act, it is added
+    for the displacements then.
 
     Attributes:
         progress: of the last frame that was found sound; at first, of the frame where the watch begins.
@@ -91,6 +93,7 @@ class Watch:
                 longest_spring=max(progress.longest_spring, reading.longest_spring),
                 energy=reading.energy,
                 reach=where.reach,
+                deepest=max(progress.deepest, -float(reading.displacement[..., 2].min())),
                 peak=max(progress.peak, reading.energy),
             )
         return wrong
@@ -116,7 +119,8 @@ class Watch:
 
     def _most_energy(self, begin: float, end: float) -> float:
         """Bound the energy at the end of an interval that begins at the last recorded frame [J]."""
-        progress, mass, virtual = self.progress, self._plan.material.mass, self._plan.material.virtual / 2
+        progress, material = self.progress, self._plan.material
+        mass, virtual = material.mass, FoundationTerm.bound(material, self._plan.scene.sheet) / 2
         forces, active, activations = self._loads.between(begin, end)
         push = float((forces * self._shares).sum())
         # Products instead of powers: these raise OverflowError where a product is infinite.

@@ -42,6 +42,7 @@ class RunProgress:
     longest_spring: float = 1.0
     energy: float = 0.0  # as in a `Reading`, at this frame [J]
     reach: float = 0.0  # root of the sum of all squared displacements at this frame [m]
+    deepest: float = 0.0  # how far any point was below its place at rest at any frame so far [m]
     peak: float = 0.0  # largest energy at any frame so far [J]
 
 

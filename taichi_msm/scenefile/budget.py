@@ -36,10 +36,10 @@ RECORD_BYTES = 1 << 16
 LABEL_PIXEL_BYTES = 60
 TRACK_BYTES = 9
 
-# Numbers per mass point: displacement and difference; with a map, the stiffness of three springs and what it is made
-# from; and the copies made at the start and for output.
+# Numbers per mass point: displacement and difference; with a map of the stiffness, that of three springs, with one of
+# the foundation its factor, and what these are made from; and the copies made at the start and for output.
 STATE_NUMBERS = 6
-MAP_NUMBERS = 6
+MAP_NUMBERS = {"map": 6, "foundation_map": 4}
 OUTPUT_NUMBERS = 15
 
 
@@ -80,7 +80,7 @@ def estimate(plan: Plan) -> Budget:
     picture = sum(width * height * each + height + FILE_BYTES for each in pixel_bytes if each)
     positions = frames * points * 3 * number_bytes
     tracks = scene.render.tracks**2 * (frames * TRACK_BYTES + 16) + FILE_BYTES if "tracks" in scene.output else 0
-    numbers = STATE_NUMBERS + OUTPUT_NUMBERS + len(scene.probes) + (MAP_NUMBERS if scene.stiffness_map else 0)
+    numbers = STATE_NUMBERS + OUTPUT_NUMBERS + len(scene.probes) + sum(MAP_NUMBERS[name] for name in scene.maps)
     # Pilots are up to two more sheets in f64; with tissue also two smaller ones.
     pilot = scene.time.tolerance is not None or not choose_pilots(plan).reason
     sheets = number_bytes + (8 * (2 + (scene.tissue is not None) * 5 / 16) if pilot else 0)
