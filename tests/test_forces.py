@@ -16,7 +16,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from taichi_msm import Simulation, run
+from taichi_msm import DivergedError, Simulation, run
 from taichi_msm.console import summary
 from taichi_msm.physics.deformed import touched
 from taichi_msm.physics.kernel import SheetLayout
@@ -193,3 +193,20 @@ def test_forces_have_the_same_bits_with_any_number_of_threads(tmp_path: Path, de
     record = json.loads((tmp_path / "out-2" / "run.json").read_text())
     assert record["workers"] == min(2, available_threads()) or device.threads == 1
     assert record["probes"][0]["greatest_force"] > 0.1
+
+
+def test_what_was_felt_before_a_divergence_is_kept(device: Device) -> None:
+    """At the frame before the last good step, also when it is found out again from an earlier one."""
+    blow = {"total": [0, 0, 1e30], "load": [[0.21, 0], [0.21, 100]]}
+    with Simulation(touching([PRESSED, blow]), threads=device.threads) as simulation:
+        simulation.advance(3)
+        start = simulation.save()
+        simulation.advance(2)
+        felt = simulation.felt
+        with pytest.raises(DivergedError):
+            simulation.advance()
+        assert simulation.felt == felt
+        good = simulation.diagnose(start).good
+        assert good is not None
+        assert good.felt == felt
+        assert felt.forces[0].force[2] < -0.1
