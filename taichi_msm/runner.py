@@ -22,10 +22,10 @@ from taichi_msm.physics.lattice import rest_positions
 from taichi_msm.physics.mesh_error import MeshEstimate
 from taichi_msm.physics.pilots import Pilots, choose_pilots
 from taichi_msm.physics.plan import Plan
-from taichi_msm.physics.probe_force import probe_records
+from taichi_msm.physics.probe_force import ProbeRecord, probe_records
 from taichi_msm.physics.run_error import Known, RunError
 from taichi_msm.physics.run_notes import run_notes
-from taichi_msm.physics.state import RunProgress
+from taichi_msm.physics.state import Felt, RunProgress
 from taichi_msm.physics.workload import ENCODING
 from taichi_msm.progress import Progress
 from taichi_msm.render.drawing_notes import drawing_notes
@@ -94,7 +94,7 @@ def run(
 
     Args:
         scene: what `load_scene` returned, or the same as a mapping.
-        directory: where frames/, animation.gif, trajectory.npz and run.json go.
+        directory: where frames/, animation.gif, trajectory.npz, forces.csv and run.json go.
         arch: cpu, cuda or vulkan.
         threads: number of CPU threads; None takes every core. With 1, pictures are encoded in this process too.
         overrides: the overrides that made the scene, for the record.
@@ -347,7 +347,7 @@ class _Run:
         seconds = {stage: watch.seconds.get(stage, 0.0) for stage in stages}
         record = {
             **ending,
-            **_facts(self._task, simulation.progress, known),
+            **_facts(self._task, simulation.progress, simulation.felt, known),
             "resumed": self._resumed,
             "timings": {**seconds, "encode": writer.encode_seconds, "total": watch.total()},
             "arch": device.arch,
@@ -380,11 +380,19 @@ def _pilots(task: _Task, *, resumed: bool) -> Pilots:
     return pilots
 
 
-def _facts(task: _Task, progress: RunProgress, known: Known) -> dict[str, Any]:
+def _facts(task: _Task, progress: RunProgress, felt: Felt, known: Known) -> dict[str, Any]:
     """Say what was run, and what is known of its last frame, for run.json."""
     manifest, plan = task.manifest, task.plan
     scene, grid, limit = plan.scene, plan.grid, plan.stable_step
-    probes = probe_records(scene)
+    probes = [
+        ProbeRecord(
+            **record,
+            greatest_force=math.hypot(*peak.force),
+            greatest_force_vector=list(peak.force),
+            greatest_force_time=peak.time,
+        )
+        for record, peak in zip(probe_records(scene), felt.greatest, strict=True)
+    ]
     return {
         # With the paths of pictures as they were given; only these two sections hold anything that is chosen.
         "scene": manifest.given.model_copy(update={"sheet": scene.sheet, "time": scene.time}).model_dump(mode="json"),

@@ -2,19 +2,28 @@
 
 from __future__ import annotations
 
+import csv
+import json
+import math
+import re
+import subprocess
+import sys
 from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from taichi_msm import Simulation
+from taichi_msm import DivergedError, Simulation, run
+from taichi_msm.console import summary
 from taichi_msm.physics.deformed import touched
 from taichi_msm.physics.kernel import SheetLayout
 from taichi_msm.physics.lattice import rest_positions
 from taichi_msm.physics.probe_force import control_point, probe_records
 from taichi_msm.scene import Scene
+from taichi_msm.system.resources import available_threads
 from taichi_msm.system.runtime import Device
 from tests import reference
 from tests.motion import dynamics_of, structure_of
@@ -130,3 +139,74 @@ def test_forces_go_on_where_they_were_saved(device: Device) -> None:
         assert simulation.felt == end
         with pytest.raises(Exception, match=r"saved at step .* probes"):
             simulation.restore(saved._replace(felt=saved.felt._replace(forces=())))
+
+
+def table_of(directory: Path) -> list[list[str]]:
+    with (directory / "forces.csv").open(newline="") as file:
+        return list(csv.reader(file))
+
+
+def test_a_run_writes_the_forces_of_all_frames(device: Device, tmp_path: Path) -> None:
+    """To the bit, and the greatest of every probe is in the record."""
+    load = {"total": [0.1, 0, -1], "load": [[0, 0], [0.2, 100], [0.4, 0]], "at": [0.2, 0.3]}
+    made = touching([load, *CASES["rubbed"]], output=["forces"])
+    expected = []
+    with Simulation(made, threads=device.threads) as simulation:
+        for frame in range(11):
+            expected += [[frame / 25, one.probe, *one.tip, *one.force] for one in simulation.forces()]
+            simulation.advance(int(frame < 10))
+    record = run(made, tmp_path / "out", threads=device.threads)
+    assert record["outputs"] == ["forces.csv", "run.json"]
+    header, *rows = table_of(tmp_path / "out")
+    assert header == ["time", "probe", "tip_x", "tip_y", "tip_z", "force_x", "force_y", "force_z"]
+    assert [list(map(float, row)) for row in rows] == expected
+    for probe, found in enumerate(record["probes"]):
+        (greatest, row) = max((math.hypot(*row[5:]), row) for row in expected if row[1] == probe)
+        assert found["greatest_force"] == greatest
+        assert [found["greatest_force_time"], *found["greatest_force_vector"]] == [row[0], *row[5:]]
+    said = summary(record, tmp_path)
+    assert re.search(r"^probes\.0: [\d.]+ N in all, at most [\d.]+ kPa$", said, re.MULTILINE)
+    assert re.search(r"^probes\.1: at most [\d.]+ N, at 0\.\d+ s$", said, re.MULTILINE)
+
+
+def test_without_probes_there_is_a_table_without_rows(device: Device, tmp_path: Path) -> None:
+    run(scene(probes=[], output=["forces"]), tmp_path, threads=device.threads)
+    assert len(table_of(tmp_path)) == 1
+
+
+def test_forces_have_the_same_bits_with_any_number_of_threads(tmp_path: Path, device: Device) -> None:
+    """Also a thread, in a process of its own."""
+    probes = json.dumps([{**PRESSED, "friction": 0.3}])
+    (tmp_path / "scene.yaml").write_text(
+        "sheet: {points: [41, 61], size: [0.3, 0.4]}\n"
+        "tissue: {young: 1.0e3, thickness: 0.01, density: 1000, foundation: 3.0e3, damping: 5}\n"
+        f"probes: {probes}\n"
+        "time: {duration: 0.4, precision: f32}\n"
+        "output: [forces]\n"
+    )
+    tables = []
+    for threads in (1, 2):
+        command = [sys.executable, "-m", "taichi_msm", "run", "scene.yaml", "--threads", str(threads), "--quiet"]
+        subprocess.run([*command, "--out", f"out-{threads}"], cwd=tmp_path, check=True)
+        tables.append((tmp_path / f"out-{threads}" / "forces.csv").read_bytes())
+    assert tables[0] == tables[1]
+    record = json.loads((tmp_path / "out-2" / "run.json").read_text())
+    assert record["workers"] == min(2, available_threads()) or device.threads == 1
+    assert record["probes"][0]["greatest_force"] > 0.1
+
+
+def test_what_was_felt_before_a_divergence_is_kept(device: Device) -> None:
+    """At the frame before the last good step, also when it is found out again from an earlier one."""
+    blow = {"total": [0, 0, 1e30], "load": [[0.21, 0], [0.21, 100]]}
+    with Simulation(touching([PRESSED, blow]), threads=device.threads) as simulation:
+        simulation.advance(3)
+        start = simulation.save()
+        simulation.advance(2)
+        felt = simulation.felt
+        with pytest.raises(DivergedError):
+            simulation.advance()
+        assert simulation.felt == felt
+        good = simulation.diagnose(start).good
+        assert good is not None
+        assert good.felt == felt
+        assert felt.forces[0].force[2] < -0.1

@@ -76,15 +76,33 @@ def interrupted(made: Scene, directory: str, device: Device, after: int = 12) ->
     return record
 
 
+# A tool that is moved, and pulls what it has gripped, besides one with a force.
+GRIPPING = (
+    "probes=[{force: [0, 300, -1000], falloff: 20, load: [[0, 0], [0.03, 100], [0.06, 0]]}, "
+    "{path: [[0, 0.5, 0.5, 0.001], [0.05, 0.5, 0.5, -0.02], [0.12, 0.6, 0.5, 0.03]], grip: [[0.05, 0.11]], "
+    "friction: 0.2, instrument: {radius: 0.05, shaft: [0, -0.3, 1], length: 0.2}}]",
+)
+
+
 @pytest.mark.parametrize(
-    "output", ["png, gif, trajectory", pytest.param("gif", marks=pytest.mark.slow), "trajectory", ""]
+    ("output", "probes"),
+    [
+        ("png, gif, trajectory", ()),
+        pytest.param("gif", (), marks=pytest.mark.slow),
+        ("trajectory", ()),
+        ("", ()),
+        ("png, forces", GRIPPING),
+        ("forces", GRIPPING),
+        ("", GRIPPING),
+    ],
+    ids=["all", "gif", "trajectory", "none", "forces and more", "forces", "forces not asked for"],
 )
 def test_a_run_that_is_interrupted_goes_on_to_the_same_bits(
-    output: str, small: Path, device: Device, monkeypatch: pytest.MonkeyPatch
+    output: str, probes: tuple[str, ...], small: Path, device: Device, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Again and again, at a frame's end and within one, and while earlier frames are drawn anew."""
     monkeypatch.setattr(solver, "MAX_STEPS_PER_LAUNCH", 300)
-    made = dragged("time.duration=0.12", f"output=[{output}]")
+    made = dragged("time.duration=0.12", f"output=[{output}]", *probes)
     whole = run(made, "whole", threads=device.threads, estimate_error=False)
     record = run(made, "parts", threads=device.threads, estimate_error=False, progress=Stop(5))
     steps = []
@@ -105,6 +123,7 @@ def test_a_run_that_is_interrupted_goes_on_to_the_same_bits(
     assert steps == sorted(steps)
     assert any(step % 1000 for step in steps), "within a frame"
     assert results(small / "parts") == results(small / "whole")
+    assert record["probes"] == whole["probes"]
     for key in ("steps", "frames", "max_displacement", "shortest_spring", "notes", "outputs", "scene", "overrides"):
         assert record[key] == whole[key]
     assert not (small / "parts" / ".partial").exists()

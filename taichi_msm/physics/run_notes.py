@@ -32,7 +32,7 @@ WRONG = 0.01
 
 def run_notes(
     plan: Plan,
-    probes: Sequence[ProbeRecord | None],
+    probes: Sequence[ProbeRecord],
     progress: RunProgress,
     estimate: Estimate | None,
     reason: str = "",

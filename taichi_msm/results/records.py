@@ -53,7 +53,7 @@ class Records:
 
     def add(self, number: int, values: NDArray[Any]) -> None:
         """Write the array of a number, over any that is there."""
-        data = np.ascontiguousarray(values, self._dtype).data.cast("B")
+        data = np.ascontiguousarray(values, self._dtype).reshape(-1).view(np.uint8).data
         self._file.seek(number * self._size)
         for rest in (memoryview(self._digest(number, data)), data):
             while rest:  # A write to an unbuffered file may take only some of the bytes.

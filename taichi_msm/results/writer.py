@@ -1,4 +1,4 @@
-"""Write the results of a run: frames, animation, trajectory and record, whole or not at all."""
+"""Write the results of a run: frames, animation, trajectory, forces and record, whole or not at all."""
 
 from __future__ import annotations
 
