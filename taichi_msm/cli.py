@@ -267,8 +267,8 @@ def check(scene: str, image: str | None, overrides: tuple[str, ...], as_json: bo
         f"{need.working_bytes / 2**20:.1f} MiB more while it runs"
     )
     for index, probe in enumerate(facts["probes"]):
-        if probe is not None:
-            click.echo(f"probes.{index}: {in_words(probe)}")
+        if said := in_words(probe):
+            click.echo(f"probes.{index}: {said}")
     for note in facts["notes"]:
         click.echo(note)
     return DONE

@@ -126,7 +126,7 @@ def summary(record: Mapping[str, Any], directory: Path) -> str:
         f"{printable(str(directory))}: {record['frames']} frames, {steps}, {rows} x {cols} points, "
         f"largest displacement {record['max_displacement']:.4g} m",
         *([f"the first {record['resumed']} frames were simulated by an earlier run"] if record["resumed"] else []),
-        *(f"probes.{index}: {in_words(probe)}" for index, probe in enumerate(record["probes"]) if probe is not None),
+        *(f"probes.{index}: {in_words(probe)}" for index, probe in enumerate(record["probes"])),
         *record["notes"],
         f"{times['total']:.2f} s: {stages}{' (encoding runs in parallel)' if beside else ''}",
     ]

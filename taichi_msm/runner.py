@@ -20,10 +20,10 @@ from taichi_msm.errors import DamagedError, DeviceError, DivergedError, FilesErr
 from taichi_msm.physics.lattice import rest_positions
 from taichi_msm.physics.pilots import AT_REST, Pilots, choose_pilots
 from taichi_msm.physics.plan import Plan
-from taichi_msm.physics.probe_force import probe_records
+from taichi_msm.physics.probe_force import ProbeRecord, probe_records
 from taichi_msm.physics.run_error import Known, RunError
 from taichi_msm.physics.run_notes import run_notes
-from taichi_msm.physics.state import RunProgress
+from taichi_msm.physics.state import Felt, RunProgress
 from taichi_msm.physics.workload import ENCODING
 from taichi_msm.progress import Progress
 from taichi_msm.render.drawing_notes import drawing_notes
@@ -92,7 +92,7 @@ def run(
 
     Args:
         scene: what `load_scene` returned, or the same as a mapping.
-        directory: where frames/, animation.gif, trajectory.npz and run.json go.
+        directory: where frames/, animation.gif, trajectory.npz, forces.csv and run.json go.
         arch: cpu, cuda or vulkan.
         threads: number of CPU threads; None takes every core. With 1, pictures are encoded in this process too.
         overrides: the overrides that made the scene, for the record.
@@ -290,7 +290,7 @@ class _Run:
             position = writer.position(frame) if frame < self._resumed else simulation.positions()
             with stage("render"):
                 observed = simulation.observe(observed.labels, position, frame / scene.time.frames_per_second)
-            writer.add(position, observed, told)
+            writer.add(position, observed, simulation.forces(), told)
             if self._error and frame > 0:
                 with stage("pilot"):
                     self._error.follow(position - rest, told)
@@ -344,7 +344,7 @@ class _Run:
         seconds = {stage: watch.seconds.get(stage, 0.0) for stage in stages}
         record = {
             **ending,
-            **_facts(self._task, simulation.progress, known),
+            **_facts(self._task, simulation.progress, simulation.felt, known),
             "resumed": self._resumed,
             "timings": {**seconds, "encode": writer.encode_seconds, "total": watch.total()},
             "arch": device.arch,
@@ -377,10 +377,19 @@ def _pilots(task: _Task, *, resumed: bool) -> Pilots:
     return pilots
 
 
-def _facts(task: _Task, progress: RunProgress, known: Known) -> dict[str, Any]:
+def _facts(task: _Task, progress: RunProgress, felt: Felt, known: Known) -> dict[str, Any]:
     """Say what was run, and what is known of its last frame, for run.json."""
     manifest, plan = task.manifest, task.plan
-    scene, probes = plan.scene, probe_records(plan.scene)
+    scene = plan.scene
+    probes = [
+        ProbeRecord(
+            **record,
+            greatest_force=math.hypot(*peak.force),
+            greatest_force_vector=list(peak.force),
+            greatest_force_time=peak.time,
+        )
+        for record, peak in zip(probe_records(scene), felt.greatest, strict=True)
+    ]
     return {
         # With the paths of pictures as they were given; only these two sections hold anything that is chosen.
         "scene": manifest.given.model_copy(update={"sheet": scene.sheet, "time": scene.time}).model_dump(mode="json"),

@@ -165,6 +165,13 @@ class Springs(Section):
     )
 
 
+class Foundation(Section):
+    """The tissue underneath, as an elastic layer; young / depth is its stiffness, force per area and displacement."""
+
+    young: Positive = key(..., "Young's modulus of the tissue underneath [Pa]", "a number above 0, in Pa")
+    depth: Positive = key(..., "depth of the tissue underneath [m]", "a number above 0, in metres")
+
+
 class Tissue(Section):
     """Tissue in physical units: a sheet of plane stress with Poisson's ratio 1/3, the same at any number of points."""
 
@@ -173,10 +180,11 @@ class Tissue(Section):
     density: Positive | None = key(
         None, "density [kg/m3]; required unless motion is quasistatic", "a number above 0, in kg/m3"
     )
-    foundation: NotNegative = key(
+    foundation: NotNegative | Foundation = key(
         0.0,
-        "stiffness of the tissue underneath, as virtual springs: force per area and displacement [N/m3]",
-        "a number, 0 or more, in N/m3",
+        "stiffness of the tissue underneath, as virtual springs: force per area and displacement [N/m3]; "
+        "or young / depth of that tissue",
+        "a number, 0 or more, in N/m3, or {young: [Pa], depth: [m]}",
     )
     foundation_active: Literal["loaded", "always"] = key(
         "loaded", "when the foundation acts: while any probe's percent is not 0, or always", "loaded or always"
@@ -191,6 +199,15 @@ class Tissue(Section):
         "plate, or a number, 0 or more, in N m",
     )
     map: StiffnessMap | None = key(None, "factor of young from place to place", "a mapping with image and range")
+    foundation_map: StiffnessMap | None = key(
+        None, "factor of the foundation from place to place", "a mapping with image and range"
+    )
+
+    @property
+    def foundation_stiffness(self) -> float:
+        """Stiffness of the foundation, where its map has the factor 1 [N/m3]."""
+        below = self.foundation
+        return below.young / below.depth if isinstance(below, Foundation) else below
 
 
 class Instrument(Section):
@@ -575,7 +592,7 @@ class Scene(Section):
 
     @property
     def maps(self) -> dict[str, StiffnessMap]:
-        """The maps of the springs or the tissue, by the keys that name them: map."""
+        """The maps of the springs or the tissue, by the keys that name them: map, foundation_map."""
         return {name: value for name, value in (self.tissue or self.springs or ()) if isinstance(value, StiffnessMap)}
 
     @property

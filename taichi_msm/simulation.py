@@ -12,12 +12,14 @@ from numpy.typing import NDArray
 from taichi_msm.arguments import are_numbers, as_array, require_frame_count
 from taichi_msm.errors import ArgumentError, DivergedError, MsmError
 from taichi_msm.physics import divergence
+from taichi_msm.physics.deformed import to_positions
 from taichi_msm.physics.diagnosis import Diagnosis, diagnose
 from taichi_msm.physics.divergence import Watch, farthest
-from taichi_msm.physics.lattice import axes
+from taichi_msm.physics.forces import Gauge
 from taichi_msm.physics.plan import Plan
 from taichi_msm.physics.rest import sheet_of
-from taichi_msm.physics.state import Reading, RunProgress, Saved
+from taichi_msm.physics.state import Felt, Reading, RunProgress, Saved, TipForce
+from taichi_msm.physics.steering import steered, with_paths_of
 from taichi_msm.progress import Pause
 from taichi_msm.render.labels import Flow, Labels, Observed, Sight
 from taichi_msm.render.picking import pick
@@ -80,12 +82,16 @@ class Simulation:
         texture = None if texture is None else require_texture(texture)
         self.device = runtime.start(arch, threads)
         self._plan = resolve(plan, self.device).plan
-        self._watch = Watch(self._plan)
-        self._closed = False
-        self._divergence: DivergedError | None = None
-        self._cores = cores
+        # As they are before they are steered.
+        self._probes = self.scene.probes
+        self._watch: Watch
+        self._gauge: Gauge
+        self._felt: Felt
+        self._placed: Array | None
+        self._divergence: DivergedError | None
+        self._closed, self._cores = False, cores
         self._dynamics = sheet_of(self._plan, self.device, cores=cores)
-        self._placed = self._first_position()
+        self._begin()
         self.renderer = Renderer(self.scene, texture)
 
     @property
@@ -142,31 +148,35 @@ class Simulation:
         """
         require_frame_count(frames)
         self._require_open()
-        if self._placed is None:
-            self._go_to(0, pause)
+        self._find_first(pause)
         for _ in range(frames):
             self._go_to(self.frame + 1, pause)
 
     def steer(self, probes: Sequence[Probe | Mapping[str, Any]]) -> None:
-        """Replace the loads from here on.
+        """Replace the loads, and where tools are moved to, from here on.
 
         Args:
             probes: the scene's probes with other numbers. Each control point must move, jump or stand as before; for a
-                tool that is to move later, give `at` as keys from the start, be it a single one.
+                tool that is to move later, give `at` as keys from the start, be it a single one. Of a tool that has a
+                path take `{"path": [[t, across, down, height], ...]}` with times after `time`: it goes straight from
+                where it is to the first of them. Its instrument, friction and grips stay, unless they are given too; a
+                grip that has begun goes on if its beginning is among them.
 
         Raises:
             ArgumentError: when the kernel was not compiled for such probes.
-            SceneError: when one of them is not a probe.
+            SceneError: when one of them is not a probe, or a tool would jump.
         """
         self._require_open()
         if not isinstance(probes, Sequence):
             raise ArgumentError(f"probes: {probes!r}; take a list of them")
-        plan = self._plan.with_probes(probes)
+        self._find_first()
+        plan = steered(self._plan, probes, self._plan.grid.time(self.steps))
         self._dynamics.steer(plan)
         self._watch.steer(plan)
+        self._gauge = Gauge(plan)
         self._plan, self.renderer.scene = plan, plan.scene
 
-    def restart(self, scene: Scene | Mapping[str, Any] | None = None) -> None:
+    def restart(self, scene: Plan | Scene | Mapping[str, Any] | None = None) -> None:
         """Begin again at rest. Nothing is compiled if the terms of the model and the precision stay the same.
 
         Args:
@@ -179,15 +189,16 @@ class Simulation:
         motion = self.scene.time.motion
         if scene is not None:
             self._plan = resolve(checked(scene), self.device).plan
+            self._probes = self.scene.probes
             self.renderer.restart(self.scene)
-        self._watch = Watch(self._plan)
-        self._divergence = None
+        else:
+            self._follow_paths(self._probes)
         if self.scene.time.motion == motion:
             self._dynamics.restart(self._plan)
         else:
             self._dynamics.close()
             self._dynamics = sheet_of(self._plan, self.device, cores=self._cores)
-        self._placed = self._first_position()
+        self._begin()
 
     def save(self) -> Saved:
         """Save all that another simulation needs to continue from here.
@@ -196,17 +207,16 @@ class Simulation:
             DivergedError: as for `advance`.
         """
         self._require_open()
-        if self._placed is None:
-            self.advance(0)
+        self._find_first()
         reading = self._dynamics.read()
         self._require_good(reading, self._watch.judge(reading))
-        return Saved(self._dynamics.state(), self.progress)
+        return Saved(self._dynamics.state(), self.progress, self._felt, self.scene.probes)
 
     def restore(self, saved: Saved) -> None:
         """Continue from where a simulation of the same scene was saved, also between two frames; to the same bits.
 
         Raises:
-            ArgumentError: when it was saved with other points, another precision or another step.
+            ArgumentError: when it was saved with other points or probes, another precision or another step.
         """
         self._require_open()
         if not isinstance(saved, Saved):
@@ -215,15 +225,17 @@ class Simulation:
         since = state.steps - saved.progress.frame * per_frame
         here = self._dynamics.displacement()
         alike = (state.displacement.shape, state.displacement.dtype) == (here.shape, here.dtype)
-        if not (alike and 0 <= since <= per_frame):
+        if not (alike and len(saved.felt.forces) == len(self.scene.probes) and 0 <= since <= per_frame):
             raise ArgumentError(
                 f"saved at step {state.steps}, frame {saved.progress.frame}, {state.displacement.dtype} of shape "
-                f"{state.displacement.shape}; take what was saved with this scene's points, precision and step"
+                f"{state.displacement.shape}; take what was saved with this scene's points, probes, precision and step"
             )
+        if saved.probes:
+            self._follow_paths(saved.probes)
         self._divergence = None
         self._dynamics.restart(self._plan, saved.state)
-        self._placed = self._place(self._dynamics.displacement())
-        self._watch.progress = saved.progress
+        self._placed = to_positions(self._dynamics.displacement(), self.scene.sheet)
+        self._watch.progress, self._felt = saved.progress, saved.felt
 
     def positions(self) -> Array:
         """Give where the points are.
@@ -232,6 +244,16 @@ class Simulation:
             Positions [m], shape (rows, cols, 3), in the scene's precision; not to be written to.
         """
         return self._position
+
+    def forces(self) -> list[TipForce]:
+        """Give what every probe does at the last frame: where its tip is, and its force on the sheet."""
+        self._find_first()
+        return list(self._felt.forces)
+
+    @property
+    def felt(self) -> Felt:
+        """The forces at the last frame, and the greatest so far."""
+        return self._felt
 
     def velocities(self) -> Array:
         """Give the velocities of the points: the mean over the last step, so those half a step before `time`.
@@ -260,7 +282,11 @@ class Simulation:
         if self._divergence is None:
             raise MsmError("this simulation has not diverged; there is nothing to find out")
         if self.scene.time.at_rest:
-            good = None if self._placed is None else Saved(self._dynamics.state(), self.progress)
+            good = (
+                None
+                if self._placed is None
+                else Saved(self._dynamics.state(), self.progress, self._felt, self.scene.probes)
+            )
             return Diagnosis(str(self._divergence), good)
         return diagnose(self._dynamics, start, pause)
 
@@ -358,7 +384,7 @@ class Simulation:
         self._dynamics.compile()
         pause()
         if self.scene.renders and (kernels := self.renderer.kernels()) not in _compiled:
-            position = self._place(self._dynamics.displacement())
+            position = to_positions(self._dynamics.displacement(), self.scene.sheet)
             first = self.observe(None, position, self.time)
             self.observe(first.labels, position, self.time)
             _compiled.add(kernels)
@@ -383,14 +409,15 @@ class Simulation:
     @property
     def _position(self) -> Array:
         """Positions of the last frame [m], which is found first where it is at rest under a load."""
-        if self._placed is None:
-            self.advance(0)
+        self._find_first()
         assert self._placed is not None
         return self._placed
 
-    def _first_position(self) -> Array | None:
-        """Give the positions at the start; None: the sheet is at rest, and its first frame is yet to be found."""
-        return None if self.scene.time.at_rest else self._place(self._dynamics.displacement())
+    def _find_first(self, pause: Pause = lambda: None) -> None:
+        """Find the first frame, where it is at rest and that is yet to be done."""
+        if self._placed is None:
+            self._require_open()
+            self._go_to(0, pause)
 
     def _go_to(self, frame: int, pause: Pause) -> None:
         """Simulate up to a frame."""
@@ -401,7 +428,9 @@ class Simulation:
             raise
         reading = self._dynamics.read()
         self._require_good(reading, self._watch.follow(reading))
-        self._placed = self._place(reading.displacement)
+        position = to_positions(reading.displacement, self.scene.sheet)
+        self._felt = self._gauge.follow(self._felt, self.frame, position, self._dynamics.tool_forces())
+        self._placed = position
 
     def _require_open(self) -> None:
         # The kernels would write to memory that was freed.
@@ -434,11 +463,15 @@ class Simulation:
             self._divergence = DivergedError(divergence.message(time, steps, fault, exact=False), steps, time, point)
             raise self._divergence
 
-    def _place(self, displacement: Array) -> Array:
-        """Turn displacements into positions."""
-        position, (x, y) = displacement, axes(self.scene.sheet)
-        # The sum is computed in float64 and rounded once, without a float64 copy of the sheet.
-        np.add(position[..., 0], x, out=position[..., 0], casting="same_kind")
-        np.add(position[..., 1], y, out=position[..., 1], casting="same_kind")
-        position.flags.writeable = False
-        return position
+    def _begin(self) -> None:
+        """Begin with the flat sheet; at rest, the first frame is yet to be found."""
+        self._divergence = None
+        self._watch, self._gauge = Watch(self._plan), Gauge(self._plan)
+        self._felt = self._gauge.at_rest()
+        flat = to_positions(self._dynamics.displacement(), self.scene.sheet)
+        self._placed = None if self.scene.time.at_rest else flat
+
+    def _follow_paths(self, probes: Sequence[Probe]) -> None:
+        """Move tools along the paths that these probes have, in place of those that they were steered along."""
+        self._plan = with_paths_of(self._plan, probes)
+        self._gauge, self.renderer.scene = Gauge(self._plan), self.scene

@@ -129,6 +129,8 @@ def random_tissue(seed: int, image: str, precision: str = "f64") -> Scene:
         tissue["bending"] = 0
     if rng.random() < 0.5:
         tissue["map"] = {"image": image, "range": [some(0.7, 1), some(1, 4)]}
+    if tissue["foundation"] and rng.random() < 0.5:
+        tissue["foundation_map"] = {"image": image, "range": [some(0.1, 1), some(1, 4)]}
     return Scene(
         sheet={"points": [rows, cols], "size": size, "fixed": fixed},
         tissue=tissue,

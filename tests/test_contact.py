@@ -26,7 +26,7 @@ def moved(*keys: list[float], **changes: Any) -> dict[str, Any]:
 def touching(probes: list[dict[str, Any]], **sections: Any) -> Scene:
     tissue = {"young": 1e3, "thickness": 0.01, "density": 1000, "foundation": 3e3, "damping": 5}
     given = {"sheet": {"points": [17, 21], "size": [0.3, 0.4]}, "tissue": tissue, "springs": None, "damping": 0}
-    return scene(**given, probes=probes, **sections)
+    return scene(**{**given, "probes": probes, **sections})
 
 
 PRESSED = moved([0, 0.5, 0.5, 0.001], [0.2, 0.52, 0.45, -0.03], [0.4, 0.6, 0.5, -0.02])

@@ -12,6 +12,7 @@ import pytest
 from taichi_msm import DivergedError, Simulation
 from taichi_msm.physics.diagnosis import Diagnosis
 from taichi_msm.physics.divergence import farthest_displacement
+from taichi_msm.physics.forces import Gauge
 from taichi_msm.physics.state import RunProgress, Saved, State
 from taichi_msm.scene import Scene
 from taichi_msm.system.runtime import Device
@@ -40,7 +41,7 @@ def pressed(precision: str = "f32", **sections: object) -> Scene:
 
 def rest(made: Scene) -> Saved:
     nothing = np.zeros((*made.sheet.points, 3), made.time.precision.replace("f", "float"))
-    return Saved(State(0, nothing, nothing), RunProgress())
+    return Saved(State(0, nothing, nothing), RunProgress(), Gauge(plan_of(made)).at_rest())
 
 
 def with_fault(saved: Saved, part: str, change: float, random: np.random.Generator) -> Saved:
@@ -149,7 +150,7 @@ def test_springs_that_begin_to_pull_from_afar_give_energy(device: Device) -> Non
     away = np.full((2, 2, 3), [0, 0, 0.02])
     held = 50 / 2 * 0.02**2 * 4
     with Simulation(made, threads=device.threads) as simulation:
-        simulation.restore(Saved(State(0, away, np.zeros_like(away)), RunProgress(reach=0.04)))
+        simulation.restore(rest(made)._replace(state=State(0, away, 0 * away), progress=RunProgress(reach=0.04)))
         simulation.advance()
         assert simulation.progress.energy > 10 * held
 

@@ -54,7 +54,7 @@ NO_PICTURE = "image: a picture is needed to draw png or gif; name one, or set ou
 Load = Callable[..., Scene]
 
 # The kinds of output, as errors list them.
-OUTPUTS = "png, gif, trajectory, coordinates, depth, flow, occlusion, instrument, tracks"
+OUTPUTS = "png, gif, trajectory, forces, coordinates, depth, flow, occlusion, instrument, tracks"
 
 
 @pytest.fixture

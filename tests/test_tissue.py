@@ -17,7 +17,7 @@ from taichi_msm.errors import ArgumentError, FilesError, SceneError
 from taichi_msm.physics import kernel_gpu, probe_force
 from taichi_msm.physics.error_control import longest
 from taichi_msm.physics.lattice import rest_positions
-from taichi_msm.physics.material import MapImage
+from taichi_msm.physics.material import Maps
 from taichi_msm.physics.mesh_error import FEWEST, CubicSampling, MeshEstimate, MeshPilot, choose_points, coarser
 from taichi_msm.physics.plan import Plan
 from taichi_msm.physics.terms.bending import BendingTerm
@@ -101,6 +101,7 @@ def test_the_random_tissues_have_every_term(image: str, device: Device) -> None:
     codes = [structure_of(random_tissue(seed, image), device).code for seed in SEEDS]
     for kind in (FoundationTerm, DampingTerm, BendingTerm):
         assert {code.get(kind) is None for code in codes} == {False, True}, kind
+    assert {term.mapped for code in codes if (term := code.get(FoundationTerm))} == {False, True}
     springs, probes = [code.require(SpringTerm) for code in codes], [code.require(ProbeTerm) for code in codes]
     for flag in ("mapped", "tense", "open_edges", "by_area"):
         assert {getattr(term, flag) for term in springs} == {False, True}, flag
@@ -426,9 +427,9 @@ def test_a_tolerance_far_out_of_reach_is_refused_after_one_run(
 ) -> None:
     tried: list[tuple[int, int]] = []
 
-    def check(scene: Scene, image: MapImage | None) -> Plan:
+    def check(scene: Scene, maps: Maps | None) -> Plan:
         tried.append(scene.sheet.points)
-        return checked(scene, image)
+        return checked(scene, maps)
 
     with pytest.raises(
         SceneError, match=r"1e-10 is out of reach: with 13 x 15 points the error is 0\.\d+, and no sheet"

@@ -8,7 +8,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from taichi_msm.physics import divergence
+from taichi_msm.physics.deformed import to_positions
 from taichi_msm.physics.divergence import Watch, farthest
+from taichi_msm.physics.forces import Gauge
 from taichi_msm.physics.lattice import axes
 from taichi_msm.physics.plan import Plan
 from taichi_msm.physics.probe_force import control_points, probe_force
@@ -37,15 +39,20 @@ def diagnose(dynamics: Dynamics, start: Saved | None, pause: Pause) -> Diagnosis
     The state of the dynamics afterwards is arbitrary.
     """
     plan, grid, bad = dynamics.plan, dynamics.plan.grid, dynamics.steps_done
-    state, progress = start or (None, RunProgress())
+    gauge = Gauge(plan)
+    state, progress, felt = (None, RunProgress(), gauge.at_rest()) if start is None else start[:3]
     watch = Watch(plan, progress)
     dynamics.restart(plan, state)
     low, wrong = dynamics.state(), ""
     while low.steps < bad:
         dynamics.advance(min(bad, (watch.progress.frame + 1) * grid.steps_per_frame) - low.steps, pause)
-        wrong = watch.follow(dynamics.read())
+        reading = dynamics.read()
+        wrong = watch.follow(reading)
         if wrong:
             break
+        if watch.progress.frame * grid.steps_per_frame == reading.steps:
+            position = to_positions(reading.displacement, plan.scene.sheet)
+            felt = gauge.follow(felt, watch.progress.frame, position, dynamics.tool_forces())
         low = dynamics.state()
     if not wrong:
         said = "but not when it was repeated, so the machine has made an error; continue with --resume"
@@ -63,7 +70,8 @@ def diagnose(dynamics: Dynamics, start: Saved | None, pause: Pause) -> Diagnosis
     reading = dynamics.read()
     cause = _cause(dynamics, high, farthest(reading.displacement)[:2], pause)
     said = f"{watch.judge(reading)}; {cause}"
-    return Diagnosis(divergence.message(grid.time(high), high, said, exact=True), Saved(low, watch.progress))
+    good = Saved(low, watch.progress, felt, plan.scene.probes)
+    return Diagnosis(divergence.message(grid.time(high), high, said, exact=True), good)
 
 
 def _cause(dynamics: Dynamics, bad: int, point: tuple[int, int], pause: Pause) -> str:

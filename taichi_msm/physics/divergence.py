@@ -13,6 +13,7 @@ from taichi_msm.physics.loads import Envelope
 from taichi_msm.physics.plan import Plan
 from taichi_msm.physics.state import Reading, RunProgress
 from taichi_msm.physics.terms import TERMS
+from taichi_msm.physics.terms.foundation import FoundationTerm
 from taichi_msm.physics.terms.probes import free_acceleration, norm
 
 # No deformation displaces a point by more than this many sheet sizes; a sheet that nothing holds may also fly away.
@@ -26,10 +27,13 @@ SWING = 4.0
 ROUNDING = 1e-9
 
 
-def farthest_displacement(plan: Plan, time: float, acceleration: float | None = None) -> float:
+def farthest_displacement(
+    plan: Plan, time: float, acceleration: float | None = None, speed: float | None = None
+) -> float:
     """Bound the displacement of a point at a time [m]; if one is larger, the simulation has diverged.
 
-    acceleration: most that the probes have given to a free point so far [m/s^2]; None: most that the scene's can.
+    acceleration, speed: most that the probes have given to a free point so far [m/s^2], and all tools that are moved
+    together [m/s]; None: most that the scene's can.
     """
     most = MOST_SHEET_SIZES * max(plan.scene.sheet.size)
     # Springs then connect every point to a fixed one; shear springs alone may skip every other point.
@@ -38,7 +42,8 @@ def farthest_displacement(plan: Plan, time: float, acceleration: float | None = 
     if plan.material.virtual > 0 and not plan.material.always:
         # The virtual springs may accelerate a point from far away, and let go of it when it is fast.
         return math.inf
-    most += sum(tool.speed for tool in plan.tools) * time
+    # An elastic body that is hit goes twice as fast as what hits it.
+    most += 2 * (_speed(plan) if speed is None else speed) * time
     return most + (free_acceleration(plan) if acceleration is None else acceleration) * time * time / 2
 
 
@@ -51,7 +56,8 @@ class Watch:
         E(b)^(1/2) <= E(a)^(1/2) + (2 m)^(-1/2) integral of |F| from a to b
 
     Tools that are moved add at most what it takes to displace every point as far as they come, at their speed.
-    The virtual springs hold another K / 2 |u|^2; when they begin to act, it is added for the displacements then.
+    The virtual springs hold at most another K / 2 |u|^2, with K of the stiffest; when they begin to act, it is added
+    for the displacements then.
 
     Attributes:
         progress: of the last frame that was found sound; at first, of the frame where the watch begins.
@@ -61,7 +67,7 @@ class Watch:
         self.progress = progress or RunProgress()
         self._plan, self._grid = plan, plan.grid
         self._loads = Envelope(plan)
-        self._acceleration = free_acceleration(plan)
+        self._acceleration, self._speed = free_acceleration(plan), _speed(plan)
         self._moved = _most_moved(plan)
         self._shares = np.array([norm(slot, plan.scene) for slot in plan.slots])
         self._swing = SWING / max(1e-9, 1 - (plan.grid.step / plan.stable_step) ** 2)
@@ -72,6 +78,7 @@ class Watch:
         self._plan = plan
         self._loads = Envelope(plan)
         self._acceleration = max(self._acceleration, free_acceleration(plan))
+        self._speed = max(self._speed, _speed(plan))
         self._moved = max(self._moved, _most_moved(plan))
 
     def follow(self, reading: Reading) -> str:
@@ -86,6 +93,7 @@ class Watch:
                 longest_spring=max(progress.longest_spring, reading.longest_spring),
                 energy=reading.energy,
                 reach=where.reach,
+                deepest=max(progress.deepest, -float(reading.displacement[..., 2].min())),
                 peak=max(progress.peak, reading.energy),
                 residual=max(progress.residual, reading.residual),
                 evaluations=progress.evaluations + reading.evaluations,
@@ -102,7 +110,7 @@ class Watch:
         begin, end = self.progress.frame / self._grid.frames_per_second, self._grid.time(reading.steps)
         point, distance, energy = f"point ({where.row}, {where.column})", where.distance, reading.energy
         # Written so that NaN is found too: no comparison with it is true.
-        if not distance <= farthest_displacement(self._plan, end, self._acceleration):
+        if not distance <= farthest_displacement(self._plan, end, self._acceleration, self._speed):
             size = max(self._plan.scene.sheet.size)
             return f"{point} is {distance:g} m from its rest position, and the sheet is {size:g} m long"
         most = self._most_energy(begin, end)
@@ -115,7 +123,8 @@ class Watch:
 
     def _most_energy(self, begin: float, end: float) -> float:
         """Bound the energy at the end of an interval that begins at the last recorded frame [J]."""
-        progress, mass, virtual = self.progress, self._plan.material.mass, self._plan.material.virtual / 2
+        progress, material = self.progress, self._plan.material
+        mass, virtual = material.mass, FoundationTerm.bound(material, self._plan.scene.sheet) / 2
         forces, active, activations = self._loads.between(begin, end)
         push = float((forces * self._shares).sum())
         # Products instead of powers: these raise OverflowError where a product is infinite.
@@ -151,6 +160,11 @@ def farthest(displacement: NDArray[np.floating]) -> Farthest:
         row, column = (int(index) for index in np.unravel_index(square.argmax(), square.shape))
         distance = float(np.linalg.norm(displacement[row, column].astype(float)))
         return Farthest(row, column, distance, math.sqrt(square.sum()))
+
+
+def _speed(plan: Plan) -> float:
+    """Add up the largest speeds of the tools that are moved [m/s]."""
+    return sum(tool.speed for tool in plan.tools)
 
 
 def _most_moved(plan: Plan) -> float:

@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 from taichi_msm.physics.lattice import axes
 from taichi_msm.physics.material import area_shares
 from taichi_msm.physics.plan import EDGE, Plan, ProbeSegment, ProbeSlot, probe_slots
-from taichi_msm.physics.probe_force import control_points, probe_force
+from taichi_msm.physics.probe_force import control_points, point_at, probe_force
 from taichi_msm.scene import WHOLE, Probe, Scene, Sheet
 
 # A time before all others [s].
@@ -39,9 +39,12 @@ class Schedule(NamedTuple):
     active: Array  # share of their stiffness with which the virtual springs act, 0 to 1; shape (steps,)
 
 
-def decay(probe: Probe, sheet: Sheet) -> Array:
-    """Give the share of a probe's force that each point feels at its control point's first place, (rows, cols)."""
-    acts, (at_x, at_y) = probe_force(probe, sheet), control_points(probe, sheet)[1][0]
+def decay(probe: Probe, sheet: Sheet, at: Array | None = None) -> Array:
+    """Give the share of a probe's force that each point feels, shape (rows, cols).
+
+    at: the control point, x and y at rest [m]; None: its first place.
+    """
+    acts, (at_x, at_y) = probe_force(probe, sheet), control_points(probe, sheet)[1][0] if at is None else at
     x, y = axes(sheet)
     shares = acts.decay(np.hypot(x - at_x, y - at_y))
     return shares * area_shares(sheet) if acts.by_area else shares
@@ -79,6 +82,27 @@ def loads_at(plan: Plan, t: Array) -> Schedule:
         for segment in np.unique(number):
             point[number == segment, n] = _held(part.segments[segment], t[number == segment])
     return Schedule(parts, strength, point, _activity(plan).values(t))
+
+
+class FrameLoad:
+    """The load of a probe at frames: the load itself, not its average.
+
+    Attributes:
+        moves: whether the control point moves.
+    """
+
+    def __init__(self, probe: Probe, sheet: Sheet) -> None:
+        self._line, (self._times, self._points) = _load(probe), control_points(probe, sheet)
+        self.moves = len(self._times) > 1
+        self._keys = np.unique(np.concatenate([self._line.times, self._times]))
+
+    def at(self, frame: int, rate: float) -> tuple[float, Array]:
+        """Give the percent, and the control point, x and y at rest [m], at a frame; at a jump, those after it."""
+        time = frame / rate
+        # A key that is as good as at the frame counts as at it.
+        key = float(self._keys[max(0, self._keys.searchsorted(time + WHOLE / rate, "right") - 1)])
+        time = key if abs(time - key) <= WHOLE / rate else time
+        return float(self._line.values(np.array([time]))[0]), point_at(self._times, self._points, time)
 
 
 def frame_loads(plan: Plan, frame: int) -> Schedule:

@@ -34,7 +34,7 @@ from numpy.typing import NDArray
 
 from taichi_msm.errors import DivergedError, SceneError
 from taichi_msm.physics.error_control import longest
-from taichi_msm.physics.material import LONGEST_CELL, MapImage, cell_ratio
+from taichi_msm.physics.material import LONGEST_CELL, Maps, cell_ratio
 from taichi_msm.physics.plan import Plan
 from taichi_msm.physics.planning import on, stable_steps, variant
 from taichi_msm.physics.probe_force import sums
@@ -184,13 +184,13 @@ def with_points(scene: Scene, points: tuple[int, int]) -> Scene:
 def choose_points(
     plan: Plan,
     device: Device,
-    check: Callable[[Scene, MapImage | None], Plan],
+    check: Callable[[Scene, Maps | None], Plan],
     progress: Count = lambda done, total: None,
 ) -> tuple[Plan, MeshEstimate]:
     """Find the fewest points, approximately, whose error is within the sheet's tolerance, and this error.
 
     No fewer points than the plan's are tried, and cells keep their shape. `check` plans a scene with other points and
-    the same map; progress counts the frames of each pilot run.
+    the same maps; progress counts the frames of each pilot run.
 
     Raises:
         SceneError: when even the largest possible number of points is too small, or cannot be run.
@@ -201,7 +201,7 @@ def choose_points(
     for _ in range(MOST_TRIALS):
         rows, cols = (round((count - 1) * times) + 1 for count in given)
         try:
-            tried = on(check(with_points(plan.scene, (rows, cols)), plan.image), device.arch)
+            tried = on(check(with_points(plan.scene, (rows, cols)), plan.maps), device.arch)
         except SceneError as error:
             asked = f"with the {rows} x {cols} points that sheet.tolerance: {tolerance:g} asks for"
             raise SceneError([f"{line} ({asked})" for line in error.lines]) from None

@@ -34,6 +34,7 @@ class Tool:
     probe: int  # index of the probe in the scene
     times: Array  # of the keys [s], shape (n,)
     middles: Array  # of the round tip at those times, c [m], shape (n, 3)
+    heights: Array  # of the lowest point of the round tip [m], shape (n,)
     axis: Array  # a, shape (3,)
     length: float  # of the middle line [m]
     radius: float  # [m]
@@ -48,16 +49,21 @@ class Tool:
     @property
     def speed(self) -> float:
         """The largest speed of the tool [m/s]."""
-        return float(self._speeds.max(initial=0.0))
+        return float(self.speeds.max(initial=0.0))
 
     @property
-    def _speeds(self) -> Array:
+    def speeds(self) -> Array:
         """The speed between the keys [m/s]."""
         return np.asarray(np.linalg.norm(np.diff(self.middles, axis=0), axis=1) / np.diff(self.times))
 
     def middle(self, t: Array) -> Array:
         """Give the middle of the tip at times [s], linear between the keys and held outside, shape (times, 3)."""
         return np.stack([np.interp(t, self.times, self.middles[:, axis]) for axis in range(3)], axis=-1)
+
+    def lowest(self, t: float) -> tuple[float, float, float]:
+        """Give the lowest point of the round tip at a time [s]; x, y and z [m]."""
+        x, y, z = (float(np.interp(t, self.times, each)) for each in (*self.middles.T[:2], self.heights))
+        return x, y, z
 
     def depth(self, sheet: Sheet, time: float) -> float:
         """Tell how deep the tool is in the sheet at rest, at a time [s]; below 0: how far from it [m]."""
@@ -95,7 +101,8 @@ def tools_of(probes: Sequence[Probe], sheet: Sheet) -> tuple[Tool, ...]:
         assert probe.instrument is not None
         rod, (time, across, down, lowest) = probe.instrument, np.array(probe.path, dtype=float).T
         middles = np.stack([(across - 0.5) * width, (0.5 - down) * height, lowest + rod.radius], axis=1)
-        tools.append(Tool(index, time, middles, unit(rod.shaft), rod.length, rod.radius, probe.friction, probe.grip))
+        shape = unit(rod.shaft), rod.length, rod.radius
+        tools.append(Tool(index, time, middles, lowest, *shape, probe.friction, probe.grip))
     return tuple(tools)
 
 
@@ -117,12 +124,19 @@ def path_problems(scene: Scene, tools: Sequence[Tool], grid: TimeGrid) -> Iterat
             if tool.friction > 0:
                 said = f"{tool.friction:g} needs time.motion: dynamic, as at rest nothing slides; remove friction"
                 yield Problem(("probes", tool.probe, "friction"), said)
-        elif tool.speed * grid.step > LARGEST_STRIDE * tool.radius * (1 + 1e-9):
-            yield Problem(
-                (*where, int(tool._speeds.argmax()) + 1),
-                f"moves {tool.speed * grid.step:.3g} m in a step of {grid.step:.3g} s, over half the radius of its "
-                f"instrument; move at most {LARGEST_STRIDE * tool.radius / grid.step:.3g} m/s, or take a smaller step",
-            )
+        elif fault := too_fast(tool, grid):
+            yield Problem((*where, fault[0]), fault[1])
+
+
+def too_fast(tool: Tool, grid: TimeGrid, first: int = 0) -> tuple[int, str] | None:
+    """Find the key after the `first` to which a tool moves too far in a step, and say so; None: there is none."""
+    speeds = tool.speeds[first:]
+    if speeds.max(initial=0.0) * grid.step <= LARGEST_STRIDE * tool.radius * (1 + 1e-9):
+        return None
+    return first + int(speeds.argmax()) + 1, (
+        f"moves {speeds.max() * grid.step:.3g} m in a step of {grid.step:.3g} s, over half the radius of its "
+        f"instrument; move at most {LARGEST_STRIDE * tool.radius / grid.step:.3g} m/s, or take a smaller step"
+    )
 
 
 def path_notes(scene: Scene, tools: Sequence[Tool]) -> Iterator[str]:

@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from taichi_msm.physics.material import MapImage, Material, has_fixed_border
+from taichi_msm.physics.material import Maps, Material, has_fixed_border
 from taichi_msm.physics.paths import Tool, tools_of
 from taichi_msm.physics.probe_force import control_points
 from taichi_msm.scene import Probe, Scene, Sheet
@@ -85,9 +85,9 @@ class Plan:
     """What a scene comes to; `planning.make_plan` makes it."""
 
     scene: Scene  # as it was given
-    image: MapImage | None  # of its map; None: it has none
+    maps: Maps  # the files of its maps
     fixed: NDArray[np.bool_]  # which points are fixed, shape (rows, cols)
-    material: Material  # what the sheet is made of, with the map as an array
+    material: Material  # what the sheet is made of, with its maps as arrays
     stable_step: float  # the largest stable step [s]; infinite where nothing oscillates
     grid: TimeGrid  # the steps
     slots: tuple[ProbeSlot, ...]  # the places where probes act with a force

@@ -15,11 +15,14 @@ from taichi_msm.physics.pilots import AT_REST
 from taichi_msm.physics.plan import Plan
 from taichi_msm.physics.probe_force import ProbeRecord
 from taichi_msm.physics.state import RunProgress
-from taichi_msm.scene import MAX_POINTS
+from taichi_msm.scene import MAX_POINTS, Foundation
 
 # The stability limit holds while no spring is compressed below this share of its rest length (see
 # `SpringTerm.bound`).
 SHORTEST = 0.5
+
+# Tissue that is compressed by more than this share of its depth gets much stiffer, which the foundation does not.
+DEEPEST = 1 / 3
 
 # No tissue can be stretched to more than this many times its rest length.
 LONGEST = 2.0
@@ -30,7 +33,7 @@ WRONG = 0.01
 
 def run_notes(
     plan: Plan,
-    probes: Sequence[ProbeRecord | None],
+    probes: Sequence[ProbeRecord],
     progress: RunProgress,
     estimate: Estimate | None,
     reason: str = "",
@@ -63,6 +66,13 @@ def run_notes(
         yield f"so few points make the run {'at least' if mesh.doubt else 'up to'} {wrong:g} % wrong{remedy}"
     if progress.max_displacement == 0 and progress.frame > 0:
         yield "nothing moved: does a probe press where and when it should?"
+    below = scene.tissue.foundation if scene.tissue is not None else None
+    if isinstance(below, Foundation) and progress.deepest > DEEPEST * below.depth:
+        yield (
+            f"the sheet was pressed {1000 * progress.deepest:.3g} mm into the {1000 * below.depth:.3g} mm of "
+            "tissue.foundation.depth: beyond a third tissue gets much stiffer than this foundation, and the true dent "
+            "is less deep; press less"
+        )
     if progress.longest_spring > LONGEST:
         yield (
             f"a spring was stretched to {progress.longest_spring:.2g} times its rest length, which no tissue "

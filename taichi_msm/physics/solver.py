@@ -21,9 +21,10 @@ from taichi_msm.physics.lattice import axes, spacing
 from taichi_msm.physics.loads import Schedule, schedule
 from taichi_msm.physics.material import area_shares
 from taichi_msm.physics.plan import Plan
+from taichi_msm.physics.pushes import sum_pushes
 from taichi_msm.physics.state import Reading, State
 from taichi_msm.physics.terms import terms_of
-from taichi_msm.physics.terms.contact import PUSHES, ContactTerm
+from taichi_msm.physics.terms.contact import ContactTerm
 from taichi_msm.physics.terms.damping import coefficients
 from taichi_msm.physics.terms.probes import ProbeTerm, standing
 from taichi_msm.physics.terms.springs import LEAST, MOST, SpringTerm
@@ -122,6 +123,7 @@ class Dynamics:
             ArgumentError: when the new probes need another kernel.
         """
         probes, before = ProbeTerm.of(plan), self.structure.code.require(ProbeTerm)
+        tools, compiled = ContactTerm.of(plan), self.structure.code.get(ContactTerm)
         if probes.moves != before.moves:
             raise ArgumentError(
                 f"probes: which control points move or jump cannot change (before: {_in_words(before.moves)}; now: "
@@ -129,6 +131,13 @@ class Dynamics:
             )
         if probes.by_area != before.by_area:
             raise ArgumentError("probes: one has total instead of force, or the reverse; restart with the new scene")
+        if [tool.probe for tool in plan.tools] != [tool.probe for tool in self.plan.tools]:
+            raise ArgumentError("probes: which of them have a path cannot change; restart with the new scene")
+        if tools and compiled and not tools.is_compiled_in(compiled):
+            raise ArgumentError(
+                "probes: friction and grips cannot be added where there were none; restart with the new scene, such as "
+                "with a friction of 1e-9, or with a grip that ends before the start"
+            )
         if standing(plan) != standing(self.plan):
             self._moving.arrays.set_fields(self.structure.code.first_field(ProbeTerm), probes.fields(plan))
         self.plan = plan
@@ -136,7 +145,7 @@ class Dynamics:
         self._tabulate(plan.grid.steps_per_frame)
 
     def advance(self, steps: int, pause: Pause = lambda: None) -> None:
-        """Take a number of steps, with a pause after every launch.
+        """Take a number of steps, with a pause after every launch. Where it begins at a frame, forces are counted anew.
 
         An exception from it stops the sheet there; another call continues.
 
@@ -150,6 +159,8 @@ class Dynamics:
         if self.structure.workers == 0:
             most = STEPS_PER_LAUNCH
         self._require_whole()
+        if steps and self.steps_done % self.plan.grid.steps_per_frame == 0:
+            sum_pushes(self.structure, self._moving.arrays, clear=True)
         end = self.steps_done + steps
         while self.steps_done < end:
             count = min(most, end - self.steps_done)
@@ -164,6 +175,7 @@ class Dynamics:
         """Compile the step and the read-out without moving anything."""
         self._moving.compile(self._loads)
         self.displacement()
+        self.tool_forces()
 
     def displacement(self) -> NDArray[Any]:
         """Read the displacements x - X [m], shape (rows, cols, 3), in the scene's precision."""
@@ -203,15 +215,15 @@ class Dynamics:
         self._moving.read(differences, values, measures)
         return values, measures
 
-    def take_pushes(self) -> NDArray[np.float64]:
-        """Read by how much each tool has moved each point since this was asked last [m], (tools, rows, cols, 3)."""
-        contact, rows, cols = self.structure.code.get(ContactTerm), self.structure.rows, self.structure.cols
-        tools = 0 if contact is None else contact.tools
-        pushes = self._contact()[: PUSHES * tools]
-        if tools:
-            first = self.structure.code.first_field(ContactTerm)
-            self._moving.arrays.set_fields(first, np.zeros_like(pushes))
-        return pushes.reshape(tools, PUSHES, rows, cols).transpose(0, 2, 3, 1).astype(np.float64)
+    def tool_forces(self) -> NDArray[np.float64]:
+        """Give at a frame the mean force of each tool since the frame before [N], shape (tools, 3).
+
+        It is the sum of m push (1 + g h / 2) / h^2 over the points and the steps, or of m push / h^2 with backward
+        differences, by the number of steps; m is the mass of a point.
+        """
+        _, gain, _ = coefficients(self.plan)
+        sums = sum_pushes(self.structure, self._moving.arrays, clear=False)
+        return sums / (gain * self.plan.grid.steps_per_frame)
 
     def _contact(self) -> NDArray[Any]:
         """Read the fields of contact, shape (fields, rows, cols)."""

@@ -45,7 +45,7 @@ class RunRecord(TypedDict, total=False):
     max_displacement: float  # [m]
     shortest_spring: float  # smallest ratio of a spring's length to its rest length
     longest_spring: float  # and the largest
-    probes: list[ProbeRecord | None]  # forces of each at 100 %; none of one that is moved
+    probes: list[ProbeRecord]  # forces of each
     notes: list[str]  # what to know before trusting the result
     error_estimate: ErrorRecord | None  # None: there is none, for the reason that follows
     error_estimate_reason: str

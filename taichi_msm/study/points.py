@@ -187,7 +187,7 @@ def lattices(plan: Plan) -> Iterator[Plan]:
     """Plan the numbers of points to compare, as far as the scene allows them; its own come last."""
     for share in COARSER:
         points = _scaled(plan, share)
-        coarse, _ = try_plan(with_points(plan.scene, points), plan.image) if min(points) >= FEWEST else (None, [])
+        coarse, _ = try_plan(with_points(plan.scene, points), plan.maps) if min(points) >= FEWEST else (None, [])
         if coarse is not None:
             yield coarse
     if min(plan.scene.sheet.points) >= FEWEST:

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from taichi_msm.physics.lattice import spacing
-from taichi_msm.physics.material import MapImage, map_factors, read_map
+from taichi_msm.physics.material import MapImage, cell_factors, point_factors, read_map
 from taichi_msm.scene import Scene, StiffnessMap, Tissue
 
 Array = NDArray[np.float64]
@@ -64,8 +64,18 @@ def factors(scene: Scene) -> Array:
     rows, cols = scene.sheet.points
     if scene.stiffness_map is None:
         return np.ones((rows - 1, cols - 1))
-    changed = Path(scene.stiffness_map.image).stat().st_mtime_ns
-    return map_factors(scene.stiffness_map, _read(scene.stiffness_map, changed), rows - 1, cols - 1)
+    return cell_factors(scene.stiffness_map, _image(scene.stiffness_map), scene.sheet)
+
+
+def foundation_factors(scene: Scene) -> Array:
+    """Give the factor of the foundation at every point, shape (rows, cols); ones without a map."""
+    of = scene.maps.get("foundation_map")
+    return np.ones(scene.sheet.points) if of is None else point_factors(of, _image(of), scene.sheet)
+
+
+def _image(of: StiffnessMap) -> MapImage:
+    """Read the file of a map, again only when it has changed."""
+    return _read(of, Path(of.image).stat().st_mtime_ns)
 
 
 @lru_cache(maxsize=8)
@@ -111,7 +121,7 @@ def _of_tissue(scene: Scene, tissue: Tissue) -> Sheet:
     mass = (tissue.density or 0.0) * tissue.thickness * dx * dy / 4 * quarters
     plate = tissue.young * tissue.thickness**3 / 12 / (1 - 1 / 9)
     bending = plate if tissue.bending == "plate" else float(tissue.bending)
-    virtual = tissue.foundation * dx * dy / 4 * quarters
+    virtual = tissue.foundation_stiffness * dx * dy / 4 * quarters * foundation_factors(scene)
     return Sheet(springs, mass, tissue.damping * mass, virtual, bending * dx * dy)
 
 

@@ -95,6 +95,11 @@ class ContactTerm(Term):
                 own[held, SINCE:AXIS] = (places[1:] - tool.middle(np.array([taken / grid.steps_per_second])))[held]
         return columns
 
+    def is_compiled_in(self, compiled: Self) -> bool:
+        """Tell whether a kernel that was compiled for `compiled` does all that these tools need."""
+        rubs = all(rubs <= able for rubs, able in zip(self.rubs, compiled.rubs, strict=True))
+        return rubs and self.grips <= compiled.grips
+
     def reaching(self, code: StepCode) -> Callable[..., Any]:
         """Make Taichi's function reaches(sheet, i, low, high, now): whether a tool may touch or hold a point of row i.
 
