@@ -31,14 +31,17 @@ def farthest_displacement(plan: Plan, time: float, acceleration: float | None = 
 
     acceleration: most that the probes have given to a free point so far [m/s^2]; None: most that the scene's can.
     """
-    most = MOST_SHEET_SIZES * max(plan.scene.sheet.size)
+    # A tool takes along what it holds.
+    most = MOST_SHEET_SIZES * max(plan.scene.sheet.size) + sum(tool.way + tool.radius for tool in plan.tools)
     # Springs then connect every point to a fixed one; shear springs alone may skip every other point.
     if plan.scene.sheet.fixed not in ("none", ()) and min(plan.material.across, plan.material.down) > 0:
         return most
     if plan.material.virtual > 0 and not plan.material.always:
         # The virtual springs may accelerate a point from far away, and let go of it when it is fast.
         return math.inf
-    most += sum(tool.speed for tool in plan.tools) * time
+    if plan.tools:
+        # No point is faster than if it had its share of all energy that the tools may have given.
+        most += math.sqrt(2 * _most_moved(plan) / plan.fixed.size / plan.material.mass) * time
     return most + (free_acceleration(plan) if acceleration is None else acceleration) * time * time / 2
 
 
@@ -50,7 +53,8 @@ class Watch:
 
         E(b)^(1/2) <= E(a)^(1/2) + (2 m)^(-1/2) integral of |F| from a to b
 
-    Tools that are moved add at most what it takes to displace every point as far as they come, at their speed.
+    Tools that are moved add at most the energy E_T that it takes to displace every point as far as they come and are
+    wide, at their speed; where much is displaced already it takes more, so E_T^(1/2) is added to the right side.
     The virtual springs hold another K / 2 |u|^2; when they begin to act, it is added for the displacements then.
 
     Attributes:
@@ -116,12 +120,12 @@ class Watch:
         push = float((forces * self._shares).sum())
         # Products instead of powers: these raise OverflowError where a product is infinite.
         root = math.sqrt(progress.energy + active * virtual * progress.reach * progress.reach)
-        root += push * (end - begin) / math.sqrt(2 * mass)
+        root += push * (end - begin) / math.sqrt(2 * mass) + math.sqrt(self._moved)
         reach = progress.reach + (end - begin) * root * math.sqrt(2 / mass)
         for _ in range(activations):
             root = math.sqrt(root * root + virtual * reach * reach)
             reach += (end - begin) * root * math.sqrt(2 / mass)
-        return self._swing * (root * root + self._moved) + ROUNDING * progress.peak + self._least
+        return self._swing * root * root + ROUNDING * progress.peak + self._least
 
 
 def message(time: float, step: int, wrong: str, *, exact: bool) -> str:
@@ -151,11 +155,12 @@ def farthest(displacement: NDArray[np.floating]) -> Farthest:
 
 def _most_moved(plan: Plan) -> float:
     """Bound the energy that the tools which are moved can have given to the points [J]."""
-    material, count = plan.material, math.prod(plan.scene.sheet.points)
+    material, step, most = plan.material, plan.grid.step, 0.0
     stiffness = sum(term.bound(material, plan.scene.sheet) for term in TERMS)
-    return sum(
-        count * (stiffness * tool.way * tool.way + material.mass * tool.speed * tool.speed) / 2 for tool in plan.tools
-    )
+    for tool in plan.tools:
+        far, speed = tool.way + tool.radius, tool.stride(step, plan.scene.time.duration)[0] / step
+        most += (stiffness * far * far + material.mass * speed * speed) / 2
+    return plan.fixed.size * most
 
 
 def _underflow(plan: Plan) -> float:

@@ -17,6 +17,10 @@ A tool that is hardly wider than a cell presses with more or less than its total
 coarser runs press as hard as the first one does, and the part of the total that the first one misses is added to the
 error.
 
+Where tools are moved, they touch more points one by one, and in a coarse run few or none. So the order counts as 1, and
+what is told is hardly exceeded: "at most about" (docs/decisions/0027). The runs with fewer points are then compared
+with the run itself, as a coarse pilot may press quite otherwise.
+
 With `springs`, a sheet with other points is another sheet, so its error is not defined.
 """
 
@@ -73,6 +77,7 @@ class MeshEstimate:
 
     error: float  # largest error, as a fraction of the largest displacement; infinite: not known
     doubt: str = ""  # why it may be larger; empty: it is about that
+    at_most: bool = False  # whether it may be much smaller, because of contact
 
 
 def coarser(plan: Plan) -> Plan | None:
@@ -135,6 +140,7 @@ class MeshPilot:
         self._ratio = min((own - 1) / (other - 1) for own, other in zip(*points[:2], strict=True))
         self._differences = [0.0 for _ in plans]
         self._missing = missing_force(plan.scene)
+        self._contact = bool(plan.tools)
         self._largest, self._shortest = 0.0, 1.0
 
     def compile(self) -> None:
@@ -163,13 +169,14 @@ class MeshPilot:
         order, doubt = None, ""
         if others and first > 0:
             order = math.log(others[0] / first) / math.log(self._ratio) if others[0] > 0 else -math.inf
-        assumed = 1.0 if order is None else max(1.0, min(order, 2 - ABOVE * (order - 2)))
+        smooth = order is not None and not self._contact
+        assumed = max(1.0, min(order, 2 - ABOVE * (order - 2))) if order is not None and smooth else 1.0
         relative = first / (self._ratio**assumed - 1) / self._largest
-        if order is not None and not LOWEST_ORDER <= order <= HIGHEST_ORDER:
+        if order is not None and smooth and not LOWEST_ORDER <= order <= HIGHEST_ORDER:
             doubt = "runs with fewer points do not converge"
         elif self._material.bending == 0 and self._shortest < 1 - self._material.tension - SLACK:
             doubt = "tissue without bending is pressed together, and with more points wrinkles more"
-        return MeshEstimate((2 if doubt else 1) * relative + self._missing, doubt)
+        return MeshEstimate((2 if doubt else 1) * relative + self._missing, doubt, self._contact)
 
 
 def with_points(scene: Scene, points: tuple[int, int]) -> Scene:

@@ -44,6 +44,8 @@ def choose_pilots(plan: Plan, *, asked: bool = False) -> Pilots:
     # Beside a run in f32 a fine pilot has another one with the run's own steps.
     fine_cost = fine / own + (plan.grid.precision == "f32")
     first = (1 + points) * coarse / own if coarse else fine_cost + points
+    if coarse and plan.tools:
+        first = coarse / own + points  # As the pilots for the points are then compared with the run itself.
     if not asked and not affords_pilots(plan, first):
         return Pilots(reason="it would take more than two fifths of the run; to have it anyway, pass --estimate-error")
     if not coarse:
