@@ -17,9 +17,9 @@ A tool that is hardly wider than a cell presses with more or less than its total
 coarser runs press as hard as the first one does, and the part of the total that the first one misses is added to the
 error.
 
-Where tools are moved, they touch more points one by one, and in a coarse run few or none. So the order counts as 1, and
-what is told is hardly exceeded: "at most about" (docs/decisions/0027). The runs with fewer points are then compared
-with the run itself, as a coarse pilot may press quite otherwise.
+Where tools are moved, they touch more points one by one, and in a coarse run few or none. So the order counts as 1.5 at
+most, and what is told is hardly exceeded: "at most about" (docs/decisions/0027). The runs with fewer points are then
+compared with the run itself, as a coarse pilot may press quite otherwise, and take half its steps.
 
 With `springs`, a sheet with other points is another sheet, so its error is not defined.
 """
@@ -49,6 +49,9 @@ from taichi_msm.system.runtime import Device
 
 # Orders between which the three runs are taken to converge.
 LOWEST_ORDER, HIGHEST_ORDER = 1.0, 3.0
+
+# An order above this counts as this where tools are moved.
+WITH_CONTACT = 1.5
 
 # An order above 2 counts as one this much of the difference below 2 (docs/decisions/0022).
 ABOVE = 1 / 4
@@ -132,7 +135,9 @@ class MeshPilot:
         plans = [coarse] if coarsest is None else [coarse, coarsest]
         self._sheets = []
         for sheet in plans:
-            steps = max(math.ceil(steps / 2), stable_steps(sheet))
+            # Tools must not move too far in a step.
+            least = math.ceil(plan.grid.steps_per_frame / 2) if plan.tools else 1
+            steps = max(math.ceil(steps / 2), stable_steps(sheet), least)
             exact = sheet.with_grid(precision="f64", steps_per_frame=steps)
             self._sheets.append(Dynamics(exact, device, cores=cores))
         points = [sheet.scene.sheet.points for sheet in (plan, *plans)]
@@ -169,10 +174,11 @@ class MeshPilot:
         order, doubt = None, ""
         if others and first > 0:
             order = math.log(others[0] / first) / math.log(self._ratio) if others[0] > 0 else -math.inf
-        smooth = order is not None and not self._contact
-        assumed = max(1.0, min(order, 2 - ABOVE * (order - 2))) if order is not None and smooth else 1.0
+        assumed = 1.0
+        if order is not None:
+            assumed = max(1.0, min(order, WITH_CONTACT if self._contact else 2 - ABOVE * (order - 2)))
         relative = first / (self._ratio**assumed - 1) / self._largest
-        if order is not None and smooth and not LOWEST_ORDER <= order <= HIGHEST_ORDER:
+        if order is not None and not self._contact and not LOWEST_ORDER <= order <= HIGHEST_ORDER:
             doubt = "runs with fewer points do not converge"
         elif self._material.bending == 0 and self._shortest < 1 - self._material.tension - SLACK:
             doubt = "tissue without bending is pressed together, and with more points wrinkles more"

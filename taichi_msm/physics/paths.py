@@ -102,6 +102,19 @@ def path_problems(scene: Scene, tools: Sequence[Tool], grid: TimeGrid) -> Iterat
             )
 
 
+def fewest_steps(tools: Sequence[Tool], grid: TimeGrid, least: int) -> int:
+    """Count the fewest steps of a frame, `least` or more, in which no tool moves too far."""
+    frame, duration = 1 / grid.frames_per_second, grid.frames / grid.frames_per_second
+
+    def times_too_far(tool: Tool) -> float:
+        return tool.stride(frame / least, duration)[0] / (LARGEST_STRIDE * tool.radius)
+
+    # In a step of 1 / n it moves at least 1 / n as far.
+    while (most := max(map(times_too_far, tools), default=0.0)) > 1 + 1e-9:
+        least = max(least + 1, math.ceil(least * most * (1 - 1e-9)))
+    return least
+
+
 def path_notes(scene: Scene, tools: Sequence[Tool]) -> Iterator[str]:
     """Note the tools that are too thin for the points, and two that are in one place."""
     apart = max(spacing(scene.sheet))
