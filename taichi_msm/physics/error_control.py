@@ -63,8 +63,8 @@ class Estimate:
     order: int  # of the method in this scene
     # Whether the two parts are known; else, by a coarse pilot beside a run in f32, neither is larger than the error.
     parted: bool = True
-    # Whether the error may be larger: a coarse pilot shows one that only a fine one would tell, or smaller steps do not
-    # come closer to each other.
+    # Whether the error may be larger: a coarse pilot shows one that only a fine one would tell, or with contact smaller
+    # steps do not come closer to each other, or the error is so large that nothing is known.
     at_least: bool = False
     at_most: bool = False  # whether the error may be much smaller, because of contact
 
@@ -175,7 +175,9 @@ class Pilot:
             ratio = self._steps / self._plan.grid.steps_per_frame
             exact = other + (other - same) / (ratio**self._order - 1) if self._parted else other
             self._error = max(self._error, longest(displacement - exact))
-            self._largest = max(self._largest, longest(exact))
+            # Where errors fall in leaps, what is extrapolated may be larger by far.
+            best = exact if not self._plan.tools else other if ratio > 1 else displacement
+            self._largest = max(self._largest, longest(best))
             if self._same:
                 self._in_f64 = max(self._in_f64, longest(same - exact))
                 self._rounding = max(self._rounding, longest(displacement - same))
@@ -196,7 +198,8 @@ class Pilot:
         if not self._same:
             rounding, in_f64 = 0.0 if self._parted else error, error
         steps, contact = self._plan.grid.steps_per_frame, bool(self._plan.tools)
-        return Estimate(steps, error, rounding, in_f64, self._order, self._parted, self._overlap, contact)
+        at_least = contact and (self._overlap or error > LARGEST_TOLERANCE)
+        return Estimate(steps, error, rounding, in_f64, self._order, self._parted, at_least, contact)
 
 
 def reconcile(coarse: Estimate, fine: Estimate) -> Estimate:
@@ -286,7 +289,8 @@ def _out_of_reach(tolerance: float, failures: list[Estimate]) -> str:
             f"time.tolerance: {tolerance:g} is out of reach of f32, whose rounding alone makes an error of "
             f"{last.rounding:.2g} here; take time.precision: f64, or a tolerance of {_above(4 * last.rounding):g}"
         )
-    remedy = "take a weaker load or a shorter time"
+    weaker = "move the tools less deep, or take" if last.at_most else "take a weaker load or"
+    remedy = f"{weaker} a shorter time"
     if best.error < LARGEST_TOLERANCE / 2:
         remedy += f", or a tolerance of {_above(best.error):g}"
     return (
