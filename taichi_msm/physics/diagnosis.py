@@ -78,7 +78,7 @@ def _cause(dynamics: Dynamics, bad: int, point: tuple[int, int], pause: Pause) -
         if _goes_well(dynamics, finer, frames, pause):
             return f"likely cause: time.step, {grid.step:.6g} s; with {finer.grid.step:.9g} s it does not diverge here"
         tried = finer.grid.step
-    if plan.tools and (not plan.slots or _goes_well(dynamics, _without_tools(plan), frames, pause)):
+    if not plan.slots:
         speeds = [tool.stride(grid.step, plan.scene.time.duration)[0] / grid.step for tool in plan.tools]
         tool, speed = max(zip(plan.tools, speeds, strict=True), key=lambda pair: pair[1])
         said = f"likely cause: probes.{tool.probe}.path, at up to {speed:.3g} m/s"
@@ -100,11 +100,6 @@ def _goes_well(dynamics: Dynamics, plan: Plan, frames: int, pause: Pause) -> boo
         if watch.follow(dynamics.read()):
             return False
     return True
-
-
-def _without_tools(plan: Plan) -> Plan:
-    """Leave out the tools that are moved."""
-    return plan.with_probes([probe for probe in plan.scene.probes if not probe.moved])
 
 
 def _strongest_probe(scene: Scene, point: tuple[int, int]) -> tuple[int, float]:
