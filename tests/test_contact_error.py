@@ -102,7 +102,7 @@ def test_contact_is_of_order_1() -> None:
 def test_without_a_coarse_pilot_half_as_much_again_is_told(monkeypatch: pytest.MonkeyPatch, device: Device) -> None:
     monkeypatch.setattr(error_control, "Dynamics", partial(Falling, 1))
     plan = plan_of(touching([PRESSED], time={"step": 0.005}))
-    assert estimate_error(plan, device).error == pytest.approx(1.25 * 1.5 * 0.005 / (1 + 0.005), rel=0.01)
+    assert estimate_error(plan, device).error == pytest.approx(1.25 * 1.5 * 0.005 / (1 + 0.005 / 2), rel=1e-9)
 
 
 @pytest.mark.parametrize(
