@@ -123,7 +123,7 @@ SOUND = {
         sheet={**SHEET, "fixed": "none"},
         springs={"structural": 20, "shear": 10},
         damping=0,
-        probes=[moved([0, 0.5, 0.5, 0.0], [8, 0.5, 0.5, 13.0], [9, 0.5, 0.5, 12.0], friction=1.0, grip=[[0, 7.5]])],
+        probes=[moved([0, 0.5, 0.5, 0.0], [8, 0.5, 0.5, -13.0], [9, 0.5, 0.5, -12.0], friction=1.0, grip=[[0, 7.5]])],
         time={"duration": 16},
     ),
     "a tool stretches it sixteen times as far as it is long, and lets go": scene(
