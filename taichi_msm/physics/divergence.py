@@ -26,10 +26,13 @@ SWING = 4.0
 ROUNDING = 1e-9
 
 
-def farthest_displacement(plan: Plan, time: float, acceleration: float | None = None) -> float:
+def farthest_displacement(
+    plan: Plan, time: float, acceleration: float | None = None, moved: float | None = None
+) -> float:
     """Bound the displacement of a point at a time [m]; if one is larger, the simulation has diverged.
 
-    acceleration: most that the probes have given to a free point so far [m/s^2]; None: most that the scene's can.
+    acceleration, moved: most that the probes have given to a free point so far [m/s^2], and tools that are moved to all
+        points [J]; None: most that the scene's can.
     """
     # A tool takes along what it holds.
     most = MOST_SHEET_SIZES * max(plan.scene.sheet.size) + sum(tool.way + tool.radius for tool in plan.tools)
@@ -41,7 +44,8 @@ def farthest_displacement(plan: Plan, time: float, acceleration: float | None = 
         return math.inf
     if plan.tools:
         # No point is faster than if it had its share of all energy that the tools may have given.
-        most += math.sqrt(2 * _most_moved(plan) / plan.fixed.size / plan.material.mass) * time
+        given = _most_moved(plan) if moved is None else moved
+        most += math.sqrt(2 * given / plan.fixed.size / plan.material.mass) * time
     return most + (free_acceleration(plan) if acceleration is None else acceleration) * time * time / 2
 
 
@@ -102,7 +106,7 @@ class Watch:
         begin, end = self.progress.frame / self._grid.frames_per_second, self._grid.time(reading.steps)
         point, distance, energy = f"point ({where.row}, {where.column})", where.distance, reading.energy
         # Written so that NaN is found too: no comparison with it is true.
-        if not distance <= farthest_displacement(self._plan, end, self._acceleration):
+        if not distance <= farthest_displacement(self._plan, end, self._acceleration, self._moved):
             size = max(self._plan.scene.sheet.size)
             return f"{point} is {distance:g} m from its rest position, and the sheet is {size:g} m long"
         most = self._most_energy(begin, end)
@@ -158,7 +162,7 @@ def _most_moved(plan: Plan) -> float:
     material, step, most = plan.material, plan.grid.step, 0.0
     stiffness = sum(term.bound(material, plan.scene.sheet) for term in TERMS)
     for tool in plan.tools:
-        far, speed = tool.way + tool.radius, tool.stride(step, plan.scene.time.duration)[0] / step
+        far, speed = tool.way + tool.radius, tool.stride(step)[0] / step
         most += (stiffness * far * far + material.mass * speed * speed) / 2
     return plan.fixed.size * most
 

@@ -50,12 +50,14 @@ class Tool:
         """How far the tool goes in all [m]."""
         return float(np.linalg.norm(np.diff(self.middles, axis=0), axis=1).sum())
 
-    def stride(self, step: float, duration: float) -> tuple[float, int]:
-        """Give how far the tool comes in a step of a run at most [m], and the index of the key before or within which.
+    def stride(self, step: float, first: int = 0) -> tuple[float, int]:
+        """Give how far the tool comes at most in a step from 0 s on [m], and the key that it goes to then.
 
         Between the times where a key enters or leaves the step, how far it comes is a convex function.
+
+        first: the key from which on its way counts.
         """
-        begin = np.clip([0.0, *self.times, *(self.times - step)], 0, max(0.0, duration - step))
+        begin = np.maximum([0.0, *self.times, *(self.times - step)], max(0.0, self.times[first] if first else 0.0))
         far = np.linalg.norm(self.middle(begin + step) - self.middle(begin), axis=1)
         most = int(far.argmax())
         return float(far[most]), min(int(self.times.searchsorted(begin[most], "right")), len(self.times) - 1)
@@ -93,21 +95,26 @@ def path_problems(scene: Scene, tools: Sequence[Tool], grid: TimeGrid) -> Iterat
         if depth > 1e-9 * tool.radius:
             said = f"the instrument is {depth:.3g} m in the sheet at rest at 0 s; begin above it, at a greater height"
             yield Problem(where, said)
-        stride, key = tool.stride(grid.step, scene.time.duration)
-        if stride > LARGEST_STRIDE * tool.radius * (1 + 1e-9):
-            yield Problem(
-                (*where, key),
-                f"moves {stride:.3g} m in a step of {grid.step:.3g} s, over half the radius of its "
-                f"instrument; move at most {LARGEST_STRIDE * tool.radius / grid.step:.3g} m/s, or take a smaller step",
-            )
+        if fault := too_fast(tool, grid):
+            yield Problem((*where, fault[0]), fault[1])
+
+
+def too_fast(tool: Tool, grid: TimeGrid, first: int = 0) -> tuple[int, str] | None:
+    """Find the key after the `first` to which a tool moves too far in a step, and say so; None: there is none."""
+    stride, key = tool.stride(grid.step, first)
+    if stride <= LARGEST_STRIDE * tool.radius * (1 + 1e-9):
+        return None
+    return key, (
+        f"moves {stride:.3g} m in a step of {grid.step:.3g} s, over half the radius of its "
+        f"instrument; move at most {LARGEST_STRIDE * tool.radius / grid.step:.3g} m/s, or take a smaller step"
+    )
 
 
 def fewest_steps(tools: Sequence[Tool], grid: TimeGrid, least: int) -> int:
     """Count the fewest steps of a frame, `least` or more, in which no tool moves too far."""
-    frame, duration = 1 / grid.frames_per_second, grid.frames / grid.frames_per_second
 
     def times_too_far(tool: Tool) -> float:
-        return tool.stride(frame / least, duration)[0] / (LARGEST_STRIDE * tool.radius)
+        return tool.stride(1 / grid.frames_per_second / least)[0] / (LARGEST_STRIDE * tool.radius)
 
     # In a step of 1 / n it moves at least 1 / n as far.
     while (most := max(map(times_too_far, tools), default=0.0)) > 1 + 1e-9:
