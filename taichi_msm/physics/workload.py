@@ -18,8 +18,9 @@ START = 4e8
 # Work of a step of a point in f64.
 DOUBLE = 2.0
 
-# Additional work of a step for a moving control point and for bending, relative to the step without them.
-MOVING, BENDING = 1.2, 1.0
+# Additional work of a step for a moving control point, for bending and for a tool that touches, relative to the step
+# without them.
+MOVING, BENDING, CONTACT = 1.2, 1.0, 0.5
 
 # Work of encoding a pixel, and of drawing one of its samples.
 ENCODING, SAMPLE = 40.0, 6.0
@@ -61,7 +62,7 @@ def affords_pilots(plan: Plan, pilots: float) -> bool:
 def _steps(plan: Plan) -> float:
     """Count the work of stepping in f32."""
     moving = sum(slot.moves for slot in plan.slots)
-    cost = 1 + MOVING * moving + BENDING * (plan.material.bending > 0)
+    cost = 1 + MOVING * moving + BENDING * (plan.material.bending > 0) + CONTACT * len(plan.tools)
     return cost * plan.grid.steps * math.prod(plan.scene.sheet.points)
 
 
