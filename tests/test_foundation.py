@@ -18,7 +18,7 @@ from taichi_msm.physics.lattice import rest_positions
 from taichi_msm.physics.loads import schedule
 from taichi_msm.physics.mesh_error import coarser
 from taichi_msm.physics.planning import variant
-from taichi_msm.physics.state import RunProgress, Saved
+from taichi_msm.physics.state import RunProgress
 from taichi_msm.physics.terms.foundation import FoundationTerm
 from taichi_msm.runner import run
 from taichi_msm.scene import Foundation, Scene
@@ -140,8 +140,9 @@ def test_the_energy_that_it_gives_is_explained(tmp_path: Path, device: Device) -
     made = mapped(white, "none", young=1.0, damping=0, probes=[], **stiff)
     with Simulation(made, threads=device.threads) as simulation:
         away = np.full((*made.sheet.points, 3), [0, 0, 0.02])
-        state = simulation.save().state._replace(displacement=away)
-        simulation.restore(Saved(state, RunProgress(reach=farthest(away).reach)))
+        saved = simulation.save()
+        state = saved.state._replace(displacement=away)
+        simulation.restore(saved._replace(state=state, progress=RunProgress(reach=farthest(away).reach)))
         simulation.advance(2)
         held = 400 * 1e4 / 2 * 0.1**2 * 0.02**2
         # With the factor 1, and a swing of 4, a hundredth would be explained.

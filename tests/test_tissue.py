@@ -88,6 +88,14 @@ def test_a_random_tissue_is_like_the_twin(seed: int, image: str, device: Device)
     np.testing.assert_allclose(simulate(made, device), twin, rtol=0, atol=1e-12 * np.abs(twin).max())
 
 
+@pytest.mark.parametrize("points", [(2, 2), (2, 3), (3, 2)])
+def test_a_free_tissue_of_two_rows_is_like_the_twin(points: tuple[int, int], load: Any, device: Device) -> None:
+    size = [0.01 * (count - 1) for count in points]
+    made = load("sheet.fixed=none", f"sheet.points={list(points)}", f"sheet.size={size}", "tissue.pretension=0")
+    twin = reference.simulate(made) - rest_positions(made.sheet)
+    np.testing.assert_allclose(simulate(made, device), twin, rtol=0, atol=1e-12 * np.abs(twin).max())
+
+
 @pytest.mark.parametrize(
     "seed", [0, 7, pytest.param(4, marks=pytest.mark.fuzz), pytest.param(9, marks=pytest.mark.fuzz)]
 )

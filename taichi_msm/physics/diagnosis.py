@@ -87,8 +87,9 @@ def _cause(dynamics: Dynamics, bad: int, point: tuple[int, int], pause: Pause) -
             return f"likely cause: time.step, {grid.step:.6g} s; with {finer.grid.step:.9g} s it does not diverge here"
         tried = finer.grid.step
     if not plan.slots:
-        tool = max(plan.tools, key=lambda tool: tool.speed)
-        said = f"likely cause: probes.{tool.probe}.path, at up to {tool.speed:.3g} m/s"
+        speeds = [tool.stride(grid.step)[0] / grid.step for tool in plan.tools]
+        tool, speed = max(zip(plan.tools, speeds, strict=True), key=lambda pair: pair[1])
+        said = f"likely cause: probes.{tool.probe}.path, at up to {speed:.3g} m/s"
         return f"{said}; move the tool more slowly, or less far"
     index, force = _strongest_probe(plan.scene, point)
     name = "force" if plan.scene.probes[index].total is None else "total"

@@ -28,22 +28,25 @@ ROUNDING = 1e-9
 
 
 def farthest_displacement(
-    plan: Plan, time: float, acceleration: float | None = None, speed: float | None = None
+    plan: Plan, time: float, acceleration: float | None = None, moved: float | None = None
 ) -> float:
     """Bound the displacement of a point at a time [m]; if one is larger, the simulation has diverged.
 
-    acceleration, speed: most that the probes have given to a free point so far [m/s^2], and all tools that are moved
-    together [m/s]; None: most that the scene's can.
+    acceleration, moved: most that the probes have given to a free point so far [m/s^2], and tools that are moved to all
+        points [J]; None: most that the scene's can.
     """
-    most = MOST_SHEET_SIZES * max(plan.scene.sheet.size)
+    # A tool takes along what it holds.
+    most = MOST_SHEET_SIZES * max(plan.scene.sheet.size) + sum(tool.way + tool.radius for tool in plan.tools)
     # Springs then connect every point to a fixed one; shear springs alone may skip every other point.
     if plan.scene.sheet.fixed not in ("none", ()) and min(plan.material.across, plan.material.down) > 0:
         return most
     if plan.material.virtual > 0 and not plan.material.always:
         # The virtual springs may accelerate a point from far away, and let go of it when it is fast.
         return math.inf
-    # An elastic body that is hit goes twice as fast as what hits it.
-    most += 2 * (_speed(plan) if speed is None else speed) * time
+    if plan.tools:
+        # No point is faster than if it had its share of all energy that the tools may have given.
+        given = _most_moved(plan) if moved is None else moved
+        most += math.sqrt(2 * given / plan.fixed.size / plan.material.mass) * time
     return most + (free_acceleration(plan) if acceleration is None else acceleration) * time * time / 2
 
 
@@ -55,7 +58,8 @@ class Watch:
 
         E(b)^(1/2) <= E(a)^(1/2) + (2 m)^(-1/2) integral of |F| from a to b
 
-    Tools that are moved add at most what it takes to displace every point as far as they come, at their speed.
+    Tools that are moved add at most the energy E_T that it takes to displace every point as far as they come and are
+    wide, at their speed; where much is displaced already it takes more, so E_T^(1/2) is added to the right side.
     The virtual springs hold at most another K / 2 |u|^2, with K of the stiffest; when they begin to act, it is added
     for the displacements then.
 
@@ -67,7 +71,7 @@ class Watch:
         self.progress = progress or RunProgress()
         self._plan, self._grid = plan, plan.grid
         self._loads = Envelope(plan)
-        self._acceleration, self._speed = free_acceleration(plan), _speed(plan)
+        self._acceleration = free_acceleration(plan)
         self._moved = _most_moved(plan)
         self._shares = np.array([norm(slot, plan.scene) for slot in plan.slots])
         self._swing = SWING / max(1e-9, 1 - (plan.grid.step / plan.stable_step) ** 2)
@@ -78,7 +82,6 @@ class Watch:
         self._plan = plan
         self._loads = Envelope(plan)
         self._acceleration = max(self._acceleration, free_acceleration(plan))
-        self._speed = max(self._speed, _speed(plan))
         self._moved = max(self._moved, _most_moved(plan))
 
     def follow(self, reading: Reading) -> str:
@@ -110,7 +113,7 @@ class Watch:
         begin, end = self.progress.frame / self._grid.frames_per_second, self._grid.time(reading.steps)
         point, distance, energy = f"point ({where.row}, {where.column})", where.distance, reading.energy
         # Written so that NaN is found too: no comparison with it is true.
-        if not distance <= farthest_displacement(self._plan, end, self._acceleration, self._speed):
+        if not distance <= farthest_displacement(self._plan, end, self._acceleration, self._moved):
             size = max(self._plan.scene.sheet.size)
             return f"{point} is {distance:g} m from its rest position, and the sheet is {size:g} m long"
         most = self._most_energy(begin, end)
@@ -129,12 +132,12 @@ class Watch:
         push = float((forces * self._shares).sum())
         # Products instead of powers: these raise OverflowError where a product is infinite.
         root = math.sqrt(progress.energy + active * virtual * progress.reach * progress.reach)
-        root += push * (end - begin) / math.sqrt(2 * mass)
+        root += push * (end - begin) / math.sqrt(2 * mass) + math.sqrt(self._moved)
         reach = progress.reach + (end - begin) * root * math.sqrt(2 / mass)
         for _ in range(activations):
             root = math.sqrt(root * root + virtual * reach * reach)
             reach += (end - begin) * root * math.sqrt(2 / mass)
-        return self._swing * (root * root + self._moved) + ROUNDING * progress.peak + self._least
+        return self._swing * root * root + ROUNDING * progress.peak + self._least
 
 
 def message(time: float, step: int, wrong: str, *, exact: bool) -> str:
@@ -162,18 +165,14 @@ def farthest(displacement: NDArray[np.floating]) -> Farthest:
         return Farthest(row, column, distance, math.sqrt(square.sum()))
 
 
-def _speed(plan: Plan) -> float:
-    """Add up the largest speeds of the tools that are moved [m/s]."""
-    return sum(tool.speed for tool in plan.tools)
-
-
 def _most_moved(plan: Plan) -> float:
     """Bound the energy that the tools which are moved can have given to the points [J]."""
-    material, count = plan.material, math.prod(plan.scene.sheet.points)
+    material, step, most = plan.material, plan.grid.step, 0.0
     stiffness = sum(term.bound(material, plan.scene.sheet) for term in TERMS)
-    return sum(
-        count * (stiffness * tool.way * tool.way + material.mass * tool.speed * tool.speed) / 2 for tool in plan.tools
-    )
+    for tool in plan.tools:
+        far, speed = tool.way + tool.radius, tool.stride(step)[0] / step
+        most += (stiffness * far * far + material.mass * speed * speed) / 2
+    return plan.fixed.size * most
 
 
 def _underflow(plan: Plan) -> float:

@@ -17,6 +17,10 @@ A tool that is hardly wider than a cell presses with more or less than its total
 coarser runs press as hard as the first one does, and the part of the total that the first one misses is added to the
 error.
 
+Where tools are moved, they touch more points one by one, and in a coarse run few or none. So the order counts as 1.5 at
+most, and what is told is hardly exceeded: "at most about" (docs/decisions/0027). The runs with fewer points are then
+compared with the run itself, as a coarse pilot may press quite otherwise, and take half its steps.
+
 With `springs`, a sheet with other points is another sheet, so its error is not defined.
 """
 
@@ -46,6 +50,9 @@ from taichi_msm.system.runtime import Device
 # Orders between which the three runs are taken to converge.
 LOWEST_ORDER, HIGHEST_ORDER = 1.0, 3.0
 
+# An order above this counts as this where tools are moved.
+WITH_CONTACT = 1.5
+
 # An order above 2 counts as one this much of the difference below 2 (docs/decisions/0022).
 ABOVE = 1 / 4
 
@@ -73,6 +80,7 @@ class MeshEstimate:
 
     error: float  # largest error, as a fraction of the largest displacement; infinite: not known
     doubt: str = ""  # why it may be larger; empty: it is about that
+    at_most: bool = False  # whether it may be much smaller, because of contact
 
 
 def coarser(plan: Plan) -> Plan | None:
@@ -127,7 +135,9 @@ class MeshPilot:
         plans = [coarse] if coarsest is None else [coarse, coarsest]
         self._sheets = []
         for sheet in plans:
-            steps = 1 if plan.scene.time.at_rest else max(math.ceil(steps / 2), stable_steps(sheet))
+            # Tools must not move too far in a step.
+            least = math.ceil(plan.grid.steps_per_frame / 2) if plan.tools else 1
+            steps = 1 if plan.scene.time.at_rest else max(math.ceil(steps / 2), stable_steps(sheet), least)
             exact = sheet.with_grid(precision="f64", steps_per_frame=steps)
             self._sheets.append(sheet_of(exact, device, cores=cores))
         points = [sheet.scene.sheet.points for sheet in (plan, *plans)]
@@ -135,6 +145,7 @@ class MeshPilot:
         self._ratio = min((own - 1) / (other - 1) for own, other in zip(*points[:2], strict=True))
         self._differences = [0.0 for _ in plans]
         self._missing = missing_force(plan.scene)
+        self._contact = bool(plan.tools)
         self._largest, self._shortest = 0.0, 1.0
 
     def compile(self) -> None:
@@ -167,13 +178,15 @@ class MeshPilot:
         order, doubt = None, ""
         if others and first > 0:
             order = math.log(others[0] / first) / math.log(self._ratio) if others[0] > 0 else -math.inf
-        assumed = 1.0 if order is None else max(1.0, min(order, 2 - ABOVE * (order - 2)))
+        assumed = 1.0
+        if order is not None:
+            assumed = max(1.0, min(order, WITH_CONTACT if self._contact else 2 - ABOVE * (order - 2)))
         relative = first / (self._ratio**assumed - 1) / self._largest
-        if order is not None and not LOWEST_ORDER <= order <= HIGHEST_ORDER:
+        if order is not None and not self._contact and not LOWEST_ORDER <= order <= HIGHEST_ORDER:
             doubt = "runs with fewer points do not converge"
         elif self._material.bending == 0 and self._shortest < 1 - self._material.tension - SLACK:
             doubt = "tissue without bending is pressed together, and with more points wrinkles more"
-        return MeshEstimate((2 if doubt else 1) * relative + self._missing, doubt)
+        return MeshEstimate((2 if doubt else 1) * relative + self._missing, doubt, self._contact)
 
 
 def with_points(scene: Scene, points: tuple[int, int]) -> Scene:

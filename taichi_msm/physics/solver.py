@@ -287,7 +287,8 @@ class Dynamics:
         shares = areas[kinds] if layout.code.by_area else np.ones((3, layout.cols))
         by_column = np.empty((COLUMN_ROWS, layout.cols))
         by_column[MOVES : MOVES + 3] = moves[kinds] / shares
-        by_column[AREA : AREA + 3] = areas[kinds]
+        # Springs along columns ask for the shares of a row in between even where there is none.
+        by_column[AREA : AREA + 3] = areas[0], 2 * areas[0], areas[-1]
         by_column[ACROSS] = axes(sheet)[0]
         by_column[HAS_LEFT] = column > 0
         by_column[HAS_RIGHT] = column < layout.cols - 1

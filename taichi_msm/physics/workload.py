@@ -18,8 +18,9 @@ START = 4e8
 # Work of a step of a point in f64.
 DOUBLE = 2.0
 
-# Additional work of a step for a moving control point and for bending, relative to the step without them.
-MOVING, BENDING = 1.2, 1.0
+# Additional work of a step for a moving control point, for bending and for a tool that touches, relative to the step
+# without them.
+MOVING, BENDING, CONTACT = 1.2, 1.0, 0.5
 
 # Work of encoding a pixel, and of drawing one of its samples.
 ENCODING, SAMPLE = 40.0, 6.0
@@ -65,7 +66,8 @@ def affords_pilots(plan: Plan, pilots: float) -> bool:
 def _steps(plan: Plan) -> float:
     """Count the work of stepping in f32, or of finding the shape of every frame."""
     moving, points = sum(slot.moves for slot in plan.slots), plan.scene.sheet.points
-    cost, steps = 1 + MOVING * moving + BENDING * (plan.material.bending > 0), float(plan.grid.steps)
+    cost = 1 + MOVING * moving + BENDING * (plan.material.bending > 0) + CONTACT * len(plan.tools)
+    steps = float(plan.grid.steps)
     if plan.scene.time.at_rest:
         cost, steps = cost + 1, EVALUATIONS * sum(points) * (plan.grid.frames + 1)
     return cost * steps * math.prod(points)
