@@ -173,3 +173,7 @@ def test_what_was_done_is_forgotten_at_rest() -> None:
     assert not hand.held
     assert not hand.grips
     assert hand.recorded(0) == beginning
+
+
+def test_at_rest_nothing_rubs() -> None:
+    assert tool(plan(motion="quasistatic")).recorded(0).friction == 0

@@ -47,7 +47,7 @@ class MovedTool:
     a run allows. A grip begins when the tip has come to its depth, and ends when it is released.
 
     Args:
-        probe: with the instrument, and with a path or without one; its friction counts if it is given.
+        probe: with the instrument, and with a path or without one; its friction counts if it is given, and not at rest.
         plan: of the session.
 
     Attributes:
@@ -64,6 +64,8 @@ class MovedTool:
         self._deepest = min(DEEPEST * self._radius, LARGEST_SHARE * min(self._sheet.size))
         self._hover = _rounded(HOVER * self._radius)
         friction = probe.friction if "friction" in probe.model_fields_set else FRICTION
+        if plan.scene.time.at_rest:
+            friction = 0.0
         self._probe = Probe(path=((0.0, 0.5, 0.5, self._hover),), friction=friction, instrument=probe.instrument)
         self.strength = min(100.0, 100 * PRESS * self._radius / self._deepest)
         self._usual = self.strength
