@@ -25,6 +25,7 @@ from taichi_msm.physics.lattice import fixed_points, rest_positions, spacing
 from taichi_msm.physics.loads import decay, loads_at
 from taichi_msm.physics.plan import Plan
 from taichi_msm.physics.planning import make_plan
+from taichi_msm.physics.rest import Rest
 from taichi_msm.physics.solver import Dynamics
 from taichi_msm.physics.state import State
 from taichi_msm.plot_style import BLUE, DPI, GREY, STYLE, VERMILION, WIDE
@@ -42,6 +43,9 @@ STIFFER = (1, 2, 5, 10)
 BUCKLING = 5
 ENERGY_STEPS = 100_000
 MODES = 6
+
+# How close to the sheet at rest a stepped one must come, of the largest displacement; it is compared every few steps.
+CLOSE, STRIDE = 1e-6, 16
 
 # Springs of which every one is counted once: down, right.
 HALF = ((0, 1), (1, 0), (1, 1), (1, -1))
@@ -281,6 +285,41 @@ def static() -> dict[str, Any]:
     }
 
 
+def at_rest() -> dict[str, Any]:
+    """Count the evaluations of the forces that `motion: quasistatic` takes, and the steps to the same shape."""
+    press, sides = "scenes/press.yaml", (31, 61, 121)
+    held = ["probes.0.load=[[0, 100]]", "output=[]", "time.duration=1", "time.frames_per_second=100"]
+    changes = {
+        "the press, held": [],
+        "a plate instead of tension": ["tissue.pretension=0", "tissue.bending=plate"],
+        "pulled along, without tension": ["tissue.pretension=0", "probes.0.total=[2, 0, 0]"],
+    }
+    rows = []
+    for name, change in changes.items():
+        counts = [name]
+        for side in sides:
+            points = f"sheet.points=[{side}, {side}]"
+            found = load_scene(ROOT / press, [*held, *change, points, "time.motion=quasistatic"])
+            still = Rest(make_plan(found), runtime.started())
+            still.advance(0)
+            counts.append(f"{still.evaluations}")
+            if not change:
+                moving = Dynamics(
+                    make_plan(load_scene(ROOT / press, [*held, points, "time.precision=f64"])), runtime.started()
+                )
+                wanted = still.displacement()
+                while longest(moving.displacement() - wanted) > CLOSE * longest(wanted):
+                    moving.advance(STRIDE)
+                counts[-1] += f" ({moving.steps_done} steps)"
+                moving.close()
+            if side == sides[0] and name.startswith("pulled"):
+                lifted = 1000 * float(np.abs(still.displacement()[..., 2]).max())
+            still.close()
+        rows.append(counts)
+    head = ["force evaluations for a frame", *(f"{side} × {side}" for side in sides)]
+    return {"rest_table": markdown(head, rows), "rest_close": f"{CLOSE:.0e}", "rest_lifted": f"{lifted:.1f}"}
+
+
 def frequencies() -> dict[str, Any]:
     """Compare the phase of small motions with that of the modes."""
     scene = press("springs.virtual_active=always", "damping=0", "time.precision=f64", "probes=[]", "time.duration=0.8")
@@ -309,7 +348,7 @@ def main() -> None:
     """Compute, draw, and write the page."""
     runtime.start("cpu")
     facts: dict[str, Any] = {}
-    for part in (frequencies, static, energy, buckling, lambda: {"silent_table": silent_table()}):
+    for part in (frequencies, static, at_rest, energy, buckling, lambda: {"silent_table": silent_table()}):
         facts |= part()
         print(facts, flush=True)
     PAGE.write_text(TEMPLATE.read_text(encoding="utf-8").format(**facts), encoding="utf-8")

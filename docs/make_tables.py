@@ -31,7 +31,7 @@ def rows(section: dict[str, Any], definitions: dict[str, Any], prefix: str = "")
         default = f"`{json.dumps(key['default'])}`" if key.get("default") is not None else ""
         if name in section.get("required", ()):
             default = "**required**"
-        elif below and name != "camera" and {"type": "null"} not in key.get("anyOf", ()):
+        elif below and "anyOf" not in key:
             default = "none" if "items" in key else "those below"
         yield f"| `{prefix}{name}` | {key['description']} | {key['expects']} | {default} |"
         for reference in below:
@@ -91,7 +91,7 @@ TABLES: dict[tuple[str, str], Callable[[], str]] = {
     ("python", "names"): names,
     ("sweep", "sweep keys"): partial(model_keys, SweepSettings, "key", "meaning", "value", "default"),
     ("sweep", "distributions"): partial(model_keys, Distribution, "way", "how the key varies", "value"),
-    ("command-line", "outputs"): partial(outputs, "picture", "positions"),
+    ("command-line", "outputs"): partial(outputs, "picture", "positions", "forces"),
     ("labels", "labels"): partial(outputs, "labels", "flow", "tracks"),
 }
 

@@ -18,12 +18,14 @@ if TYPE_CHECKING:
         SceneError,
     )
     from taichi_msm.exports.convert import export
+    from taichi_msm.physics.state import TipForce
     from taichi_msm.playback import Playback
     from taichi_msm.render.labels import Flow, Labels, Sight
     from taichi_msm.render.surface import Surface
     from taichi_msm.runner import resume, run
     from taichi_msm.scene import (
         Camera,
+        Foundation,
         Instrument,
         Light,
         Probe,
@@ -47,6 +49,7 @@ _HOMES = {
     **dict.fromkeys(("Flow", "Labels", "Sight"), "render.labels"),
     **dict.fromkeys(("resume", "run"), "runner"),
     "Playback": "playback",
+    "TipForce": "physics.state",
     "Simulation": "simulation",
     "Surface": "render.surface",
     "Outcome": "sweeps.outcome",
@@ -62,6 +65,7 @@ __all__ = [
     "DivergedError",
     "FilesError",
     "Flow",
+    "Foundation",
     "Instrument",
     "Labels",
     "Light",
@@ -80,6 +84,7 @@ __all__ = [
     "StiffnessMap",
     "Surface",
     "Time",
+    "TipForce",
     "Tissue",
     "export",
     "load_scene",

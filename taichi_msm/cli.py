@@ -212,6 +212,7 @@ def run(
 def check(scene: str, image: str | None, overrides: tuple[str, ...], as_json: bool) -> int:
     """Validate SCENE and print the steps, time, memory and disk space it needs; compute nothing."""
     from taichi_msm.physics import probe_force
+    from taichi_msm.physics.paths import path_notes
     from taichi_msm.physics.probe_force import in_words, probe_records
     from taichi_msm.render.drawing_notes import drawing_notes
     from taichi_msm.scenefile import budget, duration
@@ -221,21 +222,26 @@ def check(scene: str, image: str | None, overrides: tuple[str, ...], as_json: bo
     with naming(scene):
         budget.require_disk(plan, Path("output"))
     loaded, grid, limit = plan.scene, plan.grid, plan.stable_step
-    need, takes = budget.estimate(plan), duration.estimate(plan)
-    facts: dict[str, Any] = {
-        "scene": loaded.model_dump(mode="json"),
+    steps = {
         "step": grid.step,
         "stable_step": limit if limit < float("inf") else None,
         "steps_per_frame": grid.steps_per_frame,
         "precision": grid.precision,
-        "steps": need.steps,
+        "steps": plan.grid.steps,
+    }
+    if loaded.time.at_rest:
+        steps |= dict.fromkeys(("step", "stable_step", "steps_per_frame", "steps"))
+    need, takes = budget.estimate(plan), duration.estimate(plan)
+    facts: dict[str, Any] = {
+        "scene": loaded.model_dump(mode="json"),
+        **steps,
         "frames": need.frames,
         "estimated_seconds": takes.seconds,
         "memory": need.memory_bytes,
         "disk": need.disk_bytes,
         "disk_while_running": need.disk_bytes + need.working_bytes,
         "probes": (records := probe_records(loaded)),
-        "notes": [*probe_force.force_notes(loaded, records), *drawing_notes(loaded)],
+        "notes": [*probe_force.force_notes(loaded, records), *path_notes(loaded, plan.tools), *drawing_notes(loaded)],
     }
     if as_json:
         print_json(facts)
@@ -248,15 +254,21 @@ def check(scene: str, image: str | None, overrides: tuple[str, ...], as_json: bo
     asking = [f"{name}.tolerance" for name in ("sheet", "time") if getattr(loaded, name).tolerance is not None]
     more, longer = (", or more", f", or longer, as {' and '.join(asking)} may ask for more") if asking else ("", "")
     click.echo(yaml.safe_dump(facts["scene"], sort_keys=False, default_flow_style=None), nl=False)
+    stepped = (
+        f"each at rest{more}, in {grid.precision}"
+        if loaded.time.at_rest
+        else f"{need.steps} steps of {grid.step:.6g} s (limit {limit:.6g} s), {grid.steps_per_frame} a frame{more}, in "
+        f"{grid.precision}"
+    )
     click.echo(
-        f"\n{need.points} points, {need.frames} frames, {need.steps} steps of {facts['step']:.6g} s "
-        f"(limit {limit:.6g} s), {facts['steps_per_frame']} a frame{more}, in {facts['precision']}\n"
+        f"\n{need.points} points, {need.frames} frames, {stepped}\n"
         f"about {rough_time(takes.seconds)} to run{longer} ({source})\n"
         f"about {need.memory_bytes / 2**20:.0f} MiB of memory, at most {need.disk_bytes / 2**20:.1f} MiB on disk, "
         f"{need.working_bytes / 2**20:.1f} MiB more while it runs"
     )
     for index, probe in enumerate(facts["probes"]):
-        click.echo(f"probes.{index}: {in_words(probe)}")
+        if said := in_words(probe):
+            click.echo(f"probes.{index}: {said}")
     for note in facts["notes"]:
         click.echo(note)
     return DONE

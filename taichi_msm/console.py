@@ -117,9 +117,14 @@ def summary(record: Mapping[str, Any], directory: Path) -> str:
     times, (rows, cols) = record["timings"], record["points"]
     stages = ", ".join(f"{stage} {seconds:.2f}" for stage, seconds in times.items() if stage != "total")
     beside = times["encode"] > 0 and record["threads"] > 1
+    steps = (
+        f"at rest to {record['residual']:.1g} of the largest force, {record['evaluations']} evaluations of the forces"
+        if record["step"] is None
+        else f"{record['steps']} steps of {record['step']:.4g} s in {record['precision']}"
+    )
     lines = [
-        f"{printable(str(directory))}: {record['frames']} frames, {record['steps']} steps of {record['step']:.4g} s in "
-        f"{record['precision']}, {rows} x {cols} points, largest displacement {record['max_displacement']:.4g} m",
+        f"{printable(str(directory))}: {record['frames']} frames, {steps}, {rows} x {cols} points, "
+        f"largest displacement {record['max_displacement']:.4g} m",
         *([f"the first {record['resumed']} frames were simulated by an earlier run"] if record["resumed"] else []),
         *(f"probes.{index}: {in_words(probe)}" for index, probe in enumerate(record["probes"])),
         *record["notes"],

@@ -9,11 +9,12 @@ from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from mmap import ACCESS_READ, mmap
 from pathlib import Path
-from typing import TYPE_CHECKING, BinaryIO
+from typing import TYPE_CHECKING, Any, BinaryIO
 
 from taichi_msm.system.streams import silenced
 
 if TYPE_CHECKING:
+    from numpy.typing import NDArray
     from PIL import Image
 
 PICTURE_FORMATS = ("PNG", "JPEG", "WEBP", "BMP", "TIFF")
@@ -63,6 +64,21 @@ def read_rgb(path: str, background: tuple[int, int, int], sha256: str | None = N
 
     with _open(path, sha256) as opened:
         return _to_rgb(ImageOps.exif_transpose(opened), background)
+
+
+def read_grey(path: str, sha256: str | None = None) -> NDArray[Any]:
+    """Read the greys of a picture, upright, shape (height, width): of 16 bits where it has them, else of 8.
+
+    Otherwise as `read_rgb`, over black.
+    """
+    import numpy as np
+    from PIL import ImageOps
+
+    with _open(path, sha256) as opened:
+        image = ImageOps.exif_transpose(opened)
+        if image.mode in _MODES_16_BIT:
+            return np.asarray(image).astype(np.uint16)
+        return np.asarray(_to_rgb(image, (0, 0, 0)).convert("L"))
 
 
 def picture_size(path: str) -> tuple[int, int]:

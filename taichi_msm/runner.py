@@ -17,15 +17,13 @@ from numpy.typing import NDArray
 
 from taichi_msm.arguments import require_path
 from taichi_msm.errors import DamagedError, DeviceError, DivergedError, FilesError, SceneError, writing
-from taichi_msm.physics.error_control import Estimate
 from taichi_msm.physics.lattice import rest_positions
-from taichi_msm.physics.mesh_error import MeshEstimate
-from taichi_msm.physics.pilots import Pilots, choose_pilots
+from taichi_msm.physics.pilots import AT_REST, Pilots, choose_pilots
 from taichi_msm.physics.plan import Plan
-from taichi_msm.physics.probe_force import probe_records
+from taichi_msm.physics.probe_force import ProbeRecord, probe_records
 from taichi_msm.physics.run_error import Known, RunError
 from taichi_msm.physics.run_notes import run_notes
-from taichi_msm.physics.state import RunProgress
+from taichi_msm.physics.state import Felt, RunProgress
 from taichi_msm.physics.workload import ENCODING
 from taichi_msm.progress import Progress
 from taichi_msm.render.drawing_notes import drawing_notes
@@ -94,7 +92,7 @@ def run(
 
     Args:
         scene: what `load_scene` returned, or the same as a mapping.
-        directory: where frames/, animation.gif, trajectory.npz and run.json go.
+        directory: where frames/, animation.gif, trajectory.npz, forces.csv and run.json go.
         arch: cpu, cuda or vulkan.
         threads: number of CPU threads; None takes every core. With 1, pictures are encoded in this process too.
         overrides: the overrides that made the scene, for the record.
@@ -249,7 +247,7 @@ class _Run:
         pilots = _pilots(task, resumed=self._resumed > 0)
         self._error: RunError | None = None
         self._known = Known(manifest.estimate, pilots.reason, manifest.mesh)
-        if not pilots.reason:
+        if pilots.some:
             try:
                 self._error = RunError(plan, pilots, self._known, device, cores)
             except DeviceError:
@@ -287,13 +285,12 @@ class _Run:
             kind, of = ("redraw", without_steps) if frame < without_steps else ("frames", self._frames)
             told = partial(self._progress, kind, frame, of)
             told()
-            if frame > simulation.frame:
-                with stage("simulate"):
-                    simulation.advance(pause=self._pause)
+            with stage("simulate"):
+                simulation.advance(max(0, frame - simulation.frame), self._pause)
             position = writer.position(frame) if frame < self._resumed else simulation.positions()
             with stage("render"):
                 observed = simulation.observe(observed.labels, position, frame / scene.time.frames_per_second)
-            writer.add(position, observed, told)
+            writer.add(position, observed, simulation.forces(), told)
             if self._error and frame > 0:
                 with stage("pilot"):
                     self._error.follow(position - rest, told)
@@ -347,7 +344,7 @@ class _Run:
         seconds = {stage: watch.seconds.get(stage, 0.0) for stage in stages}
         record = {
             **ending,
-            **_facts(self._task, simulation.progress, known),
+            **_facts(self._task, simulation.progress, simulation.felt, known),
             "resumed": self._resumed,
             "timings": {**seconds, "encode": writer.encode_seconds, "total": watch.total()},
             "arch": device.arch,
@@ -375,16 +372,24 @@ def _pilots(task: _Task, *, resumed: bool) -> Pilots:
     if asked is None and task.device.arch != "cpu":
         return Pilots(reason="on a GPU, this needs --estimate-error")
     pilots = choose_pilots(task.plan, asked=asked is True)
-    if not pilots.reason and resumed and not task.plan.scene.output:
+    if pilots.some and resumed and not task.plan.scene.output:
         return Pilots(reason="the frames before the interruption were not kept")
     return pilots
 
 
-def _facts(task: _Task, progress: RunProgress, known: Known) -> dict[str, Any]:
+def _facts(task: _Task, progress: RunProgress, felt: Felt, known: Known) -> dict[str, Any]:
     """Say what was run, and what is known of its last frame, for run.json."""
     manifest, plan = task.manifest, task.plan
-    scene, grid, limit = plan.scene, plan.grid, plan.stable_step
-    probes = probe_records(scene)
+    scene = plan.scene
+    probes = [
+        ProbeRecord(
+            **record,
+            greatest_force=math.hypot(*peak.force),
+            greatest_force_vector=list(peak.force),
+            greatest_force_time=peak.time,
+        )
+        for record, peak in zip(probe_records(scene), felt.greatest, strict=True)
+    ]
     return {
         # With the paths of pictures as they were given; only these two sections hold anything that is chosen.
         "scene": manifest.given.model_copy(update={"sheet": scene.sheet, "time": scene.time}).model_dump(mode="json"),
@@ -393,18 +398,30 @@ def _facts(task: _Task, progress: RunProgress, known: Known) -> dict[str, Any]:
         "sha256": dict(manifest.sha256),
         "overrides": list(manifest.overrides),
         "points": list(scene.sheet.points),
-        "step": grid.step,
-        "stable_step": limit if limit < math.inf else None,
-        "steps_per_frame": grid.steps_per_frame,
-        "precision": grid.precision,
-        "steps": progress.frame * grid.steps_per_frame,
+        **_steps(plan, progress),
         "max_displacement": progress.max_displacement,
         "shortest_spring": progress.shortest_spring,
         "longest_spring": progress.longest_spring,
         "probes": probes,
         "notes": [*run_notes(plan, probes, progress, *known), *drawing_notes(scene)],
-        "error_estimate": None if known.estimate is None else error_record(known.estimate, known.mesh),
+        "error_estimate": error_record(known),
         **({"error_estimate_reason": known.reason} if known.estimate is None else {}),
+    }
+
+
+def _steps(plan: Plan, progress: RunProgress) -> dict[str, Any]:
+    """Say what steps were taken; at rest there are none, and how well the forces balance is said instead."""
+    grid, limit = plan.grid, plan.stable_step
+    if plan.scene.time.at_rest:
+        steps = dict.fromkeys(("step", "stable_step", "steps_per_frame", "steps"))
+        found = {"residual": progress.residual, "evaluations": progress.evaluations}
+        return {**steps, "precision": grid.precision, **found}
+    return {
+        "step": grid.step,
+        "stable_step": limit if limit < math.inf else None,
+        "steps_per_frame": grid.steps_per_frame,
+        "precision": grid.precision,
+        "steps": progress.frame * grid.steps_per_frame,
     }
 
 
@@ -424,10 +441,16 @@ def _asked(given: Scene, scene: Scene) -> dict[str, Any]:
     return {key: asked for key, asked, chosen in pairs if asked != chosen}
 
 
-def error_record(estimate: Estimate, mesh: MeshEstimate | None = None) -> dict[str, Any]:
-    """Write an estimate for run.json, where null stands for what is not known."""
-    fields = {key: getattr(estimate, key) for key in ("error", "rounding", "in_f64", "order", "at_least")}
-    if not estimate.parted:
+def error_record(known: Known) -> dict[str, Any] | None:
+    """Write what is known of the error for run.json, where null stands for what is not known, or not there."""
+    estimate, mesh, keys = known.estimate, known.mesh, ("error", "rounding", "in_f64", "order", "at_least")
+    if estimate is not None:
+        fields: dict[str, Any] = {key: getattr(estimate, key) for key in keys}
+    elif mesh is not None and known.reason == AT_REST:
+        fields = dict.fromkeys(keys) | {"at_least": False}
+    else:
+        return None
+    if estimate is not None and not estimate.parted:
         fields |= {"rounding": None, "in_f64": None}
     if mesh is not None:
         fields |= {"mesh_error": mesh.error, "mesh_doubt": mesh.doubt}

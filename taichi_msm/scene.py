@@ -9,10 +9,12 @@ from pydantic import (
     BaseModel,
     ConfigDict,
     Field,
+    SerializerFunctionWrapHandler,
     StrictBool,
     ValidationError,
     ValidationInfo,
     field_validator,
+    model_serializer,
     model_validator,
 )
 from typing_extensions import Self
@@ -103,7 +105,7 @@ class Section(BaseModel, metaclass=_Checked):
         del deep  # The values are immutable, so a shallow copy is as good.
         if not (update is None or (isinstance(update, Mapping) and all(isinstance(name, str) for name in update))):
             raise ArgumentError(f"update: {update!r}; take a mapping from keys to values")
-        return type(self)(**{**{name: getattr(self, name) for name in type(self).model_fields}, **(update or {})})
+        return type(self)(**{**{name: getattr(self, name) for name in self.model_fields_set}, **(update or {})})
 
     def __setattr__(self, name: str, value: object) -> None:
         raise SceneError([f"{name}: a scene cannot be changed; use model_copy(update={{{name!r}: ...}})"])
@@ -118,7 +120,11 @@ class Sheet(Section):
     size: tuple[Positive, Positive] = key(
         ..., "height, width of the sheet at rest [m]", "two numbers above 0: [height, width] in metres"
     )
-    mass: Positive | None = key(None, "mass of one point [kg]; required with springs", "a number above 0, in kg")
+    mass: Positive | None = key(
+        None,
+        "mass of one point [kg]; required with springs unless motion is quasistatic",
+        "a number above 0, in kg",
+    )
     fixed: Literal["border", "corners", "none"] | tuple[Side, ...] = key(
         "border", "the points that never move", "border, corners, none, or a list of top, bottom, left, right"
     )
@@ -159,16 +165,26 @@ class Springs(Section):
     )
 
 
+class Foundation(Section):
+    """The tissue underneath, as an elastic layer; young / depth is its stiffness, force per area and displacement."""
+
+    young: Positive = key(..., "Young's modulus of the tissue underneath [Pa]", "a number above 0, in Pa")
+    depth: Positive = key(..., "depth of the tissue underneath [m]", "a number above 0, in metres")
+
+
 class Tissue(Section):
     """Tissue in physical units: a sheet of plane stress with Poisson's ratio 1/3, the same at any number of points."""
 
     young: Positive = key(..., "Young's modulus E [Pa]", "a number above 0, in Pa")
     thickness: Positive = key(..., "thickness t of the sheet [m]", "a number above 0, in metres")
-    density: Positive = key(..., "density [kg/m3]", "a number above 0, in kg/m3")
-    foundation: NotNegative = key(
+    density: Positive | None = key(
+        None, "density [kg/m3]; required unless motion is quasistatic", "a number above 0, in kg/m3"
+    )
+    foundation: NotNegative | Foundation = key(
         0.0,
-        "stiffness of the tissue underneath, as virtual springs: force per area and displacement [N/m3]",
-        "a number, 0 or more, in N/m3",
+        "stiffness of the tissue underneath, as virtual springs: force per area and displacement [N/m3]; "
+        "or young / depth of that tissue",
+        "a number, 0 or more, in N/m3, or {young: [Pa], depth: [m]}",
     )
     foundation_active: Literal["loaded", "always"] = key(
         "loaded", "when the foundation acts: while any probe's percent is not 0, or always", "loaded or always"
@@ -183,6 +199,15 @@ class Tissue(Section):
         "plate, or a number, 0 or more, in N m",
     )
     map: StiffnessMap | None = key(None, "factor of young from place to place", "a mapping with image and range")
+    foundation_map: StiffnessMap | None = key(
+        None, "factor of the foundation from place to place", "a mapping with image and range"
+    )
+
+    @property
+    def foundation_stiffness(self) -> float:
+        """Stiffness of the foundation, where its map has the factor 1 [N/m3]."""
+        below = self.foundation
+        return below.young / below.depth if isinstance(below, Foundation) else below
 
 
 class Instrument(Section):
@@ -200,11 +225,26 @@ class Instrument(Section):
         return shaft
 
 
+# The keys of a probe that only a tool with a force has, and only one with a path.
+_OF_FORCE = {"at", "total", "force", "load", "falloff", "radius", "offset"}
+_OF_PATH = {"friction", "grip"}
+
+
 class Probe(Section):
-    """A tool: where it acts, how hard, and when (eq. 5)."""
+    """A tool: a force and where and when it acts (eq. 5), or the path of a rod that touches the sheet."""
 
-    model_config = ConfigDict(json_schema_extra={"oneOf": [{"required": ["total"]}, {"required": ["force"]}]})
+    model_config = ConfigDict(
+        json_schema_extra={
+            "oneOf": [{"required": list(names)} for names in (("total",), ("force",), ("path", "instrument"))]
+        }
+    )
 
+    path: Annotated[tuple[tuple[Number, Fraction, Fraction, Number], ...], Field(min_length=1)] | None = key(
+        None,
+        "in place of a force: where the instrument is; keys [[t, across, down, height], ...], linear between, held "
+        "outside; height: of the lowest point of its round tip above the sheet at rest [m]",
+        "keys [[t, across, down, height], ...], t in seconds, height in metres",
+    )
     at: tuple[Fraction, Fraction] | Annotated[tuple[tuple[Number, Fraction, Fraction], ...], Field(min_length=1)] = key(
         (0.5, 0.5),
         "control point: fraction of the width from the left, of the height from the top; "
@@ -239,8 +279,23 @@ class Probe(Section):
         "a number, -50 to 1000",
     )
     instrument: Instrument | None = key(
-        None, "the rod that is drawn for the tool", "a mapping with radius, shaft and length"
+        None,
+        "the rod that is drawn for the tool; with path it is what touches the sheet, and required",
+        "a mapping with radius, shaft and length",
     )
+    friction: NotNegative = key(
+        0.0, "with path: Coulomb's coefficient between the instrument and the sheet", "a number, 0 or more"
+    )
+    grip: tuple[tuple[Number, Number], ...] = key(
+        (),
+        "with path: times [[from, to], ...] [s] between which the tip holds the tissue that it is at",
+        "pairs of times [[from, to], ...], in seconds",
+    )
+
+    @property
+    def moved(self) -> bool:
+        """Whether the tool is moved along a path; else it exerts a force."""
+        return self.path is not None
 
     @field_validator("force", mode="after")
     @classmethod
@@ -248,9 +303,10 @@ class Probe(Section):
         if "total" not in info.data:
             return force  # A fault of its own.
         total = info.data["total"]
-        if force is None and total is None:
+        if force is None and total is None and info.data.get("path") is None:
             raise refused(
-                "missing; expected total (whole tool) or, with springs, force (one point): [x, y, z] in newtons"
+                "missing; expected total (whole tool) or, with springs, force (one point): [x, y, z] in newtons; or "
+                "path, for a tool that is moved"
             )
         if force is not None and total is not None:
             raise refused("is given together with total; remove one of them")
@@ -281,6 +337,49 @@ class Probe(Section):
                 )
         return keys
 
+    @field_validator("path", mode="after")
+    @classmethod
+    def _goes_forward(cls, path: tuple[tuple[float, ...], ...] | None) -> tuple[tuple[float, ...], ...] | None:
+        for n in range(1, len(path or ())):
+            assert path is not None
+            before, now = path[n - 1][0], path[n][0]
+            if now <= before:
+                raise refused(
+                    f"is at {now:g} s, after one at {before:g} s; a tool cannot jump: give it a later time", n
+                )
+        return path
+
+    @field_validator("grip", mode="after")
+    @classmethod
+    def _one_grip_at_a_time(cls, grip: tuple[tuple[float, float], ...]) -> tuple[tuple[float, float], ...]:
+        for n, (begin, end) in enumerate(grip):
+            if end <= begin:
+                raise refused(f"ends at {end:g} s, and begins at {begin:g} s; give [from, to] in this order", n)
+            if n and begin < grip[n - 1][1]:
+                raise refused(f"begins at {begin:g} s, before the grip before it ends; sort them, without overlap", n)
+        return grip
+
+    @model_validator(mode="after")
+    def _one_kind(self) -> Self:
+        given = self.model_fields_set
+        if self.path is None:
+            for name in _OF_PATH & given:
+                if getattr(self, name):
+                    raise refused("goes with path; a tool with a force has none", name)
+            return self
+        for name in sorted(_OF_FORCE & given):
+            if getattr(self, name) is not None:
+                raise refused("goes with a force, and path gives the place; remove one of them", name)
+        if self.instrument is None:
+            raise refused("missing; with path expected a mapping with radius, shaft and length", "instrument")
+        return self
+
+    @model_serializer(mode="wrap")
+    def _own_keys(self, dump: SerializerFunctionWrapHandler) -> dict[str, Any]:
+        """Leave out the keys of the other kind of tool, which would be refused when they are read again."""
+        others = (_OF_PATH | {"path"}) if self.path is None else _OF_FORCE
+        return {name: value for name, value in dump(self).items() if name not in others}
+
 
 class Time(Section):
     """The time span, the frames and the steps."""
@@ -289,6 +388,12 @@ class Time(Section):
         ..., "simulated time [s]; duration x frames_per_second is a whole number", "a number above 0, in seconds"
     )
     frames_per_second: Positive = key(25.0, "frames per simulated second", "a number above 0")
+    motion: Literal["dynamic", "quasistatic"] = key(
+        "dynamic",
+        "dynamic: the sheet moves; quasistatic: every frame is the sheet at rest under its loads, and mass, density, "
+        "damping and step do not matter",
+        "dynamic or quasistatic",
+    )
     step: Literal["auto"] | Positive = key(
         "auto",
         "time step [s], a whole fraction of a frame; auto: half the stability limit or less",
@@ -313,6 +418,11 @@ class Time(Section):
     )
 
     @property
+    def at_rest(self) -> bool:
+        """Whether every frame is the sheet at rest."""
+        return self.motion == "quasistatic"
+
+    @property
     def frames(self) -> int:
         """F, the number of frame intervals; F + 1 frames are drawn."""
         return round(self.duration * self.frames_per_second)
@@ -334,6 +444,14 @@ class Time(Section):
         if self.tolerance is not None and self.step != "auto":
             said = f"a tolerance chooses the step, but step is {self.step:.12g}"
             raise refused(f"{said}; set step: auto or remove the tolerance", "tolerance")
+        return self
+
+    @model_validator(mode="after")
+    def _fits_rest(self) -> Time:
+        if self.at_rest and self.tolerance is not None:
+            raise refused("is for the time step, and motion: quasistatic takes none; remove the tolerance", "tolerance")
+        if self.at_rest and self.precision == "f32":
+            raise refused("f32 is too coarse for motion: quasistatic; take auto or f64", "precision")
         return self
 
 
@@ -426,7 +544,9 @@ class Scene(Section):
     springs: Springs | None = key(None, "instead of tissue: the springs", "a mapping with structural, shear, virtual")
     damping: NotNegative = key(0.0, "with springs: C, force per velocity [N s/m]", "a number, 0 or more, in N s/m")
     probes: Annotated[tuple[Probe, ...], Field(max_length=MAX_PROBES)] = key(
-        (), "the tools", f"a list of at most {MAX_PROBES} mappings with at, total or force, load"
+        (),
+        "the tools",
+        f"a list of at most {MAX_PROBES} mappings with at, total or force, load, or with path and instrument",
     )
     time: Time = key(..., "time span, frames and steps", "a mapping with at least duration")
     render: Render = key(Render(), "how a frame is drawn", "a mapping")
@@ -472,7 +592,7 @@ class Scene(Section):
 
     @property
     def maps(self) -> dict[str, StiffnessMap]:
-        """The maps of the springs or the tissue, by the keys that name them: map."""
+        """The maps of the springs or the tissue, by the keys that name them: map, foundation_map."""
         return {name: value for name, value in (self.tissue or self.springs or ()) if isinstance(value, StiffnessMap)}
 
     @property

@@ -12,12 +12,14 @@ from numpy.typing import NDArray
 from taichi_msm.arguments import are_numbers, as_array, require_frame_count
 from taichi_msm.errors import ArgumentError, DivergedError, MsmError
 from taichi_msm.physics import divergence
+from taichi_msm.physics.deformed import to_positions
 from taichi_msm.physics.diagnosis import Diagnosis, diagnose
 from taichi_msm.physics.divergence import Watch, farthest
-from taichi_msm.physics.lattice import axes
+from taichi_msm.physics.forces import Gauge
 from taichi_msm.physics.plan import Plan
-from taichi_msm.physics.solver import Dynamics
-from taichi_msm.physics.state import Reading, RunProgress, Saved
+from taichi_msm.physics.rest import sheet_of
+from taichi_msm.physics.state import Felt, Reading, RunProgress, Saved, TipForce
+from taichi_msm.physics.steering import steered, with_paths_of
 from taichi_msm.progress import Pause
 from taichi_msm.render.labels import Flow, Labels, Observed, Sight
 from taichi_msm.render.picking import pick
@@ -80,10 +82,16 @@ class Simulation:
         texture = None if texture is None else require_texture(texture)
         self.device = runtime.start(arch, threads)
         self._plan = resolve(plan, self.device).plan
-        self._watch = Watch(self._plan)
-        self._closed = self._diverged = False
-        self._dynamics = Dynamics(self._plan, self.device, cores=cores)
-        self._position = self._place(self._dynamics.displacement())
+        # As they are before they are steered.
+        self._probes = self.scene.probes
+        self._watch: Watch
+        self._gauge: Gauge
+        self._felt: Felt
+        self._placed: Array | None
+        self._divergence: DivergedError | None
+        self._closed, self._cores = False, cores
+        self._dynamics = sheet_of(self._plan, self.device, cores=cores)
+        self._begin()
         self.renderer = Renderer(self.scene, texture)
 
     @property
@@ -130,43 +138,45 @@ class Simulation:
         """Simulate a number of frames, with the loads of the scene's keys.
 
         Args:
-            frames: how many, 0 or more.
+            frames: how many, 0 or more; 0 finds the shape of the first frame, where that is at rest under a load.
             pause: called some times a second, between steps; what it raises stops the simulation there, and the next
                 call goes on from there.
 
         Raises:
-            DivergedError: when the simulation diverges: a position is no longer finite, or exceeds every bound.
-                `positions` and `draw` then give the last good frame.
+            DivergedError: when the simulation diverges: a position is no longer finite, or exceeds every bound; or no
+                shape is found in which the forces balance. `positions` and `draw` then give the last good frame.
         """
         require_frame_count(frames)
         self._require_open()
+        self._find_first(pause)
         for _ in range(frames):
-            end = (self.frame + 1) * self._plan.grid.steps_per_frame
-            self._dynamics.advance(end - self.steps, pause)
-            reading = self._dynamics.read()
-            self._require_good(reading, self._watch.follow(reading))
-            self._position = self._place(reading.displacement)
+            self._go_to(self.frame + 1, pause)
 
     def steer(self, probes: Sequence[Probe | Mapping[str, Any]]) -> None:
-        """Replace the loads from here on.
+        """Replace the loads, and where tools are moved to, from here on.
 
         Args:
             probes: the scene's probes with other numbers. Each control point must move, jump or stand as before; for a
-                tool that is to move later, give `at` as keys from the start, be it a single one.
+                tool that is to move later, give `at` as keys from the start, be it a single one. Of a tool that has a
+                path take `{"path": [[t, across, down, height], ...]}` with times after `time`: it goes straight from
+                where it is to the first of them. Its instrument, friction and grips stay, unless they are given too; a
+                grip that has begun goes on if its beginning is among them.
 
         Raises:
             ArgumentError: when the kernel was not compiled for such probes.
-            SceneError: when one of them is not a probe.
+            SceneError: when one of them is not a probe, or a tool would jump.
         """
         self._require_open()
         if not isinstance(probes, Sequence):
             raise ArgumentError(f"probes: {probes!r}; take a list of them")
-        plan = self._plan.with_probes(probes)
+        self._find_first()
+        plan = steered(self._plan, probes, self._plan.grid.time(self.steps))
         self._dynamics.steer(plan)
         self._watch.steer(plan)
+        self._gauge = Gauge(plan)
         self._plan, self.renderer.scene = plan, plan.scene
 
-    def restart(self, scene: Scene | Mapping[str, Any] | None = None) -> None:
+    def restart(self, scene: Plan | Scene | Mapping[str, Any] | None = None) -> None:
         """Begin again at rest. Nothing is compiled if the terms of the model and the precision stay the same.
 
         Args:
@@ -176,13 +186,19 @@ class Simulation:
             SceneError: as for `Simulation`.
         """
         self._require_open()
+        motion = self.scene.time.motion
         if scene is not None:
             self._plan = resolve(checked(scene), self.device).plan
+            self._probes = self.scene.probes
             self.renderer.restart(self.scene)
-        self._watch = Watch(self._plan)
-        self._diverged = False
-        self._dynamics.restart(self._plan)
-        self._position = self._place(self._dynamics.displacement())
+        else:
+            self._follow_paths(self._probes)
+        if self.scene.time.motion == motion:
+            self._dynamics.restart(self._plan)
+        else:
+            self._dynamics.close()
+            self._dynamics = sheet_of(self._plan, self.device, cores=self._cores)
+        self._begin()
 
     def save(self) -> Saved:
         """Save all that another simulation needs to continue from here.
@@ -191,31 +207,35 @@ class Simulation:
             DivergedError: as for `advance`.
         """
         self._require_open()
+        self._find_first()
         reading = self._dynamics.read()
         self._require_good(reading, self._watch.judge(reading))
-        return Saved(self._dynamics.state(), self.progress)
+        return Saved(self._dynamics.state(), self.progress, self._felt, self.scene.probes)
 
     def restore(self, saved: Saved) -> None:
         """Continue from where a simulation of the same scene was saved, also between two frames; to the same bits.
 
         Raises:
-            ArgumentError: when it was saved with other points, another precision or another step.
+            ArgumentError: when it was saved with other points or probes, another precision or another step.
         """
         self._require_open()
         if not isinstance(saved, Saved):
             raise ArgumentError(f"{type(saved).__name__} is not what `save` returns")
         state, per_frame = saved.state, self._plan.grid.steps_per_frame
         since = state.steps - saved.progress.frame * per_frame
-        alike = (state.displacement.shape, state.displacement.dtype) == (self._position.shape, self._position.dtype)
-        if not (alike and 0 <= since <= per_frame):
+        here = self._dynamics.displacement()
+        alike = (state.displacement.shape, state.displacement.dtype) == (here.shape, here.dtype)
+        if not (alike and len(saved.felt.forces) == len(self.scene.probes) and 0 <= since <= per_frame):
             raise ArgumentError(
                 f"saved at step {state.steps}, frame {saved.progress.frame}, {state.displacement.dtype} of shape "
-                f"{state.displacement.shape}; take what was saved with this scene's points, precision and step"
+                f"{state.displacement.shape}; take what was saved with this scene's points, probes, precision and step"
             )
-        self._diverged = False
+        if saved.probes:
+            self._follow_paths(saved.probes)
+        self._divergence = None
         self._dynamics.restart(self._plan, saved.state)
-        self._position = self._place(self._dynamics.displacement())
-        self._watch.progress = saved.progress
+        self._placed = to_positions(self._dynamics.displacement(), self.scene.sheet)
+        self._watch.progress, self._felt = saved.progress, saved.felt
 
     def positions(self) -> Array:
         """Give where the points are.
@@ -224,6 +244,16 @@ class Simulation:
             Positions [m], shape (rows, cols, 3), in the scene's precision; not to be written to.
         """
         return self._position
+
+    def forces(self) -> list[TipForce]:
+        """Give what every probe does at the last frame: where its tip is, and its force on the sheet."""
+        self._find_first()
+        return list(self._felt.forces)
+
+    @property
+    def felt(self) -> Felt:
+        """The forces at the last frame, and the greatest so far."""
+        return self._felt
 
     def velocities(self) -> Array:
         """Give the velocities of the points: the mean over the last step, so those half a step before `time`.
@@ -249,8 +279,15 @@ class Simulation:
             MsmError: when the simulation has not diverged.
         """
         self._require_open()
-        if not self._diverged:
+        if self._divergence is None:
             raise MsmError("this simulation has not diverged; there is nothing to find out")
+        if self.scene.time.at_rest:
+            good = (
+                None
+                if self._placed is None
+                else Saved(self._dynamics.state(), self.progress, self._felt, self.scene.probes)
+            )
+            return Diagnosis(str(self._divergence), good)
         return diagnose(self._dynamics, start, pause)
 
     def draw(
@@ -347,8 +384,9 @@ class Simulation:
         self._dynamics.compile()
         pause()
         if self.scene.renders and (kernels := self.renderer.kernels()) not in _compiled:
-            first = self.observe(None, self._position, self.time)
-            self.observe(first.labels, self._position, self.time)
+            position = to_positions(self._dynamics.displacement(), self.scene.sheet)
+            first = self.observe(None, position, self.time)
+            self.observe(first.labels, position, self.time)
             _compiled.add(kernels)
 
     def close(self) -> None:
@@ -367,6 +405,32 @@ class Simulation:
     def __reduce__(self) -> Any:
         remedy = "keep its `scene` and what `save` returns, and `restore` that in a new one"
         raise MsmError(f"a Simulation cannot be pickled or copied; {remedy}")
+
+    @property
+    def _position(self) -> Array:
+        """Positions of the last frame [m], which is found first where it is at rest under a load."""
+        self._find_first()
+        assert self._placed is not None
+        return self._placed
+
+    def _find_first(self, pause: Pause = lambda: None) -> None:
+        """Find the first frame, where it is at rest and that is yet to be done."""
+        if self._placed is None:
+            self._require_open()
+            self._go_to(0, pause)
+
+    def _go_to(self, frame: int, pause: Pause) -> None:
+        """Simulate up to a frame."""
+        try:
+            self._dynamics.advance(frame * self._plan.grid.steps_per_frame - self.steps, pause)
+        except DivergedError as error:
+            self._divergence = error
+            raise
+        reading = self._dynamics.read()
+        self._require_good(reading, self._watch.follow(reading))
+        position = to_positions(reading.displacement, self.scene.sheet)
+        self._felt = self._gauge.follow(self._felt, self.frame, position, self._dynamics.tool_forces())
+        self._placed = position
 
     def _require_open(self) -> None:
         # The kernels would write to memory that was freed.
@@ -394,16 +458,20 @@ class Simulation:
     def _require_good(self, reading: Reading, fault: str) -> None:
         """Raise the error of a divergence, if there is a fault."""
         if fault:
-            self._diverged = True
             steps, time = reading.steps, self._plan.grid.time(reading.steps)
             point = farthest(reading.displacement)[:2]
-            raise DivergedError(divergence.message(time, steps, fault, exact=False), steps, time, point)
+            self._divergence = DivergedError(divergence.message(time, steps, fault, exact=False), steps, time, point)
+            raise self._divergence
 
-    def _place(self, displacement: Array) -> Array:
-        """Turn displacements into positions."""
-        position, (x, y) = displacement, axes(self.scene.sheet)
-        # The sum is computed in float64 and rounded once, without a float64 copy of the sheet.
-        np.add(position[..., 0], x, out=position[..., 0], casting="same_kind")
-        np.add(position[..., 1], y, out=position[..., 1], casting="same_kind")
-        position.flags.writeable = False
-        return position
+    def _begin(self) -> None:
+        """Begin with the flat sheet; at rest, the first frame is yet to be found."""
+        self._divergence = None
+        self._watch, self._gauge = Watch(self._plan), Gauge(self._plan)
+        self._felt = self._gauge.at_rest()
+        flat = to_positions(self._dynamics.displacement(), self.scene.sheet)
+        self._placed = None if self.scene.time.at_rest else flat
+
+    def _follow_paths(self, probes: Sequence[Probe]) -> None:
+        """Move tools along the paths that these probes have, in place of those that they were steered along."""
+        self._plan = with_paths_of(self._plan, probes)
+        self._gauge, self.renderer.scene = Gauge(self._plan), self.scene

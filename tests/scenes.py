@@ -129,6 +129,8 @@ def random_tissue(seed: int, image: str, precision: str = "f64") -> Scene:
         tissue["bending"] = 0
     if rng.random() < 0.5:
         tissue["map"] = {"image": image, "range": [some(0.7, 1), some(1, 4)]}
+    if tissue["foundation"] and rng.random() < 0.5:
+        tissue["foundation_map"] = {"image": image, "range": [some(0.1, 1), some(1, 4)]}
     return Scene(
         sheet={"points": [rows, cols], "size": size, "fixed": fixed},
         tissue=tissue,
@@ -140,6 +142,80 @@ def random_tissue(seed: int, image: str, precision: str = "f64") -> Scene:
         },
         output=[],
     )
+
+
+def random_contact(seed: int, image: str, *, cells: float = 2.0) -> Scene:
+    """A random scene of tissue or springs that one to three tools press, rub and hold; `image` is for maps.
+
+    cells: how many cells the tools' radii are wide, about.
+    """
+    for attempt in range(100):
+        made = Scene.model_validate(_random_contact(np.random.default_rng([seed, attempt]), image, cells))
+        if not try_plan(made)[1]:
+            return made
+    raise AssertionError("no valid scene")
+
+
+def _random_contact(rng: np.random.Generator, image: str, cells: float) -> dict[str, Any]:
+    def some(low: float, high: float) -> float:
+        return float(rng.uniform(low, high))
+
+    def likely(chance: float) -> bool:
+        return bool(rng.random() < chance)
+
+    rows, cols = (int(rng.integers(13, 34)) for _ in range(2))
+    cell, duration = some(0.06, 0.14) / (rows - 1), float(rng.choice([0.2, 0.4]))
+    sides = ["border", "border", "corners", "none", ["left", "right"], ["top"], ["bottom", "left"]]
+    fixed = sides[rng.integers(len(sides))]
+
+    def tool() -> dict[str, Any]:
+        radius, across, down = some(0.6, 1.4) * cells * cell, some(0.2, 0.8), some(0.2, 0.8)
+        depth, touch = some(0.2, 1.5) * radius, some(0.15, 0.5) * duration
+        leave = touch + some(0.1, 0.6) * (duration - touch)
+        there = across + some(-0.1, 0.1), down + some(-0.1, 0.1)
+        path = [[0, across, down, some(0, 1e-3)], [touch, across, down, -depth], [leave, *there, -depth]]
+        if likely(0.7):
+            path.append([leave + 0.2 * duration, *there, some(0.002, 0.015)])
+        shaft = [some(-1, 1), some(-1, 1), some(0.7, 1.2)]
+        if likely(0.1):  # From below.
+            path = [[*place, -2 * radius - height] for *place, height in path]
+            shaft[2] *= -1
+        held = some(0.8, 1.3) * touch
+        return {
+            "path": path,
+            "instrument": {"radius": radius, "shaft": shaft, "length": some(0.03, 0.15)},
+            "friction": some(0.05, 0.8) if likely(0.5) else 0.0,
+            "grip": [[held, held + some(0.1, 1) * duration]] if likely(0.4) else [],
+        }
+
+    made: dict[str, Any] = {
+        "sheet": {"points": [rows, cols], "size": [cell * (rows - 1), some(0.8, 1.25) * cell * (cols - 1)]},
+        "probes": [tool() for _ in range(rng.integers(1, 4) if likely(0.5) else 1)],
+        "time": {"duration": duration, "precision": ["f32", "f64"][rng.integers(2)]},
+        "output": [],
+    }
+    made["sheet"]["fixed"] = fixed
+    made["time"]["damping_difference"] = "backward" if likely(0.15) else "central"
+    damping = float(rng.choice([0, 20, 200, 2000]))
+    support, active = likely(0.7) or fixed == "none", ["loaded", "always"][rng.integers(2)]
+    if likely(0.3):
+        made["sheet"]["mass"], made["damping"] = 1e-4, 1e-4 * damping
+        made["springs"] = {"structural": some(20, 100), "shear": some(10, 60), "virtual_active": active}
+        made["springs"]["virtual"] = some(0.5, 10) if support else 0
+        return made
+    made["tissue"] = {
+        "young": 10 ** some(3.7, 4.8),
+        "thickness": some(1e-3, 4e-3),
+        "density": 1050,
+        "foundation": 10 ** some(5, 6.5) if support else 0,
+        "foundation_active": active,
+        "damping": damping,
+        "pretension": some(5, 40) if fixed == "border" and likely(0.5) else 0,
+        "bending": "plate" if fixed == "border" and likely(0.4) else 0,
+    }
+    if likely(0.35):
+        made["tissue"]["map"] = {"image": image, "range": [some(0.7, 1), some(1, 4)]}
+    return made
 
 
 def speckle(height: int, width: int, seed: int = 0) -> NDArray[np.uint8]:

@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import math
 import os
 import shutil
 import sys
@@ -14,7 +15,7 @@ from taichi_msm.outputs.table import OUTPUTS
 from taichi_msm.runner import run
 from taichi_msm.scene import Scene
 from taichi_msm.scenefile import budget
-from taichi_msm.scenefile.budget import Budget, require_disk, size_problems
+from taichi_msm.scenefile.budget import FORCE_ROW_BYTES, Budget, require_disk, size_problems
 from taichi_msm.system import resources
 from taichi_msm.system.resources import available_memory
 from taichi_msm.system.runtime import Device
@@ -117,8 +118,8 @@ def test_a_run_takes_no_more_disk_than_was_said(size: tuple[int, int], device: D
     )
     run(made, tmp_path / "out", threads=device.threads)
     sizes = {path: path.stat().st_size for path in (tmp_path / "out").rglob("*") if path.is_file()}
-    # Four kinds of labels and the pictures at 11 frames, two kinds between them, and five files.
-    assert len(sizes) == 4 * 11 + 2 * 10 + 5
+    # Four kinds of labels and the pictures at 11 frames, two kinds between them, and six files.
+    assert len(sizes) == 4 * 11 + 2 * 10 + 6
     need = estimate(made)
     assert sum(sizes.values()) <= need.disk_bytes
     pictures = sum(size for path, size in sizes.items() if path.parent.name == "frames")
@@ -130,6 +131,19 @@ def test_tracks() -> None:
     need = estimate(scene(render={"tracks": 10}, output=["tracks"]))
     assert need.track_bytes == 100 * (21 * 9 + 16) + 1024
     assert need.disk_bytes == need.track_bytes + need.record_bytes
+
+
+def test_forces() -> None:
+    # A row has a number of a probe, and seven others of up to 24 characters.
+    longest = ",".join([repr(-math.pi * 1e-100)] * 7 + ["15"])
+    assert len(longest) < FORCE_ROW_BYTES
+    need = estimate(scene(probes=[PROBE, PROBE], output=["forces"]))
+    assert need.disk_bytes == 21 * 2 * FORCE_ROW_BYTES + 1024 + need.record_bytes
+    alone = estimate(scene(probes=[PROBE, PROBE], output=["gif"]))
+    assert need.working_bytes == alone.working_bytes + 21 * 2 * 48
+    tool = {"path": [[0, 0, 0, 1]], "instrument": {"radius": 1, "shaft": [0, 0, 1], "length": 1}, "grip": [[0, 1]]}
+    pushed = estimate(scene(probes=[PROBE, tool], output=["gif"]))
+    assert pushed.simulation_bytes == alone.simulation_bytes + 1200 * (4 + 8 + 8) * 6
 
 
 def test_an_ordinary_scene_has_no_problems() -> None:

@@ -13,8 +13,8 @@ import numpy as np
 import pytest
 
 from taichi_msm.errors import DamagedError
-from taichi_msm.physics.state import RunProgress, Saved, State
-from taichi_msm.results.checkpoint import MANIFEST, POSITIONS, STATE, Checkpoint, seal, unseal
+from taichi_msm.physics.state import Felt, PeakForce, RunProgress, Saved, State, TipForce
+from taichi_msm.results.checkpoint import FORCES, MANIFEST, POSITIONS, STATE, Checkpoint, seal, unseal
 from taichi_msm.results.manifest import Manifest, read_manifest
 from taichi_msm.scene import Scene
 from tests.scenes import scene, scene_and_grid
@@ -24,16 +24,20 @@ EVERY = 17  # steps a frame
 
 
 def small_scene() -> Scene:
-    return scene(sheet={"points": [2, 3], "size": [0.3, 0.4], "mass": 1e-3}, output=["trajectory"])
+    return scene(sheet={"points": [2, 3], "size": [0.3, 0.4], "mass": 1e-3}, output=["trajectory", "forces"])
 
 
 def checkpoint_in(directory: Path) -> Checkpoint:
     made, grid = scene_and_grid(small_scene())
-    return Checkpoint(directory / ".partial" / "checkpoint", grid, made.sheet.points, keeps_positions=True)
+    return Checkpoint(directory / ".partial" / "checkpoint", made, grid)
 
 
 def position(frame: int) -> Any:
     return np.random.default_rng(frame).normal(size=(2, 3, 3))
+
+
+def forces(frame: int) -> tuple[TipForce, ...]:
+    return (TipForce(0, (1.0, 2.0, frame / 3), (4.0, 5.0, 6.0)),)
 
 
 def manifest() -> Manifest:
@@ -43,10 +47,12 @@ def manifest() -> Manifest:
 
 def state(**changes: Any) -> Saved:
     """The state of a run at its third frame."""
-    steps = {"steps": EVERY * (FRAMES - 1), "displacement": position(8), "difference": position(9)}
+    steps: dict[str, Any] = {"steps": EVERY * (FRAMES - 1), "displacement": position(8), "difference": position(9)}
+    steps["contact"] = np.empty((0, 2, 3))
     progress = RunProgress(frame=FRAMES - 1, energy=1.0, peak=2.0, reach=3.0)
     kept = {key: changes.pop(key) for key in list(changes) if key in steps}
-    return Saved(State(**{**steps, **kept}), RunProgress(**{**vars(progress), **changes}))
+    felt = Felt(forces(8), (PeakForce(0.1, (7.0, 8.0, 9.0)),))
+    return Saved(State(**{**steps, **kept}), RunProgress(**{**vars(progress), **changes}), felt)
 
 
 @pytest.fixture
@@ -56,7 +62,7 @@ def out(tmp_path: Path) -> Path:
     checkpoint = checkpoint_in(tmp_path)
     checkpoint.begin(manifest().as_json())
     for frame in range(FRAMES):
-        checkpoint.add(position(frame))
+        checkpoint.add(position(frame), forces(frame))
     checkpoint.save(state())
     checkpoint.close()
     return tmp_path
@@ -69,11 +75,14 @@ def read(out: Path) -> list[Any]:
         saved = checkpoint.reopen()
         assert saved is not None
         positions = [checkpoint.position(frame).tolist() for frame in range(checkpoint.frames)]
+        forces = [checkpoint.forces(frame) for frame in range(checkpoint.frames)]
     finally:
         checkpoint.close()
     return [
         read_manifest(out)[0].as_json(),
         positions,
+        forces,
+        saved.felt,
         saved.state.steps,
         saved.state.displacement.tolist(),
         saved.state.difference.tolist(),
@@ -86,6 +95,7 @@ def read(out: Path) -> list[Any]:
     [
         (MANIFEST, 0.0, 1),
         (POSITIONS, 0.0, 5),
+        (FORCES, 0.0, 5),
         (STATE, 0.25, 5),
         pytest.param(POSITIONS, 0.0, 1, marks=pytest.mark.fuzz),
         pytest.param(STATE, 0.25, 1, marks=pytest.mark.fuzz),
@@ -140,6 +150,8 @@ FORGED: dict[str, Callable[[dict[str, Any]], object]] = {
     "energy not a number": lambda a: a.update(energy=np.float64(math.nan)),
     "energy below 0": lambda a: a.update(energy=np.float64(-1)),
     "no energy": lambda a: a.pop("energy"),
+    "force not a number": lambda a: a["forces"].__setitem__((0, 0), math.nan),
+    "forces of more probes": lambda a: a.update(greatest=np.zeros((2, 4))),
 }
 
 
@@ -179,14 +191,14 @@ def test_a_compressed_array_takes_no_memory(out: Path) -> None:
         read(out)
 
 
-@pytest.mark.parametrize("name", [POSITIONS, STATE])
+@pytest.mark.parametrize("name", [POSITIONS, FORCES, STATE])
 def test_parts_of_another_run_are_refused(name: str, out: Path, tmp_path: Path) -> None:
     """Of the same sheet, and whole."""
     other = checkpoint_in(tmp_path)
     part = (out / ".partial" / "checkpoint" / name).read_bytes()
     other.begin({**manifest().as_json(), "folder": "/elsewhere"})
     for frame in range(FRAMES):
-        other.add(position(frame))
+        other.add(position(frame), forces(frame))
     other.save(state())
     other.close()
     (out / ".partial" / "checkpoint" / name).write_bytes(part)
@@ -199,7 +211,7 @@ def test_positions_that_are_no_numbers_are_refused(out: Path) -> None:
     checkpoint = checkpoint_in(out)
     checkpoint.reopen()
     checkpoint.frames = 1
-    checkpoint.add(np.full((2, 3, 3), math.nan))
+    checkpoint.add(np.full((2, 3, 3), math.nan), forces(1))
     checkpoint.close()
     with pytest.raises(DamagedError):
         read(out)

@@ -12,10 +12,12 @@ import pytest
 from taichi_msm import DivergedError, Simulation
 from taichi_msm.physics.diagnosis import Diagnosis
 from taichi_msm.physics.divergence import farthest_displacement
+from taichi_msm.physics.forces import Gauge
 from taichi_msm.physics.state import RunProgress, Saved, State
 from taichi_msm.scene import Scene
 from taichi_msm.system.runtime import Device
 from tests.scenes import SHEET, plan_of, scene, with_steps
+from tests.test_contact import moved
 
 # Pressed for three frames.
 PRESS = {"force": [0, 300, -1000], "load": [[0, 100], [0.12, 100], [0.12, 0]], "falloff": 20}
@@ -40,7 +42,7 @@ def pressed(precision: str = "f32", **sections: object) -> Scene:
 
 def rest(made: Scene) -> Saved:
     nothing = np.zeros((*made.sheet.points, 3), made.time.precision.replace("f", "float"))
-    return Saved(State(0, nothing, nothing), RunProgress())
+    return Saved(State(0, nothing, nothing), RunProgress(), Gauge(plan_of(made)).at_rest())
 
 
 def with_fault(saved: Saved, part: str, change: float, random: np.random.Generator) -> Saved:
@@ -118,6 +120,31 @@ SOUND = {
         probes=[{**PLAIN, "force": [0.01, 0, 0], "load": [[0, 0], [1 / 30 - 1e-16, 100], [1 / 30 - 1e-16, 0]]}],
         time={"duration": 1, "frames_per_second": 30},
     ),
+    "a tool takes it along, and lets it fly sixty times as far as it is long": scene(
+        sheet={**SHEET, "fixed": "none"},
+        springs={"structural": 20, "shear": 10},
+        damping=0,
+        probes=[moved([0, 0.5, 0.5, 0.0], [8, 0.5, 0.5, -13.0], [9, 0.5, 0.5, -12.0], friction=1.0, grip=[[0, 7.5]])],
+        time={"duration": 16},
+    ),
+    "a tool stretches it sixteen times as far as it is long, and lets go": scene(
+        sheet={**SHEET, "fixed": ["left"]},
+        damping=0,
+        probes=[moved([0, 0.9, 0.5, 0.0], [0.8, 0.9, 0.5, 6.5], grip=[[0, 0.8]])],
+        time={"duration": 1.2, "precision": "f32"},
+    ),
+    "tools bat it about, each by half its radius in a step": scene(
+        sheet={**SHEET, "fixed": "none"},
+        springs={"structural": 20, "shear": 10},
+        damping=0,
+        probes=[
+            moved([0, x, 0.5, 0.0], *([0.2 * n, x, 0.5, (-0.6, 0.6)[n % 2]] for n in range(1, 5))) for x in (0.2, 0.8)
+        ],
+        time={"duration": 2, "step": 0.004},
+    ),
+    "a force presses it into a tool that stands": scene(
+        damping=0, probes=[moved([0, 0.5, 0.5, 0.0]), {"force": [0, 0, 0.3], "falloff": 3, "offset": 0}]
+    ),
     "moves by less than f32 can square": scene(
         sheet={"points": [9, 9], "size": [1e10, 1e10], "mass": 1},
         springs={"structural": 1},
@@ -135,6 +162,20 @@ def test_what_is_sound_is_let_pass(name: str, device: Device) -> None:
         assert simulation.progress.peak > 0
 
 
+@pytest.mark.parametrize(
+    "fault", ["displacement is no number", "difference is infinite", "thrown far away", "thrown fast"]
+)
+def test_faults_are_found_beside_a_tool(fault: str, device: Device) -> None:
+    part, change, _ = FAULTS[fault]
+    with Simulation(
+        pressed(probes=[moved([0, 0.5, 0.5, 0.0], [0.2, 0.5, 0.5, -0.03])]), threads=device.threads
+    ) as simulation:
+        simulation.advance(4)
+        simulation.restore(with_fault(simulation.save(), part, change, np.random.default_rng(4)))
+        with pytest.raises(DivergedError):
+            simulation.advance()
+
+
 def test_springs_that_begin_to_pull_from_afar_give_energy(device: Device) -> None:
     """Twice within a frame, each for a quarter of their period, and between them the sheet flies to the other side."""
     on, off = [(0.01, 0), (0.01, 1)], [(0.017, 1), (0.017, 0)]
@@ -149,7 +190,7 @@ def test_springs_that_begin_to_pull_from_afar_give_energy(device: Device) -> Non
     away = np.full((2, 2, 3), [0, 0, 0.02])
     held = 50 / 2 * 0.02**2 * 4
     with Simulation(made, threads=device.threads) as simulation:
-        simulation.restore(Saved(State(0, away, np.zeros_like(away)), RunProgress(reach=0.04)))
+        simulation.restore(rest(made)._replace(state=State(0, away, 0 * away), progress=RunProgress(reach=0.04)))
         simulation.advance()
         assert simulation.progress.energy > 10 * held
 
@@ -185,6 +226,12 @@ def test_a_force_that_is_too_strong_is_named(device: Device) -> None:
         simulation.restore(found.good)
         with pytest.raises(DivergedError):
             simulation.advance()
+
+
+def test_a_tool_that_does_no_harm_is_not_named(device: Device) -> None:
+    torn = {"force": [0, 0, -1], "load": [[0, 0], [0.1, 100], [0.1, 1e9]], "falloff": 20}
+    made = pressed(probes=[moved([0, 0.2, 0.2, 0.0], [0.2, 0.2, 0.2, -0.02]), torn])
+    assert "likely cause: probes.1.force, which reaches 454 N" in diagnosed(made, device).message
 
 
 def test_a_step_that_is_too_long_is_named(device: Device) -> None:

@@ -235,15 +235,16 @@ def test_the_shipped_script_is_valid() -> None:
 
 
 def test_the_python_shown_runs(tmp_path: Path) -> None:
-    first, second = blocks(DOCS / "python.md", "python")
+    first, second, third = blocks(DOCS / "python.md", "python")
     (labels,) = blocks(DOCS / "labels.md", "python")
     shown = "print(position.shape, picture.shape, record['status'])\n"
     (tmp_path / "scenes").symlink_to(ROOT / "scenes")
-    (tmp_path / "example.py").write_text(first + shown + second)
+    (tmp_path / "example.py").write_text(first + shown + second + third)
     done = subprocess.run([sys.executable, "example.py"], cwd=tmp_path, check=True, capture_output=True, text=True)
-    shapes, result = done.stdout.splitlines()
+    shapes, result, felt = done.stdout.splitlines()
     assert shapes == "(41, 41, 3) (512, 512, 3) complete"
     assert result.startswith("6.00 mm deep with 1.")
+    assert felt == "0.52 N at a depth of 5.0 mm, 0.40 s"
     command = [sys.executable, "-m", "taichi_msm", "run", "scenes/grasp.yaml", "--set", "output=[trajectory]"]
     subprocess.run(command, cwd=tmp_path, check=True, capture_output=True)
     (tmp_path / "example.py").write_text(labels)

@@ -171,6 +171,7 @@ def test_pilots_are_cheap(name: str, most: float, root: Path, tmp_path: Path, de
     record = run(made, tmp_path / "out", threads=device.threads)
     assert record["precision"] == "f64"
     assert told(record) < ENOUGH
+    assert record["steps"] is not None
     own = record["steps"] * math.prod(made.sheet.points)
     assert 0.5 * own <= sum(taken) - own <= most * own
 
@@ -231,6 +232,7 @@ def test_beside_f32_a_coarse_pilot_tells_a_bound(
     monkeypatch.setattr(pilots, "affords_pilots", lambda plan, steps: steps < 1)
     made = load_scene("small.yaml", [*WRONG, "time.precision=f32"])
     record = run(made, "out", threads=device.threads)
+    assert record["steps"] is not None
     steps = math.prod(made.sheet.points) * record["steps"]
     assert sum(taken) <= 1.6 * steps
     error = true_error(plan_of(made), device, fine=32)

@@ -334,7 +334,7 @@ def full_disk(*_: object, **__: object) -> None:
     raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
 
 
-@pytest.mark.parametrize("target", ["checkpoint.create", "checkpoint.replacing", "writer.add"])
+@pytest.mark.parametrize("target", ["records.create", "checkpoint.replacing", "writer.add"])
 def test_a_full_disk_is_one_line_and_changes_nothing(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, target: str
 ) -> None:

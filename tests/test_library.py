@@ -302,7 +302,7 @@ def test_what_was_saved_elsewhere_is_not_gone_on_with(simulation: Simulation, de
     for other in others:
         with Simulation(other, threads=device.threads) as elsewhere:
             elsewhere.advance(1)
-            with pytest.raises(ArgumentError, match="take what was saved with this scene's points, precision and step"):
+            with pytest.raises(ArgumentError, match="saved with this scene's points, probes, precision and step"):
                 simulation.restore(elsewhere.save())
     with pytest.raises(ArgumentError, match="int is not what `save` returns"):
         simulation.restore(3)  # type: ignore[arg-type]

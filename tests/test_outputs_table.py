@@ -14,7 +14,7 @@ from taichi_msm.results.labels import _WRITERS
 
 def test_every_label_has_its_field_and_a_format() -> None:
     for output in OUTPUTS.values():
-        assert output.source in (*Observed._fields, "positions")
+        assert output.source in (*Observed._fields, "positions", "forces")
         if output.source in ("labels", "flow"):
             assert output.name in (Labels if output.source == "labels" else Flow)._fields
             assert Path(output.file).suffix in _WRITERS

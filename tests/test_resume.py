@@ -10,7 +10,7 @@ import shutil
 import subprocess
 import sys
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -21,6 +21,7 @@ from PIL import Image
 
 from taichi_msm import FilesError, resume, run, runner
 from taichi_msm.physics import solver, workload
+from taichi_msm.physics.state import TipForce
 from taichi_msm.results.checkpoint import MANIFEST, POSITIONS, STATE, Checkpoint
 from taichi_msm.results.record import RunRecord
 from taichi_msm.scene import Scene
@@ -75,15 +76,33 @@ def interrupted(made: Scene, directory: str, device: Device, after: int = 12) ->
     return record
 
 
+# A tool that is moved, and pulls what it has gripped, besides one with a force.
+GRIPPING = (
+    "probes=[{force: [0, 300, -1000], falloff: 20, load: [[0, 0], [0.03, 100], [0.06, 0]]}, "
+    "{path: [[0, 0.5, 0.5, 0.001], [0.05, 0.5, 0.5, -0.02], [0.12, 0.6, 0.5, 0.03]], grip: [[0.05, 0.11]], "
+    "friction: 0.2, instrument: {radius: 0.05, shaft: [0, -0.3, 1], length: 0.2}}]",
+)
+
+
 @pytest.mark.parametrize(
-    "output", ["png, gif, trajectory", pytest.param("gif", marks=pytest.mark.slow), "trajectory", ""]
+    ("output", "probes"),
+    [
+        ("png, gif, trajectory", ()),
+        pytest.param("gif", (), marks=pytest.mark.slow),
+        ("trajectory", ()),
+        ("", ()),
+        ("png, forces", GRIPPING),
+        ("forces", GRIPPING),
+        ("", GRIPPING),
+    ],
+    ids=["all", "gif", "trajectory", "none", "forces and more", "forces", "forces not asked for"],
 )
 def test_a_run_that_is_interrupted_goes_on_to_the_same_bits(
-    output: str, small: Path, device: Device, monkeypatch: pytest.MonkeyPatch
+    output: str, probes: tuple[str, ...], small: Path, device: Device, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Again and again, at a frame's end and within one, and while earlier frames are drawn anew."""
     monkeypatch.setattr(solver, "MAX_STEPS_PER_LAUNCH", 300)
-    made = dragged("time.duration=0.12", f"output=[{output}]")
+    made = dragged("time.duration=0.12", f"output=[{output}]", *probes)
     whole = run(made, "whole", threads=device.threads, estimate_error=False)
     record = run(made, "parts", threads=device.threads, estimate_error=False, progress=Stop(5))
     steps = []
@@ -104,6 +123,7 @@ def test_a_run_that_is_interrupted_goes_on_to_the_same_bits(
     assert steps == sorted(steps)
     assert any(step % 1000 for step in steps), "within a frame"
     assert results(small / "parts") == results(small / "whole")
+    assert record["probes"] == whole["probes"]
     for key in ("steps", "frames", "max_displacement", "shortest_spring", "notes", "outputs", "scene", "overrides"):
         assert record[key] == whole[key]
     assert not (small / "parts" / ".partial").exists()
@@ -141,13 +161,12 @@ def test_a_run_that_finds_the_disk_full_goes_on_when_it_is_not(
     earlier = files(small / "parts")
     add = Checkpoint.add
 
-    def full(checkpoint: Checkpoint, position: NDArray[Any]) -> None:
+    def full(checkpoint: Checkpoint, position: NDArray[Any], forces: Sequence[TipForce]) -> None:
         if checkpoint.frames == 6:
             # Half of the positions fit.
-            assert checkpoint._positions
-            checkpoint._positions.write(position.tobytes()[:500])
+            checkpoint._positions._file.write(position.tobytes()[:500])
             raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
-        add(checkpoint, position)
+        add(checkpoint, position, forces)
 
     with monkeypatch.context() as patch:
         patch.setattr(Checkpoint, "add", full)

@@ -40,7 +40,10 @@ probes:
 """
 
 ROOT_KEYS = "image, region, sheet, tissue, springs, damping, probes, time, render, output"
-NO_FORCE = "missing; expected total (whole tool) or, with springs, force (one point): [x, y, z] in newtons"
+NO_FORCE = (
+    "missing; expected total (whole tool) or, with springs, force (one point): [x, y, z] in newtons; or path, for a "
+    "tool that is moved"
+)
 POINTS = "expected two whole numbers, 2 to 4096: [rows, cols]"
 A_PROBE_KEY = "expected keys [[t, percent], ...], t in seconds"
 AN_AT = "expected [across, down], fractions from -1 to 2, or keys [[t, across, down], ...]"
@@ -51,7 +54,7 @@ NO_PICTURE = "image: a picture is needed to draw png or gif; name one, or set ou
 Load = Callable[..., Scene]
 
 # The kinds of output, as errors list them.
-OUTPUTS = "png, gif, trajectory, coordinates, depth, flow, occlusion, instrument, tracks"
+OUTPUTS = "png, gif, trajectory, forces, coordinates, depth, flow, occlusion, instrument, tracks"
 
 
 @pytest.fixture
@@ -303,7 +306,8 @@ WRONG_VALUES = {
         GOOD + "probes:\n" + "  - {force: [0, 0, 1]}\n" * (MAX_PROBES + 1),
         [
             's.yaml:11:1: probes: [{"force": [0, 0, 1]}, {"force": [0, 0, 1]}, {"force": [0, 0... '
-            "is not allowed; expected a list of at most 16 mappings with at, total or force, load"
+            "is not allowed; expected a list of at most 16 mappings with at, total or force, load, or with path "
+            "and instrument"
         ],
     ),
     "nothing to draw": (GOOD.replace("[]", "[png]"), [f"s.yaml:1:1: {NO_PICTURE}"]),

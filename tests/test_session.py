@@ -19,10 +19,11 @@ from taichi_msm.errors import FilesError, SceneError
 from taichi_msm.physics.lattice import rest_positions
 from taichi_msm.physics.loads import schedule
 from taichi_msm.system.runtime import Device
-from taichi_msm.viewer import captures
+from taichi_msm.viewer import captures, hud
 from taichi_msm.viewer import session as live_session
 from taichi_msm.viewer.captures import Captures
 from taichi_msm.viewer.events import KEYS, Drag, Event, Harder, Hover, Key, Percent, Press, Release, Turn
+from taichi_msm.viewer.moved_tool import MovedTool
 from taichi_msm.viewer.script import film
 from taichi_msm.viewer.session import Session, with_live_frames
 from tests.outputs import duration
@@ -263,7 +264,7 @@ def test_every_key_changes_what_it_says(begin: Begin) -> None:
     np.testing.assert_array_equal(session.picture(), plain, err_msg="the scene's camera is the oblique one")
     session.handle(Key("no such key"))
     np.testing.assert_array_equal(session.picture(), plain)
-    others = {"up", "down", "c", "o", "space", ".", "r", "p", "g", "w", "q"}
+    others = {"up", "down", "f", "c", "o", "space", ".", "r", "p", "g", "w", "q"}
     assert set(KEYS) == {"t", "m", "l", "i", "h"} | others, "a key that no test presses"
 
 
@@ -566,3 +567,196 @@ def test_the_light_goes_back_to_that_of_the_scene(begin: Begin) -> None:
     assert session.viewport.render.shading == "none"
     session.handle(Key("l"))
     np.testing.assert_array_equal(session.picture(), before)
+
+
+# A tool that can be held by position, as its instrument is wide enough to touch several points.
+WIDE = {"radius": 0.03, "shaft": [0.3, -0.2, 1], "length": 0.2}
+BY_HAND = {**TILTED, "probes.0.instrument": WIDE}
+# Events of a session by position: it presses, drags, goes deeper, grips and lifts, and presses elsewhere.
+EVENTS: dict[int, list[Event]] = {
+    1: [Hover(15, 14)],
+    4: [Press(18, 14)],
+    14: [Drag(22, 16), Harder(10)],
+    16: [Drag(25, 15)],
+    20: [Release(), Hover(20, 17)],
+    24: [Press(20, 17, pull=True)],
+    36: [Percent(-30)],
+    46: [Turn(5, -3), Release()],
+    50: [Press(22, 11), Key("space")],
+    52: [Key("space"), Key("m")],
+}
+
+
+def moved(session: Session) -> MovedTool:
+    """The tool, which is held by position."""
+    assert isinstance(session.tool, MovedTool)
+    return session.tool
+
+
+@pytest.mark.parametrize(
+    ("overrides", "play"),
+    [
+        ({}, False),
+        ({"time.precision": "f64", "springs.virtual_active": "always"}, True),
+        ({"time.step": 0.0025, "time.frames_per_second": 20, "sheet.fixed": "none"}, False),
+    ],
+    ids=["f32", "f64 beside the scene's probes", "free, given step"],
+)
+def test_run_repeats_a_session_by_position_to_the_bit(overrides: dict[str, Any], play: bool, begin: Begin) -> None:
+    session = begin({**BY_HAND, "time.precision": "f32", "render.size": [40, 30], **overrides}, play=play)
+    session.handle(Press(20, 15))
+    advance(session, 3)
+    session.handle(Key("f"))
+    assert (session.frame, session.tool.held) == (0, False), "what was done by force is no part of the record"
+    found, gripped, felt = [session.positions().copy()], False, 0.0
+    for beat in range(62):
+        for event in EVENTS.get(beat, []):
+            session.handle(event)
+        before = session.frame
+        session.advance()
+        if session.frame > before:
+            found.append(session.positions().copy())
+        gripped, felt = gripped or moved(session).grips, max(felt, session.felt())
+    assert gripped
+    assert felt > 0
+    session.handle(Key("w"))
+    written = load_scene("captures/session-1.yaml", {"output": ["trajectory"]})
+    probe = written.probes[-1]
+    assert probe.path is not None
+    assert (probe.friction, len(probe.grip), len(written.probes)) == (0.5, 1, 1 + play)
+    assert run(written, "again", threads=2)["status"] == "complete"
+    again = np.load("again/trajectory.npz")["position"]
+    assert len(again) == len(found) == 61
+    np.testing.assert_array_equal(again, np.array(found))
+
+
+def test_by_position_the_tip_follows_the_pointer_and_feels_what_it_touches(begin: Begin) -> None:
+    session = begin(BY_HAND)
+    session.handle(Key("f"))
+    session.handle(Hover(*pixel_of(session, 8, 6)))
+    advance(session, 5)
+    assert np.array(moved(session).place) * 24 == pytest.approx([6, 8], abs=0.25)
+    assert (displacement(session) < AT_REST).all()
+    assert session.felt() == 0
+    session.handle(Press(*pixel_of(session, 8, 6)))
+    advance(session, 20)
+    pressed = session.felt()
+    assert pressed > 0
+    assert session.positions()[8, 6, 2] == pytest.approx(-0.03, abs=0.002), "a press is a radius deep"
+    session.handle(Harder(20))
+    advance(session, 20)
+    assert session.felt() > 1.2 * pressed
+    beside = session.positions()[8, 8, 0]
+    for _ in range(10):
+        x, y = session.viewport.pixel(np.array([*session._rest_point(session.tool.goal), 0])) or (0, 0)
+        session.handle(Drag(x + 1, y))
+        advance(session, 1)
+    assert session.positions()[8, 8, 0] > beside + 0.001, "friction drags the tissue along"
+    session.handle(Release())
+    advance(session, 20)
+    assert session.felt() == 0
+
+
+def test_by_position_shift_grips_and_the_wheel_lifts(begin: Begin) -> None:
+    session = begin(BY_HAND)
+    session.handle(Key("f"))
+    session.handle(Press(*pixel_of(session, 12, 12), pull=True))
+    advance(session, 20)
+    assert moved(session).grips
+    for _ in range(20):
+        session.handle(Key("down"))
+        advance(session, 1)
+    advance(session, 5)
+    assert session.positions()[12, 12, 2] > 0.02
+    session.handle(Release())
+    advance(session, 2)
+    assert not moved(session).grips
+
+
+def test_a_tool_that_the_scene_moves_is_held_by_position_from_the_start(begin: Begin) -> None:
+    path = {"path": [[0, 0.5, 0.5, 0.05]], "instrument": WIDE, "friction": 0.1}
+    force = {"force": [0, 0, -2000], "falloff": 60}
+    session = begin({**TILTED, "probes": [path, force]})
+    assert moved(session).recorded(0).friction == 0.1
+    session.handle(Key("f"))
+    assert not isinstance(session.tool, MovedTool)
+    session.handle(Press(60, 50))
+    advance(session, 10)
+    assert session.tool.percent == 100
+    session.handle(Key("f"))
+    assert moved(session).place == (0.5, 0.5)
+    assert (displacement(session) < AT_REST).all()
+
+
+@pytest.mark.parametrize(
+    ("probes", "said"),
+    [
+        (
+            [{"force": [0, 0, -2000]}],
+            "a tool that is held so needs an instrument; give a probe of the scene one",
+        ),
+        (
+            [{"path": [[0, 0.5, 0.5, 0.05]], "instrument": WIDE}],
+            "a tool that is held so needs a force; give a probe of the scene one",
+        ),
+        (
+            [{"force": [0, 0, -2000], "instrument": {**WIDE, "shaft": [0, 0, -1]}}],
+            "this tool cannot be held by position: its shaft leads down into the sheet; let it lead up",
+        ),
+    ],
+)
+def test_a_tool_that_cannot_be_held_otherwise(probes: list[dict[str, Any]], said: str, begin: Begin) -> None:
+    session = begin({**TILTED, "probes": probes})
+    tool = session.tool
+    advance(session, 2)
+    session.handle(Key("f"))
+    assert (session.notice, session.tool, session.frame) == (said, tool, 2)
+
+
+def test_a_tool_too_thin_for_the_points_says_so(begin: Begin) -> None:
+    session = begin({**TILTED, "probes.0.instrument": {**WIDE, "radius": 0.01}})
+    session.handle(Key("f"))
+    assert session.notice.startswith("probes.0: the points are 0.0125 m apart, more than half the radius")
+
+
+def bar_of(picture: np.ndarray) -> float:
+    """How much of the bar under the two lines of figures is filled."""
+    lines = [row[:, 0] for row in picture[:80] if (row[:70] == hud.OUTLINE).all(axis=-1).any()]
+    row = lines[len(lines) // 2]
+    right = int(np.flatnonzero(row == hud.OUTLINE)[-1])
+    return float((row[: right + 1] == 255).sum() / (hud.BAR * 11))
+
+
+def test_the_force_felt_is_shown_with_a_bar(begin: Begin) -> None:
+    session = begin({**BY_HAND, "render.size": [240, 200]})
+    session.handle(Key("f"))
+    bare = session.picture()
+    session.handle(Press(*pixel_of(session, 12, 12)))
+    advance(session, 20)
+    hardest = session.felt()
+    for percent in (100, 60):
+        session.handle(Percent(percent))
+        advance(session, 20)
+        hardest = max(hardest, session.felt())
+    said = session._figure_lines("")[0]
+    assert said == f"press 45 mm deep  ·  {live_session.newtons(session.felt())}"
+    bar = hud.Bar(session.felt(), hardest, "N")
+    assert bar_of(session.picture()) == pytest.approx(session.felt() / bar.end, abs=0.02)
+    session.handle(Key("r"))
+    session.handle(Percent(40))
+    assert session._figure_lines("")[0] == "next press 30 mm deep  ·  0 N"
+    session.handle(Key("i"))
+    session.handle(Key("i"))
+    assert (session.picture()[40:70, :130] == bare[40:70, :130]).all(), "no bar any more"
+
+
+@pytest.mark.parametrize(
+    ("largest", "end"), [(0.5, 0.5), (0.51, 1), (1, 1), (1.01, 2), (2.4, 5), (7, 10), (0.3, 0.5), (3e-4, 5e-4)]
+)
+def test_a_bar_ends_at_a_round_number(largest: float, end: float) -> None:
+    assert hud.Bar(0.1, largest, "N").end == pytest.approx(end)
+
+
+@pytest.mark.parametrize(("force", "said"), [(0.0, "0 N"), (0.514, "0.51 N"), (9.63, "9.6 N"), (123.4, "123 N")])
+def test_forces_are_said_with_the_digits_that_matter(force: float, said: str) -> None:
+    assert live_session.newtons(force) == said

@@ -13,6 +13,7 @@ import pytest
 from PIL import Image
 from pydantic import BaseModel
 
+from taichi_msm.physics.error_control import longest
 from taichi_msm.physics.lattice import rest_positions
 from taichi_msm.physics.mesh_error import with_points
 from taichi_msm.physics.plan import Plan
@@ -28,7 +29,7 @@ from taichi_msm.study import measure, pictures, terms
 from taichi_msm.study.peer import FailedError, TooSlowError, solve
 from taichi_msm.study.pictures import measure_pictures
 from taichi_msm.study.points import ROUNDS as POINTS_ROUNDS
-from taichi_msm.study.points import PointStudy, lattices
+from taichi_msm.study.points import PointStudy, _reference, lattices
 from taichi_msm.study.result import Drawn, Stepping, Study, Timing, observed_orders
 from taichi_msm.study.stepping import MARGIN, ROUNDS, SteppingStudy
 from taichi_msm.study.terms import measure_terms, variants
@@ -36,6 +37,7 @@ from taichi_msm.system.runtime import Device
 from tests import reference
 from tests.motion import frames_on, structure_of
 from tests.scenes import PRESS, SPRINGS, plan_of, scene, speckle
+from tests.test_contact import PRESSED, RUBBED, moved, touching
 
 SOFT_PRESS = {**PRESS, "force": [0, 300, -1000]}
 
@@ -158,6 +160,49 @@ def test_dop853_fails_where_no_step_is_small_enough(monkeypatch: pytest.MonkeyPa
     monkeypatch.setattr("scipy.integrate.solve_ivp", lambda *_, **__: failed)
     with pytest.raises(FailedError, match=r"^after 0.08 s$"):
         solve(plan_of(scene()), 1e-4, 1e-6, float("inf"), lambda: None)
+
+
+def test_dop853_is_left_out_where_tools_touch(device: Device) -> None:
+    made = touching([PRESSED])
+    with closing(SteppingStudy(plan_of(made), device, 0.01, study_of(made), nothing)) as measured:
+        measured.run()
+        measure._measure_peer(plan_of(made), measured, measure.QUICK, measured.study, lambda stage, done, total: None)
+    assert not measured.study.peers
+    (note,) = measured.study.notes
+    assert note.startswith("DOP853, SciPy's general integrator,")
+    assert note.endswith("is left out, as it knows no contact; no other figure depends on it")
+    # The reference is the finest run itself, and what a run with half its steps differs from it is its error.
+    known = measured.study.reference
+    assert known is not None
+    fine, half = (
+        frames_on(plan_of(made).with_grid(steps_per_frame=count), device)
+        for count in (known.steps_per_frame, known.steps_per_frame // 2)
+    )
+    assert measured.frames is not None
+    assert measured.frames.tobytes() == fine.tobytes()
+    assert known.error == longest(fine - half) / longest(fine)
+
+
+def test_a_study_takes_no_steps_in_which_a_tool_moves_too_far(device: Device) -> None:
+    fast = moved([0, 0.5, 0.5, 0.1], [0.1, 0.9, 0.5, 0.1], instrument={"radius": 0.005})
+    made = touching([fast], time={"step": 0.001, "duration": 0.04})
+    assert plan_of(made).stable_step > 0.01
+    with closing(SteppingStudy(plan_of(made), device, 0.001, study_of(made), nothing)) as measured:
+        measured.run()
+    assert max(point.step for point in measured.study.stepping) <= 0.005 / 2 / 1.6
+
+
+def test_points_in_contact_are_not_extrapolated() -> None:
+    fields = [np.full((count, count, 3), value) for count, value in ((7, 4.0), (13, 2.0), (25, 1.0))]
+    exact, bound = _reference(fields, extrapolate=False)
+    assert exact is fields[-1]
+    assert bound == pytest.approx(3**0.5)
+
+
+def test_a_tool_that_is_moved_is_left_out_like_any_other() -> None:
+    made = touching([PRESSED, RUBBED])
+    without = dict(variants(made))
+    assert [len(plan_of(without[f"probes.{n}"]).tools) for n in (0, 1)] == [1, 1]
 
 
 @pytest.mark.parametrize(

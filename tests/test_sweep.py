@@ -95,7 +95,7 @@ def test_each_run_is_that_of_run_with_its_cells(many: Path, program: Program) ->
     rows = table("out")
     assert list(rows[0]) == [
         *("run", "springs.structural", "probes.0.at", "time.step", "status", "error"),
-        *("max_displacement", "shortest_spring", "error_estimate", "mesh_error"),
+        *("max_displacement", "shortest_spring", "error_estimate", "mesh_error", "probes.0.force"),
     ]
     statuses = [row["status"] for row in rows]
     assert sorted(set(statuses)) == ["complete", "refused"]
@@ -117,6 +117,7 @@ def test_each_run_is_that_of_run_with_its_cells(many: Path, program: Program) ->
         one, other = (json.loads((folder / "run.json").read_text()) for folder in (here, Path("single")))
         assert row["max_displacement"] == repr(one["max_displacement"])
         assert row["error_estimate"] == repr(one["error_estimate"]["error"])
+        assert row["probes.0.force"] == repr(one["probes"][0]["greatest_force"])
         for key in ("status", "scene", "step", "max_displacement", "error_estimate", "sha256", "notes", "outputs"):
             assert one[key] == other[key]
 
@@ -207,11 +208,12 @@ def test_a_damaged_record_is_told(many: Path, program: Program, values: Any) -> 
 def test_a_run_that_diverged_is_not_taken_again(many: Path) -> None:
     record = {"status": "diverged", "error": "at 0.1 s", "max_displacement": 1.0, "shortest_spring": 0.5}
     rest: dict[str, Any] = {"error_estimate": None, "notes": ["not known"], "timings": {"total": 2.0}}
+    rest["probes"] = [{"greatest_force": 3.0}]
     values_in(Path("out"), load_sweep("many.yaml"))
     Path("out/runs/000002").mkdir(parents=True)
     Path("out/runs/000002/run.json").write_text(json.dumps({**record, **rest}))
     under_way = begin_sweep(load_sweep("many.yaml"), Path("out"))
-    assert under_way.done == [Outcome(2, "diverged", "at 0.1 s", 1.0, 0.5)]
+    assert under_way.done == [Outcome(2, "diverged", "at 0.1 s", 1.0, 0.5, forces=(3.0,))]
     assert [task.run for task in under_way.missing] == [0, 1, 3]
     assert under_way.total == 4
 

@@ -8,6 +8,7 @@ import shutil
 import sys
 from collections.abc import Callable
 from concurrent.futures import Executor, ThreadPoolExecutor
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -265,6 +266,20 @@ def test_a_table_of_parquet_has_numbers_and_lists(make: Make) -> None:
     assert columns["probes.0.at"] == [row[1] for row in result.values]
     assert set(columns["render.camera"]) == {"top", '{"eye": [0, 0, 1], "target": [0, 0, 0]}'}
     assert columns["max_displacement"] == [one.max_displacement for one in result.outcomes]
+
+
+def test_the_force_of_a_probe_has_a_column(make: Make) -> None:
+    """By another name where the key of this name varies."""
+    result = make(8)
+    outcomes = [replace(one, forces=(1.5, None) if one.run == 2 else ()) for one in result.outcomes]
+    columns = replace(result, outcomes=outcomes).columns()
+    assert list(columns)[-3:] == ["probes.0.force", "probes.1.force", "seconds"]
+    assert (columns["probes.0.force"][:4], columns["probes.1.force"][2]) == ([None, None, 1.5, None], None)
+    named = make(8, {**VARY, "probes.0.force": {"choice": [[0, 0, -1000], [0, 0, -500]]}})
+    outcomes = [replace(one, forces=(1.5,)) for one in named.outcomes]
+    named = replace(named, outcomes=outcomes)
+    assert "probes.0.force.greatest" in named.columns()
+    assert "probes.0.force" not in named.columns()
 
 
 def test_a_data_set_names_its_complete_runs(make: Make) -> None:

@@ -17,7 +17,7 @@ from taichi_msm.errors import ArgumentError, FilesError, SceneError
 from taichi_msm.physics import kernel_gpu, probe_force
 from taichi_msm.physics.error_control import longest
 from taichi_msm.physics.lattice import rest_positions
-from taichi_msm.physics.material import MapImage
+from taichi_msm.physics.material import Maps
 from taichi_msm.physics.mesh_error import FEWEST, CubicSampling, MeshEstimate, MeshPilot, choose_points, coarser
 from taichi_msm.physics.plan import Plan
 from taichi_msm.physics.terms.bending import BendingTerm
@@ -88,6 +88,14 @@ def test_a_random_tissue_is_like_the_twin(seed: int, image: str, device: Device)
     np.testing.assert_allclose(simulate(made, device), twin, rtol=0, atol=1e-12 * np.abs(twin).max())
 
 
+@pytest.mark.parametrize("points", [(2, 2), (2, 3), (3, 2)])
+def test_a_free_tissue_of_two_rows_is_like_the_twin(points: tuple[int, int], load: Any, device: Device) -> None:
+    size = [0.01 * (count - 1) for count in points]
+    made = load("sheet.fixed=none", f"sheet.points={list(points)}", f"sheet.size={size}", "tissue.pretension=0")
+    twin = reference.simulate(made) - rest_positions(made.sheet)
+    np.testing.assert_allclose(simulate(made, device), twin, rtol=0, atol=1e-12 * np.abs(twin).max())
+
+
 @pytest.mark.parametrize(
     "seed", [0, 7, pytest.param(4, marks=pytest.mark.fuzz), pytest.param(9, marks=pytest.mark.fuzz)]
 )
@@ -101,6 +109,7 @@ def test_the_random_tissues_have_every_term(image: str, device: Device) -> None:
     codes = [structure_of(random_tissue(seed, image), device).code for seed in SEEDS]
     for kind in (FoundationTerm, DampingTerm, BendingTerm):
         assert {code.get(kind) is None for code in codes} == {False, True}, kind
+    assert {term.mapped for code in codes if (term := code.get(FoundationTerm))} == {False, True}
     springs, probes = [code.require(SpringTerm) for code in codes], [code.require(ProbeTerm) for code in codes]
     for flag in ("mapped", "tense", "open_edges", "by_area"):
         assert {getattr(term, flag) for term in springs} == {False, True}, flag
@@ -426,9 +435,9 @@ def test_a_tolerance_far_out_of_reach_is_refused_after_one_run(
 ) -> None:
     tried: list[tuple[int, int]] = []
 
-    def check(scene: Scene, image: MapImage | None) -> Plan:
+    def check(scene: Scene, maps: Maps | None) -> Plan:
         tried.append(scene.sheet.points)
-        return checked(scene, image)
+        return checked(scene, maps)
 
     with pytest.raises(
         SceneError, match=r"1e-10 is out of reach: with 13 x 15 points the error is 0\.\d+, and no sheet"
@@ -462,6 +471,7 @@ def test_tissue_that_wrinkles_has_an_error_of_at_least_what_is_told(load: Any, d
 def test_a_run_says_what_its_tool_and_its_points_do(load: Any, device: Device, tmp_path: Path) -> None:
     record = run(load(), tmp_path / "out", threads=device.threads)
     (probe,) = record["probes"]
+    assert probe is not None
     assert probe["total_force"] == pytest.approx(2, rel=0.05)
     # Whole pressure acts on the flat end.
     assert probe["largest_pressure"] == pytest.approx(

@@ -236,7 +236,7 @@ def finite_elements(made: Scene) -> Array:
         Displacements of the points of the coarsest sheet [m], shape (31, 31, 2).
     """
     assert made.tissue is not None
-    (height, width), foundation = made.sheet.size, made.tissue.foundation
+    (height, width), foundation = made.sheet.size, made.tissue.foundation_stiffness
     count = 2 * (MESHES[0] - 1)
     mesh = MeshQuad.init_tensor(*(np.linspace(-side / 2, side / 2, count + 1) for side in (width, height)))
     basis = Basis(mesh, ElementVector(ElementQuad2()), intorder=6)
@@ -284,7 +284,7 @@ def series(made: Scene) -> Array:
     amplitude = 4 / samples**2 * sines @ load @ sines.T
     squares = (np.pi * waves[:, None] / height) ** 2 + (np.pi * waves / width) ** 2
     bending = PLATE if parts.bending == "plate" else parts.bending
-    amplitude /= bending * squares**2 + parts.pretension * squares + parts.foundation
+    amplitude /= bending * squares**2 + parts.pretension * squares + parts.foundation_stiffness
     at_points = np.sin(np.pi * np.outer(np.linspace(0, 1, MESHES[0]), waves))
     return at_points @ amplitude @ at_points.T
 
@@ -368,6 +368,7 @@ LIMITED: dict[str, tuple[dict[str, Any], float]] = {
     "oblong": ({"size": (0.08, 0.15)}, 1.25),
     "free": ({"fixed": "none"}, 1.25),
     "foundation": ({"foundation": 1e7}, 1.25),
+    "foundation, map of it": ({"foundation": 1e7, "foundation_range": (0.2, 5)}, 1.25),
     "pretension": ({"pretension": 20}, 1.25),
     "plate": ({"bending": "plate"}, 1.25),
     "stiff plate": ({"bending": 1e-2}, 1.25),
@@ -381,6 +382,8 @@ def limited(name: str, folder: Path, **more: Any) -> Scene:
     terms = {"size": (0.08, 0.1), "foundation": 1e5, **LIMITED[name][0], **more}
     if "range" in terms:
         terms["map"] = {"image": picture(folder), "range": terms.pop("range")}
+    if "foundation_range" in terms:
+        terms["foundation_map"] = {"image": picture(folder), "range": terms.pop("foundation_range")}
     return tissue((9, 11), foundation_active="always", **terms)
 
 
@@ -475,33 +478,42 @@ def test_an_edge_gets_its_share_of_a_tool(at: list[float], share: float) -> None
     assert tool_forces(made)[..., 2].sum() == pytest.approx(share, rel=1e-3)
 
 
-def sampled(grey: NDArray[Any], rows: int, cols: int, black: float, white: float) -> Array:
-    """The factor at the centre of every cell, texel by texel."""
+def sampled(grey: NDArray[Any], rows: Array, cols: Array, black: float, white: float) -> Array:
+    """The factor at places of the sheet, as fractions of its height and width, texel by texel."""
     height, width = grey.shape
-    found = np.zeros((rows, cols))
-    for i in range(rows):
-        for j in range(cols):
-            down, across = (i + 0.5) / rows * height - 0.5, (j + 0.5) / cols * width - 0.5
+    found = np.zeros((len(rows), len(cols)))
+    for i in range(len(rows)):
+        for j in range(len(cols)):
+            # Beyond the last texels it is constant.
+            down = min(max(rows[i] * height - 0.5, 0), height - 1)
+            across = min(max(cols[j] * width - 0.5, 0), width - 1)
             for b in (math.floor(down), math.floor(down) + 1):
                 for a in (math.floor(across), math.floor(across) + 1):
                     near = (1 - abs(down - b)) * (1 - abs(across - a))
                     found[i, j] += near * grey[min(max(b, 0), height - 1), min(max(a, 0), width - 1)]
-    return black + (white - black) * found / 255
+    return black + (white - black) * found / np.iinfo(grey.dtype).max
 
 
 @pytest.mark.parametrize("texels", [(7, 5), (40, 60), (1, 3), (8, 11)])
 @pytest.mark.parametrize("kind", ["grey", "rgb", "16 bit"])
 def test_a_map_is_sampled_at_the_centres_of_cells(texels: tuple[int, int], kind: str, tmp_path: Path) -> None:
     grey, file = speckle(*texels)[..., 0], tmp_path / "map.png"
-    if kind == "rgb":
-        Image.fromarray(np.repeat(grey[..., None], 3, axis=-1)).save(file)
-    else:
-        # 257 g of 65535 are g of 255.
-        Image.fromarray(grey.astype(np.uint16) * 257 if kind == "16 bit" else grey).save(file)
+    if kind == "16 bit":
+        grey = np.random.default_rng(0).integers(0, 65536, texels, dtype=np.uint16)
+    Image.fromarray(np.repeat(grey[..., None], 3, axis=-1) if kind == "rgb" else grey).save(file)
     stiff = {"image": str(file), "range": [6, 0.5]}
     sheet = {"points": [9, 12], "size": [0.1, 0.1], "mass": 1e-3}
     of_springs = scene_of_springs(sheet=sheet, springs={"structural": 20, "map": stiff})
+    expected = sampled(grey, (np.arange(8) + 0.5) / 8, (np.arange(11) + 0.5) / 11, 6, 0.5)
     for made in (tissue((9, 12), map=stiff), of_springs):
         factors = plan_of(made).material.factors
         assert factors is not None
-        np.testing.assert_allclose(factors, sampled(grey, 8, 11, 6, 0.5), rtol=0, atol=1e-14 * 6)
+        np.testing.assert_allclose(factors, expected, rtol=0, atol=1e-14 * 6)
+
+
+def test_a_map_of_the_foundation_is_sampled_at_the_points(tmp_path: Path) -> None:
+    deep = {"image": picture(tmp_path), "range": [6, 0.5]}
+    factors = plan_of(tissue((9, 12), foundation=1, foundation_map=deep)).material.virtual_factors
+    assert factors is not None
+    expected = sampled(speckle(7, 5)[..., 0], np.linspace(0, 1, 9), np.linspace(0, 1, 12), 6, 0.5)
+    np.testing.assert_allclose(factors, expected, rtol=0, atol=1e-14 * 6)

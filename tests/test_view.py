@@ -141,7 +141,7 @@ def test_what_view_refuses(
         (
             "events:\n  - {t: 1, do: key, name: q}",
             [
-                "s.yaml:2:21: events.0.name: there is no key 'q' here; expected one of: up, down, c, t, o, m, "
+                "s.yaml:2:21: events.0.name: there is no key 'q' here; expected one of: up, down, f, c, t, o, m, "
                 "l, space, ., r, p, g, w, i, h"
             ],
         ),
@@ -152,7 +152,7 @@ def test_what_view_refuses(
         (
             "events:\n  - {t: 1, do: percent, to: 101}\nfoo: 1",
             [
-                "s.yaml:2:25: events.0.to: 101 is not allowed; expected for percent a number from 0 to 100",
+                "s.yaml:2:25: events.0.to: 101 is not allowed; expected for percent a number from -100 to 100",
                 "s.yaml:3:1: foo: unknown key; allowed: size, events",
             ],
         ),
@@ -472,11 +472,14 @@ class Live:
 
     Args:
         screen: the screen.
+        overrides: of the scene, as for `--set`.
     """
 
-    def __init__(self, screen: Screen) -> None:
+    def __init__(self, screen: Screen, *overrides: str) -> None:
         self._screen = screen
-        size = ["--set", "render.size=[320,240]", "--set", "render.camera=oblique"]
+        size = [
+            word for key in ("render.size=[320,240]", "render.camera=oblique", *overrides) for word in ("--set", key)
+        ]
         self.process = subprocess.Popen(
             [sys.executable, "-m", "taichi_msm", "view", "small.yaml", "--threads", "2", "--out", "kept", *size],
             env=screen.environment,
@@ -553,6 +556,27 @@ def test_the_window(small: Path, screen: Screen) -> None:
     assert (live.process.returncode, err) == (0, "")
     assert out.splitlines()[-1].startswith("kept/picture-")
     assert np.abs(after - before).max() > 50
+
+
+def test_the_window_by_position(small: Path, screen: Screen) -> None:
+    live = Live(screen, "probes.0.instrument={radius: 0.04, shaft: [0.3, -0.2, 1], length: 0.3}")
+    live.kept("picture", "p")
+    live.hand("key", "f")
+
+    def path(scene: Scene) -> NDArray[np.float64]:
+        keys = scene.probes[0].path
+        return np.array(keys or np.zeros((1, 4)))
+
+    live.until(lambda scene: bool(np.ptp(path(scene)[:, 1]) > 0.01), x=200)
+    live.hand("mousedown", "1")
+    live.until(lambda scene: path(scene)[-1, 3] == -0.04, x=200)
+    live.hand("mouseup", "1", "keydown", "shift", "mousedown", "1")
+    live.until(lambda scene: scene.probes[0].grip[0][0] > 0, x=200)
+    # From 53 % of the greatest depth, a quarter of the sheet's shorter side, to as much above the sheet, and more.
+    live.hand("keyup", "shift", "click", "--repeat", "20", "5")
+    live.until(lambda scene: path(scene)[-1, 3] > 0.03, x=200)
+    live.hand("mouseup", "1", "key", "q")
+    assert live.process.communicate(timeout=60)[1] == ""
 
 
 @pytest.mark.parametrize(("number", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)])

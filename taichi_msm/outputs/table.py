@@ -25,7 +25,8 @@ class Output(NamedTuple):
 
     name: str
     file: str  # with a folder, that of the first frame of a series
-    source: Literal["picture", "labels", "flow", "tracks", "positions"]  # field of `Observed`; positions: none
+    # Field of `Observed`; positions and forces: none.
+    source: Literal["picture", "labels", "flow", "tracks", "positions", "forces"]
     means: str  # what the file holds, for users
     pixel_bytes: float = 0  # the most that a pixel takes in a file, as one of noise; 0: the size is not by pixels
     needs_camera: bool = False  # whether it can be used only with the camera's matrices
@@ -69,6 +70,12 @@ def _rows() -> Iterator[Output]:
     yield Output("gif", "animation.gif", "picture", "the pictures as an animation", pixel_bytes=1.51)
     means = "`time` [s], shape (frames,), and `position` of the mass points [m], shape (frames, rows, cols, 3)"
     yield Output("trajectory", "trajectory.npz", "positions", means)
+    means = (
+        "a row for each frame and probe: `time` [s], `probe`, `tip_x`, `tip_y`, `tip_z` [m], of the lowest point of a "
+        "tool that is moved, or of the control point on the deformed sheet, and `force_x`, `force_y`, `force_z` [N] on "
+        "the points that are not fixed; of a tool that is moved the mean since the frame before"
+    )
+    yield Output("forces", "forces.csv", "forces", means)
     means = (
         "float32 (height, width, 2): the material point at the pixel's centre, as fractions of the sheet's width from "
         "its left and of its height from its top; NaN where no sheet is seen"

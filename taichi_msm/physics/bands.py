@@ -22,8 +22,10 @@ records its place and ends, which frees its own core. Further launches continue 
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
-from taichi_msm.physics.row import row_passing
+from taichi_msm.physics.kernel import point_step
+from taichi_msm.physics.row import row_passing, row_touching
 from taichi_msm.physics.terms.bending import BendingTerm
+from taichi_msm.physics.terms.contact import ContactTerm
 from taichi_msm.physics.terms.term import DY, KernelRow, KernelSheet, StepCode
 from taichi_msm.system.runtime import ITERATIONS_PER_THREAD, ti
 
@@ -60,10 +62,35 @@ class RowBand(NamedTuple):
     progress: Any  # of all workers
 
 
-def stepping_row(code: StepCode, *, parallel: bool) -> Callable[..., Any]:
-    """Make the function that takes a step of a row of a band, as soon as the neighbours' rows allow it."""
-    vector, lanes, bending, copied = code.vector, code.lanes, code.get(BendingTerm), code.reach
-    pass_row, storing = row_passing(code), [bending.storing(code)] if bending else []
+def joining(code: StepCode) -> Callable[..., None]:
+    """Make the function that fills the halo of a row."""
+    vector, lanes = code.vector, code.lanes
+
+    @ti.func
+    def join_strips(u: ti.template(), p, width):
+        """Fill the halo of row p: before the first column of a strip comes the last one of the strip before."""
+        for c in ti.static(range(3)):
+            last = u[c][p * width + width - 2]
+            first = u[c][p * width + 1]
+            u[c][p * width + 0] = vector([last[(lane - 1) % lanes] for lane in ti.static(range(lanes))])
+            u[c][p * width + width - 1] = vector([first[(lane + 1) % lanes] for lane in ti.static(range(lanes))])
+
+    return join_strips
+
+
+def stepping_row(code: StepCode, move: Callable[..., None], *, touches: bool, parallel: bool) -> Callable[..., Any]:
+    """Make the function that takes a step of a row of a band, as soon as the neighbours' rows allow it.
+
+    Args:
+        code: of the sheet.
+        move: what it does with an entry, as for `row_passing`.
+        touches: whether tools then push the points of the row out.
+        parallel: whether there are neighbours.
+    """
+    vector, bending, copied, join_strips = code.vector, code.get(BendingTerm), code.reach, joining(code)
+    pass_row, storing = row_passing(code, move), [bending.storing(code)] if bending else []
+    contact = code.get(ContactTerm) if touches else None
+    touching = [row_touching(code, contact)] if contact else []
 
     @ti.func
     def copy_row(rows, worker, border, n, behind):
@@ -101,15 +128,6 @@ def stepping_row(code: StepCode, *, parallel: bool) -> Callable[..., Any]:
                 for c in ti.static(range(3)):
                     sheet.u[c][copy * sheet.width + b] = sheet.u[c][(i + behind * inward) * sheet.width + b]
         ti.atomic_add(band.progress[WORKER_STRIDE * band.worker + COUNTER_STRIDE * border], 1)
-
-    @ti.func
-    def join_strips(u: ti.template(), p, width):
-        """Fill the halo of row p: before the first column of a strip comes the last one of the strip before."""
-        for c in ti.static(range(3)):
-            last = u[c][p * width + width - 2]
-            first = u[c][p * width + 1]
-            u[c][p * width + 0] = vector([last[(lane - 1) % lanes] for lane in ti.static(range(lanes))])
-            u[c][p * width + width - 1] = vector([first[(lane + 1) % lanes] for lane in ti.static(range(lanes))])
 
     @ti.func
     def store_moments(sheet: ti.template(), band: ti.template(), row, moments, n):
@@ -159,6 +177,9 @@ def stepping_row(code: StepCode, *, parallel: bool) -> Callable[..., Any]:
                 after = moments + (row + 1) % MOMENTS
                 line = ti.static(KernelRow(i, kind, before, middle, after))
                 pass_row(sheet, carried, carry, line, here, other, exists, up, loads, n, row >= 0)
+                if row >= 0:
+                    for touch_row in ti.static(touching):
+                        touch_row(sheet, i, kind, loads, n)
             else:
                 for b in range(1, sheet.width - 1):
                     for c in ti.static(range(3)):
@@ -179,7 +200,10 @@ def stepping_row(code: StepCode, *, parallel: bool) -> Callable[..., Any]:
 def advancing(code: StepCode, *, parallel: bool) -> Callable[..., None]:
     """Make the kernel that takes steps, with one worker or several."""
     real, vector, vectors, lanes = code.real, code.vector, code.vectors, code.lanes
-    count_of_numbers, step_row = code.first_number(None), stepping_row(code, parallel=parallel)
+    count_of_numbers, step_row = (
+        code.first_number(None),
+        stepping_row(code, point_step(code), touches=True, parallel=parallel),
+    )
 
     @ti.func
     def work(
@@ -227,7 +251,7 @@ def advancing(code: StepCode, *, parallel: bool) -> Callable[..., None]:
         u_x: vectors, u_y: vectors, u_z: vectors,
         d_x: vectors, d_y: vectors, d_z: vectors,
         numbers_of: ti.types.ndarray(dtype=vector, ndim=1),
-        by_column: vectors, stiffness: vectors, decay: vectors,
+        by_column: vectors, stiffness: vectors, fields: vectors,
     ):  # fmt: skip
         ti.loop_config(serialize=not parallel)
         for index in range(ti.cast(sizes[WORKERS], ti.i32) * ITERATIONS_PER_THREAD):
@@ -236,7 +260,7 @@ def advancing(code: StepCode, *, parallel: bool) -> Callable[..., None]:
                 rows, width = ti.cast(sizes[ROWS], ti.i32), ti.cast(sizes[STRIP], ti.i32) + 2
                 numbers = [numbers_of[n][0] for n in ti.static(range(count_of_numbers))]
                 sheet = ti.static(
-                    KernelSheet((u_x, u_y, u_z), (d_x, d_y, d_z), by_column, stiffness, decay, numbers, rows, width)
+                    KernelSheet((u_x, u_y, u_z), (d_x, d_y, d_z), by_column, stiffness, fields, numbers, rows, width)
                 )
                 worker, workers = index // ITERATIONS_PER_THREAD, ti.cast(sizes[WORKERS], ti.i32)
                 first_row, end_row = ti.cast(sizes[FIRST_ROW], ti.i32), ti.cast(sizes[END_ROW], ti.i32)

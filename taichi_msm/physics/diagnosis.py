@@ -8,7 +8,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from taichi_msm.physics import divergence
+from taichi_msm.physics.deformed import to_positions
 from taichi_msm.physics.divergence import Watch, farthest
+from taichi_msm.physics.forces import Gauge
 from taichi_msm.physics.lattice import axes
 from taichi_msm.physics.plan import Plan
 from taichi_msm.physics.probe_force import control_points, probe_force
@@ -37,15 +39,20 @@ def diagnose(dynamics: Dynamics, start: Saved | None, pause: Pause) -> Diagnosis
     The state of the dynamics afterwards is arbitrary.
     """
     plan, grid, bad = dynamics.plan, dynamics.plan.grid, dynamics.steps_done
-    state, progress = start or (None, RunProgress())
+    gauge = Gauge(plan)
+    state, progress, felt = (None, RunProgress(), gauge.at_rest()) if start is None else start[:3]
     watch = Watch(plan, progress)
     dynamics.restart(plan, state)
     low, wrong = dynamics.state(), ""
     while low.steps < bad:
         dynamics.advance(min(bad, (watch.progress.frame + 1) * grid.steps_per_frame) - low.steps, pause)
-        wrong = watch.follow(dynamics.read())
+        reading = dynamics.read()
+        wrong = watch.follow(reading)
         if wrong:
             break
+        if watch.progress.frame * grid.steps_per_frame == reading.steps:
+            position = to_positions(reading.displacement, plan.scene.sheet)
+            felt = gauge.follow(felt, watch.progress.frame, position, dynamics.tool_forces())
         low = dynamics.state()
     if not wrong:
         said = "but not when it was repeated, so the machine has made an error; continue with --resume"
@@ -63,7 +70,8 @@ def diagnose(dynamics: Dynamics, start: Saved | None, pause: Pause) -> Diagnosis
     reading = dynamics.read()
     cause = _cause(dynamics, high, farthest(reading.displacement)[:2], pause)
     said = f"{watch.judge(reading)}; {cause}"
-    return Diagnosis(divergence.message(grid.time(high), high, said, exact=True), Saved(low, watch.progress))
+    good = Saved(low, watch.progress, felt, plan.scene.probes)
+    return Diagnosis(divergence.message(grid.time(high), high, said, exact=True), good)
 
 
 def _cause(dynamics: Dynamics, bad: int, point: tuple[int, int], pause: Pause) -> str:
@@ -78,6 +86,11 @@ def _cause(dynamics: Dynamics, bad: int, point: tuple[int, int], pause: Pause) -
         if _goes_well(dynamics, finer, frames, pause):
             return f"likely cause: time.step, {grid.step:.6g} s; with {finer.grid.step:.9g} s it does not diverge here"
         tried = finer.grid.step
+    if not plan.slots:
+        speeds = [tool.stride(grid.step)[0] / grid.step for tool in plan.tools]
+        tool, speed = max(zip(plan.tools, speeds, strict=True), key=lambda pair: pair[1])
+        said = f"likely cause: probes.{tool.probe}.path, at up to {speed:.3g} m/s"
+        return f"{said}; move the tool more slowly, or less far"
     index, force = _strongest_probe(plan.scene, point)
     name = "force" if plan.scene.probes[index].total is None else "total"
     said = f"likely cause: probes.{index}.{name}, which reaches {force:.3g} N at this point"
@@ -108,5 +121,5 @@ def _strongest_probe(scene: Scene, point: tuple[int, int]) -> tuple[int, float]:
         acts, most = probe_force(probe, scene.sheet), max(abs(percent) for _, percent in probe.load) / 100
         return most * math.hypot(*acts.force) * float(acts.decay(nearest))
 
-    strongest = max(range(len(scene.probes)), key=force)
+    strongest = max((index for index, probe in enumerate(scene.probes) if not probe.moved), key=force)
     return strongest, force(strongest)

@@ -13,6 +13,7 @@ from taichi_msm.physics.loads import Envelope
 from taichi_msm.physics.plan import Plan
 from taichi_msm.physics.state import Reading, RunProgress
 from taichi_msm.physics.terms import TERMS
+from taichi_msm.physics.terms.foundation import FoundationTerm
 from taichi_msm.physics.terms.probes import free_acceleration, norm
 
 # No deformation displaces a point by more than this many sheet sizes; a sheet that nothing holds may also fly away.
@@ -26,18 +27,26 @@ SWING = 4.0
 ROUNDING = 1e-9
 
 
-def farthest_displacement(plan: Plan, time: float, acceleration: float | None = None) -> float:
+def farthest_displacement(
+    plan: Plan, time: float, acceleration: float | None = None, moved: float | None = None
+) -> float:
     """Bound the displacement of a point at a time [m]; if one is larger, the simulation has diverged.
 
-    acceleration: most that the probes have given to a free point so far [m/s^2]; None: most that the scene's can.
+    acceleration, moved: most that the probes have given to a free point so far [m/s^2], and tools that are moved to all
+        points [J]; None: most that the scene's can.
     """
-    most = MOST_SHEET_SIZES * max(plan.scene.sheet.size)
+    # A tool takes along what it holds.
+    most = MOST_SHEET_SIZES * max(plan.scene.sheet.size) + sum(tool.way + tool.radius for tool in plan.tools)
     # Springs then connect every point to a fixed one; shear springs alone may skip every other point.
     if plan.scene.sheet.fixed not in ("none", ()) and min(plan.material.across, plan.material.down) > 0:
         return most
     if plan.material.virtual > 0 and not plan.material.always:
         # The virtual springs may accelerate a point from far away, and let go of it when it is fast.
         return math.inf
+    if plan.tools:
+        # No point is faster than if it had its share of all energy that the tools may have given.
+        given = _most_moved(plan) if moved is None else moved
+        most += math.sqrt(2 * given / plan.fixed.size / plan.material.mass) * time
     return most + (free_acceleration(plan) if acceleration is None else acceleration) * time * time / 2
 
 
@@ -49,7 +58,10 @@ class Watch:
 
         E(b)^(1/2) <= E(a)^(1/2) + (2 m)^(-1/2) integral of |F| from a to b
 
-    The virtual springs hold another K / 2 |u|^2; when they begin to act, it is added for the displacements then.
+    Tools that are moved add at most the energy E_T that it takes to displace every point as far as they come and are
+    wide, at their speed; where much is displaced already it takes more, so E_T^(1/2) is added to the right side.
+    The virtual springs hold at most another K / 2 |u|^2, with K of the stiffest; when they begin to act, it is added
+    for the displacements then.
 
     Attributes:
         progress: of the last frame that was found sound; at first, of the frame where the watch begins.
@@ -60,6 +72,7 @@ class Watch:
         self._plan, self._grid = plan, plan.grid
         self._loads = Envelope(plan)
         self._acceleration = free_acceleration(plan)
+        self._moved = _most_moved(plan)
         self._shares = np.array([norm(slot, plan.scene) for slot in plan.slots])
         self._swing = SWING / max(1e-9, 1 - (plan.grid.step / plan.stable_step) ** 2)
         self._least = _underflow(plan)
@@ -69,6 +82,7 @@ class Watch:
         self._plan = plan
         self._loads = Envelope(plan)
         self._acceleration = max(self._acceleration, free_acceleration(plan))
+        self._moved = max(self._moved, _most_moved(plan))
 
     def follow(self, reading: Reading) -> str:
         """Judge the next frame, as `judge` does, and record its progress if it is sound."""
@@ -76,13 +90,16 @@ class Watch:
         wrong = self._fault(reading, where)
         if not wrong:
             self.progress = RunProgress(
-                frame=progress.frame + 1,
+                frame=reading.steps // self._grid.steps_per_frame,
                 max_displacement=max(progress.max_displacement, where.distance),
                 shortest_spring=min(progress.shortest_spring, reading.shortest_spring),
                 longest_spring=max(progress.longest_spring, reading.longest_spring),
                 energy=reading.energy,
                 reach=where.reach,
+                deepest=max(progress.deepest, -float(reading.displacement[..., 2].min())),
                 peak=max(progress.peak, reading.energy),
+                residual=max(progress.residual, reading.residual),
+                evaluations=progress.evaluations + reading.evaluations,
             )
         return wrong
 
@@ -91,10 +108,12 @@ class Watch:
         return self._fault(reading, farthest(reading.displacement))
 
     def _fault(self, reading: Reading, where: Farthest) -> str:
+        if self._plan.scene.time.at_rest:
+            return ""  # Where the forces balance, nothing has grown without bound.
         begin, end = self.progress.frame / self._grid.frames_per_second, self._grid.time(reading.steps)
         point, distance, energy = f"point ({where.row}, {where.column})", where.distance, reading.energy
         # Written so that NaN is found too: no comparison with it is true.
-        if not distance <= farthest_displacement(self._plan, end, self._acceleration):
+        if not distance <= farthest_displacement(self._plan, end, self._acceleration, self._moved):
             size = max(self._plan.scene.sheet.size)
             return f"{point} is {distance:g} m from its rest position, and the sheet is {size:g} m long"
         most = self._most_energy(begin, end)
@@ -107,12 +126,13 @@ class Watch:
 
     def _most_energy(self, begin: float, end: float) -> float:
         """Bound the energy at the end of an interval that begins at the last recorded frame [J]."""
-        progress, mass, virtual = self.progress, self._plan.material.mass, self._plan.material.virtual / 2
+        progress, material = self.progress, self._plan.material
+        mass, virtual = material.mass, FoundationTerm.bound(material, self._plan.scene.sheet) / 2
         forces, active, activations = self._loads.between(begin, end)
         push = float((forces * self._shares).sum())
         # Products instead of powers: these raise OverflowError where a product is infinite.
         root = math.sqrt(progress.energy + active * virtual * progress.reach * progress.reach)
-        root += push * (end - begin) / math.sqrt(2 * mass)
+        root += push * (end - begin) / math.sqrt(2 * mass) + math.sqrt(self._moved)
         reach = progress.reach + (end - begin) * root * math.sqrt(2 / mass)
         for _ in range(activations):
             root = math.sqrt(root * root + virtual * reach * reach)
@@ -143,6 +163,16 @@ def farthest(displacement: NDArray[np.floating]) -> Farthest:
         row, column = (int(index) for index in np.unravel_index(square.argmax(), square.shape))
         distance = float(np.linalg.norm(displacement[row, column].astype(float)))
         return Farthest(row, column, distance, math.sqrt(square.sum()))
+
+
+def _most_moved(plan: Plan) -> float:
+    """Bound the energy that the tools which are moved can have given to the points [J]."""
+    material, step, most = plan.material, plan.grid.step, 0.0
+    stiffness = sum(term.bound(material, plan.scene.sheet) for term in TERMS)
+    for tool in plan.tools:
+        far, speed = tool.way + tool.radius, tool.stride(step)[0] / step
+        most += (stiffness * far * far + material.mass * speed * speed) / 2
+    return plan.fixed.size * most
 
 
 def _underflow(plan: Plan) -> float:

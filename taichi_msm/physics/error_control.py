@@ -6,12 +6,15 @@ The error of a displacement u_h is its distance from Richardson's extrapolation 
 
 So it includes the rounding of the run's own precision. Errors are the largest of any point at any frame, relative to
 the largest displacement of any point at any frame.
+
+Where tools are moved, a point touches from one step to the next, so that the order is about 1 and errors fall in leaps.
+What is told is then what is hardly exceeded: "at most about" (docs/decisions/0027).
 """
 
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from itertools import pairwise
 from typing import Any
@@ -22,6 +25,7 @@ from numpy.typing import NDArray
 from taichi_msm.errors import SceneError
 from taichi_msm.physics.divergence import farthest_displacement
 from taichi_msm.physics.lattice import rest_positions
+from taichi_msm.physics.paths import overlap
 from taichi_msm.physics.pilots import fine_steps
 from taichi_msm.physics.plan import Plan
 from taichi_msm.physics.solver import Dynamics
@@ -36,6 +40,10 @@ CLOSE = 0.75
 # The error of the step that a coarse pilot tells is so many times what its difference from the run shows: the kinks of
 # a load meet its steps otherwise than those of the run (docs/decisions/0021).
 MARGIN = 1.25
+
+# With contact, a fine pilot alone tells so many times the error that it shows by order 1, and with a coarse one up to
+# this share more or less (docs/decisions/0027).
+ALONE, SHARE = 1.5, 1 / 3
 
 # The largest number of pilot runs in a search, and the largest factor by which steps get finer from one to the next.
 MOST_PILOTS = 12
@@ -55,14 +63,16 @@ class Estimate:
     order: int  # of the method in this scene
     # Whether the two parts are known; else, by a coarse pilot beside a run in f32, neither is larger than the error.
     parted: bool = True
-    at_least: bool = (
-        False  # whether the error may be larger, as a coarse pilot shows one that only a fine one would tell
-    )
+    # Whether the error may be larger: a coarse pilot shows one that only a fine one would tell, or with contact smaller
+    # steps do not come closer to each other, or the error is so large that nothing is known.
+    at_least: bool = False
+    at_most: bool = False  # whether the error may be much smaller, because of contact
 
 
 def order(plan: Plan) -> int:
-    """Give the order of the method: 1 with a damping by backward differences, else 2."""
-    return 2 if plan.scene.time.damping_difference == "central" or plan.material.drag == 0 else 1
+    """Give the order of the method: 1 with a damping by backward differences or with contact, else 2."""
+    backward = plan.scene.time.damping_difference == "backward" and plan.material.drag > 0
+    return 1 if backward or plan.tools else 2
 
 
 def estimate_error(plan: Plan, device: Device, progress: Count = lambda done, total: None) -> Estimate:
@@ -126,7 +136,8 @@ class Pilot:
         # A run in f64 is itself the one with its own steps.
         own = plan.grid.precision == "f64" or coarse
         self._same = None if own else Dynamics(exact, device, cores=cores)
-        self._margin = 1.0
+        self._margin = MARGIN * ALONE if plan.tools else 1.0
+        self._overlap = overlap(plan.tools, plan.scene.time.duration) is not None
         if coarse:
             shown = (plan.grid.steps_per_frame / steps) ** self._order - 1
             self._margin = MARGIN if self._parted else max(1.0, MARGIN / shown)
@@ -164,7 +175,9 @@ class Pilot:
             ratio = self._steps / self._plan.grid.steps_per_frame
             exact = other + (other - same) / (ratio**self._order - 1) if self._parted else other
             self._error = max(self._error, longest(displacement - exact))
-            self._largest = max(self._largest, longest(exact))
+            # Where errors fall in leaps, what is extrapolated may be larger by far.
+            best = exact if not self._plan.tools else other if ratio > 1 else displacement
+            self._largest = max(self._largest, longest(best))
             if self._same:
                 self._in_f64 = max(self._in_f64, longest(same - exact))
                 self._rounding = max(self._rounding, longest(displacement - same))
@@ -184,7 +197,19 @@ class Pilot:
         error, rounding, in_f64 = (share(part) for part in (self._error, self._rounding, self._in_f64))
         if not self._same:
             rounding, in_f64 = 0.0 if self._parted else error, error
-        return Estimate(self._plan.grid.steps_per_frame, error, rounding, in_f64, self._order, self._parted)
+        steps, contact = self._plan.grid.steps_per_frame, bool(self._plan.tools)
+        at_least = contact and (self._overlap or error > LARGEST_TOLERANCE)
+        return Estimate(steps, error, rounding, in_f64, self._order, self._parted, at_least, contact)
+
+
+def reconcile(coarse: Estimate, fine: Estimate) -> Estimate:
+    """Give what both pilots of a run tell: the finer one, but with contact the coarse one within its doubt."""
+    if not fine.at_most or fine.error in (0, math.inf):
+        return fine
+    share = min(max(coarse.error / fine.error, 1 - SHARE), 1 + SHARE)
+    # But for the factors of both, the difference of the finer one from the run is larger than that of the coarse one.
+    grows = fine.error > 2 * ALONE * coarse.error
+    return replace(fine, error=share * fine.error, in_f64=share * fine.in_f64, at_least=fine.at_least or grows)
 
 
 class Trials:
@@ -264,7 +289,8 @@ def _out_of_reach(tolerance: float, failures: list[Estimate]) -> str:
             f"time.tolerance: {tolerance:g} is out of reach of f32, whose rounding alone makes an error of "
             f"{last.rounding:.2g} here; take time.precision: f64, or a tolerance of {_above(4 * last.rounding):g}"
         )
-    remedy = "take a weaker load or a shorter time"
+    weaker = "move the tools less deep, or take" if last.at_most else "take a weaker load or"
+    remedy = f"{weaker} a shorter time"
     if best.error < LARGEST_TOLERANCE / 2:
         remedy += f", or a tolerance of {_above(best.error):g}"
     return (

@@ -8,7 +8,7 @@ both ends. The arrays are one-dimensional, which saves a few instructions for ev
     by_column    for a first, a middle and a last row: 1 over the points' share of a cell's mass, 0 if they are fixed;
                  and their share of a cell's area. For all rows: x at rest [m]; whether there is a left neighbour;
                  whether there is a right one
-    decay        of every standing slot; as many rows as the sheet has
+    fields       a number for every point each, as many rows as the sheet has; those of its terms follow each other
     stiffness    with a map, of every spring: see `SpringTerm.laid_out`
     numbers      of the sheet and its terms, in the first lane of an entry each
 
@@ -63,7 +63,7 @@ class Start(NamedTuple):
 
     numbers: NDArray[Any]  # of the sheet and its terms
     by_column: NDArray[Any]  # shape (COLUMN_ROWS, cols)
-    decay: NDArray[Any]  # of the standing slots, shape (standing slots, rows, cols)
+    fields: NDArray[Any]  # of the terms, shape (fields, rows, cols)
     stiffness: NDArray[Any] | None  # as many rows as it takes; None without a map
     state: State | None  # to continue from; None: at rest
 
@@ -98,7 +98,7 @@ class SheetArrays:
         self.d = [self.rows(layout.rows) for _ in range(3)]
         self.numbers = self._memory.array(layout.code.precision, lanes, len(start.numbers))
         self.by_column = self.rows(len(start.by_column))
-        self.decay = self.rows(max(1, len(start.decay)) * layout.rows)
+        self.fields = self.rows(max(1, len(start.fields)) * layout.rows)
         self.stiffness = self.rows(1 if start.stiffness is None else len(start.stiffness))
         real = np.float32 if layout.code.precision == "f32" else np.float64
         with np.errstate(over="ignore"):
@@ -110,17 +110,29 @@ class SheetArrays:
         for c in range(3):
             self._set(self.u[c], none if state is None else np.where(held, state.displacement[stored, :, c], 0))
             self._set(self.d[c], none if state is None else state.difference[..., c])
-        self.set_decay(start.decay)
+        self._set(self.fields, start.fields)
 
     @property
     def all(self) -> tuple[Any, ...]:
         """All arrays, in the order in which kernels take them."""
-        return *self.u, *self.d, self.numbers, self.by_column, self.stiffness, self.decay
+        return *self.u, *self.d, self.numbers, self.by_column, self.stiffness, self.fields
 
-    def set_decay(self, decay: NDArray[Any]) -> None:
-        """Replace the decays of the standing slots, shape (slots, rows, cols)."""
-        if len(decay):
-            self._set(self.decay, decay)
+    def get_fields(self, first: int, count: int) -> NDArray[Any]:
+        """Read so many fields from the first one on, shape (count, rows, cols)."""
+        layout = self._layout
+        rows, entry = count * layout.rows, first * layout.rows * layout.width
+        laid = self.fields.to_numpy()[entry : entry + rows * layout.width].reshape(
+            rows, layout.width, layout.code.lanes
+        )
+        values = laid[:, 1:-1].transpose(0, 2, 1).reshape(count, layout.rows, -1)
+        return np.ascontiguousarray(values[..., : layout.cols])
+
+    def set_fields(self, first: int, values: NDArray[Any]) -> None:
+        """Replace fields from the first one on, shape (fields, rows, cols); the others stay."""
+        entries, laid = self.fields.to_numpy(), in_lanes(self._layout, values)
+        at = first * self._layout.rows * self._layout.width
+        entries[at : at + len(laid)] = laid
+        self.fields.from_numpy(entries)
 
     def _set(self, array: Any, values: NDArray[Any]) -> None:
         """Set the first rows of an array to values, shape (..., cols), and the others to zero."""
@@ -148,14 +160,19 @@ class StepKernel(Protocol):
         """Copy displacements or differences into values, shape (rows, cols, 3), and the measures of every row."""
 
 
+def point_forces(code: StepCode) -> list[Callable[..., Any]]:
+    """List the functions that add the forces of terms on points to those of springs."""
+    # Terms that reach far come first. The last bits depend on the order.
+    ordered = sorted(code.terms, key=lambda term: -term.reach)
+    return [force for term in ordered for force in term.forces(code)]
+
+
 def point_step(code: StepCode) -> Callable[..., None]:
     """Make the function that adds the forces of terms on points to those of springs, and steps.
 
     d_{n+1} = keep d_n + gain F_n,    u_{n+1} = u_n + d_{n+1}                                  (eq. 6 to 9)
     """
-    # Terms that reach far come first. The last bits depend on the order.
-    ordered = sorted(code.terms, key=lambda term: -term.reach)
-    forces = [force for term in ordered for force in term.forces(code)]
+    forces = point_forces(code)
     reducing = [reduce for term in code.terms for reduce in term.reducing(code)]
 
     @ti.func
@@ -214,7 +231,7 @@ def reading(code: StepCode, *, parallel: bool, iterations: int) -> Callable[...,
         u_x: vectors, u_y: vectors, u_z: vectors,
         d_x: vectors, d_y: vectors, d_z: vectors,
         numbers_of: ti.types.ndarray(dtype=vector, ndim=1),
-        by_column: vectors, stiffness: vectors, decay: vectors,
+        by_column: vectors, stiffness: vectors, fields: vectors,
     ):  # fmt: skip
         ti.loop_config(serialize=not parallel)
         for index in range(rows * iterations):
@@ -224,7 +241,7 @@ def reading(code: StepCode, *, parallel: bool, iterations: int) -> Callable[...,
                 width, p = strip + 2, first + i
                 numbers = [numbers_of[n][0] for n in ti.static(range(count))]
                 u, d = ti.static((u_x, u_y, u_z), (d_x, d_y, d_z))
-                sheet = ti.static(KernelSheet(u, d, by_column, stiffness, decay, numbers, rows, width))
+                sheet = ti.static(KernelSheet(u, d, by_column, stiffness, fields, numbers, rows, width))
                 sums = [vector(0) for _ in ti.static(reductions)]
                 for b in range(1, strip + 1):
                     measure(sums, sheet, p, i, b)

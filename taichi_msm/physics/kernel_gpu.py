@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from taichi_msm.physics.kernel import SheetArrays, SheetLayout, Start, point_step, reading
 from taichi_msm.physics.terms.bending import BendingTerm
+from taichi_msm.physics.terms.contact import ContactTerm
 from taichi_msm.physics.terms.springs import SpringTerm
 from taichi_msm.physics.terms.term import DX, DY, HAS_LEFT, HAS_RIGHT, Entry, KernelRow, KernelSheet, StepCode
 from taichi_msm.system.runtime import our_compilation, ti
@@ -64,7 +65,8 @@ def _gathering(code: StepCode) -> Callable[..., None]:
     structural, shear = springs.structural, springs.shear
     leaves_out = springs.open_edges and not springs.mapped
     along, to_other_row, of_row, of_column, of_diagonal = springs.between(code)
-    move = point_step(code)
+    move, contact = point_step(code), code.get(ContactTerm)
+    resolving = [contact.resolving(code)] if contact else []
 
     @ti.func
     def by_row(sheet: ti.template(), p, q, lower, b, row_exists, up):
@@ -116,7 +118,10 @@ def _gathering(code: StepCode) -> Callable[..., None]:
         before, at, after = 2 * (rows + 2) + i, 2 * (rows + 2) + i + 1, 2 * (rows + 2) + i + 2
         line = ti.static(KernelRow(i, kind, before, at, after))
         entry = ti.static(Entry(line, b, u))
-        move(sheet, entry, (1 - now) * (rows + 2) + i + 1, force, row)
+        target = (1 - now) * (rows + 2) + i + 1
+        move(sheet, entry, target, force, row)
+        for resolve in ti.static(resolving):
+            resolve(sheet, i, kind, target, b, row)
 
     return step
 
@@ -137,7 +142,7 @@ def _advancing(code: StepCode) -> Callable[..., None]:
         u_x: vectors, u_y: vectors, u_z: vectors,
         d_x: vectors, d_y: vectors, d_z: vectors,
         numbers_of: ti.types.ndarray(dtype=vector, ndim=1),
-        by_column: vectors, stiffness: vectors, decay: vectors,
+        by_column: vectors, stiffness: vectors, fields: vectors,
     ):  # fmt: skip
         for n in ti.static(range(STEPS_PER_LAUNCH)):
             for store_moment in ti.static(storing):
@@ -145,14 +150,14 @@ def _advancing(code: StepCode) -> Callable[..., None]:
                     if n < count:
                         numbers = [numbers_of[m][0] for m in ti.static(range(count_of_numbers))]
                         u, d = ti.static((u_x, u_y, u_z), (d_x, d_y, d_z))
-                        sheet = ti.static(KernelSheet(u, d, by_column, stiffness, decay, numbers, rows, cols + 2))
+                        sheet = ti.static(KernelSheet(u, d, by_column, stiffness, fields, numbers, rows, cols + 2))
                         p = (now + n) % 2 * (rows + 2) + i + 1
                         store_moment(sheet, i, p - 1, p, p + 1, b, 2 * (rows + 2) + i + 1)
             for i, b in ti.ndrange(rows, (1, cols + 1)):
                 if n < count:
                     numbers = [numbers_of[m][0] for m in ti.static(range(count_of_numbers))]
                     u, d = ti.static((u_x, u_y, u_z), (d_x, d_y, d_z))
-                    sheet = ti.static(KernelSheet(u, d, by_column, stiffness, decay, numbers, rows, cols + 2))
+                    sheet = ti.static(KernelSheet(u, d, by_column, stiffness, fields, numbers, rows, cols + 2))
                     step(sheet, loads, (now + n) % 2, i, b, n)
 
     return advance

@@ -12,7 +12,8 @@ averaged in the same way.
 from __future__ import annotations
 
 import math
-from typing import NamedTuple
+from collections.abc import Sequence
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,8 +21,8 @@ from numpy.typing import NDArray
 from taichi_msm.physics.lattice import axes
 from taichi_msm.physics.material import area_shares
 from taichi_msm.physics.plan import EDGE, Plan, ProbeSegment, ProbeSlot, probe_slots
-from taichi_msm.physics.probe_force import control_points, probe_force
-from taichi_msm.scene import Probe, Scene, Sheet
+from taichi_msm.physics.probe_force import control_points, point_at, probe_force
+from taichi_msm.scene import WHOLE, Probe, Scene, Sheet
 
 # A time before all others [s].
 LONG_AGO = -1e300
@@ -38,9 +39,12 @@ class Schedule(NamedTuple):
     active: Array  # share of their stiffness with which the virtual springs act, 0 to 1; shape (steps,)
 
 
-def decay(probe: Probe, sheet: Sheet) -> Array:
-    """Give the share of a probe's force that each point feels at its control point's first place, (rows, cols)."""
-    acts, (at_x, at_y) = probe_force(probe, sheet), control_points(probe, sheet)[1][0]
+def decay(probe: Probe, sheet: Sheet, at: Array | None = None) -> Array:
+    """Give the share of a probe's force that each point feels, shape (rows, cols).
+
+    at: the control point, x and y at rest [m]; None: its first place.
+    """
+    acts, (at_x, at_y) = probe_force(probe, sheet), control_points(probe, sheet)[1][0] if at is None else at
     x, y = axes(sheet)
     shares = acts.decay(np.hypot(x - at_x, y - at_y))
     return shares * area_shares(sheet) if acts.by_area else shares
@@ -51,8 +55,8 @@ def schedule(plan: Plan, first: int, count: int) -> Schedule:
     scene, parts = plan.scene, plan.slots
     t, h = np.arange(first, first + count) / plan.grid.steps_per_second, plan.grid.step
     strength, point = np.zeros((count, len(parts), 3)), np.zeros((count, len(parts), 2))
-    for index, probe in enumerate(scene.probes):
-        own = [n for n, part in enumerate(parts) if part.probe == index]
+    for index in sorted({part.probe for part in parts}):
+        probe, own = scene.probes[index], [n for n, part in enumerate(parts) if part.probe == index]
         turns, segments, jumps = len(own), parts[own[0]].segments, parts[own[0]].jumps
         line = _load(probe)
         if turns == 1:
@@ -71,7 +75,8 @@ def loads_at(plan: Plan, t: Array) -> Schedule:
     """Evaluate the loads themselves, not their averages, with one slot a probe, at times that are no keys [s]."""
     scene, parts = plan.scene, probe_slots(plan.scene.probes, plan.scene.sheet, 0.0)
     strength, point = np.zeros((len(t), len(parts), 3)), np.zeros((len(t), len(parts), 2))
-    for n, (part, probe) in enumerate(zip(parts, scene.probes, strict=True)):
+    for n, part in enumerate(parts):
+        probe = scene.probes[part.probe]
         strength[:, n] = np.multiply.outer(_load(probe).values(t) / 100, probe_force(probe, scene.sheet).force)
         number = part.jumps.searchsorted(t, "right")
         for segment in np.unique(number):
@@ -79,11 +84,59 @@ def loads_at(plan: Plan, t: Array) -> Schedule:
     return Schedule(parts, strength, point, _activity(plan).values(t))
 
 
+class FrameLoad:
+    """The load of a probe at frames: the load itself, not its average.
+
+    Attributes:
+        moves: whether the control point moves.
+    """
+
+    def __init__(self, probe: Probe, sheet: Sheet) -> None:
+        self._line, (self._times, self._points) = _load(probe), control_points(probe, sheet)
+        self.moves = len(self._times) > 1
+        self._keys = np.unique(np.concatenate([self._line.times, self._times]))
+
+    def at(self, frame: int, rate: float) -> tuple[float, Array]:
+        """Give the percent, and the control point, x and y at rest [m], at a frame; at a jump, those after it."""
+        time = frame / rate
+        # A key that is as good as at the frame counts as at it.
+        key = float(self._keys[max(0, self._keys.searchsorted(time + WHOLE / rate, "right") - 1)])
+        time = key if abs(time - key) <= WHOLE / rate else time
+        return float(self._line.values(np.array([time]))[0]), point_at(self._times, self._points, time)
+
+
+def frame_loads(plan: Plan, frame: int) -> Schedule:
+    """Evaluate the loads at a frame; at a jump the later value counts, and a key within WHOLE of a frame is at it.
+
+    Foundations that are `loaded` act where the percent of any probe is not 0, and from a path's first key to its last.
+    """
+    scene, rate = plan.scene, plan.grid.frames_per_second
+    time = frame / rate
+    near = [key for key in _every_key(scene) if abs(key - time) <= WHOLE / rate]
+    t = np.array([max(near, default=time)])
+    loads = loads_at(plan, t)
+    pressed = any(
+        _load(probe).values(t)[0] != 0 if probe.path is None else probe.path[0][0] <= t[0] <= probe.path[-1][0]
+        for probe in scene.probes
+    )
+    return loads._replace(active=np.array([float(plan.material.always or pressed)]))
+
+
 def key_times(scene: Scene) -> Array:
     """List the times of all keys between 0 and the end [s]: only there the loads are not smooth."""
-    loads = [[time for time, _ in probe.load] for probe in scene.probes]
-    times = np.unique(np.concatenate([[], *loads, *(control_points(probe, scene.sheet)[0] for probe in scene.probes)]))
+    times = _every_key(scene)
     return times[(times > 0) & (times < scene.time.duration)]
+
+
+def _every_key(scene: Scene) -> Array:
+    """List the times of all keys [s]."""
+    keys: list[Any] = [[]]
+    for probe in scene.probes:
+        if probe.path is None:
+            keys += [time for time, _ in probe.load], control_points(probe, scene.sheet)[0]
+        else:
+            keys += [time for time, *_ in probe.path], np.ravel(probe.grip)
+    return np.unique(np.concatenate(keys))
 
 
 class Envelope:
@@ -91,9 +144,9 @@ class Envelope:
 
     def __init__(self, plan: Plan) -> None:
         scene, self._h = plan.scene, plan.grid.step
-        self._lines = [_load(probe) for probe in scene.probes]
-        self._forces = [math.hypot(*probe_force(probe, scene.sheet).force) / 100 for probe in scene.probes]
-        self._probes = [slot.probe for slot in plan.slots]
+        probes = [scene.probes[slot.probe] for slot in plan.slots]
+        self._lines = [_load(probe) for probe in probes]
+        self._forces = [math.hypot(*probe_force(probe, scene.sheet).force) / 100 for probe in probes]
         self._activity = _activity(plan)
         self._begins = self._activity.times[self._activity.before < self._activity.after]
 
@@ -108,7 +161,7 @@ class Envelope:
         begin, end = begin - self._h, end + self._h
         most = [force * line.largest(begin, end) for force, line in zip(self._forces, self._lines, strict=True)]
         begun = self._begins.searchsorted(end, "right") - self._begins.searchsorted(begin, "left")
-        return np.array([most[probe] for probe in self._probes]), self._activity.largest(begin, end) > 0, int(begun)
+        return np.array(most), self._activity.largest(begin, end) > 0, int(begun)
 
 
 class _Line:
@@ -204,19 +257,28 @@ def _load(probe: Probe) -> _Line:
     return _Line(*np.array(probe.load, dtype=float).T)
 
 
+def _presses(probe: Probe) -> Sequence[tuple[float, float]]:
+    """Give keys of a function that is not 0 while a probe presses; a path does so from its first key to its last."""
+    if probe.path is None:
+        return probe.load
+    begin, end = probe.path[0][0], probe.path[-1][0]
+    return (begin, 1.0), (end, 1.0), (end, 0.0)
+
+
 def _activity(plan: Plan) -> _Line:
-    """Tell when the virtual springs act: 1 always or while the percent of any probe is not 0, else 0."""
+    """Tell when the virtual springs act: 1 always or while any probe presses, else 0."""
     scene = plan.scene
     if plan.material.always:
         return _Line(np.array([LONG_AGO]), np.array([1.0]))
-    times = np.unique([time for probe in scene.probes for time, _ in probe.load])
+    presses = [_presses(probe) for probe in scene.probes]
+    times = np.unique([time for keys in presses for time, _ in keys])
     if not times.size:
         return _Line(np.zeros(1), np.zeros(1))
     # A time between each two keys, and one after the last.
     middles = np.append((times[:-1] + times[1:]) / 2, times[-1] + 1)
     active = np.zeros(len(times))
-    for probe in scene.probes:
-        line = _load(probe)
+    for keys in presses:
+        line = _Line(*np.array(keys, dtype=float).T)
         after = line.times.searchsorted(middles, "right")
         following = np.minimum(after, len(line.times) - 1)
         pressed = (line.after[after - 1] != 0) | ((line.before[following] != 0) & (after < len(line.times)))

@@ -8,16 +8,16 @@ which belong to fewer cells, get less. Each term of the model derives its own nu
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from taichi_msm.errors import Problem
 from taichi_msm.physics.lattice import spacing
-from taichi_msm.picture import file_sha256, read_rgb
+from taichi_msm.picture import file_sha256, read_grey
 from taichi_msm.scene import MAX_POINTS, Scene, Sheet, StiffnessMap
 
 # Cells longer than this many times their width would need springs of negative stiffness.
@@ -29,13 +29,17 @@ Array = NDArray[np.float64]
 class MapImage(NamedTuple):
     """The file of a map. It is read once, so that a whole run has one map even if the file changes meanwhile."""
 
-    grey: NDArray[np.uint8]  # 0 to 255, shape (height, width)
+    grey: NDArray[Any]  # 0 to 255, of 16-bit pictures 0 to 65535; shape (height, width)
     sha256: str  # of the file
+
+
+# The files of a scene's maps, by the keys that name them, such as map and foundation_map.
+Maps = Mapping[str, MapImage]
 
 
 @dataclass(frozen=True, eq=False)
 class Material:
-    """The numbers of a sheet; with a map, those for a factor of 1."""
+    """The numbers of a sheet; with maps, those for a factor of 1."""
 
     mass: float  # of a point [kg]
     drag: float  # C / m [1/s]
@@ -49,6 +53,7 @@ class Material:
     bending: float  # D dx dy [N m3]
     by_area: bool  # whether points and springs at an edge get less than others, as in tissue
     factors: Array | None  # of the stiffness of every cell, shape (rows - 1, cols - 1); None without a map
+    virtual_factors: Array | None  # of K at every point, shape (rows, cols); None without a map
 
     @property
     def tensions(self) -> tuple[float, float, float]:
@@ -59,22 +64,37 @@ class Material:
 def read_map(stiffness_map: StiffnessMap) -> MapImage:
     """Read the file of a map; PictureError: it cannot be used."""
     sha256 = file_sha256(stiffness_map.image)
-    return MapImage(np.asarray(read_rgb(stiffness_map.image, (0, 0, 0), sha256).convert("L")), sha256)
+    return MapImage(read_grey(stiffness_map.image, sha256), sha256)
 
 
-def map_factors(stiffness_map: StiffnessMap, image: MapImage, rows: int, cols: int) -> Array:
-    """Interpolate the factors at the centres of rows x cols cells: bilinearly between texels, constant beyond them."""
+def cell_factors(stiffness_map: StiffnessMap, image: MapImage, sheet: Sheet) -> Array:
+    """Give the factors at the centres of the cells, shape (rows - 1, cols - 1)."""
+    rows, cols = (count - 1 for count in sheet.points)
+    return map_factors(stiffness_map, image, (np.arange(rows) + 0.5) / rows, (np.arange(cols) + 0.5) / cols)
+
+
+def point_factors(stiffness_map: StiffnessMap, image: MapImage, sheet: Sheet) -> Array:
+    """Give the factors at the mass points, shape (rows, cols)."""
+    rows, cols = (np.arange(count) / (count - 1) for count in sheet.points)
+    return map_factors(stiffness_map, image, rows, cols)
+
+
+def map_factors(stiffness_map: StiffnessMap, image: MapImage, rows: Array, cols: Array) -> Array:
+    """Interpolate the factors bilinearly between texels, constant beyond them.
+
+    rows, cols: places of the rows from the top, of the columns from the left, as fractions of the sheet.
+    """
     grey = image.grey.astype(float)
     height, width = grey.shape
-    row = np.clip((np.arange(rows) + 0.5) / rows * height - 0.5, 0, height - 1)
-    column = np.clip((np.arange(cols) + 0.5) / cols * width - 0.5, 0, width - 1)
+    row = np.clip(rows * height - 0.5, 0, height - 1)
+    column = np.clip(cols * width - 0.5, 0, width - 1)
     top, left = row.astype(int), column.astype(int)
     bottom, right = np.minimum(top + 1, height - 1), np.minimum(left + 1, width - 1)
     down, across = (row - top)[:, None], column - left
     above = grey[np.ix_(top, left)] * (1 - across) + grey[np.ix_(top, right)] * across
     below = grey[np.ix_(bottom, left)] * (1 - across) + grey[np.ix_(bottom, right)] * across
     black, white = stiffness_map.range
-    return black + (white - black) / 255 * (above * (1 - down) + below * down)
+    return black + (white - black) / np.iinfo(image.grey.dtype).max * (above * (1 - down) + below * down)
 
 
 def largest_mean(factors: Array) -> float:
@@ -112,12 +132,14 @@ def kind_problems(scene: Scene) -> Iterator[Problem]:
         if scene.springs is None:
             said = "missing; expected a mapping with young, thickness and density, or springs in its place"
             yield Problem(("tissue",), said)
-        elif sheet.mass is None:
+        elif sheet.mass is None and not scene.time.at_rest:
             yield Problem(("sheet", "mass"), "missing; with springs expected a number above 0, in kg")
         if sheet.tolerance is not None:
             said = f"{sheet.tolerance:g} needs tissue: with springs other points make another sheet; remove tolerance"
             yield Problem(("sheet", "tolerance"), said)
         return
+    if scene.tissue.density is None and not scene.time.at_rest:
+        yield Problem(("tissue", "density"), "missing; expected a number above 0, in kg/m3")
     if scene.springs is not None:
         yield Problem(("springs",), "tissue already gives the stiffness of the sheet; remove springs or tissue")
     if sheet.mass is not None:
@@ -146,6 +168,9 @@ def tissue_problems(scene: Scene, fixed: NDArray[np.bool_], factors: Array | Non
             f"{list(sheet.points)} make cells {longest:.3g} times as long as wide, and tissue allows "
             f"{LONGEST_CELL:.3g} times; {remedy}",
         )
+    if tissue.foundation_map is not None and tissue.foundation_stiffness == 0:
+        said = "needs a foundation; set tissue.foundation, such as {young: 15e3, depth: 0.05}, or remove foundation_map"
+        yield Problem(("tissue", "foundation_map"), said)
     if not has_fixed_border(fixed):
         bending = "plate" if tissue.bending == "plate" else f"{tissue.bending:g} N m"
         for name, value in (("pretension", f"{tissue.pretension:g} N/m"), ("bending", bending)):

@@ -17,6 +17,10 @@ A tool that is hardly wider than a cell presses with more or less than its total
 coarser runs press as hard as the first one does, and the part of the total that the first one misses is added to the
 error.
 
+Where tools are moved, they touch more points one by one, and in a coarse run few or none. So the order counts as 1.5 at
+most, and what is told is hardly exceeded: "at most about" (docs/decisions/0027). The runs with fewer points are then
+compared with the run itself, as a coarse pilot may press quite otherwise, and take half its steps.
+
 With `springs`, a sheet with other points is another sheet, so its error is not defined.
 """
 
@@ -32,19 +36,22 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from taichi_msm.errors import SceneError
+from taichi_msm.errors import DivergedError, SceneError
 from taichi_msm.physics.error_control import longest
-from taichi_msm.physics.material import LONGEST_CELL, MapImage, cell_ratio
+from taichi_msm.physics.material import LONGEST_CELL, Maps, cell_ratio
 from taichi_msm.physics.plan import Plan
 from taichi_msm.physics.planning import on, stable_steps, variant
 from taichi_msm.physics.probe_force import sums
-from taichi_msm.physics.solver import Dynamics
+from taichi_msm.physics.rest import sheet_of
 from taichi_msm.progress import Count, Pause
 from taichi_msm.scene import MAX_POINTS, Probe, Scene, Sheet
 from taichi_msm.system.runtime import Device
 
 # Orders between which the three runs are taken to converge.
 LOWEST_ORDER, HIGHEST_ORDER = 1.0, 3.0
+
+# An order above this counts as this where tools are moved.
+WITH_CONTACT = 1.5
 
 # An order above 2 counts as one this much of the difference below 2 (docs/decisions/0022).
 ABOVE = 1 / 4
@@ -73,6 +80,7 @@ class MeshEstimate:
 
     error: float  # largest error, as a fraction of the largest displacement; infinite: not known
     doubt: str = ""  # why it may be larger; empty: it is about that
+    at_most: bool = False  # whether it may be much smaller, because of contact
 
 
 def coarser(plan: Plan) -> Plan | None:
@@ -93,8 +101,10 @@ def coarser(plan: Plan) -> Plan | None:
 
 def _pressing_alike(probe: Probe, sheet: Sheet, other: Sheet) -> Probe:
     """Scale the total of a probe, by less than 2, so that its force on another sheet is that on this one."""
+    if probe.total is None:
+        return probe
     own, there = sums(probe, sheet)[0], sums(probe, other)[0]
-    if probe.total is None or not 0.5 * there < own < 2 * there:
+    if not 0.5 * there < own < 2 * there:
         return probe
     return probe.model_copy(update={"total": tuple(own / there * part for part in probe.total)})
 
@@ -125,14 +135,17 @@ class MeshPilot:
         plans = [coarse] if coarsest is None else [coarse, coarsest]
         self._sheets = []
         for sheet in plans:
-            steps = max(math.ceil(steps / 2), stable_steps(sheet))
+            # Tools must not move too far in a step.
+            least = math.ceil(plan.grid.steps_per_frame / 2) if plan.tools else 1
+            steps = 1 if plan.scene.time.at_rest else max(math.ceil(steps / 2), stable_steps(sheet), least)
             exact = sheet.with_grid(precision="f64", steps_per_frame=steps)
-            self._sheets.append(Dynamics(exact, device, cores=cores))
+            self._sheets.append(sheet_of(exact, device, cores=cores))
         points = [sheet.scene.sheet.points for sheet in (plan, *plans)]
         self._samplings = [CubicSampling(after, before) for before, after in pairwise(points)]
         self._ratio = min((own - 1) / (other - 1) for own, other in zip(*points[:2], strict=True))
         self._differences = [0.0 for _ in plans]
         self._missing = missing_force(plan.scene)
+        self._contact = bool(plan.tools)
         self._largest, self._shortest = 0.0, 1.0
 
     def compile(self) -> None:
@@ -144,7 +157,11 @@ class MeshPilot:
         self._largest = max(self._largest, longest(displacement))
         finer = displacement
         for n, (sheet, sampling) in enumerate(zip(self._sheets, self._samplings, strict=True)):
-            sheet.advance(sheet.plan.grid.steps_per_frame, pause)
+            try:
+                sheet.advance(sheet.plan.grid.steps_per_frame, pause)
+            except DivergedError:  # At rest; then the error is not known.
+                self._differences[n] = math.inf
+                return
             reading = sheet.read()
             with np.errstate(all="ignore"):
                 self._differences[n] = max(self._differences[n], longest(finer - sampling.at(reading.displacement)))
@@ -161,13 +178,15 @@ class MeshPilot:
         order, doubt = None, ""
         if others and first > 0:
             order = math.log(others[0] / first) / math.log(self._ratio) if others[0] > 0 else -math.inf
-        assumed = 1.0 if order is None else max(1.0, min(order, 2 - ABOVE * (order - 2)))
+        assumed = 1.0
+        if order is not None:
+            assumed = max(1.0, min(order, WITH_CONTACT if self._contact else 2 - ABOVE * (order - 2)))
         relative = first / (self._ratio**assumed - 1) / self._largest
-        if order is not None and not LOWEST_ORDER <= order <= HIGHEST_ORDER:
+        if order is not None and not self._contact and not LOWEST_ORDER <= order <= HIGHEST_ORDER:
             doubt = "runs with fewer points do not converge"
         elif self._material.bending == 0 and self._shortest < 1 - self._material.tension - SLACK:
             doubt = "tissue without bending is pressed together, and with more points wrinkles more"
-        return MeshEstimate((2 if doubt else 1) * relative + self._missing, doubt)
+        return MeshEstimate((2 if doubt else 1) * relative + self._missing, doubt, self._contact)
 
 
 def with_points(scene: Scene, points: tuple[int, int]) -> Scene:
@@ -178,13 +197,13 @@ def with_points(scene: Scene, points: tuple[int, int]) -> Scene:
 def choose_points(
     plan: Plan,
     device: Device,
-    check: Callable[[Scene, MapImage | None], Plan],
+    check: Callable[[Scene, Maps | None], Plan],
     progress: Count = lambda done, total: None,
 ) -> tuple[Plan, MeshEstimate]:
     """Find the fewest points, approximately, whose error is within the sheet's tolerance, and this error.
 
     No fewer points than the plan's are tried, and cells keep their shape. `check` plans a scene with other points and
-    the same map; progress counts the frames of each pilot run.
+    the same maps; progress counts the frames of each pilot run.
 
     Raises:
         SceneError: when even the largest possible number of points is too small, or cannot be run.
@@ -195,7 +214,7 @@ def choose_points(
     for _ in range(MOST_TRIALS):
         rows, cols = (round((count - 1) * times) + 1 for count in given)
         try:
-            tried = on(check(with_points(plan.scene, (rows, cols)), plan.image), device.arch)
+            tried = on(check(with_points(plan.scene, (rows, cols)), plan.maps), device.arch)
         except SceneError as error:
             asked = f"with the {rows} x {cols} points that sheet.tolerance: {tolerance:g} asks for"
             raise SceneError([f"{line} ({asked})" for line in error.lines]) from None
@@ -221,7 +240,7 @@ def _estimate(plan: Plan, device: Device, progress: Count) -> MeshEstimate:
     """Run a scene and its pilot in f64, and give the error that the pilot shows."""
     exact, coarse, grid = plan.with_grid(precision="f64"), coarser(plan), plan.grid
     assert coarse is not None
-    own, pilot = Dynamics(exact, device), MeshPilot(exact, coarse, device)
+    own, pilot = sheet_of(exact, device), MeshPilot(exact, coarse, device)
     for frame in range(grid.frames):
         pause = partial(progress, frame, grid.frames)
         pause()

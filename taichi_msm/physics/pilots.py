@@ -23,8 +23,12 @@ COARSEST = 0.6
 FINEST = 64
 
 # Steps of the pilots for the points, for each step of what they are compared with, in steps of the whole sheet: half
-# and a quarter of the cells a side, and of the steps.
-POINTS = 1 / 4 / 2 + 1 / 16 / 4
+# and a quarter of the cells a side, and of the steps; with contact both have half the steps.
+POINTS, POINTS_IN_CONTACT = 1 / 4 / 2 + 1 / 16 / 4, 1 / 4 / 2 + 1 / 16 / 2
+
+
+# Why there is no error of the step where the sheet is at rest.
+AT_REST = "quasistatic"
 
 
 class Pilots(NamedTuple):
@@ -34,16 +38,26 @@ class Pilots(NamedTuple):
     after: int = 0  # steps per frame of the one that follows if the first one shows too large an error; 0: none
     points: bool = False  # whether pilots with fewer points go with the run
     cost: float = 0.0  # of those that go with the run: for each of its steps theirs, in steps of the whole sheet
-    reason: str = ""  # why there are none
+    reason: str = ""  # why there are none for the step
+
+    @property
+    def some(self) -> bool:
+        """Whether there are any."""
+        return self.points or not self.reason
 
 
 def choose_pilots(plan: Plan, *, asked: bool = False) -> Pilots:
-    """Choose the pilots of a run; asked: whatever they cost."""
+    """Choose the pilots of a run; asked: whatever they cost. At rest there are none for a step."""
+    if plan.scene.time.at_rest:
+        tells = plan.scene.tissue is not None and (asked or affords_pilots(plan, POINTS))
+        return Pilots(points=tells, cost=POINTS if tells else 0.0, reason=AT_REST)
     own, coarse, fine = plan.grid.steps_per_frame, coarse_steps(plan), fine_steps(plan)
-    points = POINTS if plan.scene.tissue is not None else 0.0
+    points = (POINTS_IN_CONTACT if plan.tools else POINTS) if plan.scene.tissue is not None else 0.0
     # Beside a run in f32 a fine pilot has another one with the run's own steps.
     fine_cost = fine / own + (plan.grid.precision == "f32")
     first = (1 + points) * coarse / own if coarse else fine_cost + points
+    if coarse and plan.tools:
+        first = coarse / own + points  # Those for the points are compared with the run, not with the coarse pilot.
     if not asked and not affords_pilots(plan, first):
         return Pilots(reason="it would take more than two fifths of the run; to have it anyway, pass --estimate-error")
     if not coarse:

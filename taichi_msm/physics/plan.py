@@ -9,7 +9,8 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from taichi_msm.physics.material import MapImage, Material, has_fixed_border
+from taichi_msm.physics.material import Maps, Material, has_fixed_border
+from taichi_msm.physics.paths import Tool, tools_of
 from taichi_msm.physics.probe_force import control_points
 from taichi_msm.scene import Probe, Scene, Sheet
 from taichi_msm.timegrid import TimeGrid
@@ -54,12 +55,14 @@ class ProbeSlot:
 
 
 def probe_slots(probes: Sequence[Probe], sheet: Sheet, h: float) -> tuple[ProbeSlot, ...]:
-    """List the slots of all probes.
+    """List the slots of all probes that exert a force.
 
     h: half-width of the hat, which is the step [s]; 0 if loads are not averaged: every probe then has one slot.
     """
     slots = []
     for index, probe in enumerate(probes):
+        if probe.moved:
+            continue
         times, points = control_points(probe, sheet)
         jumps = np.flatnonzero((times[1:] == times[:-1]) & (points[1:] != points[:-1]).any(axis=1)) + 1
         parts = zip(np.split(times, jumps), np.split(points, jumps), strict=True)
@@ -72,17 +75,23 @@ def probe_slots(probes: Sequence[Probe], sheet: Sheet, h: float) -> tuple[ProbeS
     return tuple(slots)
 
 
+def slots_of(scene: Scene, grid: TimeGrid) -> tuple[ProbeSlot, ...]:
+    """List the slots of a scene's probes; at rest loads are not averaged."""
+    return probe_slots(scene.probes, scene.sheet, 0.0 if scene.time.at_rest else grid.step)
+
+
 @dataclass(frozen=True, eq=False)
 class Plan:
     """What a scene comes to; `planning.make_plan` makes it."""
 
     scene: Scene  # as it was given
-    image: MapImage | None  # of its map; None: it has none
+    maps: Maps  # the files of its maps
     fixed: NDArray[np.bool_]  # which points are fixed, shape (rows, cols)
-    material: Material  # what the sheet is made of, with the map as an array
+    material: Material  # what the sheet is made of, with its maps as arrays
     stable_step: float  # the largest stable step [s]; infinite where nothing oscillates
     grid: TimeGrid  # the steps
-    slots: tuple[ProbeSlot, ...]  # the places where probes act
+    slots: tuple[ProbeSlot, ...]  # the places where probes act with a force
+    tools: tuple[Tool, ...]  # the probes that are moved
 
     @property
     def open_edges(self) -> bool:
@@ -94,9 +103,10 @@ class Plan:
         grid = replace(self.grid, **changes)
         if grid.step == self.grid.step:
             return replace(self, grid=grid)
-        return replace(self, grid=grid, slots=probe_slots(self.scene.probes, self.scene.sheet, grid.step))
+        return replace(self, grid=grid, slots=slots_of(self.scene, grid))
 
     def with_probes(self, probes: Sequence[Probe | Mapping[str, Any]]) -> Plan:
         """Replace the probes; SceneError: one of them is not a probe."""
         scene = self.scene.model_copy(update={"probes": tuple(probes)})
-        return replace(self, scene=scene, slots=probe_slots(scene.probes, scene.sheet, self.grid.step))
+        tools = tools_of(scene.probes, scene.sheet)
+        return replace(self, scene=scene, slots=slots_of(scene, self.grid), tools=tools)

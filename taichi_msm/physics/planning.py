@@ -13,8 +13,9 @@ from numpy.typing import NDArray
 from taichi_msm.errors import Problem, SceneError
 from taichi_msm.physics import workload
 from taichi_msm.physics.lattice import fixed_points, spacing
-from taichi_msm.physics.material import MapImage, Material, kind_problems, read_map, tissue_problems
-from taichi_msm.physics.plan import Plan, probe_slots
+from taichi_msm.physics.material import MapImage, Maps, Material, kind_problems, read_map, tissue_problems
+from taichi_msm.physics.paths import path_problems, tools_of
+from taichi_msm.physics.plan import Plan, slots_of
 from taichi_msm.physics.terms import highest_frequency, material_of
 from taichi_msm.picture import PictureError
 from taichi_msm.scene import WHOLE, Scene, Sheet, Time
@@ -27,59 +28,67 @@ SMALLEST_SINGLE, LARGEST_SINGLE = 1e-15, 1e17
 SLACK = 1 - 1e-12
 
 
-def make_plan(scene: Scene, image: MapImage | None = None) -> Plan:
+def make_plan(scene: Scene, maps: Maps | None = None) -> Plan:
     """Plan a scene for a CPU as `try_plan` does; SceneError: with all that makes its sheet or its steps impossible."""
-    plan, problems = try_plan(scene, image)
+    plan, problems = try_plan(scene, maps)
     if plan is None or problems:
         raise SceneError([str(problem) for problem in problems])
     return plan
 
 
-def try_plan(scene: Scene, image: MapImage | None = None) -> tuple[Plan | None, list[Problem]]:
+def try_plan(scene: Scene, maps: Maps | None = None) -> tuple[Plan | None, list[Problem]]:
     """Plan a scene for a CPU, None where there can be no plan, and find what is wrong with its sheet and its steps.
 
     Args:
         scene: whose keys are valid each by itself.
-        image: of its map, from the plan of a scene with the same map; None: it is read.
+        maps: from the plan of a scene with the same maps; None: they are read.
     """
     problems = list(kind_problems(scene))
     if problems:
         return None, problems
-    if scene.stiffness_map is not None and image is None:
-        try:
-            image = read_map(scene.stiffness_map)
-        except PictureError as error:
-            problems.append(Problem((scene.kind, "map", "image"), str(error)))
-    fixed, material = fixed_points(scene.sheet), _material(scene, image)
+    if maps is None:
+        maps, unreadable = _read_maps(scene)
+        problems += unreadable
+    fixed, material = fixed_points(scene.sheet), material_of(scene, maps)
     problems += tissue_problems(scene, fixed, material.factors)
     if problems:
         return None, problems
-    plan = _plan(scene, image, fixed, material)
-    return plan, list(_step_problems(plan))
+    plan = _plan(scene, maps, fixed, material)
+    return plan, [*_step_problems(plan), *path_problems(scene, plan.tools, plan.grid)]
 
 
 def variant(plan: Plan, scene: Scene) -> Plan:
-    """Plan a scene that a valid one was turned into, with its map, without looking for what is wrong with it."""
-    return _plan(scene, plan.image, fixed_points(scene.sheet), _material(scene, plan.image))
+    """Plan a scene that a valid one was turned into, with its maps, without looking for what is wrong with it."""
+    return _plan(scene, plan.maps, fixed_points(scene.sheet), material_of(scene, plan.maps))
 
 
-def _material(scene: Scene, image: MapImage | None) -> Material:
-    return material_of(scene, image if scene.stiffness_map is not None else None)
+def _read_maps(scene: Scene) -> tuple[dict[str, MapImage], list[Problem]]:
+    """Read the maps of a scene, and find those that cannot be read."""
+    maps, problems = {}, []
+    for name, one in scene.maps.items():
+        try:
+            maps[name] = read_map(one)
+        except PictureError as error:
+            problems.append(Problem((scene.kind, name, "image"), str(error)))
+    return maps, problems
 
 
-def _plan(scene: Scene, image: MapImage | None, fixed: NDArray[np.bool_], material: Material) -> Plan:
+def _plan(scene: Scene, maps: Maps, fixed: NDArray[np.bool_], material: Material) -> Plan:
     limit = stable_step(material, scene.sheet, scene.time.damping_difference)
     grid = TimeGrid(scene.time.frames_per_second, scene.time.frames, steps_per_frame(scene.time, limit), "f64")
-    slots = probe_slots(scene.probes, scene.sheet, grid.step)
-    return on(Plan(scene, image, fixed, material, limit, grid, slots), "cpu")
+    tools = tools_of(scene.probes, scene.sheet)
+    return on(Plan(scene, maps, fixed, material, limit, grid, slots_of(scene, grid), tools), "cpu")
 
 
 def on(plan: Plan, arch: str) -> Plan:
     """Choose the precision for an arch, unless the scene gives it.
 
-    A tolerance asks for f64; so does `auto` where it is a small part of the run. On a GPU f64 is slow or missing.
+    A tolerance asks for f64; so does `auto` where it is a small part of the run. On a GPU f64 is slow or missing. At
+    rest it is always f64.
     """
     time = plan.scene.time
+    if time.at_rest:
+        return plan.with_grid(precision="f64")
     if time.precision != "auto":
         return plan.with_grid(precision=time.precision)
     in_f64 = arch == "cpu" and (time.tolerance is not None or workload.is_small_in_f64(plan))
@@ -106,8 +115,10 @@ def steps_per_frame(time: Time, limit: float) -> int:
     """Count the steps of one frame.
 
     auto: the fewest whose step is at most half the stability limit. A given step is rounded to a fraction of a frame.
-    A tolerance may ask for more steps, which `error_control.choose_step` finds.
+    A tolerance may ask for more steps, which `error_control.choose_step` finds. At rest a frame counts as a step.
     """
+    if time.at_rest:
+        return 1
     frame = 1 / time.frames_per_second
     if time.step == "auto":
         return max(1, math.ceil(2 * frame / limit * SLACK))
@@ -132,6 +143,8 @@ def with_chosen_grid(plan: Plan) -> Plan:
 
 def _step_problems(plan: Plan) -> Iterator[Problem]:
     """Find a given step that is unstable or does not divide a frame, and what would overflow or vanish in f32."""
+    if plan.scene.time.at_rest:
+        return
     given, limit, frame = plan.scene.time.step, plan.stable_step, 1 / plan.grid.frames_per_second
     if given == "auto":
         pass

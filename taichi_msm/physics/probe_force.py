@@ -78,7 +78,11 @@ def control_points(probe: Probe, sheet: Sheet) -> tuple[Array, Array]:
 
 def control_point(probe: Probe, sheet: Sheet, time: float) -> Array:
     """Give a probe's control point at a time, x and y at rest [m], shape (2,); where it jumps, the one it jumps to."""
-    times, points = control_points(probe, sheet)
+    return point_at(*control_points(probe, sheet), time)
+
+
+def point_at(times: Array, points: Array, time: float) -> Array:
+    """Give the control point with these keys at a time [s], as `control_point` does."""
     # Times of frames are rounded.
     after = int(np.searchsorted(times, time + SAME_TIME * max(1.0, abs(time)), side="right"))
     if after in (0, len(times)):
@@ -119,18 +123,26 @@ def sums(probe: Probe, sheet: Sheet, finer: int = 1) -> tuple[float, float]:
     return force * total / finer**2, force * largest / (dx * dy)
 
 
-class ProbeRecord(TypedDict):
-    """The forces of a probe at 100 %, at the first place of its control point."""
+class ProbeRecord(TypedDict, total=False):
+    """The forces of a probe."""
 
+    # Those of a load at 100 %, at the first place of the control point; a tool that is moved has none.
     total_force: float  # sum over all points [N]
     flat_end_force: float  # the part of a `total` that acts under the tool's flat end, on a wide sheet [N]
     largest_pressure: float  # largest force on a point per area that belongs to it [Pa]
+    # Of a run, the force on the points that are not fixed at the frame at which it is greatest.
+    greatest_force: float  # [N]
+    greatest_force_vector: Sequence[float]  # x, y and z [N]
+    greatest_force_time: float  # [s]
 
 
 def probe_records(scene: Scene) -> list[ProbeRecord]:
-    """Sum the forces of every probe of a scene."""
-    records = []
+    """Sum the forces of every probe of a scene; nothing of one that is moved."""
+    records: list[ProbeRecord] = []
     for probe in scene.probes:
+        if probe.moved:
+            records.append(ProbeRecord())
+            continue
         flat, (total, pressure) = 0.0, sums(probe, scene.sheet)
         if probe.total is not None:
             flat = math.hypot(*probe.total) * math.pi * probe.radius * probe.radius / spread(probe)
@@ -139,7 +151,10 @@ def probe_records(scene: Scene) -> list[ProbeRecord]:
 
 
 def in_words(record: ProbeRecord) -> str:
-    """Describe the forces of a probe in a line."""
+    """Describe the forces of a probe in a line; empty if nothing is known of them."""
+    if "total_force" not in record:
+        known = "greatest_force" in record
+        return f"at most {record['greatest_force']:.3g} N, at {record['greatest_force_time']:.3g} s" if known else ""
     flat = f", {record['flat_end_force']:.3g} N of it under the flat end" if record["flat_end_force"] > 0 else ""
     return f"{record['total_force']:.3g} N in all{flat}, at most {record['largest_pressure'] / 1000:.3g} kPa"
 
@@ -149,6 +164,8 @@ def force_notes(scene: Scene, records: Sequence[ProbeRecord]) -> Iterator[str]:
     across, down = spacing(scene.sheet)
     cell = f"a cell of {across:.3g} x {down:.3g} m"
     for index, (probe, record) in enumerate(zip(scene.probes, records, strict=True)):
+        if probe.moved:
+            continue
         asked, reaching = math.hypot(*probe.total) if probe.total is not None else 0.0, record["total_force"]
         if asked > 0 and reaching <= LEAST_REACHING * asked:
             yield (

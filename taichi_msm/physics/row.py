@@ -5,32 +5,36 @@ every operation is one vector instruction. The first and the last entry of a row
 end of the strips, shifted by one lane. The force of a spring between this row and the next one is added to this row at
 once and carried to the next; the force of a spring along the row is carried to the next entry. After that no other row
 depends on the old displacements of this row, so it is stepped in place.
+
+Tools that are moved then push the points out of their rods, in the rows that they reach.
 """
 
 # No `from __future__ import annotations` here: Taichi reads the annotations of a kernel.
 
 from collections.abc import Callable
 
-from taichi_msm.physics.kernel import point_step
+from taichi_msm.physics.terms.contact import ContactTerm
 from taichi_msm.physics.terms.springs import SpringTerm
 from taichi_msm.physics.terms.term import DX, DY, HAS_LEFT, HAS_RIGHT, Entry, StepCode
 from taichi_msm.system.runtime import ti
 
 
-def row_passing(code: StepCode) -> Callable[..., None]:
-    """Make the function that goes through a row and steps it."""
+def row_passing(code: StepCode, move: Callable[..., None]) -> Callable[..., None]:
+    """Make the function that goes through a row and moves it.
+
+    move(sheet, entry, target, force, now) does so with an entry, given the force of its springs: see `point_step`.
+    """
     vector, columns, springs = code.vector, code.first_column(None), code.require(SpringTerm)
     structural, shear = springs.structural, springs.shear
     leaves_out = springs.open_edges and not springs.mapped
     along, to_other_row, of_row, of_column, of_diagonal = springs.between(code)
-    move = point_step(code)
 
     @ti.func
     def pass_row(
         sheet: ti.template(), carried: ti.template(), carried_row, line: ti.template(), here, next_row, exists, up,
         loads: ti.template(), n, moving,
     ):  # fmt: skip
-        """Go through row `line`, in row `here` of u, and step it if `moving`.
+        """Go through row `line`, in row `here` of u, and move it if `moving`.
 
         The other row, `next_row` of u, is `up` above this one [m]; exists: 0 if there is none, else 1. `carried_row` is
         the row of the forces carried from row to row, and n that of the table of loads.
@@ -117,3 +121,26 @@ def row_passing(code: StepCode) -> Callable[..., None]:
             carried[c][carry + strip] = this[c]
 
     return pass_row
+
+
+def row_touching(code: StepCode, contact: ContactTerm) -> Callable[..., None]:
+    """Make the function that resolves the contact of a row with all tools, if one reaches it."""
+    columns, resolve, reaches = code.first_column(None), contact.resolving(code), contact.reaching(code)
+
+    @ti.func
+    def touch_row(sheet: ti.template(), i, kind, loads: ti.template(), n):
+        """Resolve the contact of row i after step n of the launch."""
+        now = [loads[n, c] for c in ti.static(range(columns))]
+        at = i * sheet.width
+        # Smallest and largest displacements along y and z.
+        least, most = [[sheet.u[c][at + 1] for c in ti.static((1, 2))] for _ in ti.static(range(2))]
+        for b in range(2, sheet.width - 1):
+            for n in ti.static(range(2)):
+                value = sheet.u[n + 1][at + b]
+                least[n], most[n] = ti.min(least[n], value), ti.max(most[n], value)
+        low, high = [least[0].min(), least[1].min()], [most[0].max(), most[1].max()]
+        if reaches(sheet, i, low, high, now):
+            for b in range(1, sheet.width - 1):
+                resolve(sheet, i, kind, i, b, now)
+
+    return touch_row

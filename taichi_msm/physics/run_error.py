@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 
 from numpy.typing import NDArray
 
-from taichi_msm.physics.error_control import Estimate, Pilot
+from taichi_msm.physics.error_control import Estimate, Pilot, reconcile
 from taichi_msm.physics.mesh_error import MeshEstimate, MeshPilot, coarser
 from taichi_msm.physics.pilots import ENOUGH, Pilots
 from taichi_msm.physics.plan import Plan
@@ -41,9 +41,12 @@ class RunError:
         self._plan, self._pilots, self._known = plan, pilots, known
         self._device, self._cores = device, cores
         self._coarse = known.estimate is None and 0 < pilots.beside < plan.grid.steps_per_frame
-        self._time = Pilot(plan, pilots.beside, device, cores) if known.estimate is None else None
+        tells_time = known.estimate is None and not pilots.reason
+        self._time = Pilot(plan, pilots.beside, device, cores) if tells_time else None
         coarse = coarser(plan) if pilots.points and known.mesh is None else None
-        beside = plan.with_grid(steps_per_frame=pilots.beside) if self._coarse else plan
+        # Otherwise it is compared with the run itself.
+        self._mesh_beside_coarse = self._coarse and not plan.tools
+        beside = plan.with_grid(steps_per_frame=pilots.beside) if self._mesh_beside_coarse else plan
         self._mesh = None if coarse is None else MeshPilot(beside, coarse, device, cores)
 
     def compile(self) -> None:
@@ -57,7 +60,8 @@ class RunError:
         if self._time is not None:
             self._time.follow(displacement, pause)
         if self._mesh is not None:
-            self._mesh.follow(self._time.displacement if self._time and self._coarse else displacement, pause)
+            beside = self._time.displacement if self._time and self._mesh_beside_coarse else displacement
+            self._mesh.follow(beside, pause)
 
     def finish(self, displacements: Iterator[NDArray[Any]] | None, progress: Count) -> None:
         """After the last frame, take a finer pilot where the coarse one shows an error that matters.
@@ -70,7 +74,7 @@ class RunError:
         fine = Pilot(self._plan, self._pilots.after, self._device, self._cores)
         for frame, displacement in enumerate(displacements or self._repeated(), 1):
             fine.follow(displacement, partial(progress, frame, frames))
-        self._known = self._known._replace(estimate=fine.estimate)
+        self._known = self._known._replace(estimate=reconcile(self._time.estimate, fine.estimate))
 
     def _repeated(self) -> Iterator[NDArray[Any]]:
         """Run the scene again; give the displacements of its frames."""
@@ -86,8 +90,9 @@ class RunError:
         if known.estimate is None and self._time is not None:
             estimate = self._time.estimate
             # What a coarse pilot tells of a run in f32 is an upper bound.
-            at_least = self._coarse and estimate.parted and ENOUGH <= estimate.error < math.inf
-            known = known._replace(estimate=replace(estimate, at_least=at_least))
+            if self._coarse and estimate.parted and ENOUGH <= estimate.error < math.inf:
+                estimate = replace(estimate, at_least=True)
+            known = known._replace(estimate=estimate)
         if self._mesh is not None:
             known = known._replace(mesh=self._mesh.estimate)
         return known

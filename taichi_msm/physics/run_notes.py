@@ -10,14 +10,19 @@ from taichi_msm.physics import probe_force
 from taichi_msm.physics.error_control import Estimate
 from taichi_msm.physics.material import has_fixed_border
 from taichi_msm.physics.mesh_error import MeshEstimate
+from taichi_msm.physics.paths import path_notes
+from taichi_msm.physics.pilots import AT_REST
 from taichi_msm.physics.plan import Plan
 from taichi_msm.physics.probe_force import ProbeRecord
 from taichi_msm.physics.state import RunProgress
-from taichi_msm.scene import MAX_POINTS
+from taichi_msm.scene import MAX_POINTS, Foundation
 
 # The stability limit holds while no spring is compressed below this share of its rest length (see
 # `SpringTerm.bound`).
 SHORTEST = 0.5
+
+# Tissue that is compressed by more than this share of its depth gets much stiffer, which the foundation does not.
+DEEPEST = 1 / 3
 
 # No tissue can be stretched to more than this many times its rest length.
 LONGEST = 2.0
@@ -40,23 +45,36 @@ def run_notes(
         yield error(estimate, mesh)
         if WRONG < estimate.error < math.inf:
             wrong = float(f"{100 * estimate.error:.2g}")
-            bound = "about" if estimate.parted else "up to"
+            at_most = (estimate.at_most and not estimate.at_least) or not estimate.parted
+            bound = "up to" if at_most else "about"
             yield f"the run is {bound} {wrong:g} % wrong; {_remedy(plan, estimate)}"
+    elif reason == AT_REST:
+        points = f", {_size(mesh)} of the largest displacement due to the number of points" if mesh is not None else ""
+        yield f"error: none due to a time step, as the sheet is at rest{points}"
     elif reason:
         if mesh is None:
             yield f"error not estimated: {reason}"
         else:
             yield f"error {_size(mesh)} due to the number of points; due to the time step not estimated: {reason}"
     yield from probe_force.force_notes(scene, probes)
+    yield from path_notes(scene, plan.tools)
     if mesh is not None and mesh.doubt:
         yield f"the error due to the number of points may be larger: {mesh.doubt}"
     if mesh is not None and WRONG < mesh.error < math.inf:
         wrong, cut = float(f"{100 * mesh.error:.2g}"), math.sqrt(mesh.error / (WRONG / 2))
         finer = [min(MAX_POINTS, math.ceil((count - 1) * cut) + 1) for count in scene.sheet.points]
         remedy = f"; try sheet.points: {finer}" if max(finer) < MAX_POINTS else ""
-        yield f"so few points make the run {'at least' if mesh.doubt else 'up to'} {wrong:g} % wrong{remedy}"
+        bound = ("roughly" if mesh.at_most else "at least") if mesh.doubt else "up to"
+        yield f"so few points make the run {bound} {wrong:g} % wrong{remedy}"
     if progress.max_displacement == 0 and progress.frame > 0:
         yield "nothing moved: does a probe press where and when it should?"
+    below = scene.tissue.foundation if scene.tissue is not None else None
+    if isinstance(below, Foundation) and progress.deepest > DEEPEST * below.depth:
+        yield (
+            f"the sheet was pressed {1000 * progress.deepest:.3g} mm into the {1000 * below.depth:.3g} mm of "
+            "tissue.foundation.depth: beyond a third tissue gets much stiffer than this foundation, and the true dent "
+            "is less deep; press less"
+        )
     if progress.longest_spring > LONGEST:
         yield (
             f"a spring was stretched to {progress.longest_spring:.2g} times its rest length, which no tissue "
@@ -79,7 +97,7 @@ def error(estimate: Estimate, mesh: MeshEstimate | None = None) -> str:
     """Say how wrong a run is."""
     if estimate.error == math.inf:
         return "error not known: a pilot run diverged, or steps do not resolve the damping"
-    bound = "at least " if estimate.at_least else "" if estimate.parted else "at most about "
+    bound = _bound(estimate.at_most or not estimate.parted, estimate.at_least)
     parts = [f"{bound}{estimate.in_f64:.1g} due to the time step"]
     if not estimate.parted:
         parts = [f"{bound}{estimate.error:.1g} due to the time step and rounding"]
@@ -94,7 +112,13 @@ def error(estimate: Estimate, mesh: MeshEstimate | None = None) -> str:
 
 def _size(mesh: MeshEstimate) -> str:
     """Say how large the error is that the number of points makes."""
-    return f"{'at least ' if mesh.doubt else ''}{mesh.error:.2g}" if mesh.error < math.inf else "an unknown part"
+    bound = _bound(mesh.at_most, bool(mesh.doubt))
+    return f"{bound}{mesh.error:.2g}" if mesh.error < math.inf else "an unknown part"
+
+
+def _bound(at_most: bool, at_least: bool) -> str:
+    """Say whether an error may be smaller or larger than what is told; if it may be both, it is known roughly."""
+    return ("roughly " if at_least else "at most about ") if at_most else "at least " if at_least else ""
 
 
 def _remedy(plan: Plan, estimate: Estimate) -> str:

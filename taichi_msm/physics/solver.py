@@ -18,13 +18,15 @@ from taichi_msm.physics.kernel import BYTES, SheetLayout, Start, StepKernel
 from taichi_msm.physics.kernel_cpu import Scatter
 from taichi_msm.physics.kernel_gpu import STEPS_PER_LAUNCH, Gather
 from taichi_msm.physics.lattice import axes, spacing
-from taichi_msm.physics.loads import schedule
+from taichi_msm.physics.loads import Schedule, schedule
 from taichi_msm.physics.material import area_shares
 from taichi_msm.physics.plan import Plan
+from taichi_msm.physics.pushes import sum_pushes
 from taichi_msm.physics.state import Reading, State
 from taichi_msm.physics.terms import terms_of
+from taichi_msm.physics.terms.contact import ContactTerm
 from taichi_msm.physics.terms.damping import coefficients
-from taichi_msm.physics.terms.probes import ProbeTerm, standing, standing_decays
+from taichi_msm.physics.terms.probes import ProbeTerm, standing
 from taichi_msm.physics.terms.springs import LEAST, MOST, SpringTerm
 from taichi_msm.physics.terms.term import ACROSS, AREA, COLUMN_ROWS, GAIN, HAS_LEFT, HAS_RIGHT, MOTION, MOVES, StepCode
 from taichi_msm.progress import Pause
@@ -58,7 +60,11 @@ def layout_of(plan: Plan, device: Device, cores: int | None = None) -> SheetLayo
     """
     (rows, cols), fixed, precision = plan.scene.sheet.points, plan.fixed, plan.grid.precision
     fixed_rows = bool(fixed[0].all()), bool(fixed[-1].all())
-    if device.arch == "cpu":
+    if plan.scene.time.at_rest:
+        if device.arch != "cpu":
+            raise DeviceError(f"--arch {device.arch}: time.motion: quasistatic runs on a CPU only; take --arch cpu")
+        workers = 1
+    elif device.arch == "cpu":
         # Workers wait by spinning, so more workers than cores would only hold each other up.
         cores = min(device.threads, available_threads() if cores is None else cores)
         workers = max(1, min(cores, rows * cols // POINTS_PER_WORKER, (rows - sum(fixed_rows)) // 2))
@@ -106,7 +112,7 @@ class Dynamics:
         self.structure = self._layout or layout_of(plan, self._device, self._cores)
         self._real = np.dtype(np.float32 if self.structure.code.precision == "f32" else np.float64)
         self.steps_done, self.torn = 0 if state is None else state.steps, True
-        self._first_tabled, self._loads = self.steps_done, self._table(self.steps_done, STEPS_PER_TABLE)
+        self._tabulate(STEPS_PER_TABLE)
         self._place(state)
         self.torn = False
 
@@ -117,6 +123,7 @@ class Dynamics:
             ArgumentError: when the new probes need another kernel.
         """
         probes, before = ProbeTerm.of(plan), self.structure.code.require(ProbeTerm)
+        tools, compiled = ContactTerm.of(plan), self.structure.code.get(ContactTerm)
         if probes.moves != before.moves:
             raise ArgumentError(
                 f"probes: which control points move or jump cannot change (before: {_in_words(before.moves)}; now: "
@@ -124,14 +131,21 @@ class Dynamics:
             )
         if probes.by_area != before.by_area:
             raise ArgumentError("probes: one has total instead of force, or the reverse; restart with the new scene")
+        if [tool.probe for tool in plan.tools] != [tool.probe for tool in self.plan.tools]:
+            raise ArgumentError("probes: which of them have a path cannot change; restart with the new scene")
+        if tools and compiled and not tools.is_compiled_in(compiled):
+            raise ArgumentError(
+                "probes: friction and grips cannot be added where there were none; restart with the new scene, such as "
+                "with a friction of 1e-9, or with a grip that ends before the start"
+            )
         if standing(plan) != standing(self.plan):
-            self._moving.arrays.set_decay(standing_decays(plan))
+            self._moving.arrays.set_fields(self.structure.code.first_field(ProbeTerm), probes.fields(plan))
         self.plan = plan
         # A caller that steers will steer again in a frame, so no more loads than those of a frame are tabulated.
-        self._first_tabled, self._loads = self.steps_done, self._table(self.steps_done, plan.grid.steps_per_frame)
+        self._tabulate(plan.grid.steps_per_frame)
 
     def advance(self, steps: int, pause: Pause = lambda: None) -> None:
-        """Take a number of steps, with a pause after every launch.
+        """Take a number of steps, with a pause after every launch. Where it begins at a frame, forces are counted anew.
 
         An exception from it stops the sheet there; another call continues.
 
@@ -145,6 +159,8 @@ class Dynamics:
         if self.structure.workers == 0:
             most = STEPS_PER_LAUNCH
         self._require_whole()
+        if steps and self.steps_done % self.plan.grid.steps_per_frame == 0:
+            sum_pushes(self.structure, self._moving.arrays, clear=True)
         end = self.steps_done + steps
         while self.steps_done < end:
             count = min(most, end - self.steps_done)
@@ -159,6 +175,7 @@ class Dynamics:
         """Compile the step and the read-out without moving anything."""
         self._moving.compile(self._loads)
         self.displacement()
+        self.tool_forces()
 
     def displacement(self) -> NDArray[Any]:
         """Read the displacements x - X [m], shape (rows, cols, 3), in the scene's precision."""
@@ -167,7 +184,8 @@ class Dynamics:
     def state(self) -> State:
         """Read everything that the next steps depend on."""
         self._require_whole()
-        return State(self.steps_done, self._copy(differences=False)[0], self._copy(differences=True)[0])
+        u, d = self._copy(differences=False)[0], self._copy(differences=True)[0]
+        return State(self.steps_done, u, d, self._contact())
 
     def read(self) -> Reading:
         """Read the displacements and measure the sheet, in the scene's precision."""
@@ -180,11 +198,15 @@ class Dynamics:
             math.sqrt(max(0.0, 1.0 + float(extreme))) for extreme in (springs[:, LEAST].min(), springs[:, MOST].max())
         )
         sums = measures.sum(axis=0, dtype=np.float64)
-        energy = plan.material.mass * float(sums[MOTION]) / plan.grid.step**2
+        energy = self._of_motion(sums)
         for term in code.terms:
             first = code.first_measure(type(term))
             energy += term.energy(sums[first : first + len(term.reductions)], plan)
         return Reading(self.steps_done, displacement, shortest, longest, energy / 2)
+
+    def _of_motion(self, sums: NDArray[Any]) -> float:
+        """Give twice the energy of motion [J], from the measures summed up."""
+        return self.plan.material.mass * float(sums[MOTION]) / self.plan.grid.step**2
 
     def _copy(self, *, differences: bool) -> tuple[NDArray[Any], NDArray[Any]]:
         """Copy the displacements or the differences, and the measures of every row."""
@@ -192,6 +214,24 @@ class Dynamics:
         values, measures = np.empty((rows, cols, 3), self._real), np.empty((rows, code.first_measure(None)), self._real)
         self._moving.read(differences, values, measures)
         return values, measures
+
+    def tool_forces(self) -> NDArray[np.float64]:
+        """Give at a frame the mean force of each tool since the frame before [N], shape (tools, 3).
+
+        It is the sum of m push (1 + g h / 2) / h^2 over the points and the steps, or of m push / h^2 with backward
+        differences, by the number of steps; m is the mass of a point.
+        """
+        _, gain, _ = coefficients(self.plan)
+        sums = sum_pushes(self.structure, self._moving.arrays, clear=False)
+        return sums / (gain * self.plan.grid.steps_per_frame)
+
+    def _contact(self) -> NDArray[Any]:
+        """Read the fields of contact, shape (fields, rows, cols)."""
+        code = self.structure.code
+        contact = code.get(ContactTerm)
+        if contact is None:
+            return np.empty((0, self.structure.rows, self.structure.cols), self._real)
+        return self._moving.arrays.get_fields(code.first_field(ContactTerm), contact.field_count)
 
     def _require_whole(self) -> None:
         if self.torn:
@@ -211,20 +251,29 @@ class Dynamics:
         done = self.steps_done - self._first_tabled
         if done + count > len(self._loads):
             done = 0
-            self._first_tabled = self.steps_done
-            self._loads = self._table(self.steps_done, max(count, STEPS_PER_TABLE))
+            self._tabulate(max(count, STEPS_PER_TABLE))
         return self._loads[done : done + count]
+
+    def _tabulate(self, count: int) -> None:
+        """Tabulate the loads of the next steps."""
+        self._first_tabled, self._loads = self.steps_done, self._table(self.steps_done, count)
 
     def _table(self, first: int, count: int) -> NDArray[Any]:
         """Tabulate the loads of steps first, ..., first + count - 1, shape (count, columns)."""
-        plan, code, loads = self.plan, self.structure.code, schedule(self.plan, first, count)
-        table, (_, gain, first_gain) = np.empty((count, code.first_column(None))), coefficients(plan)
+        _, gain, first_gain = coefficients(self.plan)
+        table = self._columns(schedule(self.plan, first, count), first)
         table[:, GAIN] = gain
         if first == 0:
             table[0, GAIN] = first_gain
+        return table
+
+    def _columns(self, loads: Schedule, first: int) -> NDArray[Any]:
+        """Tabulate the loads from step `first` on, shape (their number, columns), without a gain."""
+        code = self.structure.code
+        table = np.zeros((len(loads.active), code.first_column(None)))
         for term in code.terms:
             first_column = code.first_column(type(term))
-            table[:, first_column : first_column + term.column_count] = term.columns(plan, loads)
+            table[:, first_column : first_column + term.column_count] = term.columns(self.plan, loads, first)
         # Loads too large for f32 become infinite; the next reading of the sheet shows it.
         with np.errstate(over="ignore"):
             return table.astype(self._real)
@@ -238,15 +287,24 @@ class Dynamics:
         shares = areas[kinds] if layout.code.by_area else np.ones((3, layout.cols))
         by_column = np.empty((COLUMN_ROWS, layout.cols))
         by_column[MOVES : MOVES + 3] = moves[kinds] / shares
-        by_column[AREA : AREA + 3] = areas[kinds]
+        # Springs along columns ask for the shares of a row in between even where there is none.
+        by_column[AREA : AREA + 3] = areas[0], 2 * areas[0], areas[-1]
         by_column[ACROSS] = axes(sheet)[0]
         by_column[HAS_LEFT] = column > 0
         by_column[HAS_RIGHT] = column < layout.cols - 1
         numbers = *spacing(sheet), sheet.size[0] / 2, *(n for term in layout.code.terms for n in term.numbers(plan))
+        fields = np.concatenate([term.fields(plan) for term in layout.code.terms])
+        if state is not None and len(state.contact):
+            first = layout.code.first_field(ContactTerm)
+            fields[first : first + len(state.contact)] = state.contact
         stiffness = layout.code.require(SpringTerm).laid_out(plan)
         self._sheet = None  # Frees its memory before another sheet takes some.
-        kind: type[StepKernel] = Scatter if layout.workers else Gather
-        self._sheet = kind(layout, Start(np.array(numbers), by_column, standing_decays(plan), stiffness, state))
+        self._sheet = self._started(Start(np.array(numbers), by_column, fields, stiffness, state))
+
+    def _started(self, start: Start) -> StepKernel:
+        """Make the form of the kernel that the device takes."""
+        kind: type[StepKernel] = Scatter if self.structure.workers else Gather
+        return kind(self.structure, start)
 
 
 def _in_words(moves: tuple[bool, ...]) -> str:

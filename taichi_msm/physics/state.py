@@ -5,7 +5,10 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
+import numpy as np
 from numpy.typing import NDArray
+
+from taichi_msm.scene import Probe
 
 
 class State(NamedTuple):
@@ -14,6 +17,7 @@ class State(NamedTuple):
     steps: int  # number of steps taken, n
     displacement: NDArray[Any]  # u_n [m], shape (rows, cols, 3)
     difference: NDArray[Any]  # d_n = u_n - u_{n-1} [m], shape (rows, cols, 3)
+    contact: NDArray[Any] = np.empty((0, 0, 0))  # fields of `terms.contact`, shape (fields, rows, cols)
 
 
 class Reading(NamedTuple):
@@ -25,6 +29,9 @@ class Reading(NamedTuple):
     shortest_spring: float
     longest_spring: float
     energy: float  # kinetic energy and that of springs and bending, without the virtual springs [J]
+    # At rest: the largest force left on a point, as a share of the largest force; evaluations of the forces for it.
+    residual: float = 0.0
+    evaluations: int = 0
 
 
 @dataclass(frozen=True)
@@ -38,11 +45,51 @@ class RunProgress:
     longest_spring: float = 1.0
     energy: float = 0.0  # as in a `Reading`, at this frame [J]
     reach: float = 0.0  # root of the sum of all squared displacements at this frame [m]
+    deepest: float = 0.0  # how far any point was below its place at rest at any frame so far [m]
     peak: float = 0.0  # largest energy at any frame so far [J]
+    # residual, evaluations: as in a `Reading`; the largest residual of any frame so far, and all evaluations
+    residual: float = 0.0
+    evaluations: int = 0
+
+
+Numbers = tuple[float, float, float]
+
+
+class TipForce(NamedTuple):
+    """What a probe does at a frame.
+
+    Attributes:
+        probe: its index in the scene.
+        tip: the lowest point of the round end of a tool that is moved, or where the control point is on the deformed
+            sheet [m].
+        force: on the points of the sheet that are not fixed [N]; of a tool that is moved the mean over the steps since
+            the frame before, and 0 at the first one.
+    """
+
+    probe: int
+    tip: Numbers
+    force: Numbers
+
+
+class PeakForce(NamedTuple):
+    """The force of a probe at the frame at which it is greatest."""
+
+    time: float  # of that frame [s]
+    force: Numbers  # as in a `TipForce` [N]
+
+
+class Felt(NamedTuple):
+    """What is known of the forces at a frame, for every probe."""
+
+    forces: tuple[TipForce, ...]  # at this frame
+    greatest: tuple[PeakForce, ...]  # at any frame so far
 
 
 class Saved(NamedTuple):
     """A point of a run from which it can continue."""
 
     state: State  # at a step, which may lie between two frames
-    progress: RunProgress  # at the last frame up to that step
+    # progress, felt: at the last frame up to that step
+    progress: RunProgress
+    felt: Felt
+    probes: tuple[Probe, ...] = ()  # with the paths that the tools followed; none: those of the scene

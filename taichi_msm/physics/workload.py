@@ -18,11 +18,16 @@ START = 4e8
 # Work of a step of a point in f64.
 DOUBLE = 2.0
 
-# Additional work of a step for a moving control point and for bending, relative to the step without them.
-MOVING, BENDING = 1.2, 1.0
+# Additional work of a step for a moving control point, for bending and for a tool that touches, relative to the step
+# without them.
+MOVING, BENDING, CONTACT = 1.2, 1.0, 0.5
 
 # Work of encoding a pixel, and of drawing one of its samples.
 ENCODING, SAMPLE = 40.0, 6.0
+
+# Evaluations of the forces that a frame at rest takes, for each of the rows and columns together. Each is a step, and
+# as much again to move the points.
+EVALUATIONS = 2.0
 
 # Stepping in f64 is a small part of a run if it takes at most this share of the time of everything else.
 SMALL = 0.25
@@ -59,10 +64,13 @@ def affords_pilots(plan: Plan, pilots: float) -> bool:
 
 
 def _steps(plan: Plan) -> float:
-    """Count the work of stepping in f32."""
-    moving = sum(slot.moves for slot in plan.slots)
-    cost = 1 + MOVING * moving + BENDING * (plan.material.bending > 0)
-    return cost * plan.grid.steps * math.prod(plan.scene.sheet.points)
+    """Count the work of stepping in f32, or of finding the shape of every frame."""
+    moving, points = sum(slot.moves for slot in plan.slots), plan.scene.sheet.points
+    cost = 1 + MOVING * moving + BENDING * (plan.material.bending > 0) + CONTACT * len(plan.tools)
+    steps = float(plan.grid.steps)
+    if plan.scene.time.at_rest:
+        cost, steps = cost + 1, EVALUATIONS * sum(points) * (plan.grid.frames + 1)
+    return cost * steps * math.prod(points)
 
 
 def _other(scene: Scene) -> float:

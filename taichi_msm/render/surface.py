@@ -7,8 +7,10 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from taichi_msm.physics.deformed import touched
+from taichi_msm.physics.paths import tools_of, unit
 from taichi_msm.physics.probe_force import control_point
-from taichi_msm.scene import Instrument, Scene, Sheet
+from taichi_msm.scene import Instrument, Scene
 
 Array = NDArray[np.float64]
 
@@ -57,43 +59,22 @@ def surface(position: NDArray[np.floating], refine: int) -> Surface:
     )
 
 
-def touched(position: NDArray[np.floating], refine: int, sheet: Sheet, rest: Array) -> tuple[Array, Array]:
-    """Find the point of the refined surface whose rest position, x and y [m], is `rest`.
-
-    A point outside the sheet moves with the nearest point of its edge. The mass points are at `position`, as above.
-
-    Returns:
-        The point [m], and the unit normal of its cell there, upward at rest; both of shape (3,).
-    """
-    (height, width), (rows, cols), parts = sheet.size, sheet.points, refine + 1
-    across = min(1.0, max(0.0, rest[0] / width + 0.5))
-    down = min(1.0, max(0.0, 0.5 - rest[1] / height))
-    j, i = min(int(across * (cols - 1)), cols - 2), min(int(down * (rows - 1)), rows - 2)
-    a, right, below, far = (position[i + n // 2, j + n % 2].astype(np.float64) for n in range(4))
-    b, c, d = right - a, below - a, far - right - below + a
-    s, t = across * (cols - 1) - j, down * (rows - 1) - i
-    normal = np.cross(b + d * t, -(c + d * s))
-    s0, t0 = min(int(s * parts), parts - 1) / parts, min(int(t * parts), parts - 1) / parts
-    s1, t1 = s - s0, t - t0
-    # In the small quad, D s t is replaced by a function that is linear on either side of the diagonal.
-    point = a + b * s + c * t + d * (s0 * t0 + s1 * t0 + s0 * t1 + min(s1, t1) / parts)
-    beside = np.array([rest[0] - (across - 0.5) * width, rest[1] - (0.5 - down) * height, 0.0])
-    return point + beside, normal / max(float(np.linalg.norm(normal)), 1e-300)
-
-
 def rods(scene: Scene, position: NDArray[np.floating], time: float) -> list[Rod]:
     """Place the instruments of a scene at a time [s]; the mass points are at `position` [m], shape (rows, cols, 3)."""
-    return [
-        rod(probe.instrument, scene, position, control_point(probe, scene.sheet, time))
-        for probe in scene.probes
-        if probe.instrument is not None
-    ]
+    moved = {tool.probe: tool for tool in tools_of(scene.probes, scene.sheet)}
+    placed = []
+    for index, probe in enumerate(scene.probes):
+        if index in moved:
+            tool = moved[index]
+            placed.append(Rod(tool.middle(np.array([time]))[0], tool.axis, tool.length, tool.radius))
+        elif probe.instrument is not None:
+            placed.append(rod(probe.instrument, scene, position, control_point(probe, scene.sheet, time)))
+    return placed
 
 
 def rod(instrument: Instrument, scene: Scene, position: NDArray[np.floating], rest: Array) -> Rod:
     """Place an instrument; `rest` is the rest position of the point that it touches, x and y [m], shape (2,)."""
-    shaft = np.array(instrument.shaft) / max(map(abs, instrument.shaft))
-    axis = shaft / np.linalg.norm(shaft)
+    axis = unit(instrument.shaft)
     point, normal = touched(position, scene.render.refine, scene.sheet, rest)
     outward = normal if normal @ axis >= 0 else -normal
     return Rod(point + instrument.radius * outward, axis, instrument.length, instrument.radius)

@@ -1,21 +1,17 @@
 """The files from which another process can continue an unfinished run: its manifest, its frames and its last state.
 
-Every part has a checksum, which is verified before the part is used: a SHA-256 for the manifest, one for the positions
-of every frame, and the CRC-32 of the archive for the arrays of the state. What they say is not trusted, as anybody may
-have written them.
+Every part has a checksum, which is verified before the part is used: a SHA-256 for the manifest, one each for the
+positions and the forces of every frame, and the CRC-32 of the archive for the arrays of the state. What they say is not
+trusted, as anybody may have written them.
 """
 
 from __future__ import annotations
 
-import hashlib
 import json
-import math
-import os
 import re
 import time
 import zipfile
-from collections.abc import Mapping
-from contextlib import ExitStack
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, fields
 from pathlib import Path
 from typing import Any, BinaryIO
@@ -23,22 +19,27 @@ from typing import Any, BinaryIO
 import numpy as np
 from numpy.typing import NDArray
 
-from taichi_msm.errors import DamagedError, FilesError, ForeignError
+from taichi_msm.errors import FilesError
 from taichi_msm.outputs.npz import read_array, write_arrays
-from taichi_msm.physics.state import RunProgress, Saved, State
+from taichi_msm.physics.state import Felt, PeakForce, RunProgress, Saved, State, TipForce
+from taichi_msm.physics.terms.contact import contact_fields
 from taichi_msm.results.entries import FILE, FOLDER, clear, require
 from taichi_msm.results.publication import STAGING
-from taichi_msm.results.whole import DRAFT, create, replacing
+from taichi_msm.results.records import Records, damaged, digest
+from taichi_msm.results.whole import DRAFT, replacing
+from taichi_msm.scene import Scene
 from taichi_msm.timegrid import TimeGrid
 
-# A folder is a checkpoint if it has a run's manifest. Beside it are the positions of the frames and the last state.
-CHECKPOINT, MANIFEST, POSITIONS, STATE = "checkpoint", "manifest.json", "positions", "state.npz"
-PATTERNS = tuple(re.escape(name) for name in (MANIFEST, POSITIONS, STATE, DRAFT))
+# A folder is a checkpoint if it has a run's manifest. Beside it are the positions of the frames, the forces if they are
+# asked for, and the last state.
+CHECKPOINT, MANIFEST, POSITIONS, FORCES, STATE = "checkpoint", "manifest.json", "positions", "forces", "state.npz"
+PATTERNS = tuple(re.escape(name) for name in (MANIFEST, POSITIONS, FORCES, STATE, DRAFT))
 
 # The share of the time that saving states may take.
 SHARE = 0.02
 
-DIGEST_BYTES = 32
+# Numbers of a `TipForce`, and of a `PeakForce`.
+FORCE_NUMBERS, PEAK_NUMBERS = 6, 4
 
 
 class Checkpoint:
@@ -51,19 +52,21 @@ class Checkpoint:
         precision: type of the positions.
     """
 
-    def __init__(self, folder: Path, grid: TimeGrid, points: tuple[int, int], *, keeps_positions: bool) -> None:
+    def __init__(self, folder: Path, scene: Scene, grid: TimeGrid) -> None:
         self.frames = 0
         self._folder = folder
         self._grid = grid
-        self._shape = (*points, 3)
+        self._shape, self._probes = (*scene.sheet.points, 3), len(scene.probes)
+        self._contact_shape = (contact_fields(scene.probes), *scene.sheet.points)
         self.precision = np.dtype(np.float32 if grid.precision == "f32" else np.float64)
-        self._frame_bytes = math.prod(self._shape) * self.precision.itemsize
-        self._record_bytes = (DIGEST_BYTES + self._frame_bytes) if keeps_positions else 0
         self._due = 0.0
-        self._open = ExitStack()
         # The digest of the manifest, to which all parts of a checkpoint are tied.
         self._key = b""
-        self._positions: BinaryIO | None = None
+        self._positions = Records(folder / POSITIONS, self._shape, self.precision)
+        self._forces = Records(folder / FORCES, (self._probes, FORCE_NUMBERS), np.float64)
+        # What is kept of every frame.
+        self._kept = [self._positions] if scene.output else []
+        self._kept += [self._forces] if scene.asks_for("forces") else []
 
     @property
     def due(self) -> bool:
@@ -76,10 +79,10 @@ class Checkpoint:
         self._folder.mkdir(exist_ok=True)
         self.forget()
         clear(self._folder, PATTERNS)
-        # Unbuffered, so that what was written is not lost when the process is killed.
-        self._positions = self._open.enter_context(create(self._folder / POSITIONS, buffering=0))
         sealed = seal(manifest)
-        self._key = _digest(sealed)
+        self._key = digest(sealed)
+        for records in self._kept:
+            records.begin(self._key)
         with replacing(self._folder / MANIFEST) as file:
             file.write(sealed)
 
@@ -90,46 +93,33 @@ class Checkpoint:
     def reopen(self) -> Saved | None:
         """Continue an earlier run; returns the state that it saved last, or None to continue from rest."""
         self.close()
-        path = self._folder / POSITIONS
         try:
-            self._key = _digest((self._folder / MANIFEST).read_bytes())
-            self._positions = self._open.enter_context(path.open("r+b", buffering=0))
+            self._key = digest((self._folder / MANIFEST).read_bytes())
+            for records in self._kept:
+                records.reopen(self._key)
         except FileNotFoundError as error:
-            raise self._damaged(Path(error.filename).name) from None
-        status = os.fstat(self._positions.fileno())
-        if status.st_nlink > 1:
-            raise ForeignError.at(path, "a file that has other names")
+            raise damaged(self._folder / Path(error.filename).name) from None
         saved = self.load()
         frames = 0 if saved is None else saved.progress.frame + 1
-        if status.st_size < frames * self._record_bytes:
-            raise self._damaged(POSITIONS)
+        for records in self._kept:
+            records.require(frames)
         self.frames = frames
         return saved
 
-    def add(self, position: NDArray[Any]) -> None:
-        """Add the positions of the next frame [m], shape (rows, cols, 3)."""
-        if self._record_bytes:
-            assert self._positions is not None, "begin or reopen comes first"
-            data = np.ascontiguousarray(position, self.precision).data.cast("B")
-            self._positions.seek(self.frames * self._record_bytes)
-            for rest in (memoryview(self._digest(self.frames, data)), data):
-                while rest:  # A write to an unbuffered file may take only some of the bytes.
-                    rest = rest[self._positions.write(rest) :]
+    def add(self, position: NDArray[Any], forces: Sequence[TipForce]) -> None:
+        """Add the positions of the next frame [m], shape (rows, cols, 3), and the forces of every probe."""
+        for records, values in ((self._positions, position), (self._forces, _tips(forces))):
+            if records in self._kept:
+                records.add(self.frames, values)
         self.frames += 1
 
     def position(self, frame: int) -> NDArray[Any]:
         """Read the positions of a frame [m], shape (rows, cols, 3)."""
-        assert self._positions is not None, "begin or reopen comes first"
-        record = np.empty(self._record_bytes, np.uint8)
-        self._positions.seek(frame * self._record_bytes)
-        rest = record.data
-        while rest and (count := self._positions.readinto(rest)):  # type: ignore[attr-defined]
-            rest = rest[count:]
-        data = record[DIGEST_BYTES:]
-        position = data.view(self.precision).reshape(self._shape)
-        if rest or record[:DIGEST_BYTES].tobytes() != self._digest(frame, data.data) or not np.isfinite(position).all():
-            raise self._damaged(POSITIONS)
-        return position
+        return self._positions.read(frame)
+
+    def forces(self, frame: int) -> tuple[TipForce, ...]:
+        """Read the forces of a frame, where they were asked for."""
+        return _as_forces(self._forces.read(frame))
 
     def save(self, saved: Saved) -> str:
         """Save a state of the run, replacing the one saved before; the frames up to it must have been added.
@@ -146,9 +136,12 @@ class Checkpoint:
 
     def load(self) -> Saved | None:
         """Read the state that was saved last; None: none was."""
-        like = self._arrays(Saved(State(0, np.empty(0), np.empty(0)), RunProgress()))
-        sheet = self.precision, self._shape
-        kinds = {name: sheet if array.size == 0 else (array.dtype, array.shape) for name, array in like.items()}
+        like = self._arrays(Saved(State(0, np.empty(0), np.empty(0)), RunProgress(), Felt((), ())))
+        kinds = {name: (array.dtype, array.shape) for name, array in like.items()}
+        kinds["forces"] = kinds["forces"][0], (self._probes, FORCE_NUMBERS)
+        kinds["greatest"] = kinds["greatest"][0], (self._probes, PEAK_NUMBERS)
+        kinds |= dict.fromkeys(("displacement", "difference"), (self.precision, self._shape))
+        kinds["contact"] = self.precision, self._contact_shape
         try:
             with (self._folder / STATE).open("rb") as file, zipfile.ZipFile(file) as archive:
                 arrays = {name: read_array(archive, name, *kind) for name, kind in kinds.items()}
@@ -156,9 +149,11 @@ class Checkpoint:
             return None
         # A forged archive can make zipfile raise almost anything.
         except Exception:
-            raise self._damaged(STATE) from None
+            raise damaged(self._folder / STATE) from None
         progress = RunProgress(**{field.name: arrays[field.name].item() for field in fields(RunProgress)})
-        saved = Saved(State(int(arrays["steps"]), arrays["displacement"], arrays["difference"]), progress)
+        state = State(int(arrays["steps"]), arrays["displacement"], arrays["difference"], arrays["contact"])
+        greatest = tuple(PeakForce(time, (x, y, z)) for time, x, y, z in arrays["greatest"].tolist())
+        saved = Saved(state, progress, Felt(_as_forces(arrays["forces"]), greatest))
         every = self._grid.steps_per_frame
         if not (
             progress.frame <= self._grid.frames
@@ -167,24 +162,21 @@ class Checkpoint:
             and all(value >= 0 for value in asdict(progress).values())
             and arrays["manifest"].tobytes() == self._key
         ):
-            raise self._damaged(STATE)
+            raise damaged(self._folder / STATE)
         return saved
 
     def close(self) -> None:
         """Close its files."""
-        self._open.close()
+        for records in self._kept:
+            records.close()
 
     def _arrays(self, saved: Saved) -> dict[str, NDArray[Any]]:
         """Give the arrays of a state, the numbers of its progress and the digest of the manifest, all by name."""
-        named = {**saved.state._asdict(), **asdict(saved.progress), "manifest": np.frombuffer(self._key, np.uint8)}
+        greatest = np.array([(peak.time, *peak.force) for peak in saved.felt.greatest]).reshape(-1, PEAK_NUMBERS)
+        forces = {"forces": _tips(saved.felt.forces), "greatest": greatest}
+        named = {**saved.state._asdict(), **asdict(saved.progress), **forces}
+        named["manifest"] = np.frombuffer(self._key, np.uint8)
         return {name: np.asarray(value) for name, value in named.items()}
-
-    def _digest(self, frame: int, data: memoryview) -> bytes:
-        """Compute a digest of the positions that also depends on the frame and the run."""
-        return _digest(self._key, frame.to_bytes(8, "little"), data)
-
-    def _damaged(self, name: str) -> DamagedError:
-        return DamagedError(f"{self._folder / name} is damaged; run the scene again")
 
 
 def open_manifest(directory: Path) -> BinaryIO:
@@ -204,7 +196,7 @@ def is_unfinished(directory: Path) -> bool:
 
 def seal(content: Any) -> bytes:
     """Write a value as JSON together with its SHA-256."""
-    return json.dumps({"sha256": _digest(json.dumps(content).encode()).hex(), "content": content}).encode()
+    return json.dumps({"sha256": digest(json.dumps(content).encode()).hex(), "content": content}).encode()
 
 
 def unseal(data: bytes) -> Any:
@@ -218,8 +210,9 @@ def unseal(data: bytes) -> Any:
     raise ValueError("damaged")
 
 
-def _digest(*parts: bytes | memoryview) -> bytes:
-    digest = hashlib.sha256()
-    for part in parts:
-        digest.update(part)
-    return digest.digest()
+def _tips(forces: Sequence[TipForce]) -> NDArray[np.float64]:
+    return np.array([(*one.tip, *one.force) for one in forces], float).reshape(-1, FORCE_NUMBERS)
+
+
+def _as_forces(numbers: NDArray[np.float64]) -> tuple[TipForce, ...]:
+    return tuple(TipForce(n, (x, y, z), (a, b, c)) for n, (x, y, z, a, b, c) in enumerate(numbers.tolist()))

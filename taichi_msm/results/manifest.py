@@ -81,7 +81,7 @@ def read_manifest(directory: Path) -> tuple[Manifest, Plan]:
 
     Raises:
         FilesError: when there is no such run, or its manifest is damaged or impossible (DamagedError).
-        SceneError: when the map of its scene cannot be read.
+        SceneError: when a map of its scene cannot be read.
     """
     path = directory / STAGING / CHECKPOINT / MANIFEST
     try:
@@ -108,13 +108,12 @@ def read_manifest(directory: Path) -> tuple[Manifest, Plan]:
 
 
 def digests(plan: Plan) -> dict[str, str]:
-    """Compute the SHA-256 of the files of a scene's picture and map, by the keys that name them.
+    """Compute the SHA-256 of the files of a scene's picture and maps, by the keys that name them.
 
-    There is none of a picture that cannot be read. That of the map is of the file as it was read for the plan.
+    There is none of a picture that cannot be read. That of a map is of the file as it was read for the plan.
     """
-    scene, sha256 = plan.scene, {}
-    if plan.image is not None:
-        sha256[f"{scene.kind}.map.image"] = plan.image.sha256
+    scene = plan.scene
+    sha256 = {f"{scene.kind}.{name}.image": image.sha256 for name, image in plan.maps.items()}
     if scene.image is not None:
         with suppress(PictureError):
             sha256["image"] = file_sha256(scene.image)

@@ -12,10 +12,10 @@ from taichi_msm.physics.probe_force import ProbeRecord
 class ErrorRecord(TypedDict):
     """The error of a run, as fractions of the largest displacement; None: not known, because a pilot diverged."""
 
-    error: float | None  # largest of any point at any frame, due to the step and to rounding
+    error: float | None  # None at rest, too; largest of any point at any frame, due to the step and to rounding
     rounding: float | None  # the part of it that comes from f32; None also where a coarse pilot does not tell the parts
     in_f64: float | None  # the error of the same step in f64; None likewise
-    order: int  # of the method
+    order: int | None  # of the method; None at rest
     at_least: bool  # whether `error` may be larger
     mesh_error: NotRequired[float | None]  # the error that the number of points makes; only with tissue
     mesh_doubt: NotRequired[str]  # why `mesh_error` may be larger; empty: it is about that
@@ -35,15 +35,17 @@ class RunRecord(TypedDict, total=False):
     sha256: dict[str, str]
     overrides: list[str]  # of the scene file
     points: list[int]  # rows and columns of mass points
-    step: float  # [s]
+    step: float | None  # [s]; None: at rest, as the next ones
     stable_step: float | None  # the largest stable step [s]; None: every step is stable
-    steps_per_frame: int
+    steps_per_frame: int | None
     precision: str  # of the steps
-    steps: int  # in the run so far
+    steps: int | None  # in the run so far
+    residual: float  # at rest: the largest force left on a point at any frame, as a share of the largest force
+    evaluations: int  # at rest: of the forces, in the run so far
     max_displacement: float  # [m]
     shortest_spring: float  # smallest ratio of a spring's length to its rest length
     longest_spring: float  # and the largest
-    probes: list[ProbeRecord]  # forces of each at 100 %
+    probes: list[ProbeRecord]  # forces of each
     notes: list[str]  # what to know before trusting the result
     error_estimate: ErrorRecord | None  # None: there is none, for the reason that follows
     error_estimate_reason: str

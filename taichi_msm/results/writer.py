@@ -1,9 +1,11 @@
-"""Write the results of a run: frames, animation, trajectory and record, whole or not at all."""
+"""Write the results of a run: frames, animation, trajectory, forces and record, whole or not at all."""
 
 from __future__ import annotations
 
+import csv
+import io
 import json
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
@@ -14,7 +16,7 @@ from numpy.typing import NDArray
 from taichi_msm.errors import writing
 from taichi_msm.outputs import table
 from taichi_msm.outputs.npz import Pieces, write_arrays
-from taichi_msm.physics.state import Saved
+from taichi_msm.physics.state import Saved, TipForce
 from taichi_msm.progress import Pause
 from taichi_msm.render.labels import Observed
 from taichi_msm.results.checkpoint import CHECKPOINT, PATTERNS, Checkpoint
@@ -25,6 +27,8 @@ from taichi_msm.results.publication import Contents, Listed, Publication
 from taichi_msm.results.whole import add, create
 from taichi_msm.scene import Scene
 from taichi_msm.timegrid import TimeGrid
+
+FORCES_HEADER = ("time", "probe", "tip_x", "tip_y", "tip_z", "force_x", "force_y", "force_z")
 
 
 def _listed(record: Mapping[str, Any]) -> Listed:
@@ -82,7 +86,7 @@ class ResultWriter:
         names = table.file_names(table.results(scene.output), scene.time.frames + 1)
         self._publication = Publication(directory, RUN, names)
         folder = self._publication.staging / CHECKPOINT
-        self._checkpoint = Checkpoint(folder, grid, scene.sheet.points, keeps_positions=bool(scene.output))
+        self._checkpoint = Checkpoint(folder, scene, grid)
         self._labels = LabelWriter(self._publication.staged, scene)
         self._encoder: Encoder | PictureWriter | None = None
         self._open = ExitStack()
@@ -98,15 +102,28 @@ class ResultWriter:
         with writing(self._directory):
             return self._checkpoint.position(frame)
 
-    def add(self, position: NDArray[Any], observed: Observed, pause: Pause = lambda: None) -> None:
-        """Add the next frame: positions [m], shape (rows, cols, 3), and what else is wanted; `pause`: as `Encoder`."""
+    def add(
+        self,
+        position: NDArray[Any],
+        observed: Observed,
+        forces: Sequence[TipForce] = (),
+        pause: Pause = lambda: None,
+    ) -> None:
+        """Add the next frame.
+
+        Args:
+            position: of the points [m], shape (rows, cols, 3).
+            observed: what else is wanted.
+            forces: of the probes; of a frame that is stored already they are not needed.
+            pause: as for `Encoder.add`.
+        """
         with writing(self._directory):
             # Positions come first: whenever the run is interrupted, there are at least as many of them as pictures.
             if self.stored == 0:
                 self._publication.keep = False
                 self._checkpoint.begin(self._manifest or {})
             if self.frames == self.stored:
-                self._checkpoint.add(position)
+                self._checkpoint.add(position, forces)
                 self._publication.keep = self._manifest is not None
             self._labels.add(self.frames, observed)
             if self._encoder and observed.picture is not None:
@@ -138,6 +155,8 @@ class ResultWriter:
             self._labels.finish(self.frames)
             if self.frames and "trajectory" in self._scene.output:
                 self._write_trajectory()
+            if self.frames and "forces" in self._scene.output:
+                self._write_forces()
         self._finished = True
 
     def publish(self, record: Mapping[str, Any]) -> dict[str, Any]:
@@ -169,6 +188,18 @@ class ResultWriter:
         }
         with create(self._publication.staged / table.OUTPUTS["trajectory"].path()) as file:
             write_arrays(file, arrays)
+
+    def _write_forces(self) -> None:
+        """Write the forces of all frames, with numbers that can be read again without loss."""
+        with (
+            create(self._publication.staged / table.OUTPUTS["forces"].path()) as file,
+            io.TextIOWrapper(file, encoding="ascii", newline="") as text,
+        ):
+            rows = csv.writer(text, lineterminator="\n")
+            rows.writerow(FORCES_HEADER)
+            for frame in range(self.frames):
+                time = frame / self._scene.time.frames_per_second
+                rows.writerows((time, one.probe, *one.tip, *one.force) for one in self._checkpoint.forces(frame))
 
     def __enter__(self) -> ResultWriter:
         scene = self._scene

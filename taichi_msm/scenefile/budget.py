@@ -15,6 +15,7 @@ from taichi_msm.errors import Problem, SceneError
 from taichi_msm.outputs.table import OUTPUTS
 from taichi_msm.physics.pilots import choose_pilots
 from taichi_msm.physics.plan import Plan
+from taichi_msm.physics.terms.contact import contact_fields
 from taichi_msm.render import texture
 from taichi_msm.scene import Scene
 from taichi_msm.system.resources import available_memory
@@ -36,10 +37,14 @@ RECORD_BYTES = 1 << 16
 LABEL_PIXEL_BYTES = 60
 TRACK_BYTES = 9
 
-# Numbers per mass point: displacement and difference; with a map, the stiffness of three springs and what it is made
-# from; and the copies made at the start and for output.
+# Bytes of a row of the table of forces, at most, and of what is kept of one until the run ends.
+FORCE_ROW_BYTES = 180
+FORCE_BYTES = 6 * 8
+
+# Numbers per mass point: displacement and difference; with a map of the stiffness, that of three springs, with one of
+# the foundation its factor, and what these are made from; and the copies made at the start and for output.
 STATE_NUMBERS = 6
-MAP_NUMBERS = 6
+MAP_NUMBERS = {"map": 6, "foundation_map": 4}
 OUTPUT_NUMBERS = 15
 
 
@@ -56,6 +61,7 @@ class Budget:
     track_bytes: int  # memory for the tracks, which are held until the run ends, and size of their file
     picture_bytes: int  # size of the files with pictures and labels, at most
     trajectory_bytes: int  # size of the trajectory
+    force_bytes: int  # size of the table of forces, at most
     record_bytes: int  # size of the record and of the camera, at most
     working_bytes: int  # additional disk space that is used until the run ends
 
@@ -67,7 +73,7 @@ class Budget:
     @property
     def disk_bytes(self) -> int:
         """Size of all files, at most."""
-        return self.picture_bytes + self.track_bytes + self.trajectory_bytes + self.record_bytes
+        return self.picture_bytes + self.track_bytes + self.trajectory_bytes + self.force_bytes + self.record_bytes
 
 
 def estimate(plan: Plan) -> Budget:
@@ -80,9 +86,12 @@ def estimate(plan: Plan) -> Budget:
     picture = sum(width * height * each + height + FILE_BYTES for each in pixel_bytes if each)
     positions = frames * points * 3 * number_bytes
     tracks = scene.render.tracks**2 * (frames * TRACK_BYTES + 16) + FILE_BYTES if "tracks" in scene.output else 0
-    numbers = STATE_NUMBERS + OUTPUT_NUMBERS + len(scene.probes) + (MAP_NUMBERS if scene.stiffness_map else 0)
+    forces = frames * len(scene.probes) if "forces" in scene.output else 0
+    contact = contact_fields(scene.probes)
+    loads = sum(not probe.moved for probe in scene.probes)
+    numbers = STATE_NUMBERS + OUTPUT_NUMBERS + loads + contact + sum(MAP_NUMBERS[name] for name in scene.maps)
     # Pilots are up to two more sheets in f64; with tissue also two smaller ones.
-    pilot = scene.time.tolerance is not None or not choose_pilots(plan).reason
+    pilot = scene.time.tolerance is not None or choose_pilots(plan).some
     sheets = number_bytes + (8 * (2 + (scene.tissue is not None) * 5 / 16) if pilot else 0)
     return Budget(
         points=points,
@@ -93,9 +102,12 @@ def estimate(plan: Plan) -> Budget:
         track_bytes=tracks,
         picture_bytes=math.ceil(frames * picture),
         trajectory_bytes=positions + 8 * frames + FILE_BYTES if "trajectory" in scene.output else 0,
+        force_bytes=forces * FORCE_ROW_BYTES + FILE_BYTES if "forces" in scene.output else 0,
         record_bytes=2 * len(scene.model_dump_json(indent=2)) + RECORD_BYTES,
-        # Two saved states from which the run could continue, and all positions so far.
-        working_bytes=2 * points * STATE_NUMBERS * number_bytes + (positions if scene.output else 0),
+        # Two saved states from which the run could continue, and all positions and forces so far.
+        working_bytes=2 * points * (STATE_NUMBERS + contact) * number_bytes
+        + (positions if scene.output else 0)
+        + forces * FORCE_BYTES,
     )
 
 

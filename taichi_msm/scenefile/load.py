@@ -23,7 +23,7 @@ MAX_BYTES = 2**20
 
 # The keys that name pictures.
 IMAGE: Key = ("image",)
-MAPS: tuple[Key, ...] = (("tissue", "map", "image"), ("springs", "map", "image"))
+MAPS: tuple[Key, ...] = (("tissue", "map", "image"), ("tissue", "foundation_map", "image"), ("springs", "map", "image"))
 PICTURES = (IMAGE, *MAPS)
 
 # The largest number of lines in an error: nobody reads more, and a broken file may have tens of thousands of problems.

@@ -9,7 +9,7 @@ from pydantic import ValidationError
 
 from taichi_msm import faults
 from taichi_msm.errors import ArgumentError, Problem, SceneError
-from taichi_msm.physics.material import MapImage
+from taichi_msm.physics.material import Maps
 from taichi_msm.physics.plan import Plan
 from taichi_msm.physics.planning import try_plan
 from taichi_msm.render.camera import camera_problems
@@ -51,11 +51,9 @@ def validate(data: dict[str, Any]) -> tuple[Plan | None, list[Problem]]:
     return (None if problems else plan), problems
 
 
-def _joint_check(
-    scene: Scene, image: MapImage | None = None, *, picture: bool = True
-) -> tuple[Plan | None, list[Problem]]:
+def _joint_check(scene: Scene, maps: Maps | None = None, *, picture: bool = True) -> tuple[Plan | None, list[Problem]]:
     """Plan a scene whose keys are valid each by itself, and find what is wrong with several keys together."""
-    plan, problems = try_plan(scene, image)
+    plan, problems = try_plan(scene, maps)
     problems += camera_problems(scene)
     if picture:
         problems += image_problems(scene)
@@ -64,7 +62,7 @@ def _joint_check(
     return plan, problems
 
 
-def checked(scene: Plan | Scene | Mapping[str, Any], image: MapImage | None = None) -> Plan:
+def checked(scene: Plan | Scene | Mapping[str, Any], maps: Maps | None = None) -> Plan:
     """Check a scene but for its picture, or a mapping of its keys, and plan it for a CPU; a plan was checked before.
 
     Raises:
@@ -74,7 +72,7 @@ def checked(scene: Plan | Scene | Mapping[str, Any], image: MapImage | None = No
     if isinstance(scene, Plan):
         return scene
     if isinstance(scene, Scene):
-        plan, problems = _joint_check(scene, image, picture=False)
+        plan, problems = _joint_check(scene, maps, picture=False)
     elif isinstance(scene, Mapping):
         plan, problems = validate(dict(scene))
     else:
@@ -92,6 +90,9 @@ def _spare(data: dict[str, Any], problems: list[Problem]) -> dict[str, Any]:
     spared = {name: value for name, value in data.items() if name not in faulty} | {
         name: value for name, value in _STAND_INS.items() if name in faulty
     }
+    time = data.get("time")
+    if "time" in faulty and isinstance(time, Mapping) and time.get("motion", "dynamic") != "dynamic":
+        spared["time"] = {**spared["time"], "motion": "quasistatic"}
     if "sheet" in faulty and "tissue" not in spared:
         spared["sheet"] = {**spared["sheet"], "mass": 1}
     return spared

@@ -71,6 +71,8 @@ def study(
     """
     given, device = checked(scene), runtime.start(arch, threads)
     scene = given.scene
+    if scene.time.at_rest:
+        raise SceneError(["time.motion: quasistatic takes no steps, which a study compares; set time.motion: dynamic"])
     _require_memory(scene)
     texture = load_texture(scene) if scene.image is not None else None
     results = Study(
@@ -132,6 +134,9 @@ def _require_memory(scene: Scene) -> None:
 def _measure_peer(plan: Plan, stepping: SteppingStudy, effort: Effort, results: Study, progress: Progress) -> None:
     """Solve by DOP853 at several tolerances, each as many times as time allows, up to 5."""
     assert results.reference is not None
+    if plan.tools:
+        results.notes.append(f"{DOP853} is left out, as it knows no contact; {APART}")
+        return
     for index, rtol in enumerate(effort.peer_rtols):
         samples: list[float] = []
         deadline = time.perf_counter() + effort.peer

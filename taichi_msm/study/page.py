@@ -159,9 +159,10 @@ def _shortfall(study: Study) -> str:
 def _stepping(study: Study) -> Iterator[str]:
     yield "## Stepping"
     if (reference := study.reference) is not None:
+        extrapolated = ", not extrapolated as contact is of order 1," if study.touches else ", extrapolated,"
         yield (
             "An error is the largest of any point at any frame, as a fraction of the largest displacement, "
-            f"{number(reference.largest)} m. The reference is central differences in f64, extrapolated, with up to "
+            f"{number(reference.largest)} m. The reference is central differences in f64{extrapolated} with up to "
             f"{reference.steps_per_frame} steps a frame; its own error is about {number(reference.error)}. "
             f"The tolerance is {study.tolerance:g}."
         )
@@ -177,10 +178,11 @@ def _stepping(study: Study) -> Iterator[str]:
 
 def _points(study: Study) -> Iterator[str]:
     yield "## Points"
+    reference = "the finest sheet" if study.touches else "the extrapolation, of order 2, of the two finest sheets"
     yield (
         "The error is that made by the number of points, at the points and between them, where the displacement is "
         "interpolated by cubics: the largest anywhere at any frame, as a fraction of the largest displacement. The "
-        "reference is the extrapolation, of order 2, of the two finest sheets. All are stepped in f64 with the same "
+        f"reference is {reference}. All are stepped in f64 with the same "
         "step. The estimate is that of `run`, by a sheet beside it with half the cells a side. "
         "Times are those of each sheet's automatic step."
     )

@@ -84,6 +84,7 @@ def acceleration(plan: Plan) -> Callable[[Array, Array, Schedule], Array]:
     (dx, dy), (x, y) = spacing(scene.sheet), axes(scene.sheet)
     shares = area_shares(scene.sheet)
     area = shares if sheet.by_area else np.ones_like(shares)
+    held = area if sheet.virtual_factors is None else area * sheet.virtual_factors
     probes = [probe_force(probe, scene.sheet) for probe in scene.probes]
 
     def laplacian(u: Array) -> Array:
@@ -91,7 +92,7 @@ def acceleration(plan: Plan) -> Callable[[Array, Array, Schedule], Array]:
         return (u[1:-1, 2:] - 2 * inner + u[1:-1, :-2]) / dx**2 + (u[2:, 1:-1] - 2 * inner + u[:-2, 1:-1]) / dy**2
 
     def accelerate(u: Array, v: Array, loads: Schedule) -> Array:
-        force = elastic_force(every, u) - (loads.active[0] * sheet.virtual * area)[..., None] * u
+        force = elastic_force(every, u) - (loads.active[0] * sheet.virtual * held)[..., None] * u
         for slot, strength, (at_x, at_y) in zip(loads.slots, loads.strength[0], loads.point[0], strict=True):
             probe = probes[slot.probe]
             decay = probe.decay(np.hypot(x - at_x, y - at_y)) * (shares if probe.by_area else 1)

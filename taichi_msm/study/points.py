@@ -144,7 +144,7 @@ class PointStudy:
                     sheet.advance(grid.steps_per_frame)
                 fields = [sheet.displacement() for sheet in sheets]
                 with np.errstate(all="ignore"):
-                    exact, bound = _reference(fields)
+                    exact, bound = _reference(fields, extrapolate=not finest.tools)
                     apart = [longest(_sampled(one, exact) - exact) for one in fields[:-1]]
                     # Between the points of the finest sheet, its error is not known. But if its order is 1 or more, it
                     # is at most its distance from a sheet that is twice as coarse.
@@ -187,7 +187,7 @@ def lattices(plan: Plan) -> Iterator[Plan]:
     """Plan the numbers of points to compare, as far as the scene allows them; its own come last."""
     for share in COARSER:
         points = _scaled(plan, share)
-        coarse, _ = try_plan(with_points(plan.scene, points), plan.image) if min(points) >= FEWEST else (None, [])
+        coarse, _ = try_plan(with_points(plan.scene, points), plan.maps) if min(points) >= FEWEST else (None, [])
         if coarse is not None:
             yield coarse
     if min(plan.scene.sheet.points) >= FEWEST:
@@ -200,7 +200,7 @@ def _scaled(plan: Plan, factor: float) -> Lattice:
     return rows, cols
 
 
-def _reference(fields: list[Field]) -> tuple[Field, float]:
+def _reference(fields: list[Field], *, extrapolate: bool) -> tuple[Field, float]:
     """Extrapolate the two finest fields by Richardson, for an error of order 2 in the length of cells.
 
     u* = u + (u - u_r) / (r^2 - 1), where u_r has cells r times as long. The correction is computed at the points of u_r
@@ -209,10 +209,13 @@ def _reference(fields: list[Field]) -> tuple[Field, float]:
 
     Args:
         fields: two or more of displacements [m], the fewest points first, each of shape (rows, cols, 3).
+        extrapolate: whether to; else, as with contact, which has a lower order, u* is the finest one.
 
     Returns:
         u* at the points of the finest field [m], and an approximate bound of its error [m].
     """
+    if not extrapolate:
+        return fields[-1], longest(_sampled(fields[-1], fields[-2]) - fields[-2])
     exact = fields[-1] + _sampled(_correction(fields[-1], fields[-2]), fields[-1])
     if len(fields) > 2:
         before = fields[-2] + _sampled(_correction(fields[-2], fields[-3]), fields[-2])

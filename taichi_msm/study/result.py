@@ -156,6 +156,11 @@ class Study:
         self.terms = [one for one in self.terms if one.samples]
 
     @property
+    def touches(self) -> bool:
+        """Whether tools that are moved touch the sheet."""
+        return any(probe.get("path") for probe in self.settings["probes"])
+
+    @property
     def points_tolerance(self) -> float:
         """Largest allowed error due to the number of points, as a fraction of the largest displacement."""
         return float(self.settings["sheet"]["tolerance"] or self.tolerance)

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from taichi_msm.physics.divergence import farthest_displacement
 from taichi_msm.physics.error_control import longest
+from taichi_msm.physics.paths import fewest_steps
 from taichi_msm.physics.plan import Plan
 from taichi_msm.physics.planning import stable_steps, variant, with_time
 from taichi_msm.physics.solver import Dynamics
@@ -95,8 +96,8 @@ class SteppingStudy:
         return self.study.reference
 
     def _series(self, difference: str) -> Iterator[int]:
-        """Give the steps per frame of a series: of the largest stable step, doubled until a run would take too long."""
-        steps = stable_steps(self._plans[difference])
+        """Give the steps per frame of a series: of the largest valid step, doubled until a run would take too long."""
+        steps = fewest_steps(self.plan.tools, self.plan.grid, stable_steps(self._plans[difference]))
         samples: list[float] = []
         self._run("f64", difference, steps, samples)
         yield steps
@@ -108,11 +109,13 @@ class SteppingStudy:
     def _make_reference(self, finest: int) -> None:
         """Extrapolate central differences from steps well below the finest that is measured.
 
-        u* = u_{h/2} + (u_{h/2} - u_h) / 3. Its error is at most about its distance from the same with 2 h for h.
+        u* = u_{h/2} + (u_{h/2} - u_h) / 3. Its error is at most about its distance from the same with 2 h for h. With
+        contact, which is of order 1 about, nothing is extrapolated.
         """
         coarse, middle, fine = (self._run("f64", "central", finest * 2**halving, []) for halving in range(3))
-        before = middle + (middle - coarse) / 3
-        self.frames = fine + (fine - middle) / 3
+        before, self.frames = middle + (middle - coarse) / 3, fine + (fine - middle) / 3
+        if self.plan.tools:
+            before, self.frames = middle, fine
         largest = longest(self.frames)
         error = longest(self.frames - before) / largest if largest > 0 else 0.0
         self.study.reference = Reference(4 * finest, error, largest)

@@ -20,7 +20,7 @@ ROUNDS = 9
 SPRING_TERMS: dict[str, float | None] = {"structural": 0.0, "shear": 0.0, "virtual": 0.0, "map": None}
 TISSUE_TERMS: dict[str, float | None] = {
     **dict.fromkeys(("foundation", "damping", "pretension", "bending"), 0.0),
-    "map": None,
+    **dict.fromkeys(("map", "foundation_map")),
 }
 
 

@@ -22,12 +22,13 @@ class Outcome:
     shortest_spring: float | None = None  # smallest ratio of a spring's length to its rest length
     error_estimate: float | None = None  # as a fraction of the largest displacement
     mesh_error: float | None = None  # likewise
+    forces: tuple[float | None, ...] = ()  # the greatest force of every probe at any frame [N]
     notes: tuple[str, ...] = ()  # what to know before trusting the results, besides the errors
     seconds: float | None = field(default=None, compare=False)  # the time that it took [s]
 
 
-# The columns of the table after those of the keys, in their order.
-COLUMNS = ("status", "error", "max_displacement", "shortest_spring", "error_estimate", "mesh_error", "seconds")
+# The columns of the table after those of the keys, in their order; then come the forces of the probes, and seconds.
+COLUMNS = ("status", "error", "max_displacement", "shortest_spring", "error_estimate", "mesh_error")
 
 
 def outcome_of(run: int, record: Mapping[str, Any]) -> Outcome:
@@ -41,6 +42,7 @@ def outcome_of(run: int, record: Mapping[str, Any]) -> Outcome:
         record["shortest_spring"],
         estimate.get("error"),
         estimate.get("mesh_error"),
+        tuple(probe.get("greatest_force") for probe in record["probes"]),
         tuple(record["notes"][1:]),  # The first one is of the errors.
         record["timings"]["total"],
     )

@@ -11,10 +11,10 @@ from numpy.typing import NDArray
 
 from taichi_msm.sweeps.captions import short_names, short_value
 from taichi_msm.sweeps.distribution import Distribution
-from taichi_msm.sweeps.outcome import COLUMNS
 from taichi_msm.sweeps.result import SweepResult
 
-RESULTS = tuple(name for name in COLUMNS if name not in ("status", "error", "seconds"))
+# Columns of the table that are none.
+NO_RESULTS = ("status", "error", "seconds")
 
 # Of so many values at most that are no numbers, each has a label.
 MOST_LABELS = 8
@@ -47,8 +47,10 @@ def results(result: SweepResult, runs: Sequence[int]) -> dict[str, NDArray[np.fl
     """Give the results that differ between some complete runs, for each run; NaN: not complete, or not known."""
     outcomes = [result.outcomes[run] for run in runs]
     columns = {}
-    for name in RESULTS:
-        numbers = [getattr(one, name) if one.status == "complete" else None for one in outcomes]
+    for name, values in result.columns().items():
+        if name in NO_RESULTS:
+            continue
+        numbers = [values[run] if one.status == "complete" else None for run, one in zip(runs, outcomes, strict=True)]
         column = np.array(numbers, dtype=np.float64)
         if len(np.unique(column[np.isfinite(column)])) > 1:
             columns[name] = column

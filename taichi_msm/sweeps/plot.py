@@ -36,7 +36,7 @@ AREAS, SPREAD = 900, 0.3
 # Beside the dots, as a share of the axis.
 MARGIN = 0.05
 
-UNITS = {"max_displacement": " [m]"}
+UNITS = {"max_displacement": " [m]", "force": " [N]", "greatest": " [N]"}
 
 
 class Content(NamedTuple):
@@ -69,7 +69,7 @@ def _figure(content: Content) -> Figure:
     figure.supxlabel(said, x=0.01, ha="left", size=8, parse_math=False)
     panels = figure.subplots(len(content.results), len(parameters), sharex="col", sharey="row", squeeze=False)
     for row, (name, numbers) in zip(panels, content.results.items(), strict=True):
-        row[0].set_ylabel(name + UNITS.get(name, ""))
+        row[0].set_ylabel(name + UNITS.get(name.rsplit(".", 1)[-1], ""))
         if is_wide(numbers):
             row[0].set_yscale("log")
         else:

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from taichi_msm.outputs.table import RUNS, numbered
-from taichi_msm.sweeps.outcome import Outcome
+from taichi_msm.sweeps.outcome import COLUMNS, Outcome
 from taichi_msm.sweeps.sweepfile import Sweep
 
 # The files that a sweep ends with.
@@ -29,6 +29,17 @@ class SweepResult:
     sweep: Sweep
     values: list[list[Any]]  # of the varied keys, for each run
     outcomes: list[Outcome]  # one for each run, in the order of their numbers
+
+    def columns(self) -> dict[str, list[Any]]:
+        """Give the columns of the table after those of the keys, by their names: a value for each run."""
+        runs = self.outcomes
+        columns = {name: [getattr(one, name) for one in runs] for name in COLUMNS}
+        for n in range(max((len(one.forces) for one in runs), default=0)):
+            name = f"probes.{n}.force"
+            # Which is a key of a scene, too.
+            name += ".greatest" if name in self.sweep.keys else ""
+            columns[name] = [one.forces[n] if n < len(one.forces) else None for one in runs]
+        return columns | {"seconds": [one.seconds for one in runs]}
 
     def run_directory(self, run: int) -> Path:
         """Name the folder of a run."""

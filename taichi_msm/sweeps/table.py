@@ -8,7 +8,6 @@ from collections.abc import Callable, Iterable, Iterator
 from typing import Any
 
 from taichi_msm.results.whole import replacing
-from taichi_msm.sweeps.outcome import COLUMNS
 from taichi_msm.sweeps.result import PARQUET, TABLE, SweepResult
 from taichi_msm.sweeps.sweepfile import cell
 
@@ -35,7 +34,7 @@ def write_parquet(result: SweepResult) -> tuple[list[str], list[str]]:
             pyarrow.array(columns[name])
         except pyarrow.ArrowException:
             columns[name] = list(map(cell, columns[name]))
-    for name in COLUMNS:  # also if there is no value at all
+    for name in result.columns():  # also if there is no value at all
         kind = pyarrow.string() if name in ("status", "error") else pyarrow.float64()
         columns[name] = pyarrow.array(columns[name], kind)
     with replacing(result.directory / PARQUET) as file:
@@ -51,10 +50,11 @@ def csv_line(row: Iterable[Any]) -> str:
 
 
 def _names(result: SweepResult) -> list[str]:
-    return ["run", *result.sweep.keys, *COLUMNS]
+    return ["run", *result.sweep.keys, *result.columns()]
 
 
 def _rows(result: SweepResult, write: Callable[[Any], Any]) -> Iterator[list[Any]]:
     """Give the entries of every row, in which the values of keys are written somehow."""
-    for values, outcome in zip(result.values, result.outcomes, strict=True):
-        yield [outcome.run, *map(write, values), *(getattr(outcome, name) for name in COLUMNS)]
+    columns = zip(*result.columns().values(), strict=True)
+    for values, outcome, others in zip(result.values, result.outcomes, columns, strict=True):
+        yield [outcome.run, *map(write, values), *others]

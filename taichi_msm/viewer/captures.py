@@ -130,4 +130,7 @@ class Captures:
 
 def probe_values(scene: Scene) -> int:
     """Count the values that the keys of a scene's probes add to its file, which may have `MAX_NODES` in all."""
-    return sum(4 * len(probe.at) + 3 * len(probe.load) for probe in scene.probes)
+    return sum(
+        4 * len(probe.at) + 3 * len(probe.load) + 5 * len(probe.path or ()) + 3 * len(probe.grip)
+        for probe in scene.probes
+    )

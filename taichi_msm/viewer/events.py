@@ -13,7 +13,7 @@ class Hover(NamedTuple):
 
 
 class Press(NamedTuple):
-    """The tool touches the tissue at a pixel; `pull` reverses its force."""
+    """The tool touches the tissue at a pixel; `pull` reverses its force, or makes a tool held by position grip."""
 
     x: float
     y: float
@@ -39,13 +39,13 @@ class Turn(NamedTuple):
 
 
 class Percent(NamedTuple):
-    """The strength is set to another percentage of the full force."""
+    """The strength is set to another percentage of the full force or depth; below 0, a grip lifts."""
 
     percent: float
 
 
 class Harder(NamedTuple):
-    """The strength grows by this many percent of the full force; below 0 it falls."""
+    """The strength grows by this many percent of the full force or depth; below 0 it falls."""
 
     percent: float
 
@@ -58,21 +58,22 @@ class Key(NamedTuple):
 
 Event = Hover | Press | Drag | Release | Turn | Percent | Harder | Key
 
-# How much a notch of the wheel, or the up or down key, changes the strength [percent of the full force].
+# How much a notch of the wheel, or the up or down key, changes the strength [percent of the full force or depth].
 NOTCH = 5.0
 
 # What the pointer does.
 POINTER = {
-    "left button": "press with the scene's force; dragged, the tool moves",
-    "shift + left button": "the opposite force: pull, if the scene's force pushes",
-    "wheel": f"press harder or less hard, by {NOTCH:g} % of the full force",
+    "left button": "press; dragged, the tool moves",
+    "shift + left button": "the opposite force, such as pull; by position: grip",
+    "wheel": f"press harder or deeper, by {NOTCH:g} %; lift what is gripped",
     "right button": "dragged, turn the picture",
 }
 
 # Every key, and what it does.
 KEYS = {
-    "up": f"press harder, by {NOTCH:g} %; so does +",
-    "down": f"press more gently, by {NOTCH:g} %; so does -",
+    "up": f"press harder or deeper, by {NOTCH:g} %; so does +",
+    "down": f"press less, by {NOTCH:g} %; so does -",
+    "f": "reset, and hold the tool by position or by force",
     "c": "the scene's own camera",
     "t": "look from the top",
     "o": "look from the side, from above",

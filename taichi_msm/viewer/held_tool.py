@@ -1,4 +1,4 @@
-"""The tool in a person's hand, as a probe of a scene, and the pointer that moves it.
+"""The tool in a person's hand, held by force, as a probe of a scene.
 
 Every frame adds the keys that a run needs to repeat it.
 """
@@ -10,13 +10,7 @@ from collections import deque
 from collections.abc import Sequence
 from typing import Any
 
-import numpy as np
-from numpy.typing import NDArray
-
-from taichi_msm.render.picking import on_rest_plane
 from taichi_msm.scene import Probe
-from taichi_msm.simulation import Simulation
-from taichi_msm.viewer.viewport import Viewport
 
 # How long a hand takes from no force to the full force [s]. It lets go at once.
 RISE = 0.2
@@ -41,11 +35,12 @@ class HeldTool:
         strength: the percentage of the full force that a press goes up to.
         percent: the percentage of the full force that acts now, below 0 when pulling.
         place: the control point now, as fractions of the sheet.
+        probe: whose tool it is.
     """
 
     def __init__(self, probe: Probe, rate: float) -> None:
         self.strength = 100.0
-        self._probe = probe
+        self.probe = probe
         self._rate = rate
         self.rest()
 
@@ -72,6 +67,10 @@ class HeldTool:
         """Whether the tool presses, or will press, unless it is released."""
         return self._asked[-1] is not None if self._asked else self._pressing != 0
 
+    def ask(self, strength: float) -> None:
+        """Ask for another strength."""
+        self.strength = min(100.0, max(0.0, strength))
+
     def press(self, place: Place, direction: int) -> None:
         """Press (1) or pull (-1) at a place; the tool lets go of any other place."""
         if len(self._asked) > 1 and self._asked[-1] is None:
@@ -80,11 +79,11 @@ class HeldTool:
             self._asked.pop()
         if self.held:
             self.release()
-        self._asked.append((_rounded(place), direction))
+        self._asked.append((on_sheet(place), direction))
 
     def move(self, place: Place) -> None:
         """Move to another place, in a straight line within a frame."""
-        place = _rounded(place)
+        place = on_sheet(place)
         if self._asked and self._asked[-1] is not None:
             self._asked[-1] = (place, self._asked[-1][1])
         else:
@@ -112,7 +111,7 @@ class HeldTool:
         if self._pressing != 0:
             self.percent = self._nearer(self._pressing * self.strength)
             self._put(end)
-        _extend(self._load, (end, self.percent))
+        extend(self._load, (end, self.percent))
         if self._given == (self.percent, self.place):
             return None
         self._given = self.percent, self.place
@@ -132,7 +131,7 @@ class HeldTool:
         self.place = self._goal
         if self._at[-1][0] == time:
             self._at.pop()
-        _extend(self._at, (time, *self.place))
+        extend(self._at, (time, *self.place))
 
     def _as_probe(
         self, load: Sequence[tuple[float, float]], at: Sequence[tuple[float, float, float]], end: float
@@ -140,80 +139,17 @@ class HeldTool:
         """Make a probe whose control point has at least two keys, as the kernel is compiled for one that moves."""
         if len(at) == 1:
             at = [*at, (max(end, 1 / self._rate), *at[0][1:])]
-        return self._probe.model_copy(update={"load": tuple(load), "at": tuple(at)})
+        return self.probe.model_copy(update={"load": tuple(load), "at": tuple(at)})
 
 
-class Controller:
-    """Moves a tool with a pointer over the picture of a simulation."""
-
-    def __init__(self, tool: HeldTool, viewport: Viewport, simulation: Simulation) -> None:
-        self._tool = tool
-        self._viewport = viewport
-        self._simulation = simulation
-        # Where a drag begins: the place of the tool, and the point of the rest plane that was then under the pointer.
-        self._held: tuple[Place, NDArray[np.floating] | None] | None = None
-        self._pointer = (0.0, 0.0)
-        self._hovering: tuple[float, float] | None = None
-
-    def press(self, x: float, y: float, direction: int) -> bool:
-        """Press (1) or pull (-1) what is seen at a pixel; returns whether there is anything."""
-        place = self._simulation.pick((x, y), self._viewport.view)
-        if place is None:
-            return False
-        self._tool.press(place, direction)
-        self._pointer = x, y
-        self._held = place, on_rest_plane(self._viewport.view, self._pointer)
-        return True
-
-    def over(self) -> Place | None:
-        """Find the place on the sheet under a pointer that presses nothing; None if there is none."""
-        if self._tool.held or self._tool.percent != 0 or self._hovering is None:
-            return None
-        return self._simulation.pick(self._hovering, self._viewport.view)
-
-    def hover(self, x: float, y: float) -> None:
-        """Note where a pointer is that presses nothing."""
-        self._hovering = x, y
-
-    def drag(self, x: float, y: float) -> None:
-        """Move the control point as far over the sheet at rest as the pointer moved.
-
-        The deformed sheet cannot serve for this: it gives way to the tool, so each move would cause another.
-        """
-        if self._held is None:
-            return
-        self._pointer = x, y
-        ((across, down), begun), here = self._held, on_rest_plane(self._viewport.view, self._pointer)
-        if begun is None or here is None:
-            return
-        (right, up), (height, width) = here - begun, self._simulation.scene.sheet.size
-        self._tool.move((across + right / width, down - up / height))
-
-    def release(self) -> None:
-        """Let go."""
-        self._held = self._hovering = None
-        if self._tool.held:
-            self._tool.release()
-
-    def hold_on(self) -> None:
-        """Keep the tool where it is after the camera moved; a drag goes on from there."""
-        if self._held is not None:
-            self._held = self._tool.goal, on_rest_plane(self._viewport.view, self._pointer)
-
-    def forget(self) -> None:
-        """Put the tool at rest."""
-        self._tool.rest()
-        self._held = self._hovering = None
-
-
-def _extend(keys: list[Any], key: tuple[float, ...]) -> None:
+def extend(keys: list[Any], key: tuple[float, ...]) -> None:
     """Add a key; if it and the two before differ only in time, the middle one is dropped, which changes no bit."""
     if len(keys) > 1 and keys[-1][1:] == keys[-2][1:] == key[1:]:
         keys.pop()
     keys.append(key)
 
 
-def _rounded(place: Place) -> Place:
+def on_sheet(place: Place) -> Place:
     """Limit a place to the sheet, and round it to the digits that a scene file gets."""
     across, down = (round(min(1.0, max(0.0, fraction)), DIGITS) for fraction in place)
     return across, down

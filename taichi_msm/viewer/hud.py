@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import math
 import textwrap
 from collections.abc import Mapping, Sequence
 from functools import lru_cache
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -22,7 +24,11 @@ LETTER_WIDTH = 0.56
 # How many times darker the picture is behind text.
 DARKER = 3
 
+# Width of a bar, in heights of letters.
+BAR = 10
+
 SHADE = (0, 0, 0)
+OUTLINE = 140
 PUSH = (255, 255, 255)
 PULL = (255, 214, 90)
 
@@ -30,15 +36,37 @@ PULL = (255, 214, 90)
 RING = 1 / 50
 
 
-def write(picture: Picture, above: Sequence[str], below: str = "", table: Mapping[str, str] | None = None) -> None:
+class Bar(NamedTuple):
+    """A value as a bar, whose end is the next round number at or above the largest value so far."""
+
+    value: float
+    largest: float  # above 0
+    unit: str
+
+    @property
+    def end(self) -> float:
+        """The value at its end: 1, 2 or 5 times a power of ten."""
+        power = 10.0 ** math.floor(math.log10(self.largest))
+        return next(digit * power for digit in (1, 2, 5, 10) if self.largest <= digit * power * (1 + 1e-9))
+
+
+def write(
+    picture: Picture,
+    above: Sequence[str],
+    below: str = "",
+    table: Mapping[str, str] | None = None,
+    bar: Bar | None = None,
+) -> None:
     """Write text over a picture, shape (height, width, 3), which is changed, on darker panels.
 
-    Lines go `above`, into the top left corner, a table of two columns under them; the text `below` is wrapped.
+    Lines go `above`, into the top left corner, a bar and a table of two columns under them; the text `below` is
+    wrapped.
     """
     height, width = picture.shape[:2]
     size = _letter_size(picture)
     top = edge = size // 2
-    for panel in (_panel(size, *above), _columns(tuple((table or {}).items()), size)):
+    drawn = _bar(size, round(BAR * size * bar.value / bar.end), f"{bar.end:g} {bar.unit}") if bar else _panel(size)
+    for panel in (_panel(size, *above), drawn, _columns(tuple((table or {}).items()), size)):
         _lay(picture, panel, edge, top)
         top += len(panel) + edge if len(panel) else 0
     panel = _panel(size, *textwrap.wrap(below, max(1, int((width - 4 * edge) / (LETTER_WIDTH * size)))))
@@ -93,6 +121,20 @@ def _columns(rows: tuple[tuple[str, str], ...], size: int) -> NDArray[np.uint8]:
         ImageDraw.Draw(image).text((edge, edge // 2 + n * line), name, fill=255, font=font)
         ImageDraw.Draw(image).text((right, edge // 2 + n * line), meaning, fill=255, font=font)
     return np.asarray(image)
+
+
+@lru_cache(maxsize=64)
+def _bar(size: int, filled: int, end: str) -> NDArray[np.uint8]:
+    """Make the panel of a bar that is filled so far [px], with the value at its end; shape (height, width)."""
+    edge, high, long = size // 2, round(0.6 * size), BAR * size
+    words = _panel(size, end)
+    drawn = np.zeros((len(words), edge + long + words.shape[1]), np.uint8)
+    drawn[:, edge + long :] = words
+    top = (len(words) - high) // 2
+    drawn[top : top + high, edge : edge + long] = OUTLINE
+    drawn[top + 1 : top + high - 1, edge + 1 : edge + long - 1] = 0
+    drawn[top : top + high, edge : edge + min(filled, long)] = 255
+    return drawn
 
 
 def _letter_size(picture: Picture) -> int:

@@ -54,8 +54,10 @@ class ScriptEvent(Section):
         None, means="the pixel", expects="for press, pull and drag [x, y] in pixels from the top left"
     )
     by: Pair | None = key(None, means="how far the picture is turned", expects="for turn [right, down] in pixels")
-    to: Annotated[NotNegative, Field(le=100)] | None = key(
-        None, means="percent of the full force", expects="for percent a number from 0 to 100"
+    to: Annotated[Number, Field(ge=-100, le=100)] | None = key(
+        None,
+        means="percent of the full force, or of the greatest depth",
+        expects="for percent a number from -100 to 100",
     )
     name: str | None = key(None, means="a key of the window", expects="for key the name of one")
     seconds: Seconds = key(0.0, means="how long it takes [s]", expects=SECONDS)

@@ -11,10 +11,12 @@ from numpy.typing import NDArray
 
 from taichi_msm.errors import DivergedError, FilesError, SceneError
 from taichi_msm.outputs.gif import Picture
+from taichi_msm.physics.deformed import touched
+from taichi_msm.physics.paths import path_notes, path_problems
 from taichi_msm.physics.plan import Plan
 from taichi_msm.physics.planning import variant, with_time
 from taichi_msm.physics.probe_force import probe_force
-from taichi_msm.render.surface import rod, rods, touched
+from taichi_msm.render.surface import rod, rods
 from taichi_msm.render.texture import load_texture
 from taichi_msm.scene import MAX_PROBES, Scene
 from taichi_msm.scenefile.resolve import resolve
@@ -24,7 +26,9 @@ from taichi_msm.simulation import Simulation
 from taichi_msm.system import runtime
 from taichi_msm.viewer import events, hud
 from taichi_msm.viewer.captures import Captures, Film, probe_values
-from taichi_msm.viewer.held_tool import Controller, HeldTool, Place
+from taichi_msm.viewer.controller import Controller
+from taichi_msm.viewer.held_tool import HeldTool, Place
+from taichi_msm.viewer.moved_tool import MovedTool
 from taichi_msm.viewer.viewport import Viewport
 
 # A session has at most this many frames per second, what a screen shows; each is a whole part of a frame of the scene.
@@ -61,8 +65,10 @@ def with_live_frames(plan: Plan) -> tuple[Plan, int]:
 class Session:
     """A person presses the tissue of a scene with a tool. Usable in a with statement, which saves a film that is on.
 
-    The tool has the force, the falloff and the offset of the scene's first probe. If it is to `play`, the scene's own
-    probes act as well. `progress` is called often with the name of the stage; what it raises stops the work there.
+    The tool has the force, the falloff and the offset of the scene's first probe with a force. Held by position, it has
+    the instrument and the friction of the first probe with a path, or else the first instrument. At first it is held as
+    the scene's first probe is. If it is to `play`, the scene's own probes act as well. `progress` is called often with
+    the name of the stage; what it raises stops the work there.
 
     Raises:
         SceneError: when the scene has no picture, no probe, or no room for another probe.
@@ -98,11 +104,14 @@ class Session:
         self._captures = captures
         self._film: Film | None = None
         self._others = scene.probes if play else ()
-        self._instrument = scene.probes[0].instrument
-        self._lift = probe_force(scene.probes[0], scene.sheet).force[2]
-        self.tool = HeldTool(scene.probes[0], scene.time.frames_per_second)
-        plan = plan.with_probes((*self._others, self.tool.recorded(0)))
-        self.scene = plan.scene
+        # Without outputs nothing is compiled for them.
+        self._plan = replace(plan, scene=scene.model_copy(update={"output": ()}))
+        self._by_force, self._by_position = _by_force(plan), _by_position(plan)
+        tool = self._by_position if scene.probes[0].moved else self._by_force
+        assert tool is not None
+        self.tool = tool
+        plan = self._with_tool(tool)
+        self.scene = scene.model_copy(update={"probes": plan.scene.probes})
         self._figures, self._keys = True, False
         self._once = self._warned = self.paused = False
         # Frames that have passed, including those while it was paused.
@@ -110,9 +119,9 @@ class Session:
         self._notice, self._notice_until = "", 0
         self.fault = ""
         self.seconds_a_frame = 0.0
+        # The largest force that the hand has felt since the tissue was at rest [N].
+        self._hardest = 0.0
         progress("compile")
-        # Without outputs nothing is compiled for them.
-        plan = replace(plan, scene=plan.scene.model_copy(update={"output": ()}))
         self._simulation = Simulation(plan, arch, threads, texture)
         self._simulation.compile(lambda: progress("compile"))
         self._beginning = self._simulation.save()
@@ -137,6 +146,12 @@ class Session:
     def displacement(self) -> float:
         """Tell how far the tissue at the tool is from rest [m]."""
         return float(np.linalg.norm(self._touched() - [*self._rest_point(self.tool.place), 0.0]))
+
+    def felt(self) -> float:
+        """Tell the force that a hand feels which holds the tool by position, the mean over the last frame [N]."""
+        if isinstance(self.tool, HeldTool):
+            return 0.0
+        return float(np.linalg.norm(self._simulation.forces()[-1].force))
 
     def recorded(self) -> Scene:
         """Give what was done as a scene; a run of it has the same bits."""
@@ -164,7 +179,7 @@ class Session:
                 self.viewport.turn(right, down)
                 self._controller.hold_on()
             case events.Percent(percent):
-                self.tool.strength = min(100.0, max(0.0, percent))
+                self.tool.ask(percent)
             case events.Harder(percent):
                 self.handle(events.Percent(self.tool.strength + percent))
             case events.Key(name):
@@ -184,6 +199,7 @@ class Session:
             if probe := self.tool.follow(self.frame):
                 self._simulation.steer((*self._others, probe))
             self._simulation.advance()
+            self._hardest = max(self._hardest, self.felt())
         except DivergedError as error:
             self.fault = str(error)
         spent = time.perf_counter() - begun
@@ -196,7 +212,9 @@ class Session:
         A film that is on takes the picture without texts; if it cannot, the film ends.
         """
         picture = self._draw()
-        if self.tool.percent != 0 and self._instrument is None and (pixel := self.viewport.pixel(self._touched())):
+        tool = self.tool
+        hidden = isinstance(tool, MovedTool) or tool.percent == 0 or tool.probe.instrument is not None
+        if not hidden and (pixel := self.viewport.pixel(self._touched())):
             hud.mark(picture, pixel, pulls=self._pulls)
         if self._film is not None:
             try:
@@ -206,7 +224,11 @@ class Session:
                 self._film = None
                 self.say(str(error))
         above = self._figure_lines(pacing) if self._figures else ["paused"] if self.paused else []
-        hud.write(picture, above, self.notice, events.POINTER | events.KEYS if self._keys else None)
+        keys, bar = (events.POINTER | events.KEYS if self._keys else None), None
+        # A small picture has no room for both.
+        if self._figures and self._hardest > 0 and keys is None:
+            bar = hud.Bar(self.felt(), self._hardest, "N")
+        hud.write(picture, above, self.notice, keys, bar)
         return picture
 
     def say(self, notice: str) -> None:
@@ -233,8 +255,9 @@ class Session:
         """Draw the tissue and the instruments; the tool's is where the tool acts, or would if it were pressed."""
         positions, scene = self.positions(), self._simulation.scene
         instruments = rods(scene, positions, self._simulation.time)
-        if self._instrument is not None and (place := self._controller.over()):
-            instruments[-1] = rod(self._instrument, scene, positions, self._rest_point(place))
+        instrument = scene.probes[-1].instrument
+        if instrument is not None and (place := self._controller.over()):
+            instruments[-1] = rod(instrument, scene, positions, self._rest_point(place))
         return self.viewport.draw(positions, instruments)
 
     def _rest_point(self, place: Place) -> NDArray[np.float64]:
@@ -265,11 +288,12 @@ class Session:
             case ".":
                 self._once = self.paused
             case "r":
-                self._once = self._warned = False
-                self._simulation.restore(self._beginning)
                 self._controller.forget()
+                self._simulation.restore(self._beginning)
                 self._simulation.steer((*self._others, self.tool.recorded(0)))
-                self.fault = ""
+                self._begin()
+            case "f":
+                self._switch()
             case "p":
                 self.say(f"saved {self._captures.save_picture(self._draw())}")
             case "g":
@@ -285,6 +309,43 @@ class Session:
             case "h":
                 self._keys = not self._keys
 
+    def _with_tool(self, tool: HeldTool | MovedTool) -> Plan:
+        """Plan the scene with a tool at rest; SceneError: it cannot be held by position."""
+        plan = self._plan.with_probes((*self._others, tool.recorded(0)))
+        mine = [own for own in plan.tools if own.probe == len(self._others)]
+        if any(path_problems(plan.scene, mine, plan.grid)):
+            raise SceneError(
+                ["this tool cannot be held by position: its shaft leads down into the sheet; let it lead up"]
+            )
+        return plan
+
+    def _switch(self) -> None:
+        """Hold the other tool, with the tissue at rest again."""
+        tool = self._by_position if isinstance(self.tool, HeldTool) else self._by_force
+        if tool is None:
+            needs = "an instrument" if isinstance(self.tool, HeldTool) else "a force"
+            self.say(f"a tool that is held so needs {needs}; give a probe of the scene one")
+            return
+        try:
+            plan = self._with_tool(tool)
+        except SceneError as error:
+            self.say(error.lines[0])
+            return
+        self._controller.forget()
+        self._simulation.restart(plan)
+        self._simulation.compile()
+        self._beginning = self._simulation.save()
+        self.tool = self._controller.tool = tool
+        self.seconds_a_frame = 0.0
+        self._begin()
+        mine = [own for own in plan.tools if own.probe == len(self._others)]
+        self.say("; ".join(path_notes(plan.scene, mine)))
+
+    def _begin(self) -> None:
+        """Forget what was said and felt of the session so far."""
+        self._once = self._warned = False
+        self._hardest, self.fault = 0.0, ""
+
     def _end_film(self) -> None:
         """End the film that is on, and save it if it has a picture."""
         film, self._film = self._film, None
@@ -299,20 +360,29 @@ class Session:
     @property
     def _pulls(self) -> bool:
         """Whether the force of the tool points away from the sheet; a scene's force may do so by itself."""
-        return self.tool.percent * self._lift > 0
+        tool = self.tool
+        return isinstance(tool, HeldTool) and tool.percent * probe_force(tool.probe, self.scene.sheet).force[2] > 0
 
     def _figure_lines(self, pacing: str) -> list[str]:
-        tool, speed = self.tool, ""
+        speed = ""
         if self.seconds_a_frame > 0:
             speed = f"steps {1 / self.rate / self.seconds_a_frame:.2g} x real time"
         state = [word for word, on in (("paused", self.paused), ("film", self._film is not None)) if on]
+        lines = self._of_tool(), [pacing, speed, *state]
+        return [SEPARATOR.join(part for part in line if part) for line in lines]
+
+    def _of_tool(self) -> list[str]:
+        """Tell what the tool does."""
+        tool = self.tool
+        if isinstance(tool, MovedTool):
+            height = tool.height if tool.held else -tool.depth
+            does = "grip" if tool.grips else "press" if tool.held else "next press"
+            return [f"{does} {length(abs(height))} {'up' if height > 0 else 'deep'}", newtons(self.felt())]
         does = "pull" if self._pulls else "push"
         percent = f"{does} {abs(tool.percent):.0f} %" if tool.percent else f"tool {tool.strength:.0f} %"
         moved = self.displacement()
         # Smaller displacements are rounding errors of positions in f32.
-        moved = moved if moved > AT_REST * max(self.scene.sheet.size) else 0.0
-        lines = [percent, length(moved)], [pacing, speed, *state]
-        return [SEPARATOR.join(part for part in line if part) for line in lines]
+        return [percent, length(moved if moved > AT_REST * max(self.scene.sheet.size) else 0.0)]
 
 
 def _require_usable(scene: Scene, *, play: bool) -> None:
@@ -324,6 +394,24 @@ def _require_usable(scene: Scene, *, play: bool) -> None:
     }
     if any(faults.values()):
         raise SceneError([message for message, is_so in faults.items() if is_so])
+
+
+def _by_force(plan: Plan) -> HeldTool | None:
+    """Make the tool that is held by force, if a probe has one."""
+    probe = next((probe for probe in plan.scene.probes if not probe.moved), None)
+    return HeldTool(probe, plan.grid.frames_per_second) if probe else None
+
+
+def _by_position(plan: Plan) -> MovedTool | None:
+    """Make the tool that is held by position, if a probe has an instrument; one that is moved comes first."""
+    probes = sorted(plan.scene.probes, key=lambda probe: not probe.moved)
+    probe = next((probe for probe in probes if probe.instrument is not None), None)
+    return MovedTool(probe, plan) if probe else None
+
+
+def newtons(force: float) -> str:
+    """Write a force [N] with two digits, or all before the point."""
+    return f"{force:.2g} N" if force < 10 else f"{force:.0f} N"
 
 
 def length(metres: float) -> str:

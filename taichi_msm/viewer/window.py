@@ -41,6 +41,10 @@ LEFT, RIGHT = 1, 3
 
 QUIT = Key("q")
 
+# This key compiles another kernel.
+SWITCH = Key("f")
+COMPILING = "one moment: compiling"
+
 # A delay beyond this is not made up for; and no picture waits longer than this for its frames [s].
 LONGEST = 0.1
 
@@ -253,6 +257,8 @@ def show(session: Session, window: Window, pause: Pause) -> None:
         for event in window.events():
             if event == QUIT:
                 return
+            if event == SWITCH:
+                window.say(COMPILING)
             try:
                 session.handle(event)
             except FilesError as error:
@@ -261,5 +267,5 @@ def show(session: Session, window: Window, pause: Pause) -> None:
         for _ in pacing.due():
             session.advance()
         if not session.viewport.compiled:
-            window.say("one moment: compiling")
+            window.say(COMPILING)
         window.show(session.picture(pacing.said()))

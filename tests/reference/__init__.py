@@ -13,21 +13,30 @@ from tests.reference.dynamics import (
     longest_spring,
     shortest_spring,
     simulate,
+    steps,
     surgical_force,
 )
+from tests.reference.rest import clearance, equilibrium, equilibrium_outside_tool, place, potential, stiffness
 from tests.reference.sheet import sheet
 
 __all__ = [
     "bending_force",
+    "clearance",
     "displacements",
     "draw",
     "elastic_force",
     "energy",
+    "equilibrium",
+    "equilibrium_outside_tool",
     "force",
     "longest_spring",
+    "place",
+    "potential",
     "refine",
     "sheet",
     "shortest_spring",
     "simulate",
+    "steps",
+    "stiffness",
     "surgical_force",
 ]

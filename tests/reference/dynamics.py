@@ -12,6 +12,7 @@ from taichi_msm.physics.loads import Schedule, schedule
 from taichi_msm.physics.plan import Plan
 from taichi_msm.physics.planning import make_plan
 from taichi_msm.scene import Scene
+from tests.reference.contact import Contact
 from tests.reference.sheet import Springs, sheet
 
 Array = NDArray[np.float64]
@@ -158,24 +159,29 @@ def force(scene: Scene, displacement: Array, loads: Schedule, n: int) -> Array:
 
 def displacements(plan: Plan) -> Iterator[Array]:
     """Step a scene by Stoermer-Verlet (eq. 6 to 9) and yield u_0, u_1, ... [m], each of shape (rows, cols, 3)."""
+    return (u for u, _ in steps(plan))
+
+
+def steps(plan: Plan) -> Iterator[tuple[Array, Contact]]:
+    """Yield u_0, u_1, ... [m], shape (rows, cols, 3), each with the contact in the step before it."""
     scene = plan.scene
     h, made = plan.grid.step, sheet(scene)
     m, g = made.mass[..., None], (made.drag / made.mass)[..., None]
-    moves = ~plan.fixed[..., None]
+    moves, contact = ~plan.fixed[..., None], Contact(plan)
     loads = schedule(plan, 0, plan.grid.steps)
 
     previous = np.zeros((*scene.sheet.points, 3))
-    yield previous
-    current = h**2 / 2 * force(scene, previous, loads, 0) / m * moves
-    yield current
+    yield previous, contact
+    current = contact.after(0, previous, h**2 / 2 * force(scene, previous, loads, 0) / m * moves)
+    yield current, contact
     for n in range(1, len(loads.active)):
         a = force(scene, current, loads, n) / m
         if scene.time.damping_difference == "central":
             following = (2 * current - (1 - g * h / 2) * previous + h**2 * a) / (1 + g * h / 2)
         else:
             following = 2 * current - previous + h**2 * a - g * h * (current - previous)
-        previous, current = current, following * moves
-        yield current
+        previous, current = current, contact.after(n, current, following * moves)
+        yield current, contact
 
 
 def simulate(scene: Scene) -> Array:

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from taichi_msm.physics.lattice import spacing
-from taichi_msm.physics.material import MapImage, map_factors, read_map
+from taichi_msm.physics.material import MapImage, cell_factors, point_factors, read_map
 from taichi_msm.scene import Scene, StiffnessMap, Tissue
 
 Array = NDArray[np.float64]
@@ -64,8 +64,18 @@ def factors(scene: Scene) -> Array:
     rows, cols = scene.sheet.points
     if scene.stiffness_map is None:
         return np.ones((rows - 1, cols - 1))
-    changed = Path(scene.stiffness_map.image).stat().st_mtime_ns
-    return map_factors(scene.stiffness_map, _read(scene.stiffness_map, changed), rows - 1, cols - 1)
+    return cell_factors(scene.stiffness_map, _image(scene.stiffness_map), scene.sheet)
+
+
+def foundation_factors(scene: Scene) -> Array:
+    """Give the factor of the foundation at every point, shape (rows, cols); ones without a map."""
+    of = scene.maps.get("foundation_map")
+    return np.ones(scene.sheet.points) if of is None else point_factors(of, _image(of), scene.sheet)
+
+
+def _image(of: StiffnessMap) -> MapImage:
+    """Read the file of a map, again only when it has changed."""
+    return _read(of, Path(of.image).stat().st_mtime_ns)
 
 
 @lru_cache(maxsize=8)
@@ -79,7 +89,6 @@ def sheet(scene: Scene) -> Sheet:
     if scene.tissue is not None:
         return _of_tissue(scene, scene.tissue)
     assert scene.springs is not None
-    assert scene.sheet.mass is not None
     factor = factors(scene)
     cells = np.ones_like(factor)
     structural, shear = scene.springs.structural, scene.springs.shear
@@ -91,7 +100,7 @@ def sheet(scene: Scene) -> Sheet:
     }
     every = np.ones((rows, cols))
     springs = tuple(_springs(scene, ahead, k, 0 * k) for ahead, k in stiffness.items())
-    return Sheet(springs, scene.sheet.mass * every, scene.damping * every, scene.springs.virtual * every, 0.0)
+    return Sheet(springs, (scene.sheet.mass or 0.0) * every, scene.damping * every, scene.springs.virtual * every, 0.0)
 
 
 def _of_tissue(scene: Scene, tissue: Tissue) -> Sheet:
@@ -109,10 +118,10 @@ def _of_tissue(scene: Scene, tissue: Tissue) -> Sheet:
         _springs(scene, TO_LEFT, diagonal * factor, stretch * diagonal * cells),
     )
     quarters = _rows_of(_columns_of(cells))
-    mass = tissue.density * tissue.thickness * dx * dy / 4 * quarters
+    mass = (tissue.density or 0.0) * tissue.thickness * dx * dy / 4 * quarters
     plate = tissue.young * tissue.thickness**3 / 12 / (1 - 1 / 9)
     bending = plate if tissue.bending == "plate" else float(tissue.bending)
-    virtual = tissue.foundation * dx * dy / 4 * quarters
+    virtual = tissue.foundation_stiffness * dx * dy / 4 * quarters * foundation_factors(scene)
     return Sheet(springs, mass, tissue.damping * mass, virtual, bending * dx * dy)
 
 

@@ -37,7 +37,9 @@ class DampingTerm(Term):
 
     @staticmethod
     def derive(scene: Scene) -> dict[str, Any]:
-        """Give C / m [1/s]."""
+        """Give C / m [1/s]; at rest nothing moves."""
+        if scene.time.at_rest:
+            return {"drag": 0.0}
         if scene.tissue is not None:
             return {"drag": scene.tissue.damping}
         assert scene.sheet.mass is not None

@@ -1,7 +1,7 @@
 """The loads: what probes exert on the points around their control points. Scene: `probes`.
 
 The force on a point at the distance d is F exp(-max(falloff d + shift, offset)) (see `probe_force`), tabulated for
-every step in a few columns for each `ProbeSlot`. Where a control point stands, its decay is an array.
+every step in a few columns for each `ProbeSlot`. Where a control point stands, its decay is a field.
 """
 
 # No `from __future__ import annotations` here: Taichi reads the annotations of a kernel.
@@ -45,7 +45,7 @@ class ProbeTerm(Term):
         """A few columns for each slot."""
         return SLOT_COLUMNS * len(self.moves)
 
-    def columns(self, plan: Plan, loads: Schedule) -> NDArray[Any]:
+    def columns(self, plan: Plan, loads: Schedule, first: int) -> NDArray[Any]:
         """Give forces and places of every slot."""
         slots = np.empty((len(loads.active), len(self.moves), SLOT_COLUMNS))
         slots[..., FORCE:POINT] = loads.strength
@@ -55,12 +55,24 @@ class ProbeTerm(Term):
             slots[:, n, FALLOFF:] = acts.falloff, acts.shift, acts.offset
         return slots.reshape(len(slots), self.column_count)
 
+    @property
+    def field_count(self) -> int:
+        """One field for each slot that stands."""
+        return self.moves.count(False)
+
+    def fields(self, plan: Plan) -> NDArray[Any]:
+        """Give the decays of the standing slots."""
+        scene = plan.scene
+        decays = [decay(scene.probes[slot.probe], scene.sheet) for slot in plan.slots if not slot.moves]
+        return np.array(decays).reshape(-1, *scene.sheet.points)
+
     def forces(self, code: StepCode) -> Sequence[Callable[..., Any]]:
         """Make the function that adds the forces of all slots."""
         ti = code.ti
         moves, by_area, first = self.moves, self.by_area, code.first_column(ProbeTerm)
         vector, lanes = code.vector, code.lanes
-        standing = [moves[:n].count(False) for n in range(len(moves))]
+        first_field = code.first_field(ProbeTerm)
+        standing = [first_field + moves[:n].count(False) for n in range(len(moves))]
 
         @ti.func
         def add(force: ti.template(), sheet: ti.template(), entry: ti.template(), now: ti.template()):
@@ -76,17 +88,11 @@ class ProbeTerm(Term):
                     if ti.static(by_area[n]):
                         share *= sheet.by_column[(AREA + entry.row.kind) * sheet.width + entry.b]
                 else:
-                    share = sheet.decay[(standing[n] * sheet.rows + entry.row.i) * sheet.width + entry.b]
+                    share = sheet.fields[(standing[n] * sheet.rows + entry.row.i) * sheet.width + entry.b]
                 for c in ti.static(range(3)):
                     force[c] += now[column + c] * share
 
         return (add,)
-
-
-def standing_decays(plan: Plan) -> NDArray[np.float64]:
-    """Evaluate the decays of all standing slots, shape (slots, rows, cols)."""
-    scene = plan.scene
-    return np.array([decay(scene.probes[slot.probe], scene.sheet) for slot in plan.slots if not slot.moves])
 
 
 def standing(plan: Plan) -> list[tuple[object, ...]]:
@@ -100,6 +106,7 @@ def free_acceleration(plan: Plan) -> float:
     forces = (
         probe_force(probe, plan.scene.sheet).size * max(abs(percent) for _, percent in probe.load) / 100
         for probe in plan.scene.probes
+        if not probe.moved
     )
     return sum(forces) / plan.material.mass
 

@@ -109,10 +109,24 @@ class SpringTerm(Term):
         and hence no mode of the sheet. If factors differ, each cell takes the share of a point's mass that it has of
         the point's stiffness; the maximum is then multiplied by the largest mean of the factors around a point.
         """
-        across, down, shear, largest = material.across, material.down, material.shear, 1.0
+        largest = 1.0
         if material.factors is not None:
             largest = largest_mean(material.factors) if material.by_area else float(material.factors.max())
-        return 4 * max(across + down, across + 2 * shear, down + 2 * shear) * largest
+        return _unmapped_bound(material) * largest
+
+    @classmethod
+    def bounds(cls, plan: Plan) -> NDArray[Any] | float:
+        """Bound it point by point: with a map, each cell gives its corners a quarter of its own bound.
+
+        Tissue has fewer cells at a point at an edge. Springs along an edge are whole: the largest factor.
+        """
+        material, factors = plan.material, plan.material.factors
+        if factors is None:
+            factors = np.ones([count - 1 for count in plan.scene.sheet.points])
+        around = np.pad(factors, 1)
+        cells = np.stack([around[:-1, :-1], around[:-1, 1:], around[1:, :-1], around[1:, 1:]])
+        shares = cells.mean(axis=0) if material.by_area else cells.max(axis=0)
+        return _unmapped_bound(material) * shares
 
     def numbers(self, plan: Plan) -> tuple[float, ...]:
         """Give k - tau and tau of every family [N/m]."""
@@ -204,6 +218,46 @@ class SpringTerm(Term):
 
         return along, to_other_row, of_row, of_column, of_diagonal
 
+    def pulling(self, code: StepCode) -> Callable[..., Any]:
+        """Make the function that gives the square of the largest force of the springs to the right and below."""
+        ti = code.ti
+        structural, shear, vector = self.structural, self.shear, code.vector
+        along, to_other_row, of_row, of_column, of_diagonal = self.between(code)
+
+        @ti.func
+        def stronger(largest, force: ti.template()):
+            """Give the larger of a square and that of a force."""
+            return ti.max(largest, force[0] * force[0] + force[1] * force[1] + force[2] * force[2])
+
+        @ti.func
+        def pull(sheet: ti.template(), entry: ti.template()):
+            row = ti.static(entry.row)
+            u = ti.static(entry.u)
+            b, largest = entry.b, vector(0)
+            # Beyond an edge there is no spring.
+            has_left, has_right = (
+                sheet.by_column[HAS_LEFT * sheet.width + b],
+                sheet.by_column[HAS_RIGHT * sheet.width + b],
+            )
+            dx, dy = sheet.numbers[DX], sheet.numbers[DY]
+            here, below, lower = row.i * sheet.width + b, (row.i + 1) * sheet.width + b, row.i + 1
+            if ti.static(structural):
+                k = vector(0) + of_row(sheet, row.i, row.kind, b)
+                largest = stronger(largest, along(sheet, here + 1, u, k * has_right, vector(1)))
+            if lower < sheet.rows:
+                if ti.static(structural):
+                    k = vector(0) + of_column(sheet, lower, b)
+                    largest = stronger(largest, to_other_row(sheet, below, 0, u, 0 - dy, dy, k, vector(1)))
+                if ti.static(shear):
+                    diagonal = ti.sqrt(dx * dx + dy * dy)
+                    for right, exists in ti.static(((-1, has_left), (1, has_right))):
+                        k = vector(0) + of_diagonal(sheet, lower, b + ti.static(min(right, 0)))
+                        force = to_other_row(sheet, below + right, right, u, 0 - dy, diagonal, k * exists, vector(1))
+                        largest = stronger(largest, force)
+            return largest
+
+        return pull
+
     def measuring(self, code: StepCode) -> Sequence[Callable[..., None]]:
         """Make the function that measures the springs to the right of an entry and to the row below it."""
         ti = code.ti
@@ -268,6 +322,12 @@ class SpringTerm(Term):
         pads = ((0, 0), (0, 1)), ((1, 1), (0, 0)), ((1, 1), (0, 1))
         families = zip(stiffness(material, material.factors), material.tensions, pads, strict=True)
         return np.concatenate([np.pad(np.maximum(k - tension, 0), pad) for k, tension, pad in families])
+
+
+def _unmapped_bound(material: Material) -> float:
+    """Bound m w^2 where the factor of the map is 1: see `SpringTerm.bound` [N/m]."""
+    across, down, shear = material.across, material.down, material.shear
+    return 4 * max(across + down, across + 2 * shear, down + 2 * shear)
 
 
 def stiffness(material: Material, factors: NDArray[Any]) -> tuple[NDArray[Any], NDArray[Any], NDArray[Any]]:

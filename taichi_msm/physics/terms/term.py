@@ -55,6 +55,11 @@ class Term(ABC):
         """Bound the part of m w^2 that the term has in any motion [N/m]."""
         return 0.0
 
+    @classmethod
+    def bounds(cls, plan: Plan) -> NDArray[Any] | float:
+        """Bound the stiffness that each point feels, as `bound` does; shape (rows, cols), or one for all [N/m]."""
+        return cls.bound(plan.material, plan.scene.sheet)
+
     def numbers(self, plan: Plan) -> tuple[float, ...]:
         """Give its numbers."""
         return ()
@@ -64,9 +69,18 @@ class Term(ABC):
         """How many columns of the table of loads belong to the term."""
         return 0
 
-    def columns(self, plan: Plan, loads: Schedule) -> NDArray[Any]:
-        """Give its columns of the table of loads, shape (steps, column_count)."""
+    @property
+    def field_count(self) -> int:
+        """How many fields belong to the term."""
+        return 0
+
+    def columns(self, plan: Plan, loads: Schedule, first: int) -> NDArray[Any]:
+        """Give its columns of the table of loads, from step `first` on, shape (steps, column_count)."""
         return np.empty((len(loads.active), 0))
+
+    def fields(self, plan: Plan) -> NDArray[Any]:
+        """Give its fields at the start, a number for every point each, shape (field_count, rows, cols)."""
+        return np.empty((0, *plan.scene.sheet.points))
 
     def energy(self, sums: NDArray[Any], plan: Plan) -> float:
         """Give twice its energy [J], from its measures summed up."""
@@ -145,6 +159,10 @@ class StepCode:
         """Give the first column of a term in the table of loads; None: how many columns there are."""
         return STEP_COLUMNS + sum(term.column_count for term in self._before(kind))
 
+    def first_field(self, kind: type[Term] | None) -> int:
+        """Give the index of the first field of a term; None: how many fields there are."""
+        return sum(term.field_count for term in self._before(kind))
+
     def first_measure(self, kind: type[Term] | None) -> int:
         """Give the index of the first measure of a term; None: how many measures there are."""
         return STEP_MEASURES + sum(len(term.reductions) for term in self._before(kind))
@@ -160,10 +178,10 @@ class KernelSheet(NamedTuple):
     # u, d: displacements, with bending also moments, and last differences; three arrays each, for x, y and z
     u: Any
     d: Any
-    # by_column, stiffness, decay: one array each
+    # by_column, stiffness, fields: one array each
     by_column: Any
     stiffness: Any
-    decay: Any
+    fields: Any
     numbers: Any  # of the sheet and of its terms, a list of variables
     rows: Any  # of points
     width: Any  # entries of a row

@@ -1,0 +1,48 @@
+"""The deformed sheet: its points, and any place on the surface that is drawn between them."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from taichi_msm.physics.lattice import axes
+from taichi_msm.scene import Sheet
+
+Array = NDArray[np.float64]
+
+
+def to_positions(displacement: NDArray[Any], sheet: Sheet) -> NDArray[Any]:
+    """Turn displacements [m], shape (rows, cols, 3), into positions, which are not to be written to."""
+    position, (x, y) = displacement, axes(sheet)
+    # The sum is computed in float64 and rounded once, without a float64 copy of the sheet.
+    np.add(position[..., 0], x, out=position[..., 0], casting="same_kind")
+    np.add(position[..., 1], y, out=position[..., 1], casting="same_kind")
+    position.flags.writeable = False
+    return position
+
+
+def touched(position: NDArray[np.floating], refine: int, sheet: Sheet, rest: Array) -> tuple[Array, Array]:
+    """Find the point of the refined surface whose rest position, x and y [m], is `rest`.
+
+    A point outside the sheet moves with the nearest point of its edge. The mass points are at `position` [m], shape
+    (rows, cols, 3), and `refine` vertices are inserted between neighbours.
+
+    Returns:
+        The point [m], and the unit normal of its cell there, upward at rest; both of shape (3,).
+    """
+    (height, width), (rows, cols), parts = sheet.size, sheet.points, refine + 1
+    across = min(1.0, max(0.0, rest[0] / width + 0.5))
+    down = min(1.0, max(0.0, 0.5 - rest[1] / height))
+    j, i = min(int(across * (cols - 1)), cols - 2), min(int(down * (rows - 1)), rows - 2)
+    a, right, below, far = (position[i + n // 2, j + n % 2].astype(np.float64) for n in range(4))
+    b, c, d = right - a, below - a, far - right - below + a
+    s, t = across * (cols - 1) - j, down * (rows - 1) - i
+    normal = np.cross(b + d * t, -(c + d * s))
+    s0, t0 = min(int(s * parts), parts - 1) / parts, min(int(t * parts), parts - 1) / parts
+    s1, t1 = s - s0, t - t0
+    # In the small quad, D s t is replaced by a function that is linear on either side of the diagonal.
+    point = a + b * s + c * t + d * (s0 * t0 + s1 * t0 + s0 * t1 + min(s1, t1) / parts)
+    beside = np.array([rest[0] - (across - 0.5) * width, rest[1] - (0.5 - down) * height, 0.0])
+    return point + beside, normal / max(float(np.linalg.norm(normal)), 1e-300)

@@ -1,0 +1,181 @@
+"""Tools that are moved: contact, friction and grips against their twin, and against what must hold of any contact."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+
+from taichi_msm.physics.kernel import SheetLayout
+from taichi_msm.physics.paths import fewest_steps
+from taichi_msm.physics.planning import try_plan
+from taichi_msm.physics.solver import Dynamics
+from taichi_msm.physics.state import State
+from taichi_msm.scene import Scene
+from taichi_msm.system.runtime import Device
+from tests import reference
+from tests.motion import dynamics_of, structure_of
+from tests.scenes import plan_of, scene
+from tests.test_dynamics import as_on_a_gpu, assert_like_twin, with_lanes
+
+ROD = {"radius": 0.05, "shaft": [0.5, -0.6, 0.9], "length": 0.3}
+
+
+def moved(*keys: list[float], **changes: Any) -> dict[str, Any]:
+    return {"path": list(keys), "instrument": {**ROD, **changes.pop("instrument", {})}, **changes}
+
+
+def touching(probes: list[dict[str, Any]], **sections: Any) -> Scene:
+    tissue = {"young": 1e3, "thickness": 0.01, "density": 1000, "foundation": 3e3, "damping": 5}
+    given = {"sheet": {"points": [17, 21], "size": [0.3, 0.4]}, "tissue": tissue, "springs": None, "damping": 0}
+    return scene(**{**given, "probes": probes, **sections})
+
+
+PRESSED = moved([0, 0.5, 0.5, 0.001], [0.2, 0.52, 0.45, -0.03], [0.4, 0.6, 0.5, -0.02])
+RUBBED = moved([0, 0.3, 0.5, 0.0], [0.1, 0.3, 0.5, -0.03], [0.4, 0.7, 0.4, -0.03], friction=0.3)
+HELD = moved([0, 0.5, 0.4, 0.0], [0.1, 0.5, 0.4, -0.02], [0.4, 0.45, 0.6, 0.04], grip=[[0.1, 0.25], [0.3, 0.38]])
+BESIDE = moved([0, 0.6, 0.4, 0.0], [0.12, 0.55, 0.4, -0.02], [0.4, 0.9, 0.3, 0.03], grip=[[0.12, 0.4]], friction=0.5)
+
+CASES = {"pressed": [PRESSED], "rubbed": [RUBBED], "held": [HELD], "together": [HELD, RUBBED, BESIDE]}
+
+
+@pytest.mark.parametrize("precision", ["f32", "f64"])
+@pytest.mark.parametrize("case", CASES)
+def test_like_twin(case: str, precision: str, device: Device) -> None:
+    assert_like_twin(touching(CASES[case], time={"precision": precision}), device)
+
+
+@pytest.mark.parametrize("case", CASES)
+def test_the_case_is_what_its_name_says(case: str) -> None:
+    probes = range(len(CASES[case]))
+    pushed, held = set(), set()
+    for _, contact in reference.steps(plan_of(touching(CASES[case]))):
+        pushed |= {index for index in probes if contact.push[index].any()}
+        held |= set(contact.holder.ravel()) - {-1}
+    assert pushed == set(probes)
+    assert held == {index for index in probes if "grip" in CASES[case][index]}
+
+
+def states(made: Scene, device: Device, layout: SheetLayout) -> bytes:
+    """All that the next steps depend on, at the end."""
+    dynamics = dynamics_of(made, device, layout)
+    dynamics.advance(plan_of(made).grid.steps)
+    state = dynamics.state()
+    dynamics.close()
+    return b"".join(array.tobytes() for array in state[1:])
+
+
+def test_lanes_workers_and_passes_do_not_change_the_bits(device: Device) -> None:
+    made = touching(CASES["together"], time={"precision": "f32"})
+    layout = structure_of(made, device)
+    plain = states(made, device, layout)
+    for lanes, workers, depth in ((layout.code.lanes, 2, 1), (layout.code.lanes, 2, 4), (4, 1, 3), (1, 2, 1)):
+        assert states(made, device, replace(with_lanes(layout, lanes), workers=workers, depth=depth)) == plain
+    assert states(made, device, as_on_a_gpu(layout)) == plain
+
+
+def test_steps_go_on_from_a_state(device: Device) -> None:
+    made = touching(CASES["together"])
+    plan, dynamics = plan_of(made), dynamics_of(made, device)
+    dynamics.advance(plan.grid.steps * 3 // 4 + 1)
+    saved = dynamics.state()
+    assert len(saved.contact) == 3 * 3 + 4
+    dynamics.restart(plan, State(*saved))
+    dynamics.advance(plan.grid.steps - saved.steps)
+    whole = dynamics_of(made, device)
+    whole.advance(plan.grid.steps)
+    assert [part.tobytes() for part in dynamics.state()[1:]] == [part.tobytes() for part in whole.state()[1:]]
+
+
+DOWN_AND_UP = ([0, 0.5, 0.5, 0.0], [0.1, 0.5, 0.5, -0.02], [0.4, 0.6, 0.5, 0.02])
+LOADED = {"total": [0, 0, 2], "radius": 0.05, "load": [[0, 0], [0.2, 100]]}
+FRAME = 1 / 25
+
+# What is at an edge of the rules.
+EDGES: dict[str, list[dict[str, Any]]] = {
+    "equal to a frame": [moved(*DOWN_AND_UP, grip=[[3 * FRAME + 0.9e-6 * FRAME, 7 * FRAME - 0.9e-6 * FRAME]])],
+    "after a frame": [moved(*DOWN_AND_UP, grip=[[3 * FRAME + 2e-6 * FRAME, 7 * FRAME + 2e-6 * FRAME]])],
+    "one grip after the other": [moved(*DOWN_AND_UP, grip=[[0.1, 0.2], [0.2, 0.3]])],
+    "shorter than a step": [moved(*DOWN_AND_UP, grip=[[0.1001, 0.1002], [0.15, 0.1501]])],
+    "from before the start to after the end": [
+        moved([-0.5, 0.5, 0.5, 0.05], [0.3, 0.5, 0.5, -0.02], [0.9, 0.5, 0.5, 0.0], grip=[[-1, 5]])
+    ],
+    "a single key": [moved([0.1, 0.5, 0.5, 0.0], grip=[[0.1, 0.3]]), LOADED],
+    "begins late and ends early": [moved([0.1, 0.5, 0.5, 0.0], [0.2, 0.5, 0.5, -0.03])],
+    "comes from beside": [moved([0, 1.5, 0.5, -0.03], [0.4, 0.8, 0.5, -0.03])],
+    "larger than the sheet": [
+        moved([0, 0.5, 0.5, 0.0], [0.2, 0.5, 0.5, -0.05], [0.4, 0.5, 0.5, -0.01], instrument={"radius": 0.5})
+    ],
+    "from below": [
+        moved([0, 0.5, 0.5, -0.1], [0.2, 0.5, 0.45, -0.07], instrument={"shaft": [0.2, 0.1, -1]}, friction=0.3)
+    ],
+    "lies": [moved([0, 0.3, 0.5, 0.0], [0.2, 0.3, 0.5, -0.03], instrument={"shaft": [1, 0, 0]}, friction=0.3)],
+}
+
+
+@pytest.mark.parametrize("fixed", ["border", "none"])
+@pytest.mark.parametrize("case", EDGES)
+def test_edges_like_twin(case: str, fixed: str, device: Device) -> None:
+    made = touching(EDGES[case])
+    small = made.sheet.model_copy(update={"points": (9, 11), "fixed": fixed})
+    assert_like_twin(made.model_copy(update={"sheet": small}), device)
+
+
+@pytest.mark.parametrize(("height", "pushed"), [(0.05, 0.05), (0.0, 0.0), (0.1, 0.0)], ids=["axis", "below", "above"])
+@pytest.mark.parametrize("precision", ["f32", "f64"])
+def test_the_middle_line_pushes_up_and_the_surface_does_not(
+    precision: str, height: float, pushed: float, device: Device
+) -> None:
+    """A point with d = 0 and with d = radius, to the bit, and with no force on it."""
+    probe = moved([0, 0.5, 0.5, 0.0], instrument={"shaft": [1, 0, 0]}, friction=0.3)
+    plan = plan_of(scene(springs={"virtual": 1.0}, damping=0, probes=[probe], time={"precision": precision}))
+    displacement = np.zeros((*plan.scene.sheet.points, 3), precision.replace("f", "float"))
+    displacement[4, 5, 2] = height
+    dynamics = Dynamics(plan, device)
+    dynamics.restart(plan, State(1, displacement, np.zeros_like(displacement)))
+    dynamics.advance(1)
+    assert dynamics.state().contact[:3, 4, 5] == pytest.approx([0, 0, pushed])
+    assert dynamics.displacement()[4, 5] == pytest.approx([0, 0, height + pushed])
+
+
+def test_a_sheet_of_four_points_like_twin(device: Device) -> None:
+    held = moved(
+        [0, 0.2, 0.2, 0.0], [0.2, 0.2, 0.2, -0.03], [0.4, 0.6, 0.5, -0.02],
+        friction=0.3, grip=[[0.2, 0.3]], instrument={"radius": 0.2},
+    )  # fmt: skip
+    made = touching([held])
+    small = made.sheet.model_copy(update={"points": (2, 2), "size": (0.3, 0.3), "fixed": "none"})
+    assert_like_twin(made.model_copy(update={"sheet": small}), device)
+
+
+def problems(*keys: list[float], **time: Any) -> list[str]:
+    return [str(problem) for problem in try_plan(touching([moved(*keys)], time=time))[1]]
+
+
+def test_how_far_a_tool_comes_in_a_step() -> None:
+    """Half of its radius, 0.05 m, at most: within one segment of its path, across a key, and from the start on."""
+    still, step = [0, 0.5, 0.5, 0.1], {"step": 0.01}
+    assert not problems(still, [0.4, 0.5, 0.5, 0.1], **step)
+    # Between columns 0.4 m apart in all: 0.16 m/s, 2.4 m/s, 2.6 m/s.
+    assert not problems(still, [0.1, 0.5 + 0.24 / 0.4, 0.5, 0.1], **step)
+    (far,) = problems(still, [0.2, 0.5, 0.5, 0.1], [0.3, 0.5 + 0.26 / 0.4, 0.5, 0.1], **step)
+    assert far == (
+        "probes.0.path.2: moves 0.026 m in a step of 0.01 s, over half the radius of its instrument; move at most 2.5 "
+        "m/s, or take a smaller step"
+    )
+    # 0.024 m within a microsecond, and twice that within a step.
+    assert not problems(still, [0.1, 0.5, 0.5, 0.1], [0.100001, 0.56, 0.5, 0.1], **step)
+    twice = [[0.1, 0.5, 0.5, 0.1], [0.100001, 0.56, 0.5, 0.1], [0.104, 0.56, 0.5, 0.1], [0.104001, 0.62, 0.5, 0.1]]
+    assert "moves 0.048 m in a step" in problems(still, *twice, **step)[0]
+    # After the end, where a simulation may still go, and before the start.
+    assert problems(still, [0.4, 0.5, 0.5, 0.1], [0.41, 0.9, 0.5, 0.1], **step)
+    assert not problems([-0.01, 0.1, 0.5, 0.1], still, **step)
+
+
+def test_the_fewest_steps_in_which_no_tool_moves_too_far() -> None:
+    plan = plan_of(touching([moved([0, 0.5, 0.5, 0.1], [0.1, 1.5, 0.5, 0.1])]))
+    assert fewest_steps(plan.tools, plan.grid, 1) == 7  # 0.16 m in a frame, in parts of 0.025 m
+    assert fewest_steps(plan.tools, plan.grid, 9) == 9
+    assert fewest_steps((), plan.grid, 1) == 1

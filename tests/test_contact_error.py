@@ -1,0 +1,194 @@
+"""What is told of the error of runs whose tools touch the sheet, against the error itself (docs/decisions/0027)."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterator
+from functools import partial
+from typing import Any
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+from PIL import Image
+
+from taichi_msm.physics import error_control
+from taichi_msm.physics.error_control import Estimate, choose_step, estimate_error, longest, order, reconcile
+from taichi_msm.physics.mesh_error import with_points
+from taichi_msm.physics.paths import overlap, path_notes
+from taichi_msm.physics.pilots import choose_pilots
+from taichi_msm.physics.plan import Plan
+from taichi_msm.physics.planning import variant
+from taichi_msm.physics.run_error import Known, RunError
+from taichi_msm.physics.solver import Dynamics
+from taichi_msm.system.runtime import Device
+from tests.motion import frames_on, notes_of, true_error
+from tests.scenes import plan_of, random_contact
+from tests.test_accuracy import MOVED, Falling
+from tests.test_contact import HELD, PRESSED, RUBBED, moved, touching
+
+# Of 30 random scenes a few are tried by default.
+SEEDS = [pytest.param(seed, marks=[] if seed % 10 == 0 else pytest.mark.slow) for seed in range(30)]
+
+
+@pytest.fixture(scope="module")
+def image(tmp_path_factory: pytest.TempPathFactory) -> str:
+    path = tmp_path_factory.mktemp("map") / "map.png"
+    grey = (255 * np.random.default_rng(1).random((5, 5))).astype(np.uint8)
+    Image.fromarray(grey).resize((64, 64), Image.Resampling.BICUBIC).save(path)
+    return str(path)
+
+
+def told(plan: Plan, device: Device) -> Known:
+    """What a run says of its error."""
+    known = RunError(plan, choose_pilots(plan, asked=True), Known(), device, device.threads)
+    own, kept = Dynamics(plan, device), []
+    for _ in range(plan.grid.frames):
+        own.advance(plan.grid.steps_per_frame)
+        kept.append(own.displacement())
+        known.follow(kept[-1], lambda: None)
+    known.finish(iter(kept), lambda done, total: None)
+    return known.known
+
+
+@pytest.mark.parametrize("seed", SEEDS)
+def test_the_error_of_the_step_is_hardly_above_what_is_told(
+    seed: int, image: str, device: Device, record_property: Callable[[str, object], None]
+) -> None:
+    plan = plan_of(random_contact(seed, image))
+    assert choose_pilots(plan).cost <= 0.75
+    estimate = told(plan, device).estimate
+    assert estimate is not None
+    assert estimate.at_most
+    error = true_error(plan, device, fine=16)
+    record_property("told", f"{estimate.error:.3g}, {estimate.error / error:.2f} of the truth, {estimate.at_least=}")
+    assert error <= 1.5 * estimate.error or estimate.at_least
+    assert estimate.error <= 8 * error
+
+
+@pytest.mark.parametrize("seed", SEEDS)
+def test_the_error_of_the_points_is_hardly_above_what_is_told(
+    seed: int, image: str, device: Device, record_property: Callable[[str, object], None]
+) -> None:
+    plan = plan_of(random_contact(seed, image, cells=4))
+    if plan.scene.tissue is None:
+        pytest.skip("springs have none")
+    mesh = told(plan, device).mesh
+    assert mesh is not None
+    assert mesh.at_most
+    exact = plan.with_grid(precision="f64")
+    rows, cols = plan.scene.sheet.points
+    finer = variant(exact, with_points(plan.scene, (4 * rows - 3, 4 * cols - 3))).with_grid(precision="f64")
+    reference = frames_on(finer, device)[:, ::4, ::4]
+    own = frames_on(exact.with_grid(steps_per_frame=8 * plan.grid.steps_per_frame), device)
+    error = longest(own - reference) / longest(reference)
+    record_property("told", f"{mesh.error:.3g}, {mesh.error / error:.2f} of the truth, {mesh.doubt=}")
+    assert error <= 1.5 * mesh.error or mesh.doubt
+
+
+@pytest.mark.parametrize("tolerance", [0.03, pytest.param(0.003, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("case", [[PRESSED], [RUBBED], [HELD]], ids=["pressed", "rubbed", "held"])
+def test_a_tolerance_is_kept(case: list[dict[str, Any]], tolerance: float, device: Device) -> None:
+    plan, estimate = choose_step(plan_of(touching(case, time={"tolerance": tolerance})), device)
+    assert estimate.error <= tolerance
+    assert true_error(plan, device, fine=8) <= tolerance
+
+
+def test_contact_is_of_order_1() -> None:
+    assert order(plan_of(touching([PRESSED]))) == 1
+    assert order(plan_of(touching([]))) == 2
+
+
+def test_without_a_coarse_pilot_half_as_much_again_is_told(monkeypatch: pytest.MonkeyPatch, device: Device) -> None:
+    monkeypatch.setattr(error_control, "Dynamics", partial(Falling, 1))
+    plan = plan_of(touching([PRESSED], time={"step": 0.005}))
+    assert estimate_error(plan, device).error == pytest.approx(1.25 * 1.5 * 0.005 / (1 + 0.005 / 2), rel=1e-9)
+
+
+@pytest.mark.parametrize(
+    ("coarse", "share", "at_least"),
+    [(0.01, 2 / 3, True), (0.9, 0.9, False), (math.inf, 4 / 3, False), (0.34, 2 / 3, False), (0.33, 2 / 3, True)],
+)
+def test_a_coarse_pilot_decides_within_the_doubt_of_the_fine_one(coarse: float, share: float, at_least: bool) -> None:
+    def of(error: float, *, at_most: bool = True) -> Estimate:
+        return Estimate(10, error, 0.0, error, 1, at_most=at_most)
+
+    both = reconcile(of(coarse), of(1.0))
+    assert [both.error, both.in_f64] == pytest.approx([share, share])
+    assert both.at_least == at_least
+    assert reconcile(of(coarse), of(1.0, at_most=False)) == of(1.0, at_most=False)
+    assert reconcile(of(coarse), of(0.0)).error == 0
+    assert reconcile(of(coarse), of(math.inf)).error == math.inf
+
+
+def test_how_wrong_it_is_is_said_as_a_bound() -> None:
+    made = touching([PRESSED])
+
+    def said(*, at_least: bool) -> list[str]:
+        return notes_of(made, MOVED, Estimate(10, 0.04, 0.0, 0.04, 1, at_least=at_least, at_most=True))
+
+    first, step = said(at_least=False)
+    assert first == ("error at most about 0.04 of the largest displacement: at most about 0.04 due to the time step")
+    # Of order 1, it takes eight times as many steps.
+    finer = 0.04 / (8 * plan_of(made).grid.steps_per_frame)
+    assert step == f"the run is up to 4 % wrong; try time.step: {finer:.9g}"
+    assert said(at_least=True)[0].startswith("error roughly 0.04 of the largest displacement: roughly 0.04")
+
+
+def segments(rng: np.random.Generator) -> Iterator[tuple[NDArray[np.float64], NDArray[np.float64]]]:
+    """Ends of middle lines within a cube, some parallel, some of hardly any length."""
+    while True:
+        tip, along = rng.uniform(-0.2, 0.2, 3), rng.uniform(-1, 1, 3)
+        if rng.random() < 0.3:
+            along = np.array([0.0, 0.0, 1.0])
+        yield tip, tip + along / np.linalg.norm(along) * rng.choice([1e-3, 0.1, 0.3])
+
+
+def test_tools_that_run_through_each_other_are_found() -> None:
+    drawn, found = segments(np.random.default_rng(5)), 0
+    for _ in range(60):
+        ends = [next(drawn), next(drawn)]
+        shares = np.linspace(0, 1, 400)[:, None]
+        one, other = (tip + shares * (top - tip) for tip, top in ends)
+        apart = np.linalg.norm(one[:, None] - other, axis=-1).min()
+        for radius in (0.97 * apart / 2, 1.03 * apart / 2):
+            probes = [
+                moved(
+                    [0, 0.5 + tip[0] / 0.4, 0.5 - tip[1] / 0.3, tip[2] - radius],
+                    instrument={"radius": radius, "shaft": (top - tip).tolist(), "length": np.linalg.norm(top - tip)},
+                )
+                for tip, top in ends
+            ]
+            plan = plan_of(touching(probes))
+            assert overlap(plan.tools, 0.4) == ((0, 1, 0.0) if 2 * radius > apart else None), ends
+            found += 2 * radius > apart
+    assert found == 60
+
+
+def test_the_error_with_tools_in_one_place_may_be_larger(device: Device) -> None:
+    meets = moved([0, 0.8, 0.5, 0.01], [0.2, 0.55, 0.5, -0.02])
+    plan = plan_of(touching([PRESSED, meets], time={"duration": 0.2}))
+    where = overlap(plan.tools, 0.2)
+    assert where is not None
+    one, other, time = where
+    assert (one, other) == (0, 1)
+    assert [tool.middle(np.array([time]))[0, 0] for tool in plan.tools] == pytest.approx([0.008, 0.06], abs=0.1)
+    (note,) = (note for note in path_notes(plan.scene, plan.tools) if "through each other" in note)
+    assert note.startswith(f"probes.0 and probes.1: their instruments run through each other at {time:.3g} s")
+    estimate = told(plan, device).estimate
+    assert estimate is not None
+    assert estimate.at_least
+
+
+def test_the_pilot_of_the_points_is_compared_with_the_run(device: Device, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A coarse pilot, with steps twice as long, may press quite otherwise."""
+    plan = plan_of(touching([PRESSED]))
+    known = RunError(plan, choose_pilots(plan, asked=True), Known(), device, 1)
+    given: list[Any] = []
+    assert known._mesh is not None
+    monkeypatch.setattr(known._mesh, "follow", lambda displacement, pause: given.append(displacement))
+    of_the_run = np.zeros((*plan.scene.sheet.points, 3))
+    known.follow(of_the_run, lambda: None)
+    assert given[0] is of_the_run
+    steps = [sheet.plan.grid.steps_per_frame for sheet in known._mesh._sheets]
+    assert steps == [math.ceil(plan.grid.steps_per_frame / 2)] * 2

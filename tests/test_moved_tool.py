@@ -1,0 +1,179 @@
+"""The tool that a hand holds by position: what it does from frame to frame is what its record says, to the bit."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+
+from taichi_msm.physics.loads import schedule
+from taichi_msm.physics.paths import path_problems
+from taichi_msm.physics.plan import Plan
+from taichi_msm.physics.steering import steered
+from taichi_msm.physics.terms.contact import ContactTerm
+from taichi_msm.scene import Probe
+from taichi_msm.viewer.held_tool import RISE
+from taichi_msm.viewer.moved_tool import DEEPEST, FRICTION, HOVER, MovedTool
+from tests.scenes import plan_of, scene
+
+RATE = 30.0
+
+# At this rate the time of a frame is not that of its step, to the bit.
+UNEVEN = 20.1
+
+RADIUS = 0.01
+ROD: dict[str, Any] = {"instrument": {"radius": RADIUS, "shaft": [0.5, -0.6, 0.9], "length": 0.2}}
+
+
+def plan(probe: dict[str, Any] | None = None, **time: Any) -> Plan:
+    force = {"force": [0, 0, -1], **ROD}
+    # Not always, so that it matters when the tool counts as pressing.
+    springs = {"structural": 20, "shear": 10, "virtual": 0.5, "virtual_active": "loaded"}
+    return plan_of(scene(probes=[probe or force], springs=springs, time={"frames_per_second": RATE, **time}))
+
+
+def tool(made: Plan, probe: dict[str, Any] | None = None) -> MovedTool:
+    return MovedTool(Probe(**probe) if probe else made.scene.probes[0], made)
+
+
+def follow(hand: MovedTool, first: int, count: int) -> list[float]:
+    """The heights after some frames, in radii."""
+    found = []
+    for frame in range(first, first + count):
+        hand.follow(frame)
+        found.append(hand.height / RADIUS)
+    return found
+
+
+def tables(held: Plan, frame: int) -> tuple[bytes, ...]:
+    """All that the steps of a frame are told of a tool."""
+    count = held.grid.steps_per_frame
+    contact, loads = ContactTerm.of(held), schedule(held, frame * count, count)
+    assert contact is not None
+    assert contact == ContactTerm(1, (True,), True), "one kernel, whatever is done"
+    return contact.columns(held, loads, frame * count).tobytes(), loads.active.tobytes()
+
+
+@pytest.mark.parametrize("rate", [RATE, UNEVEN])
+@pytest.mark.parametrize("seed", range(3))
+def test_every_frame_is_what_the_record_says(seed: int, rate: float) -> None:
+    made, rng = plan(frames_per_second=rate, duration=12 / rate), np.random.default_rng(seed)
+    hand, frames = tool(made), 240
+    live, seen, gripped = made.with_probes((hand.recorded(0),)), [], 0
+    for frame in range(frames):
+        for _ in range(int(rng.integers(0, 3) // 2)):
+            place = (float(rng.uniform(-0.2, 1.2)), float(rng.uniform(-0.2, 1.2)))
+            match int(rng.integers(0, 5)):
+                case 0:
+                    hand.press(place, int(rng.choice([-1, 1])))
+                case 1:
+                    hand.release()
+                case 2:
+                    hand.ask(hand.strength + float(rng.integers(-40, 41)))
+                case _:
+                    hand.move(place)
+        live = steered(live, [hand.follow(frame)], made.grid.time(frame * made.grid.steps_per_frame))
+        seen.append(tables(live, frame))
+        gripped += hand.grips
+    record = made.with_probes((hand.recorded(frames),))
+    assert gripped > 5
+    assert len(record.scene.probes[0].grip) > 1
+    assert not list(path_problems(record.scene, record.tools, record.grid))
+    assert seen == [tables(record, frame) for frame in range(frames)]
+
+
+def test_a_press_goes_down_in_a_fifth_of_a_second_at_most_and_a_release_up() -> None:
+    hand = tool(plan())
+    assert follow(hand, 0, 2) == [HOVER, HOVER]
+    hand.press((0.4, 0.6), 1)
+    hand.ask(100)
+    down = follow(hand, 2, 8)
+    stride = (HOVER + DEEPEST) / (RISE * RATE)
+    assert down[:6] == pytest.approx([HOVER - stride * (n + 1) for n in range(6)], abs=1e-6)
+    assert down[5:] == pytest.approx([-DEEPEST] * 3)
+    hand.release()
+    assert follow(hand, 10, 8)[5:] == pytest.approx([HOVER] * 3)
+    assert hand.place == (0.4, 0.6)
+
+
+def test_it_goes_no_farther_in_a_step_than_a_run_allows() -> None:
+    made = plan(step=1 / RATE / 5)
+    hand = tool(made)
+    hand.move((1.0, 0.5))
+    hand.follow(0)
+    way = (hand.place[0] - 0.5) * made.scene.sheet.size[1]
+    assert 0.95 < way / (5 * RADIUS / 2) < 1
+    follow(hand, 1, 20)
+    assert hand.place == (1.0, 0.5)
+
+
+def test_a_grip_begins_where_the_tip_stops_and_ends_with_the_press() -> None:
+    hand = tool(plan())
+    usual = hand.strength
+    hand.ask(-50)
+    assert hand.strength == 0, "nothing is held that could be lifted"
+    hand.ask(usual)
+    hand.press((0.4, 0.6), -1)
+    grips = []
+    for frame in range(8):
+        hand.follow(frame)
+        grips.append(hand.grips)
+    assert grips == [False, False, True, True, True, True, True, True]
+    hand.ask(-60)
+    assert follow(hand, 8, 10)[-1] == pytest.approx(0.6 * DEEPEST)
+    hand.release()
+    assert hand.strength == usual, "the next press is no lift"
+    follow(hand, 18, 1)
+    assert hand.recorded(19).grip == ((2 / RATE, 18 / RATE),)
+
+
+def test_a_grip_that_is_on_lasts_as_long_as_the_record() -> None:
+    hand = tool(plan())
+    hand.press((0.4, 0.6), -1)
+    follow(hand, 0, 9)
+    assert hand.recorded(9).grip == ((2 / RATE, 9 / RATE),)
+
+
+def test_a_click_shorter_than_a_frame_touches_nothing() -> None:
+    hand = tool(plan())
+    hand.press((0.4, 0.6), -1)
+    hand.release()
+    assert follow(hand, 0, 3) == [HOVER] * 3
+    assert not hand.grips
+
+
+def test_it_is_no_deeper_than_the_sheet_bears() -> None:
+    rod = {"radius": 0.1, "shaft": [0, 0, 1], "length": 0.2}
+    hand = tool(plan({"force": [0, 0, -1], "instrument": rod}))
+    assert hand.strength == 100
+    assert hand.depth == pytest.approx(0.3 / 4), "a quarter of the shorter side"
+
+
+def test_what_stays_as_it_is_needs_no_keys() -> None:
+    hand = tool(plan())
+    follow(hand, 0, 50)
+    assert len(hand.recorded(50).path or ()) == 2
+
+
+def test_the_friction_is_that_of_the_scene_if_it_gives_any() -> None:
+    made = plan()
+    path = {"path": [[0, 0.5, 0.5, 0.01]], **ROD}
+    assert tool(made).recorded(0).friction == FRICTION
+    assert tool(made, path).recorded(0).friction == FRICTION
+    assert tool(made, {**path, "friction": 0.1}).recorded(0).friction == 0.1
+
+
+def test_what_was_done_is_forgotten_at_rest() -> None:
+    hand = tool(plan())
+    beginning = hand.recorded(0)
+    hand.press((0.4, 0.6), -1)
+    follow(hand, 0, 9)
+    hand.rest()
+    assert not hand.held
+    assert not hand.grips
+    assert hand.recorded(0) == beginning
+
+
+def test_at_rest_nothing_rubs() -> None:
+    assert tool(plan(motion="quasistatic")).recorded(0).friction == 0
