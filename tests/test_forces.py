@@ -28,7 +28,7 @@ from taichi_msm.system.runtime import Device
 from tests import reference
 from tests.motion import dynamics_of, structure_of
 from tests.scenes import plan_of, scene
-from tests.test_contact import CASES, PRESSED, touching
+from tests.test_contact import CASES, EDGES, PRESSED, touching
 from tests.test_dynamics import as_on_a_gpu, with_lanes
 
 Array = NDArray[np.float64]
@@ -62,6 +62,16 @@ def test_the_force_of_a_tool_is_that_of_the_twin(precision: str, error: float, d
         for index, peak in enumerate(simulation.felt.greatest):
             greatest = int(norms[:, index].argmax())
             assert (peak.time, peak.force) == ((greatest + 1) / 25, forces[greatest][index])
+
+
+def test_points_at_an_open_edge_count_with_their_mass(device: Device) -> None:
+    made = touching(EDGES["comes from beside"])
+    made = made.model_copy(update={"sheet": made.sheet.model_copy(update={"fixed": "none"})})
+    expected = expected_forces(made)
+    with Simulation(made, threads=device.threads) as simulation:
+        for each in expected:
+            simulation.advance()
+            assert np.abs(simulation.forces()[0].force - each[0]).max() < 1e-12 * np.abs(expected).max()
 
 
 def test_lanes_and_workers_do_not_change_the_bits_of_forces(device: Device) -> None:
