@@ -101,7 +101,7 @@ def silent_table() -> str:
 def stiffness(scene: Scene, displacement: Array, active: float) -> csc_matrix:
     """Assemble the second derivative of the energy over the coordinates of all points that move [N/m].
 
-    A spring of direction n and lengths L and L0 adds k ((1 - L0 / L) (I - n n^T) + n n^T) between its ends.
+    The scene is in springs without a map, so that K is the same at all points. A spring of direction n and lengths L and L0 adds k ((1 - L0 / L) (I - n n^T) + n n^T) between its ends.
     """
     rows, cols = scene.sheet.points
     dx, dy = spacing(scene.sheet)
