@@ -61,19 +61,23 @@ def test_the_case_is_what_its_name_says(case: str) -> None:
 
 
 def states(made: Scene, device: Device, layout: SheetLayout) -> bytes:
-    """All that the next steps depend on, at the end."""
-    dynamics = dynamics_of(made, device, layout)
-    dynamics.advance(plan_of(made).grid.steps)
+    """All that the next steps depend on, at the end, and the forces that the tools feel in each frame."""
+    dynamics, grid = dynamics_of(made, device, layout), plan_of(made).grid
+    forces = []
+    for _ in range(grid.frames):
+        dynamics.advance(grid.steps_per_frame)
+        forces.append(dynamics.tool_forces())
+    assert len({force.tobytes() for force in forces}) == grid.frames
     state = dynamics.state()
     dynamics.close()
-    return b"".join(array.tobytes() for array in state[1:])
+    return b"".join(array.tobytes() for array in (*state[1:], *forces))
 
 
 def test_lanes_workers_and_passes_do_not_change_the_bits(device: Device) -> None:
     made = touching(CASES["together"], time={"precision": "f32"})
     layout = structure_of(made, device)
     plain = states(made, device, layout)
-    for lanes, workers, depth in ((layout.code.lanes, 2, 1), (layout.code.lanes, 2, 4), (4, 1, 3), (1, 2, 1)):
+    for lanes, workers, depth in ((layout.code.lanes, 2, 4), (4, 1, 3), (1, 2, 1)):
         assert states(made, device, replace(with_lanes(layout, lanes), workers=workers, depth=depth)) == plain
     assert states(made, device, as_on_a_gpu(layout)) == plain
 
