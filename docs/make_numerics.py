@@ -349,7 +349,7 @@ def indentation() -> dict[str, Any]:
             row.append(f"{100 * error:+.2g} %")
         rest.close()
     head = ["depth", "force", *(f"{side} × {side}" for side in INDENTED)]
-    facts = {"tension": f"{tension:g}", "foundation": f"{foundation:g}", "radius": f"{1000 * radius:g}"}
+    facts = {"tension": f"{tension:g}", "foundation": f"{foundation / 1e3:g}", "radius": f"{1000 * radius:g}"}
     facts["fades"] = f"{1000 * fades:.1f}"
     return {f"tip_{name}": fact for name, fact in facts.items()} | {"tip_table": markdown(head, rows)}
 
