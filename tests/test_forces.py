@@ -25,7 +25,7 @@ from taichi_msm.system.resources import available_threads
 from taichi_msm.system.runtime import Device
 from tests import reference
 from tests.scenes import plan_of, scene
-from tests.test_contact import CASES, PRESSED, touching
+from tests.test_contact import CASES, EDGES, PRESSED, touching
 
 Array = NDArray[np.float64]
 
@@ -58,6 +58,16 @@ def test_the_force_of_a_tool_is_that_of_the_twin(precision: str, error: float, d
         for index, peak in enumerate(simulation.felt.greatest):
             greatest = int(norms[:, index].argmax())
             assert (peak.time, peak.force) == ((greatest + 1) / 25, forces[greatest][index])
+
+
+def test_points_at_an_open_edge_count_with_their_mass(device: Device) -> None:
+    made = touching(EDGES["comes from beside"])
+    made = made.model_copy(update={"sheet": made.sheet.model_copy(update={"fixed": "none"})})
+    expected = expected_forces(made)
+    with Simulation(made, threads=device.threads) as simulation:
+        for each in expected:
+            simulation.advance()
+            assert np.abs(simulation.forces()[0].force - each[0]).max() < 1e-12 * np.abs(expected).max()
 
 
 # Jumps up at a frame, down between two, and to another place at a third.
