@@ -18,6 +18,8 @@ if TYPE_CHECKING:
         SceneError,
     )
     from taichi_msm.exports.convert import export
+    from taichi_msm.fitting.fit import fit
+    from taichi_msm.fitting.result import FitResult
     from taichi_msm.physics.state import TipForce
     from taichi_msm.playback import Playback
     from taichi_msm.render.labels import Flow, Labels, Sight
@@ -51,9 +53,11 @@ _HOMES = {
     "Playback": "playback",
     "TipForce": "physics.state",
     "Simulation": "simulation",
+    "FitResult": "fitting.result",
     "Surface": "render.surface",
     "Outcome": "sweeps.outcome",
     "export": "exports.convert",
+    "fit": "fitting.fit",
     "load_scene": "scenefile.load",
     "sweep": "sweeps.sweep",
 }
@@ -64,6 +68,7 @@ __all__ = [
     "DeviceError",
     "DivergedError",
     "FilesError",
+    "FitResult",
     "Flow",
     "Foundation",
     "Instrument",
@@ -87,6 +92,7 @@ __all__ = [
     "TipForce",
     "Tissue",
     "export",
+    "fit",
     "load_scene",
     "resume",
     "run",

@@ -23,6 +23,7 @@ LAYERS = [
     {"simulation", "results"},
     {"runner", "playback", "console"},
     {"exports", "study", "sweeps", "viewer"},
+    {"fitting"},
     {"cli"},
     {"__main__", "__init__"},
 ]

@@ -11,12 +11,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from taichi_msm.errors import ExecutorError
-from taichi_msm.fit.prediction import Job, Predicted, Predictor, predict
+from taichi_msm.fitting.prediction import Job, Predicted, Predictor, predict
+from taichi_msm.physics.mesh_error import MeshEstimate, coarser, estimate_points
 from taichi_msm.progress import Progress
 from taichi_msm.scenefile import budget
 from taichi_msm.scenefile.validation import checked
 from taichi_msm.sweeps.cost import PROCESS_BYTES
 from taichi_msm.sweeps.pool import DiedError, Pool
+from taichi_msm.system import runtime
 from taichi_msm.system.resources import available_memory, available_threads
 
 Array = NDArray[np.float64]
@@ -56,6 +58,13 @@ class Runs:
         """Run the scene with half the cells a side; raises as `Predictor.predict` does."""
         self.count += 1
         return self._predictor.predict(x, coarse=True, pause=self._tell)
+
+    def mesh_error(self, x: Array) -> MeshEstimate | None:
+        """Estimate the error that the number of points makes; None: no tissue, or too few points to tell."""
+        plan = self._predictor.plan(x)
+        if coarser(plan) is None:
+            return None
+        return estimate_points(plan, runtime.started(), lambda done, total: self._tell())
 
     def one(self, x: Array, steps: int | None = None) -> Predicted | None:
         """Predict; None where the parameters give no run."""

@@ -14,8 +14,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from taichi_msm.errors import DivergedError, SceneError
-from taichi_msm.fit.observations import Observations
-from taichi_msm.fit.parameters import Parameter, as_data, with_values
+from taichi_msm.fitting.observations import Observations
+from taichi_msm.fitting.parameters import Parameter, as_data, with_values
 from taichi_msm.physics.mesh_error import coarser
 from taichi_msm.physics.plan import Plan
 from taichi_msm.progress import Pause
@@ -102,7 +102,7 @@ class Predictor:
             SceneError: when the values make no valid scene.
             DivergedError: when the run diverges.
         """
-        plan = self._plan(self.job.values(x))
+        plan = self.plan(x)
         if coarse:
             plan = coarser(plan) or plan
         if plan.scene.time.step == "auto" and not plan.scene.time.at_rest:
@@ -121,7 +121,9 @@ class Predictor:
             return None
         return predicted if np.isfinite(predicted.values[self.job.observations.known]).all() else None
 
-    def _plan(self, values: Array) -> Plan:
+    def plan(self, x: Array) -> Plan:
+        """Plan the scene with the parameters at x; SceneError: it is not valid."""
+        values = self.job.values(x)
         if not np.isfinite(values).all():
             raise SceneError(["the values are out of range"])
         data = with_values(self._data, self.job.parameters, values.tolist())
@@ -147,7 +149,7 @@ class Predictor:
                 forces[frame] = np.array([one.force for one in simulation.forces()]).reshape(-1, 3)
         values = self._place.at(points).swapaxes(0, 1)
         if seen.kind == "pixel":
-            values = seen_by_camera(scene, values, seen.time)
+            values = seen_by_camera(scene, values)
         felt = np.empty((0, 3))
         if seen.forces is not None:
             every = self._force_place.at(forces)
@@ -225,8 +227,8 @@ def places_at_rest(coordinates: Array, sheet: Sheet) -> Array:
     return np.stack([(across - 0.5) * width, (0.5 - down) * height, np.zeros_like(across)], axis=1)
 
 
-def seen_by_camera(scene: Scene, points: Array, time: Array) -> Array:
-    """Find where the scene's camera sees points [m], shape (N, T, 3), at times, shape (T,); NaN: behind the eye.
+def seen_by_camera(scene: Scene, points: Array) -> Array:
+    """Find where the scene's camera sees points [m], shape (N, T, 3); NaN: behind the eye.
 
     Returns pixels from the picture's upper left corner, shape (N, T, 2).
     """
@@ -239,7 +241,7 @@ def seen_by_camera(scene: Scene, points: Array, time: Array) -> Array:
 def seen_at_rest(scene: Scene, seen: Observations) -> Array:
     """Give what would be seen if the sheet stayed at rest, shape (N, T, 3 or 2)."""
     rest = np.repeat(places_at_rest(seen.coordinates, scene.sheet)[:, None], len(seen.time), axis=1)
-    return rest if seen.kind == "position" else seen_by_camera(scene, rest, seen.time)
+    return rest if seen.kind == "position" else seen_by_camera(scene, rest)
 
 
 # The predictor of the job that this process was given last.

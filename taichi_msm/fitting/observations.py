@@ -63,6 +63,11 @@ class Observations:
         """Which values are known, of the shape of the values."""
         return np.isfinite(self.values)
 
+    @property
+    def there(self) -> NDArray[np.bool_]:
+        """Which points were seen at which times, shape (N, T)."""
+        return self.known[..., 0]
+
 
 def read_observations(observed: str | Path | Mapping[str, Any], rate: float) -> Observations:
     """Read what was seen from a file, or take it from a mapping of such arrays.
@@ -132,9 +137,7 @@ def _checked(name: str, arrays: dict[str, NDArray[Any]], rate: float) -> Observa
         raise SceneError([f"{name}: every one of the {points} points {why} at all {times} times; nothing was seen"])
     unit = "m" if kind == "position" else "px"
     sigma = arrays.get("sigma")
-    return Observations(
-        name, kind, time, coordinates, values, None if sigma is None else _as_sigma(name, sigma, unit)
-    )
+    return Observations(name, kind, time, coordinates, values, None if sigma is None else _as_sigma(name, sigma, unit))
 
 
 def _as_sigma(name: str, sigma: Any, unit: str) -> float:
@@ -157,7 +160,9 @@ def _in_one_form(arrays: dict[str, NDArray[Any]], rate: float) -> dict[str, NDAr
         return {"time": times, **kept, "pixel": pixel}
     position = arrays.get("position")
     if position is not None and position.ndim == 4 and "coordinates" not in arrays:
-        rows, cols = (np.unique(np.linspace(0, n - 1, min(n, MOST_A_SIDE)).round().astype(int)) for n in position.shape[1:3])
+        rows, cols = (
+            np.unique(np.linspace(0, n - 1, min(n, MOST_A_SIDE)).round().astype(int)) for n in position.shape[1:3]
+        )
         down, across = np.meshgrid(rows / (position.shape[1] - 1), cols / (position.shape[2] - 1), indexing="ij")
         thinned = position[:, rows[:, None], cols].reshape(len(position), -1, position.shape[3])
         coordinates = np.stack([across.ravel(), down.ravel()], axis=1)

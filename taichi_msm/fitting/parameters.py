@@ -105,7 +105,9 @@ def _parameter(scene: Scene, data: dict[str, Any], key: str, bounds: Bounds | No
     path = parse_key(key)
     named = f"--free {key}"
     if path and path[-1] in MAPS:
-        raise SceneError([f"{named}: a map cannot be fitted yet; name numbers, such as {scene.kind}.{path[-1]}.range.1"])
+        raise SceneError(
+            [f"{named}: a map cannot be fitted yet; name numbers, such as {scene.kind}.{path[-1]}.range.1"]
+        )
     value = _look_up(named, data, path)
     inside = any(key == section or key.startswith(f"{section}.") for section in SECTIONS)
     if not inside or not isinstance(value, float) or any(part in HELD for part in path):
@@ -113,7 +115,7 @@ def _parameter(scene: Scene, data: dict[str, Any], key: str, bounds: Bounds | No
         what = "a section; name a number in it" if isinstance(value, dict) else what
         raise SceneError([f"{named}: {what}, which cannot be free; take a number of {', '.join(SECTIONS)}"])
     low, high = bounds or (-math.inf, math.inf)
-    if math.isnan(low + high) and not math.isinf(low) or low >= high:
+    if not low < high:
         raise SceneError([f"--bounds {key}={low:g},{high:g}: give the smaller one first, then a larger one"])
     if not low <= value <= high:
         raise SceneError([f"--bounds {key}={low:g},{high:g}: {value:g}, where it starts, is outside; --set {key}=..."])
@@ -124,14 +126,18 @@ def _parameter(scene: Scene, data: dict[str, Any], key: str, bounds: Bounds | No
         elif _is_place(path):
             scale = _natural(scene, path)
         else:
-            raise SceneError([f"{named}: starts at 0, so its size is open; add --bounds {key}=LOW,HIGH, or --set {key}=..."])
+            raise SceneError(
+                [f"{named}: starts at 0, so its size is open; add --bounds {key}=LOW,HIGH, or --set {key}=..."]
+            )
     return Parameter(key, value, low, high, scale)
 
 
 def _look_up(named: str, data: Any, path: Key) -> Any:
     """Give the value of a key; SceneError: there is none."""
     for part in path or ("",):
-        known = list(data) if isinstance(data, dict) else [str(n) for n in range(len(data))] if type(data) is list else []
+        known = (
+            list(data) if isinstance(data, dict) else [str(n) for n in range(len(data))] if type(data) is list else []
+        )
         if str(part) not in known:
             near = did_you_mean(str(part), known) or (f"; take one of {', '.join(known)}" if known else "")
             raise SceneError([f"{named}: the scene has no {str(part) or 'such key'} there{near}"])

@@ -1,9 +1,9 @@
 """Find the values with which a scene fits what was seen best: nonlinear least squares within bounds.
 
 The trust region method of SciPy, with differences of runs as derivatives: forward ones on the way, central ones where
-it ends. What is minimised is the sum of rho(r^2) over all r = (predicted - seen) / sigma, with rho(z) = z, or for robust
-fits SciPy's soft_l1, under which a number that is far off counts by |r|. Where sigma is not known, it is found in turn
-with the parameters.
+it ends. What is minimised is the sum of rho(r^2) over all r = (predicted - seen) / sigma, with rho(z) = z, or for
+robust fits SciPy's soft_l1, under which a number that is far off counts by |r|. Where sigma is not known, it is found in
+turn with the parameters.
 """
 
 from __future__ import annotations
@@ -15,9 +15,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from taichi_msm.errors import SceneError
-from taichi_msm.fit.observations import Observations
-from taichi_msm.fit.prediction import Predicted, difference
-from taichi_msm.fit.runs import Runs
+from taichi_msm.fitting.observations import Observations
+from taichi_msm.fitting.prediction import Predicted, difference
+from taichi_msm.fitting.runs import Runs
 
 Array = NDArray[np.float64]
 
@@ -252,5 +252,3 @@ def _slope(here: Array, others: list[tuple[float, Array]], key: str) -> Array:
 
 def _power_of_two(count: int) -> int:
     return 1 << (count - 1).bit_length()
-
-

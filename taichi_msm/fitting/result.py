@@ -1,0 +1,124 @@
+"""What a fit found."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, field
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from taichi_msm.fitting.identifiability import Unseen
+from taichi_msm.fitting.observations import Observations
+from taichi_msm.fitting.profiles import Place
+from taichi_msm.scene import Scene
+
+Array = NDArray[np.float64]
+
+# A number that is no more than this, and no less than its inverse, is written.
+MOST = 1e30
+
+
+class Estimate(NamedTuple):
+    """What was found of a parameter; None: not known, or none.
+
+    Attributes:
+        value: the best one.
+        standard_error: of the value.
+        interval: both ends of the 95 % interval.
+        start: where the search began.
+        identifiable: whether the standard error is at most the value.
+        mesh_error: how far, about, the number of points moves the value.
+    """
+
+    value: float
+    standard_error: float | None
+    interval: tuple[float | None, float | None]
+    start: float
+    identifiable: bool
+    mesh_error: float | None
+
+
+@dataclass(frozen=True, eq=False)
+class FitResult:
+    """What a fit found.
+
+    Attributes:
+        parameters: what was found of each, by its key.
+        correlation: of the parameters, in their order.
+        residual: the root mean square of predicted minus seen, of each coordinate [m] or [px].
+        sigma: the standard deviation of that, as given, else as found.
+        unit: of both, m or px.
+        chi_square: the sum of (predicted - seen)^2 / sigma^2, where sigma is given.
+        degrees_of_freedom: how many numbers were seen, less the parameters.
+        identifiable: whether all parameters are.
+        unseen: the combinations of parameters that the data cannot tell.
+        mesh_error: of the fitted scene, as a fraction of its largest displacement; None: not known.
+        runs: how many there were.
+        seconds: that they took.
+        notes: what the user should know, a line each.
+        scene: the scene with the best values.
+        observations: what was seen.
+        fitted: where the points are in the fitted scene, as in the observations.
+        curves: by key, the root of twice the rise of the cost, signed, at values of a parameter while the others
+            follow: its profile, or else what follows from the curvature at the best value.
+    """
+
+    parameters: dict[str, Estimate]
+    correlation: list[list[float]]
+    residual: float
+    sigma: float
+    unit: str
+    chi_square: float | None
+    degrees_of_freedom: int
+    identifiable: bool
+    unseen: list[Unseen]
+    mesh_error: float | None
+    runs: int
+    seconds: float
+    notes: list[str]
+    scene: Scene = field(repr=False)
+    observations: Observations = field(repr=False)
+    fitted: Array = field(repr=False)
+    curves: dict[str, list[Place]] = field(repr=False)
+
+    def as_json(self) -> dict[str, Any]:
+        """Give it as plain data, as in fit.json."""
+        plain = (
+            "correlation residual sigma unit chi_square degrees_of_freedom identifiable mesh_error runs seconds notes"
+        )
+        return {
+            "observed": self.observations.name,
+            "parameters": {key: one._asdict() for key, one in self.parameters.items()},
+            **{name: getattr(self, name) for name in plain.split()},
+            "unseen": [one.as_json() for one in self.unseen],
+        }
+
+    def summary(self) -> list[str]:
+        """Say in lines what was found."""
+        seen = self.observations
+        lines = [
+            f"{key}: {one.value:.6g}{f' ± {one.standard_error:.2g}' if one.standard_error is not None else ''}, "
+            f"95 % {_end(one.interval[0])} to {_end(one.interval[1])}, from {one.start:.6g}"
+            f"{'' if one.identifiable else ': not identifiable'}"
+            for key, one in self.parameters.items()
+        ]
+        lines += [one.text for one in self.unseen]
+        points, times = seen.there.shape
+        chi = ""
+        if self.chi_square is not None:
+            chi = f", chi-square {self.chi_square:.5g} for {self.degrees_of_freedom} degrees of freedom"
+        lines.append(f"residual {self.residual:.3g} {self.unit} of {points} points at {times} times{chi}")
+        if self.mesh_error is not None:
+            lines.append(f"mesh error of the fitted scene: {100 * self.mesh_error:.2g} % of the largest displacement")
+        return [*lines, *self.notes, f"{self.runs} runs, {self.seconds:.1f} s"]
+
+
+def finite(number: float) -> float | None:
+    """Give a number that can be written and means something, else None."""
+    return float(number) if math.isfinite(number) and abs(number) <= MOST else None
+
+
+def _end(end: float | None) -> str:
+    return "?" if end is None else f"{end:.6g}"
