@@ -2,8 +2,8 @@
 
 The trust region method of SciPy, with differences of runs as derivatives: forward ones on the way, central ones where
 it ends. What is minimised is the sum of rho(r^2) over all r = (predicted - seen) / sigma, with rho(z) = z, or for
-robust fits SciPy's soft_l1, under which a number that is far off counts by |r|. Where sigma is not known, it is found in
-turn with the parameters.
+robust fits SciPy's soft_l1, under which a number that is far off counts by |r|. Where sigma is not known, it is found
+in turn with the parameters.
 """
 
 from __future__ import annotations

@@ -18,7 +18,7 @@ from typing_extensions import TypedDict, Unpack
 from taichi_msm.arguments import require_path
 from taichi_msm.errors import ArgumentError, SceneError, writing
 from taichi_msm.fitting.estimation import Misfit, Search, Solution
-from taichi_msm.fitting.identifiability import shares, unseen
+from taichi_msm.fitting.identifiability import Unseen, shares, unseen
 from taichi_msm.fitting.observations import Observations, read_forces, read_observations, with_sigma
 from taichi_msm.fitting.parameters import Bounds, Parameter, as_data, make_parameters, with_values
 from taichi_msm.fitting.prediction import Job, runnable, seen_at_rest
@@ -161,8 +161,10 @@ class _Fit:
         if not search.fits(solution):
             self._notes.append("what is left is large: the scene does not move as was seen with any of these values")
         mesh, shifts = self._mesh(solution, uncertain, search.misfit)
+        self._note_mesh(solution.x, uncertain, shifts)
         found = [self._estimate(n, solution.x, uncertain, profiles, shifts) for n in range(len(job.parameters))]
-        self._note_what_is_left(solution, uncertain, motion)
+        blind = unseen(job.parameters, solution.x, uncertain, forces=seen.forces is not None)
+        self._note_what_is_left(solution, uncertain, blind, motion)
         values = [one.value for one in found]
         numbers = search.misfit.of(solution.predicted)[: search.misfit.count[0]]
         chi_square = float(uncertain.left @ uncertain.left) if seen.sigma is not None else None
@@ -176,7 +178,7 @@ class _Fit:
             chi_square=chi_square,
             degrees_of_freedom=uncertain.freedom,
             identifiable=all(one.identifiable for one in found),
-            unseen=unseen(job.parameters, solution.x, uncertain, forces=seen.forces is not None),
+            unseen=blind,
             mesh_error=mesh,
             runs=runs.count,
             seconds=time.perf_counter() - begun,
@@ -218,9 +220,6 @@ class _Fit:
         if one.start < 0 and one.is_log:
             interval.reverse()
         shift = None if shifts is None else one.error(x[n], float(shifts[n]))
-        if shifts is not None and shifts[n] > uncertain.quantile * deviation and share < 1:
-            said = f"the number of points moves it by about {shift:.2g}, more than what was seen leaves open"
-            self._notes.append(f"{one.key}: {said}; take more sheet.points")
         return Estimate(
             value=one.value(x[n]),
             standard_error=finite(one.error(x[n], deviation)),
@@ -230,14 +229,28 @@ class _Fit:
             mesh_error=None if shift is None else finite(shift),
         )
 
-    def _note_what_is_left(self, solution: Solution, uncertain: Uncertainty, motion: float) -> None:
+    def _note_mesh(self, x: Array, uncertain: Uncertainty, shifts: Array | None) -> None:
+        """Note the parameters that the number of points moves farther than what was seen leaves open."""
+        parameters = self._runs.job.parameters
+        wide = uncertain.quantile * uncertain.deviations
+        if moved_far := [
+            f"{one.key} by about {100 * one.share(x[n], float(shifts[n])):.2g} %"
+            for n, one in enumerate(parameters)
+            if shifts is not None and shifts[n] > wide[n]
+        ]:
+            said = "more than what was seen leaves open; take more sheet.points"
+            self._notes.append(f"the number of points moves {', '.join(moved_far)}: {said}")
+
+    def _note_what_is_left(
+        self, solution: Solution, uncertain: Uncertainty, blind: list[Unseen], motion: float
+    ) -> None:
         """Note parameters that are tied together, and errors that are not independent."""
         keys = [one.key for one in self._runs.job.parameters]
         correlation = uncertain.correlation
         for n, m in zip(*np.nonzero(np.triu(np.abs(correlation) > TIED, 1)), strict=True):
-            self._notes.append(
-                f"{keys[n]} and {keys[m]} correlate by {correlation[n, m]:.3f}: they are known best together"
-            )
+            if not any({keys[n], keys[m]} <= set(one.parameters) for one in blind):
+                tied = f"{keys[n]} and {keys[m]} correlate by {correlation[n, m]:.3f}"
+                self._notes.append(f"{tied}: they are known best together")
         if uncertain.factor > 1.5:
             times = math.sqrt(uncertain.factor)
             self._notes.append(f"what is left is {times:.2g} times sigma, and the intervals are widened by as much")

@@ -20,8 +20,8 @@ Array = NDArray[np.float64]
 # A parameter is not identifiable if its standard error is above this share of its value.
 MOST_ERROR = 1.0
 
-# If one is not, a direction with a larger standard deviation than this is not seen, and those belong to it whose part
-# in it is above the second number.
+# A direction with a larger standard deviation than this is not seen, and those parameters belong to it whose part in it
+# is above the second number.
 NOT_SEEN, PART = 0.5, 0.05
 
 # Exponents this close to a half of a whole number are written as such.
@@ -64,10 +64,9 @@ def shares(parameters: Sequence[Parameter], x: Array, uncertain: Uncertainty) ->
 
 def unseen(parameters: Sequence[Parameter], x: Array, uncertain: Uncertainty, *, forces: bool) -> list[Unseen]:
     """Find what the data cannot tell; forces: whether any were seen."""
-    if max(shares(parameters, x, uncertain)) <= MOST_ERROR:
-        return []
     blind = uncertain.directions[:, uncertain.along > NOT_SEEN]
-    return [_in_words(parameters, uncertain, part, blind[part], forces) for part in _groups(blind)]
+    alone = np.array(shares(parameters, x, uncertain))
+    return [_in_words(parameters, uncertain, alone, part, blind[part], forces=forces) for part in _groups(blind)]
 
 
 def _groups(blind: Array) -> Iterator[Array]:
@@ -85,9 +84,12 @@ def _groups(blind: Array) -> Iterator[Array]:
 
 
 def _in_words(
-    parameters: Sequence[Parameter], uncertain: Uncertainty, group: Array, blind: Array, forces: bool
+    parameters: Sequence[Parameter], uncertain: Uncertainty, alone: Array, group: Array, blind: Array, *, forces: bool
 ) -> Unseen:
-    """Say what is known of some parameters; blind: their parts in the directions that are not seen."""
+    """Say what is known of some parameters.
+
+    alone: every standard error as a share; group: which parameters; blind: their parts in what is not seen.
+    """
     keys = [parameters[n].key for n in group]
     known = []
     for exponents in _across(blind):
@@ -106,7 +108,9 @@ def _in_words(
         it = "it" if len(keys) == 1 else "them"
         return Unseen(keys, [], f"{names}: what was seen does not tell {it}: fix {it}")
     said = [f"{one} {'is known ' if n == 0 else ''}to {100 * one.standard_error:.2g} %" for n, one in enumerate(known)]
-    return Unseen(keys, known, f"{' and '.join(said)}, each alone is not: fix one{remedy}")
+    most = float(alone[group].max())
+    each = "is not" if most > MOST_ERROR else f"only to {100 * most:.2g} %"
+    return Unseen(keys, known, f"{', '.join(said)}, each alone {each}: fix one{remedy}")
 
 
 def _across(blind: Array) -> Iterator[Array]:

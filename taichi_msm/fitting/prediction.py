@@ -27,7 +27,7 @@ from taichi_msm.simulation import Simulation
 Array = NDArray[np.float64]
 
 # By how much a parameter is changed for a difference.
-SMOOTH, ROUGH = 1e-3, 1e-2
+SMOOTH, ROUGH = 1e-5, 1e-2
 
 
 class Predicted(NamedTuple):

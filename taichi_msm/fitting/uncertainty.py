@@ -111,7 +111,7 @@ def uncertainty(
         pulled = slope * (left / np.sqrt(far))[:, None] if robust else np.sqrt(factor) * slope
         middle = pulled.T @ pulled
     values, vectors = np.linalg.eigh(singular.Vh @ middle @ singular.Vh.T)
-    root = singular.Vh.T @ (inverse[:, None] * vectors * np.sqrt(np.maximum(values, 0.0)))
+    root = singular.Vh.T @ (inverse[:, None] ** 2 * vectors * np.sqrt(np.maximum(values, 0.0)))
     return Uncertainty(scales, factor, freedom, left, weighted, singular.Vh.T, root)
 
 
