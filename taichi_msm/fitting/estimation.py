@@ -161,6 +161,10 @@ class Search:
         seen = self._runs.job.observations
         needs_sigma = seen.sigma is None and (seen.forces is not None or self._robust)
         scales = Scales(seen.sigma or self._motion, seen.forces.sigma if seen.forces else 1.0)
+        predicted = self.predict(np.clip(start, *self._limits))
+        if self._robust and seen.sigma is None and predicted is not None:
+            sigma = self.misfit.sigma(predicted, len(start), robust=True)
+            scales = scales._replace(values=max(sigma, LEAST_SIGMA * self._motion))
         solution = self._from(start, scales)
         for _ in range(MOST_ROUNDS if needs_sigma else 0):
             left = self.misfit.sigma(solution.predicted, len(solution.x), robust=self._robust)

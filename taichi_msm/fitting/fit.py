@@ -112,15 +112,15 @@ def fit(
             raise SceneError([f"{section}.tolerance: {tolerance:g} {said}"])
     seen = with_sigma(read_observations(observed, given.time.frames_per_second), method.get("sigma"))
     parameters = make_parameters(given, free, bounds or {})
+    if forces is not None:
+        seen = replace(seen, forces=read_forces(forces[0], forces[1], len(given.probes)))
+    if wrong := list(faults(seen, given, len(parameters))):
+        raise SceneError(wrong)
     with ExitStack() as opened:
         if directory is not None:
             require_path(directory)
             opened.enter_context(writing(directory))
             published = opened.enter_context(publication(Path(directory)))
-        if forces is not None:
-            seen = _with_forces(seen, forces, len(given.probes))
-        if wrong := list(faults(seen, given, len(parameters))):
-            raise SceneError(wrong)
         job = Job(secrets.token_hex(8), runnable(given), parameters, seen)
         runs = opened.enter_context(Runs(job, workers, progress))
         result = _Fit(runs, given, method).result(begun)
@@ -217,6 +217,8 @@ class _Fit:
         else:
             ends = x[n] - uncertain.quantile * deviation, x[n] + uncertain.quantile * deviation
         interval = [None if end is None else finite(one.value(end)) for end in ends]
+        if one.is_log:  # Nothing is known of an end that underflows.
+            interval = [end or None for end in interval]
         if one.start < 0 and one.is_log:
             interval.reverse()
         shift = None if shifts is None else one.error(x[n], float(shifts[n]))
@@ -255,7 +257,7 @@ class _Fit:
             times = math.sqrt(uncertain.factor)
             self._notes.append(f"what is left is {times:.2g} times sigma, and the intervals are widened by as much")
         left = np.where(self._seen.known, solution.predicted.values - self._seen.values, np.nan)
-        if uncertain.scales.values < NOTHING_LEFT * motion or not self._seen.known.any():
+        if np.sqrt(np.nanmean(left**2)) < NOTHING_LEFT * motion:
             return
         beside, after = _alike(left, self._seen.coordinates)
         if beside > ALIKE and self._correlation is None:
@@ -292,10 +294,6 @@ def _curve(one: Parameter, n: int, x: Array, uncertain: Uncertainty, profiles: l
 def _with_values(given: Scene, job: Job, values: list[float]) -> Scene:
     """Give the scene with the values that were found, without keys that it did not have."""
     return Scene.model_validate(with_values(as_data(given), job.parameters, values))
-
-
-def _with_forces(seen: Observations, forces: tuple[str | Path, float], probes: int) -> Observations:
-    return replace(seen, forces=read_forces(forces[0], forces[1], probes))
 
 
 def _require_arguments(

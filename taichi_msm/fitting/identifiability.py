@@ -13,16 +13,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from taichi_msm.fitting.parameters import Parameter
-from taichi_msm.fitting.uncertainty import Uncertainty
+from taichi_msm.fitting.uncertainty import NOT_SEEN, Uncertainty
 
 Array = NDArray[np.float64]
 
 # A parameter is not identifiable if its standard error is above this share of its value.
 MOST_ERROR = 1.0
 
-# A direction with a larger standard deviation than this is not seen, and those parameters belong to it whose part in it
-# is above the second number.
-NOT_SEEN, PART = 0.5, 0.05
+# Parameters whose part in a direction is above this belong to it.
+PART = 0.05
 
 # Exponents this close to a half of a whole number are written as such.
 CLOSE = 0.06
@@ -36,7 +35,7 @@ class Combination(NamedTuple):
 
     def __str__(self) -> str:
         text = ""
-        for key, exponent in self.exponents.items():
+        for key, exponent in sorted(self.exponents.items(), key=lambda item: item[1] < 0):
             power = "" if abs(exponent) == 1 else f"^{abs(exponent):.3g}"
             sign = (" / " if exponent < 0 else " x ") if text else ("1 / " if exponent < 0 else "")
             text += f"{sign}{key}{power}"

@@ -113,6 +113,11 @@ class Predictor:
             self._simulation.restart(plan)
         return self._run(self._simulation, plan, whole, pause)
 
+    def compile(self, x: Array, pause: Pause = lambda: None) -> None:
+        """Compile now what the first run would compile; raises a SceneError as `predict` does."""
+        self._simulation = Simulation(self.plan(x), threads=self._threads)
+        self._simulation.compile(pause)
+
     def attempt(self, x: Array, steps: int | None = None, pause: Pause = lambda: None) -> Predicted | None:
         """Predict; None where the values give no run, or a point that was seen would be behind the eye."""
         try:

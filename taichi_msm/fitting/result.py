@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass, field
 from typing import Any, NamedTuple
 
@@ -117,7 +116,7 @@ class FitResult:
 
 def finite(number: float) -> float | None:
     """Give a number that can be written and means something, else None."""
-    return float(number) if math.isfinite(number) and abs(number) <= MOST else None
+    return float(number) if number == 0 or 1 / MOST <= abs(number) <= MOST else None
 
 
 def _end(end: float | None) -> str:

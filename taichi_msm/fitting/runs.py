@@ -48,7 +48,7 @@ class Runs:
 
     def first(self, x: Array) -> Predicted:
         """Run the scene to its end; raises as `Predictor.predict` does."""
-        self._predictor.predict(x, pause=self._tell)  # compiles
+        self._predictor.compile(x, self._tell)
         begun = time.perf_counter()
         predicted = self._predictor.predict(x, whole=True, pause=self._tell)
         self._seconds, self.count = time.perf_counter() - begun, self.count + 1

@@ -24,6 +24,9 @@ Array = NDArray[np.float64]
 # Of singular values, as a share of the largest: what is smaller is not seen at all.
 UNSEEN = 1e-9
 
+# A direction with a larger standard deviation than this is not seen.
+NOT_SEEN = 0.5
+
 # Of the intervals.
 CONFIDENCE = 0.95
 
@@ -72,9 +75,9 @@ class Uncertainty:
         return float(np.linalg.norm(exponents @ self.root))
 
     def shift(self, rows: Array) -> Array:
-        """Give how far x moves if what is predicted is off by so much, in units of r."""
+        """Give how far x moves, as far as that is seen, if what is predicted is off by so much, in units of r."""
         singular = np.linalg.svd(self.weighted, full_matrices=False)
-        inverse = np.array([1 / each if each > UNSEEN * singular.S[0] else 0.0 for each in singular.S])
+        inverse = np.where(self.along <= NOT_SEEN, 1 / np.maximum(singular.S, np.finfo(float).tiny), 0.0)
         return singular.Vh.T @ (inverse * (singular.U.T @ rows))
 
 
