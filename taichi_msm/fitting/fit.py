@@ -19,7 +19,7 @@ from taichi_msm.arguments import require_path
 from taichi_msm.errors import ArgumentError, SceneError, writing
 from taichi_msm.fitting.estimation import Misfit, Search, Solution
 from taichi_msm.fitting.identifiability import Unseen, shares, unseen
-from taichi_msm.fitting.observations import Observations, read_forces, read_observations, with_sigma
+from taichi_msm.fitting.observations import read_forces, read_observations, with_sigma
 from taichi_msm.fitting.parameters import Bounds, Parameter, as_data, make_parameters, with_values
 from taichi_msm.fitting.prediction import Job, runnable, seen_at_rest
 from taichi_msm.fitting.profiles import Place, Profile, Profiler
@@ -98,10 +98,10 @@ def fit(
 
     Example:
         >>> from taichi_msm import fit, load_scene
-        >>> scene = load_scene("scenes/press.yaml", {"sheet.points": [31, 31], "tissue.young": 6e4})
-        >>> found = fit(scene, "output/press/trajectory.npz", ["tissue.young", "tissue.foundation"])
-        >>> found.identifiable
-        True
+        >>> scene = load_scene("scenes/press.yaml", {"sheet.points": [41, 41], "tissue.young": 6e4})
+        >>> found = fit(scene, "output/press/trajectory.npz", ["tissue.young"])
+        >>> f"{found.parameters['tissue.young'].value:.4g} Pa", found.identifiable
+        ('3e+04 Pa', True)
     """
     begun = time.perf_counter()
     _require_arguments(free, bounds, workers, method)
