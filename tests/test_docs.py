@@ -39,7 +39,7 @@ PAGES = [README, ROOT / "CONTRIBUTING.md", ROOT / "CHANGELOG.md", *sorted(DOCS.g
 # Those with commands, in an order in which each finds the results that it reads.
 WITH_COMMANDS = [
     README,
-    *(DOCS / f"{name}.md" for name in ("scene", "labels", "sweep", "export", "error", "view", "study")),
+    *(DOCS / f"{name}.md" for name in ("scene", "labels", "sweep", "fit", "export", "error", "view", "study")),
 ]
 SCENES = sorted(path.stem for path in (ROOT / "scenes").glob("*.yaml"))
 
@@ -257,8 +257,8 @@ def test_the_python_shown_runs(tmp_path: Path) -> None:
     assert (tmp_path / "output" / "from-python" / "animation.gif").exists()
 
 
-# Those whose examples stand in their docstrings. Those of Playback and export read what that of run writes.
-WITH_EXAMPLES = ["run", "Playback", "export", "load_scene", "Scene", "Simulation"]
+# Those whose examples stand in their docstrings. Those of Playback, export and fit read what that of run writes.
+WITH_EXAMPLES = ["run", "Playback", "export", "fit", "load_scene", "Scene", "Simulation"]
 
 
 @pytest.mark.parametrize("name", WITH_EXAMPLES)
@@ -268,6 +268,20 @@ def test_the_example_of_a_docstring_gives_what_it_shows(name: str, examples_fold
     for test in tests:
         outcome = doctest.DocTestRunner().run(test)
         assert outcome.failed == 0, f"the example of {name} fails; see above"
+
+
+def test_the_fit_shown_is_what_it_finds(
+    examples_folder: Path, program: Program, capfd: pytest.CaptureFixture[str]
+) -> None:
+    shown, unseen = (block.splitlines() for block in blocks(DOCS / "fit.md", "text"))
+    seen, found, *_ = commands(DOCS / "fit.md")
+    assert program(*seen).returncode == 0
+    done = program(*found)
+    # But for the runs and the seconds.
+    assert done.stdout.splitlines()[:-1] == shown[:-1]
+    exec(compile(blocks(DOCS / "fit.md", "python")[0], "fit.md", "exec"), {})
+    assert capfd.readouterr().out.splitlines() == blocks(DOCS / "fit.md", "txt")[0].splitlines()
+    assert "each alone is not: fix one, or give a force (--forces)" in unseen[-1]
 
 
 def test_the_error_in_the_readme_is_that_of_the_run(device: Device, tmp_path: Path) -> None:

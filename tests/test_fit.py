@@ -155,7 +155,7 @@ def test_a_profile_agrees_with_the_curvature_where_that_is_all_there_is(tracks: 
     plain, profiled = fit(changed(), seen, free), fit(changed(), seen, free, profile=True)
     for key in free:
         ends = [np.array(one.parameters[key].interval, np.float64) for one in (profiled, plain)]
-        np.testing.assert_allclose(*ends, rtol=2e-3)
+        np.testing.assert_allclose(ends[0], ends[1], rtol=2e-3)
         curve = np.array([place.deviations for place in profiled.curves[key]])
         assert curve.min() < -1.9
         assert curve.max() > 1.9

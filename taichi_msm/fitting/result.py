@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, field
 from typing import Any, NamedTuple
 
@@ -97,20 +98,17 @@ class FitResult:
     def summary(self) -> list[str]:
         """Say in lines what was found."""
         seen = self.observations
-        lines = [
-            f"{key}: {one.value:.6g}{f' ± {one.standard_error:.2g}' if one.standard_error is not None else ''}, "
-            f"95 % {_end(one.interval[0])} to {_end(one.interval[1])}, from {one.start:.6g}"
-            f"{'' if one.identifiable else ': not identifiable'}"
-            for key, one in self.parameters.items()
-        ]
+        lines = [f"{key}: {_in_words(one)}" for key, one in self.parameters.items()]
         lines += [one.text for one in self.unseen]
         points, times = seen.there.shape
         chi = ""
         if self.chi_square is not None:
-            chi = f", chi-square {self.chi_square:.5g} for {self.degrees_of_freedom} degrees of freedom"
+            chi = f", chi-square {self.chi_square:.3g} for {self.degrees_of_freedom} degrees of freedom"
         lines.append(f"residual {self.residual:.3g} {self.unit} of {points} points at {times} times{chi}")
         if self.mesh_error is not None:
-            lines.append(f"mesh error of the fitted scene: {100 * self.mesh_error:.2g} % of the largest displacement")
+            most = "at most about " if any(probe.moved for probe in self.scene.probes) else ""
+            error = f"{most}{100 * self.mesh_error:.2g} % of the largest displacement"
+            lines.append(f"mesh error of the fitted scene: {error}")
         return [*lines, *self.notes, f"{self.runs} runs, {self.seconds:.1f} s"]
 
 
@@ -119,5 +117,15 @@ def finite(number: float) -> float | None:
     return float(number) if number == 0 or 1 / MOST <= abs(number) <= MOST else None
 
 
-def _end(end: float | None) -> str:
-    return "?" if end is None else f"{end:.6g}"
+def _in_words(one: Estimate) -> str:
+    """Write an estimate with as many digits as its error leaves."""
+    error = one.standard_error
+    digits = 3 if not error or not one.value else math.floor(math.log10(abs(one.value) / error)) + 3
+
+    def written(number: float | None) -> str:
+        return "?" if number is None else f"{float(f'{number:.{min(max(digits, 2), 9)}g}'):.10g}"
+
+    known = "" if error is None else f" ± {error:.2g}"
+    low, high = map(written, one.interval)
+    doubt = "" if one.identifiable else ": not identifiable"
+    return f"{written(one.value)}{known}, 95 % {low} to {high}, from {one.start:.6g}{doubt}"
