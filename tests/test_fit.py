@@ -14,7 +14,9 @@ from numpy.typing import NDArray
 
 from taichi_msm import SceneError, Simulation, fit, load_scene, run
 from taichi_msm.fitting.fit import Method
-from taichi_msm.fitting.prediction import surface_weights
+from taichi_msm.fitting.observations import read_observations
+from taichi_msm.fitting.parameters import make_parameters
+from taichi_msm.fitting.prediction import Job, Predictor, runnable, surface_weights
 from taichi_msm.fitting.result import FitResult
 from taichi_msm.physics.deformed import touched
 from taichi_msm.scene import Scene
@@ -342,6 +344,19 @@ def test_what_cannot_be_used_is_answered_by_one_sentence(
         assert len(caught.value.lines) == 1, name
         assert caught.value.lines[0].startswith(f"{path}: "), name
         assert ";" in caught.value.lines[0], name
+
+
+def test_values_that_make_no_scene_give_no_run(device: Device, tracks: dict[str, Array]) -> None:
+    scene = changed(tissue__damping=0)
+    free = ["tissue.damping", "tissue.young"]
+    parameters = make_parameters(scene, free, {"tissue.damping": (-100, 100)})
+    job = Job("token", runnable(scene), parameters, read_observations(tracks, 25))
+    predictor = Predictor(job, device.threads)
+    # Less than no damping; springs without length, as a tenth of young does not bear the pretension.
+    assert predictor.attempt(np.array([-0.1, 0.0])) is None
+    assert predictor.attempt(np.array([0.0, -np.log(10)])) is None
+    assert predictor.attempt(np.array([0.0, 0.0])) is not None
+    predictor.close()
 
 
 @pytest.mark.parametrize(

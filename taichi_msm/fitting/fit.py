@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from typing_extensions import TypedDict, Unpack
 
 from taichi_msm.arguments import require_path
-from taichi_msm.errors import ArgumentError, SceneError, writing
+from taichi_msm.errors import ArgumentError, DivergedError, SceneError, writing
 from taichi_msm.fitting.estimation import Misfit, Search, Solution
 from taichi_msm.fitting.identifiability import Unseen, shares, unseen
 from taichi_msm.fitting.observations import read_forces, read_observations, with_sigma
@@ -41,6 +41,9 @@ TIED, ALIKE = 0.95, 0.3
 
 # What is left is too small to say anything of below this share of the motion.
 NOTHING_LEFT = 1e-6
+
+# A parameter this close to a bound, in units of x, has ended there.
+AT_BOUND = 1e-3
 
 # Points of the curve of a parameter's curvature.
 CURVE = np.linspace(-3, 3, 25)
@@ -114,6 +117,8 @@ def fit(
     parameters = make_parameters(given, free, bounds or {})
     if forces is not None:
         seen = replace(seen, forces=read_forces(forces[0], forces[1], len(given.probes)))
+    if method.get("correlation") is not None and seen.kind != "pixel":
+        raise SceneError([f"{seen.name}: --correlation is in pixels, and these are positions; leave it out"])
     if wrong := list(faults(seen, given, len(parameters))):
         raise SceneError(wrong)
     with ExitStack() as opened:
@@ -191,10 +196,13 @@ class _Fit:
 
     def _mesh(self, solution: Solution, uncertain: Uncertainty, misfit: Misfit) -> tuple[float | None, Array | None]:
         """Estimate the error of the points, and how far it moves every parameter, in units of x."""
-        estimate = self._runs.mesh_error(solution.x)
-        if estimate is None or not math.isfinite(estimate.error):
+        try:
+            estimate = self._runs.mesh_error(solution.x)
+            if estimate is None or not math.isfinite(estimate.error):
+                return None, None
+            coarse = self._runs.coarse(solution.x)
+        except (DivergedError, SceneError):  # with fewer points
             return None, None
-        coarse = self._runs.coarse(solution.x)
         order = WITH_CONTACT if any(probe.moved for probe in self._given.probes) else 2.0
         rows = misfit.row(coarse) - misfit.row(solution.predicted)
         return estimate.error, np.abs(uncertain.shift(misfit.divided(rows, uncertain.scales))) / (2**order - 1)
@@ -206,7 +214,7 @@ class _Fit:
         one, deviation = self._runs.job.parameters[n], float(uncertain.deviations[n])
         share = shares(self._runs.job.parameters, x, uncertain)[n]
         low, high = one.limits
-        if min(x[n] - low, high - x[n]) < 1e-6:
+        if min(x[n] - low, high - x[n]) < AT_BOUND:
             bound = (
                 "a bound" if math.isfinite(one.low) or math.isfinite(one.high) else "1000 times from where it starts"
             )
@@ -271,15 +279,15 @@ class _Fit:
 
 def _alike(left: Array, coordinates: Array) -> tuple[float, float]:
     """Correlate what is left of points, shape (N, T, numbers), with that of their nearest neighbours, and in time."""
-    apart = np.linalg.norm(coordinates[:, None] - coordinates[None], axis=2)
-    np.fill_diagonal(apart, np.inf)
+    from scipy.spatial import KDTree
 
     def likeness_of(one: Array, other: Array) -> float:
         product, square = one * other, one**2 + other**2
         there = np.isfinite(product)
         return 2 * float(product[there].sum()) / max(float(square[there].sum()), 1e-300) if there.any() else 0.0
 
-    beside = likeness_of(left, left[apart.argmin(axis=1)]) if len(left) > 1 else 0.0
+    # The nearest to a point but for itself.
+    beside = likeness_of(left, left[KDTree(coordinates).query(coordinates, 2)[1][:, 1]]) if len(left) > 1 else 0.0
     return beside, likeness_of(left[:, 1:], left[:, :-1])
 
 
@@ -292,8 +300,8 @@ def _curve(one: Parameter, n: int, x: Array, uncertain: Uncertainty, profiles: l
 
 
 def _with_values(given: Scene, job: Job, values: list[float]) -> Scene:
-    """Give the scene with the values that were found, without keys that it did not have."""
-    return Scene.model_validate(with_values(as_data(given), job.parameters, values))
+    """Give the scene with the values that were found."""
+    return Scene(**with_values(as_data(given), job.parameters, values))
 
 
 def _require_arguments(

@@ -28,6 +28,7 @@ HELD = ("tolerance", "grip", "shaft", "points")
 
 # Keys of places and times, and a tool's offset, which are fitted as they are.
 PLACES = ("at", "path", "camera", "offset", "load")
+
 # Without bounds, a number that is fitted in the log stays within a factor of 1000 from where it starts.
 WIDEST = math.log(1000)
 
@@ -68,8 +69,10 @@ class Parameter:
         if not self.is_log:
             return (self.low - self.start) / self.scale, (self.high - self.start) / self.scale
         shares = sorted((self.low / self.start, self.high / self.start))
-        low, high = (math.log(share) if 0 < share < math.inf else math.inf for share in shares)
-        return max(-WIDEST, -low if low == math.inf else low), min(WIDEST, high)
+        return (
+            math.log(shares[0]) if shares[0] > 0 else -WIDEST,
+            math.log(shares[1]) if shares[1] < math.inf else WIDEST,
+        )
 
     def error(self, x: float, deviation: float) -> float:
         """Turn a standard deviation of x into that of the value."""

@@ -48,10 +48,6 @@ class Job:
     parameters: tuple[Parameter, ...]
     observations: Observations
 
-    def scene_at(self, values: Array) -> Scene:
-        """Give the scene with other values of the parameters."""
-        return Scene.model_validate(with_values(as_data(self.scene), self.parameters, values.tolist()))
-
     def values(self, x: Array) -> Array:
         """Give the values of the parameters at x."""
         return np.array([one.value(each) for one, each in zip(self.parameters, x.tolist(), strict=True)])
@@ -132,7 +128,7 @@ class Predictor:
         if not np.isfinite(values).all():
             raise SceneError(["the values are out of range"])
         data = with_values(self._data, self.job.parameters, values.tolist())
-        return checked(Scene.model_validate(data), self._maps)
+        return checked(Scene(**data), self._maps)
 
     def _run(self, simulation: Simulation, plan: Plan, whole: bool, pause: Pause) -> Predicted:
         seen, scene = self.job.observations, plan.scene

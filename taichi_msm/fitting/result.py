@@ -125,7 +125,7 @@ def _in_words(one: Estimate) -> str:
     def written(number: float | None) -> str:
         return "?" if number is None else f"{float(f'{number:.{min(max(digits, 2), 9)}g}'):.10g}"
 
-    known = "" if error is None else f" ± {error:.2g}"
+    known = "" if error is None else f" +- {error:.2g}"
     low, high = map(written, one.interval)
     doubt = "" if one.identifiable else ": not identifiable"
     return f"{written(one.value)}{known}, 95 % {low} to {high}, from {one.start:.6g}{doubt}"

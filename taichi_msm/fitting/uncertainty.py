@@ -120,8 +120,9 @@ def uncertainty(
 
 def likeness(pixels: Array, correlation: float) -> Array:
     """Tell how alike the errors of two tracks are, by where they are in the picture [px]; shape (N, N)."""
-    apart = np.linalg.norm(pixels[:, None] - pixels[None], axis=2)
-    return np.exp(-apart / correlation)
+    from scipy.spatial.distance import cdist
+
+    return np.exp(-cdist(pixels, pixels) / correlation)
 
 
 def _with_neighbours(seen: Observations, misfit: Misfit, slope: Array, alike: Array) -> Array:
