@@ -345,7 +345,8 @@ class Probe(Section):
             before, now = path[n - 1][0], path[n][0]
             if now <= before:
                 raise refused(
-                    f"is at {now:g} s, after one at {before:g} s; a tool cannot jump: give it a later time", n
+                    f"is at {now:g} s, and the key before it at {before:g} s; sort the keys, each later than the last",
+                    n,
                 )
         return path
 

@@ -145,8 +145,15 @@ def fewest_steps(tools: Sequence[Tool], grid: TimeGrid, least: int) -> int:
 
 def path_notes(scene: Scene, tools: Sequence[Tool]) -> Iterator[str]:
     """Note the tools that are too thin for the points, and two that are in one place."""
-    apart = max(spacing(scene.sheet))
+    apart, side, end = max(spacing(scene.sheet)), max(scene.sheet.size), scene.time.duration
     for tool in tools:
+        if (far := float(np.abs(tool.heights).max())) > side:
+            yield f"probes.{tool.probe}.path: a height of {far:g} m beside a sheet of {side:g} m; heights are in metres"
+        if tool.times[-1] > end * (1 + 1e-9):
+            yield f"probes.{tool.probe}.path ends at {tool.times[-1]:g} s, after the end of the scene at {end:g} s"
+        for begin, _ in tool.grips:
+            if begin >= end:
+                yield f"probes.{tool.probe}.grip begins at {begin:g} s, not before the end of the scene at {end:g} s"
         if apart > WIDEST_CELL * tool.radius:
             (height, width), most = scene.sheet.size, WIDEST_CELL * tool.radius
             points = [int(np.ceil(side / most)) + 1 for side in (height, width)]
