@@ -64,8 +64,8 @@ def forces_of(name: str) -> tuple[Floats, Floats, Floats]:
     """Return the times [s], the places of the tip [m] and the forces [N] of a scene's only tool in every frame."""
     time, tip, force = [], [], []
     with Simulation(load_scene(SCENES / f"{name}.yaml", {"output": []})) as simulation:
-        for _ in range(simulation.scene.time.frames):
-            simulation.advance()
+        for frame in range(simulation.scene.time.frames + 1):
+            simulation.advance(min(frame, 1))
             (felt,) = simulation.forces()
             time.append(simulation.time)
             tip.append(felt.tip)
@@ -85,13 +85,11 @@ def indentation() -> None:
         depth[: deepest + 1], upward[: deepest + 1], "o-", color="firebrick", markersize=4, label="going down"
     )
     over_depth.plot(depth[deepest:], upward[deepest:], "x", color="black", markersize=5, label="coming up")
-    slopes = [np.polyfit(depth[part], upward[part], 1) for part in (slice(0, 3), slice(deepest - 2, deepest + 1))]
-    for slope, at in zip(slopes, ([0, 3.2], [2.8, 6]), strict=True):
-        over_depth.plot(at, np.polyval(slope, at), "--", color="grey", linewidth=1)
-        over_depth.annotate(
-            f"{slope[0]:.2f} N/mm", (at[1], np.polyval(slope, at[1])), (5, -14), textcoords="offset points"
-        )
-    over_depth.set(xlabel="depth of the tip [mm]", xlim=(-0.2, 8))
+    slopes = [np.polyfit(depth[part], upward[part], 1) for part in (slice(1, 4), slice(deepest - 2, deepest + 1))]
+    for slope, ends, label in zip(slopes, ([0, 3.2], [2.8, 6]), ([3.2, 0.17], [3.9, 0.55]), strict=True):
+        over_depth.plot(ends, np.polyval(slope, ends), "--", color="grey", linewidth=1)
+        over_depth.annotate(f"{slope[0]:.2f} N/mm", label)
+    over_depth.set(xlabel="depth of the tip [mm]")
     over_depth.legend(frameon=False, loc="upper left")
     figure.savefig(IMAGES / "indent.png", dpi=130)
 
@@ -102,13 +100,13 @@ def palpation() -> None:
     scene = load_scene(SCENES / "tumour.yaml")
     deepest = tip[:, 2] <= tip[:, 2].min() + 1e-9
     width = 1000 * scene.sheet.size[1]
-    figure, (felt, over) = plt.subplots(2, 1, figsize=(6.4, 5.6), sharex=True, layout="constrained")
+    figure, (felt, over) = plt.subplots(2, 1, figsize=(6.4, 4.4), sharex=True, layout="constrained")
     felt.bar(1000 * tip[deepest, 0], np.linalg.norm(force[deepest], axis=1), width=5, color="firebrick")
-    felt.set(ylabel="force 3 mm deep [N]", box_aspect=0.5)
+    felt.set(ylabel="force 3 mm deep [N]", box_aspect=1 / 3)
     with Image.open(SCENES / "textures" / "tumour.png") as stiffness:
-        quarter = stiffness.height // 4
-        middle = np.asarray(stiffness)[quarter:-quarter]
-        over.imshow(middle, cmap="gray", extent=(-width / 2, width / 2, -width / 4, width / 4))
+        third = stiffness.height // 3
+        middle = np.asarray(stiffness)[third:-third]
+        over.imshow(middle, cmap="gray", extent=(-width / 2, width / 2, -width / 6, width / 6))
     over.plot(1000 * tip[deepest, 0], 1000 * tip[deepest, 1], "o", color="firebrick")
     over.set(xlabel="place of the tip, from the middle of the sheet [mm]", ylabel="[mm]")
     figure.savefig(IMAGES / "palpation.png", dpi=130)

@@ -10,7 +10,7 @@ import pytest
 
 from taichi_msm.errors import SceneError
 from taichi_msm.physics.kernel import SheetLayout
-from taichi_msm.physics.paths import fewest_steps
+from taichi_msm.physics.paths import fewest_steps, path_notes, tools_of
 from taichi_msm.physics.planning import try_plan
 from taichi_msm.physics.solver import Dynamics
 from taichi_msm.physics.state import State
@@ -164,7 +164,7 @@ REFUSED: dict[str, tuple[dict[str, Any], str]] = {
     ),
     "a jump": (
         moved([0, 0.5, 0.5, 0.0], [0, 0.5, 0.5, 0.01]),
-        "path.1: is at 0 s, after one at 0 s; a tool cannot jump: give it a later time",
+        "path.1: is at 0 s, and the key before it at 0 s; sort the keys, each later than the last",
     ),
     "no rod": ({"path": PATH}, "instrument: missing; with path expected a mapping with radius, shaft and length"),
     "a force": (
@@ -226,3 +226,12 @@ def test_the_fewest_steps_in_which_no_tool_moves_too_far() -> None:
     assert fewest_steps(plan.tools, plan.grid, 1) == 7  # 0.16 m in a frame, in parts of 0.025 m
     assert fewest_steps(plan.tools, plan.grid, 9) == 9
     assert fewest_steps((), plan.grid, 1) == 1
+
+
+def test_units_and_times_that_cannot_be_meant_are_noted() -> None:
+    late = {**PRESSED, "path": [[0, 0.5, 0.5, 1], [300, 0.5, 0.5, -5]], "grip": [[2, 3]]}
+    made = touching([late])
+    height, path, grip, *_ = path_notes(made, tools_of(made.probes, made.sheet))
+    assert height == "probes.0.path: a height of 5 m beside a sheet of 0.4 m; heights are in metres"
+    assert path == "probes.0.path ends at 300 s, after the end of the scene at 0.4 s"
+    assert grip == "probes.0.grip begins at 2 s, not before the end of the scene at 0.4 s"
