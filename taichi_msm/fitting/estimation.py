@@ -89,6 +89,11 @@ class Misfit:
         by = np.repeat(scales, self.count)
         return rows / by.reshape(-1, *(1,) * (rows.ndim - 1))
 
+    def cost(self, divided: Array, *, robust: bool) -> float:
+        """Give half the sum of rho of such rows, as SciPy does."""
+        square = divided**2
+        return float(np.sum(2 * FAR**2 * (np.sqrt(1 + square / FAR**2) - 1) if robust else square)) / 2
+
     def sigma(self, predicted: Predicted, parameters: int, *, robust: bool) -> float:
         """Estimate the standard deviation of the values' errors from what is left of them."""
         left = self.of(predicted)[: self.count[0]]
@@ -114,10 +119,6 @@ class Search:
         self._limits = limits[:, 0], limits[:, 1]
         self._known: dict[bytes, Predicted | None] = {}
 
-    def remember(self, x: Array, predicted: Predicted) -> None:
-        """Keep what was predicted before the search."""
-        self._known[x.tobytes()] = predicted
-
     def best(self, start: Array) -> Solution:
         """Find the best values from a start, and from others if that does not fit."""
         solution = self._settled(start)
@@ -141,15 +142,19 @@ class Search:
 
     def fits(self, solution: Solution) -> bool:
         """Tell whether what is left is small."""
-        sigma = self._runs.job.observations.sigma
-        left = self.misfit.sigma(solution.predicted, len(solution.x), robust=self._robust)
-        return left <= POOR_SIGMAS * sigma if sigma is not None else left <= POOR_SHARE * self._motion
+        seen = self._runs.job.observations
+        if seen.forces is not None:
+            left, most = solution.predicted.forces - seen.forces.force, POOR_SHARE**2 * np.nanmean(seen.forces.force**2)
+            if np.nanmean(left**2) > max(most, (POOR_SIGMAS * seen.forces.sigma) ** 2):
+                return False
+        of_values = self.misfit.sigma(solution.predicted, len(solution.x), robust=self._robust)
+        return of_values <= (POOR_SIGMAS * seen.sigma if seen.sigma is not None else POOR_SHARE * self._motion)
 
     def derivatives(self, solution: Solution) -> Array:
         """Give the derivatives of what is predicted by x, by central differences, shape (numbers, parameters)."""
-        return self._derivatives(solution.x, solution.predicted, central=True)
+        return self._derivatives(solution.x, solution.predicted, signs=(1, -1))
 
-    def predict(self, x: Array) -> Predicted | None:
+    def _predict(self, x: Array) -> Predicted | None:
         """Predict, unless that was done already."""
         key = x.tobytes()
         if key not in self._known:
@@ -159,20 +164,21 @@ class Search:
     def _settled(self, start: Array) -> Solution:
         """Find the best values from a start, and sigma where it is not known."""
         seen = self._runs.job.observations
-        needs_sigma = seen.sigma is None and (seen.forces is not None or self._robust)
         scales = Scales(seen.sigma or self._motion, seen.forces.sigma if seen.forces else 1.0)
-        predicted = self.predict(np.clip(start, *self._limits))
-        if self._robust and seen.sigma is None and predicted is not None:
-            sigma = self.misfit.sigma(predicted, len(start), robust=True)
-            scales = scales._replace(values=max(sigma, LEAST_SIGMA * self._motion))
+        if self._robust and seen.sigma is None and (predicted := self._predict(start)) is not None:
+            scales = scales._replace(values=self._sigma(predicted))
         solution = self._from(start, scales)
-        for _ in range(MOST_ROUNDS if needs_sigma else 0):
-            left = self.misfit.sigma(solution.predicted, len(solution.x), robust=self._robust)
-            sigma = max(left, LEAST_SIGMA * self._motion)
+        for _ in range(MOST_ROUNDS if seen.sigma is None and (seen.forces is not None or self._robust) else 0):
+            sigma = self._sigma(solution.predicted)
             if abs(sigma / solution.scales.values - 1) < SIGMA_KNOWN:
                 break
             solution = self._from(solution.x, scales._replace(values=sigma))
         return solution
+
+    def _sigma(self, predicted: Predicted) -> float:
+        """Estimate sigma, at least as large as makes sense."""
+        left = self.misfit.sigma(predicted, len(self._limits[0]), robust=self._robust)
+        return max(left, LEAST_SIGMA * self._motion)
 
     def _from(self, start: Array, scales: Scales) -> Solution:
         """Find the best values from a start."""
@@ -181,23 +187,22 @@ class Search:
         numbers = sum(self.misfit.count)
 
         def residuals(x: Array) -> Array:
-            predicted = self.predict(x)
+            predicted = self._predict(x)
             # SciPy comes nearer to the last place where it finds no number.
             if predicted is None:
                 return np.full(numbers, np.nan)
             return self.misfit.divided(self.misfit.of(predicted), scales)
 
         def jacobian(x: Array) -> Array:
-            predicted = self.predict(x)
+            predicted = self._predict(x)
             assert predicted is not None
-            return self.misfit.divided(self._derivatives(x, predicted, central=False), scales)
+            return self.misfit.divided(self._derivatives(x, predicted, signs=(1,)), scales)
 
-        low, high = self._limits
         found = least_squares(
             residuals,
-            np.clip(start, low, high),
+            start,
             jacobian,
-            (low, high),
+            self._limits,
             ftol=ENOUGH,
             xtol=ENOUGH,
             gtol=None,
@@ -205,54 +210,47 @@ class Search:
             f_scale=FAR,
             max_nfev=MOST_TRIALS,
         )
-        predicted = self.predict(found.x)
+        predicted = self._predict(found.x)
         assert predicted is not None
         return Solution(found.x, predicted, scales, float(found.cost), bool(found.status > 0))
 
-    def _derivatives(self, x: Array, predicted: Predicted, *, central: bool) -> Array:
+    def _derivatives(self, x: Array, predicted: Predicted, *, signs: tuple[int, ...]) -> Array:
         here, (low, high) = self.misfit.row(predicted), self._limits
-        places, columns = [], []
+        places = []
         for n in range(len(x)):
-            for sign in (1, -1) if central else (1,):
+            for sign in signs:
+                place = x.copy()
+                place[n] += sign * self._delta
                 # To the other side where this one is beyond a bound.
-                place = x[n] + sign * self._delta
-                place = place if low[n] <= place <= high[n] else x[n] - sign * self._delta
-                places.append(np.array([place if m == n else each for m, each in enumerate(x)]))
-                columns.append(n)
+                if not low[n] <= place[n] <= high[n]:
+                    place[n] = x[n] - sign * self._delta
+                places.append(place)
         self._runs.expected = max(self._runs.expected, self._runs.count + 3 * len(x))
-        after: dict[int, list[tuple[float, Array]]] = {n: [] for n in range(len(x))}
-        for n, place, one in zip(columns, places, self._runs.several(places, predicted.steps), strict=True):
-            if one is not None:
-                after[n].append((place[n] - x[n], self.misfit.row(one)))
-        return np.stack([_slope(here, after[n], self._runs.job.parameters[n].key) for n in range(len(x))], axis=1)
+        after = self._runs.several(places, predicted.steps)
+        columns = []
+        for n, parameter in enumerate(self._runs.job.parameters):
+            of = slice(n * len(signs), (n + 1) * len(signs))
+            rows = {
+                float(place[n]): self.misfit.row(one)
+                for place, one in zip(places[of], after[of], strict=True)
+                if one is not None
+            }
+            if not rows:
+                remedy = "give --bounds or another start by --set"
+                raise SceneError([f"{parameter.key}: no run close to its value succeeds; {remedy}"])
+            if len(rows) == 1:
+                rows[float(x[n])] = here
+            (one, first), (other, second) = rows.items()
+            columns.append((first - second) / (one - other))
+        return np.stack(columns, axis=1)
 
     def _cost(self, predicted: Predicted, scales: Scales) -> float:
-        """Give the cost of a prediction, as SciPy does."""
-        square = self.misfit.divided(self.misfit.of(predicted), scales) ** 2
-        return float(np.sum(soft_l1(square) if self._robust else square)) / 2
+        return self.misfit.cost(self.misfit.divided(self.misfit.of(predicted), scales), robust=self._robust)
 
     def _other_starts(self) -> list[Array]:
         """Choose other starts, spread evenly over the bounds, at most a factor of 10 from the first."""
         from scipy.stats import qmc
 
         low, high = (np.clip(limit, -SPREAD, SPREAD) for limit in self._limits)
-        shares = qmc.Sobol(len(low), seed=1).random(_power_of_two(LOOKED_AT * len(low)))
-        return list(low + shares * (high - low))
-
-
-def soft_l1(square: Array) -> Array:
-    """Give rho of squares, as SciPy's soft_l1 with its scale."""
-    return 2 * FAR**2 * (np.sqrt(1 + square / FAR**2) - 1)
-
-
-def _slope(here: Array, others: list[tuple[float, Array]], key: str) -> Array:
-    """Give the derivative at a place from what is predicted at one or two others."""
-    if not others:
-        raise SceneError([f"{key}: no run close to its value succeeds; give --bounds or another start by --set"])
-    if len(others) == 1 or others[0][0] == others[1][0]:
-        return (others[0][1] - here) / others[0][0]
-    return (others[0][1] - others[1][1]) / (others[0][0] - others[1][0])
-
-
-def _power_of_two(count: int) -> int:
-    return 1 << (count - 1).bit_length()
+        shares = qmc.Sobol(len(low), seed=1).random_base2((LOOKED_AT * len(low) - 1).bit_length())
+        return list(qmc.scale(shares, low, high))

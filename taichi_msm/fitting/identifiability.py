@@ -12,7 +12,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from taichi_msm.fitting.parameters import Parameter
+from taichi_msm.fitting.parameters import Parameter, rounded
 from taichi_msm.fitting.uncertainty import NOT_SEEN, Uncertainty
 
 Array = NDArray[np.float64]
@@ -55,16 +55,11 @@ class Unseen(NamedTuple):
         return {"parameters": self.parameters, "known": known, "text": self.text}
 
 
-def shares(parameters: Sequence[Parameter], x: Array, uncertain: Uncertainty) -> list[float]:
-    """Give every standard error as a share of the value."""
-    pairs = zip(parameters, x.tolist(), uncertain.deviations.tolist(), strict=True)
-    return [one.share(place, deviation) for one, place, deviation in pairs]
-
-
 def unseen(parameters: Sequence[Parameter], x: Array, uncertain: Uncertainty, *, forces: bool) -> list[Unseen]:
     """Find what the data cannot tell; forces: whether any were seen."""
     blind = uncertain.directions[:, uncertain.along > NOT_SEEN]
-    alone = np.array(shares(parameters, x, uncertain))
+    pairs = zip(parameters, x.tolist(), uncertain.deviations.tolist(), strict=True)
+    alone = np.array([one.share(place, deviation) for one, place, deviation in pairs])
     return [_in_words(parameters, uncertain, alone, part, blind[part], forces=forces) for part in _groups(blind)]
 
 
@@ -106,10 +101,10 @@ def _in_words(
     if not known:
         it = "it" if len(keys) == 1 else "them"
         return Unseen(keys, [], f"{names}: what was seen does not tell {it}: fix {it}")
-    said = [f"{one} {'is known ' if n == 0 else ''}to {100 * one.standard_error:.2g} %" for n, one in enumerate(known)]
+    said = ", ".join(f"{one} is known to {rounded(100 * one.standard_error)} %" for one in known)
     most = float(alone[group].max())
-    each = "is not" if most > MOST_ERROR else f"only to {100 * most:.2g} %"
-    return Unseen(keys, known, f"{', '.join(said)}, each alone {each}: fix one{remedy}")
+    each = "is not" if most > MOST_ERROR else f"only to {rounded(100 * most)} %"
+    return Unseen(keys, known, f"{said}, each alone {each}: fix one{remedy}")
 
 
 def _across(blind: Array) -> Iterator[Array]:

@@ -7,11 +7,10 @@ trajectory.npz and a tracks.npz of a run are taken as they are.
 
 from __future__ import annotations
 
-import csv
 import math
 import zipfile
 import zlib
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Literal
@@ -178,31 +177,19 @@ def read_forces(path: str | Path, sigma: float, probes: int) -> Forces:
     name = str(path)
     if not 0 < sigma < math.inf:
         raise SceneError([f"--forces {name},{sigma:g}: take a number above 0, the standard deviation in newtons"])
-    try:
-        with Path(path).open(newline="", encoding="utf-8") as file:
-            rows = list(_force_rows(name, csv.DictReader(file)))
-    except OSError as error:
-        raise SceneError([f"{name}: {(error.strerror or str(error)).lower()}; name a forces.csv"]) from None
-    except (UnicodeDecodeError, csv.Error):
-        raise SceneError([f"{name}: not a table of text; name a forces.csv"]) from None
-    table = np.array(rows, np.float64).reshape(-1, 5)
-    if not np.isfinite(table[:, 2:]).any():
-        raise SceneError([f"{name}: no force in it; give rows with time, probe, force_x, force_y, force_z"])
-    for probe in table[:, 1]:
-        if not (probe == int(probe) and 0 <= probe < probes):
-            raise SceneError([f"{name}: probe: {probe:g}; the scene has {probes}, numbered from 0"])
-    return Forces(name, table[:, 0], table[:, 1].astype(np.intp), table[:, 2:], sigma)
-
-
-def _force_rows(name: str, reader: csv.DictReader[str]) -> Iterator[list[float]]:
     columns = ("time", "probe", "force_x", "force_y", "force_z")
-    if missing := [column for column in columns if column not in (reader.fieldnames or ())]:
-        raise SceneError([f"{name}:1: {missing[0]}: missing; expected the columns {', '.join(columns)}"])
-    for row in reader:
-        try:
-            numbers = [float(row[column] or "nan") for column in columns]
-        except (TypeError, ValueError):
-            raise SceneError([f"{name}:{reader.line_num}: not five numbers; expected {', '.join(columns)}"]) from None
-        if not all(map(math.isfinite, numbers[:2])):
-            raise SceneError([f"{name}:{reader.line_num}: no time or probe; give both in every row"])
-        yield numbers
+    expected = f"name a forces.csv, with the columns {', '.join(columns)}"
+    try:
+        table: Any = np.genfromtxt(name, delimiter=",", names=True, encoding="utf-8", ndmin=1)
+    except OSError as error:
+        raise SceneError([f"{name}: {(error.strerror or 'no such file').lower()}; {expected}"]) from None
+    except ValueError:
+        raise SceneError([f"{name}: no table of numbers; {expected}"]) from None
+    if missing := [column for column in columns if column not in (table.dtype.names or ())]:
+        raise SceneError([f"{name}: {missing[0]}: missing; {expected}"])
+    time, probe, force = table["time"], table["probe"], np.stack([table[column] for column in columns[2:]], axis=1)
+    if not (np.isfinite(force).any() and np.isfinite(time).all()):
+        raise SceneError([f"{name}: no force, or no time in a row; {expected}, and numbers in them"])
+    if wrong := [one for one in probe.tolist() if one not in range(probes)]:
+        raise SceneError([f"{name}: probe: {wrong[0]:g}; the scene has {probes}, numbered from 0"])
+    return Forces(name, time, probe.astype(np.intp), force, sigma)

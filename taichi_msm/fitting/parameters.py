@@ -37,6 +37,11 @@ MAPS = ("map", "foundation_map")
 Bounds = tuple[float, float]
 
 
+def rounded(number: float) -> str:
+    """Write a number that is known roughly, in two digits."""
+    return f"{float(f'{number:.2g}'):g}"
+
+
 @dataclass(frozen=True)
 class Parameter:
     """A number of the scene that is fitted, as x, which is 0 where it starts."""

@@ -33,7 +33,8 @@ def plot(result: FitResult, file: BinaryIO) -> None:
 
 
 def _figure(result: FitResult) -> Figure:
-    count = 3 + len(result.parameters)
+    forces = result.observations.forces is not None
+    count = 3 + forces + len(result.parameters)
     rows = math.ceil(count / COLUMNS)
     engine = ConstrainedLayoutEngine(w_pad=0.1, h_pad=0.1)
     figure = Figure(figsize=(WIDE, HEIGHT * rows + 0.5), dpi=DPI, layout=engine)
@@ -43,7 +44,9 @@ def _figure(result: FitResult) -> Figure:
     _plot_motion(panels[0], result)
     _plot_match(panels[1], result)
     _plot_left(panels[2], result)
-    for axes, key in zip(panels[3:], result.parameters, strict=False):
+    if forces:
+        _plot_forces(panels[3], result)
+    for axes, key in zip(panels[3 + forces :], result.parameters, strict=False):
         _plot_parameter(axes, result, key)
     for axes in panels[count:]:
         axes.set_axis_off()
@@ -93,6 +96,24 @@ def _plot_left(axes: Axes, result: FitResult) -> None:
     axes.set(title="What is left", xlim=(0, 1), ylim=(1, 0), xlabel="across", ylabel="down", aspect=height / width)
     assert isinstance(axes.figure, Figure)
     axes.figure.colorbar(dots, ax=axes, label=f"root mean square [{unit}]", shrink=0.8)
+
+
+def _plot_forces(axes: Axes, result: FitResult) -> None:
+    """Draw every tool's force in time."""
+    seen = result.observations.forces
+    assert seen is not None
+    for probe in np.unique(seen.probe):
+        rows = np.flatnonzero(seen.probe == probe)
+        rows = rows[np.argsort(seen.time[rows])]
+        label = len(axes.lines) == 0
+        for component in np.flatnonzero(np.isfinite(seen.force[rows]).any(axis=0)):
+            fitted, points = (force[rows, component] for force in (result.fitted_forces, seen.force))
+            axes.plot(seen.time[rows], fitted, color=BLUE, label="fitted" if label else None)
+            axes.plot(seen.time[rows], points, ".", color=VERMILION, markersize=3, label="seen" if label else None)
+            axes.text(seen.time[rows[-1]], fitted[-1], f" {'xyz'[component]}", verticalalignment="center")
+            label = False
+    axes.set(title="Forces on the sheet", xlabel="time [s]", ylabel="force [N]")
+    axes.legend()
 
 
 def _plot_parameter(axes: Axes, result: FitResult, key: str) -> None:

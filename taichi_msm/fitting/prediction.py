@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import NamedTuple, cast
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,7 +20,7 @@ from taichi_msm.physics.mesh_error import coarser
 from taichi_msm.physics.plan import Plan
 from taichi_msm.progress import Pause
 from taichi_msm.render.camera import view
-from taichi_msm.scene import WHOLE, Scene, Sheet
+from taichi_msm.scene import Scene, Sheet
 from taichi_msm.scenefile.validation import checked
 from taichi_msm.simulation import Simulation
 
@@ -71,9 +71,11 @@ class Predictor:
         plan = checked(job.scene)
         self._maps, self._threads = plan.maps, threads
         self._simulation: Simulation | None = None
+        # Times in frames, without the rounding of their product.
         rate, seen = plan.grid.frames_per_second, job.observations
-        self._place = _Between(seen.time, rate)
-        self._force_place = _Between(seen.forces.time if seen.forces else np.empty(0), rate)
+        self._place = np.round(seen.time * rate, 6)
+        self._force_place = np.round((seen.forces.time if seen.forces else np.empty(0)) * rate, 6)
+        self._last = math.ceil(max(1.0, *self._place, *self._force_place))
 
     def predict(
         self,
@@ -134,27 +136,21 @@ class Predictor:
         seen, scene = self.job.observations, plan.scene
         # A coarse run has other points than the others.
         corners, weights = surface_weights(seen.coordinates, scene.sheet, scene.render.refine)
-        needed = dict.fromkeys([*self._place.frames, *self._force_place.frames])
-        last = plan.grid.frames if whole else max(needed)
-        rest = places_at_rest(seen.coordinates, scene.sheet)
-        points: dict[int, Array] = {}
-        forces: dict[int, Array] = {}
-        motion = np.zeros(last + 1)
-        for frame in range(last + 1):
+        points, forces = [], []
+        for frame in range((plan.grid.frames if whole else self._last) + 1):
             simulation.advance(min(frame, 1), pause)
             position = simulation.positions().reshape(-1, 3)
-            there = np.einsum("nk,nkc->nc", weights, position[corners])
-            motion[frame] = np.linalg.norm(there - rest, axis=1).max()
-            if frame in needed:
-                points[frame] = there
-                forces[frame] = np.array([one.force for one in simulation.forces()]).reshape(-1, 3)
-        values = self._place.at(points).swapaxes(0, 1)
+            points.append(np.einsum("nk,nkc->nc", weights, position[corners]))
+            if seen.forces is not None:
+                forces.append([one.force for one in simulation.forces()])
+        rest = places_at_rest(seen.coordinates, scene.sheet)
+        motion = np.linalg.norm(np.array(points) - rest, axis=2).max(axis=1)
+        values = _between(np.array(points), self._place).swapaxes(0, 1)
         if seen.kind == "pixel":
             values = seen_by_camera(scene, values)
         felt = np.empty((0, 3))
         if seen.forces is not None:
-            every = self._force_place.at(forces)
-            felt = every[np.arange(len(every)), seen.forces.probe]
+            felt = _between(np.array(forces), self._force_place)[np.arange(len(self._force_place)), seen.forces.probe]
         return Predicted(values, felt, plan.grid.steps_per_frame, motion)
 
     def close(self) -> None:
@@ -177,29 +173,11 @@ def _with_margin(plan: Plan) -> int:
     return math.ceil(2 * frame / plan.stable_step * (1 + difference(plan.scene)))
 
 
-class _Between:
-    """Times as places between frames: the frames before and after, and the share of the second."""
+def _between(frames: Array, place: Array) -> Array:
+    """Interpolate what is given for each frame, shape (frames, ...), linearly at places between them."""
+    from scipy.interpolate import make_interp_spline
 
-    def __init__(self, time: Array, rate: float) -> None:
-        frame = time * rate
-        nearest = np.round(frame)
-        frame = np.where(np.abs(frame - nearest) <= WHOLE * np.maximum(1.0, nearest), nearest, frame)
-        self.before = np.floor(frame).astype(int)
-        self.share = frame - self.before
-        self.after = self.before + (self.share > 0)
-
-    @property
-    def frames(self) -> list[int]:
-        """The frames that are needed."""
-        return sorted({*self.before.tolist(), *self.after.tolist()})
-
-    def at(self, frames: dict[int, Array]) -> Array:
-        """Interpolate arrays, given at frames, at the times; shape (times, ...)."""
-        if not len(self.before):
-            return np.empty((0, 0, 3))
-        before = np.stack([frames[n] for n in self.before.tolist()])
-        after = np.stack([frames[n] for n in self.after.tolist()])
-        return before + self.share[:, None, None] * (after - before)
+    return cast("Array", make_interp_spline(np.arange(len(frames)), frames, k=1)(place))
 
 
 def surface_weights(coordinates: Array, sheet: Sheet, refine: int) -> tuple[NDArray[np.intp], Array]:

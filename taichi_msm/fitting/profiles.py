@@ -14,7 +14,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from taichi_msm.fitting.estimation import FAR, Misfit, Solution, soft_l1
+from taichi_msm.fitting.estimation import FAR, Misfit, Solution
 from taichi_msm.fitting.prediction import Predicted
 from taichi_msm.fitting.runs import Runs
 from taichi_msm.fitting.uncertainty import Uncertainty
@@ -34,7 +34,7 @@ class Place(NamedTuple):
     """A place on a profile."""
 
     x: float  # of the parameter
-    deviations: float  # the root of twice the rise of the cost over f, with the sign of the side; nan: no run there
+    deviations: float  # the root of twice the rise of the cost over f, and its sign; infinite: no run there
 
 
 class Profile(NamedTuple):
@@ -50,96 +50,79 @@ class Profiler:
 
     def __init__(self, misfit: Misfit, solution: Solution, uncertain: Uncertainty, *, robust: bool) -> None:
         self._misfit, self._solution, self._uncertain, self._robust = misfit, solution, uncertain, robust
-        self._least = self._cost(uncertain.left)
+        self._least = misfit.cost(uncertain.left, robust=robust)
 
     def profiles(self, runs: Runs) -> list[Profile]:
         """Draw the profile of every parameter, all sides at once."""
         limits = [one.limits for one in runs.job.parameters]
         sides = {(n, sign): self._side(n, sign, limits[n][sign > 0]) for n in range(len(limits)) for sign in (-1, 1)}
-        places: dict[tuple[int, int], list[Place]] = {}
-        asked = {which: next(side) for which, side in sides.items()}
-        while asked:
-            runs.expected = max(runs.expected, runs.count + 2 * len(asked))
-            predicted = runs.several(list(asked.values()))
-            following = {}
-            for which, one in zip(asked, predicted, strict=True):
+        places: dict[tuple[int, int], list[Place]] = {which: [] for which in sides}
+        asked: dict[tuple[int, int], Array | None] = {which: next(side, None) for which, side in sides.items()}
+        while waiting := [(which, place) for which, place in asked.items() if place is not None]:
+            runs.expected = max(runs.expected, runs.count + 2 * len(waiting))
+            predicted = runs.several([place for _, place in waiting])
+            for (which, _), one in zip(waiting, predicted, strict=True):
                 try:
-                    following[which] = sides[which].send(one)
+                    asked[which] = sides[which].send(one)
                 except StopIteration as stop:
-                    places[which] = stop.value
-            asked = following
+                    asked[which], places[which] = None, stop.value
         return [self._profile(n, places[n, -1], places[n, 1]) for n in range(len(limits))]
 
     def _profile(self, n: int, below: list[Place], above: list[Place]) -> Profile:
-        here, quantile = float(self._solution.x[n]), self._uncertain.quantile
-        ends = []
-        for side in (below, above):
-            last = side[-1] if side else Place(here, math.nan)
-            reached = abs(abs(last.deviations) / quantile - 1) < 5 * CLOSE
-            ends.append(last.x if reached else None)
-        good = [place for place in [*below, Place(here, 0.0), *above] if math.isfinite(place.deviations)]
-        return Profile(sorted(good), ends[0], ends[1])
+        quantile = self._uncertain.quantile
+        ends = [
+            side[-1].x if side and abs(abs(side[-1].deviations) / quantile - 1) < 5 * CLOSE else None
+            for side in (below, above)
+        ]
+        places = [*below, Place(float(self._solution.x[n]), 0.0), *above]
+        return Profile(sorted(place for place in places if math.isfinite(place.deviations)), ends[0], ends[1])
 
     def _side(self, n: int, sign: int, limit: float) -> Side:
-        """Go out to one side of a parameter; asks for predictions, and returns the places."""
+        """Go from the best values to where the interval ends, or to a bound."""
         x, root, quantile = self._solution.x, self._uncertain.root, self._uncertain.quantile
         variance = float(root[n] @ root[n])
         valley = root @ root[n] / variance
+        most = abs(limit - x[n])
         places: list[Place] = []
-        away = quantile * math.sqrt(variance)
-        for _ in range(MOST_PLACES):
-            away = min(away, abs(limit - x[n]))
-            if away == 0:
-                break
+        # The end lies between distances, with the rise at each, which is nearly proportional to the distance.
+        near, far = (0.0, 0.0), (math.inf, math.inf)
+        away = min(quantile * math.sqrt(variance), most)
+        while away > 0 and len(places) < MOST_PLACES:
             place = x + sign * away * valley
             place[n] = x[n] + sign * away
             least = yield from self._least_at(n, place)
             rise = math.sqrt(max(0.0, 2 * (least - self._least) / self._uncertain.factor))
             places.append(Place(float(place[n]), sign * rise))
-            if abs(rise / quantile - 1) < CLOSE or (away >= abs(limit - x[n]) and rise < quantile):
+            if abs(rise / quantile - 1) < CLOSE or (away == most and rise < quantile):
                 break
-            away = self._next(away, rise, places, float(x[n]))
+            near, far = ((away, rise), far) if rise < quantile else (near, (away, rise))
+            if far[1] < math.inf:
+                away = near[0] + (far[0] - near[0]) * (quantile - near[1]) / (far[1] - near[1])
+            elif far[0] < math.inf:  # Where there is no run.
+                away = (near[0] + far[0]) / 2
+            else:
+                away = min(away * min(3.0, quantile / max(rise, 1e-3)), most)
         return places
-
-    def _next(self, away: float, rise: float, places: list[Place], here: float) -> float:
-        """Guess where the interval ends: the rise is nearly proportional to the distance."""
-        if not math.isfinite(rise):
-            return away / 2
-        tried = sorted(
-            (abs(place.deviations), abs(place.x - here)) for place in places if math.isfinite(place.deviations)
-        )
-        quantile = self._uncertain.quantile
-        below = max(((rose, far) for rose, far in tried if rose < quantile), default=(0.0, 0.0))
-        above = min(((rose, far) for rose, far in tried if rose >= quantile), default=None)
-        if above is None:
-            return min(3 * away, away * quantile / max(rise, 1e-3))
-        return below[1] + (above[1] - below[1]) * (quantile - below[0]) / (above[0] - below[0])
 
     def _least_at(self, n: int, place: Array) -> Generator[Array, Predicted | None, float]:
         """Let the other parameters follow; returns the least cost, infinite where there is no run."""
-        others = np.array([m for m in range(len(place)) if m != n], dtype=int)
-        deviations = self._uncertain.deviations[others]
+        others = np.delete(np.arange(len(place)), n)
+        slope, deviations = self._uncertain.weighted[:, others], self._uncertain.deviations[others]
         least = math.inf
         for _ in range(MOST_STEPS):
             predicted = yield place
             if predicted is None:
-                return least
+                break
             left = self._misfit.divided(self._misfit.of(predicted), self._uncertain.scales)
-            cost = self._cost(left)
+            cost = self._misfit.cost(left, robust=self._robust)
             if cost > least:
-                return least
+                break
             least = cost
-            if not len(others):
-                return least
             # Of a robust cost, the pull of what is far off, over the root of its weight.
             pull = left * (1 + (left / FAR) ** 2) ** 0.25 if self._robust else left
-            slope = self._uncertain.weighted[:, others]
             step = -np.linalg.lstsq(slope, pull, rcond=None)[0]
             if np.all(np.abs(step) < AT_REST * deviations):
-                return least
+                break
             place = place.copy()
             place[others] += step
         return least
-
-    def _cost(self, left: Array) -> float:
-        return float(np.sum(soft_l1(left**2) if self._robust else left**2)) / 2

@@ -11,29 +11,27 @@ from numpy.typing import NDArray
 
 from taichi_msm.fitting.identifiability import Unseen
 from taichi_msm.fitting.observations import Observations
+from taichi_msm.fitting.parameters import rounded
 from taichi_msm.fitting.profiles import Place
 from taichi_msm.scene import Scene
 
 Array = NDArray[np.float64]
 
-# A number that is no more than this, and no less than its inverse, is written.
-MOST = 1e30
-
 
 class Estimate(NamedTuple):
-    """What was found of a parameter; None: not known, or none.
+    """What was found of a parameter.
 
     Attributes:
         value: the best one.
         standard_error: of the value.
-        interval: both ends of the 95 % interval.
+        interval: both ends of the 95 % interval; None: there is none within the bounds.
         start: where the search began.
         identifiable: whether the standard error is at most the value.
-        mesh_error: how far, about, the number of points moves the value.
+        mesh_error: how far, about, the number of points moves the value; None: not known.
     """
 
     value: float
-    standard_error: float | None
+    standard_error: float
     interval: tuple[float | None, float | None]
     start: float
     identifiable: bool
@@ -48,8 +46,9 @@ class FitResult:
         parameters: what was found of each, by its key.
         correlation: of the parameters, in their order.
         residual: the root mean square of predicted minus seen, of each coordinate [m] or [px].
-        sigma: the standard deviation of that, as given, else as found.
-        unit: of both, m or px.
+        residual_force: the same of the forces [N]; None: none were seen.
+        sigma: the standard deviation of the coordinates, as given, else as found.
+        unit: of residual and sigma, m or px.
         chi_square: the sum of (predicted - seen)^2 / sigma^2, where sigma is given.
         degrees_of_freedom: how many numbers were seen, less the parameters.
         identifiable: whether all parameters are.
@@ -61,6 +60,7 @@ class FitResult:
         scene: the scene with the best values.
         observations: what was seen.
         fitted: where the points are in the fitted scene, as in the observations.
+        fitted_forces: the forces in the fitted scene, as in the observations [N], shape (rows, 3).
         curves: by key, the root of twice the rise of the cost, signed, at values of a parameter while the others
             follow: its profile, or else what follows from the curvature at the best value.
     """
@@ -68,6 +68,7 @@ class FitResult:
     parameters: dict[str, Estimate]
     correlation: list[list[float]]
     residual: float
+    residual_force: float | None
     sigma: float
     unit: str
     chi_square: float | None
@@ -81,17 +82,16 @@ class FitResult:
     scene: Scene = field(repr=False)
     observations: Observations = field(repr=False)
     fitted: Array = field(repr=False)
+    fitted_forces: Array = field(repr=False)
     curves: dict[str, list[Place]] = field(repr=False)
 
     def as_json(self) -> dict[str, Any]:
         """Give it as plain data, as in fit.json."""
-        plain = (
-            "correlation residual sigma unit chi_square degrees_of_freedom identifiable mesh_error runs seconds notes"
-        )
+        plain = "correlation residual residual_force sigma unit chi_square degrees_of_freedom identifiable mesh_error"
         return {
             "observed": self.observations.name,
             "parameters": {key: one._asdict() for key, one in self.parameters.items()},
-            **{name: getattr(self, name) for name in plain.split()},
+            **{name: getattr(self, name) for name in (*plain.split(), "runs", "seconds", "notes")},
             "unseen": [one.as_json() for one in self.unseen],
         }
 
@@ -104,17 +104,13 @@ class FitResult:
         chi = ""
         if self.chi_square is not None:
             chi = f", chi-square {self.chi_square:.3g} for {self.degrees_of_freedom} degrees of freedom"
-        lines.append(f"residual {self.residual:.3g} {self.unit} of {points} points at {times} times{chi}")
+        force = "" if self.residual_force is None else f", {self.residual_force:.3g} N"
+        lines.append(f"residual {self.residual:.3g} {self.unit} of {points} points at {times} times{force}{chi}")
         if self.mesh_error is not None:
             most = "at most about " if any(probe.moved for probe in self.scene.probes) else ""
-            error = f"{most}{100 * self.mesh_error:.2g} % of the largest displacement"
+            error = f"{most}{rounded(100 * self.mesh_error)} % of the largest displacement"
             lines.append(f"mesh error of the fitted scene: {error}")
         return [*lines, *self.notes, f"{self.runs} runs, {self.seconds:.1f} s"]
-
-
-def finite(number: float) -> float | None:
-    """Give a number that can be written and means something, else None."""
-    return float(number) if number == 0 or 1 / MOST <= abs(number) <= MOST else None
 
 
 def _in_words(one: Estimate) -> str:
@@ -125,7 +121,6 @@ def _in_words(one: Estimate) -> str:
     def written(number: float | None) -> str:
         return "?" if number is None else f"{float(f'{number:.{min(max(digits, 2), 9)}g}'):.10g}"
 
-    known = "" if error is None else f" +- {error:.2g}"
     low, high = map(written, one.interval)
     doubt = "" if one.identifiable else ": not identifiable"
-    return f"{written(one.value)}{known}, 95 % {low} to {high}, from {one.start:.6g}{doubt}"
+    return f"{written(one.value)} +- {rounded(error)}, 95 % {low} to {high}, from {one.start:.6g}{doubt}"

@@ -23,9 +23,6 @@ MOVES = 1.5
 # Frames miss the motion if the points move less at the observed times than this share of their motion.
 MISSED = 0.1
 
-# Straight lines between frames are too coarse if they miss more than this share of the motion.
-COARSE = 0.02
-
 # Pixels are of another camera, and positions of another place, if the points are farther from where they are at rest
 # than this [px], or this share of the sheet, and than so many times the motion.
 ASTRAY, ASIDE, TIMES = 3.0, 0.02, 3.0
@@ -65,23 +62,6 @@ def faults_beside(seen: Observations, scene: Scene, first: Predicted) -> Iterato
             f"{moving[0]:g} and {moving[-1]:g} s too"
         )
     yield from _elsewhere(seen, scene, first)
-
-
-def notes_beside(seen: Observations, scene: Scene, first: Predicted) -> Iterator[str]:
-    """Say what is not wrong, but coarse."""
-    rate = scene.time.frames_per_second
-    frames = seen.time * rate
-    between = np.abs(frames - np.round(frames)) > WHOLE * np.maximum(1.0, frames)
-    if not between.any() or len(first.motion) < 3:
-        return
-    bend = np.abs(np.diff(first.motion, 2)).max() / 8
-    whole = first.motion.max()
-    if bend > COARSE * whole:
-        finer = rate * math.ceil(math.sqrt(bend / (COARSE * whole)))
-        yield (
-            f"frames are so far apart that straight lines between them miss {100 * bend / whole:.2g} % of the motion; "
-            f"take --set time.frames_per_second={finer:g}"
-        )
 
 
 def moved(seen: Observations, scene: Scene) -> float:

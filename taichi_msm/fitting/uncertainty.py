@@ -76,9 +76,8 @@ class Uncertainty:
 
     def shift(self, rows: Array) -> Array:
         """Give how far x moves, as far as that is seen, if what is predicted is off by so much, in units of r."""
-        singular = np.linalg.svd(self.weighted, full_matrices=False)
-        inverse = np.where(self.along <= NOT_SEEN, 1 / np.maximum(singular.S, np.finfo(float).tiny), 0.0)
-        return singular.Vh.T @ (inverse * (singular.U.T @ rows))
+        seen = self.directions[:, self.along <= NOT_SEEN]
+        return seen @ np.linalg.lstsq(self.weighted @ seen, rows, rcond=None)[0]
 
 
 def uncertainty(
@@ -106,15 +105,15 @@ def uncertainty(
     weighted = slope * far[:, None] ** (-0.75)
     factor = 1.0 if robust else max(1.0, float(left @ left) / freedom) if seen.sigma is not None else 1.0
     singular = np.linalg.svd(weighted, full_matrices=False)
-    inverse = 1 / np.maximum(singular.S, max(UNSEEN * singular.S[0], np.finfo(float).tiny))
-    # M, in the directions of the parameters.
+    held = np.maximum(singular.S, UNSEEN * max(1.0, singular.S[0]))
     if alike is not None:
         middle = factor * _with_neighbours(seen, misfit, slope, alike)
     else:
         pulled = slope * (left / np.sqrt(far))[:, None] if robust else np.sqrt(factor) * slope
         middle = pulled.T @ pulled
-    values, vectors = np.linalg.eigh(singular.Vh @ middle @ singular.Vh.T)
-    root = singular.Vh.T @ (inverse[:, None] ** 2 * vectors * np.sqrt(np.maximum(values, 0.0)))
+    # In the singular directions; those that are not seen at all keep the error that the smallest singular value gives.
+    values, vectors = np.linalg.eigh(singular.Vh @ middle @ singular.Vh.T + np.diag(held**2 - singular.S**2))
+    root = singular.Vh.T @ (held[:, None] ** -2 * vectors * np.sqrt(np.maximum(values, 0.0)))
     return Uncertainty(scales, factor, freedom, left, weighted, singular.Vh.T, root)
 
 
