@@ -224,7 +224,8 @@ def test_the_commands_work(small_scenes: Path, program: Program) -> None:
         opens_a_window = arguments[0] == "view" and "--record" not in arguments
         needs_a_session = any("session-1" in word for word in arguments)
         needs_vtk = "vtk" in arguments and importlib.util.find_spec("vtk") is None
-        if opens_a_window or needs_a_session or needs_vtk or arguments[0] == "study" or "--resume" in arguments:
+        played_elsewhere = arguments[0] in ("study", "fit") or "--resume" in arguments
+        if opens_a_window or needs_a_session or needs_vtk or played_elsewhere:
             continue
         done = program(*arguments)
         assert done.returncode == 0, (arguments, done.stderr)
@@ -274,11 +275,16 @@ def test_the_fit_shown_is_what_it_finds(
     examples_folder: Path, program: Program, capfd: pytest.CaptureFixture[str]
 ) -> None:
     shown, unseen = (block.splitlines() for block in blocks(DOCS / "fit.md", "text"))
-    seen, found, *_ = commands(DOCS / "fit.md")
+    seen, found, pressed, _, with_forces = commands(DOCS / "fit.md")
     assert program(*seen).returncode == 0
     done = program(*found)
     # But for the runs and the seconds.
     assert done.stdout.splitlines()[:-1] == shown[:-1]
+    smaller = "--set", "sheet.points=[13,13]", "--set", "time.frames_per_second=4"
+    assert program(*pressed, *smaller).returncode == 0
+    told = program(*with_forces, *smaller)
+    assert told.returncode == 0, told.stderr
+    assert "not identifiable" not in told.stdout
     exec(compile(blocks(DOCS / "fit.md", "python")[0], "fit.md", "exec"), {})
     assert capfd.readouterr().out.splitlines() == blocks(DOCS / "fit.md", "txt")[0].splitlines()
     assert "each alone is not: fix one, or give a force (--forces)" in unseen[-1]

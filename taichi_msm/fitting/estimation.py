@@ -21,8 +21,8 @@ from taichi_msm.fitting.runs import Runs
 
 Array = NDArray[np.float64]
 
-# Where the fit ends: the cost, or all parameters, change by less than this share.
-ENOUGH = 1e-8
+# Where the fit ends: the cost, or all parameters, change by less than these shares.
+ENOUGH_COST, ENOUGH = 1e-6, 1e-8
 
 # The most trials of one search, and the most times that sigma and the parameters are found in turn.
 MOST_TRIALS, MOST_ROUNDS = 40, 6
@@ -118,6 +118,7 @@ class Search:
         limits = np.array([one.limits for one in runs.job.parameters])
         self._limits = limits[:, 0], limits[:, 1]
         self._known: dict[bytes, Predicted | None] = {}
+        self._beside: dict[bytes, Predicted | None] = {}
 
     def best(self, start: Array) -> Solution:
         """Find the best values from a start, and from others if that does not fit."""
@@ -203,7 +204,7 @@ class Search:
             start,
             jacobian,
             self._limits,
-            ftol=ENOUGH,
+            ftol=ENOUGH_COST,
             xtol=ENOUGH,
             gtol=None,
             loss="soft_l1" if self._robust else "linear",
@@ -215,34 +216,34 @@ class Search:
         return Solution(found.x, predicted, scales, float(found.cost), bool(found.status > 0))
 
     def _derivatives(self, x: Array, predicted: Predicted, *, signs: tuple[int, ...]) -> Array:
-        here, (low, high) = self.misfit.row(predicted), self._limits
-        places = []
-        for n in range(len(x)):
-            for sign in signs:
-                place = x.copy()
-                place[n] += sign * self._delta
-                # To the other side where this one is beyond a bound.
-                if not low[n] <= place[n] <= high[n]:
-                    place[n] = x[n] - sign * self._delta
-                places.append(place)
+        places = [
+            [self._changed(x, n, sign) for sign in signs if sign == 1 or self._inside(x, n)] for n in range(len(x))
+        ]
         self._runs.expected = max(self._runs.expected, self._runs.count + 3 * len(x))
-        after = self._runs.several(places, predicted.steps)
+        # Where the search ends, half of them were predicted by its last derivatives.
+        new = [place for several in places for place in several if place.tobytes() not in self._beside]
+        after = zip(new, self._runs.several(new, predicted.steps), strict=True)
+        self._beside = {**self._beside, **{place.tobytes(): one for place, one in after}}
+        self._beside = {place.tobytes(): self._beside[place.tobytes()] for several in places for place in several}
         columns = []
         for n, parameter in enumerate(self._runs.job.parameters):
-            of = slice(n * len(signs), (n + 1) * len(signs))
-            rows = {
-                float(place[n]): self.misfit.row(one)
-                for place, one in zip(places[of], after[of], strict=True)
-                if one is not None
-            }
-            if not rows:
+            known = [(place[n], one) for place in places[n] if (one := self._beside[place.tobytes()]) is not None]
+            if not known:
                 remedy = "give --bounds or another start by --set"
                 raise SceneError([f"{parameter.key}: no run close to its value succeeds; {remedy}"])
-            if len(rows) == 1:
-                rows[float(x[n])] = here
-            (one, first), (other, second) = rows.items()
-            columns.append((first - second) / (one - other))
+            (one, first), (other, second) = [*known, (x[n], predicted)][:2]
+            columns.append((self.misfit.row(first) - self.misfit.row(second)) / (one - other))
         return np.stack(columns, axis=1)
+
+    def _inside(self, x: Array, n: int) -> bool:
+        """Tell whether a parameter can be changed to both sides."""
+        return bool(self._limits[0][n] <= x[n] - self._delta and x[n] + self._delta <= self._limits[1][n])
+
+    def _changed(self, x: Array, n: int, sign: int) -> Array:
+        """Change a parameter, upward where that is within the bounds, else downward."""
+        place = x.copy()
+        place[n] += self._delta if sign == 1 and x[n] + self._delta <= self._limits[1][n] else -self._delta
+        return place
 
     def _cost(self, predicted: Predicted, scales: Scales) -> float:
         return self.misfit.cost(self.misfit.divided(self.misfit.of(predicted), scales), robust=self._robust)
