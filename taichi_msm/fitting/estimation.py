@@ -24,6 +24,9 @@ Array = NDArray[np.float64]
 # Where the fit ends: the cost, or all parameters, change by less than these shares.
 ENOUGH_COST, ENOUGH = 1e-6, 1e-8
 
+# Or the slope of the cost is no more than this.
+FLAT = 1e-12
+
 # The most trials of one search, and the most times that sigma and the parameters are found in turn.
 MOST_TRIALS, MOST_ROUNDS = 40, 6
 
@@ -199,18 +202,19 @@ class Search:
             assert predicted is not None
             return self.misfit.divided(self._derivatives(x, predicted, signs=(1,)), scales)
 
-        found = least_squares(
-            residuals,
-            start,
-            jacobian,
-            self._limits,
-            ftol=ENOUGH_COST,
-            xtol=ENOUGH,
-            gtol=None,
-            loss="soft_l1" if self._robust else "linear",
-            f_scale=FAR,
-            max_nfev=MOST_TRIALS,
-        )
+        with np.errstate(all="ignore"):  # SciPy divides by slopes that are 0.
+            found = least_squares(
+                residuals,
+                start,
+                jacobian,
+                self._limits,
+                ftol=ENOUGH_COST,
+                xtol=ENOUGH,
+                gtol=FLAT,
+                loss="soft_l1" if self._robust else "linear",
+                f_scale=FAR,
+                max_nfev=MOST_TRIALS,
+            )
         predicted = self._predict(found.x)
         assert predicted is not None
         return Solution(found.x, predicted, scales, float(found.cost), bool(found.status > 0))

@@ -168,7 +168,6 @@ def _fit(runs: Runs, given: Scene, method: Method) -> FitResult:
         runs=runs.count,
         seconds=0.0,
         notes=[
-            *notes.of_frames(seen, given, first),
             *notes.of_the_search(solution, parameters, fits=search.fits(solution)),
             *notes.of_the_points(parameters, solution.x, uncertain, shifts),
             *notes.of_ties(parameters, uncertain, blind),

@@ -95,9 +95,9 @@ def _in_words(
         known.append(Combination(parts, uncertain.of_combination(whole)))
     remedy = "" if forces else ", or give a force (--forces)"
     names = " and ".join([", ".join(keys[:-1]), keys[-1]] if len(keys) > 1 else keys)
-    if not all(parameters[n].is_log for n in group):
-        return Unseen(keys, [], f"{names} cannot be told apart by what was seen: fix one{remedy}")
     known = [one for one in known if one.standard_error <= MOST_ERROR]
+    if known and not all(parameters[n].is_log for n in group):
+        return Unseen(keys, [], f"{names} cannot be told apart by what was seen: fix one{remedy}")
     if not known:
         it = "it" if len(keys) == 1 else "them"
         return Unseen(keys, [], f"{names}: what was seen does not tell {it}: fix {it}")

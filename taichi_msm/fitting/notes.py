@@ -12,14 +12,9 @@ from taichi_msm.fitting.estimation import Solution
 from taichi_msm.fitting.identifiability import Unseen
 from taichi_msm.fitting.observations import Observations
 from taichi_msm.fitting.parameters import Parameter, rounded
-from taichi_msm.fitting.prediction import Predicted
 from taichi_msm.fitting.uncertainty import Uncertainty
-from taichi_msm.scene import WHOLE, Scene
 
 Array = NDArray[np.float64]
-
-# Straight lines between frames are too coarse if they miss more than this share of the motion.
-COARSE = 0.02
 
 # A parameter this close to a bound, in units of x, has ended there.
 AT_BOUND = 1e-3
@@ -29,19 +24,6 @@ TIED, ALIKE = 0.95, 0.3
 
 # What is left is too small to say anything of below this share of the motion.
 NOTHING_LEFT = 1e-6
-
-
-def of_frames(seen: Observations, scene: Scene, first: Predicted) -> Iterator[str]:
-    """Note frames that are too far apart for the observed times between them; first: a run of the whole scene."""
-    rate = scene.time.frames_per_second
-    frames = seen.time * rate
-    between = np.abs(frames - np.round(frames)) > WHOLE * np.maximum(1.0, frames)
-    if not between.any() or len(first.motion) < 3:
-        return
-    missed = np.abs(np.diff(first.motion, 2)).max() / 8 / first.motion.max()
-    if missed > COARSE:
-        said = f"frames are so far apart that straight lines between them miss {rounded(100 * missed)} % of the motion"
-        yield f"{said}; take --set time.frames_per_second={rate * math.ceil(math.sqrt(missed / COARSE)):g}"
 
 
 def of_the_search(solution: Solution, parameters: Sequence[Parameter], *, fits: bool) -> Iterator[str]:

@@ -116,11 +116,12 @@ class FitResult:
 def _in_words(one: Estimate) -> str:
     """Write an estimate with as many digits as its error leaves."""
     error = one.standard_error
-    digits = 3 if not error or not one.value else math.floor(math.log10(abs(one.value) / error)) + 3
+    digits = 3 if not one.value else math.floor(math.log10(abs(one.value) / max(error, 1e-300))) + 3
 
     def written(number: float | None) -> str:
         return "?" if number is None else f"{float(f'{number:.{min(max(digits, 2), 9)}g}'):.10g}"
 
     low, high = map(written, one.interval)
+    known = "?" if error > 1000 * max(abs(one.value), abs(one.start)) else rounded(error)
     doubt = "" if one.identifiable else ": not identifiable"
-    return f"{written(one.value)} +- {rounded(error)}, 95 % {low} to {high}, from {one.start:.6g}{doubt}"
+    return f"{written(one.value)} +- {known}, 95 % {low} to {high}, from {one.start:.6g}{doubt}"

@@ -66,13 +66,10 @@ def faults_beside(seen: Observations, scene: Scene, first: Predicted) -> Iterato
 
 def moved(seen: Observations, scene: Scene) -> float:
     """Give the motion of the point that moves most: root mean square over time, or from rest [m] or [px]."""
-    known = seen.there
-    centre = seen_at_rest(scene, seen)
-    if known.sum(axis=1).max() > 1:
-        total = np.where(seen.known, seen.values, 0.0).sum(axis=1)
-        centre = (total / np.maximum(1, known.sum(axis=1))[:, None])[:, None]
-    square = np.where(seen.known, (seen.values - centre) ** 2, 0.0)
-    return float(np.sqrt(square.mean(axis=2).sum(axis=1) / np.maximum(1, known.sum(axis=1))).max())
+    known = seen.there.any(axis=1)
+    values, several = seen.values[known], seen.there.sum(axis=1).max() > 1
+    centre = np.nanmean(values, axis=1, keepdims=True) if several else seen_at_rest(scene, seen)[known]
+    return float(np.sqrt(np.nanmean((values - centre) ** 2, axis=(1, 2)).max()))
 
 
 def _times(time: Array, name: str, scene: Scene) -> Iterator[str]:
@@ -99,13 +96,9 @@ def _units(seen: Observations, scene: Scene) -> Iterator[str]:
         float(np.linalg.norm(points - points.mean(axis=0), axis=1).max()) for points in (middle, rest[:, :2])
     )
     if expected > 0 and spread > 0 and not 1 / OFF < spread / expected < OFF:
-        power = round(math.log10(spread / expected))
-        said = f"the points are {spread:.3g} m from their middle, and {expected:.3g} m at rest"
-        unit = {3: "; are they in mm? divide them by 1000", 2: "; are they in cm? divide them by 100"}
-        remedy = unit.get(
-            power, f"; give metres: they seem {'multiplied' if power > 0 else 'divided'} by 1e{abs(power)}"
-        )
-        yield f"{seen.name}: position: {said}{remedy}"
+        said = f"the points are {spread:.3g} m from their middle, and {expected:.3g} m at rest; give metres"
+        unit = {3: ": are they in mm? divide them by 1000", 2: ": are they in cm? divide them by 100"}
+        yield f"{seen.name}: position: {said}{unit.get(round(math.log10(spread / expected)), '')}"
 
 
 def _elsewhere(seen: Observations, scene: Scene, first: Predicted) -> Iterator[str]:

@@ -105,14 +105,15 @@ def uncertainty(
     weighted = slope * far[:, None] ** (-0.75)
     factor = 1.0 if robust else max(1.0, float(left @ left) / freedom) if seen.sigma is not None else 1.0
     singular = np.linalg.svd(weighted, full_matrices=False)
-    held = np.maximum(singular.S, UNSEEN * max(1.0, singular.S[0]))
+    blind = UNSEEN * max(1.0, singular.S[0]) >= singular.S
+    held = np.where(blind, UNSEEN, singular.S)
     if alike is not None:
         middle = factor * _with_neighbours(seen, misfit, slope, alike)
     else:
         pulled = slope * (left / np.sqrt(far))[:, None] if robust else np.sqrt(factor) * slope
         middle = pulled.T @ pulled
-    # In the singular directions; those that are not seen at all keep the error that the smallest singular value gives.
-    values, vectors = np.linalg.eigh(singular.Vh @ middle @ singular.Vh.T + np.diag(held**2 - singular.S**2))
+    # In the singular directions; those that are not seen at all have an error, as if they were just seen.
+    values, vectors = np.linalg.eigh(singular.Vh @ middle @ singular.Vh.T + np.diag(blind * held**2))
     root = singular.Vh.T @ (held[:, None] ** -2 * vectors * np.sqrt(np.maximum(values, 0.0)))
     return Uncertainty(scales, factor, freedom, left, weighted, singular.Vh.T, root)
 
