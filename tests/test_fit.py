@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 import yaml
 from numpy.typing import NDArray
+from scipy.stats import t as student
 
 from taichi_msm import SceneError, Simulation, fit, load_scene, run
 from taichi_msm.fitting.fit import Method
@@ -152,16 +153,21 @@ def test_intervals_hold_the_truth_as_often_as_they_say(tracks: dict[str, Array])
     assert 0.5 < float(np.std(ratios)) < 1.5
 
 
-def test_a_profile_agrees_with_the_curvature_where_that_is_all_there_is(tracks: dict[str, Array]) -> None:
-    # Intervals of 1 %, within which all is linear.
-    seen, free = noisy(tracks, 0.005), ["tissue.young", "tissue.foundation"]
-    plain, profiled = fit(changed(), seen, free), fit(changed(), seen, free, profile=True)
-    for key in free:
-        ends = [np.array(one.parameters[key].interval, np.float64) for one in (profiled, plain)]
-        np.testing.assert_allclose(ends[0], ends[1], rtol=2e-3)
-        curve = np.array([place.deviations for place in profiled.curves[key]])
-        assert curve.min() < -1.9
-        assert curve.max() > 1.9
+def test_a_profile_ends_where_the_others_can_no_longer_make_up_for_it(tracks: dict[str, Array]) -> None:
+    # Errors so large that the motion is not linear in the damping.
+    seen = noisy(tracks, 0.5, sigma=0.5)
+    best = fit(changed(), seen, ["tissue.damping", "tissue.foundation"], profile=True)
+    assert best.chi_square is not None
+    quantile = student.ppf(0.975, best.degrees_of_freedom)
+    for end in best.parameters["tissue.damping"].interval:
+        assert end is not None
+        held = fit(changed(tissue__damping=end), seen, ["tissue.foundation"])
+        assert held.chi_square is not None
+        # An end is found to 1 % of its distance.
+        assert held.chi_square - best.chi_square == pytest.approx(quantile**2, rel=0.03)
+    curve = np.array([place.deviations for place in best.curves["tissue.damping"]])
+    assert curve.min() < -1.9
+    assert curve.max() > 1.9
 
 
 def test_what_pictures_cannot_tell_is_named_and_a_force_tells_it(tracks: dict[str, Array], tmp_path: Path) -> None:
@@ -198,6 +204,14 @@ def test_a_product_is_known_where_its_factors_are_not(motion: Array) -> None:
     (unseen,) = found.unseen
     assert unseen.text.startswith("tissue.young x tissue.thickness is known to ")
     assert not found.identifiable
+
+
+def test_an_occluded_track_is_not_used() -> None:
+    points, occluded = np.zeros((2, 3, 2), np.float32), np.zeros((2, 3), np.bool_)
+    occluded[1, 2] = True
+    seen = read_observations({"coordinates": [[0.5, 0.5], [0.2, 0.7]], "points": points, "occluded": occluded}, 25)
+    assert seen.time.tolist() == [0, 0.04, 0.08]
+    assert (seen.there != occluded).all()
 
 
 def test_a_number_that_nothing_shows_is_not_identifiable(motion: Array) -> None:
