@@ -253,6 +253,14 @@ def test_what_is_far_off_counts_less_in_a_robust_fit(tracks: dict[str, Array]) -
     assert errors[1] < 3 * robust.parameters["tissue.foundation"].standard_error / 3e5
 
 
+def test_a_robust_fit_of_good_tracks_is_nearly_the_same(tracks: dict[str, Array]) -> None:
+    # Without errors, so that sigma alone tells how well the number is known.
+    key, seen = "tissue.foundation", {**tracks, "sigma": 0.1}
+    plain, robust = (fit(changed(), seen, [key], robust=one, profile=one).parameters[key] for one in (False, True))
+    assert robust.standard_error == pytest.approx(plain.standard_error, rel=0.01)
+    np.testing.assert_allclose(np.array(robust.interval, float), np.array(plain.interval, float), rtol=1e-3)
+
+
 def test_errors_that_are_alike_widen_the_intervals_and_are_told(tracks: dict[str, Array]) -> None:
     # Each frame's tracks are off by one number, as when a camera shakes.
     rng, seen = np.random.default_rng(2), noisy(tracks, 0.02)
@@ -260,9 +268,11 @@ def test_errors_that_are_alike_widen_the_intervals_and_are_told(tracks: dict[str
     free = ["tissue.young", "tissue.foundation"]
     plain = fit(changed(), seen, free, workers=1)
     assert any("neighbouring points is alike" in note and "--correlation PX" in note for note in plain.notes)
-    alike = fit(changed(), seen, free, correlation=1000, workers=1)
+    alike = fit(changed(), seen, free, correlation=1000, workers=1, profile=True)
     assert alike.parameters[free[1]].standard_error > 2 * plain.parameters[free[1]].standard_error
     assert not any("--correlation" in note for note in alike.notes)
+    low, high = np.array(alike.parameters[free[1]].interval, float)
+    assert (high - low) / (2 * 1.96) == pytest.approx(alike.parameters[free[1]].standard_error, rel=0.1)
 
 
 def test_the_points_move_what_is_found_about_as_far_as_is_said(device: Device) -> None:

@@ -110,7 +110,9 @@ def _plot_forces(axes: Axes, result: FitResult) -> None:
             fitted, points = (force[rows, component] for force in (result.fitted_forces, seen.force))
             axes.plot(seen.time[rows], fitted, color=BLUE, label="fitted" if label else None)
             axes.plot(seen.time[rows], points, ".", color=VERMILION, markersize=3, label="seen" if label else None)
-            axes.text(seen.time[rows[-1]], fitted[-1], f" {'xyz'[component]}", verticalalignment="center")
+            largest = np.argmax(np.abs(fitted))
+            if abs(fitted[largest]) > 0.1 * np.abs(result.fitted_forces).max():
+                axes.text(seen.time[rows[largest]], fitted[largest], f"  {'xyz'[component]}")
             label = False
     axes.set(title="Forces on the sheet", xlabel="time [s]", ylabel="force [N]")
     axes.legend()

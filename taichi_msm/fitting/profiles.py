@@ -1,8 +1,8 @@
 """Intervals by profile: how far a parameter can go until the others can no longer make up for it.
 
 The value of a parameter is held, and the others follow to where the cost is least. The interval ends where the cost
-has risen by t^2 f / 2, as many standard deviations as Student's t asks for. With J from the solution, the others take
-one run a step.
+has risen by t^2 f / 2, as many standard deviations as Student's t asks for, or farther by as much as errors that are
+alike widen them. With J from the solution, the others take one run a step.
 """
 
 from __future__ import annotations
@@ -91,7 +91,7 @@ class Profiler:
             place = x + sign * away * valley
             place[n] = x[n] + sign * away
             least = yield from self._least_at(n, place)
-            rise = math.sqrt(max(0.0, 2 * (least - self._least) / self._uncertain.factor))
+            rise = math.sqrt(max(0.0, 2 * (least - self._least) / self._uncertain.factor)) / self._uncertain.wider[n]
             places.append(Place(float(place[n]), sign * rise))
             if abs(rise / quantile - 1) < CLOSE or (away == most and rise < quantile):
                 break

@@ -2,11 +2,11 @@
 
 With J the derivatives of r = (predicted - seen) / sigma by x, the covariance of x is
 
-    C = (J^T W J)^-1 M (J^T W J)^-1,    M = f J^T W^2 J
+    C = f (J^T W J)^-1 M (J^T W J)^-1,    M = J^T W J
 
-where W = 1 and f = 1 where sigma is known and what is left is not larger, else f is the mean of r^2 per degree of
-freedom. In a robust fit W is the second derivative of rho, and M has the squares of its first. If errors of
-neighbouring tracks are alike, M = J^T K J, with K = exp(-distance / correlation) for two tracks in one frame.
+where W = 1, and f is the mean of r^2 per degree of freedom, but at least 1. In a robust fit W is the second derivative
+of half of rho, and f the mean of the squares of its first over that of W. If errors of neighbouring tracks are alike,
+M = J^T K J, with K = exp(-distance / correlation) for two tracks in one frame.
 """
 
 from __future__ import annotations
@@ -46,6 +46,7 @@ class Uncertainty:
     weighted: Array  # W^(1/2) J, shape (numbers, n)
     directions: Array  # shape (n, n)
     root: Array  # F with C = F F^T, shape (n, n)
+    wider: Array  # how many times K makes the deviations wider, shape (n,)
 
     @property
     def deviations(self) -> Array:
@@ -103,19 +104,17 @@ def uncertainty(
     slope = misfit.divided(derivatives, scales)
     far = 1 + (left / FAR) ** 2 if robust else np.ones_like(left)
     weighted = slope * far[:, None] ** (-0.75)
-    factor = 1.0 if robust else max(1.0, float(left @ left) / freedom) if seen.sigma is not None else 1.0
+    factor = max(1.0, float(np.sum(left**2 / far)) / freedom / float(np.mean(far**-1.5)))
     singular = np.linalg.svd(weighted, full_matrices=False)
     blind = UNSEEN * max(1.0, singular.S[0]) >= singular.S
     held = np.where(blind, UNSEEN, singular.S)
-    if alike is not None:
-        middle = factor * _with_neighbours(seen, misfit, slope, alike)
-    else:
-        pulled = slope * (left / np.sqrt(far))[:, None] if robust else np.sqrt(factor) * slope
-        middle = pulled.T @ pulled
+    middle = weighted.T @ weighted if alike is None else _with_neighbours(seen, misfit, slope, alike)
     # In the singular directions; those that are not seen at all have an error, as if they were just seen.
-    values, vectors = np.linalg.eigh(singular.Vh @ middle @ singular.Vh.T + np.diag(blind * held**2))
+    values, vectors = np.linalg.eigh(factor * singular.Vh @ middle @ singular.Vh.T + np.diag(blind * held**2))
     root = singular.Vh.T @ (held[:, None] ** -2 * vectors * np.sqrt(np.maximum(values, 0.0)))
-    return Uncertainty(scales, factor, freedom, left, weighted, singular.Vh.T, root)
+    plain = np.sqrt(factor) * np.linalg.norm(singular.Vh.T / held, axis=1)
+    wider = np.linalg.norm(root, axis=1) / plain
+    return Uncertainty(scales, factor, freedom, left, weighted, singular.Vh.T, root, wider)
 
 
 def likeness(pixels: Array, correlation: float) -> Array:
