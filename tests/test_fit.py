@@ -442,6 +442,7 @@ def test_values_that_make_no_scene_give_no_run(device: Device, tracks: dict[str,
         (["--free", "tissue.young", "--forces", "none.csv"], "expected FILE,SIGMA"),
         (["--free", "tissue.young", "--set", "sheet.tolerance=0.1"], "sheet.tolerance: 0.1 is for one run"),
         (["--free", "tissue.young", "--sigma", "0"], "seen.npz: sigma: 0; take one number above 0"),
+        (["--free", "tissue.young", "--correlation", "0"], "--correlation 0: take a number of pixels above 0"),
     ],
 )
 def test_wrong_arguments_are_answered_in_a_line(
