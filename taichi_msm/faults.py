@@ -57,15 +57,16 @@ class _Fault(NamedTuple):
     context: dict[str, Any]  # the numbers and names in the text
     section: type[BaseModel]  # that the key belongs to
     expects: str  # what the key may hold
-    choice: Key | None  # the key, or the nearest one above it, that may hold values of several kinds
-    branch: str  # the kind that was tried
+    # The keys above it that may hold several kinds of value, each with the kind that was tried.
+    choices: tuple[tuple[Key, str], ...]
     words: tuple[str, ...]  # those that the value may be
 
 
 def _fault(error: Any, section: type[BaseModel]) -> _Fault:
     """Follow an error's location through the models, skipping pydantic's names for the kinds of a value."""
     path: Key = ()
-    expects, choice, branch = "", None, ""
+    expects = ""
+    choices: tuple[tuple[Key, str], ...] = ()
     words: tuple[tuple[str, ...], ...] = (), ()
     parts = iter(error["loc"])
     for part in parts:
@@ -73,12 +74,12 @@ def _fault(error: Any, section: type[BaseModel]) -> _Fault:
         if part in section.model_fields:
             section, expects, has_choice, words = _describe(section, part)
             if has_choice:
-                choice, branch = path, next(parts, "")
+                choices += ((path, next(parts, "")),)
     context = error.get("ctx", {})
     if "key" in context:
         path += (context["key"],)
     in_list = bool(path) and isinstance(path[-1], int)
-    return _Fault(path, error["type"], error["msg"], context, section, expects, choice, branch, words[in_list])
+    return _Fault(path, error["type"], error["msg"], context, section, expects, choices, words[in_list])
 
 
 @cache
@@ -120,17 +121,20 @@ def _choose_kinds(faults: Sequence[_Fault]) -> Iterator[_Fault]:
 
     That is the kind whose check got furthest into the value; if two got equally far, the whole value is at fault.
     """
-    reached: dict[Key | None, dict[str, int]] = defaultdict(dict)
+    reached: dict[Key, dict[str, int]] = defaultdict(dict)
     for fault in faults:
-        reached[fault.choice][fault.branch] = max(reached[fault.choice].get(fault.branch, 0), len(fault.path))
+        for choice, branch in fault.choices:
+            reached[choice][branch] = max(reached[choice].get(branch, 0), len(fault.path))
     for fault in faults:
-        branches = reached[fault.choice]
-        furthest = max(branches.values())
-        if fault.choice is None:
-            yield fault
-        elif list(branches.values()).count(furthest) > 1:
-            yield fault._replace(path=fault.choice, kind="choice")
-        elif branches[fault.branch] == furthest:
+        for choice, branch in fault.choices:
+            branches = reached[choice]
+            furthest = max(branches.values())
+            if list(branches.values()).count(furthest) > 1:
+                yield fault._replace(path=choice, kind="choice")
+                break
+            if branches[branch] != furthest:
+                break
+        else:
             yield fault
 
 

@@ -49,6 +49,8 @@ A_PROBE_KEY = "expected keys [[t, percent], ...], t in seconds"
 AN_AT = "expected [across, down], fractions from -1 to 2, or keys [[t, across, down], ...]"
 A_CAMERA = "expected top, oblique, or {eye: [x, y, z], target: [x, y, z], up: [x, y, z], fov: degrees}"
 VECTOR_M = "expected three numbers: [x, y, z] in metres"
+EYE = f"{VECTOR_M}, or keys [[t, x, y, z], ...], t in seconds"
+CAMERA_KEYS = "calibration, scale, intrinsics, distortion, outside, pose, poses, eye, target, up, fov"
 NO_PICTURE = "image: a picture is needed to draw png or gif; name one, or set output to [trajectory] or []"
 
 Load = Callable[..., Scene]
@@ -136,8 +138,8 @@ WRONG_KEYS = {
     "unknown and named as the kind of value": (
         GOOD + "render: {camera: {Camera: {eye: 1}}}\n",
         [
-            f"s.yaml:11:10: render.camera.eye: missing; {VECTOR_M}",
-            "s.yaml:11:19: render.camera.Camera: unknown key; allowed: eye, target, up, fov",
+            f"s.yaml:11:10: render.camera.eye: missing; {EYE}",
+            f"s.yaml:11:19: render.camera.Camera: unknown key; allowed: {CAMERA_KEYS}",
         ],
     ),
     "missing": (
@@ -154,7 +156,7 @@ WRONG_KEYS = {
     ),
     "missing in a camera": (
         GOOD + "render:\n  camera: {fov: 30}\n",
-        [f"s.yaml:12:3: render.camera.eye: missing; {VECTOR_M}"],
+        [f"s.yaml:12:3: render.camera.eye: missing; {EYE}"],
     ),
     "duplicate": (
         GOOD.replace("size:", "mass: 1\n  size:"),
@@ -354,7 +356,7 @@ SEVERAL_KINDS = {
     ),
     "camera, a number in it": (
         GOOD + "render: {camera: {eye: [0, 0, z]}}\n",
-        [f's.yaml:11:31: render.camera.eye.2: "z" is not allowed; {VECTOR_M}'],
+        [f's.yaml:11:19: render.camera.eye: [0, 0, "z"] is not allowed; {EYE}'],
     ),
     "at, one of two numbers": (
         GOOD + PROBE.replace("0.5, 0.5", "0.5, x"),
@@ -733,7 +735,7 @@ def test_an_override_mends_a_fault_of_the_file(load: Load) -> None:
         ),
         (
             ["render.camera={fov: 30}"],
-            f"--set render.camera={{fov: 30}}: render.camera.eye: missing; {VECTOR_M}",
+            f"--set render.camera={{fov: 30}}: render.camera.eye: missing; {EYE}",
         ),
         (
             ["probes.0.load.1=[-1, 0]"],

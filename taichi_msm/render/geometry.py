@@ -12,6 +12,7 @@ listed row by row: upper left and right, lower left and right.
 
 from typing import Any, NamedTuple
 
+from taichi_msm.render import bending
 from taichi_msm.render import uniforms as uni
 from taichi_msm.render.samples import INFINITY
 from taichi_msm.system.runtime import ti
@@ -86,7 +87,7 @@ def w_at(depth, numbers: ti.template()):
 @ti.func
 def line_of_sight(x, y, numbers: ti.template()):
     """Give how far points that are seen at (x, y) are to the right and above the axis of view, at w = 1 [m]."""
-    return (x - numbers[uni.CENTRE_X]) * numbers[uni.SPREAD], (numbers[uni.CENTRE_Y] - y) * numbers[uni.SPREAD]
+    return (x - numbers[uni.CENTRE_X]) * numbers[uni.SPREAD_X], (numbers[uni.CENTRE_Y] - y) * numbers[uni.SPREAD_Y]
 
 
 @ti.func
@@ -255,8 +256,31 @@ def depth_at(s, t, triangle: ti.template()):
 
 
 @ti.func
-def triangle_bounds(column, line, lower, part, near, width, height, patch: ti.template()):
+def cell_bounds(at, cols, outline: ti.template(), numbers: ti.template(), point: ti.template()):
+    """Find the bounds of a cell in a picture that a lens has bent.
+
+    What `store_bent` stored of its upper left mass point is at `at`, in a sheet of so many columns.
+    """
+    below = at + cols * bending.BENT_NUMBERS
+    corners = ti.static((at, at + bending.BENT_NUMBERS, below, below + bending.BENT_NUMBERS))
+    x, y = ti.static((outline.x, outline.y))
+    longest = ti.max(
+        bending.side(x, y, 0, 1), bending.side(x, y, 1, 3), bending.side(x, y, 3, 2), bending.side(x, y, 2, 0)
+    )
+    within = point[corners[0] + 2] + point[corners[1] + 2] + point[corners[2] + 2] + point[corners[3] + 2] > 3.5
+    seen_x = [point[here] for here in corners]
+    seen_y = [point[here + 1] for here in corners]
+    return bending.bent_bounds(x, y, seen_x, seen_y, within, longest, numbers)
+
+
+@ti.func
+def triangle_bounds(
+    column, line, lower, part, near, width, height,
+    patch: ti.template(), numbers: ti.template(), lens: ti.template(),
+):  # fmt: skip
     """Find the bounds of a small triangle in a picture of this width and height; other arguments as for `triangle_at`.
+
+    `lens` is the model of the camera's lens, empty if it bends no lines.
 
     Returns:
         Least and largest x, least and largest y; and by what fraction of its side it is enlarged.
@@ -277,7 +301,20 @@ def triangle_bounds(column, line, lower, part, near, width, height, patch: ti.te
         low_y = ti.min(p[1] / p[2], q[1] / q[2], r[1] / r[2])
         high_y = ti.max(p[1] / p[2], q[1] / q[2], r[1] / r[2])
         extent = ti.max(high_x - low_x, high_y - low_y, 1e-3)
-        overstep += OVERSTEP_OF_PICTURE * (width + height) / extent
+        if ti.static(lens != ""):
+            box = uni.VISIBLE
+            around = numbers[box + 1] - numbers[box] + numbers[box + 3] - numbers[box + 2]
+            overstep += OVERSTEP_OF_PICTURE * around / extent
+            x = [k[0] / k[2] for k in ti.static((p, q, r))]
+            y = [k[1] / k[2] for k in ti.static((p, q, r))]
+            longest = ti.max(bending.side(x, y, 0, 1), bending.side(x, y, 1, 2), bending.side(x, y, 2, 0))
+            seen = [bending.bent(x[n], y[n], numbers, lens) for n in ti.static(range(3))]
+            low_x, high_x, low_y, high_y = bending.bent_bounds(
+                x, y, [one[0] for one in seen], [one[1] for one in seen], seen[0][2] and seen[1][2] and seen[2][2],
+                longest, numbers,
+            )  # fmt: skip
+        else:
+            overstep += OVERSTEP_OF_PICTURE * (width + height) / extent
     elif p[2] <= near and q[2] <= near and r[2] <= near:
         high_x = -1.0
     return low_x, high_x, low_y, high_y, overstep

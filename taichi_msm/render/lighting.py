@@ -94,8 +94,11 @@ def tilt(normal: ti.template(), rise_x, rise_y, numbers: ti.template()):
 
 
 @ti.func
-def light_tissue(x, y, depth, normal: ti.template(), rise_x, rise_y, appearance: ti.template()):
-    """Light wet tissue, whose relief rises by so much from texel to texel: give the colours' factor and summand."""
+def light_tissue(x, y, depth, normal: ti.template(), rise_x, rise_y, column, row, appearance: ti.template()):
+    """Light wet tissue, whose relief rises by so much from texel to texel: give the colours' factor and summand.
+
+    Samples are in these columns and rows of the picture; without distortion they would be at (x, y).
+    """
     config, numbers = ti.static((appearance.config, appearance.numbers))
     tilted = [normal[n] for n in ti.static(range(3))]
     if ti.static(config.relief):
@@ -109,8 +112,8 @@ def light_tissue(x, y, depth, normal: ti.template(), rise_x, rise_y, appearance:
         share, gloss = share * left, gloss * left
     if ti.static(config.vignette):
         # The distance from the middle of the picture is in units of half its diagonal.
-        off_x, off_y = x - numbers[uni.CENTRE_X], y - numbers[uni.CENTRE_Y]
-        diagonal = numbers[uni.CENTRE_X] * numbers[uni.CENTRE_X] + numbers[uni.CENTRE_Y] * numbers[uni.CENTRE_Y]
+        off_x, off_y = column - numbers[uni.MIDDLE_X], row - numbers[uni.MIDDLE_Y]
+        diagonal = numbers[uni.MIDDLE_X] * numbers[uni.MIDDLE_X] + numbers[uni.MIDDLE_Y] * numbers[uni.MIDDLE_Y]
         rim = 1.0 - numbers[uni.VIGNETTE] * (off_x * off_x + off_y * off_y) / diagonal
         share, gloss = share * rim, gloss * rim
     # Where a point is infinite or NaN, so is its normal.

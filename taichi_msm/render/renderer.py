@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from taichi_msm.arguments import are_numbers, as_array
 from taichi_msm.errors import ArgumentError
-from taichi_msm.render.camera import View, view
+from taichi_msm.render.camera import View, moves, view, view_at
 from taichi_msm.render.labels import Flow, Labels, Observed, Sight, track_grid
 from taichi_msm.render.surface import Rod
 from taichi_msm.render.texture import load_texture
@@ -55,23 +55,23 @@ class Renderer:
         self._drawings.clear()
         self.scene, self.view = scene, view(scene)
 
-    def set_up(self, camera: CameraLike) -> View:
-        """Set up a camera; raises a SceneError if it is not valid, or sees nothing."""
+    def set_up(self, camera: CameraLike, time: float = 0.0) -> View:
+        """Set up a camera at a time [s]; raises a SceneError if it is not valid, or sees nothing."""
         if isinstance(camera, View):
             return camera
         if camera is None:
-            return self.view
+            return view_at(self.scene, time) if moves(self.scene) else self.view
         # The scene is checked as a whole, so that an error names the key as a scene has it.
         render = {**dict(self.scene.render), "camera": camera}
-        return view(self.scene.model_copy(update={"render": render}))
+        return view(self.scene.model_copy(update={"render": render}), time)
 
     def draw(self, shot: Shot, style: Render | None = None) -> NDArray[np.uint8]:
         """Draw a picture; `style`: the scene's `render` with another shading, or with the mesh shown or hidden."""
-        return self._drawing(style, picture=True, labels=False).draw(*shot)
+        return self._drawing(style, picture=True, labels=False, lens=shot.view.model).draw(*shot)
 
-    def is_compiled(self, style: Render) -> bool:
-        """Tell whether a picture in a style, as for `draw`, has been drawn before."""
-        return self._key(style, picture=True, labels=False) in self._drawings
+    def is_compiled(self, style: Render, camera: View) -> bool:
+        """Tell whether a picture in a style, as for `draw`, has been drawn before from such a camera."""
+        return self._key(style, picture=True, labels=False, lens=camera.model) in self._drawings
 
     def kernels(self) -> tuple[object, ...]:
         """Give all that the kernels of `observe` are compiled for."""
@@ -81,7 +81,7 @@ class Renderer:
 
     def labels(self, shot: Shot) -> Labels:
         """Give what each pixel shows at its centre."""
-        labels = self._drawing(picture=False, labels=True).look(*shot).labels
+        labels = self._drawing(picture=False, labels=True, lens=shot.view.model).look(*shot).labels
         assert labels is not None
         return labels
 
@@ -114,7 +114,8 @@ class Renderer:
         together = scene.render.supersample == 1
         observed = Observed()
         if scene.draws:
-            observed = self._drawing(picture=True, labels=scene.labels_pixels and together).look(*shot)
+            labels = scene.labels_pixels and together
+            observed = self._drawing(picture=True, labels=labels, lens=shot.view.model).look(*shot)
         if scene.labels_pixels and observed.labels is None:
             observed = observed._replace(labels=self.labels(shot))
         if before is not None and scene.asks_for("flow"):
@@ -127,19 +128,20 @@ class Renderer:
         """Free the memory."""
         self._drawings.clear()
 
-    def _drawing(self, style: Render | None = None, *, picture: bool, labels: bool) -> Drawing:
-        key = self._key(style or self.scene.render, picture=picture, labels=labels)
+    def _drawing(self, style: Render | None = None, *, picture: bool, labels: bool, lens: str) -> Drawing:
+        key = self._key(style or self.scene.render, picture=picture, labels=labels, lens=lens)
         if key not in self._drawings:
             from taichi_msm.render.rasterizer import Drawing, drawing_config
 
             scene = self.scene if style is None else self.scene.model_copy(update={"render": style})
             texture = self._texture() if picture else np.zeros((1, 1, 3), np.uint8)
-            self._drawings[key] = Drawing(scene, texture, drawing_config(scene, picture=picture, labels=labels))
+            config = drawing_config(scene, picture=picture, labels=labels, lens=lens)
+            self._drawings[key] = Drawing(scene, texture, config)
         return self._drawings[key]
 
-    def _key(self, style: Render, *, picture: bool, labels: bool) -> tuple[object, ...]:
+    def _key(self, style: Render, *, picture: bool, labels: bool, lens: str) -> tuple[object, ...]:
         """Give all that tells the drawings of this scene apart."""
-        return picture, labels, style.shading, style.wireframe, self.scene.has_instruments
+        return picture, labels, lens, style.shading, style.wireframe, self.scene.has_instruments
 
     def _texture(self) -> NDArray[np.uint8]:
         """Give the picture on the sheet, which is read again only if the scene names another one."""

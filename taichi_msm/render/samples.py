@@ -47,6 +47,7 @@ class DrawingConfig(NamedTuple):
     metal: bool  # whether they are shaded
     picture: bool  # whether colours are written
     labels: bool  # whether labels are written; needs one sample per pixel
+    lens: str  # the model of the lens, pinhole or fisheye; empty if it bends no lines
     lanes: int  # samples in a tile
 
     @property
@@ -73,6 +74,26 @@ class DrawingConfig(NamedTuple):
     def planes(self) -> int:
         """Vectors stored per tile."""
         return len(self.plane)
+
+    @property
+    def bends(self) -> bool:
+        """Whether there is a lens that bends lines."""
+        return self.lens != ""
+
+    @property
+    def place_planes(self) -> int:
+        """Vectors of the table of places per tile: x and y, and what changes them (places.py); 0 without a lens."""
+        return 0 if not self.lens else 6 if self.place_steps else 2
+
+    @property
+    def place_steps(self) -> bool:
+        """Whether the table has the way to the next samples."""
+        return bool(self.lens) and (self.tissue or self.wireframe)
+
+    @property
+    def band_places(self) -> int:
+        """Vectors of the table of places per row of tiles and tile across, in a band on a CPU, less its bounds."""
+        return self.band_lines * self.place_planes
 
     @property
     def band_rows(self) -> int:
@@ -137,6 +158,7 @@ class Band(NamedTuple):
     height: Any
     near: Any  # only what is farther than this is drawn
     numbers: Any
+    places: Any  # entry of `samples` where the band's places begin, if there is a lens
 
 
 @ti.func
@@ -169,6 +191,28 @@ def centres(left, top, config: ti.template()):
     columns = config.floats([lane % width + 0.5 for lane in ti.static(range(config.lanes))])
     lines = config.floats([lane // width + 0.5 for lane in ti.static(range(config.lanes))])
     return columns + ti.cast(left, ti.f32), lines + ti.cast(top, ti.f32)
+
+
+@ti.func
+def places(left, top, at, samples: ti.template(), config: ti.template()):
+    """Give x and y of the samples of a tile, as `centres`, without distortion; `at` is the entry of its places."""
+    x, y = centres(left, top, config)
+    if ti.static(config.bends):
+        x, y = samples[at], samples[at + 1]
+    return x, y
+
+
+@ti.func
+def places_of(at, band: ti.template()):
+    """Give the entry of the places of a tile that begins at entry `at` of the samples."""
+    return band.places + (at - band.first) // band.config.planes * band.config.place_planes
+
+
+@ti.func
+def steps(at, band: ti.template()):
+    """Give the ways from the samples of a tile to the next on the right and to the next below, without distortion."""
+    way = places_of(at, band) + 2
+    return [band.samples[way + n] for n in ti.static(range(4))]
 
 
 @ti.func

@@ -13,7 +13,7 @@ from PIL import Image
 from taichi_msm.outputs.flo import write_flo
 from taichi_msm.outputs.npz import write_arrays
 from taichi_msm.outputs.table import CAMERA, OUTPUTS, results
-from taichi_msm.render.camera import calibration, view
+from taichi_msm.render.camera import calibration, moves, pose, view, view_at
 from taichi_msm.render.labels import Observed, track_grid
 from taichi_msm.results.whole import add, create
 from taichi_msm.scene import Scene
@@ -57,6 +57,9 @@ class LabelWriter:
                 (self._folder / output.path(number)).unlink(missing_ok=True)
         if CAMERA in results(self._scene.output):
             matrices = {"size": list(self._scene.render.size), **calibration(view(self._scene))}
+            if moves(self._scene):
+                rate = self._scene.time.frames_per_second
+                matrices["poses"] = [pose(view_at(self._scene, frame / rate)) for frame in range(frames)]
             add(self._folder / CAMERA, (json.dumps(matrices, indent=2) + "\n").encode())
         if self._scene.asks_for("tracks"):
             points, occluded = self._points[:, :frames], self._occluded[:, :frames]

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from functools import cache
 from typing import NamedTuple
 
 import numpy as np
@@ -12,9 +13,11 @@ from taichi_msm.render import style
 from taichi_msm.render.camera import view
 from taichi_msm.render.surface import Rod
 from taichi_msm.scene import Scene
+from tests.reference.lens import undistorted
 from tests.reference.shading import headlight, meet, metal, normals, normals_at, sample, tissue
 
 Array = NDArray[np.float64]
+Sampled = Callable[[float, float], tuple[Array, Array]]
 
 
 def refine(values: Array, n: int) -> Array:
@@ -57,17 +60,16 @@ def weights(triangle: Array, x: Array, y: Array) -> Array:
         return np.asarray(cross / cross.sum(axis=0))
 
 
-def wire_share(scene: Scene, triangle: Array, x: Array, y: Array) -> Array:
+def wire_share(scene: Scene, triangle: Array, at: Sampled) -> Array:
     """Give the share of the mesh lines in the colour of the pixels of a triangle.
 
     Args:
         scene: the scene.
         triangle: corners (X, Y, w, depth, u, v, ...), shape (3, k).
-        x: pixel, right [px of the supersampled picture], any shape.
-        y: pixel, down, the same shape.
+        at: gives the places of the pixels, shifted by so many pixels.
 
     Returns:
-        Share 0 to 1, the shape of x.
+        Share 0 to 1, of the pixels' shape.
     """
     rows, cols = scene.sheet.points
 
@@ -75,8 +77,13 @@ def wire_share(scene: Scene, triangle: Array, x: Array, y: Array) -> Array:
         u, v = np.tensordot(triangle[:, 4:6].T, weights(triangle, x, y), 1)
         return np.array([u * (cols - 1), v * (rows - 1)])
 
-    here = mesh(x, y)
-    slope = np.hypot(mesh(x + 1, y) - here, mesh(x, y + 1) - here)
+    here, (x, y) = mesh(*at(0, 0)), at(0, 0)
+    # A lens bends the way to the next pixel, which is taken as straight.
+    right, below = (
+        [middle + (far - near) / 2e-3 for middle, far, near in zip((x, y), at(*way), at(*back), strict=True)]
+        for way, back in (((1e-3, 0), (-1e-3, 0)), ((0, 1e-3), (0, -1e-3)))
+    )
+    slope = np.hypot(mesh(*right) - here, mesh(*below) - here)
     distance = np.abs(here - np.round(here)) / np.maximum(slope, 1e-12)
     half = style.WIRE_WIDTH / 2 * scene.render.supersample
     return np.asarray(style.WIRE_OPACITY * np.clip(half + 0.5 - distance.min(axis=0), 0, 1))
@@ -118,9 +125,15 @@ def look(scene: Scene, position: Array, factor: int = 1, texels: tuple[int, int]
     u, v = np.meshgrid(np.arange(cols) / (cols - 1), np.arange(rows) / (rows - 1))
     surface = refine(np.concatenate([projected, u[..., None], v[..., None]], axis=-1), scene.render.refine)
 
+    @cache
+    def places(right: float, down: float) -> tuple[Array, Array]:
+        y, x = np.mgrid[:height, :width] + 0.5
+        x, y = undistorted(camera, (x + right) / factor, (y + down) / factor)
+        return x * factor, y * factor
+
     seen = Seen(*(np.full((height, width), value) for value in (np.inf, np.nan, np.nan, 0.0, 0.0, 1.0)))
     for triangle in triangles(surface):
-        if (triangle[:, 2] > camera.near).all():
+        if (triangle[:, 2] > camera.near).all() and camera.lens is None:
             corner = triangle[:, :2] / triangle[:, 2:3] - 0.5
             left, top = np.maximum(np.floor(corner.min(axis=0)), 0).astype(int)
             right, bottom = np.minimum(np.ceil(corner.max(axis=0)), [width - 1, height - 1]).astype(int)
@@ -129,14 +142,19 @@ def look(scene: Scene, position: Array, factor: int = 1, texels: tuple[int, int]
         if right < left or bottom < top:
             continue
         box = np.s_[top : bottom + 1, left : right + 1]
-        y, x = np.mgrid[box].astype(float) + 0.5
+
+        def at(right: float, down: float, box: tuple[slice, slice] = box) -> tuple[Array, Array]:
+            x, y = places(right, down)
+            return x[box], y[box]
+
+        x, y = at(0, 0)
         share = weights(triangle, x, y)
         w, depth, u, v = np.tensordot(triangle[:, 2:].T, share, 1)
         here = (share >= -1e-12).all(axis=0) & (w > camera.near) & (depth < seen.depth[box])
-        wire = wire_share(scene, triangle, x, y) if scene.render.wireframe else np.zeros_like(x)
+        wire = wire_share(scene, triangle, at) if scene.render.wireframe else np.zeros_like(x)
         # From the upper left the corners go down and around: counter-clockwise where the front is seen.
         front = np.full_like(x, -np.sign(np.linalg.det(triangle[:, :3])))
-        found = Seen(depth, u, v, wire, footprint(triangle, x, y, texels), front)
+        found = Seen(depth, u, v, wire, footprint(triangle, at, texels), front)
         for kept, new in zip(seen, found, strict=True):
             kept[box][here] = new[here]
     return seen
@@ -150,15 +168,14 @@ def triangles(surface: Array) -> Iterator[Array]:
         yield np.array([corners[0], *corners[2:]])
 
 
-def footprint(triangle: Array, x: Array, y: Array, texels: tuple[int, int]) -> Array:
+def footprint(triangle: Array, at: Sampled, texels: tuple[int, int]) -> Array:
     """Give the larger of a sample's width and height on the texture, in units of style.SHARP texels.
 
     It is found by finite differences over a thousandth of a sample.
 
     Args:
         triangle: corners (X, Y, w, depth, u, v), shape (3, 6).
-        x: sample, right, any shape.
-        y: sample, down, the same shape.
+        at: gives the places of the samples, shifted by so many samples.
         texels: width and height of the texture.
     """
     step = 1e-3
@@ -167,8 +184,8 @@ def footprint(triangle: Array, x: Array, y: Array, texels: tuple[int, int]) -> A
         u, v = np.tensordot(triangle[:, 4:6].T, weights(triangle, x, y), 1)
         return np.array([u * texels[0], v * texels[1]])
 
-    right = place(x + step, y) - place(x - step, y)
-    down = place(x, y + step) - place(x, y - step)
+    right = place(*at(step, 0)) - place(*at(-step, 0))
+    down = place(*at(0, step)) - place(*at(0, -step))
     return np.asarray(np.maximum(np.hypot(*right), np.hypot(*down)) / (2 * step * style.SHARP))
 
 

@@ -11,6 +11,7 @@ from taichi_msm.render.camera import view
 from taichi_msm.render.surface import Rod
 from taichi_msm.scene import Scene
 from tests.reference.drawing import look, refine, triangles, weights
+from tests.reference.lens import distort
 from tests.reference.shading import meet
 
 Array = NDArray[np.float64]
@@ -62,9 +63,14 @@ def find(scene: Scene, coordinates: Array, position: Array) -> tuple[Array, NDAr
     lower = surface[i, j] * (1 - t) + surface[i + 1, j] * (t - s) + surface[i + 1, j + 1] * s
     found = np.where(t > s, lower, upper)
     with np.errstate(divide="ignore", invalid="ignore"):
-        pixels = np.where(found[:, 2:3] > camera.near, found[:, :2] / found[:, 2:3], np.nan)
-    x, y = pixels.T
-    hidden = ~((x >= 0) & (y >= 0) & (x < width) & (y < height))
+        places = np.where(found[:, 2:3] > camera.near, found[:, :2] / found[:, 2:3], np.nan)
+    x, y = places.T
+    pixels = places
+    if camera.lens is not None:
+        across, along = ((places - camera.centre) / camera.scale).T
+        pixels = np.stack(distort(camera, across, along), axis=-1) * camera.scale + camera.centre
+        pixels[~(np.hypot(across, along) < camera.lens.limit)] = np.nan
+    hidden: NDArray[np.bool_] = np.logical_not(((pixels >= 0) & (pixels < (width, height))).all(axis=1))
     limit = found[:, 3] - TOUCHING * max(scene.sheet.size)
     for triangle in triangles(surface):
         share = weights(triangle, x, y)

@@ -11,6 +11,7 @@ from taichi_msm.render import style
 from taichi_msm.render.camera import View
 from taichi_msm.render.surface import Rod
 from taichi_msm.scene import Scene
+from tests.reference.lens import undistorted
 
 Array = NDArray[np.float64]
 
@@ -157,10 +158,11 @@ def points(camera: View, factor: int, depth: Array) -> Array:
     """
     right, up, toward = camera.axes
     y, x = (np.mgrid[: depth.shape[0], : depth.shape[1]] + 0.5) / factor
+    x, y = undistorted(camera, x, y)
     depth = np.where(np.isfinite(depth), depth, camera.distance)
     w = (depth if camera.pinhole else np.ones_like(depth))[..., None]
-    across = ((x - camera.centre[0]) / camera.scale)[..., None] * right
-    along = ((camera.centre[1] - y) / camera.scale)[..., None] * up
+    across = ((x - camera.centre[0]) / camera.scale[0])[..., None] * right
+    along = ((camera.centre[1] - y) / camera.scale[1])[..., None] * up
     return np.asarray(camera.eye + (across + along) * w - depth[..., None] * toward)
 
 
@@ -235,7 +237,8 @@ def tissue(
         ratio = np.maximum(np.linalg.norm(away - foot, axis=-1) / rod.radius, 1)
         share, gloss = (value * (1 - style.SHADE / ratio**2) for value in (share, gloss))
     y, x = (np.mgrid[: depth.shape[0], : depth.shape[1]] + 0.5) / factor
-    off = np.hypot(x - camera.centre[0], y - camera.centre[1]) / np.hypot(*camera.centre)
+    middle = camera.size / 2
+    off = np.hypot(x - middle[0], y - middle[1]) / np.hypot(*middle)
     rim = (1 - light.vignette * off**2)[..., None]
     return np.asarray(np.minimum((colour * share[..., None] + gloss[..., None]) * rim, 255))
 
@@ -269,7 +272,9 @@ def meet(rods: Sequence[Rod], camera: View, size: tuple[int, int], factor: int) 
     width, height = size[0] * factor, size[1] * factor
     y, x = (np.mgrid[:height, :width] + 0.5) / factor
     right, up, toward = camera.axes
-    aside = ((x - camera.centre[0])[..., None] * right + (camera.centre[1] - y)[..., None] * up) / camera.scale
+    x, y = undistorted(camera, x, y)
+    across, along = (x - camera.centre[0]) / camera.scale[0], (camera.centre[1] - y) / camera.scale[1]
+    aside = across[..., None] * right + along[..., None] * up
     nearest, normal = np.full((height, width), np.inf), np.zeros((height, width, 3))
 
     def sight(depth: Array) -> Array:
