@@ -456,22 +456,24 @@ class Time(Section):
         return self
 
 
-class Intrinsics(Section):
-    """The focal lengths and the principal point of a calibrated camera, in OpenCV's pixels."""
-
-    fx: Positive = key(..., "focal length across [px]", "a number above 0, in pixels")
-    fy: Positive = key(..., "focal length down [px]", "a number above 0, in pixels")
-    cx: Number = key(..., "principal point across [px]; the centre of the first pixel is 0", "a number, in pixels")
-    cy: Number = key(..., "principal point down [px]; the centre of the first pixel is 0", "a number, in pixels")
-
-
 # The coefficients of OpenCV's models of distortion, in its order.
 COEFFICIENTS = {
     "pinhole": ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6"),
     "fisheye": ("k1", "k2", "k3", "k4"),
 }
 
-_COEFFICIENT = "a number, without unit"
+_MOST = 1e6
+_COEFFICIENT = f"a number, {-_MOST:g} to {_MOST:g}"
+Coefficient = Annotated[Number, Field(ge=-_MOST, le=_MOST)]
+
+
+class Intrinsics(Section):
+    """The focal lengths and the principal point of a calibrated camera, in OpenCV's pixels."""
+
+    fx: Positive = key(..., "focal length across [px]", "a number above 0, in pixels")
+    fy: Positive = key(..., "focal length down [px]", "a number above 0, in pixels")
+    cx: Coefficient = key(..., "principal point across [px]; the centre of the first pixel is 0", _COEFFICIENT)
+    cy: Coefficient = key(..., "principal point down [px]; the centre of the first pixel is 0", _COEFFICIENT)
 
 
 class Distortion(Section):
@@ -480,14 +482,14 @@ class Distortion(Section):
     model: Literal["pinhole", "fisheye"] = key(
         "pinhole", "pinhole: OpenCV's rational model; fisheye: its fisheye, with k1 to k4", "pinhole or fisheye"
     )
-    k1: Number = key(0.0, "radial coefficient", _COEFFICIENT)
-    k2: Number = key(0.0, "radial coefficient", _COEFFICIENT)
-    k3: Number = key(0.0, "radial coefficient", _COEFFICIENT)
-    k4: Number = key(0.0, "radial coefficient; of a pinhole in the denominator", _COEFFICIENT)
-    k5: Number = key(0.0, "radial coefficient in the denominator", _COEFFICIENT)
-    k6: Number = key(0.0, "radial coefficient in the denominator", _COEFFICIENT)
-    p1: Number = key(0.0, "tangential coefficient", _COEFFICIENT)
-    p2: Number = key(0.0, "tangential coefficient", _COEFFICIENT)
+    k1: Coefficient = key(0.0, "radial coefficient", _COEFFICIENT)
+    k2: Coefficient = key(0.0, "radial coefficient", _COEFFICIENT)
+    k3: Coefficient = key(0.0, "radial coefficient", _COEFFICIENT)
+    k4: Coefficient = key(0.0, "radial coefficient; of a pinhole in the denominator", _COEFFICIENT)
+    k5: Coefficient = key(0.0, "radial coefficient in the denominator", _COEFFICIENT)
+    k6: Coefficient = key(0.0, "radial coefficient in the denominator", _COEFFICIENT)
+    p1: Coefficient = key(0.0, "tangential coefficient", _COEFFICIENT)
+    p2: Coefficient = key(0.0, "tangential coefficient", _COEFFICIENT)
 
     @property
     def coefficients(self) -> tuple[float, ...]:

@@ -207,14 +207,13 @@ def _place_key(camera: Camera) -> str:
 def _lens_problems(scene: Scene) -> Iterator[Problem]:
     """Find where a lens folds back within the picture."""
     camera = view_at(scene, 0.0)
-    assert camera.lens is not None
-    if not np.isnan(camera.undistorted(border(camera.size))).any():
+    if camera.lens is None or not np.isnan(camera.undistorted(border(camera.size))).any():
         return
-    fold = "folds back" if camera.lens.limit < WIDEST else "reaches 88 degrees from the axis of view"
+    end = "folds back" if camera.lens.limit < WIDEST else "reaches 88 degrees"
     good = math.floor(camera.lens.rim * float(camera.scale.min()))
     far = math.ceil(float(np.linalg.norm(border(camera.size) - camera.centre, axis=-1).max()))
-    said = f"{fold} {good} px from the principal point, and the picture reaches {far} px; take coefficients that are"
-    yield Problem(("render", "camera", "distortion"), f"{said} good to there, or set outside: background")
+    said = f"{end} at {good} px from the principal point, and the picture reaches {far} px; take coefficients"
+    yield Problem(("render", "camera", "distortion"), f"{said} that are good to there, or set outside: background")
 
 
 def border(size: Array) -> Array:

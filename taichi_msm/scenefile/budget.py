@@ -17,7 +17,7 @@ from taichi_msm.physics.pilots import choose_pilots
 from taichi_msm.physics.plan import Plan
 from taichi_msm.physics.terms.contact import contact_fields
 from taichi_msm.render import texture
-from taichi_msm.scene import Scene
+from taichi_msm.scene import Camera, Scene
 from taichi_msm.system.resources import available_memory
 
 MAX_STEPS = 10**12
@@ -28,6 +28,9 @@ SAMPLE_BYTES = 48  # per sample, at most
 BAND_ROWS = 16  # rows of samples that a thread holds at a time
 PIXEL_BYTES = 3 * 12  # per pixel of the frame: its colours, from sums to bytes
 PICTURE_PIXEL_BYTES = 20  # per pixel of the picture's file, while it is decoded and converted; its texture takes less
+
+# Bytes of a sample's place where a lens bends lines, while these are found and copied.
+PLACE_BYTES = 100
 
 # The most that a file takes besides [bytes], but for a byte for every row of a PNG; and run.json besides its scene.
 FILE_BYTES = 1024
@@ -169,6 +172,9 @@ def drawing_bytes(scene: Scene) -> int:
     factor = scene.render.supersample
     band_rows = min(height * factor, BAND_ROWS * (os.cpu_count() or 1))
     samples = band_rows * width * factor * SAMPLE_BYTES
+    camera = scene.render.camera
+    if isinstance(camera, Camera) and camera.distortion is not None:
+        samples += width * height * factor**2 * PLACE_BYTES
     pixel = PIXEL_BYTES + (LABEL_PIXEL_BYTES if scene.labels_pixels else 0)
     return rows * cols * POINT_BYTES + samples + width * height * pixel + picture * PICTURE_PIXEL_BYTES
 

@@ -26,6 +26,9 @@ IMAGE: Key = ("image",)
 MAPS: tuple[Key, ...] = (("tissue", "map", "image"), ("tissue", "foundation_map", "image"), ("springs", "map", "image"))
 PICTURES = (IMAGE, *MAPS)
 
+# The keys that name files of a camera.
+CAMERA_FILES: tuple[Key, ...] = (("render", "camera", "calibration"), ("render", "camera", "poses"))
+
 # The largest number of lines in an error: nobody reads more, and a broken file may have tens of thousands of problems.
 MAX_LINES = 100
 
@@ -102,8 +105,8 @@ def plan_file(file: File, overrides: Sequence[str] | Mapping[str, Any] = (), ima
     )
     for override in parsed:
         draft.override(override)
-    for key in PICTURES if image is None else MAPS:
-        draft.find_picture(key, file.folder)
+    for key in (*(PICTURES if image is None else MAPS), *CAMERA_FILES):
+        draft.find_file(key, file.folder)
     if image is not None:
         draft.override(_Override(f"--image {cut(str(image))}", IMAGE, str(image)))
     plan, problems = validate(draft.data)
@@ -196,8 +199,8 @@ class Draft:
         elif problem := self._put(override.path, override.value, place):
             self.problems.append((place, problem))
 
-    def find_picture(self, key: Key, folder: Path) -> None:
-        """Change the path of a picture, given relative to a folder, to one from the current directory."""
+    def find_file(self, key: Key, folder: Path) -> None:
+        """Change the path of a file, given relative to a folder, to one from the current directory."""
         holder: Any = self.data
         for part in key[:-1]:
             holder = holder.get(part) if isinstance(holder, dict) else None
@@ -209,8 +212,10 @@ class Draft:
         given = any(key[:n] in self._overridden for n in range(1, len(key) + 1))
         if not given and not is_below(folder / image, folder):
             remedy = ", or name it with --image" if key == IMAGE else ""
-            said = f"{image} is not below the scene's folder; put the picture there{remedy}"
-            self.problems.append((self._place(key), Problem(key, said)))
+            said = (
+                f"{image} is not below the scene's folder; put {'it' if key in CAMERA_FILES else 'the picture'} there"
+            )
+            self.problems.append((self._place(key), Problem(key, said + remedy)))
             del holder[key[-1]]
 
     def report(self, problems: Iterable[Problem]) -> None:
