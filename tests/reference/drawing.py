@@ -133,14 +133,15 @@ def look(scene: Scene, position: Array, factor: int = 1, texels: tuple[int, int]
 
     seen = Seen(*(np.full((height, width), value) for value in (np.inf, np.nan, np.nan, 0.0, 0.0, 1.0)))
     for triangle in triangles(surface):
-        if (triangle[:, 2] > camera.near).all() and camera.lens is None:
-            corner = triangle[:, :2] / triangle[:, 2:3] - 0.5
-            left, top = np.maximum(np.floor(corner.min(axis=0)), 0).astype(int)
-            right, bottom = np.minimum(np.ceil(corner.max(axis=0)), [width - 1, height - 1]).astype(int)
-        else:
-            left, top, right, bottom = 0, 0, width - 1, height - 1
-        if right < left or bottom < top:
-            continue
+        left, top, right, bottom = 0, 0, width - 1, height - 1
+        if (triangle[:, 2] > camera.near).all():
+            corner = triangle[:, :2] / triangle[:, 2:3]
+            x, y = places(0, 0)
+            low, high = corner.min(axis=0) - 1, corner.max(axis=0) + 1
+            near = (x > low[0]) & (x < high[0]) & (y > low[1]) & (y < high[1])
+            if not near.any():
+                continue
+            (top, bottom), (left, right) = (np.flatnonzero(near.any(axis=axis))[[0, -1]] for axis in (1, 0))
         box = np.s_[top : bottom + 1, left : right + 1]
 
         def at(right: float, down: float, box: tuple[slice, slice] = box) -> tuple[Array, Array]:
