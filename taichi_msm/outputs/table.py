@@ -88,7 +88,7 @@ def _rows() -> Iterator[Output]:
     yield Output("depth", "depth/0000.tiff", "labels", means, pixel_bytes=4, needs_camera=True)
     means = (
         "Middlebury's format: how far what is seen moves until the next frame, right and down [px], hidden there or "
-        "not; 1e10: no sheet, or it goes behind the eye"
+        "not; 1e10: no sheet, or it goes behind the eye or beyond the lens's limit"
     )
     yield Output("flow", "flow/0000.flo", "flow", means, pixel_bytes=8, needs_camera=True)
     means = "255 where what is seen is hidden or outside the picture in the next frame, else 0"

@@ -7,7 +7,8 @@ there, in samples of its picture.
 from taichi_msm.render import uniforms as uni
 from taichi_msm.system.runtime import ti
 
-# Numbers that are stored of a mass point: where it is seen [samples], and 1 if it is within the radius of the lens.
+# Numbers that are stored of a mass point: where it is seen [samples], and 1 if it is in front of the camera and within
+# the radius of the lens.
 BENT_NUMBERS = 3
 
 # An angle is found from a half of a half of half of it, by its series in the tangent: the terms' divisors, the smallest
@@ -66,10 +67,11 @@ def bent(x, y, numbers: ti.template(), lens: ti.template()):
 
 
 @ti.func
-def store_bent(at, x, y, numbers: ti.template(), point: ti.template(), lens: ti.template()):
-    """Store where a mass point is seen."""
-    seen_x, seen_y, within = bent(x, y, numbers, lens)
-    point[at], point[at + 1], point[at + 2] = seen_x, seen_y, ti.cast(within, ti.f32)
+def store_bent(at, here, numbers: ti.template(), point: ti.template(), lens: ti.template()):
+    """Store at `at` where the mass point is seen whose numbers begin at `here`."""
+    seen_x, seen_y, within = bent(point[here + uni.SEEN], point[here + uni.SEEN + 1], numbers, lens)
+    point[at], point[at + 1] = seen_x, seen_y
+    point[at + 2] = ti.cast(within and point[here + 2] > numbers[uni.NEAR], ti.f32)
 
 
 @ti.func

@@ -17,8 +17,8 @@ from taichi_msm.render import uniforms as uni
 from taichi_msm.render.samples import INFINITY
 from taichi_msm.system.runtime import ti
 
-# The numbers of a mass point: (X, Y, w, depth), its place in the picture [samples].
-SEEN, POINT_NUMBERS = 4, 6
+# The numbers of a mass point: (X, Y, w, depth), its place in the picture [samples], at SEEN.
+SEEN, POINT_NUMBERS = uni.SEEN, 6
 
 # A triangle that is drawn by itself is enlarged a little, so that no gap is left beside it: by this fraction of its
 # side, and by this fraction of the picture's, which is what f32 resolves.
@@ -253,6 +253,28 @@ def is_within(s, t, overstep, near, triangle: ti.template()):
 def depth_at(s, t, triangle: ti.template()):
     """Give the depth of a triangle's plane at (s, t)."""
     return triangle.p[3] + triangle.r[3] * s + triangle.d[3] * t
+
+
+@ti.func
+def may_reach(corner, at, cols, top, bottom, numbers: ti.template(), point: ti.template()):
+    """Tell whether a cell may be seen between two rows of a picture that a lens has bent: what saves `cell_bounds`.
+
+    The numbers of its upper left mass point begin at `corner`, and what `store_bent` stored of it at `at`.
+    """
+    below, under = corner + cols * POINT_NUMBERS, at + cols * bending.BENT_NUMBERS
+    bent_corners = ti.static((at, at + bending.BENT_NUMBERS, under, under + bending.BENT_NUMBERS))
+    within = [point[here + 2] for here in bent_corners]
+    seen = [point[here + 1] for here in bent_corners]
+    corners = ti.static((corner, corner + POINT_NUMBERS, below, below + POINT_NUMBERS))
+    x = [point[here + SEEN] for here in corners]
+    y = [point[here + SEEN + 1] for here in corners]
+    longest = ti.max(
+        bending.side(x, y, 0, 1), bending.side(x, y, 1, 3), bending.side(x, y, 3, 2), bending.side(x, y, 2, 0)
+    )
+    far = numbers[uni.BEND] * longest + 2.0
+    lowest, highest = ti.max(seen[0], seen[1], seen[2], seen[3]), ti.min(seen[0], seen[1], seen[2], seen[3])
+    partly = within[0] + within[1] + within[2] + within[3] < 3.5
+    return partly or (lowest + far > top and highest - far < bottom)
 
 
 @ti.func

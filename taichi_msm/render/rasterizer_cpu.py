@@ -14,7 +14,7 @@ from taichi_msm.render import uniforms as uni
 from taichi_msm.render.attributes import NORMAL_NUMBERS, DrawnSheet, store_normal
 from taichi_msm.render.bending import BENT_NUMBERS, store_bent
 from taichi_msm.render.coverage import cover
-from taichi_msm.render.geometry import POINT_NUMBERS, SEEN, project
+from taichi_msm.render.geometry import POINT_NUMBERS, SEEN, may_reach, project
 from taichi_msm.render.instrument_coverage import cover_with_rods
 from taichi_msm.render.labels import LABEL_NUMBERS
 from taichi_msm.render.places import bounds, tiled
@@ -97,7 +97,7 @@ def project_row(
         here = (i * cols + j) * POINT_NUMBERS
         if ti.static(config.bends):
             bent = rows * cols * STORED + (i * cols + j) * BENT_NUMBERS
-            store_bent(bent, point[here + SEEN], point[here + SEEN + 1], numbers, point, config.lens)
+            store_bent(bent, here, numbers, point, config.lens)
         if point[here + 2] > numbers[uni.NEAR]:
             low = ti.min(low, point[here + SEEN + 1])
             high = ti.max(high, point[here + SEEN + 1])
@@ -148,7 +148,13 @@ def cover_band(sheet: ti.template(), band: ti.template()):
         high = ti.max(point[row + 1], point[row + 3])
         if low < bottom and high > top:
             for j in range(sheet.cols - 1):
-                cover(i, j, (), sheet, band)
+                if ti.static(config.bends):
+                    cell = i * sheet.cols + j
+                    bent = sheet.bent + cell * BENT_NUMBERS
+                    if may_reach(cell * POINT_NUMBERS, bent, sheet.cols, band.top, band.bottom, band.numbers, point):
+                        cover(i, j, (), sheet, band)
+                else:
+                    cover(i, j, (), sheet, band)
 
 
 @cache

@@ -19,7 +19,6 @@ from taichi_msm.render.bins import BOUNDS, ROUNDS_OF_SEARCH, binned, owner, reac
 from taichi_msm.render.coverage import Part, cover
 from taichi_msm.render.geometry import (
     POINT_NUMBERS,
-    SEEN,
     cell_bounds,
     corner_of,
     is_whole,
@@ -147,8 +146,9 @@ def _sheet_kernels(config: DrawingConfig) -> tuple[Callable[..., None], Callable
             project(position, index // cols, index % cols, cols, numbers, point, False)
             store_normal(position, index // cols, index % cols, rows, cols, config, numbers, point)
             if ti.static(config.bends):
-                seen, at = index * POINT_NUMBERS + SEEN, rows * cols * BENT + index * BENT_NUMBERS
-                store_bent(at, point[seen], point[seen + 1], numbers, point, config.lens)
+                store_bent(
+                    rows * cols * BENT + index * BENT_NUMBERS, index * POINT_NUMBERS, numbers, point, config.lens
+                )
 
         for cell in range((sizes[uni.ROWS] - 1) * (sizes[uni.COLS] - 1)):
             cols, parts = sizes[uni.COLS], ti.cast(numbers[uni.PARTS], ti.i32)

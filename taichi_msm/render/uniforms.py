@@ -45,6 +45,9 @@ LIGHT_X, LIGHT_Y, FARNESS, UNIT, AMBIENT, GLOSS, VIGNETTE = range(37, 44)
 # to texel.
 ACROSS, UP, SLOPE_X, SLOPE_Y = 44, 47, 50, 51
 
+# A mass point's place in the picture is after its X, Y, w and depth.
+SEEN = 4
+
 # Whatever is in front of a point by less than this counts as the point's own place [m].
 TOUCHING = 52
 TOUCHING_SHARE = 1e-9  # this distance as a fraction of the sheet's larger side
