@@ -21,7 +21,7 @@ STAGES = {
     "compile": "compiling the kernels",
     "check": "checking the finished frames",
     "redraw": "drawing finished frames",
-    "frames": "simulating and drawing",
+    "frames": "simulating",
     "diagnosis": "finding out why it diverged",
     "stepping": "measuring the stepping",
     "dop853": "measuring DOP853",

@@ -212,7 +212,7 @@ class Tissue(Section):
 
 
 class Instrument(Section):
-    """The rod that is drawn for a probe: metal, with a rounded tip that touches the sheet at the control point."""
+    """A metal rod with a rounded tip: what touches the sheet along a path; of a force what is drawn at its place."""
 
     radius: Positive = key(..., "radius of the rod [m]", "a number above 0, in metres")
     shaft: Vector = key(..., "direction from the tip along the rod", "three numbers, not all 0: [x, y, z]")
@@ -244,7 +244,7 @@ class Probe(Section):
         None,
         "in place of a force: where the instrument is; keys [[t, across, down, height], ...], linear between, held "
         "outside; height: of the lowest point of its round tip above the sheet at rest [m]",
-        "keys [[t, across, down, height], ...], t in seconds, height in metres",
+        "keys [[t, across, down, height], ...], t in seconds, across and down from -1 to 2, height in metres",
     )
     at: tuple[Fraction, Fraction] | Annotated[tuple[tuple[Number, Fraction, Fraction], ...], Field(min_length=1)] = key(
         (0.5, 0.5),
@@ -301,10 +301,10 @@ class Probe(Section):
     @field_validator("force", mode="after")
     @classmethod
     def _one_force(cls, force: Vector | None, info: ValidationInfo) -> Vector | None:
-        if "total" not in info.data:
+        if not {"path", "total"} <= info.data.keys():
             return force  # A fault of its own.
         total = info.data["total"]
-        if force is None and total is None and info.data.get("path") is None:
+        if force is None and total is None and info.data["path"] is None:
             raise refused(
                 "missing; expected total (whole tool) or, with springs, force (one point): [x, y, z] in newtons; or "
                 "path, for a tool that is moved"
@@ -346,7 +346,8 @@ class Probe(Section):
             before, now = path[n - 1][0], path[n][0]
             if now <= before:
                 raise refused(
-                    f"is at {now:g} s, after one at {before:g} s; a tool cannot jump: give it a later time", n
+                    f"is at {now:g} s, and the key before it at {before:g} s; sort the keys, each later than the last",
+                    n,
                 )
         return path
 

@@ -252,7 +252,7 @@ class Simulation:
 
     @property
     def felt(self) -> Felt:
-        """The forces at the last frame, and the greatest so far."""
+        """The forces at the last frame that was found, and the greatest so far, as in `progress`."""
         return self._felt
 
     def velocities(self) -> Array:

@@ -496,15 +496,15 @@ def test_a_log_shows_what_is_done_and_left(capsys: pytest.CaptureFixture[str], m
             shown.update("compile", 0, 0)
     lines = capsys.readouterr().err.splitlines()
     assert lines[:4] == [
-        "simulating and drawing: 41 of 101 done, about 3 min left",
-        "simulating and drawing: 45 of 101 done, about 3 min left",
-        "simulating and drawing: 48 of 101 done, about 3 min left",
-        "simulating and drawing: 51 of 101 done, about 2 min left",
+        "simulating: 41 of 101 done, about 3 min left",
+        "simulating: 45 of 101 done, about 3 min left",
+        "simulating: 48 of 101 done, about 3 min left",
+        "simulating: 51 of 101 done, about 2 min left",
     ]
     assert lines[-4:] == [
-        "simulating and drawing: 95 of 101 done, about 18 s left",
-        "simulating and drawing: 98 of 101 done, about 8 s left",
-        "simulating and drawing: 101 of 101 done",
+        "simulating: 95 of 101 done, about 18 s left",
+        "simulating: 98 of 101 done, about 8 s left",
+        "simulating: 101 of 101 done",
         "compiling the kernels",
     ]
     assert len(lines) == 20, "one in ten seconds"
@@ -522,10 +522,10 @@ def test_a_frame_that_is_being_stepped_counts_as_time(
         for now, frame in ((260, 1), (270, 2), (280, 1), (290, 2)):  # noqa: B007
             progress.update("pilot", frame, 4)
     assert capsys.readouterr().err.splitlines() == [
-        "simulating and drawing: 1 of 4 done",
-        "simulating and drawing: 2 of 4 done, about 2 min left",
-        "simulating and drawing: 2 of 4 done, about 89 s left",
-        "simulating and drawing: 2 of 4 done, about 1 s left",
+        "simulating: 1 of 4 done",
+        "simulating: 2 of 4 done, about 2 min left",
+        "simulating: 2 of 4 done, about 89 s left",
+        "simulating: 2 of 4 done, about 1 s left",
         "pilot runs: 1 of 4 done",
         "pilot runs: 2 of 4 done, about 20 s left",
         "pilot runs: 1 of 4 done",

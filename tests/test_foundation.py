@@ -238,7 +238,8 @@ def test_the_sheet_may_be_pressed_to_a_third_of_the_depth() -> None:
     assert not notes_of(made, RunProgress(1, 0.02, deepest=0.0099), None), "pulled up, or aside, by more"
     assert notes_of(made, RunProgress(1, 0.02, deepest=0.0101), None) == [
         "the sheet was pressed 10.1 mm into the 30 mm of tissue.foundation.depth: beyond a third tissue gets much "
-        "stiffer than this foundation, and the true dent is less deep; press less"
+        "stiffer than this foundation, so that the true dent of a force is less deep, and the true force of a path "
+        "larger; press less"
     ]
     assert not notes_of(tissue((9, 9), foundation=5e5), RunProgress(1, 0.02, deepest=0.02), None), "of unknown depth"
 

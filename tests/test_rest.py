@@ -12,7 +12,9 @@ from PIL import Image
 
 from taichi_msm.errors import DivergedError
 from taichi_msm.physics.kernel import SheetLayout
+from taichi_msm.physics.lattice import rest_positions
 from taichi_msm.physics.loads import frame_loads
+from taichi_msm.physics.paths import path_notes
 from taichi_msm.physics.plan import Plan
 from taichi_msm.physics.rest import ENOUGH, Rest
 from taichi_msm.physics.solver import Dynamics, layout_of
@@ -143,6 +145,8 @@ def test_a_grip_holds_the_points_of_the_frame_before(device: Device) -> None:
     assert_close(
         u, reference.equilibrium(plan, frame_loads(plan, 2), moved_by + nearly_flat(plan) * ~held[..., None], held)
     )
+    others = reference.force(plan.scene, u, frame_loads(plan, 2), 0)[~plan.fixed].sum(axis=0)
+    np.testing.assert_allclose(rest.tool_forces()[0], -others, rtol=0, atol=1e-6 * np.abs(others).max())
     # Let go, at the first frame after the end of the grip, it is flat: the tip is above it.
     rest.advance(1)
     assert not rest.displacement().any()
@@ -150,8 +154,24 @@ def test_a_grip_holds_the_points_of_the_frame_before(device: Device) -> None:
 
 
 def test_one_frame_goes_the_way_of_many(device: Device) -> None:
-    made = at_rest([PRESSED])
-    assert_close(shape_of(plan_of(made), device), shape_of(plan_of(with_rate(made, 20)), device, 20))
+    """At its end the middle of the tip is below the flat sheet, which it would push aside."""
+    made = at_rest([moved([0, 0.5, 0.5, 0.001], [1, 0.5, 0.5, -0.06])])
+    u = shape_of(plan_of(made), device)
+    assert u[..., 2].min() < -0.059
+    assert_close(u, shape_of(plan_of(with_rate(made, 20)), device, 20))
+
+
+@pytest.mark.parametrize("frames", [1, 10])
+def test_a_rod_that_lies_does_not_fall_through_the_sheet(frames: int, device: Device) -> None:
+    """At its end the flat sheet would be above it."""
+    rod = {"radius": 0.005, "shaft": [1, 0, 0], "length": 0.03}
+    made = at_rest(
+        [moved([0, 0.5, 0.5, 0], [1, 0.5, 0.5, -0.015], instrument=rod)],
+        sheet={"points": [31, 31], "size": [0.1, 0.1]},
+        tissue={"young": 3e4, "thickness": 3e-3, "foundation": 3e5, "pretension": 25},
+    )
+    u = shape_of(plan_of(with_rate(made, frames)), device, frames)
+    assert u[..., 2].min() == pytest.approx(-0.015, rel=0.01)
 
 
 def with_rate(made: Scene, rate: float) -> Scene:
@@ -278,5 +298,11 @@ def test_a_sheet_that_nothing_holds_never_rests(device: Device) -> None:
         with pytest.raises(DivergedError, match=r"diverged at 1 s, frame 1: no shape .* nothing holds the sheet; fix"):
             simulation.advance()
         assert simulation.frame == 0
-        assert not (simulation.positions() - simulation.positions()).any()
+        assert (simulation.positions() == rest_positions(simulation.scene.sheet)).all()
         assert "nothing holds" in simulation.diagnose().message
+
+
+def test_a_grip_between_two_frames_is_noted() -> None:
+    plan = plan_of(at_rest([moved([0, 0.5, 0.5, 0.001], grip=[[0.2, 0.8], [0.9, 1.5]])]))
+    (note,) = (note for note in path_notes(plan.scene, plan.tools) if "grip" in note)
+    assert note == "probes.0.grip from 0.2 to 0.8 s holds nothing: no frame is between them"

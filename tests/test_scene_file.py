@@ -789,7 +789,7 @@ def test_errors_in_overrides(load: Load, overrides: Any, expected: str) -> None:
 
 def test_an_item_of_a_list_that_is_not_there(load: Load) -> None:
     assert lines(load, GOOD, ["probes.0.load=[[0, 1]]"]) == [
-        "--set probes.0.load=[[0, 1]]: probes.0: no such item; the list has 0, numbered from 0, as in probes.0.load"
+        "--set probes.0.load=[[0, 1]]: probes.0: no such item; the list is empty, so set it as a whole"
     ]
 
 

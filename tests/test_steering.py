@@ -154,9 +154,9 @@ FORCE = {"total": [0, 0, -1], "load": [[0, 100]]}
 STRUCTURE: dict[str, tuple[list[Any], str]] = {
     "friction": ([{"path": [[0.1, *AT]], "friction": 0.1}, FORCE], "friction and grips cannot be added"),
     "grips": ([{"path": [[0.1, *AT]], "grip": [[0.1, 0.2]]}, FORCE], "friction and grips cannot be added"),
-    "another tool": ([PRESSED, PRESSED], "cannot change"),
+    "another tool": ([PRESSED, PRESSED], "which of them have a path cannot change"),
     "exchanged": ([FORCE, PRESSED], "which of them have a path cannot change"),
-    "one less": ([FORCE], "which of them have a path cannot change"),
+    "one less": ([FORCE], "1 are given, and the scene has 2; give all of them"),
 }
 
 

@@ -183,6 +183,6 @@ def tissue_problems(scene: Scene, fixed: NDArray[np.bool_], factors: Array | Non
         if tissue.pretension >= most:
             yield Problem(
                 ("tissue", "pretension"),
-                f"{tissue.pretension:g} N/m needs springs without length; take less than {most:.3g} N/m, or a larger "
-                "young",
+                f"{tissue.pretension:g} N/m is too much for young, {tissue.young:g} Pa, and thickness: without it the "
+                f"sheet would shrink to nothing; take less than {most:.3g} N/m, or a larger young",
             )

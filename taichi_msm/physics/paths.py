@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from taichi_msm.errors import Problem
 from taichi_msm.physics.lattice import spacing
-from taichi_msm.scene import Probe, Scene, Sheet
+from taichi_msm.scene import WHOLE, Probe, Scene, Sheet
 from taichi_msm.timegrid import TimeGrid
 
 # A tool may move by this share of its radius in a step, and be this much larger than the distance between points
@@ -72,6 +72,12 @@ class Tool:
         x, y, z = (float(np.interp(t, self.times, each)) for each in (*self.middles.T[:2], self.heights))
         return x, y, z
 
+    def touches(self, places: Array, t: float) -> bool:
+        """Tell whether any of these places [m], shape (n, 3), is in or, but for rounding, on the rod at a time [s]."""
+        r = places - self.middle(np.array([t]))[0]
+        s = np.clip(r @ self.axis, 0, self.length)
+        return bool((np.linalg.norm(r - s[:, None] * self.axis, axis=1) < self.radius * (1 + 1e-6)).any())
+
     def strides(self, begin: float, end: float) -> Array:
         """Cut the way from one time to another into parts of at most LARGEST_STRIDE radii; the ends of these [s]."""
         parts, most = 1, LARGEST_STRIDE * self.radius * (1 + 1e-9)
@@ -102,6 +108,13 @@ def unit(shaft: Sequence[float]) -> Array:
     """Give a direction the length 1; the largest number is divided by first, so that no square overflows."""
     axis = np.array(shaft) / max(map(abs, shaft))
     return np.asarray(axis / np.linalg.norm(axis))
+
+
+def grip_frames(grip: tuple[float, float], rate: float) -> range:
+    """List the frames at rest that a grip holds: from the first at or after its begin to before that of its end."""
+    # But for rounding.
+    begin, end = (max(0, math.ceil(time * rate - WHOLE)) for time in grip)
+    return range(begin, end)
 
 
 def path_problems(scene: Scene, tools: Sequence[Tool], grid: TimeGrid) -> Iterator[Problem]:
@@ -145,8 +158,17 @@ def fewest_steps(tools: Sequence[Tool], grid: TimeGrid, least: int) -> int:
 
 def path_notes(scene: Scene, tools: Sequence[Tool]) -> Iterator[str]:
     """Note the tools that are too thin for the points, and two that are in one place."""
-    apart = max(spacing(scene.sheet))
+    apart, side, end = max(spacing(scene.sheet)), max(scene.sheet.size), scene.time.duration
     for tool in tools:
+        if (far := float(np.abs(tool.heights).max())) > side:
+            yield f"probes.{tool.probe}.path: a height of {far:g} m beside a sheet of {side:g} m; heights are in metres"
+        if tool.times[-1] > end * (1 + 1e-9):
+            yield f"probes.{tool.probe}.path ends at {tool.times[-1]:g} s, after the end of the scene at {end:g} s"
+        for begin, until in tool.grips:
+            if begin >= end:
+                yield f"probes.{tool.probe}.grip begins at {begin:g} s, not before the end of the scene at {end:g} s"
+            elif scene.time.at_rest and not grip_frames((begin, until), scene.time.frames_per_second):
+                yield f"probes.{tool.probe}.grip from {begin:g} to {until:g} s holds nothing: no frame is between them"
         if apart > WIDEST_CELL * tool.radius:
             (height, width), most = scene.sheet.size, WIDEST_CELL * tool.radius
             points = [int(np.ceil(side / most)) + 1 for side in (height, width)]

@@ -13,8 +13,8 @@ springs that are pressed together, or on a rod, can give way; there the search g
 times the evaluations. So a weak instability may go unnoticed: 1 % above a critical load, but not 3 %
 (tests/test_rest.py).
 
-Where nothing presses on the flat sheet, that is the shape: without tension it has no stiffness out of its plane, so
-that the forces would never tell the way back.
+Where nothing holds the sheet or is in its way any more, it is flat: without tension it has no stiffness out of its
+plane, so that the forces would never tell the way back.
 """
 
 from __future__ import annotations
@@ -33,19 +33,21 @@ from taichi_msm.physics.kernel import SheetLayout, Start
 from taichi_msm.physics.kernel_rest import Relaxation
 from taichi_msm.physics.lattice import rest_positions
 from taichi_msm.physics.loads import frame_loads
-from taichi_msm.physics.paths import GRASP, Tool
+from taichi_msm.physics.paths import GRASP, Tool, grip_frames
 from taichi_msm.physics.plan import Plan
 from taichi_msm.physics.solver import Dynamics
 from taichi_msm.physics.state import Reading, State
 from taichi_msm.physics.terms import inertia
 from taichi_msm.physics.terms.contact import AFTER, COLUMNS, HELD, PUSHES, SINCE, TAKEN, TOOL_COLUMNS, ContactTerm
 from taichi_msm.progress import Pause
-from taichi_msm.scene import WHOLE
 from taichi_msm.system.runtime import Device
 
 # A frame is done when the forces left are this share of the largest; it is disturbed when they are that share. Where
 # the balance may not be stable, the search goes on to a smaller share.
 ENOUGH, DISTURBED, SURE = 1e-7, 1e-3, 1e-9
+
+# Where no force is larger, there is none [N].
+NOTHING = 1e-30
 
 # Springs may be this much shorter than without any force before they count as pushing.
 SLACK = 1e-9
@@ -111,7 +113,8 @@ class Rest(Dynamics):
 
         It is minus the sum of all other forces on the points that the tool touches or holds.
         """
-        return -np.einsum("tij,ijk->tk", self._touched().astype(float), self._copy(differences=True)[0])
+        # Not -0.
+        return 0.0 - np.einsum("tij,ijk->tk", self._touched().astype(float), self._copy(differences=True)[0])
 
     def _touched(self) -> NDArray[np.bool_]:
         """Tell which points each tool touches or holds, shape (tools, rows, cols)."""
@@ -153,25 +156,38 @@ class Rest(Dynamics):
         self.evaluations = 0
         relaxation, before, loads = self._relaxation, self._before, frame_loads(self.plan, frame)
         contact = self._gripping(frame, before)
-        holds = len(contact) > PUSHES * len(self.plan.tools) and contact[PUSHES * len(self.plan.tools) + HELD].any()
+        held = PUSHES * len(self.plan.tools) + HELD
+        held_before, holds = (len(fields) > held and bool(fields[held].any()) for fields in (before.contact, contact))
         if len(contact):
             relaxation.arrays.set_fields(self.structure.code.first_field(ContactTerm), contact)
-        *ways, last = (self._at(time, frame, self._columns(loads, frame)) for time in self._times(frame))
-        if not loads.strength.any() and not holds:
-            relaxation.place(np.zeros_like(before.displacement))
-            self._astray = True
-            done, left = relaxation.relax(1, 0.0, last)
-            self.evaluations += done
-            if left == 0:
-                self._astray, self.residual = False, 0.0
-                return
         if self._astray:
             relaxation.place(before.displacement)
-        self._astray = True
-        for row in ways:
-            self._relax(frame, row, DISTURBED, pause)
-        self.residual = self._relax(frame, last, ENOUGH, pause)
-        self._astray = False
+        self._astray, left = True, 0.0
+        *ways, end = self._times(frame)
+        for time in (*ways, end):
+            row = self._at(time, frame, self._columns(loads, frame))
+            # What is let go falls, whatever tool is in its way.
+            free = not loads.strength.any() and not holds and (held_before or not self._meets_tool(time))
+            if free and self._falls_flat(row):
+                left = 0.0
+            else:
+                left = self._relax(frame, row, ENOUGH if time == end else DISTURBED, pause)
+        self._astray, self.residual = False, left
+
+    def _meets_tool(self, time: float) -> bool:
+        """Tell whether a tool at that time is in the way of the sheet as it is."""
+        place = rest_positions(self.plan.scene.sheet) + self._copy(differences=False)[0]
+        return any(tool.touches(place[~self.plan.fixed], time) for tool in self.plan.tools)
+
+    def _falls_flat(self, row: NDArray[Any]) -> bool:
+        """Lay the sheet flat, if it stays so."""
+        relaxation, shape = self._relaxation, self._copy(differences=False)[0]
+        relaxation.place(np.zeros_like(shape))
+        done, left = relaxation.relax(1, 0.0, row)
+        self.evaluations += done
+        if left > 0:
+            relaxation.place(shape)
+        return left == 0
 
     def _times(self, frame: int) -> list[float]:
         """List the times of the shapes on the way to a frame, and that of the frame itself."""
@@ -185,18 +201,16 @@ class Rest(Dynamics):
             own = self.structure.code.first_column(ContactTerm) + COLUMNS + TOOL_COLUMNS * n
             middle = tool.middle(np.array([time]))[0]
             row[0, own + AFTER : own + AFTER + 3] = middle
-            for taken, _ in self._held(tool, frame):
+            for taken in self._held(tool, frame):
                 row[0, own + SINCE : own + SINCE + 3] = middle - self._taken_at(tool, taken)
         return row
 
-    def _held(self, tool: Tool, frame: int) -> Iterator[tuple[int, int]]:
-        """Give the grip of a tool at a frame, if any: the frame when it begins, and that when it ends."""
-        rate = self.plan.grid.frames_per_second
+    def _held(self, tool: Tool, frame: int) -> Iterator[int]:
+        """Give the grip of a tool at a frame, if any: the frame when it began."""
         for grip in tool.grips:
-            # The first frames at or after these times, but for rounding.
-            begin, end = (max(0, math.ceil(time * rate - WHOLE)) for time in grip)
-            if begin <= frame < end:
-                yield begin, end
+            frames = grip_frames(grip, self.plan.grid.frames_per_second)
+            if frame in frames:
+                yield frames.start
 
     def _taken_at(self, tool: Tool, frame: int) -> Array:
         """Tell where a tool was when it took hold at a frame: with the points as they were the frame before."""
@@ -209,9 +223,9 @@ class Rest(Dynamics):
             return contact
         held, taken = contact[PUSHES * len(tools) + HELD], contact[PUSHES * len(tools) + TAKEN :]
         place = rest_positions(self.plan.scene.sheet) + before.displacement
-        begun = [any(begin == frame for begin, _ in self._held(tool, frame)) for tool in tools]
+        begun = [frame in self._held(tool, frame) for tool in tools]
         for n, tool in enumerate(tools):
-            if begun[n] or not any(self._held(tool, frame)):
+            if begun[n] or not list(self._held(tool, frame)):
                 held[held == n + 1] = 0
         for n, tool in enumerate(tools):
             if begun[n]:
@@ -227,21 +241,21 @@ class Rest(Dynamics):
         relaxation.stop()
         per_launch = max(1, min(PER_LAUNCH, POINTS_PER_LAUNCH // (self.structure.rows * self.structure.cols)))
         most, evaluations, disturbed = MOST_EVALUATIONS * longer, 0, wanted >= DISTURBED
-        scale, last = relaxation.scale(row), math.inf
+        scale, last = max(NOTHING, relaxation.scale(row)), math.inf
         while True:
             # The first evaluation tells whether there is anything to do.
             first = evaluations == 0
             enough = (wanted if first or disturbed else DISTURBED) * scale
             done, left = relaxation.relax(1 if first else min(per_launch, most - evaluations), enough, row)
             evaluations += done
-            scale = relaxation.scale(row)
+            scale = max(NOTHING, relaxation.scale(row))
             if left <= min(enough, wanted * scale):
                 if wanted == ENOUGH and not first and evaluations < last and self._may_give():
                     # A balance that is not stable shows while these evaluations last.
                     wanted, last = SURE, 4 * evaluations
                     continue
                 self.evaluations += evaluations
-                return left / scale if scale > 0 else 0.0
+                return left / scale
             if wanted == SURE and (left > 10 * ENOUGH * scale or evaluations >= last):
                 wanted = ENOUGH
             if not (left < np.inf and scale < np.inf) or evaluations >= most:

@@ -72,8 +72,8 @@ def run_notes(
     if isinstance(below, Foundation) and progress.deepest > DEEPEST * below.depth:
         yield (
             f"the sheet was pressed {1000 * progress.deepest:.3g} mm into the {1000 * below.depth:.3g} mm of "
-            "tissue.foundation.depth: beyond a third tissue gets much stiffer than this foundation, and the true dent "
-            "is less deep; press less"
+            "tissue.foundation.depth: beyond a third tissue gets much stiffer than this foundation, so that the true "
+            "dent of a force is less deep, and the true force of a path larger; press less"
         )
     if progress.longest_spring > LONGEST:
         yield (

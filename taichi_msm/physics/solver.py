@@ -124,6 +124,8 @@ class Dynamics:
         """
         probes, before = ProbeTerm.of(plan), self.structure.code.require(ProbeTerm)
         tools, compiled = ContactTerm.of(plan), self.structure.code.get(ContactTerm)
+        if [tool.probe for tool in plan.tools] != [tool.probe for tool in self.plan.tools]:
+            raise ArgumentError("probes: which of them have a path cannot change; restart with the new scene")
         if probes.moves != before.moves:
             raise ArgumentError(
                 f"probes: which control points move or jump cannot change (before: {_in_words(before.moves)}; now: "
@@ -131,8 +133,6 @@ class Dynamics:
             )
         if probes.by_area != before.by_area:
             raise ArgumentError("probes: one has total instead of force, or the reverse; restart with the new scene")
-        if [tool.probe for tool in plan.tools] != [tool.probe for tool in self.plan.tools]:
-            raise ArgumentError("probes: which of them have a path cannot change; restart with the new scene")
         if tools and compiled and not tools.is_compiled_in(compiled):
             raise ArgumentError(
                 "probes: friction and grips cannot be added where there were none; restart with the new scene, such as "

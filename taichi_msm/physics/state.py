@@ -63,7 +63,7 @@ class TipForce(NamedTuple):
         tip: the lowest point of the round end of a tool that is moved, or where the control point is on the deformed
             sheet [m].
         force: on the points of the sheet that are not fixed [N]; of a tool that is moved the mean over the steps since
-            the frame before, and 0 at the first one.
+            the frame before, 0 at the first frame; or where the sheet is at rest, that at the frame.
     """
 
     probe: int

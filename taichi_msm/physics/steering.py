@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from taichi_msm.errors import Problem, SceneError
+from taichi_msm.errors import ArgumentError, Problem, SceneError
 from taichi_msm.physics.paths import LARGEST_STRIDE, Tool, too_fast, tools_of
 from taichi_msm.physics.plan import Plan
 from taichi_msm.scene import WHOLE, Probe
@@ -26,15 +26,18 @@ def steered(plan: Plan, probes: Sequence[Probe | Mapping[str, Any]], now: float)
     in a mapping, what is not given of its instrument, friction and grips stays.
 
     Raises:
+        ArgumentError: when they are more or fewer.
         SceneError: when one of them is not a probe; or when a tool that is moved would jump, or do something before
             `now`.
     """
     before = plan.scene.probes
-    given = [_completed(before[n], probe) if n < len(before) else probe for n, probe in enumerate(probes)]
+    if len(probes) != len(before):
+        raise ArgumentError(f"probes: {len(probes)} are given, and the scene has {len(before)}; give all of them")
+    given = [_completed(*pair) for pair in zip(before, probes, strict=True)]
     after = plan.with_probes(given)
     steering = [
         _Steering(plan, index, *pair, now)
-        for index, pair in enumerate(zip(before, after.scene.probes, strict=False))
+        for index, pair in enumerate(zip(before, after.scene.probes, strict=True))
         if pair[0].moved and pair[1].moved and pair[0] != pair[1]
     ]
     if lines := [str(problem) for one in steering for problem in one.problems()]:

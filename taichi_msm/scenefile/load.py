@@ -257,6 +257,8 @@ class Draft:
             elif not (isinstance(part, int) and part < len(holder)):
                 example = ".".join(str(one) for one in (*here, 0, *path[n:][isinstance(part, int) :]))
                 said = f"no such item; the list has {len(holder)}, numbered from 0, as in {example}"
+                if not holder:
+                    said = "no such item; the list is empty, so set it as a whole"
                 return Problem((*here, part), said)
             here = (*here, part)
             if n == len(path) - 1:
