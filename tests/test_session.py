@@ -67,6 +67,18 @@ def advance(session: Session, frames: int) -> list[np.ndarray]:
     return found
 
 
+def played(session: Session, events: dict[int, list[Event]], beats: int) -> Iterator[np.ndarray]:
+    """Give the positions at every frame of a session in which these events happen, each before the beat of its key."""
+    yield session.positions().copy()
+    for beat in range(beats):
+        for event in events.get(beat, []):
+            session.handle(event)
+        before = session.frame
+        session.advance()
+        if session.frame > before:
+            yield session.positions().copy()
+
+
 def displacement(session: Session) -> np.ndarray:
     return np.linalg.norm(session.positions() - rest_positions(session.scene.sheet), axis=-1)
 
@@ -143,7 +155,7 @@ def test_a_drag_moves_the_control_point_with_the_pointer(begin: Begin) -> None:
 def test_run_repeats_a_session_to_the_bit(overrides: dict[str, Any], play: bool, begin: Begin) -> None:
     session = begin({**TILTED, "render.size": [40, 30], **overrides}, play=play)
     rng = np.random.default_rng(4)
-    found = [session.positions().copy()]
+    found: list[np.ndarray] = []
     events: dict[int, list[Event]] = {
         2: [Press(20, 12)],
         9: [Drag(23, 14)],
@@ -155,13 +167,8 @@ def test_run_repeats_a_session_to_the_bit(overrides: dict[str, Any], play: bool,
         36: [Press(22, 18), Key("space"), Key("m")],
         38: [Key("space"), Harder(15)],
     }
-    for beat in range(50):
-        for event in events.get(beat, []):
-            session.handle(event)
-        before = session.frame
-        session.advance()
-        if session.frame > before:
-            found.append(session.positions().copy())
+    for position in played(session, events, 50):
+        found.append(position)
         if rng.random() < 0.1:
             session.picture()
     assert session.frame == 48, "paused for two"
@@ -608,14 +615,10 @@ def test_run_repeats_a_session_by_position_to_the_bit(overrides: dict[str, Any],
     advance(session, 3)
     session.handle(Key("f"))
     assert (session.frame, session.tool.held) == (0, False), "what was done by force is no part of the record"
-    found, gripped, felt = [session.positions().copy()], False, 0.0
-    for beat in range(62):
-        for event in EVENTS.get(beat, []):
-            session.handle(event)
-        before = session.frame
-        session.advance()
-        if session.frame > before:
-            found.append(session.positions().copy())
+    found: list[np.ndarray] = []
+    gripped, felt = False, 0.0
+    for position in played(session, EVENTS, 62):
+        found.append(position)
         gripped, felt = gripped or moved(session).grips, max(felt, session.felt())
     assert gripped
     assert felt > 0

@@ -235,7 +235,10 @@ PER_POINT = "is per point, so that more points would be pressed deeper; set tota
 LONG = "[13, 40] make cells 3.25 times as long as wide, and tissue allows 1.73 times; try [24, 40]"
 WIDE = "[40, 13] make cells 3.25 times as long as wide, and tissue allows 1.73 times; try [40, 24]"
 OPEN = "1 N/m needs every side fixed; set sheet.fixed: border, or pretension: 0"
-TIGHT = "90 N/m needs springs without length; take less than 90 N/m, or a larger young"
+TIGHT = (
+    "90 N/m is too much for young, 30000 Pa, and thickness: without it the sheet would shrink to nothing; "
+    "take less than 90 N/m, or a larger young"
+)
 NO_MAP = "no such file or directory; name a picture that can be read"
 SIZE = (
     "sheet.points: [13, 15] make cells 1.17e+05 times as long as wide, and tissue allows 1.73 times; "
