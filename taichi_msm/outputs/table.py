@@ -97,7 +97,8 @@ def _rows() -> Iterator[Output]:
     yield Output("instrument", "instrument/0000.png", "labels", means, pixel_bytes=0.5)
     means = (
         "of `render.tracks` × `render.tracks` points in the middle of equal fields of the sheet: `coordinates` (N, 2), "
-        "`points` (N, frames, 2) [px] from the picture's upper left corner, NaN behind the eye, `occluded` (N, frames)"
+        "`points` (N, frames, 2) [px] from the picture's upper left corner, NaN behind the eye, `occluded` (N, frames) "
+        "and `position` (N, frames, 3) [m] in the world, on the drawn surface"
     )
     yield Output("tracks", "tracks.npz", "tracks", means, needs_camera=True)
 

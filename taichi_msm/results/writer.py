@@ -125,7 +125,7 @@ class ResultWriter:
             if self.frames == self.stored:
                 self._checkpoint.add(position, forces)
                 self._publication.keep = self._manifest is not None
-            self._labels.add(self.frames, observed)
+            self._labels.add(self.frames, observed, position)
             if self._encoder and observed.picture is not None:
                 self._encoder.add(observed.picture, pause)
             self.frames += 1

@@ -35,7 +35,7 @@ RECORD_BYTES = 1 << 16
 
 # Bytes of a pixel while its labels are found and written; and of a tracked point in a frame, held until the end.
 LABEL_PIXEL_BYTES = 60
-TRACK_BYTES = 9
+TRACK_BYTES = 21
 
 # Bytes of a row of the table of forces, at most, and of what is kept of one until the run ends.
 FORCE_ROW_BYTES = 180
