@@ -613,6 +613,6 @@ class Scene(Section):
     def _picture_given(self) -> Scene:
         if self.draws and self.image is None:
             raise refused(
-                "a picture is needed to draw png or gif; name one, or set output to [trajectory] or []", "image"
+                "a picture is needed to draw png, gif or mp4; name one, or set output to [trajectory] or []", "image"
             )
         return self

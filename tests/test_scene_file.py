@@ -49,12 +49,12 @@ A_PROBE_KEY = "expected keys [[t, percent], ...], t in seconds"
 AN_AT = "expected [across, down], fractions from -1 to 2, or keys [[t, across, down], ...]"
 A_CAMERA = "expected top, oblique, or {eye: [x, y, z], target: [x, y, z], up: [x, y, z], fov: degrees}"
 VECTOR_M = "expected three numbers: [x, y, z] in metres"
-NO_PICTURE = "image: a picture is needed to draw png or gif; name one, or set output to [trajectory] or []"
+NO_PICTURE = "image: a picture is needed to draw png, gif or mp4; name one, or set output to [trajectory] or []"
 
 Load = Callable[..., Scene]
 
 # The kinds of output, as errors list them.
-OUTPUTS = "png, gif, trajectory, forces, coordinates, depth, flow, occlusion, instrument, tracks"
+OUTPUTS = "png, gif, mp4, trajectory, forces, coordinates, depth, flow, occlusion, instrument, tracks"
 
 
 @pytest.fixture
@@ -287,8 +287,8 @@ WRONG_VALUES = {
         [f's.yaml:10:1: output: "png" is not allowed; expected a list of {OUTPUTS}'],
     ),
     "unknown output": (
-        GOOD.replace("[]", "[trajectory, mp4]"),
-        [f's.yaml:10:22: output.1: "mp4" is not allowed; expected a list of {OUTPUTS}'],
+        GOOD.replace("[]", "[trajectory, avi]"),
+        [f's.yaml:10:22: output.1: "avi" is not allowed; expected a list of {OUTPUTS}'],
     ),
     "an instrument without a direction": (
         GOOD + "probes: [{force: [0, 0, 1], instrument: {radius: 0.01, shaft: [0, 0, 0], length: 0.1}}]\n",
@@ -1030,7 +1030,7 @@ def test_the_schema_rejects_what_is_wrong(validator: jsonschema.Draft202012Valid
         {"damping": "1"},
         {"probes": [{}]},
         {"render": {"camera": "side"}},
-        {"output": ["mp4"]},
+        {"output": ["avi"]},
     ):
         assert not validator.is_valid(good | wrong), wrong
     for key in ("sheet", "springs", "time"):

@@ -63,11 +63,15 @@ class Output(NamedTuple):
 def _rows() -> Iterator[Output]:
     """Give the table, in the order in which errors and help name the outputs.
 
-    PNGs store pixels of noise, codes of a GIF have 12 bits, and masks have two values; most pictures take a half or a
-    third of that.
+    PNGs store pixels of noise, codes of a GIF have 12 bits, films in yuv420p 12 bits a pixel before they are encoded,
+    and masks two values; most pictures take a half or a third of that.
     """
     yield Output("png", "frames/0000.png", "picture", "the picture", pixel_bytes=3.01)
     yield Output("gif", "animation.gif", "picture", "the pictures as an animation", pixel_bytes=1.51)
+    means = (
+        "the pictures as a film, H.264 in yuv420p; an odd last row or column is repeated; needs PyAV (`pip install av`)"
+    )
+    yield Output("mp4", "animation.mp4", "picture", means, pixel_bytes=1.6)
     means = "`time` [s], shape (frames,), and `position` of the mass points [m], shape (frames, rows, cols, 3)"
     yield Output("trajectory", "trajectory.npz", "positions", means)
     means = (

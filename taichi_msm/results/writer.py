@@ -1,4 +1,4 @@
-"""Write the results of a run: frames, animation, trajectory, forces and record, whole or not at all."""
+"""Write the results of a run: frames, animations, trajectory, forces and record, whole or not at all."""
 
 from __future__ import annotations
 
@@ -213,6 +213,7 @@ class ResultWriter:
                     png="png" in scene.output,
                     gif="gif" in scene.output,
                     background=scene.render.background,
+                    mp4="mp4" in scene.output,
                 )
                 locks = self._publication.lock_descriptors
                 self._encoder = Encoder(job, locks) if self._beside else PictureWriter(job)

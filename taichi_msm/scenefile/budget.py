@@ -29,6 +29,9 @@ BAND_ROWS = 16  # rows of samples that a thread holds at a time
 PIXEL_BYTES = 3 * 12  # per pixel of the frame: its colours, from sums to bytes
 PICTURE_PIXEL_BYTES = 20  # per pixel of the picture's file, while it is decoded and converted; its texture takes less
 
+# Bytes of a pixel while a film is encoded, most of them in the frames that the encoder looks ahead.
+FILM_PIXEL_BYTES = 80
+
 # The most that a file takes besides [bytes], but for a byte for every row of a PNG; and run.json besides its scene.
 FILE_BYTES = 1024
 RECORD_BYTES = 1 << 16
@@ -170,6 +173,7 @@ def drawing_bytes(scene: Scene) -> int:
     band_rows = min(height * factor, BAND_ROWS * (os.cpu_count() or 1))
     samples = band_rows * width * factor * SAMPLE_BYTES
     pixel = PIXEL_BYTES + (LABEL_PIXEL_BYTES if scene.labels_pixels else 0)
+    pixel += FILM_PIXEL_BYTES if "mp4" in scene.output else 0
     return rows * cols * POINT_BYTES + samples + width * height * pixel + picture * PICTURE_PIXEL_BYTES
 
 
