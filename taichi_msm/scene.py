@@ -573,7 +573,7 @@ class Scene(Section):
     @property
     def renders(self) -> bool:
         """Whether any output depends on what the camera sees."""
-        return self.asks_for("picture", "labels", "flow", "tracks")
+        return any(OUTPUTS[name].is_seen for name in self.output)
 
     @property
     def has_instruments(self) -> bool:

@@ -17,6 +17,10 @@ NUMBERED = r"[0-9]{6,}"
 FIRST, NUMBER = "0000", r"(?:[0-9]{4}|[1-9][0-9]{4,14})"
 
 
+# The columns of the table of forces.
+FORCES_HEADER = ("time", "probe", "tip_x", "tip_y", "tip_z", "force_x", "force_y", "force_z")
+
+
 class Output(NamedTuple):
     """An entry of a scene's `output`.
 
@@ -40,6 +44,11 @@ class Output(NamedTuple):
     def is_series(self) -> bool:
         """Whether there is a file for every frame."""
         return "/" in self.file
+
+    @property
+    def is_seen(self) -> bool:
+        """Whether it depends on what a camera sees; in a run with several cameras each has its own."""
+        return self.source in ("picture", "labels", "flow", "tracks")
 
     @property
     def until_next(self) -> bool:

@@ -28,8 +28,6 @@ from taichi_msm.results.whole import add, create
 from taichi_msm.scene import Scene
 from taichi_msm.timegrid import TimeGrid
 
-FORCES_HEADER = ("time", "probe", "tip_x", "tip_y", "tip_z", "force_x", "force_y", "force_z")
-
 
 def _listed(record: Mapping[str, Any]) -> Listed:
     """Tell of a file whether it is one of the run with this record."""
@@ -196,7 +194,7 @@ class ResultWriter:
             io.TextIOWrapper(file, encoding="ascii", newline="") as text,
         ):
             rows = csv.writer(text, lineterminator="\n")
-            rows.writerow(FORCES_HEADER)
+            rows.writerow(table.FORCES_HEADER)
             for frame in range(self.frames):
                 time = frame / self._scene.time.frames_per_second
                 rows.writerows((time, one.probe, *one.tip, *one.force) for one in self._checkpoint.forces(frame))
