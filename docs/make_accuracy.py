@@ -28,7 +28,7 @@ from taichi_msm.system.compiler import named
 ROOT = Path(__file__).parent.parent
 PAGE, TEMPLATE = ROOT / "docs" / "accuracy.md", ROOT / "docs" / "accuracy.template"
 IMAGES = ROOT / "docs" / "images"
-SCENES = ("press", "figure-3", "drag", "grasp", "two-tools", "tumour")
+SCENES = ("press", "figure-3", "drag", "grasp", "two-tools")
 HARD = sorted((ROOT / "tests" / "hard").glob("*.yaml"))
 TOLERANCE = 1e-3
 

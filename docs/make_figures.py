@@ -11,8 +11,10 @@ import shutil
 import tempfile
 from pathlib import Path
 
+import matplotlib.pyplot as plt
 import numpy as np
 import skimage
+from numpy.typing import NDArray
 from PIL import Image
 
 from taichi_msm import Simulation, load_scene, run
@@ -23,13 +25,14 @@ from taichi_msm.viewer.captures import Captures
 from taichi_msm.viewer.script import film, load_script, timed
 from taichi_msm.viewer.session import Session
 
+Floats = NDArray[np.float64]
+
 ROOT = Path(__file__).parent.parent
 SCENES = ROOT / "scenes"
 IMAGES = ROOT / "docs" / "images"
 
 # For every scene the moment that shows it best [s].
-MOMENTS = {"drag": 0.92, "grasp": 0.76, "two-tools": 0.84}
-PALPATION = 1.0
+MOMENTS = {"drag": 1.12, "two-tools": 0.84, "tumour": 2.2}
 
 # The stages of the paper's figure 3: at rest, pressed, pressed fully, let go.
 STAGES = (0.0, 0.2, 0.4, 0.64)
@@ -49,13 +52,66 @@ def frames(scene_file: Path, moments: tuple[float, ...], size: tuple[int, int]) 
     return pictures
 
 
-def animation(name: str, size: int, *overrides: str, image: Path | None = None) -> None:
-    """Keep the GIF of the scene press, in another size or on another picture."""
+def animation(name: str, scene: str, size: int, *overrides: str, image: Path | None = None) -> None:
+    """Keep the GIF of a scene, in another size or on another picture."""
     settings = [f"render.size=[{size},{size}]", "render.supersample=2", "output=[gif]", *overrides]
-    scene = load_scene(SCENES / "press.yaml", settings, image)
     with tempfile.TemporaryDirectory() as directory:
-        run(scene, directory, overrides=settings)
+        run(load_scene(SCENES / f"{scene}.yaml", settings, image), directory, overrides=settings)
         shutil.copy(Path(directory) / "animation.gif", IMAGES / f"{name}.gif")
+
+
+def forces_of(name: str) -> tuple[Floats, Floats, Floats]:
+    """Return the times [s], the places of the tip [m] and the forces [N] of a scene's only tool in every frame."""
+    time, tip, force = [], [], []
+    with Simulation(load_scene(SCENES / f"{name}.yaml", {"output": []})) as simulation:
+        for _ in range(simulation.scene.time.frames):
+            simulation.advance()
+            (felt,) = simulation.forces()
+            time.append(simulation.time)
+            tip.append(felt.tip)
+            force.append(felt.force)
+    return np.array(time), np.array(tip), np.array(force)
+
+
+def indentation() -> None:
+    """Plot the force of the scene indent against time and depth."""
+    time, tip, force = forces_of("indent")
+    depth, upward = -1000 * tip[:, 2], -force[:, 2]
+    deepest = int(depth.argmax())
+    figure, (over_time, over_depth) = plt.subplots(1, 2, figsize=(9, 3.4), sharey=True, layout="constrained")
+    over_time.plot(time, upward, "o-", color="firebrick", markersize=3)
+    over_time.set(xlabel="time [s]", ylabel="force on the tip [N]")
+    over_depth.plot(
+        depth[: deepest + 1], upward[: deepest + 1], "o-", color="firebrick", markersize=4, label="going down"
+    )
+    over_depth.plot(depth[deepest:], upward[deepest:], "x", color="black", markersize=5, label="coming up")
+    slopes = [np.polyfit(depth[part], upward[part], 1) for part in (slice(0, 3), slice(deepest - 2, deepest + 1))]
+    for slope, at in zip(slopes, ([0, 3.2], [2.8, 6]), strict=True):
+        over_depth.plot(at, np.polyval(slope, at), "--", color="grey", linewidth=1)
+        over_depth.annotate(
+            f"{slope[0]:.2f} N/mm", (at[1], np.polyval(slope, at[1])), (5, -14), textcoords="offset points"
+        )
+    over_depth.set(xlabel="depth of the tip [mm]", xlim=(-0.2, 8))
+    over_depth.legend(frameon=False, loc="upper left")
+    figure.savefig(IMAGES / "indent.png", dpi=130)
+
+
+def palpation() -> None:
+    """Plot the force that a finger feels at each place of the scene tumour, above the map of stiffness."""
+    _, tip, force = forces_of("tumour")
+    scene = load_scene(SCENES / "tumour.yaml")
+    deepest = tip[:, 2] <= tip[:, 2].min() + 1e-9
+    width = 1000 * scene.sheet.size[1]
+    figure, (felt, over) = plt.subplots(2, 1, figsize=(6.4, 5.6), sharex=True, layout="constrained")
+    felt.bar(1000 * tip[deepest, 0], np.linalg.norm(force[deepest], axis=1), width=5, color="firebrick")
+    felt.set(ylabel="force 3 mm deep [N]", box_aspect=0.5)
+    with Image.open(SCENES / "textures" / "tumour.png") as stiffness:
+        quarter = stiffness.height // 4
+        middle = np.asarray(stiffness)[quarter:-quarter]
+        over.imshow(middle, cmap="gray", extent=(-width / 2, width / 2, -width / 4, width / 4))
+    over.plot(1000 * tip[deepest, 0], 1000 * tip[deepest, 1], "o", color="firebrick")
+    over.set(xlabel="place of the tip, from the middle of the sheet [mm]", ylabel="[mm]")
+    figure.savefig(IMAGES / "palpation.png", dpi=130)
 
 
 def live(name: str, size: int, rate: float, seconds: float) -> None:
@@ -104,16 +160,16 @@ def grid(pictures: list[Image.Image], columns: int, gap: int = 6) -> Image.Image
 def main() -> None:
     """Write every picture."""
     IMAGES.mkdir(exist_ok=True)
-    animation("press", 340)
-    animation("retina", 320, "render.camera=top", image=RETINA)
+    animation("press", "press", 320)
+    animation("grasp", "grasp", 320)
+    animation("retina", "press", 320, "render.camera=top", image=RETINA)
+    indentation()
+    palpation()
     live("live", 250, 10, 4.8)
     stages = frames(SCENES / "figure-3.yaml", STAGES, (560, 420))
     grid(stages, 2).save(IMAGES / "figure-3.jpg", quality=90)
     stills = [frames(SCENES / f"{name}.yaml", (moment,), (400, 400))[0] for name, moment in MOMENTS.items()]
     grid(stills, 3).save(IMAGES / "scenes.jpg", quality=90)
-    stiffness = Image.open(SCENES / "textures" / "tumour.png").convert("RGB").resize((400, 400))
-    palpation = frames(SCENES / "tumour.yaml", (0.0, PALPATION), (400, 400))
-    grid([*palpation, stiffness], 3).save(IMAGES / "tumour.jpg", quality=90)
     grid(data_set(8, moment=0.72, size=300), 4).save(IMAGES / "data-set.jpg", quality=88)
     sweep()
     for path in sorted(IMAGES.iterdir()):

@@ -16,8 +16,10 @@ from matplotlib import style
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
+from scipy.optimize import brentq
 from scipy.sparse import coo_matrix, csc_matrix, identity
 from scipy.sparse.linalg import eigsh, spsolve
+from scipy.special import k0, k1
 
 from taichi_msm import Scene, load_scene
 from taichi_msm.physics.error_control import estimate_error, longest
@@ -46,6 +48,9 @@ MODES = 6
 
 # How close to the sheet at rest a stepped one must come, of the largest displacement; it is compared every few steps.
 CLOSE, STRIDE = 1e-6, 16
+
+# The points a side of the sheets that a round tip is pressed into.
+INDENTED = (61, 121, 241)
 
 # Springs of which every one is counted once: down, right.
 HALF = ((0, 1), (1, 0), (1, 1), (1, -1))
@@ -101,7 +106,8 @@ def silent_table() -> str:
 def stiffness(scene: Scene, displacement: Array, active: float) -> csc_matrix:
     """Assemble the second derivative of the energy over the coordinates of all points that move [N/m].
 
-    A spring of direction n and lengths L and L0 adds k ((1 - L0 / L) (I - n n^T) + n n^T) between its ends.
+    The scene is in springs, so that K is the same at all points. A spring of direction n and lengths L and L0 adds
+    k ((1 - L0 / L) (I - n n^T) + n n^T) between its ends.
     """
     rows, cols = scene.sheet.points
     dx, dy = spacing(scene.sheet)
@@ -320,6 +326,49 @@ def at_rest() -> dict[str, Any]:
     return {"rest_table": markdown(head, rows), "rest_close": f"{CLOSE:.0e}", "rest_lifted": f"{lifted:.1f}"}
 
 
+def indentation() -> dict[str, Any]:
+    """Press a round tip into a membrane on a foundation, at rest, and compare its force with the closed form."""
+    tension, foundation, radius, depths = 25.0, 4e5, 0.04, (1e-4, 2e-4, 4e-4)
+    fades, count = math.sqrt(tension / foundation), len(depths)
+    rod = {"radius": radius, "shaft": [0, 0, 1], "length": 0.1}
+    path = [[0, 0.5, 0.5, 0.0], *([n + 1, 0.5, 0.5, -depth] for n, depth in enumerate(depths))]
+    held = {"young": 3e4, "thickness": 3e-3, "pretension": tension, "foundation": foundation}
+    rows = [[f"{1000 * depth:g} mm", f"{resistance(depth, radius, tension, foundation):.4g} N"] for depth in depths]
+    for side in INDENTED:
+        scene = Scene(
+            sheet={"points": [side, side], "size": [0.1, 0.1]},
+            tissue={**held, "foundation_active": "always"},
+            probes=[{"path": path, "instrument": rod}],
+            time={"motion": "quasistatic", "duration": count, "frames_per_second": 1},
+            output=[],
+        )
+        rest = Rest(make_plan(scene), runtime.started())
+        for row, depth in zip(rows, depths, strict=True):
+            rest.advance(1)
+            error = -rest.tool_forces()[0, 2] / resistance(depth, radius, tension, foundation) - 1
+            row.append(f"{100 * error:+.2g} %")
+        rest.close()
+    head = ["depth", "force", *(f"{side} × {side}" for side in INDENTED)]
+    facts = {"tension": f"{tension:g}", "foundation": f"{foundation / 1e3:g}", "radius": f"{1000 * radius:g}"}
+    facts["fades"] = f"{1000 * fades:.1f}"
+    return {f"tip_{name}": fact for name, fact in facts.items()} | {"tip_table": markdown(head, rows)}
+
+
+def resistance(depth: float, radius: float, tension: float, foundation: float) -> float:
+    """Give the force of a round tip on an endless membrane on a foundation [N].
+
+    S w'' = K w, so that w is K0(r / l), l^2 = S / K, outside of the circle that touches, and a paraboloid within.
+    """
+    fades = math.sqrt(tension / foundation)
+
+    def depth_of(c: float) -> float:
+        return float(c / radius * fades / k1(c / fades) * k0(c / fades) + c**2 / (2 * radius))
+
+    c = brentq(lambda c: depth_of(c) - depth, 1e-9, radius / 2)
+    below = foundation * (math.pi * c**2 * depth - math.pi * c**4 / (4 * radius))
+    return float(below + tension * 2 * math.pi * c * c / radius)
+
+
 def frequencies() -> dict[str, Any]:
     """Compare the phase of small motions with that of the modes."""
     scene = press("springs.virtual_active=always", "damping=0", "time.precision=f64", "probes=[]", "time.duration=0.8")
@@ -348,7 +397,7 @@ def main() -> None:
     """Compute, draw, and write the page."""
     runtime.start("cpu")
     facts: dict[str, Any] = {}
-    for part in (frequencies, static, at_rest, energy, buckling, lambda: {"silent_table": silent_table()}):
+    for part in (frequencies, static, at_rest, indentation, energy, buckling, lambda: {"silent_table": silent_table()}):
         facts |= part()
         print(facts, flush=True)
     PAGE.write_text(TEMPLATE.read_text(encoding="utf-8").format(**facts), encoding="utf-8")

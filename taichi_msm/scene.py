@@ -300,10 +300,10 @@ class Probe(Section):
     @field_validator("force", mode="after")
     @classmethod
     def _one_force(cls, force: Vector | None, info: ValidationInfo) -> Vector | None:
-        if "total" not in info.data:
+        if not {"path", "total"} <= info.data.keys():
             return force  # A fault of its own.
         total = info.data["total"]
-        if force is None and total is None and info.data.get("path") is None:
+        if force is None and total is None and info.data["path"] is None:
             raise refused(
                 "missing; expected total (whole tool) or, with springs, force (one point): [x, y, z] in newtons; or "
                 "path, for a tool that is moved"

@@ -8,12 +8,14 @@ from typing import Any
 import numpy as np
 import pytest
 
+from taichi_msm.errors import SceneError
 from taichi_msm.physics.kernel import SheetLayout
 from taichi_msm.physics.paths import fewest_steps
 from taichi_msm.physics.planning import try_plan
 from taichi_msm.physics.solver import Dynamics
 from taichi_msm.physics.state import State
 from taichi_msm.scene import Scene
+from taichi_msm.scenefile.validation import checked
 from taichi_msm.system.runtime import Device
 from tests import reference
 from tests.motion import dynamics_of, structure_of
@@ -59,19 +61,23 @@ def test_the_case_is_what_its_name_says(case: str) -> None:
 
 
 def states(made: Scene, device: Device, layout: SheetLayout) -> bytes:
-    """All that the next steps depend on, at the end."""
-    dynamics = dynamics_of(made, device, layout)
-    dynamics.advance(plan_of(made).grid.steps)
+    """All that the next steps depend on, at the end, and the forces that the tools feel in each frame."""
+    dynamics, grid = dynamics_of(made, device, layout), plan_of(made).grid
+    forces = []
+    for _ in range(grid.frames):
+        dynamics.advance(grid.steps_per_frame)
+        forces.append(dynamics.tool_forces())
+    assert len({force.tobytes() for force in forces}) == grid.frames
     state = dynamics.state()
     dynamics.close()
-    return b"".join(array.tobytes() for array in state[1:])
+    return b"".join(array.tobytes() for array in (*state[1:], *forces))
 
 
 def test_lanes_workers_and_passes_do_not_change_the_bits(device: Device) -> None:
     made = touching(CASES["together"], time={"precision": "f32"})
     layout = structure_of(made, device)
     plain = states(made, device, layout)
-    for lanes, workers, depth in ((layout.code.lanes, 2, 1), (layout.code.lanes, 2, 4), (4, 1, 3), (1, 2, 1)):
+    for lanes, workers, depth in ((layout.code.lanes, 2, 4), (4, 1, 3), (1, 2, 1)):
         assert states(made, device, replace(with_lanes(layout, lanes), workers=workers, depth=depth)) == plain
     assert states(made, device, as_on_a_gpu(layout)) == plain
 
@@ -148,6 +154,47 @@ def test_a_sheet_of_four_points_like_twin(device: Device) -> None:
     made = touching([held])
     small = made.sheet.model_copy(update={"points": (2, 2), "size": (0.3, 0.3), "fixed": "none"})
     assert_like_twin(made.model_copy(update={"sheet": small}), device)
+
+
+PATH = PRESSED["path"]
+REFUSED: dict[str, tuple[dict[str, Any], str]] = {
+    "in the sheet": (
+        moved([0, 0.5, 0.5, -0.01]),
+        "path: the instrument is 0.01 m in the sheet at rest at 0 s; begin above it, at a greater height",
+    ),
+    "a jump": (
+        moved([0, 0.5, 0.5, 0.0], [0, 0.5, 0.5, 0.01]),
+        "path.1: is at 0 s, after one at 0 s; a tool cannot jump: give it a later time",
+    ),
+    "no rod": ({"path": PATH}, "instrument: missing; with path expected a mapping with radius, shaft and length"),
+    "a force": (
+        {**PRESSED, "total": [0, 0, -1]},
+        "total: goes with a force, and path gives the place; remove one of them",
+    ),
+    "no path": ({"total": [0, 0, -1], "friction": 0.1}, "friction: goes with path; a tool with a force has none"),
+    "a grip that ends before": (
+        {**PRESSED, "grip": [[0.2, 0.1]]},
+        "grip.0: ends at 0.1 s, and begins at 0.2 s; give [from, to] in this order",
+    ),
+    "two grips at once": (
+        {**PRESSED, "grip": [[0.1, 0.3], [0.2, 0.4]]},
+        "grip.1: begins at 0.2 s, before the grip before it ends; sort them, without overlap",
+    ),
+}
+
+
+@pytest.mark.parametrize("case", REFUSED)
+def test_what_a_tool_cannot_be_is_refused_with_the_remedy(case: str) -> None:
+    probe, said = REFUSED[case]
+    given: dict[str, Any] = {
+        "sheet": {"points": [9, 11], "size": [0.3, 0.4]},
+        "tissue": {"young": 1e3, "thickness": 0.01, "density": 1000},
+        "time": {"duration": 0.4},
+        "output": [],
+    }
+    with pytest.raises(SceneError) as refused:
+        checked({**given, "probes": [probe]})
+    assert list(refused.value.lines) == [f"probes.0.{said}"]
 
 
 def problems(*keys: list[float], **time: Any) -> list[str]:

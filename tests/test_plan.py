@@ -17,6 +17,9 @@ from taichi_msm.cli import main
 from taichi_msm.physics import lattice, material, plan, planning, terms
 from taichi_msm.physics.planning import make_plan, variant
 
+# Gives a scene a map.
+MAP = "tissue.map={image: textures/tumour.png, range: [1, 13]}"
+
 DERIVED = [
     (terms, "material_of"),
     (terms, "highest_frequency"),
@@ -52,25 +55,25 @@ def calls(monkeypatch: pytest.MonkeyPatch) -> Counter[str]:
 
 def test_a_run_derives_everything_once(root: Path, tmp_path: Path, calls: Counter[str]) -> None:
     short = ["--set", "time.duration=0.08", "--set", "output=[trajectory]", "--no-estimate", "--quiet"]
-    assert main(["run", str(root / "scenes/tumour.yaml"), "--out", str(tmp_path / "out"), *short]) == 0
+    assert main(["run", str(root / "scenes/press.yaml"), "--set", MAP, "--out", str(tmp_path / "out"), *short]) == 0
     assert calls == dict.fromkeys((name for _, name in DERIVED), 1)
 
 
 def test_pilots_with_fewer_points_derive_their_own_sheets_once(root: Path, tmp_path: Path, calls: Counter[str]) -> None:
     short = ["--set", "time.duration=0.08", "--set", "output=[]", "--estimate-error", "--quiet"]
-    assert main(["run", str(root / "scenes/tumour.yaml"), "--out", str(tmp_path / "out"), *short]) == 0
+    assert main(["run", str(root / "scenes/press.yaml"), "--set", MAP, "--out", str(tmp_path / "out"), *short]) == 0
     assert {calls[name] for name in ("material_of", "fixed_points", "map_factors", "stable_step")} == {3}
     assert calls["read_map"] == 1, "the map's file"
 
 
 def test_a_check_derives_everything_once(root: Path, calls: Counter[str], capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(["check", str(root / "scenes/tumour.yaml")]) == 0
+    assert main(["check", str(root / "scenes/press.yaml"), "--set", MAP]) == 0
     assert calls == dict.fromkeys((name for _, name in DERIVED), 1)
     assert "limit" in capsys.readouterr().out
 
 
 def test_a_scene_without_the_map_of_another_one_has_none(root: Path) -> None:
-    mapped = make_plan(load_scene(root / "scenes/tumour.yaml"))
+    mapped = make_plan(load_scene(root / "scenes/press.yaml", [MAP]))
     assert mapped.scene.tissue is not None
     tissue = mapped.scene.tissue.model_copy(update={"map": None})
     plain = variant(mapped, mapped.scene.model_copy(update={"tissue": tissue}))

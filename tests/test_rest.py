@@ -143,6 +143,8 @@ def test_a_grip_holds_the_points_of_the_frame_before(device: Device) -> None:
     assert_close(
         u, reference.equilibrium(plan, frame_loads(plan, 2), moved_by + nearly_flat(plan) * ~held[..., None], held)
     )
+    others = reference.force(plan.scene, u, frame_loads(plan, 2), 0)[~plan.fixed].sum(axis=0)
+    np.testing.assert_allclose(rest.tool_forces()[0], -others, rtol=0, atol=1e-6 * np.abs(others).max())
     # Let go, at the first frame after the end of the grip, it is flat: the tip is above it.
     rest.advance(1)
     assert not rest.displacement().any()
@@ -150,8 +152,11 @@ def test_a_grip_holds_the_points_of_the_frame_before(device: Device) -> None:
 
 
 def test_one_frame_goes_the_way_of_many(device: Device) -> None:
-    made = at_rest([PRESSED])
-    assert_close(shape_of(plan_of(made), device), shape_of(plan_of(with_rate(made, 20)), device, 20))
+    """At its end the middle of the tip is below the flat sheet, which it would push aside."""
+    made = at_rest([moved([0, 0.5, 0.5, 0.001], [1, 0.5, 0.5, -0.06])])
+    u = shape_of(plan_of(made), device)
+    assert u[..., 2].min() < -0.059
+    assert_close(u, shape_of(plan_of(with_rate(made, 20)), device, 20))
 
 
 def with_rate(made: Scene, rate: float) -> Scene:

@@ -11,8 +11,10 @@ import numpy as np
 import pytest
 
 from taichi_msm.errors import DeviceError, DivergedError, SceneError
+from taichi_msm.physics.lattice import rest_positions
 from taichi_msm.physics.rest import ENOUGH, sheet_of
 from taichi_msm.physics.solver import layout_of
+from taichi_msm.results.finished_run import read_run
 from taichi_msm.runner import resume, run
 from taichi_msm.scene import Scene
 from taichi_msm.scenefile.load import load_scene
@@ -111,6 +113,13 @@ def test_a_run_tells_how_well_the_forces_balance(device: Device, tmp_path: Path)
     assert estimate["mesh_error"]
     assert record["notes"][0].startswith("error: none due to a time step, as the sheet is at rest, ")
     assert np.load(tmp_path / "out" / "trajectory.npz")["position"].shape == (FRAMES + 1, *made.sheet.points, 3)
+
+
+def test_a_run_that_begins_pressed_is_read_again(device: Device, tmp_path: Path) -> None:
+    made = at_rest([PUSH], output=["trajectory"])
+    run(made, tmp_path, threads=device.threads)
+    positions = read_run(tmp_path).positions()
+    assert (positions[0] - rest_positions(made.sheet))[..., 2].min() < -1e-3
 
 
 def test_an_interrupted_run_ends_with_the_same_bits(device: Device, tmp_path: Path) -> None:

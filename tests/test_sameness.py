@@ -127,13 +127,14 @@ def test_tissue_gives_the_same_bytes_while_bounds_are_checked(fixed: str, root: 
     settings = [
         "sheet.points=[33, 35]",
         f"sheet.fixed={fixed}",
-        *(() if fixed == "border" else ("tissue.pretension=0", "tissue.bending=0")),
+        "tissue.map={image: textures/tumour.png, range: [1, 13]}",
+        *(["tissue.bending=plate"] if fixed == "border" else ["tissue.pretension=0"]),
         "probes.0.at=[[0, 0.1, 0.1], [0.05, 0.9, 0.95]]",
         "time.duration=0.08",
         "output=[trajectory]",
     ]
     overrides = [word for setting in settings for word in ("--set", setting)]
-    command = [sys.executable, "-m", "taichi_msm", "run", str(root / "scenes" / "tumour.yaml"), *overrides]
+    command = [sys.executable, "-m", "taichi_msm", "run", str(root / "scenes" / "press.yaml"), *overrides]
     for debug in ("0", "1"):
         subprocess.run(
             [*command, "--out", str(tmp_path / debug)],

@@ -27,6 +27,7 @@ from taichi_msm.scenefile.load import load_scene
 from taichi_msm.system.runtime import Device
 from tests.outputs import results
 from tests.scenes import speckle
+from tests.test_contact import moved, touching
 from tests.test_drawing import dented, drawable, with_instruments
 
 DRIVERS = sorted(Path("/usr/share/vulkan/icd.d").glob("lvp_icd*.json"))
@@ -96,6 +97,37 @@ def test_runs_on_a_gpu_are_those_on_the_cpu(small: Path, root: Path, device: Dev
         assert (np.abs(flows[0] - flows[1]).max(axis=-1) > 0.01).mean() < 0.002
         masks = [np.asarray(Image.open(f"{name}/occlusion/{frame:04}.png")) for name in ("whole", "cpu")]
         assert (masks[0] != masks[1]).mean() < 0.002
+
+
+# A run in the current directory.
+TOUCHING = """
+from taichi_msm import run
+from tests.test_vulkan import touched
+print(run(touched(), "there", arch="vulkan")["arch"])
+"""
+
+
+def touched() -> Scene:
+    """A tool that presses, rubs, grips and lets go."""
+    keys = [0, 0.4, 0.5, 0.0], [0.1, 0.4, 0.5, -0.03], [0.2, 0.6, 0.45, -0.03], [0.4, 0.6, 0.5, 0.03]
+    made = touching([moved(*keys, friction=0.3, grip=[[0.2, 0.3]])], time={"precision": "f32"})
+    return made.model_copy(update={"output": ("trajectory", "forces")})
+
+
+def test_tools_touch_on_a_gpu_as_on_the_cpu(
+    tmp_path: Path, root: Path, device: Device, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    done = vulkan(str(DRIVERS[0]), "-c", TOUCHING, root=root)
+    assert (done.returncode, done.stdout) == (0, "vulkan\n"), done.stderr
+    run(touched(), "here", threads=device.threads)
+    there, here = (np.load(f"{name}/trajectory.npz")["position"] for name in ("there", "here"))
+    # 60 steps of a sheet of 0.4 m.
+    assert np.abs(there - here).max() < 60 * 0.4 * 2.0**-24
+    assert np.abs(here - here[0]).max() > 0.02
+    there, here = (np.loadtxt(f"{name}/forces.csv", delimiter=",", skiprows=1)[:, 5:] for name in ("there", "here"))
+    # Either is within 2e-3 of the twin's (tests/test_forces.py).
+    assert np.abs(there - here).max() < 4e-3 * np.abs(here).max()
 
 
 # Prints what `looks` gives, by name, into a file.

@@ -111,7 +111,8 @@ class Rest(Dynamics):
 
         It is minus the sum of all other forces on the points that the tool touches or holds.
         """
-        return -np.einsum("tij,ijk->tk", self._touched().astype(float), self._copy(differences=True)[0])
+        # Not -0.
+        return 0.0 - np.einsum("tij,ijk->tk", self._touched().astype(float), self._copy(differences=True)[0])
 
     def _touched(self) -> NDArray[np.bool_]:
         """Tell which points each tool touches or holds, shape (tools, rows, cols)."""

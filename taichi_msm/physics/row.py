@@ -13,7 +13,7 @@ Tools that are moved then push the points out of their rods, in the rows that th
 
 from collections.abc import Callable
 
-from taichi_msm.physics.terms.contact import ContactTerm
+from taichi_msm.physics.terms.contact import ContactTerm, greatest_lane
 from taichi_msm.physics.terms.springs import SpringTerm
 from taichi_msm.physics.terms.term import DX, DY, HAS_LEFT, HAS_RIGHT, Entry, StepCode
 from taichi_msm.system.runtime import ti
@@ -126,6 +126,7 @@ def row_passing(code: StepCode, move: Callable[..., None]) -> Callable[..., None
 def row_touching(code: StepCode, contact: ContactTerm) -> Callable[..., None]:
     """Make the function that resolves the contact of a row with all tools, if one reaches it."""
     columns, resolve, reaches = code.first_column(None), contact.resolving(code), contact.reaching(code)
+    greatest = greatest_lane(code)
 
     @ti.func
     def touch_row(sheet: ti.template(), i, kind, loads: ti.template(), n):
@@ -138,7 +139,8 @@ def row_touching(code: StepCode, contact: ContactTerm) -> Callable[..., None]:
             for n in ti.static(range(2)):
                 value = sheet.u[n + 1][at + b]
                 least[n], most[n] = ti.min(least[n], value), ti.max(most[n], value)
-        low, high = [least[0].min(), least[1].min()], [most[0].max(), most[1].max()]
+        low = [0 - greatest(0.0 - least[n]) for n in ti.static(range(2))]
+        high = [greatest(most[n]) for n in ti.static(range(2))]
         if reaches(sheet, i, low, high, now):
             for b in range(1, sheet.width - 1):
                 resolve(sheet, i, kind, i, b, now)

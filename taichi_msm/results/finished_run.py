@@ -66,10 +66,10 @@ class FinishedRun:
         rest = rest_positions(self.scene.sheet)
         with reading(path):
             positions = map_array(path, "position", dtype, (self.frames, *rest.shape))
-        # Every run begins at rest; this is checked, as anybody may have written the file. Kernels and other programs
-        # take numbers in f32. Written so that NaN is found too.
-        begins_at_rest = np.array_equal(positions[0], rest.astype(dtype))
-        if not begins_at_rest or not all(np.abs(position).max() <= MOST for position in positions):
+        # Every run in motion begins flat; this is checked, as anybody may have written the file. Kernels and other
+        # programs take numbers in f32. Written so that NaN is found too.
+        begins_right = self.scene.time.at_rest or np.array_equal(positions[0], rest.astype(dtype))
+        if not begins_right or not all(np.abs(position).max() <= MOST for position in positions):
             raise damaged(path)
         return positions
 

@@ -31,9 +31,10 @@ from taichi_msm.physics.terms.term import ACROSS, DY, MOVES, TOP, StepCode, Term
 from taichi_msm.scene import WHOLE, Probe
 
 # Columns of the table of loads. For all tools: the weight of a step's pushes. For each tool: the middle of its tip
-# after the step and before it; what its grip does, and how far it has come since that began; its shape and friction.
+# after the step and before it; what its grip does, and how far it has come since that began; its shape and friction;
+# 1 / the y and the z of its axis.
 WEIGHT, COLUMNS = 0, 1
-AFTER, BEFORE, GRIP, SINCE, AXIS, LENGTH, RADIUS, FRICTION, TOOL_COLUMNS = 0, 3, 6, 7, 10, 13, 14, 15, 16
+AFTER, BEFORE, GRIP, SINCE, AXIS, LENGTH, RADIUS, FRICTION, INVERSE, TOOL_COLUMNS = 0, 3, 6, 7, 10, 13, 14, 15, 16, 18
 
 # What a grip does in a step: nothing, begin, or go on.
 IDLE, BEGINS, GOES_ON = 0.0, 1.0, 2.0
@@ -86,7 +87,8 @@ class ContactTerm(Term):
             own = columns[:, COLUMNS + TOOL_COLUMNS * n : COLUMNS + TOOL_COLUMNS * (n + 1)]
             places = tool.middle(t)
             own[:, AFTER:BEFORE], own[:, BEFORE:GRIP] = places[1:], places[:-1]
-            own[:, AXIS:] = *tool.axis, tool.length, tool.radius, tool.friction
+            inverse = [1 / slope if abs(slope) > NONE else 1 / NONE for slope in tool.axis[1:]]
+            own[:, AXIS:] = *tool.axis, tool.length, tool.radius, tool.friction, *inverse
             for begin, end in tool.grips:
                 # The first steps at or after these times, but for rounding.
                 taken, left = (max(0, math.ceil((at - WHOLE * frame) * grid.steps_per_second)) for at in (begin, end))
@@ -105,19 +107,16 @@ class ContactTerm(Term):
 
         The displacements of the row along y and z are between `low` and `high`, two numbers each.
         """
-        ti, real, tools, grips = code.ti, code.real, self.tools, self.grips
+        ti, real, vector, tools, grips = code.ti, code.real, code.vector, self.tools, self.grips
+        greatest = greatest_lane(code)
         first = code.first_column(ContactTerm) + COLUMNS
         holding = (code.first_field(ContactTerm) + PUSHES * tools + HELD) if grips else 0
 
         @ti.func
-        def cut(low, high, begin, end, start, slope):
-            """Cut the part of a line, from `begin` to `end`, where start + slope s is between two numbers."""
-            if ti.abs(slope) > NONE:
-                one, other = (low - start) / slope, (high - start) / slope
-                begin, end = ti.max(begin, ti.min(one, other)), ti.min(end, ti.max(one, other))
-            elif not low <= start <= high:
-                end = begin - 1
-            return begin, end
+        def cut(low, high, begin, end, start, inverse):
+            """Cut the part of a line, from `begin` to `end`, where start + s / inverse is between two numbers."""
+            one, other = (low - start) * inverse, (high - start) * inverse
+            return ti.max(begin, ti.min(one, other)), ti.min(end, ti.max(one, other))
 
         @ti.func
         def reaches(sheet: ti.template(), i, low: ti.template(), high: ti.template(), now: ti.template()):
@@ -128,15 +127,19 @@ class ContactTerm(Term):
                 near = 1.001 * now[own + RADIUS]
                 begin, end = cut(
                     y + low[0] - near, y + high[0] + near, ti.cast(0, real), now[own + LENGTH], now[own + AFTER + 1],
-                    now[own + AXIS + 1],
+                    now[own + INVERSE],
                 )  # fmt: skip
-                begin, end = cut(low[1] - near, high[1] + near, begin, end, now[own + AFTER + 2], now[own + AXIS + 2])
+                begin, end = cut(
+                    low[1] - near, high[1] + near, begin, end, now[own + AFTER + 2], now[own + INVERSE + 1]
+                )
                 reached = reached or begin <= end
                 if ti.static(grips):
                     reached = reached or now[own + GRIP] == BEGINS
             if ti.static(grips):
+                held = vector(0)
                 for b in range(1, sheet.width - 1):
-                    reached = reached or sheet.fields[(holding * sheet.rows + i) * sheet.width + b].max() > 0
+                    held = ti.max(held, sheet.fields[(holding * sheet.rows + i) * sheet.width + b])
+                reached = reached or greatest(held) > 0
             return reached
 
         return reaches
@@ -150,6 +153,7 @@ class ContactTerm(Term):
         first_field, first = code.first_field(ContactTerm), code.first_column(ContactTerm)
         grip_field = first_field + PUSHES * tools
         own, part = [first + COLUMNS + TOOL_COLUMNS * tool for tool in range(tools)], parting(code)
+        greatest = greatest_lane(code)
 
         @ti.func
         def resolve(sheet: ti.template(), i, kind, at, b, now: ti.template()):
@@ -185,43 +189,60 @@ class ContactTerm(Term):
                 sheet.fields[(grip_field + HELD) * row * sheet.width + here] = held
                 free = ti.select(held == 0, free, vector(0))
             for tool in ti.static(range(tools)):
-                push = [vector(0) for _ in ti.static(range(3))]
                 inside, normal_x, normal_y, normal_z = part(rest, u, now, own[tool])
-                depth, normal = ti.max(inside, 0) * free, [normal_x, normal_y, normal_z]
-                for c in ti.static(range(3)):
-                    push[c] = depth * normal[c]
-                if ti.static(rubs[tool]):
-                    slip = [
-                        d[c] + push[c] - (now[own[tool] + AFTER + c] - now[own[tool] + BEFORE + c])
-                        for c in ti.static(range(3))
-                    ]
-                    along = vector(0)
-                    for c in ti.static(range(3)):
-                        along += slip[c] * normal[c]
-                    speed = vector(0)
-                    for c in ti.static(range(3)):
-                        slip[c] = slip[c] - along * normal[c]
-                        speed += slip[c] * slip[c]
-                    stopped = now[own[tool] + FRICTION] * depth / ti.max(ti.sqrt(speed), NONE)
-                    stopped = ti.min(stopped, 1)
-                    for c in ti.static(range(3)):
-                        push[c] = push[c] - slip[c] * stopped
+                depth = ti.max(inside, 0) * free
+                pushed = depth
                 if ti.static(grips):
+                    pushed = ti.select(held == tool + 1, vector(1), depth)
+                if greatest(pushed) > 0:
+                    normal = [normal_x, normal_y, normal_z]
+                    push = [depth * normal[c] for c in ti.static(range(3))]
+                    if ti.static(rubs[tool]):
+                        slip = [
+                            d[c] + push[c] - (now[own[tool] + AFTER + c] - now[own[tool] + BEFORE + c])
+                            for c in ti.static(range(3))
+                        ]
+                        along = vector(0)
+                        for c in ti.static(range(3)):
+                            along += slip[c] * normal[c]
+                        speed = vector(0)
+                        for c in ti.static(range(3)):
+                            slip[c] = slip[c] - along * normal[c]
+                            speed += slip[c] * slip[c]
+                        stopped = now[own[tool] + FRICTION] * depth / ti.max(ti.sqrt(speed), NONE)
+                        stopped = ti.min(stopped, 1)
+                        for c in ti.static(range(3)):
+                            push[c] = push[c] - slip[c] * stopped
+                    if ti.static(grips):
+                        for c in ti.static(range(3)):
+                            target = sheet.fields[(grip_field + TAKEN + c) * row * sheet.width + here]
+                            target += now[own[tool] + SINCE + c]
+                            push[c] = ti.select(held == tool + 1, target - u[c], push[c])
                     for c in ti.static(range(3)):
-                        target = sheet.fields[(grip_field + TAKEN + c) * row * sheet.width + here]
-                        target += now[own[tool] + SINCE + c]
-                        push[c] = ti.select(held == tool + 1, target - u[c], push[c])
-                for c in ti.static(range(3)):
-                    u[c] += push[c]
-                    d[c] += push[c]
-                    pushes = (first_field + PUSHES * tool + c) * row * sheet.width + here
-                    # Not `+=`, which would be atomic, and of vectors that does not compile.
-                    sheet.fields[pushes] = sheet.fields[pushes] + push[c] * now[first + WEIGHT]
-            for c in ti.static(range(3)):
-                sheet.u[c][entry] = u[c]
-                sheet.d[c][here] = d[c]
+                        # A lane that is not pushed keeps its bits, the sign of a zero too.
+                        u[c] = ti.select(pushed > 0, u[c] + push[c], u[c])
+                        d[c] = ti.select(pushed > 0, d[c] + push[c], d[c])
+                        sheet.u[c][entry], sheet.d[c][here] = u[c], d[c]
+                        pushes = (first_field + PUSHES * tool + c) * row * sheet.width + here
+                        # Not `+=`, which would be atomic, and of vectors that does not compile.
+                        sheet.fields[pushes] = sheet.fields[pushes] + push[c] * now[first + WEIGHT]
 
         return resolve
+
+
+def greatest_lane(code: StepCode) -> Callable[..., Any]:
+    """Make Taichi's function greatest(values), the greatest lane, by shuffles: Taichi's own takes lane after lane."""
+    ti, vector, lanes = code.ti, code.vector, code.lanes
+    halves = [lanes >> n for n in range(1, lanes.bit_length())]
+
+    @ti.func
+    def greatest(values: ti.template()):
+        most = values + vector(0)
+        for half in ti.static(halves):
+            most = ti.max(most, vector([most[(lane + half) % lanes] for lane in ti.static(range(lanes))]))
+        return most[0]
+
+    return greatest
 
 
 def parting(code: StepCode) -> Callable[..., Any]:
