@@ -92,7 +92,7 @@ def run(
 
     Args:
         scene: what `load_scene` returned, or the same as a mapping.
-        directory: where frames/, animation.gif, trajectory.npz, forces.csv and run.json go.
+        directory: where frames/, animation.gif, animation.mp4, trajectory.npz, forces.csv and run.json go.
         arch: cpu, cuda or vulkan.
         threads: number of CPU threads; None takes every core. With 1, pictures are encoded in this process too.
         overrides: the overrides that made the scene, for the record.

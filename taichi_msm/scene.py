@@ -765,7 +765,7 @@ class Scene(Section):
     @property
     def renders(self) -> bool:
         """Whether any output depends on what the camera sees."""
-        return self.asks_for("picture", "labels", "flow", "tracks")
+        return any(OUTPUTS[name].is_seen for name in self.output)
 
     @property
     def has_instruments(self) -> bool:
@@ -805,6 +805,6 @@ class Scene(Section):
     def _picture_given(self) -> Scene:
         if self.draws and self.image is None:
             raise refused(
-                "a picture is needed to draw png or gif; name one, or set output to [trajectory] or []", "image"
+                "a picture is needed to draw png, gif or mp4; name one, or set output to [trajectory] or []", "image"
             )
         return self

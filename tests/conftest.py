@@ -64,6 +64,33 @@ def results(ran: Path, tmp_path: Path) -> Path:
     return Path(shutil.copytree(ran, tmp_path / "results"))
 
 
+@pytest.fixture(scope="session")
+def seen_by_two(device: runtime.Device, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A run as two cameras beside each other have seen it, in `left` and `right`, to be read only; of 320 x 256 px."""
+    here = tmp_path_factory.mktemp("stereo")
+    Image.fromarray(speckle(60, 80)).save(here / "speckle.png")
+    (here / "small.yaml").write_text(SMALL)
+    for side, x in (("left", -0.004), ("right", 0.004)):
+        camera = f"{{eye: [{x}, -0.1, 0.5], target: [{x}, 0, 0], fov: 38}}"
+        overrides = [f"render.camera={camera}", "render.size=[320, 256]", "render.tracks=6"]
+        scene = load_scene(here / "small.yaml", [*overrides, "output=[png, trajectory, forces, tracks]"])
+        run(scene, here / side, threads=device.threads, estimate_error=False)
+    stereo = here / "stereo"
+    for side in ("left", "right"):
+        (stereo / side).mkdir(parents=True)
+        for name in ("frames", "tracks.npz", "camera.json"):
+            (here / side / name).rename(stereo / side / name)
+    for name in ("run.json", "trajectory.npz", "forces.csv"):
+        (here / "left" / name).rename(stereo / name)
+    return stereo
+
+
+@pytest.fixture
+def stereo(seen_by_two: Path, tmp_path: Path) -> Path:
+    """A copy of these results, to be changed."""
+    return Path(shutil.copytree(seen_by_two, tmp_path / "stereo"))
+
+
 Program = Callable[..., subprocess.CompletedProcess[str]]
 
 

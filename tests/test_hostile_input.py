@@ -253,7 +253,7 @@ RULES: dict[str, list[Any]] = {
     "time.damping_difference": ["forward"],
     "time.precision": ["f16", 32],
     "time.step": [1e6, "fast", 0],
-    "output": [["mp4"], "png", {"png": True}],
+    "output": [["avi"], "png", {"png": True}],
 }
 
 

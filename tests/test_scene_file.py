@@ -51,12 +51,12 @@ A_CAMERA = "expected top, oblique, or {eye: [x, y, z], target: [x, y, z], up: [x
 VECTOR_M = "expected three numbers: [x, y, z] in metres"
 EYE = f"{VECTOR_M}, or keys [[t, x, y, z], ...], t in seconds"
 CAMERA_KEYS = "calibration, scale, intrinsics, distortion, outside, pose, poses, eye, target, up, fov"
-NO_PICTURE = "image: a picture is needed to draw png or gif; name one, or set output to [trajectory] or []"
+NO_PICTURE = "image: a picture is needed to draw png, gif or mp4; name one, or set output to [trajectory] or []"
 
 Load = Callable[..., Scene]
 
 # The kinds of output, as errors list them.
-OUTPUTS = "png, gif, trajectory, forces, coordinates, depth, flow, occlusion, instrument, tracks"
+OUTPUTS = "png, gif, mp4, trajectory, forces, coordinates, depth, flow, occlusion, instrument, tracks"
 
 
 @pytest.fixture
@@ -289,8 +289,8 @@ WRONG_VALUES = {
         [f's.yaml:10:1: output: "png" is not allowed; expected a list of {OUTPUTS}'],
     ),
     "unknown output": (
-        GOOD.replace("[]", "[trajectory, mp4]"),
-        [f's.yaml:10:22: output.1: "mp4" is not allowed; expected a list of {OUTPUTS}'],
+        GOOD.replace("[]", "[trajectory, avi]"),
+        [f's.yaml:10:22: output.1: "avi" is not allowed; expected a list of {OUTPUTS}'],
     ),
     "an instrument without a direction": (
         GOOD + "probes: [{force: [0, 0, 1], instrument: {radius: 0.01, shaft: [0, 0, 0], length: 0.1}}]\n",
@@ -1032,7 +1032,7 @@ def test_the_schema_rejects_what_is_wrong(validator: jsonschema.Draft202012Valid
         {"damping": "1"},
         {"probes": [{}]},
         {"render": {"camera": "side"}},
-        {"output": ["mp4"]},
+        {"output": ["avi"]},
     ):
         assert not validator.is_valid(good | wrong), wrong
     for key in ("sheet", "springs", "time"):

@@ -17,6 +17,10 @@ NUMBERED = r"[0-9]{6,}"
 FIRST, NUMBER = "0000", r"(?:[0-9]{4}|[1-9][0-9]{4,14})"
 
 
+# The columns of the table of forces.
+FORCES_HEADER = ("time", "probe", "tip_x", "tip_y", "tip_z", "force_x", "force_y", "force_z")
+
+
 class Output(NamedTuple):
     """An entry of a scene's `output`.
 
@@ -42,6 +46,11 @@ class Output(NamedTuple):
         return "/" in self.file
 
     @property
+    def is_seen(self) -> bool:
+        """Whether it depends on what a camera sees; in a run with several cameras each has its own."""
+        return self.source in ("picture", "labels", "flow", "tracks")
+
+    @property
     def until_next(self) -> bool:
         """Whether it tells of a frame what happens until the next one; then there is none of the last frame."""
         return self.source == "flow"
@@ -63,11 +72,15 @@ class Output(NamedTuple):
 def _rows() -> Iterator[Output]:
     """Give the table, in the order in which errors and help name the outputs.
 
-    PNGs store pixels of noise, codes of a GIF have 12 bits, and masks have two values; most pictures take a half or a
-    third of that.
+    PNGs store pixels of noise, codes of a GIF have 12 bits, films in yuv420p 12 bits a pixel before they are encoded,
+    and masks two values; most pictures take a half or a third of that.
     """
     yield Output("png", "frames/0000.png", "picture", "the picture", pixel_bytes=3.01)
     yield Output("gif", "animation.gif", "picture", "the pictures as an animation", pixel_bytes=1.51)
+    means = (
+        "the pictures as a film, H.264 in yuv420p; an odd last row or column is repeated; needs PyAV (`pip install av`)"
+    )
+    yield Output("mp4", "animation.mp4", "picture", means, pixel_bytes=1.6)
     means = "`time` [s], shape (frames,), and `position` of the mass points [m], shape (frames, rows, cols, 3)"
     yield Output("trajectory", "trajectory.npz", "positions", means)
     means = (
@@ -97,7 +110,8 @@ def _rows() -> Iterator[Output]:
     yield Output("instrument", "instrument/0000.png", "labels", means, pixel_bytes=0.5)
     means = (
         "of `render.tracks` × `render.tracks` points in the middle of equal fields of the sheet: `coordinates` (N, 2), "
-        "`points` (N, frames, 2) [px] from the picture's upper left corner, NaN behind the eye, `occluded` (N, frames)"
+        "`points` (N, frames, 2) [px] from the picture's upper left corner, NaN behind the eye, `occluded` (N, frames) "
+        "and `position` (N, frames, 3) [m] in the world, on the drawn surface"
     )
     yield Output("tracks", "tracks.npz", "tracks", means, needs_camera=True)
 

@@ -17,7 +17,7 @@ from pydantic import TypeAdapter
 from taichi_msm.arguments import require_path
 from taichi_msm.errors import FilesError, MsmError, SceneError
 from taichi_msm.outputs.npz import map_array
-from taichi_msm.outputs.table import OUTPUTS, RECORD, SWEEP
+from taichi_msm.outputs.table import CAMERA, OUTPUTS, RECORD, SWEEP
 from taichi_msm.physics.lattice import rest_positions
 from taichi_msm.physics.planning import try_plan
 from taichi_msm.picture import PictureError, file_sha256, read_rgb
@@ -48,6 +48,7 @@ class FinishedRun:
     sha256: Mapping[str, str]  # of the files of its pictures, by the keys that name them
     overrides: list[str]  # that made the scene from its file
     _record: bytes = field(repr=False)
+    camera: str = ""  # by whose name what is seen is found, in a run with several cameras
 
     @property
     def time(self) -> NDArray[np.float64]:
@@ -119,9 +120,22 @@ class FinishedRun:
 
     def has(self, key: str) -> bool:
         """Tell whether the results have what an entry of `output` asks for."""
-        path = self.directory / OUTPUTS[key].result
+        path = self._folder(key) / OUTPUTS[key].result
         with reading(path):
             return path.exists()
+
+    def cameras(self) -> list[str]:
+        """Name the cameras of a run that has several, in alphabetical order; none: it has one, without a name."""
+        with reading(self.directory):
+            return sorted(
+                path.name
+                for path in self.directory.iterdir()
+                if not path.is_symlink() and (path / CAMERA).is_file() and not (path / RECORD).exists()
+            )
+
+    def _folder(self, key: str) -> Path:
+        """Give the folder of what was written for an entry of `output`."""
+        return self.directory / self.camera if OUTPUTS[key].is_seen else self.directory
 
     def remedy(self, *keys: str) -> str:
         """Say how to get the results of further entries of a scene's `output`."""
@@ -135,13 +149,14 @@ class FinishedRun:
 
         Raises a FilesError when it is not there.
         """
-        result, path = OUTPUTS[key].result, self.directory / OUTPUTS[key].path(frame)
+        result, folder = OUTPUTS[key].result, self._folder(key)
+        path = folder / OUTPUTS[key].path(frame)
         if not self.has(key):
-            raise FilesError(f"{result}: not among the results of {self.directory}; {self.remedy(key)}")
+            raise FilesError(f"{result}: not among the results of {folder}; {self.remedy(key)}")
         if not path.is_file():
             raise FilesError(f"{path}: no such file; {self.remedy(key)}")
         # The results may come from anybody, and what is read here may be given to others.
-        if (self.directory / result).is_symlink() or path.is_symlink():
+        if (folder / result).is_symlink() or path.is_symlink():
             raise FilesError(f"{path}: a symbolic link, which no run writes; {self.remedy(key)}")
         return path
 

@@ -1,4 +1,4 @@
-"""Write pictures as PNG and GIF."""
+"""Write pictures as PNG, GIF and MP4."""
 
 from __future__ import annotations
 
@@ -16,6 +16,7 @@ from typing import NamedTuple
 from PIL import Image
 
 from taichi_msm.outputs.gif import GifWriter, Palette, Picture, shades
+from taichi_msm.outputs.mp4 import Mp4Writer
 from taichi_msm.outputs.table import OUTPUTS
 from taichi_msm.progress import Pause
 from taichi_msm.results.whole import create
@@ -29,14 +30,15 @@ PATIENCE = 0.1
 
 
 class Job(NamedTuple):
-    """What to encode: as `frames/0000.png` and so on, as `animation.gif`, or as both."""
+    """What to encode: as `frames/0000.png` and so on, as `animation.gif`, as `animation.mp4`, or as several of them."""
 
     folder: Path  # where the files go
     size: tuple[int, int]  # width, height of the pictures [px]
     rate: float  # frames per second
     png: bool
     gif: bool
-    background: tuple[int, int, int]  # a colour that the animation keeps exactly
+    background: tuple[int, int, int]  # a colour that the GIF keeps exactly
+    mp4: bool = False
 
     def still(self, number: int) -> Path:
         """Name the PNG of a frame."""
@@ -65,7 +67,7 @@ class PictureWriter:
         self._job, self._waiting, self._hurry = job, waiting, hurry or Event()
         self._frames = self._begun = 0
         self._seconds = 0.0
-        self._gif: GifWriter | None = None
+        self._films: list[GifWriter | Mp4Writer] = []
         self._files = ExitStack()
         self._pending: deque[Future[None]] = deque()
         self._stills = ThreadPoolExecutor(max(1, min(waiting, os.cpu_count() or 1)))
@@ -111,10 +113,10 @@ class PictureWriter:
         return _seconds(_write_png, picture, self._job.still(number))
 
     def _complete(self, picture: Picture, number: int, still: Future[float] | None) -> None:
-        """Complete a frame: first its still, then its place in the film, which so has no frame without a still."""
+        """Complete a frame: first its still, then its place in the films, which so have no frame without a still."""
         self._give_up_in_a_hurry(number)
         spent = still.result() if still else 0.0
-        self._seconds += spent + (_seconds(self._film, picture) if self._job.gif else 0.0)
+        self._seconds += spent + _seconds(self._film, picture)
         self._frames += 1
 
     def _give_up_in_a_hurry(self, number: int) -> None:
@@ -124,16 +126,19 @@ class PictureWriter:
 
     def _film(self, picture: Picture) -> None:
         job = self._job
-        if self._gif is None:  # The first frame shows the colours that the animation needs.
+        if self._frames == 0 and job.gif:  # The first frame shows the colours that the animation needs.
             file = self._files.enter_context(create(job.folder / OUTPUTS["gif"].path()))
-            self._gif = GifWriter(file, job.size, job.rate, Palette(shades(picture), job.background))
-        self._gif.add(picture)
+            self._films.append(GifWriter(file, job.size, job.rate, Palette(shades(picture), job.background)))
+        if self._frames == 0 and job.mp4:
+            file = self._files.enter_context(create(job.folder / OUTPUTS["mp4"].path()))
+            self._films.append(Mp4Writer(file, job.size, job.rate))
+        for film in self._films:
+            film.add(picture)
 
     def _close(self) -> None:
-        """Complete the film, once."""
-        if self._gif is not None:
-            self._seconds += _seconds(self._gif.close)
-            self._gif = None
+        """Complete the films, once."""
+        while self._films:
+            self._seconds += _seconds(self._films.pop().close)
 
 
 def _await(task: Future[None], pause: Pause) -> None:

@@ -1,4 +1,4 @@
-"""Write the results of a run: frames, animation, trajectory, forces and record, whole or not at all."""
+"""Write the results of a run: frames, animations, trajectory, forces and record, whole or not at all."""
 
 from __future__ import annotations
 
@@ -27,8 +27,6 @@ from taichi_msm.results.publication import Contents, Listed, Publication
 from taichi_msm.results.whole import add, create
 from taichi_msm.scene import Scene
 from taichi_msm.timegrid import TimeGrid
-
-FORCES_HEADER = ("time", "probe", "tip_x", "tip_y", "tip_z", "force_x", "force_y", "force_z")
 
 
 def _listed(record: Mapping[str, Any]) -> Listed:
@@ -125,7 +123,7 @@ class ResultWriter:
             if self.frames == self.stored:
                 self._checkpoint.add(position, forces)
                 self._publication.keep = self._manifest is not None
-            self._labels.add(self.frames, observed)
+            self._labels.add(self.frames, observed, position)
             if self._encoder and observed.picture is not None:
                 self._encoder.add(observed.picture, pause)
             self.frames += 1
@@ -196,7 +194,7 @@ class ResultWriter:
             io.TextIOWrapper(file, encoding="ascii", newline="") as text,
         ):
             rows = csv.writer(text, lineterminator="\n")
-            rows.writerow(FORCES_HEADER)
+            rows.writerow(table.FORCES_HEADER)
             for frame in range(self.frames):
                 time = frame / self._scene.time.frames_per_second
                 rows.writerows((time, one.probe, *one.tip, *one.force) for one in self._checkpoint.forces(frame))
@@ -213,6 +211,7 @@ class ResultWriter:
                     png="png" in scene.output,
                     gif="gif" in scene.output,
                     background=scene.render.background,
+                    mp4="mp4" in scene.output,
                 )
                 locks = self._publication.lock_descriptors
                 self._encoder = Encoder(job, locks) if self._beside else PictureWriter(job)

@@ -32,13 +32,16 @@ PICTURE_PIXEL_BYTES = 20  # per pixel of the picture's file, while it is decoded
 # Bytes of a sample's place where a lens bends lines, while these are found and copied.
 PLACE_BYTES = 100
 
+# Bytes of a pixel while a film is encoded, most of them in the frames that the encoder looks ahead.
+FILM_PIXEL_BYTES = 80
+
 # The most that a file takes besides [bytes], but for a byte for every row of a PNG; and run.json besides its scene.
 FILE_BYTES = 1024
 RECORD_BYTES = 1 << 16
 
 # Bytes of a pixel while its labels are found and written; and of a tracked point in a frame, held until the end.
 LABEL_PIXEL_BYTES = 60
-TRACK_BYTES = 9
+TRACK_BYTES = 21
 
 # Bytes of a row of the table of forces, at most, and of what is kept of one until the run ends.
 FORCE_ROW_BYTES = 180
@@ -176,6 +179,7 @@ def drawing_bytes(scene: Scene) -> int:
     if isinstance(camera, Camera) and camera.distortion is not None:
         samples += width * height * factor**2 * PLACE_BYTES
     pixel = PIXEL_BYTES + (LABEL_PIXEL_BYTES if scene.labels_pixels else 0)
+    pixel += FILM_PIXEL_BYTES if "mp4" in scene.output else 0
     return rows * cols * POINT_BYTES + samples + width * height * pixel + picture * PICTURE_PIXEL_BYTES
 
 

@@ -54,14 +54,7 @@ def find(scene: Scene, coordinates: Array, position: Array) -> tuple[Array, NDAr
     camera, (width, height) = view(scene), scene.render.size
     points = np.concatenate([position, np.ones((*position.shape[:2], 1))], axis=-1) @ camera.matrix.T
     surface = refine(points, scene.render.refine)
-    rows, cols = surface.shape[:2]
-    # The vertex to the upper left of each point, and the point's place in the small quad of that vertex.
-    across, down = coordinates[:, 0] * (cols - 1), coordinates[:, 1] * (rows - 1)
-    j, i = (np.clip(p.astype(int), 0, count - 2) for p, count in ((across, cols), (down, rows)))
-    s, t = (across - j)[:, None], (down - i)[:, None]
-    upper = surface[i, j] * (1 - s) + surface[i, j + 1] * (s - t) + surface[i + 1, j + 1] * t
-    lower = surface[i, j] * (1 - t) + surface[i + 1, j] * (t - s) + surface[i + 1, j + 1] * s
-    found = np.where(t > s, lower, upper)
+    found = between(surface, coordinates)
     with np.errstate(divide="ignore", invalid="ignore"):
         places = np.where(found[:, 2:3] > camera.near, found[:, :2] / found[:, 2:3], np.nan)
     x, y = places.T
@@ -77,3 +70,15 @@ def find(scene: Scene, coordinates: Array, position: Array) -> tuple[Array, NDAr
         w, depth = np.tensordot(triangle[:, 2:].T, share, 1)
         hidden |= (share >= 0).all(axis=0) & (w > camera.near) & (depth < limit)
     return pixels, hidden
+
+
+def between(surface: Array, coordinates: Array) -> Array:
+    """Interpolate what the vertices of a refined surface have, linear on each triangle, at some coordinates."""
+    rows, cols = surface.shape[:2]
+    # The vertex to the upper left of each point, and the point's place in the small quad of that vertex.
+    across, down = coordinates[:, 0] * (cols - 1), coordinates[:, 1] * (rows - 1)
+    j, i = (np.clip(p.astype(int), 0, count - 2) for p, count in ((across, cols), (down, rows)))
+    s, t = (across - j)[:, None], (down - i)[:, None]
+    upper = surface[i, j] * (1 - s) + surface[i, j + 1] * (s - t) + surface[i + 1, j + 1] * t
+    lower = surface[i, j] * (1 - t) + surface[i + 1, j] * (t - s) + surface[i + 1, j + 1] * s
+    return np.where(t > s, lower, upper)
