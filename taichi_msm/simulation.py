@@ -310,7 +310,7 @@ class Simulation:
         return self.renderer.draw(self._shot(camera, positions, time))
 
     def labels(self, camera: CameraLike = None, positions: Array | None = None, time: float | None = None) -> Labels:
-        """Give what each pixel shows at its centre: the material point, the depth, whether it is an instrument.
+        """Give what each pixel shows at its centre: the material point, depth, normal, whether it is an instrument.
 
         `camera`, `positions` and `time` are as for `draw`, here and in the methods below, and so are the errors.
         """

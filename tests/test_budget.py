@@ -118,8 +118,8 @@ def test_a_run_takes_no_more_disk_than_was_said(size: tuple[int, int], device: D
     )
     run(made, tmp_path / "out", threads=device.threads)
     sizes = {path: path.stat().st_size for path in (tmp_path / "out").rglob("*") if path.is_file()}
-    # Four kinds of labels and the pictures at 11 frames, two kinds between them, and seven files.
-    assert len(sizes) == 4 * 11 + 2 * 10 + 7
+    # Five kinds of labels and the pictures at 11 frames, two kinds between them, and seven files.
+    assert len(sizes) == 5 * 11 + 2 * 10 + 7
     need = estimate(made)
     assert sum(sizes.values()) <= need.disk_bytes
     pictures = sum(size for path, size in sizes.items() if path.parent.name == "frames")

@@ -100,6 +100,11 @@ def _rows() -> Iterator[Output]:
     )
     yield Output("depth", "depth/0000.tiff", "labels", means, pixel_bytes=4, needs_camera=True)
     means = (
+        "float32 (height, width, 3): the unit normal of what is seen, of the drawn triangle without relief or of the "
+        "instrument, toward the camera, in its axes (x right, y down, z forward); NaN: background"
+    )
+    yield Output("normals", "normals/0000.npy", "labels", means, pixel_bytes=12, needs_camera=True)
+    means = (
         "Middlebury's format: how far what is seen moves until the next frame, right and down [px], hidden there or "
         "not; 1e10: no sheet, or it goes behind the eye or beyond the lens's limit"
     )

@@ -4,8 +4,8 @@ from typing import Any, NamedTuple
 
 from taichi_msm.render import style
 from taichi_msm.render import uniforms as uni
-from taichi_msm.render.geometry import POINT_NUMBERS, on_triangle
-from taichi_msm.render.samples import keep, steps
+from taichi_msm.render.geometry import POINT_NUMBERS, facet, on_triangle
+from taichi_msm.render.samples import keep, keep_unit, steps
 from taichi_msm.system.runtime import ti
 
 # The numbers of the unit normal at a mass point; normals are stored after the other numbers of all mass points.
@@ -168,6 +168,8 @@ def store(
     if ti.static(config.labels):
         keep(at + plane.across, visible, (cell.j + across) / cell.across, samples)
         keep(at + plane.down, visible, (cell.i + along) / cell.down, samples)
+    if ti.static(config.normals):
+        keep_unit(at + plane.facet_x, visible, facet(x, y, triangle, band.numbers), samples)
     if ti.static(config.headlit):
         normal = normal_at(across, along, cell, sheet)
         keep(at + plane.light, visible, headlight(normal, band.numbers), samples)

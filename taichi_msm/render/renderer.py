@@ -81,9 +81,7 @@ class Renderer:
 
     def labels(self, shot: Shot) -> Labels:
         """Give what each pixel shows at its centre."""
-        labels = self._drawing(picture=False, labels=True, lens=shot.view.model).look(*shot).labels
-        assert labels is not None
-        return labels
+        return self._labels(shot, normals=True)
 
     def flow(self, before: Labels, shot: Shot) -> Flow:
         """Give the optical flow to a shot from another one, whose labels are given."""
@@ -112,12 +110,13 @@ class Renderer:
         scene = self.scene
         # Labels need one sample, at the pixel's centre; with several samples per pixel, none is there.
         together = scene.render.supersample == 1
+        normals = "normals" in scene.output
         observed = Observed()
         if scene.draws:
             labels = scene.labels_pixels and together
-            observed = self._drawing(picture=True, labels=labels, lens=shot.view.model).look(*shot)
+            observed = self._drawing(picture=True, labels=labels, normals=normals, lens=shot.view.model).look(*shot)
         if scene.labels_pixels and observed.labels is None:
-            observed = observed._replace(labels=self.labels(shot))
+            observed = observed._replace(labels=self._labels(shot, normals=normals))
         if before is not None and scene.asks_for("flow"):
             observed = observed._replace(flow=self.flow(before, shot))
         if scene.asks_for("tracks"):
@@ -128,20 +127,29 @@ class Renderer:
         """Free the memory."""
         self._drawings.clear()
 
-    def _drawing(self, style: Render | None = None, *, picture: bool, labels: bool, lens: str) -> Drawing:
-        key = self._key(style or self.scene.render, picture=picture, labels=labels, lens=lens)
+    def _labels(self, shot: Shot, *, normals: bool) -> Labels:
+        labels = self._drawing(picture=False, labels=True, normals=normals, lens=shot.view.model).look(*shot).labels
+        assert labels is not None
+        return labels
+
+    def _drawing(
+        self, style: Render | None = None, *, picture: bool, labels: bool, lens: str, normals: bool = False
+    ) -> Drawing:
+        key = self._key(style or self.scene.render, picture=picture, labels=labels, lens=lens, normals=normals)
         if key not in self._drawings:
             from taichi_msm.render.rasterizer import Drawing, drawing_config
 
             scene = self.scene if style is None else self.scene.model_copy(update={"render": style})
             texture = self._texture() if picture else np.zeros((1, 1, 3), np.uint8)
-            config = drawing_config(scene, picture=picture, labels=labels, lens=lens)
+            config = drawing_config(scene, picture=picture, labels=labels, normals=normals, lens=lens)
             self._drawings[key] = Drawing(scene, texture, config)
         return self._drawings[key]
 
-    def _key(self, style: Render, *, picture: bool, labels: bool, lens: str) -> tuple[object, ...]:
+    def _key(
+        self, style: Render, *, picture: bool, labels: bool, lens: str, normals: bool = False
+    ) -> tuple[object, ...]:
         """Give all that tells the drawings of this scene apart."""
-        return picture, labels, lens, style.shading, style.wireframe, self.scene.has_instruments
+        return picture, labels, labels and normals, lens, style.shading, style.wireframe, self.scene.has_instruments
 
     def _texture(self) -> NDArray[np.uint8]:
         """Give the picture on the sheet, which is read again only if the scene names another one."""

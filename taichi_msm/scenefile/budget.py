@@ -39,8 +39,10 @@ FILM_PIXEL_BYTES = 80
 FILE_BYTES = 1024
 RECORD_BYTES = 1 << 16
 
-# Bytes of a pixel while its labels are found and written; and of a tracked point in a frame, held until the end.
+# Bytes of a pixel while its labels are found and written, and its normal; and of a tracked point in a frame, held until
+# the end.
 LABEL_PIXEL_BYTES = 60
+NORMAL_PIXEL_BYTES = 24
 TRACK_BYTES = 21
 
 # Bytes of a row of the table of forces, at most, and of what is kept of one until the run ends.
@@ -179,6 +181,7 @@ def drawing_bytes(scene: Scene) -> int:
     if isinstance(camera, Camera) and camera.distortion is not None:
         samples += width * height * factor**2 * PLACE_BYTES
     pixel = PIXEL_BYTES + (LABEL_PIXEL_BYTES if scene.labels_pixels else 0)
+    pixel += NORMAL_PIXEL_BYTES if "normals" in scene.output else 0
     pixel += FILM_PIXEL_BYTES if "mp4" in scene.output else 0
     return rows * cols * POINT_BYTES + samples + width * height * pixel + picture * PICTURE_PIXEL_BYTES
 

@@ -98,6 +98,7 @@ class Seen(NamedTuple):
         wire: share of the mesh lines in the colour.
         footprint: the larger of a sample's width and height on the texture, in units of style.SHARP texels.
         front: 1 where the front of the triangle is seen, else -1.
+        facet: normal of the triangle's front in the world [m^2], shape (height, width, 3); NaN where none is.
     """
 
     depth: Array
@@ -106,6 +107,7 @@ class Seen(NamedTuple):
     wire: Array
     footprint: Array
     front: Array
+    facet: Array
 
 
 def look(scene: Scene, position: Array, factor: int = 1, texels: tuple[int, int] = (1, 1)) -> Seen:
@@ -123,7 +125,7 @@ def look(scene: Scene, position: Array, factor: int = 1, texels: tuple[int, int]
     matrix = camera.matrix * np.array([[factor], [factor], [1], [1]])
     projected = np.concatenate([position, np.ones((rows, cols, 1))], axis=-1) @ matrix.T
     u, v = np.meshgrid(np.arange(cols) / (cols - 1), np.arange(rows) / (rows - 1))
-    surface = refine(np.concatenate([projected, u[..., None], v[..., None]], axis=-1), scene.render.refine)
+    surface = refine(np.concatenate([projected, u[..., None], v[..., None], position], axis=-1), scene.render.refine)
 
     @cache
     def places(right: float, down: float) -> tuple[Array, Array]:
@@ -131,7 +133,8 @@ def look(scene: Scene, position: Array, factor: int = 1, texels: tuple[int, int]
         x, y = undistorted(camera, (x + right) / factor, (y + down) / factor)
         return x * factor, y * factor
 
-    seen = Seen(*(np.full((height, width), value) for value in (np.inf, np.nan, np.nan, 0.0, 0.0, 1.0)))
+    nothing = (np.inf, np.nan, np.nan, 0.0, 0.0, 1.0, [np.nan] * 3)
+    seen = Seen(*(np.full((height, width, *np.shape(value)), value) for value in nothing))
     for triangle in triangles(surface):
         left, top, right, bottom = 0, 0, width - 1, height - 1
         if (triangle[:, 2] > camera.near).all():
@@ -150,12 +153,13 @@ def look(scene: Scene, position: Array, factor: int = 1, texels: tuple[int, int]
 
         x, y = at(0, 0)
         share = weights(triangle, x, y)
-        w, depth, u, v = np.tensordot(triangle[:, 2:].T, share, 1)
+        w, depth, u, v = np.tensordot(triangle[:, 2:6].T, share, 1)
         here = (share >= -1e-12).all(axis=0) & (w > camera.near) & (depth < seen.depth[box])
         wire = wire_share(scene, triangle, at) if scene.render.wireframe else np.zeros_like(x)
         # From the upper left the corners go down and around: counter-clockwise where the front is seen.
         front = np.full_like(x, -np.sign(np.linalg.det(triangle[:, :3])))
-        found = Seen(depth, u, v, wire, footprint(triangle, at, texels), front)
+        facet = np.broadcast_to(np.cross(*np.diff(triangle[:, 6:], axis=0)), (*x.shape, 3))
+        found = Seen(depth, u, v, wire, footprint(triangle, at, texels), front, facet)
         for kept, new in zip(seen, found, strict=True):
             kept[box][here] = new[here]
     return seen
