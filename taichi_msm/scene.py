@@ -824,17 +824,17 @@ def _require_beside(name: str, cameras: Mapping[str, AnyCamera]) -> None:
     while isinstance(camera, Camera) and camera.beside is not None:
         other = camera.beside
         if other in way:
-            said = "itself" if len(way) == 1 else f"itself, by way of {', '.join(way[1:])}"
-            raise refused(f"{other} is {said}; name a camera that has an eye", name, "beside")
+            if len(way) == 1:
+                raise refused(f"{other} is this camera itself; name another one", name, "beside")
+            raise refused(f"goes round, {', '.join([*way, other])}; give one of them an eye", name, "beside")
         if other not in cameras:
             if len(way) > 1:
                 return  # It is reported where it is named.
-            near = did_you_mean(other, cameras) or f"; there are {', '.join(one for one in cameras if one != name)}"
+            others = [one for one in cameras if one != name]
+            near = did_you_mean(other, others) or f"; the others are {', '.join(others)}"
             raise refused(f"{other}: no camera has this name{near}", name, "beside")
         way.append(other)
         camera = cameras[other]
-    if camera == "top":
-        raise refused(f"{way[-1]} is top, which has no perspective; name a camera that has an eye", name, "beside")
 
 
 class Scene(Section):

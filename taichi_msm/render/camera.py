@@ -103,6 +103,14 @@ class View(NamedTuple):
             return pixels
         return self.centre + self.scale * self.lens.undistort((pixels - self.centre) / self.scale)
 
+    def disparity(self, depth: NDArray[np.float32]) -> NDArray[np.float32]:
+        """Tell how far to the left what is seen at depths [m] is for the camera beside this one [px]; 0 for depth 0.
+
+        Neither may have a lens that bends lines.
+        """
+        w = np.where(depth == 0, np.inf, depth if self.pinhole else 1.0)
+        return (self.scale[0] * self.baseline / w).astype(np.float32)
+
     def sight(self, pixel: tuple[float, float]) -> View:
         """Give a view in which what is seen at the centre of a pixel, right and down from (0, 0), has X = Y = 0."""
         matrix, place = self.matrix.copy(), self.undistorted(np.array(pixel) + 0.5)
@@ -155,9 +163,9 @@ def view_at(scene: Scene, time: float, name: str = "") -> View:
     else:
         seen = _pinhole(camera if isinstance(camera, Camera) else _oblique(scene), scene, time)
     if away:
-        eye, matrix = seen.eye + away * seen.axes[0], seen.matrix.copy()
-        matrix[:, 3] = -matrix[:, :3] @ eye
-        seen = seen._replace(matrix=matrix, eye=eye)
+        shift, matrix = away * seen.axes[0], seen.matrix.copy()
+        matrix[:, 3] -= matrix[:, :3] @ shift
+        seen = seen._replace(matrix=matrix, eye=seen.eye + shift)
     lamp = None if name == render.main else view_at(scene, time)
     return seen._replace(baseline=render.baseline(name), lamp=lamp)
 

@@ -103,12 +103,6 @@ class Stereo(NamedTuple):
     disparity: NDArray[np.float32]
 
 
-def stereo(depth: NDArray[np.float32], focal: float, baseline: float) -> Stereo:
-    """Find the disparity, focal baseline / depth, of a camera with a focal length [px] and one beside it."""
-    seen = np.where(depth == 0, np.inf, depth.astype(np.float64))
-    return Stereo((focal * baseline / seen).astype(np.float32))
-
-
 class Sight(NamedTuple):
     """Where material points are seen.
 

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from taichi_msm.arguments import are_numbers, as_array
 from taichi_msm.errors import ArgumentError, did_you_mean
 from taichi_msm.render.camera import View, moves, view, view_at
-from taichi_msm.render.labels import Flow, Labels, Observed, Sight, stereo, track_grid
+from taichi_msm.render.labels import Flow, Labels, Observed, Sight, Stereo, track_grid
 from taichi_msm.render.surface import Rod
 from taichi_msm.render.texture import load_texture
 from taichi_msm.scene import PRESETS, Camera, Render, Scene
@@ -133,8 +133,7 @@ class Renderer:
         if scene.labels_pixels and observed.labels is None:
             observed = observed._replace(labels=self.labels(shot))
         if observed.labels is not None and scene.asks_for("stereo") and shot.view.baseline:
-            pair = stereo(observed.labels.depth, float(shot.view.scale[0]), shot.view.baseline)
-            observed = observed._replace(stereo=pair)
+            observed = observed._replace(stereo=Stereo(shot.view.disparity(observed.labels.depth)))
         if before is not None and scene.asks_for("flow"):
             observed = observed._replace(flow=self.flow(before, shot))
         if scene.asks_for("tracks"):

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from taichi_msm.outputs.gif import Picture
-from taichi_msm.render.camera import View, held, pinhole, turned
+from taichi_msm.render.camera import View, held, pinhole, turned, view
 from taichi_msm.render.renderer import Renderer, Shot
 from taichi_msm.render.surface import Rod
 from taichi_msm.scene import AnyCamera, Camera, Render
@@ -41,8 +41,8 @@ class Viewport:
         """Choose another camera; those beside it follow."""
         if isinstance(camera, Camera) and not self._plays:
             camera = held(camera, 0.0)
-        self.view = self._renderer.set_up(camera, self._time)
         self.render = self.render.with_main(camera)
+        self.view = view(self._renderer.scene.model_copy(update={"render": self.render, "output": ()}), self._time)
 
     def follow(self, time: float) -> bool:
         """Go where a moving camera is at a time [s]; returns whether it moves."""
@@ -50,7 +50,7 @@ class Viewport:
         camera = self.render.main_camera
         moving = isinstance(camera, Camera) and camera.moves
         if moving:
-            self.view = self._renderer.set_up(camera, time)
+            self.view = self._renderer.set_up(None, time)
         return moving
 
     def recorded(self, duration: float) -> Render:
