@@ -767,10 +767,18 @@ class Render(Section):
                 raise refused(error.message(), name, *(error.context or {}).get("below", ())) from None
         return calibrated
 
+    @model_validator(mode="before")
+    @classmethod
+    def _without_null(cls, data: Any) -> Any:
+        """Take `camera: null` for none, as an override cannot remove a key."""
+        if isinstance(data, Mapping) and data.get("camera", "") is None:
+            return {name: value for name, value in data.items() if name != "camera"}
+        return data
+
     @model_validator(mode="after")
     def _one_way_to_the_cameras(self) -> Self:
         if self.cameras is not None and "camera" in self.model_fields_set:
-            raise refused("is given together with cameras; remove one of them", "camera")
+            raise refused("is given together with cameras; remove one of them, or set it to null", "camera")
         return self
 
     @model_serializer(mode="wrap")

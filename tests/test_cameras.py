@@ -319,9 +319,12 @@ def test_errors_name_the_camera_and_the_key(name: str, small: Path) -> None:
 
 
 def test_what_does_not_go_together_is_refused(small: Path) -> None:
-    both = "--set render.camera=top: render.camera: is given together with cameras; remove one of them"
+    both = (
+        "--set render.camera=top: render.camera: is given together with cameras; remove one of them, or set it to null"
+    )
     assert fails_with("left: top", "render.camera=top") == [both]
-    load_scene("s.yaml", ["render.camera=top", "render.cameras=null"])
+    for override, cameras in (("render.cameras=null", [""]), ("render.camera=null", ["left"])):
+        assert list(load_scene("s.yaml", ["render.camera=top", override]).render.all_cameras) == cameras
     of_none = "disparity needs a camera beside another one; take render.cameras with {beside: NAME, baseline: metres}"
     assert fails_with("left: top", "output=[disparity]") == [
         f"--set output=[disparity]: output: {of_none}, or leave it out"

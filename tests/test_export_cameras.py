@@ -51,8 +51,8 @@ def test_a_camera_is_chosen_by_its_name(name: str, stereo: Path, program: Progra
 
 def test_a_choice_that_is_none_is_told_of(stereo: Path, program: Program) -> None:
     wrong = {
-        (): "its cameras are left and right; choose one with --camera",
-        ("--camera", "lift"): "no camera 'lift'; its cameras are left and right; did you mean 'left'?",
+        (): "its cameras are left, right; choose one with --camera",
+        ("--camera", "lift"): "no camera 'lift'; its cameras are left, right; did you mean 'left'?",
     }
     for options, said in wrong.items():
         done = program("export", str(stereo), "--format", "tapvid", *options)
