@@ -890,11 +890,11 @@ class Scene(Section):
     @property
     def folders(self) -> dict[str, tuple[str, ...]]:
         """The entries of output by their folders: what a camera sees goes to its own, the rest to that of the run."""
-        cameras = self.render.all_cameras
-        folders = {"": tuple(name for name in self.output if not OUTPUTS[name].is_seen)}
-        for camera in cameras:
-            of_pair = bool(self.render.baseline(camera))
-            seen = (name for name in self.output if OUTPUTS[name].is_seen and (of_pair or not OUTPUTS[name].of_pair))
+        wanted = [output for name, output in OUTPUTS.items() if name in self.output]
+        folders = {"": tuple(output.name for output in wanted if not output.is_seen)}
+        for camera in self.render.all_cameras:
+            has_pair = bool(self.render.baseline(camera))
+            seen = (output.name for output in wanted if output.is_seen and (has_pair or not output.of_pair))
             folders[camera] = (*folders.get(camera, ()), *seen)
         return folders
 
