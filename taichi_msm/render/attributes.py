@@ -108,7 +108,7 @@ def absolute(values):
 def headlight(normal: ti.template(), numbers: ti.template()):
     """Share of the headlight that is reflected: the cosine between the normal and the direction to the light."""
     length = ti.sqrt(normal[0] * normal[0] + normal[1] * normal[1] + normal[2] * normal[2])
-    toward = uni.AXES + 6
+    toward = uni.HEADLIGHT
     cosine = absolute(normal[0] * numbers[toward] + normal[1] * numbers[toward + 1] + normal[2] * numbers[toward + 2])
     cosine = cosine / ti.max(length, 1e-30)
     # Where a point is infinite or NaN, so is its normal.

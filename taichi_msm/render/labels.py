@@ -102,6 +102,17 @@ class Flow(NamedTuple):
     occlusion: NDArray[np.uint8]
 
 
+class Stereo(NamedTuple):
+    """What a pair of cameras that are beside each other see differently.
+
+    Attributes:
+        disparity: how far to the left what a pixel shows is in the other picture [px], shape (height, width); 0 where
+            nothing is seen.
+    """
+
+    disparity: NDArray[np.float32]
+
+
 class Sight(NamedTuple):
     """Where material points are seen.
 
@@ -120,6 +131,7 @@ class Observed(NamedTuple):
     picture: NDArray[np.uint8] | None = None  # colours, shape (height, width, 3)
     labels: Labels | None = None
     flow: Flow | None = None  # from the frame before to this one
+    stereo: Stereo | None = None
     tracks: Sight | None = None  # where the tracked points are
 
 

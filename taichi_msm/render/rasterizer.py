@@ -100,9 +100,8 @@ class Drawing:
         """Find the places of the samples, where a lens bends lines, again only if its view of them changes."""
         if not self.config.lens:
             return
-        optics = camera.lens, *camera.scale, *camera.centre
-        if optics != self._optics:
-            self._optics = optics
+        if camera.optics != self._optics:
+            self._optics = camera.optics
             self._form.place(sample_places(camera, self.config.supersample, steps=self.config.place_steps))
 
     def _numbers(self, camera: View, rods: Sequence[Rod]) -> NDArray[np.float32]:

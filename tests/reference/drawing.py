@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from taichi_msm.render import style
-from taichi_msm.render.camera import view
+from taichi_msm.render.camera import View, view
 from taichi_msm.render.surface import Rod
 from taichi_msm.scene import Scene
 from tests.reference.lens import undistorted
@@ -110,7 +110,9 @@ class Seen(NamedTuple):
     facet: Array
 
 
-def look(scene: Scene, position: Array, factor: int = 1, texels: tuple[int, int] = (1, 1)) -> Seen:
+def look(
+    scene: Scene, position: Array, factor: int = 1, texels: tuple[int, int] = (1, 1), camera: View | None = None
+) -> Seen:
     """Find what every sample shows: refine, project, and keep the nearest triangle at every sample.
 
     Args:
@@ -118,10 +120,11 @@ def look(scene: Scene, position: Array, factor: int = 1, texels: tuple[int, int]
         position: positions of the mass points [m], shape (rows, cols, 3).
         factor: samples per pixel along each axis.
         texels: width and height of the texture.
+        camera: another camera than the scene's.
     """
     rows, cols = scene.sheet.points
     width, height = (size * factor for size in scene.render.size)
-    camera = view(scene)
+    camera = camera or view(scene)
     matrix = camera.matrix * np.array([[factor], [factor], [1], [1]])
     projected = np.concatenate([position, np.ones((rows, cols, 1))], axis=-1) @ matrix.T
     u, v = np.meshgrid(np.arange(cols) / (cols - 1), np.arange(rows) / (rows - 1))
@@ -194,7 +197,9 @@ def footprint(triangle: Array, at: Sampled, texels: tuple[int, int]) -> Array:
     return np.asarray(np.maximum(np.hypot(*right), np.hypot(*down)) / (2 * step * style.SHARP))
 
 
-def draw(scene: Scene, position: Array, texture: NDArray[np.uint8], rods: Sequence[Rod] = ()) -> NDArray[np.uint8]:
+def draw(
+    scene: Scene, position: Array, texture: NDArray[np.uint8], rods: Sequence[Rod] = (), camera: View | None = None
+) -> NDArray[np.uint8]:
     """Draw one frame.
 
     Args:
@@ -202,12 +207,13 @@ def draw(scene: Scene, position: Array, texture: NDArray[np.uint8], rods: Sequen
         position: positions of the mass points [m], shape (rows, cols, 3).
         texture: the picture on the sheet, shape (height, width, 3).
         rods: the instruments.
+        camera: another camera than the scene's.
 
     Returns:
         Colours, shape (height, width, 3).
     """
-    factor, camera = scene.render.supersample, view(scene)
-    seen = look(scene, position, factor, (texture.shape[1], texture.shape[0]))
+    factor, camera = scene.render.supersample, camera or view(scene)
+    seen = look(scene, position, factor, (texture.shape[1], texture.shape[0]), camera)
     sheet = np.isfinite(seen.depth)
     u, v = np.where(sheet, seen.u, 0), np.where(sheet, seen.v, 0)
     normal = normals_at(normals(position), u, v) * seen.front[..., None]
@@ -216,7 +222,7 @@ def draw(scene: Scene, position: Array, texture: NDArray[np.uint8], rods: Sequen
     else:
         lit = sample(texture, u, v)
     if scene.render.shading == "headlight":
-        lit *= headlight(normal, camera.axes[2])[..., None]
+        lit *= headlight(normal, (camera.lamp or camera).axes[2])[..., None]
     wire = seen.wire[..., None]
     lit = lit * (1 - wire) + np.array(style.WIRE_COLOUR) * wire
     colour = np.where(sheet[..., None], lit, np.array(scene.render.background, float))
