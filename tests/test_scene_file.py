@@ -56,7 +56,9 @@ NO_PICTURE = "image: a picture is needed to draw png, gif or mp4; name one, or s
 Load = Callable[..., Scene]
 
 # The kinds of output, as errors list them.
-OUTPUTS = "png, gif, mp4, trajectory, forces, coordinates, depth, normals, flow, occlusion, disparity, instrument, tracks"
+OUTPUTS = (
+    "png, gif, mp4, trajectory, forces, coordinates, depth, normals, flow, occlusion, disparity, instrument, tracks"
+)
 
 
 @pytest.fixture
