@@ -6,6 +6,7 @@ import errno
 import io
 from fractions import Fraction
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -51,7 +52,12 @@ def read(path: Path) -> tuple[Any, list[NDArray[np.uint8]], list[float]]:
         assert (stream.codec_context.name, stream.codec_context.pix_fmt) == ("h264", "yuv420p")
         assert stream.frames == len(frames)
         pictures = [frame.to_ndarray(format="rgb24") for frame in frames]
-        return stream, pictures, [float(frame.pts * frame.time_base) for frame in frames]
+        # What it knows is gone with the container.
+        names = ("width", "height", "frames", "average_rate", "time_base", "duration")
+        known = SimpleNamespace(**{name: getattr(stream, name) for name in names})
+        codec = stream.codec_context
+        known.colours = codec.colorspace, codec.color_primaries, codec.color_trc, codec.color_range
+        return known, pictures, [float(frame.pts * frame.time_base) for frame in frames]
 
 
 @pytest.mark.parametrize("size", [(64, 48), (63, 48), (64, 47), (33, 31), (1, 1)])
@@ -84,8 +90,7 @@ def test_the_colours_are_named_so_that_no_player_guesses(tmp_path: Path) -> None
     drawn = [np.full((32, 32, 3), colour, np.uint8) for colour in ((200, 30, 30), (30, 200, 30), (30, 30, 200))]
     write(tmp_path / "a.mp4", drawn, 25)
     stream, shown, _ = read(tmp_path / "a.mp4")
-    code = stream.codec_context
-    assert (code.colorspace, code.color_primaries, code.color_trc, code.color_range) == (1, 1, 1, 1)
+    assert stream.colours == (1, 1, 1, 1)
     for one, other in zip(shown, drawn, strict=True):
         assert np.abs(one.astype(int) - other).max() <= OF_FIELDS
 

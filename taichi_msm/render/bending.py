@@ -5,6 +5,7 @@ there, in samples of its picture.
 """
 
 from taichi_msm.render import uniforms as uni
+from taichi_msm.render.places import BEYOND
 from taichi_msm.system.runtime import ti
 
 # Numbers that are stored of a mass point: where it is seen [samples], and 1 if it is in front of the camera and within
@@ -109,8 +110,8 @@ def bent_bounds(
         right >= numbers[box] and left <= numbers[box + 1] and bottom >= numbers[box + 2] and top <= numbers[box + 3]
     )
     return (
-        ti.select(shown, low_x - far, 1.0),
-        ti.select(shown, high_x + far, -1.0),
-        ti.select(shown, low_y - far, 1.0),
-        ti.select(shown, high_y + far, -1.0),
+        ti.select(shown, low_x - far, BEYOND),
+        ti.select(shown, high_x + far, -BEYOND),
+        ti.select(shown, low_y - far, BEYOND),
+        ti.select(shown, high_y + far, -BEYOND),
     )

@@ -25,6 +25,9 @@ SEEN, POINT_NUMBERS = uni.SEEN, 6
 OVERSTEP = 1e-5
 OVERSTEP_OF_PICTURE = 2e-6
 
+# By this fraction of its size a triangle must be beyond an edge of the picture to be left out.
+BESIDE = 1e-3
+
 # In f32, a cell is drawn as a whole only if its outline stays within this distance [samples].
 FARTHEST = float(1 << 16)
 
@@ -315,6 +318,21 @@ def cell_bounds(at, cols, outline: ti.template(), numbers: ti.template(), point:
 
 
 @ti.func
+def is_beside(p, q, r, left, right, top, bottom):
+    """Tell whether a triangle that may reach behind the camera is beyond an edge of the picture.
+
+    X = x w is a plane for each edge x, behind the camera too; a point beyond it has a larger X, or a smaller one.
+    """
+    beside = False
+    for axis, way, edge in ti.static(((0, -1.0, left), (0, 1.0, right), (1, -1.0, top), (1, 1.0, bottom))):
+        beyond = [(k[axis] - edge * k[2]) * way for k in ti.static((p, q, r))]
+        size = ti.max(*[ti.abs(k[axis]) + ti.abs(edge * k[2]) for k in ti.static((p, q, r))])
+        # By more than it is enlarged, and than f32 can tell.
+        beside = beside or ti.min(*beyond) > BESIDE * size
+    return beside
+
+
+@ti.func
 def triangle_bounds(
     column, line, lower, part, near, width, height,
     patch: ti.template(), numbers: ti.template(), lens: ti.template(),
@@ -358,4 +376,10 @@ def triangle_bounds(
             overstep += OVERSTEP_OF_PICTURE * (width + height) / extent
     elif p[2] <= near and q[2] <= near and r[2] <= near:
         high_x = -1.0
+    else:
+        left, right, top, bottom = 0.0, high_x, 0.0, ti.cast(height, ti.f32)
+        if ti.static(lens != ""):
+            left, right, top, bottom = [numbers[uni.VISIBLE + n] for n in ti.static(range(4))]
+        if is_beside(p, q, r, left, right, top, bottom):
+            high_x = -1.0
     return low_x, high_x, low_y, high_y, overstep
