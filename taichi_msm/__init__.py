@@ -18,6 +18,7 @@ if TYPE_CHECKING:
         SceneError,
     )
     from taichi_msm.exports.convert import export
+    from taichi_msm.gradients import Gradient, gradient
     from taichi_msm.physics.state import TipForce
     from taichi_msm.playback import Playback
     from taichi_msm.render.labels import Flow, Labels, Sight
@@ -48,6 +49,7 @@ __version__ = "0.1.0"
 _HOMES = {
     **dict.fromkeys(("Flow", "Labels", "Sight"), "render.labels"),
     **dict.fromkeys(("resume", "run"), "runner"),
+    **dict.fromkeys(("Gradient", "gradient"), "gradients"),
     "Playback": "playback",
     "TipForce": "physics.state",
     "Simulation": "simulation",
@@ -66,6 +68,7 @@ __all__ = [
     "FilesError",
     "Flow",
     "Foundation",
+    "Gradient",
     "Instrument",
     "Labels",
     "Light",
@@ -87,6 +90,7 @@ __all__ = [
     "TipForce",
     "Tissue",
     "export",
+    "gradient",
     "load_scene",
     "resume",
     "run",

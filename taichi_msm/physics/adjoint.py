@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from taichi_msm.arguments import are_numbers, as_array
 from taichi_msm.errors import ArgumentError, MsmError, SceneError
 from taichi_msm.physics.adjoint_motion import MotionAdjoint
+from taichi_msm.physics.adjoint_rest import RestAdjoint
 from taichi_msm.physics.lattice import rest_positions
 from taichi_msm.physics.plan import Plan
 from taichi_msm.physics.planning import stable_step
@@ -17,6 +18,13 @@ from taichi_msm.physics.slopes import Derivatives, derivatives
 from taichi_msm.system.runtime import Device
 
 Array = NDArray[np.float64]
+
+
+def require_differentiable(plan: Plan) -> None:
+    """Make sure that a scene has a gradient; SceneError: it has tools with a path."""
+    for tool in plan.tools:
+        said = "a tool with a path has no gradient, as points meet and leave it; fit such scenes by differences"
+        raise SceneError([f"probes.{tool.probe}.path: {said}"])
 
 
 class Adjoint:
@@ -28,17 +36,20 @@ class Adjoint:
         cores: number of cores that it may use; None: all.
 
     Raises:
-        SceneError: when a probe has a path: the contact of a tool has no derivative where it begins and ends.
+        SceneError: when a probe has a path.
     """
 
     def __init__(self, plan: Plan, device: Device, cores: int | None = None) -> None:
-        for tool in plan.tools:
-            raise SceneError([f"probes.{tool.probe}.path: has no gradient, as points meet and leave the tool; take differences"])
+        require_differentiable(plan)
         material, points = plan.material, plan.scene.sheet.points
         if material.factors is None:
             material = replace(material, factors=np.ones((points[0] - 1, points[1] - 1)))
         self._plan = replace(plan.with_grid(precision="f64"), material=material)
-        self._sheet = MotionAdjoint(self._plan, device, cores=cores)
+        self._sheet: MotionAdjoint | RestAdjoint
+        if plan.scene.time.at_rest:
+            self._sheet = RestAdjoint(self._plan, device)
+        else:
+            self._sheet = MotionAdjoint(self._plan, device, cores=cores)
         self._ran = False
 
     def run(self, factors: Array | None = None) -> Array:
@@ -77,8 +88,8 @@ class Adjoint:
         shape = plan.grid.frames + 1, *plan.scene.sheet.points, 3
         if not are_numbers(slope, shape) or not np.isfinite(slope).all():
             raise ArgumentError(
-                f"the loss's derivative: {slope.dtype} of shape {slope.shape}; take finite numbers of shape {shape}, as "
-                "the positions have"
+                f"the loss's derivative: {slope.dtype} of shape {slope.shape}; take finite numbers of shape {shape}, "
+                "that of the positions"
             )
         return derivatives(plan, *self._sheet.backward(np.asarray(slope, float)))
 
@@ -91,7 +102,7 @@ class Adjoint:
             raise ArgumentError(f"factors: take numbers above {least:g}, of shape {shape}")
         material = replace(plan.material, factors=np.asarray(factors, float))
         limit = stable_step(material, plan.scene.sheet, plan.scene.time.damping_difference)
-        if plan.grid.step > limit:
+        if not plan.scene.time.at_rest and plan.grid.step > limit:
             raise ArgumentError(
                 f"factors: up to {factors.max():g} need a step of {limit:.6g} s or less, and the scene's is "
                 f"{plan.grid.step:.6g} s; set a smaller time.step"

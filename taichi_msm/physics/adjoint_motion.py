@@ -39,6 +39,7 @@ from taichi_msm.physics.material import area_shares
 from taichi_msm.physics.plan import Plan
 from taichi_msm.physics.slopes import LoadSlopes, Slopes
 from taichi_msm.physics.solver import Dynamics
+from taichi_msm.physics.state import State
 from taichi_msm.physics.terms.damping import coefficients
 from taichi_msm.physics.terms.foundation import point_shares
 from taichi_msm.physics.terms.probes import ProbeTerm
@@ -68,9 +69,21 @@ class _Arrays(NamedTuple):
 class MotionAdjoint(Dynamics):
     """A sheet in motion, and its adjoint; its plan has a map of the stiffness, in f64."""
 
-    def restart(self, plan: Plan, state: Any = None) -> None:
+    # What memory was taken for.
+    _allocated: tuple[Any, ...] = ()
+
+    def restart(self, plan: Plan, state: State | None = None) -> None:
         """Begin again with the same scene or another, as `Dynamics` does."""
         super().restart(plan, state)
+        self._slopes = self.structure.code.require(ProbeTerm).slopes(plan)
+        key = self.structure, plan.grid.steps, len(self._slopes)
+        if key != self._allocated:
+            self._allocate()
+            self._allocated = key
+
+    def _allocate(self) -> None:
+        """Take memory for a layout, a number of steps and of standing slots."""
+        plan = self.plan
         # Segments and their beginnings, which are two shapes each, then take about the same memory.
         self._segment = math.ceil(math.sqrt(2 * plan.grid.steps))
         layout, memory = self.structure, Memory()
@@ -78,7 +91,6 @@ class MotionAdjoint(Dynamics):
         # No two workers write to one page of what they carry.
         self._carried_rows = 1 - (-PAGE // row_bytes)
         self._extra = (MOMENTS + self._carried_rows) * layout.workers
-        self._slopes = layout.code.require(ProbeTerm).slopes(plan)
         sums = -(-ROW_SUMS * layout.rows // layout.width)
 
         def rows(count: int) -> Any:
@@ -88,7 +100,8 @@ class MotionAdjoint(Dynamics):
             return [rows(count) for _ in range(3)]
 
         kept = -(-plan.grid.steps // self._segment) * layout.rows
-        self._memory, self._arrays = memory, _Arrays(
+        self._memory = memory
+        self._arrays = _Arrays(
             three(kept), three(kept),
             three((self._segment + 1) * layout.rows + self._extra), three(layout.rows),
             three(ADJOINT_PARTS * layout.rows + self._extra), three(layout.rows),
@@ -125,9 +138,11 @@ class MotionAdjoint(Dynamics):
         start = gain * (~self.plan.fixed / shares)[..., None] * by_frame[-1]
         for c in range(3):
             # p, an empty buffer, and q.
-            write(arrays.adjoint[c], in_lanes(layout, np.concatenate([start[..., c], 0 * start[..., c], start[..., c]])))
+            parts = start[..., c], 0 * start[..., c], start[..., c]
+            write(arrays.adjoint[c], in_lanes(layout, np.concatenate(parts)))
         none = np.zeros((SUM_PARTS * layout.rows, layout.cols))
-        write(arrays.found, in_lanes(layout, np.concatenate([none, *self._slopes.reshape(-1, layout.rows, layout.cols)])))
+        slopes = self._slopes.reshape(-1, layout.cols)
+        write(arrays.found, in_lanes(layout, np.concatenate([none, slopes])))
         loads, self._buffer = LoadSlopes(self.plan), BUFFERS
         totals = np.zeros(2)
         for first in reversed(range(0, grid.steps, self._segment)):
@@ -152,9 +167,7 @@ class MotionAdjoint(Dynamics):
         entries = layout.rows * layout.width
         _, begin = copying(layout.code)
         with our_compilation():
-            begin(
-                entries, first // self._segment * entries, *arrays.kept, *arrays.last, *arrays.shapes, *arrays.moving
-            )
+            begin(entries, first // self._segment * entries, *arrays.kept, *arrays.last, *arrays.shapes, *arrays.moving)
         table, most = self._table(first, count + 1), self._most_steps()
         for done in range(0, count, most):
             steps = min(most, count - done)

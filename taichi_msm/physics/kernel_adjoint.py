@@ -5,14 +5,14 @@ e be the derivative of the loss by d'. Then p = G e follows, from the last step 
 
     p_n = p_{n+1} + q_n,    q_n = keep q_{n+1} + G (F'(u_n) p_{n+1} + l_n)
 
-where F' is the tangent, which is symmetric, and l_n the derivative of the loss by u_n itself: the steps of a sheet whose
-springs are the tangents of the springs. So the adjoint is swept like the sheet. What enters the force of step n changes
+where F' is the tangent, which is symmetric, and l_n the derivative of the loss by u_n itself: the steps of a sheet with
+the tangents of the springs for springs. So the adjoint is swept like the sheet. What enters the force of step n changes
 the loss by the product of p_{n+1} with the change of the force; these products are added up on the way.
 
 Every worker has a band of rows, and steps it from one buffer into another as soon as its neighbours have come as far. A
 row is swept from left to right, cell by cell. Each spring is evaluated once, except those between two bands, which both
-workers evaluate alike; sums are kept row by row. So the bits do not depend on the number of workers. A worker that waits
-in vain gives up, and one worker goes on for all (`bands`).
+workers evaluate alike; sums are kept row by row. So the bits do not depend on the number of workers. Where a worker
+waits in vain it gives up, and one worker goes on for all (`bands`).
 """
 
 # No `from __future__ import annotations` here: Taichi reads the annotations of a kernel.
@@ -43,9 +43,9 @@ STRIDE = 16
 # What the adjoint's arrays hold, by multiples of the sheet's rows: p in two buffers, q, and the derivative of the loss.
 BUFFERS, LAST, LOSS, ADJOINT_PARTS = 0, 2, 3, 4
 
-# What is added up, by multiples of the sheet's rows: the derivatives by k - tau of springs along rows, along columns and
-# of diagonals, and by the logarithm of K of the points; after them the slopes of the decays of standing slots; and then
-# sums of a row each: of p d, which tells the derivative by keep; by tau of each family; by the bending stiffness.
+# What is added up, by multiples of the sheet's rows: the derivatives by k - tau of springs along rows, along columns
+# and of diagonals, and by the logarithm of K, for a share of 1; after them the slopes of the decays of standing slots;
+# and then sums of a row each: of p d, for the derivative by keep; by tau of each family; by the logarithm of D.
 FAMILIES, HELD, SUM_PARTS = 0, 3, 4
 KEPT, TENSE, BENT, ROW_SUMS = 0, 1, 4, 5
 
@@ -133,10 +133,12 @@ def _banded(take: Callable[..., None], *, parallel: bool) -> Callable[..., None]
     return work
 
 
-def _moments(code: StepCode) -> Callable[..., None]:
-    """Make the function that stores the moments that row i of a band needs: of the row after it, at first of three."""
+def _storing(code: StepCode) -> list[Callable[..., None]]:
+    """Make the function that stores the moments that row i of a band needs, if any: at first of three, then of one."""
     bending, join_strips = code.get(BendingTerm), joining(code)
-    storing = [bending.storing(code)] if bending else []
+    if bending is None:
+        return []
+    store_moment = bending.storing(code)
 
     @ti.func
     def store_moments(sheet: ti.template(), band: ti.template(), i):
@@ -146,18 +148,21 @@ def _moments(code: StepCode) -> Callable[..., None]:
             here, after = band.before + ti.max(0, ti.min(ahead, last)), band.before + ti.min(ahead + 1, last)
             target = band.moments + (ahead + MOMENTS) % MOMENTS
             for b in range(1, sheet.width - 1):
-                for store_moment in ti.static(storing):
-                    store_moment(sheet, ahead, before, here, after, b, target)
+                store_moment(sheet, ahead, before, here, after, b, target)
             join_strips(sheet.u, target, sheet.width)
 
-    return store_moments
+    return [store_moments]
 
 
 def _recording(code: StepCode, *, parallel: bool) -> Callable[..., None]:
     """Make the kernel that takes steps, each from one shape to the next."""
     real, vector, vectors = code.real, code.vector, code.vectors
-    count_of_numbers, bends, join_strips = code.first_number(None), code.get(BendingTerm) is not None, joining(code)
-    store_moments, step = _moments(code), point_step(code)
+    count_of_numbers, join_strips, storing, step = (
+        code.first_number(None),
+        joining(code),
+        _storing(code),
+        point_step(code),
+    )
 
     @ti.func
     def move(sheet: ti.template(), entry: ti.template(), target, force: ti.template(), now: ti.template()):
@@ -179,7 +184,7 @@ def _recording(code: StepCode, *, parallel: bool) -> Callable[..., None]:
                 for c in ti.static(range(3)):
                     sheet.u[c][carry * sheet.width + b] = vector(0)
         for i in range(ti.max(low - 1, 0), high):
-            if ti.static(bends):
+            for store_moments in ti.static(storing):
                 if i >= low:
                     store_moments(sheet, band, i)
             kind = ti.select(i == sheet.rows - 1, 2, ti.select(i == 0, 0, 1))
@@ -218,12 +223,13 @@ def _recording(code: StepCode, *, parallel: bool) -> Callable[..., None]:
 
 def _row_sweeping(code: StepCode) -> Callable[..., None]:
     """Make the function that takes a row of the adjoint a step backward."""
-    real, vector, columns, springs = code.real, code.vector, code.first_column(None), code.require(SpringTerm)
-    structural, shear, tense, bends = springs.structural, springs.shear, springs.tense, code.get(BendingTerm) is not None
+    vector, columns, springs = code.vector, code.first_column(None), code.require(SpringTerm)
+    structural, shear, tense = springs.structural, springs.shear, springs.tense
     differentiate, (*_, of_row, of_column, of_diagonal) = springs.tangent(code), springs.between(code)
     tangents = [add for term in code.terms for add in term.tangents(code)]
     reducing = [reduce for term in code.terms for reduce in term.reducing(code)]
-    probes, laplacian, holds = code.require(ProbeTerm), five_point(code), code.get(FoundationTerm) is not None
+    probes, holds = code.require(ProbeTerm), code.get(FoundationTerm) is not None
+    curving = [] if code.get(BendingTerm) is None else [five_point(code)]
     sense, slots, standing = probes.sensing(code, SUM_PARTS), len(probes.moves), probes.moves.count(False)
     first_tension, held = code.first_number(SpringTerm) + 3, code.first_column(FoundationTerm) if holds else 0
 
@@ -282,9 +288,8 @@ def _row_sweeping(code: StepCode) -> Callable[..., None]:
                     force[c] = carried + (beside[c] - right[c]) - (to_right[c] + down[c])
                     sheet.u[c][carry + b] = (under[c] + to_left[c]) + down[c]
                 if owned:
-                    p, u = [sheet.u[c][here + b] for c in ti.static(range(3))], [
-                        sheet.shapes[c][here + ahead + b] for c in ti.static(range(3))
-                    ]
+                    p = [sheet.u[c][here + b] for c in ti.static(range(3))]
+                    u = [sheet.shapes[c][here + ahead + b] for c in ti.static(range(3))]
                     entry = ti.static(Entry(line, b, p))
                     for add_change in ti.static(tangents):
                         add_change(force, sheet, entry, now)
@@ -320,7 +325,7 @@ def _row_sweeping(code: StepCode) -> Callable[..., None]:
                         kept *= sheet.by_column[(AREA + kind) * width + b]
                     sums[KEPT] += kept
                     sense(pushed, sheet, entry, now)
-                    if ti.static(bends):
+                    for laplacian in ti.static(curving):
                         if kind == 1:
                             # Between the shapes of rows; and moments of p are D times its Laplacian, 0 at edges.
                             shape = band.shape + i
@@ -346,8 +351,8 @@ def _row_sweeping(code: StepCode) -> Callable[..., None]:
 def _sweeping(code: StepCode, *, parallel: bool) -> Callable[..., None]:
     """Make the kernel that takes steps of the adjoint, from the last to the first."""
     real, vector, vectors = code.real, code.vector, code.vectors
-    count_of_numbers, bends, join_strips = code.first_number(None), code.get(BendingTerm) is not None, joining(code)
-    store_moments, sweep_row = _moments(code), _row_sweeping(code)
+    count_of_numbers, join_strips, storing = code.first_number(None), joining(code), _storing(code)
+    sweep_row = _row_sweeping(code)
 
     @ti.func
     def take(sheet: ti.template(), tables: ti.template(), sizes: ti.template(), worker, k):
@@ -367,7 +372,7 @@ def _sweeping(code: StepCode, *, parallel: bool) -> Callable[..., None]:
                 for c in ti.static(range(3)):
                     sheet.u[c][carry * sheet.width + b] = vector(0)
         for i in range(ti.max(low - 1, 0), high):
-            if ti.static(bends):
+            for store_moments in ti.static(storing):
                 if i >= low:
                     store_moments(sheet, band, i)
             sweep_row(sheet, band, i, tables.loads, tables.pushes)

@@ -83,7 +83,8 @@ def schedule(plan: Plan, first: int, count: int) -> Schedule:
 
 def loads_at(plan: Plan, t: Array) -> Schedule:
     """Evaluate the loads themselves, not their averages, with one slot a probe, at times that are no keys [s]."""
-    scene, parts = plan.scene, probe_slots(plan.scene.probes, plan.scene.sheet, 0.0)
+    scene = plan.scene
+    parts = plan.slots if scene.time.at_rest else probe_slots(scene.probes, scene.sheet, 0.0)
     strength, point = np.zeros((len(t), len(parts), 3)), np.zeros((len(t), len(parts), 2))
     for n, part in enumerate(parts):
         probe = scene.probes[part.probe]

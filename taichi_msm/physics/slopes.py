@@ -1,9 +1,9 @@
 """Derivatives of a loss by the numbers that the steps of a sheet are made of, and by those of its scene.
 
 From the scene to a `Material`, and on to what a step keeps and gains, lead short closed forms (`derive` of every term,
-`damping.coefficients`). They are differentiated by complex steps, exact to the last digits: f(x + i h) = f(x) + i h f'(x)
-with an h so small that its square vanishes. Loads are linear in percents, components of forces and control points; so
-the derivative by one of these is the load that it has as 1, with 0 in the place of all others.
+`damping.coefficients`). They are differentiated by complex steps, exact to the last digits: f(x + i h) is
+f(x) + i h f'(x) with an h so small that its square vanishes. Loads are linear in percents, in components of forces, and
+control points in their keys; so the derivative by one of these is what comes out for 1, with 0 for all others.
 """
 
 from __future__ import annotations
@@ -18,6 +18,7 @@ from pydantic import BaseModel
 
 from taichi_msm.physics.loads import Schedule
 from taichi_msm.physics.plan import Plan, ProbeSegment
+from taichi_msm.physics.probe_force import control_points
 from taichi_msm.physics.terms import material_of
 from taichi_msm.physics.terms.damping import coefficients
 from taichi_msm.physics.terms.springs import stiffness
@@ -125,14 +126,15 @@ def _by_factors(plan: Plan, slopes: Slopes) -> Array:
         along_rows[[0, -1]] *= 2
         along_columns[:, [0, -1]] *= 2
     across = material.across / 2 * (along_rows[:-1] + along_rows[1:])
-    return across + material.down / 2 * (along_columns[:, :-1] + along_columns[:, 1:]) + material.shear * slopes.springs[2]
+    down = material.down / 2 * (along_columns[:, :-1] + along_columns[:, 1:])
+    return across + down + material.shear * slopes.springs[2]
 
 
 def _paths(scene: Scene) -> Iterator[tuple[str, ...]]:
     """List the keys of the material that have a derivative."""
     names = ["young", "thickness", "foundation", "pretension", "bending"]
-    moving = [("tissue", "density"), ("tissue", "damping")]
-    every = [("tissue", name) for name in names]
+    moving: list[tuple[str, ...]] = [("tissue", "density"), ("tissue", "damping")]
+    every: list[tuple[str, ...]] = [("tissue", name) for name in names]
     if scene.tissue is None:
         every = [("springs", name) for name in ("structural", "shear", "virtual")]
         moving = [("sheet", "mass"), ("damping",)]
@@ -176,7 +178,7 @@ class LoadSlopes:
             probe = plan.scene.probes[index]
             self.by_key[f"probes.{index}.{_force(probe)}"] = np.zeros(3)
             self.by_key[f"probes.{index}.load"] = np.zeros(len(probe.load))
-            self.by_key[f"probes.{index}.at"] = np.zeros(np.shape(probe.at)[:-1] + (2,))
+            self.by_key[f"probes.{index}.at"] = np.zeros((*np.shape(probe.at)[:-1], 2))
 
     def add(self, schedule_of: Callable[[Plan], Schedule], pushes: Array, times: tuple[float, float]) -> None:
         """Add the derivatives by some steps.
@@ -197,7 +199,7 @@ class LoadSlopes:
                 unit = schedule_of(self._with_probe(index, {"load": load})).strength
                 self._at(index, "load")[n] += (by_force * unit).sum()
             places = self._at(index, "at").reshape(-1, 2)
-            at = [key[0] for key in probe.at] if len(places) > 1 else [0.0]
+            at = control_points(probe, self._plan.scene.sheet)[0].tolist()
             # A control point is held before its first key, too.
             for n in _acting(at, times, before=True):
                 share = schedule_of(self._with_place(index, n)).point
