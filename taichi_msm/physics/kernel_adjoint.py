@@ -418,6 +418,7 @@ def copying(code: StepCode) -> tuple[Callable[..., None], Callable[..., None]]:
         kept_x: vectors, kept_y: vectors, kept_z: vectors,
     ):  # fmt: skip
         """Copy the first entries of u to those from `first` on of what is kept."""
+        ti.loop_config(serialize=True)
         for n in range(entries):
             for u, kept in ti.static(((u_x, kept_x), (u_y, kept_y), (u_z, kept_z))):
                 kept[first + n] = u[n]
@@ -432,6 +433,7 @@ def copying(code: StepCode) -> tuple[Callable[..., None], Callable[..., None]]:
         d_x: vectors, d_y: vectors, d_z: vectors,
     ):  # fmt: skip
         """Begin with the shape before the one kept, this one, and its last difference."""
+        ti.loop_config(serialize=True)
         for n in range(entries):
             for kept, last, u, d in ti.static((
                 (kept_x, last_x, u_x, d_x), (kept_y, last_y, u_y, d_y), (kept_z, last_z, u_z, d_z)
