@@ -103,7 +103,7 @@ class MotionAdjoint(Dynamics):
         self._memory = memory
         self._arrays = _Arrays(
             three(kept), three(kept),
-            three((self._segment + 1) * layout.rows + self._extra), three(layout.rows),
+            three(self._segment * layout.rows + self._extra), three(layout.rows),
             three(ADJOINT_PARTS * layout.rows + self._extra), three(layout.rows),
             rows((SUM_PARTS + 2 * len(self._slopes)) * layout.rows + sums),
         )  # fmt: skip
@@ -172,25 +172,30 @@ class MotionAdjoint(Dynamics):
 
     def _keep(self, segment: int) -> None:
         """Keep the state at the beginning of a segment."""
-        layout, arrays = self.structure, self._arrays
-        entries = layout.rows * layout.width
-        keep, _ = copying(layout.code)
+        arrays, first = self._arrays, segment * self._entries
+        self._copy_entries(0, first, self._moving.arrays.u, arrays.kept)
+        self._copy_entries(0, first, self._moving.arrays.d, arrays.last)
+
+    @property
+    def _entries(self) -> int:
+        """Entries of a shape."""
+        return self.structure.rows * self.structure.width
+
+    def _copy_entries(self, source: int, target: int, of: list[Any], to: list[Any]) -> None:
+        """Copy a shape from one entry of three arrays to one of others."""
         with our_compilation():
-            keep(entries, segment * entries, *self._moving.arrays.u, *arrays.kept)
-            keep(entries, segment * entries, *self._moving.arrays.d, *arrays.last)
+            copying(self.structure.code)(self._entries, source, target, *of, *to)
 
     def _record(self, first: int, table: Array) -> None:
         """Take the steps of a segment, from its first one on, and keep every shape; table: of its loads."""
         layout, arrays, count = self.structure, self._arrays, len(table) - 1
-        entries = layout.rows * layout.width
-        _, begin = copying(layout.code)
-        with our_compilation():
-            begin(entries, first // self._segment * entries, *arrays.kept, *arrays.last, *arrays.shapes, *arrays.moving)
+        begins = first // self._segment * self._entries
+        self._copy_entries(begins, 0, arrays.kept, arrays.shapes)
+        self._copy_entries(begins, 0, arrays.last, arrays.moving)
         most = self._most_steps()
         for done in range(0, count, most):
             steps = min(most, count - done)
-            # The first shape is that before the segment.
-            sizes = self._sizes(steps, 1 + done, (self._segment + 1) * layout.rows)
+            sizes = self._sizes(steps, done, self._segment * layout.rows)
             self._launch(0, sizes, table[done : done + steps], *arrays.shapes, *arrays.moving, *self._sheet_arrays)
 
     def _last_frame(self, first: int, end: int) -> int:
@@ -208,7 +213,7 @@ class MotionAdjoint(Dynamics):
         frame, beyond = divmod(end - count, grid.steps_per_frame)
         if not beyond:
             self._put(by_frame[frame])
-        sizes = self._sizes(count, end - first, ADJOINT_PARTS * layout.rows, not beyond)
+        sizes = self._sizes(count, end - first - 1, ADJOINT_PARTS * layout.rows, not beyond)
         pushes = np.zeros((count, layout.rows, max(1, PUSHED * len(self.plan.slots))))
         self._launch(1, sizes, table, pushes, *arrays.adjoint, *arrays.shapes, *self._sheet_arrays, arrays.found)
         self._buffer = (self._buffer + count) % 2
@@ -216,13 +221,9 @@ class MotionAdjoint(Dynamics):
 
     def _put(self, slopes: Array) -> None:
         """Put the derivative by the shape of a frame where the kernel adds it."""
-        layout, arrays = self.structure, self._arrays
-        entries = layout.rows * layout.width
         for c in range(3):
-            write(arrays.loss[c], in_lanes(layout, slopes[..., c]))
-        keep, _ = copying(layout.code)
-        with our_compilation():
-            keep(entries, LOSS * entries, *arrays.loss, *arrays.adjoint)
+            write(self._arrays.loss[c], in_lanes(self.structure, slopes[..., c]))
+        self._copy_entries(0, LOSS * self._entries, self._arrays.loss, self._arrays.adjoint)
 
     def _collect(self, gain: float, totals: Array) -> Slopes:
         """Add up what was found."""
