@@ -28,7 +28,7 @@ from tests.test_accuracy import MOVED, Falling
 from tests.test_contact import HELD, PRESSED, RUBBED, moved, touching
 
 # Of 30 random scenes a few are tried by default.
-SEEDS = [pytest.param(seed, marks=[] if seed in (0, 18, 20) else pytest.mark.slow) for seed in range(30)]
+SEEDS = [pytest.param(seed, marks=[] if seed in (0, 18) else pytest.mark.slow) for seed in range(30)]
 
 
 @pytest.fixture(scope="module")

@@ -85,6 +85,9 @@ CASES = (
     "nothing fixed", "one side, map", "moving",
 )  # fmt: skip
 
+# These have every term, and each way to fix a sheet but one.
+QUICK = ("springs, one side", "tension", "plate, map", "corners", "one side, map", "moving")
+
 
 def shape_of(plan: Plan, device: Device, frames: int = 1, layout: SheetLayout | None = None) -> Array:
     """Displacements of the last of some frames [m]."""
@@ -105,7 +108,9 @@ def assert_close(u: Array, twin: Array) -> None:
     np.testing.assert_allclose(u, twin, rtol=0, atol=CLOSE * float(np.abs(twin).max()))
 
 
-@pytest.mark.parametrize("name", CASES)
+@pytest.mark.parametrize(
+    "name", [pytest.param(name, marks=() if name in QUICK else pytest.mark.slow) for name in CASES]
+)
 def test_like_scipy(name: str, grey: str, device: Device) -> None:
     plan = plan_of(case(name, grey))
     u = shape_of(plan, device)
@@ -197,7 +202,7 @@ def test_lanes_do_not_change_the_bits(made: Scene, device: Device) -> None:
     plan = plan_of(made)
     layout = layout_of(plan, device)
     plain = shape_of(plan, device).tobytes()
-    for lanes in {1, 2, 4, 8} - {layout.code.lanes}:
+    for lanes in (1, 4):
         assert shape_of(plan, device, layout=with_lanes(layout, lanes)).tobytes() == plain
 
 
