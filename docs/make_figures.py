@@ -100,6 +100,31 @@ def four_pixels() -> None:
     figure.savefig(IMAGES / "pixels.png", dpi=110)
 
 
+def stereo(moment: float, size: int) -> None:
+    """Show what two cameras see of the scene grasp at a moment [s], and the disparity of the left one."""
+    right = {"beside": "left", "baseline": 0.005}
+    camera = load_scene(SCENES / "grasp.yaml").render.camera
+    assert isinstance(camera, Camera)
+    cameras = {"left": camera.model_dump(mode="json", exclude_unset=True), "right": right}
+    changes = {"render.camera": None, "render.cameras": cameras, "render.size": [size, size]}
+    scene = load_scene(SCENES / "grasp.yaml", {**changes, "output": ["png", "disparity"]})
+    frame = round(moment * scene.time.frames_per_second)
+    with tempfile.TemporaryDirectory() as directory:
+        run(scene, directory)
+        pair = [Image.open(Path(directory, name, "frames", f"{frame:04}.png")).convert("RGB") for name in cameras]
+        disparity = np.array(Image.open(Path(directory, "left", "disparity", f"{frame:04}.tiff")))
+    figure, axes = plt.subplots(1, 3, figsize=(10.4, 3.2), layout="constrained")
+    shown = np.where(disparity > 0, disparity, np.nan)
+    axes[0].imshow(pair[0])
+    axes[1].imshow(pair[1])
+    image = axes[2].imshow(shown, cmap="viridis")
+    for axis, title in zip(axes, ("left", "right", "disparity of left [px]"), strict=True):
+        axis.set_title(title)
+        axis.axis("off")
+    figure.colorbar(image, ax=axes[2])
+    figure.savefig(IMAGES / "stereo.jpg", dpi=110, pil_kwargs={"quality": 90})
+
+
 def forces_of(name: str) -> tuple[Floats, Floats, Floats]:
     """Return the times [s], the places of the tip [m] and the forces [N] of a scene's only tool in every frame."""
     time, tip, force = [], [], []
@@ -202,6 +227,7 @@ def main() -> None:
     animation("grasp", "grasp", 320)
     endoscope(288)
     four_pixels()
+    stereo(0.8, 400)
     animation("retina", "press", 320, "render.camera=top", image=RETINA)
     indentation()
     palpation()

@@ -18,6 +18,9 @@ if TYPE_CHECKING:
         SceneError,
     )
     from taichi_msm.exports.convert import export
+    from taichi_msm.fitting.fit import fit
+    from taichi_msm.fitting.result import FitResult
+    from taichi_msm.gradients import Gradient, gradient
     from taichi_msm.physics.state import TipForce
     from taichi_msm.playback import Playback
     from taichi_msm.render.labels import Flow, Labels, Sight
@@ -51,12 +54,15 @@ __version__ = "0.1.0"
 _HOMES = {
     **dict.fromkeys(("Flow", "Labels", "Sight"), "render.labels"),
     **dict.fromkeys(("resume", "run"), "runner"),
+    **dict.fromkeys(("Gradient", "gradient"), "gradients"),
     "Playback": "playback",
     "TipForce": "physics.state",
     "Simulation": "simulation",
+    "FitResult": "fitting.result",
     "Surface": "render.surface",
     "Outcome": "sweeps.outcome",
     "export": "exports.convert",
+    "fit": "fitting.fit",
     "load_scene": "scenefile.load",
     "sweep": "sweeps.sweep",
 }
@@ -68,8 +74,10 @@ __all__ = [
     "Distortion",
     "DivergedError",
     "FilesError",
+    "FitResult",
     "Flow",
     "Foundation",
+    "Gradient",
     "Instrument",
     "Intrinsics",
     "Labels",
@@ -93,6 +101,8 @@ __all__ = [
     "TipForce",
     "Tissue",
     "export",
+    "fit",
+    "gradient",
     "load_scene",
     "resume",
     "run",

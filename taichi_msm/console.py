@@ -33,6 +33,7 @@ STAGES = {
     "export": "exporting",
     "workers": "waiting for a worker of the cluster",
     "runs": "running",
+    "fit": "fitting",
     "contact": "drawing the last frames",
 }
 

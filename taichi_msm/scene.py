@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable, Mapping
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
@@ -17,13 +18,14 @@ from pydantic import (
     model_serializer,
     model_validator,
 )
+from pydantic_core import PydanticCustomError
 from typing_extensions import Self
 
 from taichi_msm import faults
 from taichi_msm.camera_files import CameraFileError, read_calibration, read_poses
-from taichi_msm.errors import ArgumentError, SceneError
+from taichi_msm.errors import ArgumentError, SceneError, did_you_mean
 from taichi_msm.faults import LARGEST, SMALLEST, refused
-from taichi_msm.outputs.table import OUTPUTS
+from taichi_msm.outputs.table import CAMERA_NAME, EXPORTS, FOLDERS, MAX_NAME, OUTPUTS
 
 MAX_POINTS = 4096
 MAX_PROBES = 16
@@ -551,9 +553,20 @@ class Camera(Section):
         "file, or its rows [t, tx, ty, tz, qx, qy, qz, qw], from the camera to the world",
         "the path of a file",
     )
+    beside: Annotated[str, Field(strict=True, min_length=1)] | None = key(
+        None,
+        "in `cameras`, in place of all else but baseline: the name of another camera, which this one is like",
+        "the name of another camera",
+    )
+    baseline: Number | None = key(
+        None,
+        "how far it is from the camera that it is beside, along the x axis of that [m]",
+        "a number but 0, in metres",
+    )
     eye: Vector | Times | None = key(
         None,
-        "where the camera is [m], or keys of it, linear between, held outside; required unless there is pose or poses",
+        "where the camera is [m], or keys of it, linear between, held outside; required unless there is pose, poses or "
+        "beside",
         "three numbers: [x, y, z] in metres," + _KEYS,
     )
     target: Vector | Times = key(
@@ -588,7 +601,7 @@ class Camera(Section):
     @field_validator("eye", "target", "up", mode="after")
     @classmethod
     def _in_order(cls, keys: Any, info: ValidationInfo) -> Any:
-        if info.field_name == "eye" and keys is None and not {"pose", "poses"} & _given(info):
+        if info.field_name == "eye" and keys is None and not {"beside", "pose", "poses"} & _given(info):
             raise refused("missing; expected " + cls.model_fields["eye"].json_schema_extra["expects"])  # type: ignore
         if keys is None or not isinstance(keys[0], tuple):
             return keys
@@ -600,6 +613,16 @@ class Camera(Section):
     @model_validator(mode="after")
     def _said_once(self) -> Self:
         given = {name for name in self.model_fields_set if getattr(self, name) is not None}
+        if self.beside is not None:
+            for name in sorted(given - {"beside", "baseline"}):
+                raise refused(
+                    "is given together with beside, and a camera beside another is like that; remove it", name
+                )
+            if self.baseline is None or abs(self.baseline) < SMALLEST:
+                what = "missing" if self.baseline is None else f"{self.baseline:g} puts it where {self.beside} is"
+                raise refused(f"{what}; expected a number but 0, in metres", "baseline")
+        elif self.baseline is not None:
+            raise refused("goes with beside, the name of another camera; add it or remove this", "baseline")
         for ways in (("calibration", "intrinsics", "fov"), ("pose", "poses", "eye"), ("calibration", "distortion")):
             if len(both := [name for name in ways if name in given]) > 1:
                 raise refused(f"is given together with {both[0]}; remove one of them", both[1])
@@ -610,6 +633,8 @@ class Camera(Section):
     @model_serializer(mode="wrap")
     def _own_keys(self, dump: SerializerFunctionWrapHandler) -> dict[str, Any]:
         """Leave out what was not given and has no meaning beside what was."""
+        if self.beside is not None:
+            return {name: value for name, value in dump(self).items() if name in ("beside", "baseline")}
         needed = {"eye", "target", "up"} if self.eye is not None else {"pose", "poses"} & self.model_fields_set
         needed |= {"intrinsics"} if self.intrinsics is not None else {"fov"}
         needed |= {name for name in ("distortion", "outside") if name in self.model_fields_set}
@@ -654,6 +679,11 @@ def _given(info: ValidationInfo) -> set[str]:
     return {name for name in names if info.data.get(name, name) is not None}
 
 
+# A camera as a scene has it.
+AnyCamera = Literal["top", "oblique"] | Camera
+PRESETS = ("top", "oblique")
+
+
 class Light(Section):
     """How shading: tissue lights the sheet, from beside the camera."""
 
@@ -676,10 +706,16 @@ class Render(Section):
     refine: Annotated[Whole, Field(ge=0, le=MAX_REFINE)] = key(
         10, "points inserted between two neighbours when drawing", f"a whole number, 0 to {MAX_REFINE}"
     )
-    camera: Literal["top", "oblique"] | Camera = key(
+    camera: AnyCamera = key(
         "top",
         "top: straight down, to scale; oblique: tilted, shows depth; or a pinhole camera",
         "top, oblique, or {eye: [x, y, z], target: [x, y, z], up: [x, y, z], fov: degrees}",
+    )
+    cameras: dict[str, AnyCamera] | None = key(
+        None,
+        "in place of camera: several by name, each with files in a folder of its own; the first is the main one, whose "
+        "light is in all pictures",
+        "names of a-z, 0-9, _ and -, each with top, oblique, {eye: [x, y, z], ...} or {beside: NAME, baseline: metres}",
     )
     shading: Literal["none", "headlight", "tissue"] = key(
         "headlight",
@@ -701,9 +737,112 @@ class Render(Section):
 
     @field_validator("camera", mode="after")
     @classmethod
-    def _calibrated(cls, camera: str | Camera, info: ValidationInfo) -> str | Camera:
+    def _calibrated(cls, camera: AnyCamera, info: ValidationInfo) -> AnyCamera:
+        if isinstance(camera, Camera) and camera.beside is not None:
+            raise refused("goes with render.cameras, where the other camera has its name", "beside")
         # A size at fault is reported by itself.
         return camera.calibrated(info.data["size"]) if isinstance(camera, Camera) and "size" in info.data else camera
+
+    @field_validator("cameras", mode="after")
+    @classmethod
+    def _known_by_name(cls, cameras: dict[str, AnyCamera] | None, info: ValidationInfo) -> dict[str, AnyCamera] | None:
+        if cameras is None:
+            return None
+        if not cameras:
+            raise refused("has no camera; add one by its name")
+        for name, camera in cameras.items():
+            if not re.fullmatch(CAMERA_NAME, name):
+                raise refused(f"is no name of a camera; take up to {MAX_NAME} of a-z, 0-9, _ and -", name)
+            if name in FOLDERS or name.startswith(EXPORTS):
+                raise refused("is the name of a folder that is not a camera's; take another name", name)
+            if isinstance(camera, Camera) and camera.beside is not None:
+                _require_beside(name, cameras)
+        if "size" not in info.data:
+            return cameras
+        calibrated = {}
+        for name, camera in cameras.items():
+            try:
+                calibrated[name] = camera.calibrated(info.data["size"]) if isinstance(camera, Camera) else camera
+            except PydanticCustomError as error:
+                raise refused(error.message(), name, *(error.context or {}).get("below", ())) from None
+        return calibrated
+
+    @model_validator(mode="before")
+    @classmethod
+    def _without_null(cls, data: Any) -> Any:
+        """Take `camera: null` for none, as an override cannot remove a key."""
+        if isinstance(data, Mapping) and data.get("camera", "") is None:
+            return {name: value for name, value in data.items() if name != "camera"}
+        return data
+
+    @model_validator(mode="after")
+    def _one_way_to_the_cameras(self) -> Self:
+        if self.cameras is not None and "camera" in self.model_fields_set:
+            raise refused("is given together with cameras; remove one of them, or set it to null", "camera")
+        return self
+
+    @model_serializer(mode="wrap")
+    def _one_kind(self, dump: SerializerFunctionWrapHandler) -> dict[str, Any]:
+        """Leave out `camera` beside `cameras`, or the latter if there is none."""
+        unused = "cameras" if self.cameras is None else "camera"
+        return {name: value for name, value in dump(self).items() if name != unused}
+
+    @property
+    def all_cameras(self) -> dict[str, AnyCamera]:
+        """The cameras by the folders for what they see: the run's own, which is "", for one without a name."""
+        return {"": self.camera} if self.cameras is None else self.cameras
+
+    @property
+    def main(self) -> str:
+        """The name of the main camera, which has the light; "": the only one, without a name."""
+        return next(iter(self.all_cameras))
+
+    @property
+    def main_camera(self) -> AnyCamera:
+        """The main camera."""
+        return self.all_cameras[self.main]
+
+    def with_main(self, camera: AnyCamera) -> Self:
+        """Replace the main camera; those beside it follow."""
+        if self.cameras is None:
+            return self.model_copy(update={"camera": camera})
+        return self.model_copy(update={"cameras": {**self.cameras, self.main: camera}})
+
+    def origin(self, name: str) -> tuple[AnyCamera, float]:
+        """Give the camera that a named one is like, itself or one that it is beside, and how far that is away [m]."""
+        camera, away = self.all_cameras[name], 0.0
+        while isinstance(camera, Camera) and camera.beside is not None:
+            away += camera.baseline or 0.0
+            camera = self.all_cameras[camera.beside]
+        return camera, away
+
+    def baseline(self, name: str) -> float:
+        """Tell how far the first camera beside a named one is from it [m]; 0: there is none."""
+        for camera in self.all_cameras.values():
+            if isinstance(camera, Camera) and camera.beside == name and camera.baseline is not None:
+                return camera.baseline
+        return 0.0
+
+
+def _require_beside(name: str, cameras: Mapping[str, AnyCamera]) -> None:
+    """Make sure that a camera is beside another one that has a place."""
+    if name == next(iter(cameras)):
+        raise refused("the first camera is the main one, beside no other; put another one first", name, "beside")
+    way, camera = [name], cameras[name]
+    while isinstance(camera, Camera) and camera.beside is not None:
+        other = camera.beside
+        if other in way:
+            if len(way) == 1:
+                raise refused(f"{other} is this camera itself; name another one", name, "beside")
+            raise refused(f"goes round, {', '.join([*way, other])}; give one of them an eye", name, "beside")
+        if other not in cameras:
+            if len(way) > 1:
+                return  # It is reported where it is named.
+            others = [one for one in cameras if one != name]
+            near = did_you_mean(other, others) or f"; the others are {', '.join(others)}"
+            raise refused(f"{other}: no camera has this name{near}", name, "beside")
+        way.append(other)
+        camera = cameras[other]
 
 
 class Scene(Section):
@@ -748,6 +887,17 @@ class Scene(Section):
         f"a list of {', '.join(OUTPUTS)}",
     )
 
+    @property
+    def folders(self) -> dict[str, tuple[str, ...]]:
+        """The entries of output by their folders: what a camera sees goes to its own, the rest to that of the run."""
+        wanted = [output for name, output in OUTPUTS.items() if name in self.output]
+        folders = {"": tuple(output.name for output in wanted if not output.is_seen)}
+        for camera in self.render.all_cameras:
+            has_pair = bool(self.render.baseline(camera))
+            seen = (output.name for output in wanted if output.is_seen and (has_pair or not output.of_pair))
+            folders[camera] = (*folders.get(camera, ()), *seen)
+        return folders
+
     def asks_for(self, *sources: str) -> bool:
         """Tell whether the values of any output are in one of these fields of `Observed`."""
         return any(OUTPUTS[name].source in sources for name in self.output)
@@ -760,7 +910,7 @@ class Scene(Section):
     @property
     def labels_pixels(self) -> bool:
         """Whether any output is a label of every pixel."""
-        return self.asks_for("labels", "flow")
+        return self.asks_for("labels", "flow", "stereo")
 
     @property
     def renders(self) -> bool:

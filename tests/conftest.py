@@ -70,19 +70,11 @@ def seen_by_two(device: runtime.Device, tmp_path_factory: pytest.TempPathFactory
     here = tmp_path_factory.mktemp("stereo")
     Image.fromarray(speckle(60, 80)).save(here / "speckle.png")
     (here / "small.yaml").write_text(SMALL)
-    for side, x in (("left", -0.004), ("right", 0.004)):
-        camera = f"{{eye: [{x}, -0.1, 0.5], target: [{x}, 0, 0], fov: 38}}"
-        overrides = [f"render.camera={camera}", "render.size=[320, 256]", "render.tracks=6"]
-        scene = load_scene(here / "small.yaml", [*overrides, "output=[png, trajectory, forces, tracks]"])
-        run(scene, here / side, threads=device.threads, estimate_error=False)
-    stereo = here / "stereo"
-    for side in ("left", "right"):
-        (stereo / side).mkdir(parents=True)
-        for name in ("frames", "tracks.npz", "camera.json"):
-            (here / side / name).rename(stereo / side / name)
-    for name in ("run.json", "trajectory.npz", "forces.csv"):
-        (here / "left" / name).rename(stereo / name)
-    return stereo
+    left = "{eye: [-0.004, -0.1, 0.5], target: [-0.004, 0, 0], fov: 38}"
+    cameras = f"render.cameras={{left: {left}, right: {{beside: left, baseline: 0.008}}}}"
+    overrides = [cameras, "render.size=[320, 256]", "render.tracks=6", "output=[png, trajectory, forces, tracks]"]
+    run(load_scene(here / "small.yaml", overrides), here / "stereo", threads=device.threads, estimate_error=False)
+    return here / "stereo"
 
 
 @pytest.fixture

@@ -21,9 +21,10 @@ LAYERS = [
     {"physics"},
     {"render"},
     {"scenefile"},
-    {"simulation", "results"},
+    {"gradients", "simulation", "results"},
     {"runner", "playback", "console"},
     {"exports", "study", "sweeps", "viewer"},
+    {"fitting"},
     {"cli"},
     {"__main__", "__init__"},
 ]

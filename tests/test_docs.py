@@ -39,7 +39,7 @@ PAGES = [README, ROOT / "CONTRIBUTING.md", ROOT / "CHANGELOG.md", *sorted(DOCS.g
 # Those with commands, in an order in which each finds the results that it reads.
 WITH_COMMANDS = [
     README,
-    *(DOCS / f"{name}.md" for name in ("scene", "labels", "sweep", "export", "error", "view", "study")),
+    *(DOCS / f"{name}.md" for name in ("scene", "labels", "sweep", "fit", "export", "error", "view", "study")),
 ]
 SCENES = sorted(path.stem for path in (ROOT / "scenes").glob("*.yaml"))
 
@@ -224,7 +224,8 @@ def test_the_commands_work(small_scenes: Path, program: Program) -> None:
         opens_a_window = arguments[0] == "view" and "--record" not in arguments
         needs_a_session = any("session-1" in word for word in arguments)
         needs_vtk = "vtk" in arguments and importlib.util.find_spec("vtk") is None
-        if opens_a_window or needs_a_session or needs_vtk or arguments[0] == "study" or "--resume" in arguments:
+        played_elsewhere = arguments[0] in ("study", "fit") or "--resume" in arguments
+        if opens_a_window or needs_a_session or needs_vtk or played_elsewhere:
             continue
         done = program(*arguments)
         assert done.returncode == 0, (arguments, done.stderr)
@@ -235,21 +236,23 @@ def test_the_shipped_script_is_valid() -> None:
 
 
 def test_the_python_shown_runs(tmp_path: Path) -> None:
-    first, second, third = blocks(DOCS / "python.md", "python")
+    first, second, third, fourth = blocks(DOCS / "python.md", "python")
     (labels,) = blocks(DOCS / "labels.md", "python")
     shown = "print(position.shape, picture.shape, record['status'])\n"
     (tmp_path / "scenes").symlink_to(ROOT / "scenes")
-    (tmp_path / "example.py").write_text(first + shown + second + third)
+    (tmp_path / "example.py").write_text(first + shown + second + third + fourth)
     done = subprocess.run([sys.executable, "example.py"], cwd=tmp_path, check=True, capture_output=True, text=True)
-    shapes, result, felt = done.stdout.splitlines()
+    shapes, result, felt, *slopes = done.stdout.splitlines()
     assert shapes == "(41, 41, 3) (512, 512, 3) complete"
     assert result.startswith("6.00 mm deep with 1.")
     assert felt == "0.52 N at a depth of 5.0 mm, 0.40 s"
+    assert len(slopes) == 3
+    assert slopes[2] == "by the stiffness of every cell: (30, 30)"
     command = [sys.executable, "-m", "taichi_msm", "run", "scenes/grasp.yaml", "--set", "output=[trajectory]"]
     subprocess.run(command, cwd=tmp_path, check=True, capture_output=True)
     (tmp_path / "example.py").write_text(labels)
     done = subprocess.run([sys.executable, "example.py"], cwd=tmp_path, check=True, capture_output=True, text=True)
-    assert done.stdout == "(512, 512, 2) (512, 512) (512, 512, 2) (512, 512)\n"
+    assert done.stdout == "(512, 512, 2) (512, 512) (512, 512, 2) (512, 512) (512, 512, 3)\n"
     (tmp_path / "example.py").write_text(blocks(DOCS / "export.md", "python")[0])
     done = subprocess.run([sys.executable, "example.py"], cwd=tmp_path, check=True, capture_output=True, text=True)
     written = ["000000/surface.glb", "000001/surface.glb", "index.csv"]
@@ -257,8 +260,8 @@ def test_the_python_shown_runs(tmp_path: Path) -> None:
     assert (tmp_path / "output" / "from-python" / "animation.gif").exists()
 
 
-# Those whose examples stand in their docstrings. Those of Playback and export read what that of run writes.
-WITH_EXAMPLES = ["run", "Playback", "export", "load_scene", "Scene", "Simulation"]
+# Those whose examples stand in their docstrings. Those of Playback, export and fit read what that of run writes.
+WITH_EXAMPLES = ["run", "Playback", "export", "fit", "gradient", "load_scene", "Scene", "Simulation"]
 
 
 @pytest.mark.parametrize("name", WITH_EXAMPLES)
@@ -268,6 +271,25 @@ def test_the_example_of_a_docstring_gives_what_it_shows(name: str, examples_fold
     for test in tests:
         outcome = doctest.DocTestRunner().run(test)
         assert outcome.failed == 0, f"the example of {name} fails; see above"
+
+
+def test_the_fit_shown_is_what_it_finds(
+    examples_folder: Path, program: Program, capfd: pytest.CaptureFixture[str]
+) -> None:
+    shown, unseen = (block.splitlines() for block in blocks(DOCS / "fit.md", "text"))
+    seen, found, pressed, _, with_forces = commands(DOCS / "fit.md")
+    assert program(*seen).returncode == 0
+    done = program(*found)
+    # But for the runs and the seconds.
+    assert done.stdout.splitlines()[:-1] == shown[:-1]
+    smaller = "--set", "sheet.points=[13,13]", "--set", "time.frames_per_second=4"
+    assert program(*pressed, *smaller).returncode == 0
+    told = program(*with_forces, *smaller)
+    assert told.returncode == 0, told.stderr
+    assert "not identifiable" not in told.stdout
+    exec(compile(blocks(DOCS / "fit.md", "python")[0], "fit.md", "exec"), {})
+    assert capfd.readouterr().out.splitlines() == blocks(DOCS / "fit.md", "txt")[0].splitlines()
+    assert "each alone is not: fix one, or give a force (--forces)" in unseen[-1]
 
 
 def test_the_error_in_the_readme_is_that_of_the_run(device: Device, tmp_path: Path) -> None:

@@ -143,7 +143,7 @@ def test_the_shape_of_a_tile_does_not_change_the_bits(lanes: int, device: Device
     ]
     for render in renders:
         made, texture = with_instruments(drawable(**render)), speckle(300, 200)
-        position, config = dented(made), drawing_config(made, labels="supersample" not in render)
+        position, config = dented(made), drawing_config(made, labels="supersample" not in render, normals=True)
         placed = rods(made, position, 0)
         expected = Drawing(made, texture, config).look(position, rods=placed)
         alone = Drawing(made, texture, config._replace(lanes=lanes)).look(position, rods=placed)

@@ -21,7 +21,7 @@ from tests.reference import labels as twin
 from tests.reference.drawing import refine as refined
 from tests.test_resume import interrupted, published
 
-ALL = "output=[png, coordinates, depth, flow, occlusion, instrument, tracks, trajectory]"
+ALL = "output=[png, coordinates, depth, normals, flow, occlusion, instrument, tracks, trajectory]"
 OBLIQUE = "render.camera=oblique"
 ROD = "probes.0.instrument={radius: 0.01, shaft: [1, -0.5, 0.6], length: 0.2}"
 

@@ -146,7 +146,7 @@ def test_the_shape_of_a_tile_does_not_change_the_bits(lens: str, lanes: int, dev
     renders: list[dict[str, Any]] = [{"shading": "tissue", "size": [79, 57]}, {"wireframe": True, "supersample": 3}]
     for render in renders:
         made, texture = seen_through(lens, **render), speckle(30, 20)
-        position, config = folded(made), drawing_config(made, labels="supersample" not in render)
+        position, config = folded(made), drawing_config(made, labels="supersample" not in render, normals=True)
         placed = rods(made, position, 0)
         expected = Drawing(made, texture, config).look(position, rods=placed)
         alone = Drawing(made, texture, config._replace(lanes=lanes)).look(position, rods=placed)

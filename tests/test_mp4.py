@@ -135,10 +135,10 @@ def test_a_film_alone_is_enough_and_the_same_after_an_interruption(small: Path, 
 
 
 def test_a_film_can_be_given_up(tmp_path: Path) -> None:
-    job = Job(tmp_path, (64, 48), 25.0, png=False, gif=True, background=(0, 0, 0), mp4=True)
+    job = Job((tmp_path,), (64, 48), 25.0, png=False, gif=True, background=(0, 0, 0), mp4=True)
     writer = PictureWriter(job)
     for frame in range(30):
-        writer.add(smooth(64, 48, frame))
+        writer.add(smooth(64, 48, frame)[None])
     writer.abort()
     assert {path.name for path in tmp_path.iterdir()} == {"animation.gif", "animation.mp4"}
 

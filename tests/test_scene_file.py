@@ -50,13 +50,15 @@ AN_AT = "expected [across, down], fractions from -1 to 2, or keys [[t, across, d
 A_CAMERA = "expected top, oblique, or {eye: [x, y, z], target: [x, y, z], up: [x, y, z], fov: degrees}"
 VECTOR_M = "expected three numbers: [x, y, z] in metres"
 EYE = f"{VECTOR_M}, or keys [[t, x, y, z], ...], t in seconds"
-CAMERA_KEYS = "calibration, scale, intrinsics, distortion, outside, pose, poses, eye, target, up, fov"
+CAMERA_KEYS = "calibration, scale, intrinsics, distortion, outside, pose, poses, beside, baseline, eye, target, up, fov"
 NO_PICTURE = "image: a picture is needed to draw png, gif or mp4; name one, or set output to [trajectory] or []"
 
 Load = Callable[..., Scene]
 
 # The kinds of output, as errors list them.
-OUTPUTS = "png, gif, mp4, trajectory, forces, coordinates, depth, flow, occlusion, instrument, tracks"
+OUTPUTS = (
+    "png, gif, mp4, trajectory, forces, coordinates, depth, normals, flow, occlusion, disparity, instrument, tracks"
+)
 
 
 @pytest.fixture

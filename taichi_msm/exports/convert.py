@@ -120,7 +120,7 @@ def _views(run: FinishedRun, name: str, camera: str | None) -> list[FinishedRun]
     wanted = shown if shown != ANY else () if camera is None else (camera,)
     if wanted and set(wanted) <= set(known):
         return [replace(run, camera=each) for each in wanted]
-    said = f"its cameras are {' and '.join(known)}" if known else "it has one camera, without a name"
+    said = f"its cameras are {', '.join(known)}" if known else "it has one camera, without a name"
     if shown != ANY:
         said = f"{name} needs the cameras {' and '.join(wanted)}; {said}; run the scene with `cameras` of these names"
     elif camera is None:

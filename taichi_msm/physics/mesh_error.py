@@ -218,7 +218,7 @@ def choose_points(
         except SceneError as error:
             asked = f"with the {rows} x {cols} points that sheet.tolerance: {tolerance:g} asks for"
             raise SceneError([f"{line} ({asked})" for line in error.lines]) from None
-        estimate = _estimate(tried, device, progress)
+        estimate = estimate_points(tried, device, progress)
         if estimate.error <= tolerance:
             return tried, estimate
         # The error falls with the square of the length of the cells, or more slowly.
@@ -236,8 +236,8 @@ def choose_points(
     )
 
 
-def _estimate(plan: Plan, device: Device, progress: Count) -> MeshEstimate:
-    """Run a scene and its pilot in f64, and give the error that the pilot shows."""
+def estimate_points(plan: Plan, device: Device, progress: Count) -> MeshEstimate:
+    """Run a scene for which there is a `coarser` one, and its pilot, in f64; give the error that the pilot shows."""
     exact, coarse, grid = plan.with_grid(precision="f64"), coarser(plan), plan.grid
     assert coarse is not None
     own, pilot = sheet_of(exact, device), MeshPilot(exact, coarse, device)

@@ -4,8 +4,8 @@ from typing import Any, NamedTuple
 
 from taichi_msm.render import style
 from taichi_msm.render import uniforms as uni
-from taichi_msm.render.geometry import POINT_NUMBERS, on_triangle
-from taichi_msm.render.samples import keep, steps
+from taichi_msm.render.geometry import POINT_NUMBERS, facet, on_triangle
+from taichi_msm.render.samples import keep, keep_unit, steps
 from taichi_msm.system.runtime import ti
 
 # The numbers of the unit normal at a mass point; normals are stored after the other numbers of all mass points.
@@ -108,7 +108,7 @@ def absolute(values):
 def headlight(normal: ti.template(), numbers: ti.template()):
     """Share of the headlight that is reflected: the cosine between the normal and the direction to the light."""
     length = ti.sqrt(normal[0] * normal[0] + normal[1] * normal[1] + normal[2] * normal[2])
-    toward = uni.AXES + 6
+    toward = uni.HEADLIGHT
     cosine = absolute(normal[0] * numbers[toward] + normal[1] * numbers[toward + 1] + normal[2] * numbers[toward + 2])
     cosine = cosine / ti.max(length, 1e-30)
     # Where a point is infinite or NaN, so is its normal.
@@ -168,6 +168,8 @@ def store(
     if ti.static(config.labels):
         keep(at + plane.across, visible, (cell.j + across) / cell.across, samples)
         keep(at + plane.down, visible, (cell.i + along) / cell.down, samples)
+    if ti.static(config.normals):
+        keep_unit(at + plane.facet_x, visible, facet(x, y, triangle, band.numbers), samples)
     if ti.static(config.headlit):
         normal = normal_at(across, along, cell, sheet)
         keep(at + plane.light, visible, headlight(normal, band.numbers), samples)

@@ -28,6 +28,9 @@ NEAR = 1e-6
 # The largest number of a camera's matrix that kernels can hold, in f32 and multiplied by the samples along a pixel.
 LARGEST_NUMBER = float(np.finfo(np.float32).max) / MAX_SUPERSAMPLE
 
+# A camera may be this many times the sheet's larger side away from the one that it is beside.
+FARTHEST = 1e6
+
 # A matrix that is farther from orthonormal than this is no rotation.
 ORTHONORMAL = 1e-3
 
@@ -59,11 +62,18 @@ class View(NamedTuple):
     distance: float  # from the eye to the point that it looks at, of a moving camera when it begins [m]
     pinhole: bool
     lens: Lens | None = None  # None: it bends no lines
+    baseline: float = 0.0  # to the first camera beside it, along its x axis [m]; 0: there is none
+    lamp: View | None = None  # the camera that has the light; None: itself
 
     @property
     def model(self) -> str:
         """The model of the lens, pinhole or fisheye; empty if it bends no lines."""
         return "" if self.lens is None else "fisheye" if self.lens.fisheye else "pinhole"
+
+    @property
+    def optics(self) -> tuple[object, ...]:
+        """The lens, and what the places of samples depend on besides; empty if it bends no lines."""
+        return () if self.lens is None else (self.lens, *self.scale, *self.centre)
 
     def project(self, points: Array) -> Array:
         """Map points [m], shape (..., 3), to (X, Y, w, depth), without distortion, shape (..., 4)."""
@@ -92,6 +102,14 @@ class View(NamedTuple):
         if self.lens is None:
             return pixels
         return self.centre + self.scale * self.lens.undistort((pixels - self.centre) / self.scale)
+
+    def disparity(self, depth: NDArray[np.float32]) -> NDArray[np.float32]:
+        """Tell how far to the left what is seen at depths [m] is for the camera beside this one [px]; 0 for depth 0.
+
+        Neither may have a lens that bends lines.
+        """
+        w = np.where(depth == 0, np.inf, depth if self.pinhole else 1.0)
+        return (self.scale[0] * self.baseline / w).astype(np.float32)
 
     def sight(self, pixel: tuple[float, float]) -> View:
         """Give a view in which what is seen at the centre of a pixel, right and down from (0, 0), has X = Y = 0."""
@@ -129,53 +147,86 @@ def pose(camera: View) -> list[list[float]]:
 
 
 def view(scene: Scene, time: float = 0.0) -> View:
-    """Set up the scene's camera at a time [s]; raises a SceneError when it sees nothing."""
+    """Set up the scene's main camera at a time [s]; raises a SceneError when any of its cameras sees nothing."""
     if blind := [str(problem) for problem in camera_problems(scene)]:
         raise SceneError(blind)
     return view_at(scene, time)
 
 
-def view_at(scene: Scene, time: float) -> View:
-    """Set up the camera, which is in order, of a scene at a time [s]."""
-    camera = scene.render.camera
+def view_at(scene: Scene, time: float, name: str = "") -> View:
+    """Set up the camera of a name, which is in order, of a scene at a time [s]; without a name the main one."""
+    render = scene.render
+    name = name or render.main
+    camera, away = render.origin(name)
     if camera == "top":
-        return _top(scene)
-    return _pinhole(camera if isinstance(camera, Camera) else _oblique(scene), scene, time)
+        seen = _top(scene)
+    else:
+        seen = _pinhole(camera if isinstance(camera, Camera) else _oblique(scene), scene, time)
+    if away:
+        shift, matrix = away * seen.axes[0], seen.matrix.copy()
+        matrix[:, 3] -= matrix[:, :3] @ shift
+        seen = seen._replace(matrix=matrix, eye=seen.eye + shift)
+    lamp = None if name == render.main else view_at(scene, time)
+    return seen._replace(baseline=render.baseline(name), lamp=lamp)
 
 
-def moves(scene: Scene) -> bool:
-    """Tell whether the scene's camera moves."""
-    camera = scene.render.camera
+def moves(scene: Scene, name: str = "") -> bool:
+    """Tell whether the camera of a name moves; without a name the main one."""
+    camera, _ = scene.render.origin(name or scene.render.main)
     return isinstance(camera, Camera) and camera.moves
 
 
 def camera_problems(scene: Scene) -> Iterator[Problem]:
-    """Say why a pinhole camera sees nothing, or cannot be computed, if so."""
-    camera = scene.render.camera
-    if not isinstance(camera, Camera):
-        return
-    problem = next(_place_problems(camera, scene), None)
-    if problem is not None:
-        yield problem
-    elif camera.distortion is not None and camera.outside == "refuse":
-        yield from _lens_problems(scene)
+    """Say why cameras see nothing, or cannot be computed, if so, and why there is no disparity that is asked for."""
+    sound = True
+    for name, camera in scene.render.all_cameras.items():
+        problem = next(_problems_of(camera, scene, name), None) if isinstance(camera, Camera) else None
+        if problem is not None:
+            at: Key = ("render", "cameras", name) if name else ("render", "camera")
+            yield Problem(at + problem.path, problem.message)
+            sound = False
+    if sound and scene.asks_for("stereo"):
+        yield from _disparity_problems(scene)
+
+
+def _problems_of(camera: Camera, scene: Scene, name: str) -> Iterator[Problem]:
+    """Find what is wrong with a camera; keys are those of its section."""
+    if camera.beside is None:
+        yield from _place_problems(camera, scene)
+        if camera.distortion is not None and camera.outside == "refuse":
+            yield from _lens_problems(view_at(scene, 0.0, name))
+    elif abs(scene.render.origin(name)[1]) > FARTHEST * max(scene.sheet.size):
+        said = f"puts it more than {FARTHEST:g} times the size of the sheet away; take a smaller number, in metres"
+        yield Problem(("baseline",), said)
+
+
+def _disparity_problems(scene: Scene) -> Iterator[Problem]:
+    """Find why there is no disparity."""
+    pairs = [name for name in scene.render.all_cameras if scene.render.baseline(name)]
+    if not pairs:
+        said = "disparity needs a camera beside another one; take render.cameras with {beside: NAME, baseline: metres}"
+        yield Problem(("output",), f"{said}, or leave it out")
+    for name in pairs:
+        if view_at(scene, 0.0, name).lens is not None:
+            said = f"disparity is along rows only without distortion, and {name} has one; leave out one of them"
+            yield Problem(("output",), said)
+            return
 
 
 def _place_problems(camera: Camera, scene: Scene) -> Iterator[Problem]:
-    """Find what is wrong with a camera's place, at any frame."""
-    at: Key = ("render", "camera")
+    """Find what is wrong with a camera's place, at any frame; keys are those of its section."""
     if camera.pose is not None:
         turn = np.array(camera.pose.rotation)
         if not (np.abs(turn @ turn.T - np.eye(3)).max() <= ORTHONORMAL and np.linalg.det(turn) > 0):
             said = "is no rotation; its rows are three unit vectors, right, down and forward, across each other"
-            yield Problem((*at, "pose", "rotation"), said)
+            yield Problem(("pose", "rotation"), said)
             return
     if camera.poses is not None:
         begin, end, last = camera.poses[0][0], camera.poses[-1][0], scene.time.duration
         slack = WHOLE / scene.time.frames_per_second
         if begin > slack or end < last - slack:  # type: ignore[operator]
             said = f"covers {begin:g} s to {end:g} s, but the scene goes from 0 s to {last:g} s; shorten time.duration"
-            yield Problem((*at, "poses"), f"{said} or give the poses of all of it")
+            yield Problem(("poses",), f"{said} or give the poses of all of it")
             return
     rate = scene.time.frames_per_second
     for time in [frame / rate for frame in range(scene.time.frames + 1)] if camera.moves else [0.0]:
@@ -184,18 +235,18 @@ def _place_problems(camera: Camera, scene: Scene) -> Iterator[Problem]:
             eye, target, up = (list(at_time(value, time)) for value in (camera.eye, camera.target, camera.up))
             sight = unit(np.subtract(eye, target))
             if math.dist(eye, target) < SMALLEST:
-                yield Problem((*at, "eye"), f"{eye} is also the target{when}; move one of them")
+                yield Problem(("eye",), f"{eye} is also the target{when}; move one of them")
                 return
             if not np.linalg.norm(np.cross(sight, unit(np.array(up)))) > 1e-9:
                 said = f"{up} is zero or along the line of sight{when}; take a direction across it"
-                yield Problem((*at, "up"), said)
+                yield Problem(("up",), said)
                 return
         if np.abs(_pinhole(camera, scene, time).matrix).max() > LARGEST_NUMBER:
             if camera.eye is not None and camera.intrinsics is None:
                 said = f"{eye} is too far away for {camera.fov:g} degrees{when}; move it nearer or widen fov"
             else:
                 said = f"is too far away for its focal length{when}; move it nearer"
-            yield Problem((*at, _place_key(camera)), said)
+            yield Problem((_place_key(camera),), said)
             return
 
 
@@ -204,16 +255,15 @@ def _place_key(camera: Camera) -> str:
     return next(name for name in ("eye", "pose", "poses") if getattr(camera, name) is not None)
 
 
-def _lens_problems(scene: Scene) -> Iterator[Problem]:
-    """Find where a lens folds back within the picture."""
-    camera = view_at(scene, 0.0)
+def _lens_problems(camera: View) -> Iterator[Problem]:
+    """Find where a lens folds back within the picture; keys are those of the camera's section."""
     if camera.lens is None or not np.isnan(camera.undistorted(border(camera.size))).any():
         return
     end = "folds back" if camera.lens.limit < WIDEST else "reaches 88 degrees"
     good = math.floor(camera.lens.rim * float(camera.scale.min()))
     far = math.ceil(float(np.linalg.norm(border(camera.size) - camera.centre, axis=-1).max()))
     said = f"{end} at {good} px from the principal point, and the picture reaches {far} px; take coefficients"
-    yield Problem(("render", "camera", "distortion"), f"{said} that are good to there, or set outside: background")
+    yield Problem(("distortion",), f"{said} that are good to there, or set outside: background")
 
 
 def border(size: Array) -> Array:
@@ -225,11 +275,11 @@ def border(size: Array) -> Array:
 
 
 def pinhole(scene: Scene, time: float = 0.0) -> Camera:
-    """Give the scene's camera at a time [s] as a pinhole camera that stays there.
+    """Give the scene's main camera at a time [s] as a pinhole camera that stays there.
 
     The orthographic one becomes one above the sheet, at equal scale.
     """
-    camera = scene.render.camera
+    camera = scene.render.main_camera
     if isinstance(camera, Camera):
         return held(camera, time)
     if camera == "oblique":

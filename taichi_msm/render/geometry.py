@@ -259,6 +259,25 @@ def depth_at(s, t, triangle: ti.template()):
 
 
 @ti.func
+def facet(x, y, triangle: ti.template(), numbers: ti.template()):
+    """Give the normal of a triangle on the side that is seen at (x, y), of any length, in OpenCV's axes, a list."""
+    sides = [
+        [
+            (k[0] - k[2] * numbers[uni.CENTRE_X]) * numbers[uni.SPREAD_X],
+            (k[1] - k[2] * numbers[uni.CENTRE_Y]) * numbers[uni.SPREAD_Y],
+            k[3],
+        ]
+        for k in ti.static((triangle.r, triangle.d))
+    ]
+    r, d = ti.static(sides)
+    normal = [r[1] * d[2] - r[2] * d[1], r[2] * d[0] - r[0] * d[2], r[0] * d[1] - r[1] * d[0]]
+    right, up = line_of_sight(x, y, numbers)
+    along = (normal[0] * right - normal[1] * up) * numbers[uni.PINHOLE] + normal[2]
+    toward = ti.select(along > 0.0, -1.0, 1.0)
+    return [normal[n] * toward for n in ti.static(range(3))]
+
+
+@ti.func
 def may_reach(corner, at, cols, top, bottom, numbers: ti.template(), point: ti.template()):
     """Tell whether a cell may be seen between two rows of a picture that a lens has bent: what saves `cell_bounds`.
 

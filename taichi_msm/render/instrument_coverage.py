@@ -9,7 +9,7 @@ beyond an end of the segment, the line of sight is intersected with the sphere a
 from taichi_msm.render import uniforms as uni
 from taichi_msm.render.geometry import line_of_sight, w_at
 from taichi_msm.render.places import BEYOND
-from taichi_msm.render.samples import INFINITY, clip, keep, places, places_of, tiles_of
+from taichi_msm.render.samples import INFINITY, clip, keep, keep_unit, places, places_of, tiles_of
 from taichi_msm.system.runtime import ti
 
 
@@ -76,6 +76,9 @@ def cover_tile_with_rod(at, x, y, n, band: ti.template()):
         keep(at + plane.normal_x, visible, n_x, samples)
         keep(at + plane.normal_y, visible, n_y, samples)
         keep(at + plane.normal_z, visible, n_z, samples)
+    if ti.static(band.config.normals):
+        # In OpenCV's axes.
+        keep_unit(at + plane.facet_x, visible, [n_x, n_y * (-1.0), n_z * (-1.0)], samples)
 
 
 @ti.func

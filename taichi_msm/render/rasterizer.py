@@ -29,7 +29,7 @@ from taichi_msm.system.runtime import lanes
 
 
 def drawing_config(
-    scene: Scene, *, picture: bool = True, labels: bool = False, lens: str | None = None
+    scene: Scene, *, picture: bool = True, labels: bool = False, normals: bool = False, lens: str | None = None
 ) -> DrawingConfig:
     """Decide what the kernel must be compiled for; `picture` and `labels` together take one sample per pixel.
 
@@ -37,6 +37,7 @@ def drawing_config(
         scene: the scene.
         picture: whether colours are drawn.
         labels: whether labels are written.
+        normals: whether normals are among them.
         lens: the model of the camera's lens, `View.model`; None: of the scene's own camera.
     """
     render = scene.render
@@ -53,6 +54,7 @@ def drawing_config(
         metal=picture and scene.has_instruments,
         picture=picture,
         labels=labels,
+        normals=labels and normals,
         lens=view_at(scene, 0.0).model if lens is None else lens,
         lanes=lanes("f32"),
     )
@@ -98,9 +100,8 @@ class Drawing:
         """Find the places of the samples, where a lens bends lines, again only if its view of them changes."""
         if not self.config.lens:
             return
-        optics = camera.lens, *camera.scale, *camera.centre
-        if optics != self._optics:
-            self._optics = optics
+        if camera.optics != self._optics:
+            self._optics = camera.optics
             self._form.place(sample_places(camera, self.config.supersample, steps=self.config.place_steps))
 
     def _numbers(self, camera: View, rods: Sequence[Rod]) -> NDArray[np.float32]:

@@ -16,7 +16,7 @@ from taichi_msm.render.bending import BENT_NUMBERS, store_bent
 from taichi_msm.render.coverage import cover
 from taichi_msm.render.geometry import POINT_NUMBERS, SEEN, may_reach, project
 from taichi_msm.render.instrument_coverage import cover_with_rods
-from taichi_msm.render.labels import LABEL_NUMBERS
+from taichi_msm.render.labels import label_numbers
 from taichi_msm.render.places import bounds, tiled
 from taichi_msm.render.samples import INFINITY, Band, Bytes, DrawingConfig, Floats, Integers, clear
 from taichi_msm.render.shading import PixelArrays, resolve
@@ -70,7 +70,9 @@ class Bands:
         stride = config.tiles_across(width) * config.tile_width if config.in_words else width
         picture = np.empty((height, stride, 3) if config.picture else (1, 4, 3), np.uint8)
         # Without labels nothing is written there; an array of Taichi's is passed in half the time of one of NumPy's.
-        labels: Any = np.zeros(LABEL_NUMBERS * width * height, np.float32) if config.labels else self._point
+        labels: Any = self._point
+        if config.labels:
+            labels = np.zeros(label_numbers(normals=config.normals) * width * height, np.float32)
         sizes[[uni.ROWS_TAKEN, uni.ROWS_PROJECTED, uni.BANDS_TAKEN]] = 0
         with our_compilation(optimised=False):
             self._draw(

@@ -28,7 +28,7 @@ from taichi_msm.render.geometry import (
     triangle_bounds,
 )
 from taichi_msm.render.instrument_coverage import cover_with_rods
-from taichi_msm.render.labels import LABEL_NUMBERS
+from taichi_msm.render.labels import label_numbers
 from taichi_msm.render.samples import INFINITY, Band, Bytes, DrawingConfig, Floats, Integers, clear
 from taichi_msm.render.shading import PixelArrays, resolve
 from taichi_msm.render.texture_filter import Appearance
@@ -72,7 +72,8 @@ class Threads:
         # Before the strip are the places of all samples, if there is a lens.
         self._samples = ti.ndarray(config.floats, height * config.supersample * across * config.place_planes + strip)
         self._colours = launches.array(np.uint8, 3 * width * height if config.picture else 1)
-        self._labels = launches.array(np.float32, LABEL_NUMBERS * width * height if config.labels else 1)
+        numbers = label_numbers(normals=config.normals) if config.labels else 0
+        self._labels = launches.array(np.float32, max(numbers * width * height, 1))
 
     def place(self, places: NDArray[np.float32]) -> None:
         """Take the places of the samples of the pictures that follow, as `rasterizer_cpu.Bands.place` does."""

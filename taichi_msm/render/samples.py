@@ -47,6 +47,7 @@ class DrawingConfig(NamedTuple):
     metal: bool  # whether they are shaded
     picture: bool  # whether colours are written
     labels: bool  # whether labels are written; needs one sample per pixel
+    normals: bool  # whether normals are among them
     lens: str  # the model of the lens, pinhole or fisheye; empty if it bends no lines
     lanes: int  # samples in a tile
 
@@ -130,6 +131,7 @@ def _planes(config: DrawingConfig) -> Any:
     """Number the planes that a config needs."""
     needed = {
         **{name: config.labels for label in LABELS.values() for name in label.planes},
+        **dict.fromkeys(LABELS["normals"].planes, config.normals),
         **dict.fromkeys(("depth", "texel_x", "texel_y"), True),  # of what is seen; its place in the texture [texels]
         "light": config.headlit,  # share of the headlight that comes back
         "wire": config.wireframe,  # share of the mesh's lines in the colour
@@ -227,3 +229,11 @@ def clear(at, band: ti.template()):
 def keep(at, visible, value, samples: ti.template()):
     """Store a plane's value for the samples where it is visible."""
     samples[at] = ti.select(visible, value, samples[at])
+
+
+@ti.func
+def keep_unit(at, visible, vector: ti.template(), samples: ti.template()):
+    """Store the direction of a vector in three planes, as `keep` stores one value."""
+    length = ti.sqrt(vector[0] * vector[0] + vector[1] * vector[1] + vector[2] * vector[2])
+    for n in ti.static(range(3)):
+        keep(at + n, visible, vector[n] / length, samples)

@@ -37,8 +37,8 @@ MATRIX, AXES, NEAR, PARTS, BACKGROUND = 0, 16, 25, 26, 27
 # pinhole camera, else 0. The middle of the picture [samples].
 CENTRE_X, CENTRE_Y, SPREAD_X, SPREAD_Y, PINHOLE, MIDDLE_X, MIDDLE_Y = range(30, 37)
 
-# The light's place [m]; its distance from the point in the middle of the picture [m]; the factor that makes the light 1
-# there; the scene's numbers.
+# The light's place to the right and up, in the camera's frame [m]; its distance from the point in the middle of the
+# picture of the main camera [m]; the factor that makes the light 1 there; the scene's numbers.
 LIGHT_X, LIGHT_Y, FARNESS, UNIT, AMBIENT, GLOSS, VIGNETTE = range(37, 44)
 
 # The sheet's axes to the right and up, in the camera's frame; the slope of the relief for a step of one grey from texel
@@ -56,9 +56,12 @@ TOUCHING_SHARE = 1e-9  # this distance as a fraction of the sheet's larger side
 # and samples per metre at w = 1; the numbers of `places.Visible`, in samples.
 LENS, LENS_RADIUS, PICTURE_X, PICTURE_Y, FOCAL_X, FOCAL_Y, VISIBLE, BEND, STRETCH = 53, *range(61, 67), 70, 71
 
+# The light's place toward the camera, in its frame [m]; the direction to the headlight, in the world.
+LIGHT_Z, HEADLIGHT = 72, 73
+
 # Then the instruments, each with the middle of its tip and its axis in the camera's frame; its length and radius; and
 # its bounds in the picture [samples].
-RODS, ROD_NUMBERS = 72, 12
+RODS, ROD_NUMBERS = 76, 12
 TIP, AXIS, LENGTH, RADIUS, LEFT, TOP, RIGHT, BOTTOM = 0, 3, 6, 7, 8, 9, 10, 11
 
 
@@ -84,10 +87,14 @@ def view_numbers(
     numbers[BACKGROUND:CENTRE_X] = render.background
     numbers[CENTRE_X:SPREAD_X], numbers[SPREAD_X:PINHOLE] = view.centre * factor, 1 / (view.scale * factor)
     numbers[PINHOLE], numbers[MIDDLE_X:LIGHT_X] = view.pinhole, view.size / 2 * factor
-    x, y = style.LIGHT_RIGHT * view.distance, style.LIGHT_UP * view.distance
-    far, light = math.hypot(x, y, view.distance), render.light
-    unit = (1 + style.WRAP) / (view.distance / far + style.WRAP)
-    numbers[LIGHT_X:ACROSS] = x, y, far, unit, light.ambient, light.gloss, light.vignette
+    lamp, light = view.lamp or view, render.light
+    place = np.array([style.LIGHT_RIGHT, style.LIGHT_UP, 0.0]) * lamp.distance
+    far = math.hypot(place[0], place[1], lamp.distance)
+    unit = (1 + style.WRAP) / (lamp.distance / far + style.WRAP)
+    if lamp is not view:
+        place = view.axes @ (lamp.eye + place @ lamp.axes - view.eye)
+    numbers[[LIGHT_X, LIGHT_Y, LIGHT_Z]], numbers[HEADLIGHT:RODS] = place, lamp.axes[2]
+    numbers[FARNESS:ACROSS] = far, unit, light.ambient, light.gloss, light.vignette
     numbers[ACROSS:UP], numbers[UP:SLOPE_X] = view.axes[:, 0], view.axes[:, 1]
     height = light.relief / 100 / 255 * max(sheet)
     numbers[SLOPE_X:TOUCHING] = height * texture[0] / sheet[1], -height * texture[1] / sheet[0]

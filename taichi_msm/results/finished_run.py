@@ -17,7 +17,7 @@ from pydantic import TypeAdapter
 from taichi_msm.arguments import require_path
 from taichi_msm.errors import FilesError, MsmError, SceneError
 from taichi_msm.outputs.npz import map_array
-from taichi_msm.outputs.table import CAMERA, OUTPUTS, RECORD, SWEEP
+from taichi_msm.outputs.table import OUTPUTS, RECORD, SWEEP
 from taichi_msm.physics.lattice import rest_positions
 from taichi_msm.physics.planning import try_plan
 from taichi_msm.picture import PictureError, file_sha256, read_rgb
@@ -48,7 +48,7 @@ class FinishedRun:
     sha256: Mapping[str, str]  # of the files of its pictures, by the keys that name them
     overrides: list[str]  # that made the scene from its file
     _record: bytes = field(repr=False)
-    camera: str = ""  # by whose name what is seen is found, in a run with several cameras
+    camera: str = ""  # of which what is seen is read; "": the only one, without a name
 
     @property
     def time(self) -> NDArray[np.float64]:
@@ -125,13 +125,8 @@ class FinishedRun:
             return path.exists()
 
     def cameras(self) -> list[str]:
-        """Name the cameras of a run that has several, in alphabetical order; none: it has one, without a name."""
-        with reading(self.directory):
-            return sorted(
-                path.name
-                for path in self.directory.iterdir()
-                if not path.is_symlink() and (path / CAMERA).is_file() and not (path / RECORD).exists()
-            )
+        """Name the cameras; none: it has one, without a name."""
+        return list(self.scene.render.cameras or ())
 
     def _folder(self, key: str) -> Path:
         """Give the folder of what was written for an entry of `output`."""
@@ -181,7 +176,7 @@ def read_run(directory: str | Path) -> FinishedRun:
         chosen = scene.time.precision != "auto" and scene.sheet.tolerance is scene.time.tolerance is None
         if not isinstance(frames, int) or not 1 <= frames <= scene.time.frames + 1 or not chosen:
             raise damaged(path)
-    return FinishedRun(path.parent, record["status"], scene, frames, sha256, overrides, data)
+    return FinishedRun(path.parent, record["status"], scene, frames, sha256, overrides, data, scene.render.main)
 
 
 @contextmanager

@@ -13,9 +13,9 @@ from PIL import Image
 
 from taichi_msm.outputs.flo import write_flo
 from taichi_msm.outputs.npz import write_arrays
-from taichi_msm.outputs.table import CAMERA, OUTPUTS, results
+from taichi_msm.outputs.table import CAMERA, OUTPUTS
 from taichi_msm.physics.deformed import on_surface
-from taichi_msm.render.camera import calibration, moves, pose, view, view_at
+from taichi_msm.render.camera import calibration, moves, pose, view_at
 from taichi_msm.render.labels import Observed, track_grid
 from taichi_msm.results.whole import add, create
 from taichi_msm.scene import Scene
@@ -25,13 +25,13 @@ COMPRESS_LEVEL = 1
 
 
 class LabelWriter:
-    """Writes the labels that a scene's `output` asks for into a folder, frame by frame."""
+    """Writes the labels of a camera that a scene's `output` asks for into a folder, frame by frame."""
 
-    def __init__(self, folder: Path, scene: Scene) -> None:
-        self._folder = folder
-        self._scene = scene
-        wanted = [output for name, output in OUTPUTS.items() if name in scene.output]
-        self._series = [output for output in wanted if output.source in ("labels", "flow")]
+    def __init__(self, folder: Path, scene: Scene, camera: str = "") -> None:
+        self._folder, self._scene, self._camera = folder, scene, camera
+        wanted = [output for name, output in OUTPUTS.items() if name in scene.folders[camera]]
+        self._series = [output for output in wanted if output.source in ("labels", "flow", "stereo")]
+        self._described = any(output.needs_camera for output in wanted)
         # Tracks are held until all are there, as their file has them point by point.
         shape = scene.render.tracks**2 if scene.asks_for("tracks") else 0, scene.time.frames + 1
         self._points, self._occluded = np.empty((*shape, 2), np.float32), np.empty(shape, np.bool_)
@@ -60,11 +60,12 @@ class LabelWriter:
         for output in self._series:
             for number in range(output.count(frames), self._added):
                 (self._folder / output.path(number)).unlink(missing_ok=True)
-        if CAMERA in results(self._scene.output):
-            matrices = {"size": list(self._scene.render.size), **calibration(view(self._scene))}
-            if moves(self._scene):
-                rate = self._scene.time.frames_per_second
-                matrices["poses"] = [pose(view_at(self._scene, frame / rate)) for frame in range(frames)]
+        if self._described:
+            scene, name = self._scene, self._camera
+            matrices = {"size": list(scene.render.size), **calibration(view_at(scene, 0.0, name))}
+            if moves(scene, name):
+                rate = scene.time.frames_per_second
+                matrices["poses"] = [pose(view_at(scene, frame / rate, name)) for frame in range(frames)]
             add(self._folder / CAMERA, (json.dumps(matrices, indent=2) + "\n").encode())
         if self._scene.asks_for("tracks"):
             tracks = {"points": self._points, "occluded": self._occluded, "position": self._position}

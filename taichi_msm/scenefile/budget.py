@@ -39,8 +39,10 @@ FILM_PIXEL_BYTES = 80
 FILE_BYTES = 1024
 RECORD_BYTES = 1 << 16
 
-# Bytes of a pixel while its labels are found and written; and of a tracked point in a frame, held until the end.
+# Bytes of a pixel while its labels are found and written, and its normal; and of a tracked point in a frame, held until
+# the end.
 LABEL_PIXEL_BYTES = 60
+NORMAL_PIXEL_BYTES = 24
 TRACK_BYTES = 21
 
 # Bytes of a row of the table of forces, at most, and of what is kept of one until the run ends.
@@ -88,10 +90,12 @@ def estimate(plan: Plan) -> Budget:
     rows, cols = scene.sheet.points
     points, number_bytes = rows * cols, 4 if grid.precision == "f32" else 8
     frames, (width, height) = grid.frames + 1, scene.render.size
-    pixel_bytes = [output.pixel_bytes for name, output in OUTPUTS.items() if name in scene.output]
+    pixel_bytes = [OUTPUTS[name].pixel_bytes for folder in scene.folders.values() for name in folder]
+    cameras = len(scene.render.all_cameras)
     picture = sum(width * height * each + height + FILE_BYTES for each in pixel_bytes if each)
     positions = frames * points * 3 * number_bytes
     tracks = scene.render.tracks**2 * (frames * TRACK_BYTES + 16) + FILE_BYTES if "tracks" in scene.output else 0
+    tracks *= cameras
     forces = frames * len(scene.probes) if "forces" in scene.output else 0
     contact = contact_fields(scene.probes)
     loads = sum(not probe.moved for probe in scene.probes)
@@ -175,12 +179,14 @@ def drawing_bytes(scene: Scene) -> int:
     factor = scene.render.supersample
     band_rows = min(height * factor, BAND_ROWS * (os.cpu_count() or 1))
     samples = band_rows * width * factor * SAMPLE_BYTES
-    camera = scene.render.camera
-    if isinstance(camera, Camera) and camera.distortion is not None:
-        samples += width * height * factor**2 * PLACE_BYTES
+    cameras = scene.render.all_cameras.values()
+    bent = sum(isinstance(camera, Camera) and camera.distortion is not None for camera in cameras)
+    samples += width * height * factor**2 * PLACE_BYTES * bent
     pixel = PIXEL_BYTES + (LABEL_PIXEL_BYTES if scene.labels_pixels else 0)
+    pixel += NORMAL_PIXEL_BYTES if "normals" in scene.output else 0
     pixel += FILM_PIXEL_BYTES if "mp4" in scene.output else 0
-    return rows * cols * POINT_BYTES + samples + width * height * pixel + picture * PICTURE_PIXEL_BYTES
+    pixels = width * height * len(cameras)
+    return rows * cols * POINT_BYTES + samples + pixels * pixel + picture * PICTURE_PIXEL_BYTES
 
 
 def _free_disk(directory: Path) -> int:

@@ -281,7 +281,7 @@ class Session:
             case "down":
                 self.handle(events.Harder(-events.NOTCH))
             case "c" | "t" | "o":
-                self.viewport.look({"c": self.scene.render.camera, "t": "top", "o": "oblique"}[key])
+                self.viewport.look({"c": self.scene.render.main_camera, "t": "top", "o": "oblique"}[key])
                 self._controller.hold_on()
             case "m":
                 self.viewport.mesh()

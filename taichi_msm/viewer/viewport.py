@@ -10,10 +10,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from taichi_msm.outputs.gif import Picture
-from taichi_msm.render.camera import View, held, pinhole, turned
+from taichi_msm.render.camera import View, held, pinhole, turned, view
 from taichi_msm.render.renderer import Renderer, Shot
 from taichi_msm.render.surface import Rod
-from taichi_msm.scene import Camera, Render
+from taichi_msm.scene import AnyCamera, Camera, Render
 
 
 class Viewport:
@@ -30,34 +30,35 @@ class Viewport:
         self._renderer, self._plays, self._time = renderer, play, 0.0
         self.render: Render = renderer.scene.render
         self.view: View = renderer.view
-        self.look(self.render.camera)
+        self.look(self.render.main_camera)
 
     @property
     def compiled(self) -> bool:
         """Whether the next picture can be drawn without compiling a kernel."""
         return self._renderer.is_compiled(self.render, self.view)
 
-    def look(self, camera: str | Camera) -> None:
-        """Choose another camera."""
+    def look(self, camera: AnyCamera) -> None:
+        """Choose another camera; those beside it follow."""
         if isinstance(camera, Camera) and not self._plays:
             camera = held(camera, 0.0)
-        self.view = self._renderer.set_up(camera, self._time)
-        self._change(camera=camera)
+        self.render = self.render.with_main(camera)
+        self.view = view(self._renderer.scene.model_copy(update={"render": self.render, "output": ()}), self._time)
 
     def follow(self, time: float) -> bool:
         """Go where a moving camera is at a time [s]; returns whether it moves."""
         self._time = time
-        moving = isinstance(self.render.camera, Camera) and self.render.camera.moves
+        camera = self.render.main_camera
+        moving = isinstance(camera, Camera) and camera.moves
         if moving:
             self.view = self._renderer.set_up(None, time)
         return moving
 
     def recorded(self, duration: float) -> Render:
         """Give how it is drawn for a scene of some duration [s], to the end of which the last pose is held."""
-        camera = self.render.camera
+        camera = self.render.main_camera
         if isinstance(camera, Camera) and isinstance(camera.poses, tuple) and camera.poses[-1][0] < duration:
             last = (duration, *camera.poses[-1][1:])
-            return self.render.model_copy(update={"camera": camera.model_copy(update={"poses": (*camera.poses, last)})})
+            return self.render.with_main(camera.model_copy(update={"poses": (*camera.poses, last)}))
         return self.render
 
     def turn(self, right: float, down: float) -> None:

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from taichi_msm.render import style
-from taichi_msm.render.camera import view
+from taichi_msm.render.camera import View, view
 from taichi_msm.render.surface import Rod
 from taichi_msm.scene import Scene
 from tests.reference.lens import undistorted
@@ -98,6 +98,7 @@ class Seen(NamedTuple):
         wire: share of the mesh lines in the colour.
         footprint: the larger of a sample's width and height on the texture, in units of style.SHARP texels.
         front: 1 where the front of the triangle is seen, else -1.
+        facet: normal of the triangle's front in the world [m^2], shape (height, width, 3); NaN where none is.
     """
 
     depth: Array
@@ -106,9 +107,12 @@ class Seen(NamedTuple):
     wire: Array
     footprint: Array
     front: Array
+    facet: Array
 
 
-def look(scene: Scene, position: Array, factor: int = 1, texels: tuple[int, int] = (1, 1)) -> Seen:
+def look(
+    scene: Scene, position: Array, factor: int = 1, texels: tuple[int, int] = (1, 1), camera: View | None = None
+) -> Seen:
     """Find what every sample shows: refine, project, and keep the nearest triangle at every sample.
 
     Args:
@@ -116,14 +120,15 @@ def look(scene: Scene, position: Array, factor: int = 1, texels: tuple[int, int]
         position: positions of the mass points [m], shape (rows, cols, 3).
         factor: samples per pixel along each axis.
         texels: width and height of the texture.
+        camera: another camera than the scene's.
     """
     rows, cols = scene.sheet.points
     width, height = (size * factor for size in scene.render.size)
-    camera = view(scene)
+    camera = camera or view(scene)
     matrix = camera.matrix * np.array([[factor], [factor], [1], [1]])
     projected = np.concatenate([position, np.ones((rows, cols, 1))], axis=-1) @ matrix.T
     u, v = np.meshgrid(np.arange(cols) / (cols - 1), np.arange(rows) / (rows - 1))
-    surface = refine(np.concatenate([projected, u[..., None], v[..., None]], axis=-1), scene.render.refine)
+    surface = refine(np.concatenate([projected, u[..., None], v[..., None], position], axis=-1), scene.render.refine)
 
     @cache
     def places(right: float, down: float) -> tuple[Array, Array]:
@@ -131,7 +136,8 @@ def look(scene: Scene, position: Array, factor: int = 1, texels: tuple[int, int]
         x, y = undistorted(camera, (x + right) / factor, (y + down) / factor)
         return x * factor, y * factor
 
-    seen = Seen(*(np.full((height, width), value) for value in (np.inf, np.nan, np.nan, 0.0, 0.0, 1.0)))
+    nothing = (np.inf, np.nan, np.nan, 0.0, 0.0, 1.0, [np.nan] * 3)
+    seen = Seen(*(np.full((height, width, *np.shape(value)), value) for value in nothing))
     for triangle in triangles(surface):
         left, top, right, bottom = 0, 0, width - 1, height - 1
         if (triangle[:, 2] > camera.near).all():
@@ -150,12 +156,13 @@ def look(scene: Scene, position: Array, factor: int = 1, texels: tuple[int, int]
 
         x, y = at(0, 0)
         share = weights(triangle, x, y)
-        w, depth, u, v = np.tensordot(triangle[:, 2:].T, share, 1)
+        w, depth, u, v = np.tensordot(triangle[:, 2:6].T, share, 1)
         here = (share >= -1e-12).all(axis=0) & (w > camera.near) & (depth < seen.depth[box])
         wire = wire_share(scene, triangle, at) if scene.render.wireframe else np.zeros_like(x)
         # From the upper left the corners go down and around: counter-clockwise where the front is seen.
         front = np.full_like(x, -np.sign(np.linalg.det(triangle[:, :3])))
-        found = Seen(depth, u, v, wire, footprint(triangle, at, texels), front)
+        facet = np.broadcast_to(np.cross(*np.diff(triangle[:, 6:], axis=0)), (*x.shape, 3))
+        found = Seen(depth, u, v, wire, footprint(triangle, at, texels), front, facet)
         for kept, new in zip(seen, found, strict=True):
             kept[box][here] = new[here]
     return seen
@@ -190,7 +197,9 @@ def footprint(triangle: Array, at: Sampled, texels: tuple[int, int]) -> Array:
     return np.asarray(np.maximum(np.hypot(*right), np.hypot(*down)) / (2 * step * style.SHARP))
 
 
-def draw(scene: Scene, position: Array, texture: NDArray[np.uint8], rods: Sequence[Rod] = ()) -> NDArray[np.uint8]:
+def draw(
+    scene: Scene, position: Array, texture: NDArray[np.uint8], rods: Sequence[Rod] = (), camera: View | None = None
+) -> NDArray[np.uint8]:
     """Draw one frame.
 
     Args:
@@ -198,12 +207,13 @@ def draw(scene: Scene, position: Array, texture: NDArray[np.uint8], rods: Sequen
         position: positions of the mass points [m], shape (rows, cols, 3).
         texture: the picture on the sheet, shape (height, width, 3).
         rods: the instruments.
+        camera: another camera than the scene's.
 
     Returns:
         Colours, shape (height, width, 3).
     """
-    factor, camera = scene.render.supersample, view(scene)
-    seen = look(scene, position, factor, (texture.shape[1], texture.shape[0]))
+    factor, camera = scene.render.supersample, camera or view(scene)
+    seen = look(scene, position, factor, (texture.shape[1], texture.shape[0]), camera)
     sheet = np.isfinite(seen.depth)
     u, v = np.where(sheet, seen.u, 0), np.where(sheet, seen.v, 0)
     normal = normals_at(normals(position), u, v) * seen.front[..., None]
@@ -212,7 +222,7 @@ def draw(scene: Scene, position: Array, texture: NDArray[np.uint8], rods: Sequen
     else:
         lit = sample(texture, u, v)
     if scene.render.shading == "headlight":
-        lit *= headlight(normal, camera.axes[2])[..., None]
+        lit *= headlight(normal, (camera.lamp or camera).axes[2])[..., None]
     wire = seen.wire[..., None]
     lit = lit * (1 - wire) + np.array(style.WIRE_COLOUR) * wire
     colour = np.where(sheet[..., None], lit, np.array(scene.render.background, float))

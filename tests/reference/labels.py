@@ -40,6 +40,17 @@ def labels(scene: Scene, position: Array, rods: Sequence[Rod] = ()) -> tuple[Arr
     return coordinates, np.where(np.isfinite(depth), depth, 0), nearer
 
 
+def normals(scene: Scene, position: Array, rods: Sequence[Rod] = ()) -> Array:
+    """Give the unit normal of what each pixel shows at its centre, toward the camera; arguments as for `labels`.
+
+    It is in OpenCV's axes of the camera, shape (height, width, 3); NaN where nothing is seen.
+    """
+    camera, seen = view(scene), look(scene, position)
+    depth, outward = meet(rods, camera, scene.render.size, 1)
+    normal = np.where((depth < seen.depth)[..., None], outward, seen.facet * seen.front[..., None])
+    return normal / np.linalg.norm(normal, axis=-1, keepdims=True) @ (camera.axes.T * [1, -1, -1])
+
+
 def find(scene: Scene, coordinates: Array, position: Array) -> tuple[Array, NDArray[np.bool_]]:
     """Find where material points are seen, and whether the sheet hides them or they are outside the picture.
 

@@ -1,0 +1,226 @@
+"""From a scene and what was seen to the values of its parameters, with their uncertainty."""
+
+from __future__ import annotations
+
+import secrets
+import time
+from collections.abc import Mapping, Sequence
+from contextlib import ExitStack
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from typing_extensions import TypedDict, Unpack
+
+from taichi_msm.arguments import require_path
+from taichi_msm.errors import ArgumentError, DivergedError, SceneError, writing
+from taichi_msm.fitting import notes
+from taichi_msm.fitting.estimation import Search, Solution
+from taichi_msm.fitting.identifiability import MOST_ERROR, unseen
+from taichi_msm.fitting.observations import read_forces, read_observations, with_sigma
+from taichi_msm.fitting.parameters import Bounds, Parameter, as_data, make_parameters, with_values
+from taichi_msm.fitting.prediction import Job, runnable, seen_at_rest
+from taichi_msm.fitting.profiles import Place, Profile, Profiler
+from taichi_msm.fitting.report import publication, write_report
+from taichi_msm.fitting.result import Estimate, FitResult
+from taichi_msm.fitting.runs import Runs
+from taichi_msm.fitting.suspicions import faults, faults_beside, moved
+from taichi_msm.fitting.uncertainty import Uncertainty, likeness, uncertainty
+from taichi_msm.physics.mesh_error import WITH_CONTACT
+from taichi_msm.progress import Progress
+from taichi_msm.scene import Scene
+from taichi_msm.scenefile.load import load_scene
+from taichi_msm.scenefile.validation import checked
+
+Array = NDArray[np.float64]
+
+# Where a parameter's curvature is drawn, in standard deviations; they are at most so large, in units of x.
+CURVE, WIDEST = np.linspace(-3, 3, 25), 3.0
+
+
+class Method(TypedDict, total=False):
+    """How a fit is made."""
+
+    sigma: float | None  # standard deviation of what was seen, in place of that in the file [m] or [px]
+    robust: bool  # whether what is far off counts less
+    profile: bool  # whether the intervals are found by profiles
+    correlation: float | None  # how far in the picture errors of tracks are alike [px]
+
+
+def fit(
+    scene: str | Path | Scene | Mapping[str, Any],
+    observed: str | Path | Mapping[str, Any],
+    free: Sequence[str],
+    *,
+    bounds: Mapping[str, Bounds] | None = None,
+    forces: tuple[str | Path, float] | None = None,
+    directory: str | Path | None = None,
+    workers: int | None = None,
+    progress: Progress = lambda stage, done, total: None,
+    **method: Unpack[Method],
+) -> FitResult:
+    """Find the numbers of a scene with which it moves as was seen, and how well they are known.
+
+    Args:
+        scene: a scene file, what `load_scene` returned, or the same as a mapping. Its numbers are where the search
+            begins.
+        observed: an .npz file, or a mapping of such arrays: `time` [s], shape (T,); `coordinates` of points, across and
+            down, shape (N, 2); `position` [m], shape (N, T, 3), or `pixel` [px] of the scene's camera, shape (N, T, 2);
+            NaN where not seen; `sigma`, the standard deviation of their errors, may be left out. Or a run's
+            trajectory.npz or tracks.npz.
+        free: the keys that are fitted, by their dotted paths, such as tissue.young or probes.0.total.2.
+        bounds: smallest and largest values of keys.
+        forces: a forces.csv of the same motion, and the standard deviation of its forces [N].
+        directory: where fit.json, scene.yaml and fit.png go; None: nothing is written.
+        workers: processes that take runs side by side; None: as many as pay.
+        progress: called often, with the stage, the runs done and about how many there will be; what it raises stops the
+            fit, and nothing is written.
+        **method: sigma, in place of the file's; robust: whether numbers that are far off count less; profile: whether
+            the intervals are found by going there; correlation: how far apart in the picture errors of tracks are alike
+            [px].
+
+    Returns:
+        What was found; also where the data do not tell a parameter: then `identifiable` is False.
+
+    Raises:
+        ArgumentError: when a keyword is unknown.
+        SceneError: when the scene, the keys or what was seen cannot be used, each with the remedy.
+        DivergedError: when the scene diverges where it begins.
+        FilesError: when the directory cannot be written.
+
+    Example:
+        >>> from taichi_msm import fit, load_scene
+        >>> scene = load_scene("scenes/press.yaml", {"sheet.points": [41, 41], "tissue.young": 6e4})
+        >>> found = fit(scene, "output/press/trajectory.npz", ["tissue.young"])
+        >>> f"{found.parameters['tissue.young'].value:.4g} Pa", found.identifiable
+        ('3e+04 Pa', True)
+    """
+    begun = time.perf_counter()
+    if unknown := set(method) - set(Method.__annotations__):
+        raise ArgumentError(f"{unknown.pop()}: unknown; take {', '.join(Method.__annotations__)}")
+    given = load_scene(scene) if isinstance(scene, (str, Path)) else checked(scene).scene
+    for section in ("sheet", "time"):
+        if (tolerance := getattr(given, section).tolerance) is not None:
+            said = "is for one run, and a fit compares many; remove it, and take what `run` chose for it"
+            raise SceneError([f"{section}.tolerance: {tolerance:g} {said}"])
+    seen = with_sigma(read_observations(observed, given.time.frames_per_second), method.get("sigma"))
+    parameters = make_parameters(given, [free] if isinstance(free, str) else free, bounds or {})
+    if forces is not None:
+        seen = replace(seen, forces=read_forces(forces[0], forces[1], len(given.probes)))
+    if (correlation := method.get("correlation")) is not None:
+        if not 0 < correlation < np.inf:
+            raise SceneError([f"--correlation {correlation:g}: take a number of pixels above 0"])
+        if seen.kind != "pixel":
+            raise SceneError([f"{seen.name}: --correlation is in pixels, and these are positions; leave it out"])
+    if wrong := list(faults(seen, given, len(parameters))):
+        raise SceneError(wrong)
+    with ExitStack() as opened:
+        if directory is not None:
+            require_path(directory)
+            opened.enter_context(writing(directory))
+            published = opened.enter_context(publication(Path(directory)))
+        job = Job(secrets.token_hex(8), runnable(given), parameters, seen)
+        runs = opened.enter_context(Runs(job, workers, progress))
+        result = replace(_fit(runs, given, method), seconds=time.perf_counter() - begun)
+        if directory is not None:
+            progress("write", 0, 0)
+            write_report(result, published)
+    return result
+
+
+def _fit(runs: Runs, given: Scene, method: Method) -> FitResult:
+    """Search, and say how well the best values are known."""
+    parameters, seen = runs.job.parameters, runs.job.observations
+    robust, correlation = method.get("robust", False), method.get("correlation")
+    start = np.zeros(len(parameters))
+    runs.expected = 8 * len(start) + 4
+    first = runs.first(start)
+    if wrong := list(faults_beside(seen, given, first)):
+        raise SceneError(wrong)
+    motion = moved(seen, given) or 1.0
+    search = Search(runs, motion, robust=robust)
+    solution = search.best(start)
+    alike = None if correlation is None else likeness(seen_at_rest(given, seen)[:, 0], correlation)
+    uncertain = uncertainty(search.misfit, seen, solution, search.derivatives(solution), alike, robust=robust)
+    profiles = None
+    if method.get("profile"):
+        profiles = Profiler(search.misfit, solution, uncertain, robust=robust).profiles(runs)
+    mesh, shifts = _mesh(runs, search, solution, uncertain)
+    places = enumerate(solution.x.tolist())
+    estimates = [_estimate(parameters[n], x, n, uncertain, profiles, shifts) for n, x in places]
+    blind = unseen(parameters, solution.x, uncertain, forces=seen.forces is not None)
+    left = search.misfit.of(solution.predicted)
+    values, forces = left[: search.misfit.count[0]], left[search.misfit.count[0] :]
+    return FitResult(
+        parameters={one.key: estimate for one, estimate in zip(parameters, estimates, strict=True)},
+        correlation=uncertain.correlation.tolist(),
+        residual=float(np.sqrt(np.mean(values**2))),
+        residual_force=float(np.sqrt(np.mean(forces**2))) if len(forces) else None,
+        sigma=uncertain.scales.values,
+        unit=seen.unit,
+        chi_square=float(uncertain.left @ uncertain.left) if seen.sigma is not None else None,
+        degrees_of_freedom=uncertain.freedom,
+        identifiable=all(one.identifiable for one in estimates),
+        unseen=blind,
+        mesh_error=mesh,
+        runs=runs.count,
+        seconds=0.0,
+        notes=[
+            *notes.of_the_search(solution, parameters, fits=search.fits(solution)),
+            *notes.of_the_points(parameters, solution.x, uncertain, shifts),
+            *notes.of_ties(parameters, uncertain, blind),
+            *notes.of_what_is_left(seen, solution, uncertain, motion, independent=correlation is None),
+        ],
+        scene=Scene(**with_values(as_data(given), parameters, [one.value for one in estimates])),
+        observations=seen,
+        fitted=solution.predicted.values,
+        fitted_forces=solution.predicted.forces,
+        curves={one.key: _curve(one, n, solution.x, uncertain, profiles) for n, one in enumerate(parameters)},
+    )
+
+
+def _mesh(runs: Runs, search: Search, solution: Solution, uncertain: Uncertainty) -> tuple[float | None, Array | None]:
+    """Estimate the error of the points, and how far it moves every parameter, in units of x."""
+    try:
+        estimate = runs.mesh_error(solution.x)
+        if estimate is None or not np.isfinite(estimate.error):
+            return None, None
+        coarse = runs.coarse(solution.x)
+    except (DivergedError, SceneError):  # with fewer points
+        return None, None
+    order = WITH_CONTACT if any(probe.moved for probe in runs.job.scene.probes) else 2.0
+    rows = search.misfit.row(coarse) - search.misfit.row(solution.predicted)
+    return estimate.error, np.abs(uncertain.shift(search.misfit.divided(rows, uncertain.scales))) / (2**order - 1)
+
+
+def _estimate(
+    one: Parameter, x: float, n: int, uncertain: Uncertainty, profiles: list[Profile] | None, shifts: Array | None
+) -> Estimate:
+    """Put together what is known of the parameter with number n."""
+    deviation = float(uncertain.deviations[n])
+    away = uncertain.quantile * deviation
+    ends: tuple[float | None, float | None] = (x - away, x + away)
+    if profiles is not None:
+        ends = profiles[n].low, profiles[n].high
+    low, high = one.limits
+    interval = [None if end is None or not low <= end <= high else one.value(end) for end in ends]
+    if one.start < 0 and one.is_log:
+        interval.reverse()
+    return Estimate(
+        value=one.value(x),
+        standard_error=one.error(x, deviation),
+        interval=(interval[0], interval[1]),
+        start=one.start,
+        identifiable=one.share(x, deviation) <= MOST_ERROR,
+        mesh_error=None if shifts is None else one.error(x, float(shifts[n])),
+    )
+
+
+def _curve(one: Parameter, n: int, x: Array, uncertain: Uncertainty, profiles: list[Profile] | None) -> list[Place]:
+    """Give the profile of a parameter, or what its curvature tells, at values."""
+    if profiles is not None:
+        return [Place(one.value(place.x), place.deviations) for place in profiles[n].places]
+    deviation = min(float(uncertain.deviations[n]), WIDEST)
+    return [Place(one.value(x[n] + share * deviation), float(share)) for share in CURVE]

@@ -1,0 +1,186 @@
+"""What was seen of a tissue: where some of its points were at some times, and the forces of tools.
+
+An .npz file has `time` (T,) [s], `coordinates` (N, 2), across and down, and `position` (N, T, 3) [m] or `pixel`
+(N, T, 2) [px], NaN where not seen, and may have `sigma`, the standard deviation of each number's error. A
+trajectory.npz and a tracks.npz of a run are taken as they are.
+"""
+
+from __future__ import annotations
+
+import math
+import zipfile
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from taichi_msm.arguments import as_array
+from taichi_msm.errors import SceneError
+
+Array = NDArray[np.float64]
+
+# A trajectory is thinned out to so many points a side.
+MOST_A_SIDE = 64
+
+NEEDS = "time (T,), coordinates (N, 2) and position (N, T, 3) or pixel (N, T, 2)"
+
+
+@dataclass(frozen=True, eq=False)
+class Forces:
+    """Forces of tools on the sheet, as in a forces.csv."""
+
+    name: str  # of the file, in messages
+    time: Array  # of every row [s], shape (rows,)
+    probe: NDArray[np.intp]  # whose it is, shape (rows,)
+    force: Array  # [N], shape (rows, 3); NaN: not measured
+    sigma: float  # standard deviation of each component's error [N]
+
+
+@dataclass(frozen=True, eq=False)
+class Observations:
+    """Where points were at some times, with NaN where that is not known."""
+
+    name: str  # of the file, in messages
+    kind: Literal["position", "pixel"]
+    time: Array  # [s], shape (T,)
+    coordinates: Array  # across and down as fractions of the sheet, shape (N, 2)
+    values: Array  # [m] or [px], shape (N, T, 3 or 2)
+    sigma: float | None  # standard deviation of each number's error [m] or [px]; None: not known
+    forces: Forces | None = None
+
+    @property
+    def unit(self) -> str:
+        """Of the values and of sigma."""
+        return "m" if self.kind == "position" else "px"
+
+    @property
+    def known(self) -> NDArray[np.bool_]:
+        """Which values are known, of the shape of the values."""
+        return np.isfinite(self.values)
+
+    @property
+    def there(self) -> NDArray[np.bool_]:
+        """Which points were seen at which times, shape (N, T)."""
+        return self.known[..., 0]
+
+
+def read_observations(observed: str | Path | Mapping[str, Any], rate: float) -> Observations:
+    """Read what was seen from a file, or take it from a mapping of such arrays.
+
+    rate: the scene's frames per second, which tell the times of a tracks.npz.
+
+    Raises a SceneError when it cannot be used by itself, whatever the scene is.
+    """
+    if isinstance(observed, Mapping):
+        return _checked("observed", {str(key): as_array(value, str(key)) for key, value in observed.items()}, rate)
+    return _checked(str(observed), _arrays(str(observed)), rate)
+
+
+def with_sigma(seen: Observations, sigma: float | None) -> Observations:
+    """Give the errors another standard deviation, unless that is None."""
+    return seen if sigma is None else replace(seen, sigma=_as_sigma(seen.name, sigma, seen.unit))
+
+
+def _arrays(name: str) -> dict[str, NDArray[Any]]:
+    """Read the arrays of a file."""
+    path, remedy = Path(name), f"name an .npz with {NEEDS}, or a run's trajectory.npz or tracks.npz"
+    try:
+        if not path.is_file():
+            raise SceneError([f"{name}: {'a folder' if path.is_dir() else 'no such file'}; {remedy}"])
+        with np.load(path, allow_pickle=False) as archive:
+            return {key: archive[key] for key in archive.files}
+    except (OSError, ValueError, EOFError, zipfile.BadZipFile) as error:
+        reason = (error.strerror or "cannot be read").lower() if isinstance(error, OSError) else "not an .npz"
+        raise SceneError([f"{name}: {reason}; {remedy}"]) from None
+
+
+def _checked(name: str, arrays: dict[str, NDArray[Any]], rate: float) -> Observations:
+    """Make observations of arrays; SceneError: they are none."""
+    arrays = _in_one_form(arrays, rate)
+    kinds = [kind for kind in ("position", "pixel") if kind in arrays]
+    if missing := [key for key in ("time", "coordinates") if key not in arrays] + ([] if kinds else ["position"]):
+        raise SceneError([f"{name}: {missing[0]}: missing; expected {NEEDS}"])
+    if len(kinds) == 2:
+        raise SceneError([f"{name}: has both position and pixel; leave one of them out"])
+    kind: Literal["position", "pixel"] = "position" if kinds[0] == "position" else "pixel"
+    for key in ("time", "coordinates", kind):
+        if arrays[key].dtype.kind not in "fiu":
+            raise SceneError([f"{name}: {key}: {arrays[key].dtype} is no number; expected {NEEDS}"])
+    time, coordinates, values = (np.asarray(arrays[key], np.float64) for key in ("time", "coordinates", kind))
+    size = 3 if kind == "position" else 2
+    points, times = len(coordinates) if coordinates.ndim else 0, len(time) if time.ndim else 0
+    expected = {"time": (times,), "coordinates": (points, 2), kind: (points, times, size)}
+    for key, array in (("time", time), ("coordinates", coordinates), (kind, values)):
+        if array.shape != expected[key] or array.size == 0:
+            said = f"{name}: {key}: shape {array.shape}; expected {NEEDS}"
+            if key == kind and array.shape == (times, points, size):
+                said = f"{name}: {key}: shape {array.shape}; the points come first: take {key}.swapaxes(0, 1)"
+            raise SceneError([said])
+    if not np.isfinite(time).all():
+        raise SceneError([f"{name}: time: holds NaN or infinity; give the time of every column in seconds"])
+    if not ((coordinates >= 0) & (coordinates <= 1)).all():
+        said = "give across and down as fractions of the sheet, 0 to 1, from its upper left corner"
+        raise SceneError([f"{name}: coordinates: {coordinates.flat[np.abs(coordinates - 0.5).argmax()]:g}; {said}"])
+    # A point is seen in all its numbers or not at all.
+    values = np.where(np.isfinite(values).all(axis=2, keepdims=True), values, np.nan)
+    if not np.isfinite(values).any():
+        why = "is NaN or occluded"
+        raise SceneError([f"{name}: every one of the {points} points {why} at all {times} times; nothing was seen"])
+    unit = "m" if kind == "position" else "px"
+    sigma = arrays.get("sigma")
+    return Observations(name, kind, time, coordinates, values, None if sigma is None else _as_sigma(name, sigma, unit))
+
+
+def _as_sigma(name: str, sigma: Any, unit: str) -> float:
+    array = np.asarray(sigma)
+    if array.dtype.kind not in "fiu" or array.size != 1 or not 0 < float(array.ravel()[0]) < math.inf:
+        shown = f"{float(array.ravel()[0]):g}" if array.size == 1 and array.dtype.kind in "fiu" else str(array.shape)
+        said = f"take one number above 0, the standard deviation of the errors [{unit}], or leave it out"
+        raise SceneError([f"{name}: sigma: {shown}; {said}"])
+    return float(array.ravel()[0])
+
+
+def _in_one_form(arrays: dict[str, NDArray[Any]], rate: float) -> dict[str, NDArray[Any]]:
+    """Turn the arrays of a trajectory.npz or a tracks.npz into those of our own files."""
+    if {"points", "occluded", "coordinates"} <= arrays.keys():
+        pixel = np.where(arrays["occluded"][..., None], np.nan, arrays["points"])
+        return {"time": np.arange(pixel.shape[1]) / rate, "coordinates": arrays["coordinates"], "pixel": pixel}
+    position = arrays.get("position")
+    if position is not None and position.ndim == 4 and "coordinates" not in arrays:
+        rows, cols = (
+            np.unique(np.linspace(0, n - 1, min(n, MOST_A_SIDE)).round().astype(int)) for n in position.shape[1:3]
+        )
+        down, across = np.meshgrid(rows / (position.shape[1] - 1), cols / (position.shape[2] - 1), indexing="ij")
+        thinned = position[:, rows[:, None], cols].reshape(len(position), -1, position.shape[3])
+        coordinates = np.stack([across.ravel(), down.ravel()], axis=1)
+        return {**arrays, "coordinates": coordinates, "position": thinned.swapaxes(0, 1)}
+    return arrays
+
+
+def read_forces(path: str | Path, sigma: float, probes: int) -> Forces:
+    """Read a forces.csv; SceneError: it is none, or tells of a probe that the scene lacks.
+
+    sigma: standard deviation of the error of each component [N].
+    """
+    name = str(path)
+    if not 0 < sigma < math.inf:
+        raise SceneError([f"--forces {name},{sigma:g}: take a number above 0, the standard deviation in newtons"])
+    columns = ("time", "probe", "force_x", "force_y", "force_z")
+    expected = f"name a forces.csv, with the columns {', '.join(columns)}"
+    try:
+        table: Any = np.genfromtxt(name, delimiter=",", names=True, encoding="utf-8", ndmin=1)
+    except OSError as error:
+        raise SceneError([f"{name}: {(error.strerror or 'no such file').lower()}; {expected}"]) from None
+    except ValueError:
+        raise SceneError([f"{name}: no table of numbers; {expected}"]) from None
+    if missing := [column for column in columns if column not in (table.dtype.names or ())]:
+        raise SceneError([f"{name}: {missing[0]}: missing; {expected}"])
+    time, probe, force = table["time"], table["probe"], np.stack([table[column] for column in columns[2:]], axis=1)
+    if not (np.isfinite(force).any() and np.isfinite(time).all()):
+        raise SceneError([f"{name}: no force, or no time in a row; {expected}, and numbers in them"])
+    if wrong := [one for one in probe.tolist() if one not in range(probes)]:
+        raise SceneError([f"{name}: probe: {wrong[0]:g}; the scene has {probes}, numbered from 0"])
+    return Forces(name, time, probe.astype(np.intp), force, sigma)

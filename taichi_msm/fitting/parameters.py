@@ -1,0 +1,190 @@
+"""The numbers of a scene that are fitted: which may be, on which scale, and between which bounds.
+
+A number whose size alone is open, such as a stiffness or a force, is fitted as the logarithm of its magnitude, so that
+it keeps its sign, and all such numbers change by the same share. Others, and those that start at 0, are fitted as they
+are, in units of their range.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from copy import deepcopy
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from taichi_msm.errors import Key, SceneError, did_you_mean
+from taichi_msm.scene import Scene
+from taichi_msm.scenefile.load import parse_key
+
+Array = NDArray[np.float64]
+
+# Where a number must be to be free; in these there are choices, sizes of arrays, or what the tissue does not feel.
+SECTIONS = ("tissue", "springs", "damping", "sheet", "probes", "render.camera")
+HELD = ("tolerance", "grip", "shaft", "points")
+
+# Keys of places and times, and a tool's offset, which are fitted as they are.
+PLACES = ("at", "path", "camera", "offset", "load")
+
+# Without bounds, a number that is fitted in the log stays within a factor of 1000 from where it starts.
+WIDEST = math.log(1000)
+
+MAPS = ("map", "foundation_map")
+
+Bounds = tuple[float, float]
+
+
+def rounded(number: float) -> str:
+    """Write a number that is known roughly, in two digits."""
+    return f"{float(f'{number:.2g}'):g}"
+
+
+@dataclass(frozen=True)
+class Parameter:
+    """A number of the scene that is fitted, as x, which is 0 where it starts."""
+
+    key: str  # its dotted path
+    start: float
+    low: float  # the smallest value allowed; -inf: any
+    high: float
+    scale: float  # x = (value - start) / scale; 0: x = log(value / start)
+
+    @property
+    def path(self) -> Key:
+        """The way to it in the data of a scene."""
+        return parse_key(self.key)
+
+    @property
+    def is_log(self) -> bool:
+        """Whether it is fitted in the log of its magnitude."""
+        return self.scale == 0
+
+    def value(self, x: float) -> float:
+        """Give the value at x; infinite where it overflows."""
+        if not self.is_log:
+            return self.start + x * self.scale
+        return self.start * (math.exp(x) if x < 700 else math.inf)
+
+    @property
+    def limits(self) -> Bounds:
+        """The bounds of x."""
+        if not self.is_log:
+            return (self.low - self.start) / self.scale, (self.high - self.start) / self.scale
+        shares = sorted((self.low / self.start, self.high / self.start))
+        return (
+            math.log(shares[0]) if shares[0] > 0 else -WIDEST,
+            math.log(shares[1]) if shares[1] < math.inf else WIDEST,
+        )
+
+    def error(self, x: float, deviation: float) -> float:
+        """Turn a standard deviation of x into that of the value."""
+        return deviation * (abs(self.value(x)) if self.is_log else self.scale)
+
+    def share(self, x: float, deviation: float) -> float:
+        """Give a standard deviation of x as a share of the value; of a place, of its range."""
+        if self.is_log:
+            return deviation
+        natural = self.scale if _is_place(self.path) else abs(self.value(x))
+        return deviation * self.scale / natural if natural else math.inf
+
+
+def make_parameters(scene: Scene, free: Sequence[str], bounds: Mapping[str, Bounds]) -> tuple[Parameter, ...]:
+    """Find the numbers that are to be fitted; SceneError: with all that cannot be."""
+    data, faults, parameters = as_data(scene), [], []
+    if not free:
+        faults.append("--free: names no key; take one or more, such as --free tissue.young")
+    for key in dict.fromkeys(free):
+        try:
+            parameters.append(_parameter(scene, data, key, bounds.get(key)))
+        except SceneError as error:
+            faults += error.lines
+    for key in bounds:
+        if key not in free:
+            faults.append(f"--bounds {key}: not among --free{did_you_mean(key, free) or '; name it there too'}")
+    if faults:
+        raise SceneError(faults)
+    return tuple(parameters)
+
+
+def _parameter(scene: Scene, data: dict[str, Any], key: str, bounds: Bounds | None) -> Parameter:
+    path = parse_key(key)
+    named = f"--free {key}"
+    if path and path[-1] in MAPS:
+        raise SceneError(
+            [f"{named}: a map cannot be fitted yet; name numbers, such as {scene.kind}.{path[-1]}.range.1"]
+        )
+    value = _look_up(named, data, path)
+    inside = any(key == section or key.startswith(f"{section}.") for section in SECTIONS)
+    if not inside or not isinstance(value, float) or any(part in HELD for part in path):
+        what = "a list; name one of its numbers by its index" if isinstance(value, list) else f"{value!r}"
+        what = "a section; name a number in it" if isinstance(value, dict) else what
+        raise SceneError([f"{named}: {what}, which cannot be free; take a number of {', '.join(SECTIONS)}"])
+    low, high = bounds or (-math.inf, math.inf)
+    if not low < high:
+        raise SceneError([f"--bounds {key}={low:g},{high:g}: give the smaller one first, then a larger one"])
+    if not low <= value <= high:
+        raise SceneError([f"--bounds {key}={low:g},{high:g}: {value:g}, where it starts, is outside; --set {key}=..."])
+    scale = 0.0
+    if value == 0 or _is_place(path):
+        if math.isfinite(high - low):
+            scale = high - low
+        elif _is_place(path):
+            scale = _natural(scene, path)
+        else:
+            raise SceneError(
+                [f"{named}: starts at 0, so its size is open; add --bounds {key}=LOW,HIGH, or --set {key}=..."]
+            )
+    return Parameter(key, value, low, high, scale)
+
+
+def _look_up(named: str, data: Any, path: Key) -> Any:
+    """Give the value of a key; SceneError: there is none."""
+    for part in path or ("",):
+        known = (
+            list(data) if isinstance(data, dict) else [str(n) for n in range(len(data))] if type(data) is list else []
+        )
+        if str(part) not in known:
+            near = did_you_mean(str(part), known) or (f"; take one of {', '.join(known)}" if known else "")
+            raise SceneError([f"{named}: the scene has no {str(part) or 'such key'} there{near}"])
+        data = data[part if isinstance(data, list) else str(part)]
+    return data
+
+
+def _is_place(path: Key) -> bool:
+    """Tell whether a number is a place, a time or a percent, which may pass through 0."""
+    return any(part in PLACES for part in path)
+
+
+def _natural(scene: Scene, path: Key) -> float:
+    """Give the range of a place that has no bounds."""
+    time, last = scene.time.duration, path[-1]
+    if "offset" in path:
+        return 1.0
+    if "load" in path:
+        return 100.0 if last == 1 else time
+    if "camera" in path:
+        return max(scene.sheet.size) if "fov" not in path else 1.0
+    if "path" in path:
+        return (time, 1.0, 1.0, 0.1 * max(scene.sheet.size))[int(last)]
+    # Of `at`, which may have a time before the place.
+    return time if len(path) == 5 and last == 0 else 1.0
+
+
+def as_data(scene: Scene) -> dict[str, Any]:
+    """Give the keys of a scene, with its defaults, as plain data."""
+    return scene.model_dump(mode="json", exclude_none=True)
+
+
+def with_values(data: dict[str, Any], parameters: Sequence[Parameter], values: Sequence[float]) -> dict[str, Any]:
+    """Put the values of parameters into the data of a scene."""
+    changed = deepcopy(data)
+    for parameter, value in zip(parameters, values, strict=True):
+        holder: Any = changed
+        for part in parameter.path[:-1]:
+            holder = holder[part if isinstance(holder, list) else str(part)]
+        last = parameter.path[-1]
+        holder[last if isinstance(holder, list) else str(last)] = value
+    return changed

@@ -1,0 +1,133 @@
+"""A fit as a picture: what was seen against what was fitted, what is left on the sheet, and how well each is known."""
+
+from __future__ import annotations
+
+import math
+import warnings
+from typing import BinaryIO
+
+import numpy as np
+from matplotlib import style
+from matplotlib.axes import Axes
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
+from matplotlib.layout_engine import ConstrainedLayoutEngine
+from matplotlib.ticker import MaxNLocator
+
+from taichi_msm.errors import printable
+from taichi_msm.fitting.result import FitResult
+from taichi_msm.plot_style import BLUE, DPI, GREY, ORANGE, STYLE, VERMILION, WIDE
+
+# Columns of panels, the height of one [in], and how many points are drawn in time and how many dots.
+COLUMNS, HEIGHT, FEW, MOST_DOTS = 3, 2.7, 3, 20000
+
+
+def plot(result: FitResult, file: BinaryIO) -> None:
+    """Draw a fit as a PNG."""
+    with style.context(STYLE, after_reset=True), warnings.catch_warnings():
+        # A name may contain characters that the font lacks; a point that was never seen has no mean.
+        warnings.filterwarnings("ignore", "Glyph .* missing")
+        warnings.filterwarnings("ignore", "Mean of empty slice")
+        # Without the version of Matplotlib.
+        _figure(result).savefig(file, format="png", metadata={"Software": None})
+
+
+def _figure(result: FitResult) -> Figure:
+    forces = result.observations.forces is not None
+    count = 3 + forces + len(result.parameters)
+    rows = math.ceil(count / COLUMNS)
+    engine = ConstrainedLayoutEngine(w_pad=0.1, h_pad=0.1)
+    figure = Figure(figsize=(WIDE, HEIGHT * rows + 0.5), dpi=DPI, layout=engine)
+    FigureCanvasAgg(figure)
+    figure.suptitle(f"Fit to {printable(result.observations.name)}", x=0.01, ha="left", parse_math=False)
+    panels = list(figure.subplots(rows, COLUMNS, squeeze=False).ravel())
+    _plot_motion(panels[0], result)
+    _plot_match(panels[1], result)
+    _plot_left(panels[2], result)
+    if forces:
+        _plot_forces(panels[3], result)
+    for axes, key in zip(panels[3 + forces :], result.parameters, strict=False):
+        _plot_parameter(axes, result, key)
+    for axes in panels[count:]:
+        axes.set_axis_off()
+    return figure
+
+
+def _unit(result: FitResult) -> tuple[float, str]:
+    return (1000.0, "mm") if result.unit == "m" else (1.0, "px")
+
+
+def _plot_motion(axes: Axes, result: FitResult) -> None:
+    """Draw how the points that move most go in time, along the direction in which they move most."""
+    seen, (scale, unit) = result.observations, _unit(result)
+    order, centre = np.argsort(seen.time), np.nanmean(result.fitted, axis=1, keepdims=True)
+    motion = np.nan_to_num(result.fitted - centre)
+    for number, n in enumerate(np.argsort(-np.linalg.norm(motion, axis=(1, 2)))[:FEW]):
+        along = np.linalg.svd(motion[n], full_matrices=False).Vh[0]
+        along = along if along[np.argmax(np.abs(along))] > 0 else -along
+        fitted, points = (scale * (values[n] - centre[n]) @ along for values in (result.fitted, seen.values))
+        axes.plot(seen.time[order], fitted[order], color=BLUE, label="fitted" if number == 0 else None)
+        label = "seen" if number == 0 else None
+        axes.plot(seen.time, points, ".", color=VERMILION, markersize=3, label=label)
+    axes.set(title="The points that move most", xlabel="time [s]", ylabel=f"place along the motion [{unit}]")
+    axes.legend()
+
+
+def _plot_match(axes: Axes, result: FitResult) -> None:
+    """Draw every number that was seen against the fitted one, both from their means."""
+    seen, (scale, unit) = result.observations, _unit(result)
+    middle = np.nanmean(result.fitted, axis=1, keepdims=True)
+    one, other = (scale * (values - middle)[seen.known] for values in (result.fitted, seen.values))
+    thinned = slice(None, None, math.ceil(len(one) / MOST_DOTS) or 1)
+    axes.scatter(one[thinned], other[thinned], 2, color=BLUE, alpha=0.4, linewidths=0)
+    if len(one):
+        ends = [float(one.min()), float(one.max())]
+        axes.plot(ends, ends, color=GREY, linewidth=0.8)
+    axes.set(title="Seen against fitted", xlabel=f"fitted, from the mean [{unit}]", ylabel=f"seen [{unit}]")
+
+
+def _plot_left(axes: Axes, result: FitResult) -> None:
+    """Draw what is left at every point, on the sheet."""
+    seen, (scale, unit) = result.observations, _unit(result)
+    left = scale * np.sqrt(np.nanmean(np.where(seen.known, result.fitted - seen.values, np.nan) ** 2, axis=(1, 2)))
+    across, down = seen.coordinates.T
+    dots = axes.scatter(across, down, 14, c=left, cmap="viridis", vmin=0)
+    height, width = result.scene.sheet.size
+    axes.set(title="What is left", xlim=(0, 1), ylim=(1, 0), xlabel="across", ylabel="down", aspect=height / width)
+    assert isinstance(axes.figure, Figure)
+    axes.figure.colorbar(dots, ax=axes, label=f"root mean square [{unit}]", shrink=0.8)
+
+
+def _plot_forces(axes: Axes, result: FitResult) -> None:
+    """Draw every tool's force in time."""
+    seen = result.observations.forces
+    assert seen is not None
+    for probe in np.unique(seen.probe):
+        rows = np.flatnonzero(seen.probe == probe)
+        rows = rows[np.argsort(seen.time[rows])]
+        label = len(axes.lines) == 0
+        for component in np.flatnonzero(np.isfinite(seen.force[rows]).any(axis=0)):
+            fitted, points = (force[rows, component] for force in (result.fitted_forces, seen.force))
+            axes.plot(seen.time[rows], fitted, color=BLUE, label="fitted" if label else None)
+            axes.plot(seen.time[rows], points, ".", color=VERMILION, markersize=3, label="seen" if label else None)
+            largest = np.argmax(np.abs(fitted))
+            if abs(fitted[largest]) > 0.1 * np.abs(result.fitted_forces).max():
+                axes.text(seen.time[rows[largest]], fitted[largest], f"  {'xyz'[component]}")
+            label = False
+    axes.set(title="Forces on the sheet", xlabel="time [s]", ylabel="force [N]")
+    axes.legend()
+
+
+def _plot_parameter(axes: Axes, result: FitResult, key: str) -> None:
+    """Draw how the misfit rises on both sides of a value, and its interval."""
+    one, places = result.parameters[key], result.curves[key]
+    axes.plot([place.x for place in places], [place.deviations**2 for place in places], ".-", color=BLUE)
+    ends = [end for end in one.interval if end is not None]
+    axes.axvline(one.value, color=GREY, linewidth=0.8)
+    for end in ends:
+        axes.axvline(end, color=ORANGE, linewidth=0.8, linestyle=(0, (4, 2)))
+    axes.set_xlim(min(place.x for place in places), max(place.x for place in places))
+    axes.set_ylim(0, 9)
+    axes.xaxis.set_major_locator(MaxNLocator(4))
+    axes.set_title(printable(key), parse_math=False)
+    axes.set(xlabel="value; dashed: 95 %", ylabel="rise of chi-square")

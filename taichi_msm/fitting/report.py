@@ -1,0 +1,74 @@
+"""The files of a fit: fit.json, the scene with what was found, copies of its pictures, and a picture of the fit."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import yaml
+
+from taichi_msm.errors import printable
+from taichi_msm.fitting.result import FitResult
+from taichi_msm.results.entries import files
+from taichi_msm.results.publication import Contents, Listed, Publication
+from taichi_msm.results.whole import add, create
+from taichi_msm.scene import Scene
+from taichi_msm.system.versions import versions
+
+RECORD, SCENE, PLOT, PICTURES = "fit.json", "scene.yaml", "fit.png", "pictures"
+
+PATTERNS = (r"fit\.json", r"scene\.yaml", r"fit\.png", rf"{PICTURES}/.+")
+
+# What fit.png needs, and is left out without.
+NO_PLOT = 'fit.png is left out, as matplotlib is not installed; pip install "taichi-msm[report]"'
+
+
+def _listed(record: Mapping[str, Any]) -> Listed:
+    return {RECORD, *record["files"]}.__contains__
+
+
+def publication(directory: Path) -> Publication:
+    """Begin to replace the fit in a directory."""
+    return Publication(directory, Contents("fit", RECORD, PATTERNS, _listed), [RECORD, SCENE, PLOT])
+
+
+def write_report(result: FitResult, published: Publication) -> None:
+    """Write the files of a fit, and put them in place."""
+    folder = published.staged
+    add(folder / SCENE, _scene_text(result, folder).encode())
+    try:
+        from taichi_msm.fitting.plot import plot
+    except ImportError:
+        result.notes.append(NO_PLOT)
+    else:
+        with create(folder / PLOT) as file:
+            plot(result, file)
+    written = sorted(files(folder, PATTERNS, strict=True))
+    record = {**result.as_json(), "versions": versions(), "files": written}
+    add(folder / RECORD, (json.dumps(record, indent=1, ensure_ascii=False, allow_nan=False) + "\n").encode())
+    published.publish([*written, RECORD])
+
+
+def _scene_text(result: FitResult, folder: Path) -> str:
+    """Write the fitted scene, and copy its pictures beside it."""
+    names: dict[str, str] = {}
+
+    def copied(path: str) -> str:
+        if path not in names:
+            name, number = Path(path).name, 1
+            while f"{PICTURES}/{name}" in names.values():
+                number += 1
+                name = f"{Path(path).stem}-{number}{Path(path).suffix}"
+            (folder / PICTURES).mkdir(exist_ok=True)
+            shutil.copyfile(path, folder / PICTURES / name)
+            names[path] = f"{PICTURES}/{name}"
+        return names[path]
+
+    scene: Scene = result.scene.with_pictures(copied)
+    data = scene.model_dump(mode="json", exclude_none=True)
+    text = yaml.safe_dump(data, sort_keys=False, default_flow_style=None, width=120, allow_unicode=True)
+    found = ", ".join(f"{key} {one.value:.6g}" for key, one in result.parameters.items())
+    return f"# Fitted to {printable(result.observations.name)}: {printable(found)}; more in {RECORD}.\n{text}"

@@ -1,0 +1,127 @@
+"""What a fit found."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, field
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from taichi_msm.fitting.identifiability import Unseen
+from taichi_msm.fitting.observations import Observations
+from taichi_msm.fitting.parameters import rounded
+from taichi_msm.fitting.profiles import Place
+from taichi_msm.scene import Scene
+
+Array = NDArray[np.float64]
+
+
+class Estimate(NamedTuple):
+    """What was found of a parameter.
+
+    Attributes:
+        value: the best one.
+        standard_error: of the value.
+        interval: both ends of the 95 % interval; None: there is none within the bounds.
+        start: where the search began.
+        identifiable: whether the standard error is at most the value.
+        mesh_error: how far, about, the number of points moves the value; None: not known.
+    """
+
+    value: float
+    standard_error: float
+    interval: tuple[float | None, float | None]
+    start: float
+    identifiable: bool
+    mesh_error: float | None
+
+
+@dataclass(frozen=True, eq=False)
+class FitResult:
+    """What a fit found.
+
+    Attributes:
+        parameters: what was found of each, by its key.
+        correlation: of the parameters, in their order.
+        residual: the root mean square of predicted minus seen, of each coordinate [m] or [px].
+        residual_force: the same of the forces [N]; None: none were seen.
+        sigma: the standard deviation of the coordinates, as given, else as found.
+        unit: of residual and sigma, m or px.
+        chi_square: the sum of (predicted - seen)^2 / sigma^2, where sigma is given.
+        degrees_of_freedom: how many numbers were seen, less the parameters.
+        identifiable: whether all parameters are.
+        unseen: the combinations of parameters that the data cannot tell.
+        mesh_error: of the fitted scene, as a fraction of its largest displacement; None: not known.
+        runs: how many there were.
+        seconds: that they took.
+        notes: what the user should know, a line each.
+        scene: the scene with the best values.
+        observations: what was seen.
+        fitted: where the points are in the fitted scene, as in the observations.
+        fitted_forces: the forces in the fitted scene, as in the observations [N], shape (rows, 3).
+        curves: by key, the root of twice the rise of the cost, signed, at values of a parameter while the others
+            follow: its profile, or else what follows from the curvature at the best value.
+    """
+
+    parameters: dict[str, Estimate]
+    correlation: list[list[float]]
+    residual: float
+    residual_force: float | None
+    sigma: float
+    unit: str
+    chi_square: float | None
+    degrees_of_freedom: int
+    identifiable: bool
+    unseen: list[Unseen]
+    mesh_error: float | None
+    runs: int
+    seconds: float
+    notes: list[str]
+    scene: Scene = field(repr=False)
+    observations: Observations = field(repr=False)
+    fitted: Array = field(repr=False)
+    fitted_forces: Array = field(repr=False)
+    curves: dict[str, list[Place]] = field(repr=False)
+
+    def as_json(self) -> dict[str, Any]:
+        """Give it as plain data, as in fit.json."""
+        plain = "correlation residual residual_force sigma unit chi_square degrees_of_freedom identifiable mesh_error"
+        return {
+            "observed": self.observations.name,
+            "parameters": {key: one._asdict() for key, one in self.parameters.items()},
+            **{name: getattr(self, name) for name in (*plain.split(), "runs", "seconds", "notes")},
+            "unseen": [one.as_json() for one in self.unseen],
+        }
+
+    def summary(self) -> list[str]:
+        """Say in lines what was found."""
+        seen = self.observations
+        lines = [f"{key}: {_in_words(one)}" for key, one in self.parameters.items()]
+        lines += [one.text for one in self.unseen]
+        points, times = seen.there.shape
+        chi = ""
+        if self.chi_square is not None:
+            chi = f", chi-square {self.chi_square:.3g} for {self.degrees_of_freedom} degrees of freedom"
+        force = "" if self.residual_force is None else f", {self.residual_force:.3g} N"
+        lines.append(f"residual {self.residual:.3g} {self.unit} of {points} points at {times} times{force}{chi}")
+        if self.mesh_error is not None:
+            most = "at most about " if any(probe.moved for probe in self.scene.probes) else ""
+            error = f"{most}{rounded(100 * self.mesh_error)} % of the largest displacement"
+            lines.append(f"mesh error of the fitted scene: {error}")
+        return [*lines, *self.notes, f"{self.runs} runs, {self.seconds:.1f} s"]
+
+
+def _in_words(one: Estimate) -> str:
+    """Write an estimate with as many digits as its error leaves."""
+    error = one.standard_error
+    digits = 3 if not one.value else math.floor(math.log10(abs(one.value) / max(error, 1e-300))) + 3
+
+    def written(number: float | None) -> str:
+        return "?" if number is None else f"{float(f'{number:.{min(max(digits, 2), 9)}g}'):.10g}"
+
+    low, high = map(written, one.interval)
+    known = "?" if error > 1000 * max(abs(one.value), abs(one.start)) else rounded(error)
+    doubt = "" if one.identifiable else ": not identifiable"
+    return f"{written(one.value)} +- {known}, 95 % {low} to {high}, from {one.start:.6g}{doubt}"

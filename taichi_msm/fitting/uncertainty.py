@@ -1,0 +1,137 @@
+"""How well the best values are known: their covariance from the derivatives where the search ends.
+
+With J the derivatives of r = (predicted - seen) / sigma by x, the covariance of x is
+
+    C = f (J^T W J)^-1 M (J^T W J)^-1,    M = J^T W J
+
+where W = 1, and f is the mean of r^2 per degree of freedom, but at least 1. In a robust fit W is the second derivative
+of half of rho, and f the mean of the squares of its first over that of W. If errors of neighbouring tracks are alike,
+M = J^T K J, with K = exp(-distance / correlation) for two tracks in one frame.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from taichi_msm.fitting.estimation import FAR, Misfit, Scales, Solution
+from taichi_msm.fitting.observations import Observations
+
+Array = NDArray[np.float64]
+
+# Of singular values, as a share of the largest: what is smaller is not seen at all.
+UNSEEN = 1e-9
+
+# A direction with a larger standard deviation than this is not seen.
+NOT_SEEN = 0.5
+
+# Of the intervals.
+CONFIDENCE = 0.95
+
+
+@dataclass(frozen=True, eq=False)
+class Uncertainty:
+    """What the derivatives tell of the parameters' errors, in units of x.
+
+    With n parameters, the columns of `directions` are combinations of x that are seen independently of each other, the
+    one that is seen best first.
+    """
+
+    scales: Scales  # standard deviations of what was seen, found or given
+    factor: float  # f
+    freedom: int  # degrees of freedom
+    left: Array  # r
+    weighted: Array  # W^(1/2) J, shape (numbers, n)
+    directions: Array  # shape (n, n)
+    root: Array  # F with C = F F^T, shape (n, n)
+    wider: Array  # how many times K makes the deviations wider, shape (n,)
+
+    @property
+    def deviations(self) -> Array:
+        """Standard deviations of x, shape (n,)."""
+        return np.linalg.norm(self.root, axis=1)
+
+    @property
+    def along(self) -> Array:
+        """Standard deviations of the directions, shape (n,)."""
+        return np.linalg.norm(self.directions.T @ self.root, axis=1)
+
+    @property
+    def correlation(self) -> Array:
+        """Correlations of x, shape (n, n)."""
+        each = self.root / np.maximum(self.deviations, np.finfo(float).tiny)[:, None]
+        return np.clip(each @ each.T, -1.0, 1.0)
+
+    @property
+    def quantile(self) -> float:
+        """So many standard deviations each side of a value are its interval, by Student's t."""
+        from scipy.stats import t
+
+        return float(t.ppf((1 + CONFIDENCE) / 2, self.freedom))
+
+    def of_combination(self, exponents: Array) -> float:
+        """Give the standard deviation of a combination of x."""
+        return float(np.linalg.norm(exponents @ self.root))
+
+    def shift(self, rows: Array) -> Array:
+        """Give how far x moves, as far as that is seen, if what is predicted is off by so much, in units of r."""
+        seen = self.directions[:, self.along <= NOT_SEEN]
+        return seen @ np.linalg.lstsq(self.weighted @ seen, rows, rcond=None)[0]
+
+
+def uncertainty(
+    misfit: Misfit, seen: Observations, solution: Solution, derivatives: Array, alike: Array | None, *, robust: bool
+) -> Uncertainty:
+    """Work out the uncertainty of a solution.
+
+    Args:
+        misfit: of what was seen.
+        seen: what was seen.
+        solution: the best values.
+        derivatives: of what is predicted by x, shape (numbers, parameters).
+        alike: K for every two points, shape (N, N); None: errors are independent.
+        robust: whether what is far off counts less.
+    """
+    parameters = len(solution.x)
+    freedom = max(1, sum(misfit.count) - parameters)
+    scales = solution.scales
+    if seen.sigma is None:
+        found = misfit.sigma(solution.predicted, parameters, robust=robust)
+        scales = scales._replace(values=max(found, np.finfo(float).tiny))
+    left = misfit.divided(misfit.of(solution.predicted), scales)
+    slope = misfit.divided(derivatives, scales)
+    far = 1 + (left / FAR) ** 2 if robust else np.ones_like(left)
+    weighted = slope * far[:, None] ** (-0.75)
+    factor = max(1.0, float(np.sum(left**2 / far)) / freedom / float(np.mean(far**-1.5)))
+    singular = np.linalg.svd(weighted, full_matrices=False)
+    blind = UNSEEN * max(1.0, singular.S[0]) >= singular.S
+    held = np.where(blind, UNSEEN, singular.S)
+    middle = weighted.T @ weighted if alike is None else _with_neighbours(seen, misfit, slope, alike)
+    # In the singular directions; those that are not seen at all have an error, as if they were just seen.
+    values, vectors = np.linalg.eigh(factor * singular.Vh @ middle @ singular.Vh.T + np.diag(blind * held**2))
+    root = singular.Vh.T @ (held[:, None] ** -2 * vectors * np.sqrt(np.maximum(values, 0.0)))
+    plain = np.sqrt(factor) * np.linalg.norm(singular.Vh.T / held, axis=1)
+    wider = np.linalg.norm(root, axis=1) / plain
+    return Uncertainty(scales, factor, freedom, left, weighted, singular.Vh.T, root, wider)
+
+
+def likeness(pixels: Array, correlation: float) -> Array:
+    """Tell how alike the errors of two tracks are, by where they are in the picture [px]; shape (N, N)."""
+    from scipy.spatial.distance import cdist
+
+    return np.exp(-cdist(pixels, pixels) / correlation)
+
+
+def _with_neighbours(seen: Observations, misfit: Misfit, slope: Array, alike: Array) -> Array:
+    """Give J^T K J, frame by frame and coordinate by coordinate; forces are independent."""
+    values = misfit.count[0]
+    whole = np.zeros((*seen.values.shape, slope.shape[1]))
+    whole[seen.known] = slope[:values]
+    total = slope[values:].T @ slope[values:]
+    for frame in range(whole.shape[1]):
+        for coordinate in range(whole.shape[2]):
+            one = whole[:, frame, coordinate]
+            total = total + one.T @ alike @ one
+    return total

@@ -1,0 +1,482 @@
+"""Numbers of a scene from what was seen: they come back, as well known as is said."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import yaml
+from numpy.typing import NDArray
+from scipy.stats import t as student
+
+from taichi_msm import SceneError, Simulation, fit, load_scene, run
+from taichi_msm.fitting.fit import Method
+from taichi_msm.fitting.observations import read_observations
+from taichi_msm.fitting.parameters import make_parameters
+from taichi_msm.fitting.prediction import Job, Predictor, runnable, seen_by_camera, surface_weights
+from taichi_msm.fitting.result import FitResult
+from taichi_msm.fitting.suspicions import MOVES, faults, moved
+from taichi_msm.physics.deformed import on_surface, touched
+from taichi_msm.scene import Scene
+from taichi_msm.system import resources
+from taichi_msm.system.runtime import Device
+from tests.conftest import Program
+
+Array = NDArray[np.float64]
+
+TRUTH: dict[str, Any] = {
+    "sheet": {"points": [9, 9], "size": [0.1, 0.1]},
+    "tissue": {
+        "young": 2e4,
+        "thickness": 3e-3,
+        "density": 1050,
+        "foundation": 3e5,
+        "foundation_active": "always",
+        "damping": 200,
+        "pretension": 10,
+    },
+    "probes": [
+        {"total": [0, 0, -2], "radius": 0.01, "falloff": 100, "load": [[0, 0], [0.1, 100], [0.2, 100], [0.2, 0]]}
+    ],
+    "time": {"duration": 0.4, "frames_per_second": 25, "precision": "f64"},
+    "render": {"camera": {"eye": [0, -0.06, 0.09]}, "tracks": 6},
+    "output": [],
+}
+
+GRID = (np.arange(6) + 0.5) / 6
+PLACES = np.stack([axis.ravel() for axis in np.meshgrid(GRID, GRID)], axis=1)
+
+
+@pytest.fixture(scope="module", autouse=True)
+def one_device(device: Device) -> Iterator[None]:
+    """A fit takes every core, and a process has one device."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(resources, "available_threads", lambda: device.threads)
+        patch.setattr("taichi_msm.system.runtime.resources.available_threads", lambda: device.threads)
+        yield
+
+
+def changed(**keys: Any) -> Scene:
+    """The truth with other values, by their dotted paths with __ for the dots."""
+    data = json.loads(json.dumps(TRUTH))
+    for key, value in keys.items():
+        *sections, name = key.split("__")
+        holder = data
+        for section in sections:
+            holder = holder[int(section) if section.isdigit() else section]
+        holder[name] = value
+    return Scene.model_validate(data)
+
+
+@pytest.fixture(scope="module")
+def motion(device: Device) -> Array:
+    """Positions of the mass points in every frame of the truth [m], shape (frames, rows, cols, 3)."""
+    with Simulation(changed(), threads=device.threads) as simulation:
+        frames = [simulation.positions()]
+        for _ in range(10):
+            simulation.advance()
+            frames.append(simulation.positions())
+    return np.array(frames)
+
+
+@pytest.fixture(scope="module")
+def tracks(device: Device, motion: Array) -> dict[str, Array]:
+    """What the truth's camera sees of the places, without errors."""
+    with Simulation(changed(), threads=device.threads) as simulation:
+        pixels = [simulation.locate(PLACES, positions=positions).pixels for positions in motion]
+    return {"time": np.arange(11) / 25, "coordinates": PLACES, "pixel": np.stack(pixels, axis=1).astype(np.float64)}
+
+
+def noisy(tracks: dict[str, Array], error: float, seed: int = 0, **more: Any) -> dict[str, Any]:
+    pixel = tracks["pixel"] + np.random.default_rng(seed).normal(0, error, tracks["pixel"].shape)
+    return {**tracks, "pixel": pixel, **more}
+
+
+def save(path: Path, arrays: Mapping[str, Any]) -> None:
+    np.savez(path, **arrays)
+
+
+def values(result: FitResult) -> list[float]:
+    return [one.value for one in result.parameters.values()]
+
+
+def test_points_are_on_the_surface_that_is_drawn(motion: Array) -> None:
+    sheet, position = changed().sheet, motion[5]
+    for refine in (0, 3):
+        corners, weights = surface_weights(PLACES, sheet, refine)
+        points = np.einsum("nk,nkc->nc", weights, position.reshape(-1, 3)[corners])
+        for place, point in zip(PLACES, points, strict=True):
+            rest = np.array([(place[0] - 0.5) * 0.1, (0.5 - place[1]) * 0.1])
+            np.testing.assert_allclose(point, touched(position, refine, sheet, rest)[0], atol=1e-15)
+
+
+def test_a_camera_that_moves_and_bends_lines_sees_what_is_predicted(motion: Array, device: Device) -> None:
+    eye = [[0, 0, -0.06, 0.09], [0.4, 0.02, -0.05, 0.1]]
+    made = changed(render__camera={"eye": eye, "fov": 40, "distortion": {"k1": -0.3, "k2": 0.1}})
+    with Simulation(made, threads=device.threads) as simulation:
+        pixels = [simulation.locate(PLACES, positions=motion[n], time=n / 25).pixels for n in range(11)]
+    points = np.stack([on_surface(each, made.render.refine, PLACES) for each in motion], axis=1)
+    seen = seen_by_camera(made, points, np.arange(11) / 25)
+    np.testing.assert_allclose(seen, np.stack(pixels, axis=1), atol=1e-4)
+
+
+def test_the_truth_comes_back_from_a_start_that_is_far_off(motion: Array) -> None:
+    start = changed(tissue__young=6e4, tissue__foundation=6e4, tissue__damping=1000, probes__0__at=[0.4, 0.6])
+    free = ["tissue.young", "tissue.foundation", "tissue.damping", "probes.0.at.0"]
+    seen = {"time": np.arange(11) / 25, "position": motion}
+    found = fit(start, seen, [*free, "probes.0.at.1"], workers=1)
+    np.testing.assert_allclose(values(found), [2e4, 3e5, 200, 0.5, 0.5], rtol=1e-6)
+    assert found.identifiable
+    assert found.parameters["tissue.young"].start == 6e4
+
+
+def test_other_starts_are_tried_where_the_first_does_not_fit(motion: Array) -> None:
+    # From a tool at the other end of the sheet nothing leads to the middle.
+    start = changed(probes__0__at=[0.05, 0.05])
+    seen = {"time": np.arange(11) / 25, "position": motion}
+    found = fit(
+        start, seen, ["probes.0.at.0", "probes.0.at.1"], bounds={"probes.0.at.0": (0, 1), "probes.0.at.1": (0, 1)}
+    )
+    np.testing.assert_allclose(values(found), [0.5, 0.5], atol=1e-5)
+
+
+def test_intervals_hold_the_truth_as_often_as_they_say(tracks: dict[str, Array]) -> None:
+    # Errors so small that the motion is linear in the parameters within their intervals.
+    start = changed(tissue__damping=300, tissue__foundation=2e5)
+    held, ratios = [], []
+    for seed in range(8):
+        more = {"sigma": 0.05} if seed % 2 else {}
+        found = fit(start, noisy(tracks, 0.05, seed, **more), ["tissue.damping", "tissue.foundation"], workers=1)
+        assert found.sigma == pytest.approx(0.05, rel=0.12)  # of 792 numbers, 4.8 / sqrt(2 * 790)
+        for one, truth in zip(found.parameters.values(), (200, 3e5), strict=True):
+            low, high = one.interval
+            assert low is not None
+            assert high is not None
+            held.append(low < truth < high)
+            ratios.append((one.value - truth) / one.standard_error)
+    # Of 16 at 95 % each: 13 or fewer with a probability of 4 %; the seeds are fixed.
+    assert sum(held) >= 14
+    # The standard deviation of 16 standard normal numbers is 1 +- 0.18.
+    assert 0.5 < float(np.std(ratios)) < 1.5
+
+
+def test_a_profile_ends_where_the_others_can_no_longer_make_up_for_it(tracks: dict[str, Array]) -> None:
+    # Errors so large that the motion is not linear in the damping.
+    seen = noisy(tracks, 0.5, sigma=0.5)
+    best = fit(changed(), seen, ["tissue.damping", "tissue.foundation"], profile=True)
+    assert best.chi_square is not None
+    quantile = student.ppf(0.975, best.degrees_of_freedom)
+    for end in best.parameters["tissue.damping"].interval:
+        assert end is not None
+        held = fit(changed(tissue__damping=end), seen, ["tissue.foundation"])
+        assert held.chi_square is not None
+        # An end is found to 1 % of its distance.
+        assert held.chi_square - best.chi_square == pytest.approx(quantile**2, rel=0.03)
+    curve = np.array([place.deviations for place in best.curves["tissue.damping"]])
+    assert curve.min() < -1.9
+    assert curve.max() > 1.9
+
+
+def test_what_pictures_cannot_tell_is_named_and_a_force_tells_it(tracks: dict[str, Array], tmp_path: Path) -> None:
+    # Without inertia only ratios of forces are seen.
+    at_rest = {**TRUTH, "time": {**TRUTH["time"], "motion": "quasistatic"}, "output": ["tracks", "forces"]}
+    run(at_rest, tmp_path / "truth", threads=2, estimate_error=False)
+    start = Scene.model_validate(at_rest).model_copy(update={"output": ()})
+    free = ["tissue.young", "tissue.foundation", "tissue.pretension", "probes.0.total.2"]
+    found = fit(start, tmp_path / "truth" / "tracks.npz", free, sigma=0.1, workers=1)
+    assert not found.identifiable
+    assert not any(one.identifiable for one in found.parameters.values())
+    (unseen,) = found.unseen
+    assert unseen.parameters == free
+    assert len(unseen.known) == 3
+    assert all(sorted(map(abs, one.exponents.values())) == [1, 1] for one in unseen.known)
+    assert "each alone is not: fix one, or give a force (--forces)" in unseen.text
+    forces = tmp_path / "truth" / "forces.csv", 0.01
+    told = fit(start, tmp_path / "truth" / "tracks.npz", free, sigma=0.1, forces=forces, workers=1)
+    assert told.identifiable
+    assert told.unseen == []
+    assert told.residual_force is not None
+    assert told.residual_force < 1e-4
+    assert told.fitted_forces.shape == (11, 3)
+    np.testing.assert_allclose(values(told), [2e4, 3e5, 10, -2], rtol=1e-4)
+
+
+def test_a_product_is_known_where_its_factors_are_not(motion: Array) -> None:
+    # At rest and without bending, young and thickness act only as their product.
+    scene = changed(time__motion="quasistatic")
+    with Simulation(scene) as simulation:
+        simulation.advance(4)
+        position = simulation.positions()[None]
+    found = fit(scene, {"time": [0.16], "position": position, "sigma": 1e-5}, ["tissue.young", "tissue.thickness"])
+    (unseen,) = found.unseen
+    assert unseen.text.startswith("tissue.young x tissue.thickness is known to ")
+    assert not found.identifiable
+
+
+def test_an_occluded_track_is_not_used() -> None:
+    points, occluded = np.zeros((2, 3, 2), np.float32), np.zeros((2, 3), np.bool_)
+    occluded[1, 2] = True
+    seen = read_observations({"coordinates": [[0.5, 0.5], [0.2, 0.7]], "points": points, "occluded": occluded}, 25)
+    assert seen.time.tolist() == [0, 0.04, 0.08]
+    assert (seen.there != occluded).all()
+
+
+def test_a_number_that_nothing_shows_is_not_identifiable(motion: Array) -> None:
+    # Positions do not depend on the camera.
+    seen = {"time": np.arange(11) / 25, "position": motion, "sigma": 1e-5}
+    found = fit(changed(), seen, ["tissue.foundation", "render.camera.eye.2"])
+    assert found.parameters["tissue.foundation"].identifiable
+    assert not found.parameters["render.camera.eye.2"].identifiable
+    assert [one.text for one in found.unseen] == ["render.camera.eye.2: what was seen does not tell it: fix it"]
+
+
+def test_depths_and_forces_of_a_tool_tell_the_foundation(device: Device, tmp_path: Path) -> None:
+    # A table of force and depth, and one point, below the tip.
+    tool = {
+        "path": [[0, 0.5, 0.5, 0], [0.4, 0.5, 0.5, -0.004]],
+        "instrument": {"radius": 0.02, "shaft": [0, 0, 1], "length": 0.1},
+    }
+    timed = {"duration": 0.4, "frames_per_second": 10, "motion": "quasistatic"}
+    truth = changed(probes=[tool], time=timed)
+    rows = ["time,probe,force_x,force_y,force_z"]
+    with Simulation(truth, threads=device.threads) as simulation:
+        for _ in range(4):
+            simulation.advance()
+            rows.append(f"{simulation.time},0,,,{simulation.forces()[0].force[2]}")
+    (tmp_path / "forces.csv").write_text("\n".join(rows))
+    below = {"time": [0.4], "coordinates": [[0.5, 0.5]], "position": [[[0, 0, -0.004]]], "sigma": 1e-4}
+    start, forces = changed(probes=[tool], time=timed, tissue__foundation=1e5), (tmp_path / "forces.csv", 0.001)
+    found = fit(start, below, ["tissue.foundation"], forces=forces, directory=tmp_path / "fit")
+    assert values(found) == pytest.approx([3e5], rel=1e-4)
+    assert (tmp_path / "fit" / "fit.png").stat().st_size > 10_000
+
+
+def test_what_is_far_off_counts_less_in_a_robust_fit(tracks: dict[str, Array]) -> None:
+    seen, free = noisy(tracks, 0.1), ["tissue.foundation"]
+    seen["pixel"][[7, 20]] += np.linspace(0, 40, 11)[:, None]
+    plain, robust = fit(changed(), seen, free, workers=1), fit(changed(), seen, free, robust=True, workers=1)
+    errors = [abs(values(one)[0] / 3e5 - 1) for one in (plain, robust)]
+    assert errors[1] < 0.1 * errors[0]
+    assert errors[1] < 3 * robust.parameters["tissue.foundation"].standard_error / 3e5
+
+
+def test_a_robust_fit_of_good_tracks_is_nearly_the_same(tracks: dict[str, Array]) -> None:
+    # Without errors, so that sigma alone tells how well the number is known.
+    key, seen = "tissue.foundation", {**tracks, "sigma": 0.1}
+    plain, robust = (fit(changed(), seen, [key], robust=one, profile=one).parameters[key] for one in (False, True))
+    assert robust.standard_error == pytest.approx(plain.standard_error, rel=0.01)
+    np.testing.assert_allclose(np.array(robust.interval, float), np.array(plain.interval, float), rtol=1e-3)
+
+
+def test_errors_that_are_alike_widen_the_intervals_and_are_told(tracks: dict[str, Array]) -> None:
+    # Each frame's tracks are off by one number, as when a camera shakes.
+    rng, seen = np.random.default_rng(2), noisy(tracks, 0.02)
+    seen["pixel"] += rng.normal(0, 0.5, (1, 11, 2))
+    free = ["tissue.young", "tissue.foundation"]
+    plain = fit(changed(), seen, free, workers=1)
+    assert any("neighbouring points is alike" in note and "--correlation PX" in note for note in plain.notes)
+    alike = fit(changed(), seen, free, correlation=1000, workers=1, profile=True)
+    assert alike.parameters[free[1]].standard_error > 2 * plain.parameters[free[1]].standard_error
+    assert not any("--correlation" in note for note in alike.notes)
+    low, high = np.array(alike.parameters[free[1]].interval, float)
+    assert (high - low) / (2 * 1.96) == pytest.approx(alike.parameters[free[1]].standard_error, rel=0.1)
+
+
+def test_the_points_move_what_is_found_about_as_far_as_is_said(device: Device) -> None:
+    finer = changed(sheet__points=[33, 33])
+    with Simulation(finer, threads=device.threads) as simulation:
+        frames = [simulation.positions()[::4, ::4]]
+        for _ in range(10):
+            simulation.advance()
+            frames.append(simulation.positions()[::4, ::4])
+    found = fit(changed(), {"time": np.arange(11) / 25, "position": np.array(frames)}, ["tissue.foundation"])
+    one = found.parameters["tissue.foundation"]
+    assert one.mesh_error is not None
+    assert found.mesh_error is not None
+    # The finer scene has a sixteenth of the error left; half of so few points are too few to tell it closely.
+    assert abs(one.value - 3e5) / 4 < one.mesh_error < 4 * abs(one.value - 3e5)
+    assert any("the number of points moves tissue.foundation" in note for note in found.notes)
+
+
+def test_side_by_side_and_one_after_another_give_the_same_bits(tracks: dict[str, Array]) -> None:
+    found = [fit(changed(tissue__young=3e4), noisy(tracks, 0.1), ["tissue.young"], workers=count) for count in (1, 2)]
+    assert values(found[0]) == values(found[1])
+    assert found[0].runs == found[1].runs
+
+
+def test_a_number_below_0_stays_there_and_one_that_starts_at_0_needs_bounds(tracks: dict[str, Array]) -> None:
+    found = fit(
+        changed(probes__0__total=[0, 0, -1]), tracks, ["probes.0.total.2"], bounds={"probes.0.total.2": (-5, 5)}
+    )
+    one = found.parameters["probes.0.total.2"]
+    assert one.value == pytest.approx(-2, rel=1e-4)
+    assert one.interval[0] is not None
+    assert one.interval[1] is not None
+    assert one.interval[0] <= one.value <= one.interval[1]
+    start = changed(tissue__damping=0)
+    with pytest.raises(SceneError, match=r"tissue\.damping: starts at 0, so its size is open; add --bounds"):
+        fit(start, tracks, ["tissue.damping"])
+    found = fit(start, tracks, ["tissue.damping"], bounds={"tissue.damping": (0, 1000)})
+    assert values(found) == pytest.approx([200], rel=1e-4)
+
+
+def test_an_interrupted_fit_leaves_nothing(tracks: dict[str, Array], tmp_path: Path) -> None:
+    def stop(stage: str, done: int, total: int) -> None:
+        if done > 3:
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        fit(changed(tissue__young=3e4), tracks, ["tissue.young"], directory=tmp_path / "fit", progress=stop)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_the_command_writes_what_it_found(tracks: dict[str, Array], small: Path, program: Program) -> None:
+    (small / "press.yaml").write_text(yaml.safe_dump({**TRUTH, "image": "speckle.png", "output": ["png"]}))
+    save(small / "seen.npz", noisy(tracks, 0.1, sigma=0.1))
+    given = "--set", "tissue.young=3e4", "--bounds", "tissue.young=1e4,1e5"
+    done = program("fit", "press.yaml", "seen.npz", "--free", "tissue.young", "tissue.foundation", *given, "--json")
+    assert done.returncode == 0, done.stderr
+    said = json.loads(done.stdout)
+    folder = small / "output" / "press-fit"
+    record = json.loads((folder / "fit.json").read_text())
+    assert said["parameters"] == record["parameters"]
+    assert sorted(record["files"]) == ["fit.png", "pictures/speckle.png", "scene.yaml"]
+    assert (folder / "pictures" / "speckle.png").read_bytes() == (small / "speckle.png").read_bytes()
+    fitted = load_scene(folder / "scene.yaml")
+    assert fitted.tissue is not None
+    assert fitted.tissue.young == record["parameters"]["tissue.young"]["value"]
+    assert fitted.output == ("png",)
+    young = record["parameters"]["tissue.young"]
+    assert young.keys() == {"value", "standard_error", "interval", "start", "identifiable", "mesh_error"}
+    assert young["interval"][0] < young["value"] < young["interval"][1]
+    assert np.array(record["correlation"]).shape == (2, 2)
+    assert 0.8 < record["chi_square"] / record["degrees_of_freedom"] < 1.2
+    assert record["sigma"] == 0.1
+    assert record["identifiable"] is True
+    assert record["unseen"] == []
+    # Again, in place of the first.
+    done = program("fit", "press.yaml", "seen.npz", "--free", "tissue.young", "--set", "image=speckle.png")
+    assert "tissue.young: 2" in done.stdout
+
+
+def bad(tracks: dict[str, Array], motion: Array) -> Iterator[tuple[str, dict[str, Any], str]]:
+    """What cannot be used, and what is said of it."""
+    position = {"time": np.arange(11) / 25, "coordinates": PLACES, "position": np.zeros((36, 11, 3))}
+    mass = {"time": np.arange(11) / 25, "position": motion}
+    hidden = np.full_like(tracks["pixel"], np.nan)
+    lone = hidden.copy()
+    lone[0, 3] = tracks["pixel"][0, 3]
+    yield "few", {**tracks, "pixel": lone}, "2 numbers were seen, too few for 3 parameters"
+    yield "hidden", {**tracks, "pixel": hidden}, "every one of the 36 points is NaN or occluded at all 11 times"
+    still = np.repeat(tracks["pixel"][:, :1], 11, axis=1)
+    yield "still", {**tracks, "pixel": still}, "no point moves at all; observe while a tool acts"
+    yield "noise", {**tracks, "sigma": 50.0}, "no point moves by more than its error, sigma 50 px"
+    late = {**tracks, "time": np.linspace(0, 0.004, 11)}
+    yield "missed", late, "its 11 times miss the motion: .*; observe between 0.08 and 0.2 s too"
+    yield "mm", {**mass, "position": 1000 * motion}, "; give metres: are they in mm\\? divide them by 1000"
+    yield "ms", {**tracks, "time": 1000 * tracks["time"]}, "scene ends at 0.4 s; are they in ms\\? divide time by 1000"
+    yield "late", {**tracks, "time": tracks["time"] + 0.1}, "up to 0.5 s, and the scene ends at 0.4 s; cut them off"
+    yield "early", {**tracks, "time": tracks["time"] - 0.1}, "from -0.1 s, and the scene begins at 0 s"
+    yield (
+        "camera",
+        {**tracks, "pixel": 2 * tracks["pixel"]},
+        "from where the scene's camera sees them at rest in its 512",
+    )
+    yield (
+        "origin",
+        {**mass, "position": motion + 0.05},
+        "from where they are at rest in the scene; count from the sheet's",
+    )
+    yield "sigma", {**tracks, "sigma": 0.0}, "sigma: 0; take one number above 0"
+    yield "pixels", {**tracks, "coordinates": 512 * PLACES}, "coordinates: 469.333; give across and down as fractions"
+    yield "turned", {**tracks, "pixel": tracks["pixel"].swapaxes(0, 1)}, "the points come first: take pixel.swapaxes"
+    yield "lacks", {"time": tracks["time"], "pixel": tracks["pixel"]}, "coordinates: missing; expected time"
+    yield "both", {**tracks, **position}, "has both position and pixel; leave one of them out"
+
+
+def test_what_cannot_be_used_is_answered_by_one_sentence(
+    tracks: dict[str, Array], motion: Array, tmp_path: Path
+) -> None:
+    free = ["tissue.young", "tissue.foundation", "tissue.damping"]
+    for name, arrays, message in bad(tracks, motion):
+        path = tmp_path / f"{name}.npz"
+        save(path, arrays)
+        with pytest.raises(SceneError, match=message) as caught:
+            fit(changed(), path, free, workers=1)
+        assert len(caught.value.lines) == 1, name
+        assert caught.value.lines[0].startswith(f"{path}: "), name
+        assert ";" in caught.value.lines[0], name
+
+
+def test_motion_of_many_tracks_is_seen_though_it_is_smaller_than_their_errors(tracks: dict[str, Array]) -> None:
+    # The square of the motion is 0.4 of that of the errors, of 36 points at 11 times.
+    motion = 0.95 * np.sin(np.arange(11))[:, None]
+    noise = np.random.default_rng(3).normal(0, 1, tracks["pixel"].shape)
+    for moving in (True, False):
+        pixel = tracks["pixel"][:, :1] + moving * motion + noise
+        seen = read_observations({**tracks, "pixel": pixel, "sigma": 1.0}, 25)
+        assert moved(seen, changed()) < MOVES
+        assert bool(list(faults(seen, changed(), 1))) != moving
+
+
+def test_values_that_make_no_scene_give_no_run(device: Device, tracks: dict[str, Array]) -> None:
+    scene = changed(tissue__damping=0)
+    free = ["tissue.damping", "tissue.young"]
+    parameters = make_parameters(scene, free, {"tissue.damping": (-100, 100)})
+    job = Job("token", runnable(scene), parameters, read_observations(tracks, 25))
+    predictor = Predictor(job, device.threads)
+    # Less than no damping; springs without length, as a tenth of young does not bear the pretension.
+    assert predictor.attempt(np.array([-0.1, 0.0])) is None
+    assert predictor.attempt(np.array([0.0, -np.log(10)])) is None
+    assert predictor.attempt(np.array([0.0, 0.0])) is not None
+    predictor.close()
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["--free", "tissue.yuong"], "--free tissue.yuong: the scene has no yuong there; did you mean 'young'?"),
+        (["--free", "sheet.points.0"], "--free sheet.points.0: 9, which cannot be free"),
+        (["--free", "time.duration"], "--free time.duration: 0.4, which cannot be free"),
+        (["--free", "tissue.map"], "--free tissue.map: a map cannot be fitted yet"),
+        (["--free", "tissue.map", "--resolution", "16"], "a map cannot be fitted yet"),
+        ([], "--free: names no key"),
+        (["--free", "tissue.young", "--bounds", "tissue.young=9"], "expected KEY=LOW,HIGH"),
+        (["--free", "tissue.young", "--bounds", "tissue.young=3e4,9e4"], "20000, where it starts, is outside"),
+        (["--free", "tissue.young", "--bounds", "tissue.damping=1,2"], "--bounds tissue.damping: not among --free"),
+        (["--free", "tissue.young", "--forces", "none.csv,0.1"], "none.csv: no such file; name a forces.csv"),
+        (["--free", "tissue.young", "--forces", "none.csv"], "expected FILE,SIGMA"),
+        (["--free", "tissue.young", "--set", "sheet.tolerance=0.1"], "sheet.tolerance: 0.1 is for one run"),
+        (["--free", "tissue.young", "--sigma", "0"], "seen.npz: sigma: 0; take one number above 0"),
+        (["--free", "tissue.young", "--correlation", "0"], "--correlation 0: take a number of pixels above 0"),
+    ],
+)
+def test_wrong_arguments_are_answered_in_a_line(
+    tracks: dict[str, Array], small: Path, program: Program, arguments: list[str], message: str
+) -> None:
+    (small / "press.yaml").write_text(yaml.safe_dump(TRUTH))
+    save(small / "seen.npz", tracks)
+    done = program("fit", "press.yaml", "seen.npz", *arguments)
+    assert done.returncode == 2
+    assert message in done.stderr
+    assert len(done.stderr.splitlines()) == 1
+    assert not (small / "output").exists()
+
+
+@pytest.mark.parametrize("text", [b"", b"nothing", b"PK\x05\x06" + bytes(18)], ids=["empty", "text", "no arrays"])
+def test_a_file_that_is_none_is_refused(small: Path, program: Program, text: bytes) -> None:
+    (small / "press.yaml").write_text(yaml.safe_dump(TRUTH))
+    (small / "seen.npz").write_bytes(text)
+    done = program("fit", "press.yaml", "seen.npz", "--free", "tissue.young")
+    assert done.returncode == 2
+    assert done.stderr.startswith("seen.npz: ")
+    assert len(done.stderr.splitlines()) == 1
+
+
+def test_methods_are_those_that_are_described() -> None:
+    assert fit.__doc__ is not None
+    assert all(f"{name}" in fit.__doc__ for name in Method.__annotations__)
