@@ -32,6 +32,9 @@ MODELS = ("plumb_bob", "rational_polynomial", "equidistant", "fisheye")
 # OpenCV's numbers of coefficients: only the first of them are known here, the others must be 0.
 COUNTS, KNOWN = (0, 4, 5, 8, 12, 14), 8
 
+# No number of a calibration is larger.
+LARGEST = 1e6
+
 # Quaternions whose length is farther from 1 are no rotations.
 UNIT = 1e-3
 
@@ -59,12 +62,15 @@ def read_calibration(path: str) -> Calibration:
     model = data.get("distortion_model", "")
     if model and model not in MODELS:
         raise CameraFileError(f"{path}: distortion_model: {model} is not known; expected one of: {', '.join(MODELS)}")
-    fisheye = model in MODELS[2:] or bool(data.get("fisheye_model"))
+    fisheye = model in MODELS[2:] or any(_numbers(path, data, ("fisheye_model",), required=False))
     if len(values) not in ((4,) if fisheye else COUNTS) or any(values[KNOWN:]):
         expected = "4 of a fisheye" if fisheye else "k1, k2, p1, p2, k3, k4, k5, k6"
         raise CameraFileError(f"{path}: {len(values)} distortion coefficients that are not known; expected {expected}")
     width, height = (_numbers(path, data, names, required=False) for names in (WIDTH, HEIGHT))
     size = (round(width[0]), round(height[0])) if width and height else None
+    if size is not None and min(size) < 1:
+        said = f"of pictures of {size[0]} x {size[1]} pixels; write the size of those that were calibrated with"
+        raise CameraFileError(f"{path}: {said}")
     return Calibration((matrix[0], matrix[4]), (matrix[2], matrix[5]), fisheye, tuple(values[:KNOWN]), size)
 
 
@@ -84,16 +90,21 @@ def read_poses(path: str) -> tuple[tuple[float, ...], ...]:
             row = ()
         if len(row) != 8 or not all(math.isfinite(number) for number in row):
             raise CameraFileError(f"{path}:{n}: not a pose; expected eight numbers: t tx ty tz qx qy qz qw")
-        if rows and row[0] <= rows[-1][0]:
-            said = f"goes back in time, from {rows[-1][0]:g} s to {row[0]:g} s; sort the lines by time"
-            raise CameraFileError(f"{path}:{n}: {said}")
-        if abs(math.hypot(*row[4:]) - 1) > UNIT:
-            said = f"its quaternion has the length {math.hypot(*row[4:]):g}, so it is no rotation; scale it to 1"
-            raise CameraFileError(f"{path}:{n}: {said}")
+        if fault := pose_fault(row, rows[-1] if rows else None):
+            raise CameraFileError(f"{path}:{n}: {fault}")
         rows.append(row)
     if not rows:
         raise CameraFileError(f"{path}: no poses; expected lines t tx ty tz qx qy qz qw")
     return tuple(rows)
+
+
+def pose_fault(row: Sequence[float], before: Sequence[float] | None) -> str:
+    """Say what is wrong with a row of a trajectory after another one; nothing: an empty text."""
+    if before is not None and row[0] <= before[0]:
+        return f"is at {row[0]:.9g} s, and the pose before it at {before[0]:.9g} s; sort them, each later than the last"
+    if abs(math.hypot(*row[4:]) - 1) > UNIT:
+        return f"its quaternion has the length {math.hypot(*row[4:]):g}, so it is no rotation; scale it to 1"
+    return ""
 
 
 def _read(name: str) -> str:
@@ -178,8 +189,9 @@ def _numbers(path: str, data: Mapping[str, Any], names: Sequence[str], *, requir
         numbers = [float(one) for one in flat]
     except (TypeError, ValueError):
         numbers = [math.nan]
-    if not all(math.isfinite(number) for number in numbers):
-        raise CameraFileError(f"{path}: {name}: not finite numbers; write them as OpenCV does")
+    # Written so that NaN is found too.
+    if not all(abs(number) <= LARGEST for number in numbers):
+        raise CameraFileError(f"{path}: {name}: not numbers up to {LARGEST:g}; write them as OpenCV does")
     return numbers
 
 

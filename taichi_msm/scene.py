@@ -22,7 +22,7 @@ from pydantic_core import PydanticCustomError
 from typing_extensions import Self
 
 from taichi_msm import faults
-from taichi_msm.camera_files import CameraFileError, read_calibration, read_poses
+from taichi_msm.camera_files import CameraFileError, pose_fault, read_calibration, read_poses
 from taichi_msm.errors import ArgumentError, SceneError, did_you_mean
 from taichi_msm.faults import LARGEST, SMALLEST, refused
 from taichi_msm.outputs.table import CAMERA_NAME, EXPORTS, FOLDERS, MAX_NAME, OUTPUTS
@@ -517,7 +517,9 @@ class Pose(Section):
 
 
 Times = Annotated[tuple[tuple[Number, Number, Number, Number], ...], Field(min_length=1)]
-Quaternions = tuple[tuple[Number, Number, Number, Number, Number, Number, Number, Number], ...]
+Quaternions = Annotated[
+    tuple[tuple[Number, Number, Number, Number, Number, Number, Number, Number], ...], Field(min_length=1)
+]
 
 _KEYS = " or keys [[t, x, y, z], ...], t in seconds"
 
@@ -537,7 +539,9 @@ class Camera(Section):
         None, "in place of fov: as calibrated, in OpenCV's pixels", "a mapping with fx, fy, cx and cy"
     )
     distortion: Distortion | None = key(
-        None, "how the lens bends lines, in OpenCV's terms", "a mapping with k1, k2, p1, p2, k3, k4, k5, k6"
+        None,
+        "how the lens bends lines, in OpenCV's terms",
+        "a mapping with k1, k2, p1, p2, k3 to k6, or with model: fisheye and k1 to k4",
     )
     outside: Literal["refuse", "background"] = key(
         "refuse",
@@ -551,7 +555,7 @@ class Camera(Section):
         None,
         "in place of eye, target and up: the camera's place over time, a file in TUM's format, relative to the scene "
         "file, or its rows [t, tx, ty, tz, qx, qy, qz, qw], from the camera to the world",
-        "the path of a file",
+        "the path of a file, or rows [[t, tx, ty, tz, qx, qy, qz, qw], ...]",
     )
     beside: Annotated[str, Field(strict=True, min_length=1)] | None = key(
         None,
@@ -592,6 +596,9 @@ class Camera(Section):
     @classmethod
     def _read_poses(cls, poses: str | Quaternions | None) -> Quaternions | None:
         if not isinstance(poses, str):
+            for n, row in enumerate(poses or ()):
+                if fault := pose_fault(row, poses[n - 1] if n else None):  # type: ignore[index]
+                    raise refused(fault, n)
             return poses
         try:
             return read_poses(poses)  # type: ignore[return-value]
@@ -607,7 +614,8 @@ class Camera(Section):
             return keys
         for n in range(1, len(keys)):
             if keys[n][0] <= keys[n - 1][0]:
-                raise refused(f"is at {keys[n][0]:g} s, after one at {keys[n - 1][0]:g} s; sort the keys by time", n)
+                said = f"is at {keys[n][0]:g} s, and the key before it at {keys[n - 1][0]:g} s"
+                raise refused(f"{said}; sort the keys, each later than the last", n)
         return keys
 
     @model_validator(mode="after")
@@ -623,6 +631,8 @@ class Camera(Section):
                 raise refused(f"{what}; expected a number but 0, in metres", "baseline")
         elif self.baseline is not None:
             raise refused("goes with beside, the name of another camera; add it or remove this", "baseline")
+        if self.scale and self.calibration is None:
+            raise refused("goes with calibration; remove it", "scale")
         for ways in (("calibration", "intrinsics", "fov"), ("pose", "poses", "eye"), ("calibration", "distortion")):
             if len(both := [name for name in ways if name in given]) > 1:
                 raise refused(f"is given together with {both[0]}; remove one of them", both[1])
@@ -648,6 +658,9 @@ class Camera(Section):
             found = read_calibration(self.calibration)
         except CameraFileError as error:
             raise refused(str(error), "calibration") from None
+        if self.scale and found.size is None:
+            said = "tells no size of its pictures, so it cannot be scaled; add image_width and image_height"
+            raise refused(f"{self.calibration}: {said}, or remove scale", "calibration")
         across, down = (new / old for new, old in zip(size, found.size or size, strict=True))
         if (across, down) != (1, 1) and not self.scale:
             assert found.size is not None
@@ -755,6 +768,8 @@ class Render(Section):
                 raise refused(f"is no name of a camera; take up to {MAX_NAME} of a-z, 0-9, _ and -", name)
             if name in FOLDERS or name.startswith(EXPORTS):
                 raise refused("is the name of a folder that is not a camera's; take another name", name)
+            if name in PRESETS and camera != name:
+                raise refused("is the name of another camera; take another name", name)
             if isinstance(camera, Camera) and camera.beside is not None:
                 _require_beside(name, cameras)
         if "size" not in info.data:

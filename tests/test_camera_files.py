@@ -35,6 +35,7 @@ def write_opencv(path: str) -> None:
     storage = cv2.FileStorage(path, cv2.FILE_STORAGE_WRITE)
     storage.write("image_width", 40)
     storage.write("image_height", 30)
+    storage.write("fisheye_model", 0)
     storage.write("camera_matrix", MATRIX)
     storage.write("distortion_coefficients", np.array([COEFFICIENTS]))
     storage.release()
@@ -103,8 +104,13 @@ def test_pictures_of_another_size_are_refused_or_scaled(small: Path) -> None:
         ("a: &a [1]\nb: *a", "camera.yml: neither YAML, XML nor JSON; name a calibration"),
         ('<!DOCTYPE a [<!ENTITY b "c">]><a/>', "camera.yml: neither YAML, XML nor JSON; name a calibration"),
         ("K: 3", "camera.yml: its camera matrix is not [fx, 0, cx, 0, fy, cy, 0, 0, 1]; write it like that"),
+        (
+            "K: [1, 0, 1, 0, 1, 1, 0, 0, 1]\nwidth: 0\nheight: 0",
+            "camera.yml: of pictures of 0 x 0 pixels; write the size of those that were calibrated with",
+        ),
+        ("K: [1, 0, 1e9, 0, 1, 1, 0, 0, 1]", "camera.yml: K: not numbers up to 1e+06; write them as OpenCV does"),
         ("k: 3", "camera.yml: has no camera_matrix; name a calibration of OpenCV, ROS or STIR"),
-        ("K: [x]", "camera.yml: K: not finite numbers; write them as OpenCV does"),
+        ("K: [x]", "camera.yml: K: not numbers up to 1e+06; write them as OpenCV does"),
         (
             "K: [1, 0, 1, 0, 1, 1, 0, 0, 1]\nD: [1, 2, 3]",
             "camera.yml: 3 distortion coefficients that are not known; expected k1, k2, p1, p2, k3, k4, k5, k6",
@@ -161,7 +167,7 @@ def test_a_trajectory_is_read(small: Path) -> None:
     [
         (
             TUM.replace("0.4 0.1", "0.2 0.1"),
-            "poses.txt:4: goes back in time, from 0.2 s to 0.2 s; sort the lines by time",
+            "poses.txt:4: is at 0.2 s, and the pose before it at 0.2 s; sort them, each later than the last",
         ),
         (
             TUM.replace("0.6 0.8", "0.6 0.9"),
@@ -169,6 +175,11 @@ def test_a_trajectory_is_read(small: Path) -> None:
         ),
         (TUM.replace("0.6 0.8", "0.6"), "poses.txt:4: not a pose; expected eight numbers: t tx ty tz qx qy qz qw"),
         ("# nothing\n", "poses.txt: no poses; expected lines t tx ty tz qx qy qz qw"),
+        (
+            TUM.replace("0.0 0.0 0.0", "0.1 0.0 0.0"),
+            "covers 0.1 s to 0.4 s, but the scene goes from 0 s to 0.4 s; its times are those of the scene: subtract "
+            "the first one from all",
+        ),
         (
             TUM.replace("0.4 0.1", "0.3 0.1"),
             "covers 0 s to 0.3 s, but the scene goes from 0 s to 0.4 s; shorten time.duration or give the poses of all "

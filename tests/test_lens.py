@@ -97,10 +97,14 @@ def test_beyond_the_fold_there_is_nothing() -> None:
     lens = Lens(False, (-0.5, 0, 0, 0, 0, 0, 0, 0))
     # r - r^3 / 2 is largest, sqrt(8 / 27), at r = sqrt(2 / 3).
     assert lens.limit == pytest.approx(np.sqrt(2 / 3))
-    assert lens.rim == pytest.approx(np.sqrt(8 / 27))
-    found = lens.undistort(np.array([[0.0, 0.0], [0.0, lens.rim * 0.9999], [lens.rim * 1.0001, 0.0]]))
+    rim = np.sqrt(8 / 27)
+    found = lens.undistort(np.array([[0.0, 0.0], [0.0, rim * 0.9999], [rim * 1.0001, 0.0]]))
     np.testing.assert_array_equal(np.isnan(found[:, 0]), [False, False, True])
     np.testing.assert_array_equal(found[0], [0, 0])
+    # Before a pole, here at r = sqrt(5), everything is seen.
+    lens = Lens(False, (-0.2, 0.02, 0, 0, 0, -0.2, 0, 0))
+    place = np.array([[0.0, 1e-3], [0.0, 1.0], [2.0, 0.0], [2.2, 0.0]])
+    np.testing.assert_allclose(lens.undistort(lens.distort(place)), place, atol=1e-9)
     # t - t^3 / 2 is largest at t = sqrt(2 / 3).
     assert Lens(True, (-0.5, 0, 0, 0)).limit == pytest.approx(np.tan(np.sqrt(2 / 3)))
 

@@ -113,7 +113,7 @@ def test_a_pose_is_that_of_an_eye_and_a_target() -> None:
     # Rounded ones are made orthonormal.
     np.testing.assert_allclose(view(posed(pose=pose, fov=50)).matrix, view(by_eye).matrix, atol=1e-9)
     for wrong in (matrix[:, :3] * 1.002, matrix[[1, 0, 2], :3]):
-        with pytest.raises(SceneError, match=r"render.camera.pose.rotation: is no rotation; its rows are three unit"):
+        with pytest.raises(SceneError, match=r"render.camera.pose.rotation: is no rotation but .*; its rows are the"):
             view(posed(pose={**pose, "rotation": wrong.tolist()}))
 
 
@@ -123,12 +123,20 @@ STOP = [[0, 0, 0, 1, 1, 0, 0, 0]]
 @pytest.mark.parametrize(
     ("camera", "said"),
     [
-        ({"eye": [[0, 0, 0, 1], [0, 0, 0, 2]]}, "eye.1: is at 0 s, after one at 0 s; sort the keys by time"),
+        (
+            {"eye": [[0, 0, 0, 1], [0, 0, 0, 2]]},
+            "eye.1: is at 0 s, and the key before it at 0 s; sort the keys, each later than the last",
+        ),
         (
             {"eye": [0, 0, 1], "target": [[0, 0, 0, 0], [0.2, 0, 0, 1]]},
             "eye: [0.0, 0.0, 1.0] is also the target at 0.2 s; move one of them",
         ),
         ({"eye": [0, 0, 1], "poses": STOP}, "eye: is given together with poses; remove one of them"),
+        (
+            {"poses": [*STOP, *STOP]},
+            "poses.1: is at 0 s, and the pose before it at 0 s; sort them, each later than the last",
+        ),
+        ({"eye": [0, 0, 1], "scale": True}, "scale: goes with calibration; remove it"),
         ({"poses": STOP, "up": [0, 1, 0]}, "up: goes with eye; a pose has a direction of its own"),
         (
             {"eye": [0, 0, 1], "intrinsics": {"fx": 1, "fy": 1, "cx": 0, "cy": 0}, "fov": 30},

@@ -31,6 +31,9 @@ LARGEST_NUMBER = float(np.finfo(np.float32).max) / MAX_SUPERSAMPLE
 # A camera may be this many times the sheet's larger side away from the one that it is beside.
 FARTHEST = 1e6
 
+# In so many directions it is looked how far a lens is good.
+DIRECTIONS = 64
+
 # A matrix that is farther from orthonormal than this is no rotation.
 ORTHONORMAL = 1e-3
 
@@ -218,15 +221,20 @@ def _place_problems(camera: Camera, scene: Scene) -> Iterator[Problem]:
     if camera.pose is not None:
         turn = np.array(camera.pose.rotation)
         if not (np.abs(turn @ turn.T - np.eye(3)).max() <= ORTHONORMAL and np.linalg.det(turn) > 0):
-            said = "is no rotation; its rows are three unit vectors, right, down and forward, across each other"
-            yield Problem(("pose", "rotation"), said)
+            apart = np.abs(turn @ turn.T - np.eye(3)).max()
+            what = "a mirror" if np.linalg.det(turn) < 0 else f"{apart:.2g} from orthonormal"
+            said = "its rows are the directions to the right, down and forward, of length 1 and across each other"
+            yield Problem(("pose", "rotation"), f"is no rotation but {what}; {said}")
             return
     if camera.poses is not None:
         begin, end, last = camera.poses[0][0], camera.poses[-1][0], scene.time.duration
         slack = WHOLE / scene.time.frames_per_second
         if begin > slack or end < last - slack:  # type: ignore[operator]
-            said = f"covers {begin:g} s to {end:g} s, but the scene goes from 0 s to {last:g} s; shorten time.duration"
-            yield Problem(("poses",), f"{said} or give the poses of all of it")
+            said = f"covers {begin:.9g} s to {end:.9g} s, but the scene goes from 0 s to {last:g} s"
+            remedy = "its times are those of the scene: subtract the first one from all"
+            if begin <= slack:  # type: ignore[operator]
+                remedy = "shorten time.duration or give the poses of all of it"
+            yield Problem(("poses",), f"{said}; {remedy}")
             return
     rate = scene.time.frames_per_second
     for time in [frame / rate for frame in range(scene.time.frames + 1)] if camera.moves else [0.0]:
@@ -260,8 +268,11 @@ def _lens_problems(camera: View) -> Iterator[Problem]:
     if camera.lens is None or not np.isnan(camera.undistorted(border(camera.size))).any():
         return
     end = "folds back" if camera.lens.limit < WIDEST else "reaches 88 degrees"
-    good = math.floor(camera.lens.rim * float(camera.scale.min()))
     far = math.ceil(float(np.linalg.norm(border(camera.size) - camera.centre, axis=-1).max()))
+    angle = np.linspace(0, 2 * np.pi, DIRECTIONS)
+    circle = np.stack([np.cos(angle), np.sin(angle)], axis=-1)
+    radii = (radius for radius in range(far + 1) if np.isnan(camera.undistorted(camera.centre + radius * circle)).any())
+    good = max(0, next(radii, far) - 1)
     said = f"{end} at {good} px from the principal point, and the picture reaches {far} px; take coefficients"
     yield Problem(("distortion",), f"{said} that are good to there, or set outside: background")
 

@@ -45,11 +45,6 @@ class Lens(NamedTuple):
         """The largest r up to which the lens is taken: it folds back there, or is too far from the axis."""
         return _limit(self)
 
-    @property
-    def rim(self) -> float:
-        """How far from the axis the limit is seen, without tangential distortion."""
-        return float(self._radial(np.array(self.limit))[0])
-
     def distort(self, place: Array) -> Array:
         """Give the distorted places of places, both of shape (..., 2)."""
         return self._bend(place)[0]
@@ -64,7 +59,8 @@ class Lens(NamedTuple):
         Newton's method, begun at the solution without tangential distortion.
         """
         limit = self.limit
-        near = limit * np.sin(np.linspace(0, np.pi / 2, 4097))
+        # Not up to the limit, which may be a pole.
+        near = limit * np.sin(np.linspace(0, np.pi / 2, 4097)[:-1])
         reach = np.linalg.norm(distorted, axis=-1, keepdims=True)
         radius = np.interp(reach, self._radial(near)[0], near)
         with np.errstate(invalid="ignore", divide="ignore"):
