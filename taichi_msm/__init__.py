@@ -20,6 +20,7 @@ if TYPE_CHECKING:
     from taichi_msm.exports.convert import export
     from taichi_msm.fitting.fit import fit
     from taichi_msm.fitting.result import FitResult
+    from taichi_msm.gradients import Gradient, gradient
     from taichi_msm.physics.state import TipForce
     from taichi_msm.playback import Playback
     from taichi_msm.render.labels import Flow, Labels, Sight
@@ -50,6 +51,7 @@ __version__ = "0.1.0"
 _HOMES = {
     **dict.fromkeys(("Flow", "Labels", "Sight"), "render.labels"),
     **dict.fromkeys(("resume", "run"), "runner"),
+    **dict.fromkeys(("Gradient", "gradient"), "gradients"),
     "Playback": "playback",
     "TipForce": "physics.state",
     "Simulation": "simulation",
@@ -71,6 +73,7 @@ __all__ = [
     "FitResult",
     "Flow",
     "Foundation",
+    "Gradient",
     "Instrument",
     "Labels",
     "Light",
@@ -93,6 +96,7 @@ __all__ = [
     "Tissue",
     "export",
     "fit",
+    "gradient",
     "load_scene",
     "resume",
     "run",

@@ -20,7 +20,7 @@ LAYERS = [
     {"physics"},
     {"render"},
     {"scenefile"},
-    {"simulation", "results"},
+    {"gradients", "simulation", "results"},
     {"runner", "playback", "console"},
     {"exports", "study", "sweeps", "viewer"},
     {"fitting"},

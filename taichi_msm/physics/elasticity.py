@@ -34,6 +34,15 @@ class SpringFamily(NamedTuple):
         between = displacement[self.there] - displacement[self.here] + self.offset
         return between, np.linalg.norm(between, axis=-1)
 
+    def tangent(self, displacement: Array) -> Array:
+        """Give how the forces change as an end moves [N/m], symmetric, shape (..., 3, 3): see `terms.springs`."""
+        between, length = self.apart(displacement)
+        unit, slack = between / length[..., None], self.unstretched / length
+        straight = self.stiffness * (1 - slack)
+        return straight[..., None, None] * np.eye(3) + (self.stiffness * slack)[..., None, None] * (
+            unit[..., :, None] * unit[..., None, :]
+        )
+
 
 def spring_families(plan: Plan) -> Iterator[SpringFamily]:
     """List the springs along rows, along columns and along both diagonals, each spring once."""

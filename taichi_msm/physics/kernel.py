@@ -81,6 +81,12 @@ def in_lanes(layout: SheetLayout, values: NDArray[Any]) -> NDArray[Any]:
     return laid.reshape(-1, layout.code.lanes)
 
 
+def out_of_lanes(layout: SheetLayout, entries: NDArray[Any], rows: int) -> NDArray[Any]:
+    """Give the columns of the first rows of what `in_lanes` has laid out, shape (rows, cols)."""
+    laid = entries[: rows * layout.width].reshape(rows, layout.width, layout.code.lanes)
+    return laid[:, 1:-1].transpose(0, 2, 1).reshape(rows, -1)[:, : layout.cols]
+
+
 class SheetArrays:
     """The arrays that both forms of kernel 1 have.
 
@@ -120,12 +126,9 @@ class SheetArrays:
     def get_fields(self, first: int, count: int) -> NDArray[Any]:
         """Read so many fields from the first one on, shape (count, rows, cols)."""
         layout = self._layout
-        rows, entry = count * layout.rows, first * layout.rows * layout.width
-        laid = self.fields.to_numpy()[entry : entry + rows * layout.width].reshape(
-            rows, layout.width, layout.code.lanes
-        )
-        values = laid[:, 1:-1].transpose(0, 2, 1).reshape(count, layout.rows, -1)
-        return np.ascontiguousarray(values[..., : layout.cols])
+        entries = self.fields.to_numpy()[first * layout.rows * layout.width :]
+        values = out_of_lanes(layout, entries, count * layout.rows)
+        return np.ascontiguousarray(values.reshape(count, layout.rows, layout.cols))
 
     def set_fields(self, first: int, values: NDArray[Any]) -> None:
         """Replace fields from the first one on, shape (fields, rows, cols); the others stay."""

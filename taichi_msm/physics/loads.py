@@ -50,6 +50,16 @@ def decay(probe: Probe, sheet: Sheet, at: Array | None = None) -> Array:
     return shares * area_shares(sheet) if acts.by_area else shares
 
 
+def decay_slope(probe: Probe, sheet: Sheet, at: Array | None = None) -> Array:
+    """Differentiate `decay` by x and y of the control point [1/m], shape (2, rows, cols); at its tip, 0."""
+    acts, (at_x, at_y) = probe_force(probe, sheet), control_points(probe, sheet)[1][0] if at is None else at
+    x, y = axes(sheet)
+    off = np.stack(np.broadcast_arrays(x - at_x, y - at_y))
+    distance = np.hypot(*off)
+    outside = (acts.falloff * distance + acts.shift > acts.offset) & (distance > 0)
+    return decay(probe, sheet, at) * acts.falloff * outside * off / np.where(outside, distance, 1)
+
+
 def schedule(plan: Plan, first: int, count: int) -> Schedule:
     """Average the loads over the steps first, ..., first + count - 1 of a plan."""
     scene, parts = plan.scene, plan.slots
@@ -73,7 +83,8 @@ def schedule(plan: Plan, first: int, count: int) -> Schedule:
 
 def loads_at(plan: Plan, t: Array) -> Schedule:
     """Evaluate the loads themselves, not their averages, with one slot a probe, at times that are no keys [s]."""
-    scene, parts = plan.scene, probe_slots(plan.scene.probes, plan.scene.sheet, 0.0)
+    scene = plan.scene
+    parts = plan.slots if scene.time.at_rest else probe_slots(scene.probes, scene.sheet, 0.0)
     strength, point = np.zeros((len(t), len(parts), 3)), np.zeros((len(t), len(parts), 2))
     for n, part in enumerate(parts):
         probe = scene.probes[part.probe]

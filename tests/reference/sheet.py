@@ -120,7 +120,7 @@ def _of_tissue(scene: Scene, tissue: Tissue) -> Sheet:
     quarters = _rows_of(_columns_of(cells))
     mass = (tissue.density or 0.0) * tissue.thickness * dx * dy / 4 * quarters
     plate = tissue.young * tissue.thickness**3 / 12 / (1 - 1 / 9)
-    bending = plate if tissue.bending == "plate" else float(tissue.bending)
+    bending = plate if tissue.bending == "plate" else tissue.bending
     virtual = tissue.foundation_stiffness * dx * dy / 4 * quarters * foundation_factors(scene)
     return Sheet(springs, mass, tissue.damping * mass, virtual, bending * dx * dy)
 
@@ -142,5 +142,5 @@ def _springs(scene: Scene, ahead: tuple[int, int], stiffness: Array, pull: Array
     here = slice(0, rows - down), slice(max(0, -right), cols - max(0, right))
     there = slice(down, rows), slice(max(0, right), cols - max(0, -right))
     length = math.hypot(right * dx, down * dy)
-    shorter = np.divide(pull * length, stiffness, out=np.zeros_like(stiffness), where=stiffness > 0)
+    shorter = np.divide(pull * length, stiffness, out=np.zeros_like(pull), where=stiffness.real > 0)
     return Springs(here, there, np.array([right * dx, -down * dy, 0.0]), length, stiffness, length - shorter)

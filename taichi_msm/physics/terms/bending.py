@@ -96,6 +96,10 @@ class BendingTerm(Term):
 
         return (add,)
 
+    def tangents(self, code: StepCode) -> Sequence[Callable[..., Any]]:
+        """Make the function that adds the change of the force, which is linear in the displacements."""
+        return self.forces(code)
+
     def measuring(self, code: StepCode) -> Sequence[Callable[..., None]]:
         """Make the function that adds up the square of the Laplacian, which is 0 at edges."""
         ti = code.ti

@@ -11,6 +11,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
+import numpy as np
 from numpy.typing import NDArray
 from typing_extensions import Self
 
@@ -76,10 +77,7 @@ class FoundationTerm(Term):
 
     def fields(self, plan: Plan) -> NDArray[Any]:
         """Give each point's share of K: its factor times its share of a cell's area."""
-        factors = plan.material.virtual_factors
-        if factors is None:
-            return super().fields(plan)
-        return factors[None] * area_shares(plan.scene.sheet)
+        return point_shares(plan)[None] if self.mapped else super().fields(plan)
 
     def forces(self, code: StepCode) -> Sequence[Callable[..., Any]]:
         """Make the function that adds -K u."""
@@ -102,3 +100,14 @@ class FoundationTerm(Term):
                     force[c] = force[c] - now[column] * entry.u[c]
 
         return (add,)
+
+    def tangents(self, code: StepCode) -> Sequence[Callable[..., Any]]:
+        """Make the function that adds the change of the force, which is linear in the displacements."""
+        return self.forces(code)
+
+
+def point_shares(plan: Plan) -> NDArray[Any]:
+    """Give each point's share of K: its factor times its share of a cell's area; shape (rows, cols)."""
+    material = plan.material
+    shares = area_shares(plan.scene.sheet) if material.by_area else np.ones(plan.fixed.shape)
+    return shares if material.virtual_factors is None else material.virtual_factors * shares

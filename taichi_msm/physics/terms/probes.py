@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from typing_extensions import Self
 
 from taichi_msm.physics.lattice import axes, spacing
-from taichi_msm.physics.loads import Schedule, decay
+from taichi_msm.physics.loads import Schedule, decay, decay_slope
 from taichi_msm.physics.plan import Plan, ProbeSlot
 from taichi_msm.physics.probe_force import probe_force
 from taichi_msm.physics.terms.term import ACROSS, AREA, DY, TOP, StepCode, Term
@@ -93,6 +93,57 @@ class ProbeTerm(Term):
                     force[c] += now[column + c] * share
 
         return (add,)
+
+    def slopes(self, plan: Plan) -> NDArray[Any]:
+        """Give the derivatives of the decays of the standing slots by x and y of the control point, (slots, 2, ...)."""
+        scene = plan.scene
+        slopes = [decay_slope(scene.probes[slot.probe], scene.sheet) for slot in plan.slots if not slot.moves]
+        return np.array(slopes).reshape(-1, 2, *scene.sheet.points)
+
+    def sensing(self, code: StepCode, first_slope: int) -> Callable[..., None]:
+        """Make the function that differentiates the work of all slots by their forces and their control points.
+
+        An entry's work on it is the product of the force and `entry.u`; of a slot, three derivatives by the force and
+        two by the control point are added to a list. `slopes` are in `sheet.found`, from `first_slope` times the
+        sheet's rows on.
+        """
+        ti = code.ti
+        moves, by_area, first = self.moves, self.by_area, code.first_column(ProbeTerm)
+        vector, lanes, first_field = code.vector, code.lanes, code.first_field(ProbeTerm)
+        standing = [moves[:n].count(False) for n in range(len(moves))]
+
+        @ti.func
+        def sense(sums: ti.template(), sheet: ti.template(), entry: ti.template(), now: ti.template()):
+            i, b = entry.row.i, entry.b
+            for n in ti.static(range(len(moves))):
+                column = ti.static(first + SLOT_COLUMNS * n)
+                share, slope = vector(0), [vector(0), vector(0)]
+                if ti.static(moves[n]):
+                    off_x = sheet.by_column[ACROSS * sheet.width + b] - now[column + POINT]
+                    off_y = sheet.numbers[TOP] - i * sheet.numbers[DY] - now[column + POINT + 1]
+                    distance = ti.sqrt(off_x * off_x + off_y * off_y)
+                    exponent = now[column + FALLOFF] * distance + now[column + SHIFT]
+                    # 0 on the flat end, and where the point is the control point.
+                    turned = now[column + FALLOFF] / ti.select(distance > 0, distance, vector(1))
+                    turned = ti.select(exponent > now[column + OFFSET], turned, vector(0))
+                    exponent = ti.max(exponent, now[column + OFFSET])
+                    share = vector([ti.exp(-exponent[lane]) for lane in ti.static(range(lanes))])
+                    if ti.static(by_area[n]):
+                        share *= sheet.by_column[(AREA + entry.row.kind) * sheet.width + b]
+                    slope[0], slope[1] = share * turned * off_x, share * turned * off_y
+                else:
+                    share = sheet.fields[((first_field + standing[n]) * sheet.rows + i) * sheet.width + b]
+                    for axis in ti.static(range(2)):
+                        row = (first_slope + 2 * standing[n] + axis) * sheet.rows + i
+                        slope[axis] = sheet.found[row * sheet.width + b]
+                work = vector(0)
+                for c in ti.static(range(3)):
+                    sums[5 * n + c] += share * entry.u[c]
+                    work += now[column + c] * entry.u[c]
+                for axis in ti.static(range(2)):
+                    sums[5 * n + 3 + axis] += work * slope[axis]
+
+        return sense
 
 
 def standing(plan: Plan) -> list[tuple[object, ...]]:

@@ -218,6 +218,37 @@ class SpringTerm(Term):
 
         return along, to_other_row, of_row, of_column, of_diagonal
 
+    def tangent(self, code: StepCode) -> Callable[..., Any]:
+        """Make the function that differentiates the force of a point P on its neighbour Q.
+
+        As u_P - u_Q changes from q by p, the force of k - tau and tau changes by
+
+            (k - tau) (s p + (1 - s) ((o + q) . p) (o + q) / L^2) + tau p,    s = 1 - L0 / L
+
+        which is symmetric. The product of the force with p changes with k - tau by s (o + q) . p, with tau by q . p.
+        """
+        ti, tense = code.ti, self.tense
+
+        @ti.func
+        def differentiate(q: ti.template(), p: ti.template(), x0, y0, length, k, tension):
+            """Give the change of the force, x, y and z; and of its product with p by k - tau and by tau."""
+            to = [q[0] + x0, q[1] + y0, q[2]]
+            square = to[0] * to[0] + to[1] * to[1] + (to[2] * to[2] + TINY)
+            longer = q[0] * (to[0] + x0) + (q[1] * (to[1] + y0) + q[2] * q[2])
+            both = square + length * ti.sqrt(square)
+            # One division in the place of two.
+            inverse = 1 / (square * both)
+            share = longer * square * inverse
+            along = to[0] * p[0] + to[1] * p[1] + to[2] * p[2]
+            straight, turned = k * share, k * ((1 - share) * both * inverse * along)
+            if ti.static(tense):
+                straight += tension
+            change = [straight * p[c] + turned * to[c] for c in ti.static(range(3))]
+            apart = q[0] * p[0] + q[1] * p[1] + q[2] * p[2]
+            return [change[0], change[1], change[2], share * along, apart]
+
+        return differentiate
+
     def pulling(self, code: StepCode) -> Callable[..., Any]:
         """Make the function that gives the square of the largest force of the springs to the right and below."""
         ti = code.ti

@@ -93,6 +93,13 @@ class Term(ABC):
         """
         return ()
 
+    def tangents(self, code: StepCode) -> Sequence[Callable[..., Any]]:
+        """Make Taichi's functions add(force, sheet, entry, now) that add the change of the force on a point.
+
+        Entry and sheet hold the change of the displacements in the place of displacements.
+        """
+        return ()
+
     def reducing(self, code: StepCode) -> Sequence[Callable[..., Any]]:
         """Make Taichi's functions reduce(d, sheet) that change the last difference of a point, a list of x, y and z."""
         return ()

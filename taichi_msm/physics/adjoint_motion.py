@@ -1,0 +1,253 @@
+"""The derivatives of a loss by what the steps of a moving sheet are made of.
+
+A forward run keeps the state every so many steps, about the root of their number. Backward, each segment between two
+such states is run again, all of its shapes are kept, and the adjoint is swept over them (`kernel_adjoint`).
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from taichi_msm.errors import DivergedError
+from taichi_msm.physics import divergence
+from taichi_msm.physics.bands import MOMENTS
+from taichi_msm.physics.divergence import Watch, farthest
+from taichi_msm.physics.kernel import in_lanes, out_of_lanes
+from taichi_msm.physics.kernel_adjoint import (
+    ADJOINT_PARTS,
+    BENT,
+    BUFFERS,
+    FAMILIES,
+    HELD,
+    KEPT,
+    LOSS,
+    PUSHED,
+    ROW_SUMS,
+    STRIDE,
+    SUM_PARTS,
+    TENSE,
+    copying,
+    kernels,
+)
+from taichi_msm.physics.kernel_cpu import PAGE, PATIENCE
+from taichi_msm.physics.loads import schedule
+from taichi_msm.physics.material import area_shares
+from taichi_msm.physics.plan import Plan
+from taichi_msm.physics.slopes import LoadSlopes, Slopes
+from taichi_msm.physics.solver import Dynamics
+from taichi_msm.physics.state import State
+from taichi_msm.physics.terms.damping import coefficients
+from taichi_msm.physics.terms.foundation import point_shares
+from taichi_msm.physics.terms.probes import ProbeTerm
+from taichi_msm.physics.terms.term import GAIN
+from taichi_msm.system.runtime import Memory, our_compilation, write
+
+# A launch of the adjoint takes no more steps times points than this, about 0.1 s of one core.
+POINT_STEPS_PER_LAUNCH = 10_000_000
+
+Array = NDArray[np.float64]
+
+
+class _Arrays(NamedTuple):
+    """The arrays of the adjoint; those of three, for x, y and z."""
+
+    # kept, last: displacements and last differences at the beginning of every segment
+    kept: list[Any]
+    last: list[Any]
+    # shapes, moving: displacements in a segment, one shape after the other, and the last difference
+    shapes: list[Any]
+    moving: list[Any]
+    adjoint: list[Any]  # see `kernel_adjoint`
+    loss: list[Any]  # the derivative by the shape of a frame
+    found: Any  # what is added up
+
+
+class MotionAdjoint(Dynamics):
+    """A sheet in motion, and its adjoint; its plan has a map of the stiffness, in f64."""
+
+    # What memory was taken for.
+    _allocated: tuple[Any, ...] = ()
+
+    def restart(self, plan: Plan, state: State | None = None) -> None:
+        """Begin again with the same scene or another, as `Dynamics` does."""
+        super().restart(plan, state)
+        self._slopes = self.structure.code.require(ProbeTerm).slopes(plan)
+        key = self.structure, plan.grid.steps, len(self._slopes)
+        if key != self._allocated:
+            self._allocate()
+            self._allocated = key
+
+    def _allocate(self) -> None:
+        """Take memory for a layout, a number of steps and of standing slots."""
+        plan = self.plan
+        # Segments and their beginnings, which are two shapes each, then take about the same memory.
+        self._segment = math.ceil(math.sqrt(2 * plan.grid.steps))
+        layout, memory = self.structure, Memory()
+        row_bytes = layout.width * layout.code.lanes * 8
+        # No two workers write to one page of what they carry.
+        self._carried_rows = 1 - (-PAGE // row_bytes)
+        self._extra = (MOMENTS + self._carried_rows) * layout.workers
+        sums = -(-ROW_SUMS * layout.rows // layout.width)
+
+        def rows(count: int) -> Any:
+            return memory.array("f64", layout.code.lanes, count * layout.width)
+
+        def three(count: int) -> list[Any]:
+            return [rows(count) for _ in range(3)]
+
+        kept = -(-plan.grid.steps // self._segment) * layout.rows
+        self._memory = memory
+        self._arrays = _Arrays(
+            three(kept), three(kept),
+            three((self._segment + 1) * layout.rows + self._extra), three(layout.rows),
+            three(ADJOINT_PARTS * layout.rows + self._extra), three(layout.rows),
+            rows((SUM_PARTS + 2 * len(self._slopes)) * layout.rows + sums),
+        )  # fmt: skip
+
+    def run(self) -> Array:
+        """Take all steps anew; returns the displacements of every frame [m], shape (F + 1, rows, cols, 3).
+
+        Raises:
+            DivergedError: when the sheet diverges.
+        """
+        plan, grid = self.plan, self.plan.grid
+        watch, frames = Watch(plan), np.zeros((grid.frames + 1, *plan.scene.sheet.points, 3))
+        marks = {*range(0, grid.steps + 1, grid.steps_per_frame), *range(0, grid.steps, self._segment)}
+        for n in sorted(marks):
+            self.advance(n - self.steps_done)
+            if n % self._segment == 0 and n < grid.steps:
+                self._keep(n // self._segment)
+            if n and n % grid.steps_per_frame == 0:
+                reading = self.read()
+                fault = watch.follow(reading)
+                if fault:
+                    said = divergence.message(grid.time(n), n, fault, exact=False)
+                    raise DivergedError(said, n, grid.time(n), farthest(reading.displacement)[:2])
+                frames[n // grid.steps_per_frame] = reading.displacement
+        return frames
+
+    def backward(self, by_frame: Array) -> tuple[Slopes, LoadSlopes]:
+        """Sweep the adjoint of the last `run`; by_frame: derivative of the loss by what that returned."""
+        grid, layout, arrays = self.plan.grid, self.structure, self._arrays
+        _, gain, _ = coefficients(self.plan)
+        shares = area_shares(self.plan.scene.sheet) if layout.code.by_area else np.ones((layout.rows, layout.cols))
+        start = gain * (~self.plan.fixed / shares)[..., None] * by_frame[-1]
+        for c in range(3):
+            # p, an empty buffer, and q.
+            parts = start[..., c], 0 * start[..., c], start[..., c]
+            write(arrays.adjoint[c], in_lanes(layout, np.concatenate(parts)))
+        none = np.zeros((SUM_PARTS * layout.rows, layout.cols))
+        slopes = self._slopes.reshape(-1, layout.cols)
+        write(arrays.found, in_lanes(layout, np.concatenate([none, slopes])))
+        loads, self._buffer = LoadSlopes(self.plan), BUFFERS
+        totals = np.zeros(2)
+        for first in reversed(range(0, grid.steps, self._segment)):
+            self._record(first)
+            end = min(first + self._segment, grid.steps)
+            while end > first:
+                end = self._sweep(first, end, by_frame, loads, totals)
+        return self._collect(gain, totals), loads
+
+    def _keep(self, segment: int) -> None:
+        """Keep the state at the beginning of a segment."""
+        layout, arrays = self.structure, self._arrays
+        entries = layout.rows * layout.width
+        keep, _ = copying(layout.code)
+        with our_compilation():
+            keep(entries, segment * entries, *self._moving.arrays.u, *arrays.kept)
+            keep(entries, segment * entries, *self._moving.arrays.d, *arrays.last)
+
+    def _record(self, first: int) -> None:
+        """Take the steps of a segment, whose number is that of its first one, and keep every shape."""
+        layout, arrays, count = self.structure, self._arrays, min(self._segment, self.plan.grid.steps - first) - 1
+        entries = layout.rows * layout.width
+        _, begin = copying(layout.code)
+        with our_compilation():
+            begin(entries, first // self._segment * entries, *arrays.kept, *arrays.last, *arrays.shapes, *arrays.moving)
+        table, most = self._table(first, count + 1), self._most_steps()
+        for done in range(0, count, most):
+            steps = min(most, count - done)
+            # The first shape is that before the segment.
+            sizes = self._sizes(steps, 1 + done, (self._segment + 1) * layout.rows)
+            self._launch(0, sizes, table[done : done + steps], *arrays.shapes, *arrays.moving, *self._sheet_arrays)
+
+    def _sweep(self, first: int, end: int, by_frame: Array, loads: LoadSlopes, totals: Array) -> int:
+        """Sweep back from step `end`, to the last frame before it at most; returns how far."""
+        layout, arrays, grid = self.structure, self._arrays, self.plan.grid
+        frame = (end - 1) // grid.steps_per_frame
+        begin = max(first, frame * grid.steps_per_frame, end - self._most_steps())
+        with_loss = begin == frame * grid.steps_per_frame
+        if with_loss:
+            self._put(by_frame[frame])
+        sizes = self._sizes(end - begin, end - first, ADJOINT_PARTS * layout.rows, with_loss)
+        pushes = np.zeros((end - begin, layout.rows, max(1, PUSHED * len(self.plan.slots))))
+        table = self._table(begin, end - begin)
+        self._launch(1, sizes, table, pushes, *arrays.adjoint, *arrays.shapes, *self._sheet_arrays, arrays.found)
+        self._buffer = (self._buffer + end - begin) % 2
+        if self.plan.slots:
+            by_slot = pushes.sum(axis=1).reshape(end - begin, -1, PUSHED)
+            if begin == 0:
+                # The first step has another gain.
+                by_slot[0] *= table[0, GAIN] / coefficients(self.plan)[1]
+            work = (by_slot[..., :3] * schedule(self.plan, begin, end - begin).strength).sum(axis=(1, 2))
+            totals += work[int(begin == 0) :].sum(), work[: int(begin == 0)].sum()
+            h = grid.step
+            times = begin * h - h, end * h
+            loads.add(lambda plan: schedule(plan, begin, end - begin), by_slot, times)
+        return begin
+
+    def _put(self, slopes: Array) -> None:
+        """Put the derivative by the shape of a frame where the kernel adds it."""
+        layout, arrays = self.structure, self._arrays
+        entries = layout.rows * layout.width
+        for c in range(3):
+            write(arrays.loss[c], in_lanes(layout, slopes[..., c]))
+        keep, _ = copying(layout.code)
+        with our_compilation():
+            keep(entries, LOSS * entries, *arrays.loss, *arrays.adjoint)
+
+    def _collect(self, gain: float, totals: Array) -> Slopes:
+        """Add up what was found."""
+        layout = self.structure
+        rows, cols, found = layout.rows, layout.cols, self._arrays.found.to_numpy()
+        every = out_of_lanes(layout, found, SUM_PARTS * rows).reshape(SUM_PARTS, rows, cols)
+        first = (SUM_PARTS + 2 * len(self._slopes)) * rows * layout.width
+        # Row by row, each in the order of its lanes.
+        sums = found[first : first + ROW_SUMS * rows].reshape(rows, ROW_SUMS, -1).sum(axis=2).sum(axis=0)
+        springs = every[FAMILIES][:, :-1], every[FAMILIES + 1][:-1], every[FAMILIES + 2][:-1, :-1]
+        held = every[HELD] * point_shares(self.plan)
+        slopes = Slopes(springs, sums[TENSE:BENT], held, float(sums[BENT]), keep=float(sums[KEPT]) / gain)
+        slopes.gain = slopes.work(self.plan) + float(totals[0])
+        slopes.first_gain = float(totals[1])
+        return slopes
+
+    @property
+    def _sheet_arrays(self) -> tuple[Any, ...]:
+        """The arrays of the sheet that the kernels only read."""
+        arrays = self._moving.arrays
+        return arrays.numbers, arrays.by_column, arrays.stiffness, arrays.fields
+
+    def _most_steps(self) -> int:
+        return max(1, POINT_STEPS_PER_LAUNCH // (self.structure.rows * self.structure.cols))
+
+    def _sizes(self, count: int, shape: int, extra: int, with_loss: bool = False) -> NDArray[np.int64]:
+        """List the sizes of a launch, in the order that `kernel_adjoint` gives; extra: rows before moments."""
+        layout = self.structure
+        carry = extra + MOMENTS * layout.workers
+        return np.array([
+            count, layout.workers, layout.rows, layout.strip, shape, extra, carry, self._carried_rows, PATIENCE,
+            self._buffer if extra == ADJOINT_PARTS * layout.rows else 0, with_loss,
+        ])  # fmt: skip
+
+    def _launch(self, which: int, sizes: NDArray[np.int64], *arguments: Any) -> None:
+        """Launch the kernel that records, or the one that sweeps; if a worker gives up, one goes on alone."""
+        code, workers = self.structure.code, self.structure.workers
+        progress = np.zeros(STRIDE * workers, np.int64)
+        for parallel in (True, False) if workers > 1 else (False,):
+            if (progress[::STRIDE] < sizes[0]).any():
+                with our_compilation():
+                    kernels(code, parallel=parallel)[which](sizes, progress, *arguments)
