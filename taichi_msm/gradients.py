@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Any
@@ -10,6 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from taichi_msm.arguments import are_numbers, as_array
 from taichi_msm.errors import ArgumentError
 from taichi_msm.physics.adjoint import Adjoint, require_differentiable
 from taichi_msm.physics.slopes import Derivatives
@@ -84,7 +84,9 @@ def gradient(scene: Scene | Mapping[str, Any], loss: Loss, threads: int | None =
         said = f"returned {type(returned).__name__}; return a pair, its value and its derivative by the positions"
         raise ArgumentError(f"loss: {said}")
     value, slope = returned
-    if not (np.ndim(value) == 0 and math.isfinite(value)):
-        raise ArgumentError(f"loss: its value is {value!r}; return a finite number")
+    given = as_array(value, "loss")
+    if not are_numbers(given, ()) or not np.isfinite(given):
+        said = f"an array of shape {given.shape}" if given.ndim else repr(value)
+        raise ArgumentError(f"loss: its value is {said}; return a finite number")
     found = adjoint.backward(slope)
     return Gradient(found.numbers, found.maps, float(value))

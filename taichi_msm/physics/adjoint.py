@@ -27,6 +27,13 @@ def require_differentiable(plan: Plan) -> None:
         raise SceneError([f"probes.{tool.probe}.path: {said}"])
 
 
+def mapped(plan: Plan) -> Plan:
+    """Give a plan a map of the stiffness, of factors 1 where it has none, and steps in f64."""
+    material, (rows, cols) = plan.material, plan.scene.sheet.points
+    factors = np.ones((rows - 1, cols - 1)) if material.factors is None else material.factors
+    return replace(plan.with_grid(precision="f64"), material=replace(material, factors=factors))
+
+
 class Adjoint:
     """A compiled sheet that is run and differentiated any number of times, in f64; a map of its stiffness may change.
 
@@ -41,10 +48,7 @@ class Adjoint:
 
     def __init__(self, plan: Plan, device: Device, cores: int | None = None) -> None:
         require_differentiable(plan)
-        material, points = plan.material, plan.scene.sheet.points
-        if material.factors is None:
-            material = replace(material, factors=np.ones((points[0] - 1, points[1] - 1)))
-        self._plan = replace(plan.with_grid(precision="f64"), material=material)
+        self._plan = mapped(plan)
         self._sheet: MotionAdjoint | RestAdjoint
         if plan.scene.time.at_rest:
             self._sheet = RestAdjoint(self._plan, device)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from functools import lru_cache
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -52,7 +52,7 @@ class Sheet(NamedTuple):
     mass: Array
     drag: Array
     virtual: Array
-    bending: float
+    bending: Any
 
 
 # Points from one end of a spring to the other, down and right.
