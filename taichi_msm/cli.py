@@ -613,8 +613,6 @@ def fit(
         raise click.BadParameter(
             "a map cannot be fitted yet; leave it out, and name numbers", param_hint="--resolution"
         )
-    if correlation is not None and not 0 < correlation < math.inf:
-        raise click.BadParameter(f"{correlation:g}; take a number of pixels above 0", param_hint="--correlation")
     limits = dict(map(read_bounds, (*bounds, *(word for word in more if "=" in word))))
     loaded = load_scene(scene, overrides)
     directory = result_directory(out, f"{Path(scene).stem}-fit")

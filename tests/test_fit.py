@@ -19,6 +19,7 @@ from taichi_msm.fitting.observations import read_observations
 from taichi_msm.fitting.parameters import make_parameters
 from taichi_msm.fitting.prediction import Job, Predictor, runnable, surface_weights
 from taichi_msm.fitting.result import FitResult
+from taichi_msm.fitting.suspicions import MOVES, faults, moved
 from taichi_msm.physics.deformed import touched
 from taichi_msm.scene import Scene
 from taichi_msm.system import resources
@@ -401,6 +402,17 @@ def test_what_cannot_be_used_is_answered_by_one_sentence(
         assert ";" in caught.value.lines[0], name
 
 
+def test_motion_of_many_tracks_is_seen_though_it_is_smaller_than_their_errors(tracks: dict[str, Array]) -> None:
+    # The square of the motion is 0.4 of that of the errors, of 36 points at 11 times.
+    motion = 0.95 * np.sin(np.arange(11))[:, None]
+    noise = np.random.default_rng(3).normal(0, 1, tracks["pixel"].shape)
+    for moving in (True, False):
+        pixel = tracks["pixel"][:, :1] + moving * motion + noise
+        seen = read_observations({**tracks, "pixel": pixel, "sigma": 1.0}, 25)
+        assert moved(seen, changed()) < MOVES
+        assert bool(list(faults(seen, changed(), 1))) != moving
+
+
 def test_values_that_make_no_scene_give_no_run(device: Device, tracks: dict[str, Array]) -> None:
     scene = changed(tissue__damping=0)
     free = ["tissue.damping", "tissue.young"]
@@ -430,6 +442,7 @@ def test_values_that_make_no_scene_give_no_run(device: Device, tracks: dict[str,
         (["--free", "tissue.young", "--forces", "none.csv"], "expected FILE,SIGMA"),
         (["--free", "tissue.young", "--set", "sheet.tolerance=0.1"], "sheet.tolerance: 0.1 is for one run"),
         (["--free", "tissue.young", "--sigma", "0"], "seen.npz: sigma: 0; take one number above 0"),
+        (["--free", "tissue.young", "--correlation", "0"], "--correlation 0: take a number of pixels above 0"),
     ],
 )
 def test_wrong_arguments_are_answered_in_a_line(

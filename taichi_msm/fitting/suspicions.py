@@ -17,8 +17,9 @@ Array = NDArray[np.float64]
 # Units are wrong if what was seen is spread so many times wider than the points are at rest, or narrower.
 OFF = 30.0
 
-# Points move if one of them does by more than its error: so many sigma in the root mean square over time.
-MOVES = 1.5
+# Points move if one of them does by so many sigma in the root mean square over time, or if the sum of all squares over
+# sigma^2 is so many of its standard deviations above what errors alone give.
+MOVES, SIGNIFICANT = 1.5, 5.0
 
 # Frames miss the motion if the points move less at the observed times than this share of their motion.
 MISSED = 0.1
@@ -40,8 +41,7 @@ def faults(seen: Observations, scene: Scene, parameters: int) -> Iterator[str]:
     if seen.forces is not None:
         yield from _times(seen.forces.time, seen.forces.name, scene)
     yield from _units(seen, scene)
-    motion = moved(seen, scene)
-    if seen.forces is None and not motion > max(MOVES * (seen.sigma or 0.0), 0.0):
+    if seen.forces is None and _is_still(seen, scene):
         said = f"by more than its error, sigma {seen.sigma:g} {seen.unit}" if seen.sigma else "at all"
         yield f"{name}: no point moves {said}; observe while a tool acts, at points near it"
 
@@ -66,10 +66,24 @@ def faults_beside(seen: Observations, scene: Scene, first: Predicted) -> Iterato
 
 def moved(seen: Observations, scene: Scene) -> float:
     """Give the motion of the point that moves most: root mean square over time, or from rest [m] or [px]."""
+    return float(np.sqrt(np.nanmean(_motion(seen, scene) ** 2, axis=(1, 2)).max()))
+
+
+def _motion(seen: Observations, scene: Scene) -> Array:
+    """Give the points that were seen from their means in time, or, if each was seen once, from rest."""
     known = seen.there.any(axis=1)
     values, several = seen.values[known], seen.there.sum(axis=1).max() > 1
-    centre = np.nanmean(values, axis=1, keepdims=True) if several else seen_at_rest(scene, seen)[known]
-    return float(np.sqrt(np.nanmean((values - centre) ** 2, axis=(1, 2)).max()))
+    return values - (np.nanmean(values, axis=1, keepdims=True) if several else seen_at_rest(scene, seen)[known])
+
+
+def _is_still(seen: Observations, scene: Scene) -> bool:
+    """Tell whether nothing was seen but errors."""
+    if seen.sigma is None:
+        return moved(seen, scene) == 0
+    square = float(np.nansum((_motion(seen, scene) / seen.sigma) ** 2))
+    freedom = seen.known.sum() - seen.known.any(axis=1).sum()
+    is_significant = square > freedom + SIGNIFICANT * math.sqrt(2 * freedom) > 0
+    return not (is_significant or moved(seen, scene) > MOVES * seen.sigma)
 
 
 def _times(time: Array, name: str, scene: Scene) -> Iterator[str]:
