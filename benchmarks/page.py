@@ -8,7 +8,7 @@ from importlib import metadata
 from pathlib import Path
 from typing import Any
 
-from benchmarks import bounds, looks, native, terms, whole_run
+from benchmarks import bounds, gradients, looks, native, terms, whole_run
 from benchmarks.drawing.measure import WANTED
 from benchmarks.parts import NARROW, PIXELS, READY, REFINE
 from benchmarks.process import ROOT
@@ -78,6 +78,7 @@ def tables(results: Results) -> dict[str, str]:
         "flat_table": ("drawing", lambda: drawing_table(results["drawing"]["flat"])),
         "whole_run_table": ("whole_run", lambda: whole_run_table(results["whole_run"])),
         "terms_table": ("terms", lambda: terms_table(results["terms"])),
+        "gradient_table": ("gradient", lambda: gradient_table(results["gradient"])),
         "looks_table": ("looks", lambda: looks_table(results["looks"]["pictures"])),
         "rates_table": ("looks", lambda: rates_table(results["looks"]["rates"])),
         "compilers_table": ("compilers", lambda: compilers_table(results["compilers"])),
@@ -254,6 +255,17 @@ def terms_table(measured: dict[str, dict[str, list[float]]]) -> str:
         for name in names
     ]
     return table(["a step", *medians], rows)
+
+
+def gradient_table(measured: dict[str, dict[str, dict[str, list[float]]]]) -> str:
+    """Show the time of a forward run and of a gradient, and how many times that of this program's run it is."""
+    rows = []
+    for size, peers in measured.items():
+        run = Timing.of(peers[gradients.OURS]["forward"]).median
+        for name, samples in peers.items():
+            forward, whole = (Timing.of(samples[kind]) for kind in ("forward", "gradient"))
+            rows.append([f"{size}, {name}", timing(forward), timing(whole), f"{whole.median / run:.1f}"])
+    return table(["a gradient", "forward run", "value and gradient", "in forward runs of taichi_msm"], rows)
 
 
 def looks_table(measured: dict[str, dict[str, list[float]]]) -> str:

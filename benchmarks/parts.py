@@ -6,7 +6,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from typing import Any
 
-from benchmarks import bounds, compilers, instructions, looks, terms, whole_run
+from benchmarks import bounds, compilers, gradients, instructions, looks, terms, whole_run
 from benchmarks.drawing import FLAT, LIT
 from benchmarks.race import Progress, race
 from benchmarks.stepping import FASTEST, PEERS
@@ -180,6 +180,7 @@ PARTS: dict[str, Callable[[Effort, Progress], Any]] = {
     "stepping": stepping,
     "drawing": drawing,
     "terms": lambda effort, progress: terms.measure(effort.rounds, progress),
+    "gradient": lambda effort, progress: gradients.measure(effort.rounds, progress),
     "looks": lambda effort, progress: looks.measure(effort.rounds, progress),
     # A run takes seconds, and varies by a tenth.
     "whole_run": lambda effort, progress: whole_run.measure(3 * effort.rounds, progress),

@@ -38,7 +38,7 @@ from taichi_msm.physics.loads import schedule
 from taichi_msm.physics.material import area_shares
 from taichi_msm.physics.plan import Plan
 from taichi_msm.physics.slopes import LoadSlopes, Slopes
-from taichi_msm.physics.solver import Dynamics
+from taichi_msm.physics.solver import STEPS_PER_TABLE, Dynamics
 from taichi_msm.physics.state import State
 from taichi_msm.physics.terms.damping import coefficients
 from taichi_msm.physics.terms.foundation import point_shares
@@ -103,7 +103,7 @@ class MotionAdjoint(Dynamics):
         self._memory = memory
         self._arrays = _Arrays(
             three(kept), three(kept),
-            three((self._segment + 1) * layout.rows + self._extra), three(layout.rows),
+            three(self._segment * layout.rows + self._extra), three(layout.rows),
             three(ADJOINT_PARTS * layout.rows + self._extra), three(layout.rows),
             rows((SUM_PARTS + 2 * len(self._slopes)) * layout.rows + sums),
         )  # fmt: skip
@@ -143,72 +143,87 @@ class MotionAdjoint(Dynamics):
         none = np.zeros((SUM_PARTS * layout.rows, layout.cols))
         slopes = self._slopes.reshape(-1, layout.cols)
         write(arrays.found, in_lanes(layout, np.concatenate([none, slopes])))
-        loads, self._buffer = LoadSlopes(self.plan), BUFFERS
-        totals = np.zeros(2)
-        for first in reversed(range(0, grid.steps, self._segment)):
-            self._record(first)
-            end = min(first + self._segment, grid.steps)
-            while end > first:
-                end = self._sweep(first, end, by_frame, loads, totals)
+        loads, self._buffer, totals = LoadSlopes(self.plan), BUFFERS, np.zeros(2)
+        block = max(1, STEPS_PER_TABLE // self._segment) * self._segment
+        for first in reversed(range(0, grid.steps, block)):
+            totals += self._sweep_block(first, min(first + block, grid.steps), by_frame, loads)
         return self._collect(gain, totals), loads
+
+    def _sweep_block(self, first: int, end: int, by_frame: Array, loads: LoadSlopes) -> Array:
+        """Sweep back over some segments; returns the work of the loads on the adjoint after step 0, and in step 0."""
+        table, h = self._table(first, end - first), self.plan.grid.step
+        by_slot = np.zeros((end - first, len(self.plan.slots), PUSHED))
+        at = end
+        for begin in reversed(range(first, end, self._segment)):
+            self._record(begin, table[begin - first : at - first])
+            while at > begin:
+                to = self._last_frame(begin, at)
+                rows = slice(to - first, at - first)
+                by_slot[rows] = self._sweep(begin, at, by_frame, table[rows])
+                at = to
+        if first == 0:
+            # The first step has another gain.
+            by_slot[0] *= table[0, GAIN] / coefficients(self.plan)[1]
+        if not self.plan.slots:
+            return np.zeros(2)
+        loads.add(lambda plan: schedule(plan, first, end - first), by_slot, (first * h - h, end * h))
+        work = (by_slot[..., :3] * schedule(self.plan, first, end - first).strength).sum(axis=(1, 2))
+        return np.array([work[int(first == 0) :].sum(), work[: int(first == 0)].sum()])
 
     def _keep(self, segment: int) -> None:
         """Keep the state at the beginning of a segment."""
-        layout, arrays = self.structure, self._arrays
-        entries = layout.rows * layout.width
-        keep, _ = copying(layout.code)
-        with our_compilation():
-            keep(entries, segment * entries, *self._moving.arrays.u, *arrays.kept)
-            keep(entries, segment * entries, *self._moving.arrays.d, *arrays.last)
+        arrays, first = self._arrays, segment * self._entries
+        self._copy_entries(0, first, self._moving.arrays.u, arrays.kept)
+        self._copy_entries(0, first, self._moving.arrays.d, arrays.last)
 
-    def _record(self, first: int) -> None:
-        """Take the steps of a segment, whose number is that of its first one, and keep every shape."""
-        layout, arrays, count = self.structure, self._arrays, min(self._segment, self.plan.grid.steps - first) - 1
-        entries = layout.rows * layout.width
-        _, begin = copying(layout.code)
+    @property
+    def _entries(self) -> int:
+        """Entries of a shape."""
+        return self.structure.rows * self.structure.width
+
+    def _copy_entries(self, source: int, target: int, of: list[Any], to: list[Any]) -> None:
+        """Copy a shape from one entry of three arrays to one of others."""
         with our_compilation():
-            begin(entries, first // self._segment * entries, *arrays.kept, *arrays.last, *arrays.shapes, *arrays.moving)
-        table, most = self._table(first, count + 1), self._most_steps()
+            copying(self.structure.code)(self._entries, source, target, *of, *to)
+
+    def _record(self, first: int, table: Array) -> None:
+        """Take the steps of a segment, from its first one on, and keep every shape; table: of its loads."""
+        layout, arrays, count = self.structure, self._arrays, len(table) - 1
+        begins = first // self._segment * self._entries
+        self._copy_entries(begins, 0, arrays.kept, arrays.shapes)
+        self._copy_entries(begins, 0, arrays.last, arrays.moving)
+        most = self._most_steps()
         for done in range(0, count, most):
             steps = min(most, count - done)
-            # The first shape is that before the segment.
-            sizes = self._sizes(steps, 1 + done, (self._segment + 1) * layout.rows)
+            sizes = self._sizes(steps, done, self._segment * layout.rows)
             self._launch(0, sizes, table[done : done + steps], *arrays.shapes, *arrays.moving, *self._sheet_arrays)
 
-    def _sweep(self, first: int, end: int, by_frame: Array, loads: LoadSlopes, totals: Array) -> int:
-        """Sweep back from step `end`, to the last frame before it at most; returns how far."""
-        layout, arrays, grid = self.structure, self._arrays, self.plan.grid
-        frame = (end - 1) // grid.steps_per_frame
-        begin = max(first, frame * grid.steps_per_frame, end - self._most_steps())
-        with_loss = begin == frame * grid.steps_per_frame
-        if with_loss:
+    def _last_frame(self, first: int, end: int) -> int:
+        """Tell how far back a launch goes from step `end` of a segment: to the last frame before it at most."""
+        frame = (end - 1) // self.plan.grid.steps_per_frame * self.plan.grid.steps_per_frame
+        return max(first, frame, end - self._most_steps())
+
+    def _sweep(self, first: int, end: int, by_frame: Array, table: Array) -> Array:
+        """Sweep back from step `end` of the segment that begins with step `first`, over the steps of a table.
+
+        Returns:
+            Derivatives by the force and the control point of every slot in every step, shape (steps, slots, 5).
+        """
+        layout, arrays, grid, count = self.structure, self._arrays, self.plan.grid, len(table)
+        frame, beyond = divmod(end - count, grid.steps_per_frame)
+        if not beyond:
             self._put(by_frame[frame])
-        sizes = self._sizes(end - begin, end - first, ADJOINT_PARTS * layout.rows, with_loss)
-        pushes = np.zeros((end - begin, layout.rows, max(1, PUSHED * len(self.plan.slots))))
-        table = self._table(begin, end - begin)
+        sizes = self._sizes(count, end - first - 1, ADJOINT_PARTS * layout.rows, not beyond)
+        pushes = np.zeros((count, layout.rows, max(1, PUSHED * len(self.plan.slots))))
         self._launch(1, sizes, table, pushes, *arrays.adjoint, *arrays.shapes, *self._sheet_arrays, arrays.found)
-        self._buffer = (self._buffer + end - begin) % 2
-        if self.plan.slots:
-            by_slot = pushes.sum(axis=1).reshape(end - begin, -1, PUSHED)
-            if begin == 0:
-                # The first step has another gain.
-                by_slot[0] *= table[0, GAIN] / coefficients(self.plan)[1]
-            work = (by_slot[..., :3] * schedule(self.plan, begin, end - begin).strength).sum(axis=(1, 2))
-            totals += work[int(begin == 0) :].sum(), work[: int(begin == 0)].sum()
-            h = grid.step
-            times = begin * h - h, end * h
-            loads.add(lambda plan: schedule(plan, begin, end - begin), by_slot, times)
-        return begin
+        self._buffer = (self._buffer + count) % 2
+        return pushes[..., : PUSHED * len(self.plan.slots)].sum(axis=1).reshape(count, -1, PUSHED)
 
     def _put(self, slopes: Array) -> None:
         """Put the derivative by the shape of a frame where the kernel adds it."""
-        layout, arrays = self.structure, self._arrays
-        entries = layout.rows * layout.width
         for c in range(3):
-            write(arrays.loss[c], in_lanes(layout, slopes[..., c]))
-        keep, _ = copying(layout.code)
-        with our_compilation():
-            keep(entries, LOSS * entries, *arrays.loss, *arrays.adjoint)
+            write(self._arrays.loss[c], in_lanes(self.structure, slopes[..., c]))
+        self._copy_entries(0, LOSS * self._entries, self._arrays.loss, self._arrays.adjoint)
 
     def _collect(self, gain: float, totals: Array) -> Slopes:
         """Add up what was found."""

@@ -45,7 +45,7 @@ BUFFERS, LAST, LOSS, ADJOINT_PARTS = 0, 2, 3, 4
 
 # What is added up, by multiples of the sheet's rows: the derivatives by k - tau of springs along rows, along columns
 # and of diagonals, and by the logarithm of K, for a share of 1; after them the slopes of the decays of standing slots;
-# and then sums of a row each: of p d, for the derivative by keep; by tau of each family; by the logarithm of D.
+# and then sums of a row each: of q u, for the derivative by keep; by tau of each family; by the logarithm of D.
 FAMILIES, HELD, SUM_PARTS = 0, 3, 4
 KEPT, TENSE, BENT, ROW_SUMS = 0, 1, 4, 5
 
@@ -295,6 +295,8 @@ def _row_sweeping(code: StepCode) -> Callable[..., None]:
                         add_change(force, sheet, entry, now)
                     gain = now[GAIN] * sheet.by_column[(MOVES + kind) * width + b]
                     q = [sheet.u[c][(LAST * sheet.rows + i) * width + b] for c in ti.static(range(3))]
+                    # The sum of p_{n+1} (u_n - u_{n-1}) over all n, added up in another order: of u_n q_{n+1}.
+                    kept = q[0] * u[0] + q[1] * u[1] + q[2] * u[2]
                     for reduce in ti.static(reducing):
                         reduce(q, sheet)
                     if band.with_loss:
@@ -318,9 +320,6 @@ def _row_sweeping(code: StepCode) -> Callable[..., None]:
                         sums[TENSE + ALONG_ROW] = sums[TENSE + ALONG_ROW] - right[4]
                         sums[TENSE + ALONG_COLUMN] = sums[TENSE + ALONG_COLUMN] - down[4]
                         sums[TENSE + DIAGONAL] = sums[TENSE + DIAGONAL] - (to_right[4] + to_left[4])
-                    kept = vector(0)
-                    for c in ti.static(range(3)):
-                        kept += p[c] * (u[c] - sheet.shapes[c][here + ahead - sheet.rows * width + b])
                     if ti.static(code.by_area):
                         kept *= sheet.by_column[(AREA + kind) * width + b]
                     sums[KEPT] += kept
@@ -406,38 +405,21 @@ def _sweeping(code: StepCode, *, parallel: bool) -> Callable[..., None]:
 
 
 @cache
-def copying(code: StepCode) -> tuple[Callable[..., None], Callable[..., None]]:
-    """Make the kernels that keep a state of the sheet among others, and that begin a segment with one."""
+def copying(code: StepCode) -> Callable[..., None]:
+    """Make the kernel that copies so many entries, from one entry of some arrays to one of others."""
     vectors = code.vectors
 
     @ti.kernel
-    def keep(
+    def copy(
         entries: ti.i32,
-        first: ti.i32,
-        u_x: vectors, u_y: vectors, u_z: vectors,
-        kept_x: vectors, kept_y: vectors, kept_z: vectors,
+        source: ti.i32,
+        target: ti.i32,
+        from_x: vectors, from_y: vectors, from_z: vectors,
+        to_x: vectors, to_y: vectors, to_z: vectors,
     ):  # fmt: skip
-        """Copy the first entries of u to those from `first` on of what is kept."""
+        ti.loop_config(serialize=True)
         for n in range(entries):
-            for u, kept in ti.static(((u_x, kept_x), (u_y, kept_y), (u_z, kept_z))):
-                kept[first + n] = u[n]
+            for a, b in ti.static(((from_x, to_x), (from_y, to_y), (from_z, to_z))):
+                b[target + n] = a[source + n]
 
-    @ti.kernel
-    def begin(
-        entries: ti.i32,
-        first: ti.i32,
-        kept_x: vectors, kept_y: vectors, kept_z: vectors,
-        last_x: vectors, last_y: vectors, last_z: vectors,
-        u_x: vectors, u_y: vectors, u_z: vectors,
-        d_x: vectors, d_y: vectors, d_z: vectors,
-    ):  # fmt: skip
-        """Begin with the shape before the one kept, this one, and its last difference."""
-        for n in range(entries):
-            for kept, last, u, d in ti.static((
-                (kept_x, last_x, u_x, d_x), (kept_y, last_y, u_y, d_y), (kept_z, last_z, u_z, d_z)
-            )):  # fmt: skip
-                u[n] = kept[first + n] - last[first + n]
-                u[entries + n] = kept[first + n]
-                d[n] = last[first + n]
-
-    return keep, begin
+    return copy
