@@ -36,7 +36,7 @@ class Sight:
         self._between = between(np.eye(frames), np.round(seen.time * scene.time.frames_per_second, 6))
 
     def points(self, position: Array) -> Array:
-        """Give where the points are [m], shape (N, T, 3), for positions of every frame, shape (frames, rows, cols, 3)."""
+        """Give where the points are [m], shape (N, T, 3), for positions of shape (frames, rows, cols, 3)."""
         at_frames = np.array([self._surface @ frame.reshape(-1, 3) for frame in position])
         return np.einsum("tf,fnc->ntc", self._between, at_frames)
 

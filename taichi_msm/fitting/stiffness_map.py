@@ -1,166 +1,226 @@
-"""A map of stiffness from what was seen: many fields at once, kept smooth as far as what was seen allows.
-
-Minimises, over the logs x of the factors of all fields, within bounds, by L-BFGS-B with the gradient of the adjoint
-
-    1/2 sum ((predicted - seen) / sigma)^2 + w/2 sum (x_p - x_q)^2        over all neighbouring fields p, q
-
-(Tikhonov, with the gradient of the log of the map). The weight w follows from the discrepancy principle: it is the
-largest with which what is left is what sigma lets expect, a chi-square of the count of the numbers that were seen.
-It is found from large weights down, so that each search begins near its end.
-
-The errors are those of Laplace's approximation, the inverse of J^T J / sigma^2 + w L at the best map: J has differences
-of one run for each field as columns, L is the matrix of the second sum. That sum is only as true as the tissue is
-smooth. So a field is called unknown if what was seen tells it to no better than UNKNOWN even when all others are given.
-"""
+"""Fit the map of a tissue's stiffness: from a scene and what was seen to a picture of factors, and of their errors."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
-from dataclasses import dataclass
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
+from taichi_msm.errors import SceneError
+from taichi_msm.fitting.fields import Fields, centres
 from taichi_msm.fitting.observations import Observations
+from taichi_msm.fitting.parameters import Bounds, rounded
+from taichi_msm.fitting.prediction import Predicted, places_at_rest, runnable
+from taichi_msm.fitting.result import FitResult, FittedMap
 from taichi_msm.fitting.sight import Sight
-from taichi_msm.physics.adjoint import Adjoint
+from taichi_msm.fitting.suspicions import faults, faults_beside
+from taichi_msm.fitting.tikhonov import Search, Solution
+from taichi_msm.physics.adjoint import Adjoint, require_differentiable
+from taichi_msm.physics.material import map_factors
+from taichi_msm.physics.mesh_error import coarser
 from taichi_msm.physics.plan import Plan
+from taichi_msm.physics.planning import stable_step
+from taichi_msm.progress import Progress
+from taichi_msm.scene import Scene, StiffnessMap
+from taichi_msm.scenefile.validation import checked
+from taichi_msm.system import runtime
 
 Array = NDArray[np.float64]
 
-# A field whose relative error is larger, if all other fields are known, is unknown.
-UNKNOWN = 0.5
+KEY = "tissue.map"
 
-# At the first weight a step of so much in the log between all neighbours costs as much as what is left at the start.
-ROUGHNESS = 0.1
+# The factors of a map without bounds.
+LOW, HIGH = 0.1, 10.0
 
-# The weight is divided by LESS at most MOST times; chi-square is wanted within SHARE, by so many searches in between.
-LESS, MOST, SHARE, BETWEEN = 10.0, 8, 0.05, 3
+# A factor stays so far above the one with which a spring would have no length without its pretension.
+TAUT = 1.05
 
-# Where no weight gives the chi-square that is expected, one is taken that comes this close to the least.
-NEARLY = 1.05
+# What half the cells a side make different is so many times the error of the cells: 2^2 - 1.
+RICHARDSON = 3.0
 
-# A search ends where the cost changes by less than this share; memory of L-BFGS; the most iterations.
-ENOUGH, MEMORY, ITERATIONS = 1e-5, 30, 200
+# How many runs a search takes, about: for the progress.
+USUAL = 150
 
-# By how much a field's log is changed for a difference.
-DIFFERENCE = 1e-2
+# A field has ended at a bound if its log is as near.
+AT_BOUND = 1e-3
 
 
-class Fields:
-    """R x R fields of a map, and the cells of a sheet: the factors of the cells, as of the picture of such a map."""
+@dataclass(frozen=True)
+class MapTask:
+    """What map is asked for."""
 
-    def __init__(self, resolution: int, cells: tuple[int, int]) -> None:
-        self.resolution = resolution
-        centres = (np.arange(resolution) + 0.5) / resolution
-        # Like `material.map_factors`: linear between the centres of fields, constant beyond.
-        self._down, self._across = (
-            np.stack([np.interp((np.arange(n) + 0.5) / n, centres, unit) for unit in np.eye(resolution)], axis=1)
-            for n in cells
+    resolution: int
+    limits: Bounds  # of the factors
+
+
+def map_task(scene: Scene, free: Sequence[str], bounds: Mapping[str, Bounds], resolution: int | None) -> MapTask | None:
+    """Say what map is to be fitted; None: numbers are; SceneError: what was asked for cannot be."""
+    if KEY not in free:
+        if resolution is not None:
+            raise SceneError([f"--resolution {resolution}: is that of a map; add --free {KEY}"])
+        return None
+    named = f"--free {KEY}"
+    if others := [key for key in free if key != KEY]:
+        raise SceneError(
+            [f"{named}: a map is found alone, as its level and {others[0]} can look alike; leave that out"]
         )
-
-    def factors(self, x: Array) -> Array:
-        """Give the factors of the cells for logs of those of the fields, shape (R^2,)."""
-        return self._down @ np.exp(x).reshape(self.resolution, -1) @ self._across.T
-
-    def backward(self, x: Array, by_cell: Array) -> Array:
-        """Turn the derivative of a loss by the factors of the cells into that by x."""
-        return np.exp(x) * (self._down.T @ by_cell @ self._across).ravel()
-
-    def roughness(self) -> Array:
-        """Give L: x L x is the sum of the squared differences of neighbouring fields, shape (R^2, R^2)."""
-        line, one = np.diff(np.eye(self.resolution), axis=0), np.eye(self.resolution)
-        return np.kron(line.T @ line, one) + np.kron(one, line.T @ line)
-
-
-@dataclass(frozen=True, eq=False)
-class Found:
-    """A map at the end of a search."""
-
-    x: Array  # logs of the factors
-    chi_square: float
-    weight: float
+    if scene.tissue is None:
+        raise SceneError([f"{named}: the scene has springs; describe them as tissue"])
+    cells = min(scene.sheet.points) - 1
+    if resolution is None:
+        raise SceneError([f"{named}: add --resolution R, the fields along a side, such as {min(16, cells)}"])
+    if not 2 <= resolution <= cells:
+        said = f"take 2 to {cells}, as the sheet has {cells} cells along a side, or more sheet.points"
+        raise SceneError([f"--resolution {resolution}: {said}"])
+    if wrong := [key for key in bounds if key != KEY]:
+        raise SceneError([f"--bounds {wrong[0]}: not among --free; take {KEY}=LOW,HIGH, factors of young"])
+    low, high = bounds.get(KEY, (LOW, HIGH))
+    low, high = (LOW if low == -math.inf else low), (HIGH if high == math.inf else high)
+    if not 0 < low < high:
+        raise SceneError([f"--bounds {KEY}={low:g},{high:g}: take factors of young above 0, the smaller one first"])
+    return MapTask(resolution, (low, high))
 
 
-class Search:
-    """The search for a map."""
+def fit_map(given: Scene, seen: Observations, task: MapTask, progress: Progress) -> FitResult:
+    """Find a map.
 
-    def __init__(
-        self,
-        adjoint: Adjoint,
-        plan: Plan,
-        seen: Observations,
-        sigma: float,
-        fields: Fields,
-        limits: tuple[float, float],
-        tell: Callable[[], None],
-    ) -> None:
-        self._adjoint, self._fields, self._limits, self._tell = adjoint, fields, limits, tell
-        self._seen, self._sigma = seen, sigma
-        self._sight = Sight(plan.scene, seen, plan.grid.frames + 1)
-        self._rough = fields.roughness()
-        self.count = 0
+    Raises:
+        SceneError: when the scene or what was seen cannot be used.
+        DivergedError: when a run diverges.
+    """
+    plan = _for_factors(checked(runnable(given)), task.limits[1])
+    require_differentiable(plan)
+    if wrong := list(_unusable(seen, given, task)):
+        raise SceneError(wrong)
+    assert seen.sigma is not None
+    low = max(task.limits[0], TAUT * plan.material.tension)
+    limits = math.log(low), math.log(task.limits[1])
+    fields = Fields(task.resolution, _cells(plan))
+    start = np.clip(np.log(_start(plan, task.resolution)), *limits).ravel()
+    device = runtime.start("cpu")
+    adjoint, sight = Adjoint(plan, device), Sight(plan.scene, seen, plan.grid.frames + 1)
 
-    def predict(self, x):
-        self._tell()
-        self.count += 1
-        points = self._sight.points(self._adjoint.run(self._fields.factors(x)))
-        return points, self._sight.seen(points)
+    def tell() -> None:
+        done = search.runs if search is not None else 0
+        progress("fit", done, max(USUAL + 2 * len(start), done + 1))
 
-    def left(self, predicted):
-        return np.where(self._seen.known, predicted - self._seen.values, 0.0) / self._sigma
+    search: Search | None = None
+    tell()
+    points = _first(adjoint, sight, fields, start, seen, given)
+    by_points, mesh_error = 0.0, None
+    if (half := coarser(plan)) is not None:
+        few = Fields(task.resolution, _cells(half)).factors(start)
+        other = Sight(half.scene, seen, half.grid.frames + 1)
+        moved = other.points(Adjoint(half, device).run(few))
+        apart = (other.seen(moved) - sight.seen(points))[seen.known] / RICHARDSON
+        by_points = float(np.sqrt(np.mean(apart**2)))
+        motion = np.linalg.norm(points - places_at_rest(seen.coordinates, given.sheet)[:, None], axis=2).max()
+        mesh_error = float(np.linalg.norm(moved - points, axis=2).max() / RICHARDSON / motion)
+    sigma = math.hypot(seen.sigma, by_points)
+    search = Search(adjoint, sight, seen, sigma, fields, limits, tell)
+    solution = search.best(start)
+    side = task.resolution, task.resolution
+    found = FittedMap(np.exp(solution.x).reshape(side), solution.errors.reshape(side), solution.choice, sigma)
+    fitted = search.predict(solution.x)[1]
+    left = (fitted - seen.values)[seen.known]
+    tissue = given.tissue
+    assert tissue is not None
+    drawn = StiffnessMap(image=FittedMap.FILE, range=found.range)
+    return FitResult(
+        parameters={},
+        correlation=[],
+        residual=float(np.sqrt(np.mean(left**2))),
+        residual_force=None,
+        sigma=seen.sigma,
+        unit=seen.unit,
+        chi_square=float(np.sum((left / seen.sigma) ** 2)),
+        degrees_of_freedom=left.size,
+        identifiable=not found.unknown.any(),
+        unseen=[],
+        mesh_error=mesh_error,
+        runs=search.runs + 1,
+        seconds=0.0,
+        notes=list(_notes(seen, solution, found, by_points, limits)),
+        scene=given.model_copy(update={"tissue": tissue.model_copy(update={"map": drawn})}),
+        observations=seen,
+        fitted=fitted,
+        fitted_forces=np.empty((0, 3)),
+        curves={},
+        map=found,
+    )
 
-    def misfit(self, x):
-        points, predicted = self.predict(x)
-        left = self.left(predicted)
-        slope = self._sight.backward(points, left / self._sigma)
-        by_cell = self._adjoint.backward(slope).maps["tissue.map"]
-        return float((left**2).sum()), self._fields.backward(x, by_cell)
 
-    def at_weight(self, x, weight):
-        from scipy.optimize import minimize
-        last = {}
-        def cost(x):
-            chi, slope = self.misfit(x)
-            last[x.tobytes()] = chi
-            rough = self._rough @ x
-            return chi / 2 + weight / 2 * float(x @ rough), slope + weight * rough
-        n0 = self.count
-        found = minimize(cost, x, jac=True, method="L-BFGS-B", bounds=[self._limits] * len(x),
-            options={"maxcor": MEMORY, "ftol": ENOUGH, "gtol": 0.0, "maxiter": ITERATIONS})
-        print("w %.3g chi/N %.4g evals %d %s" % (weight, last[found.x.tobytes()]/self._seen.known.sum(), self.count-n0, found.message), flush=True)
-        return Found(found.x, last[found.x.tobytes()], weight)
+def _unusable(seen: Observations, scene: Scene, task: MapTask) -> Iterator[str]:
+    """Say why a map cannot be found from what was seen, before anything is run."""
+    if seen.sigma is None:
+        said = "a map is found as smooth as the errors of what was seen allow; give their standard deviation by --sigma"
+        yield f"{seen.name}: sigma: missing: {said}"
+        return
+    if (known := int(seen.known.sum())) <= (needed := task.resolution**2):
+        said = f"{known} numbers were seen, too few for {needed} fields; observe more points, or take fewer fields"
+        yield f"{seen.name}: {said}: --resolution {max(2, math.isqrt(max(known - 1, 0)))}"
+        return
+    yield from faults(seen, scene, task.resolution**2)
 
-    def best(self, x):
-        wanted = float(self._seen.known.sum())
-        chi, _ = self.misfit(x)
-        weight = chi / (len(x) * 2 * ROUGHNESS**2)
-        all_ = [self.at_weight(x, weight)]
-        while all_[-1].chi_square > wanted and len(all_) <= MOST:
-            o = all_[-1]
-            if o.weight * float(o.x @ self._rough @ o.x) < 0.01 * o.chi_square: break
-            all_.append(self.at_weight(all_[-1].x, all_[-1].weight / LESS))
-        if all_[-1].chi_square > wanted:
-            return next(one for one in all_ if one.chi_square <= NEARLY * all_[-1].chi_square)
-        if len(all_) == 1: return all_[0]
-        above, below = all_[-2:]
-        for _ in range(BETWEEN):
-            if below.chi_square > (1 - SHARE) * wanted:
-                break
-            share = math.log(wanted * (1 - SHARE/2) / below.chi_square) / math.log(above.chi_square / below.chi_square)
-            share = min(max(share, .1), .9)
-            w = below.weight * (above.weight / below.weight) ** share
-            one = self.at_weight(below.x, w)
-            if one.chi_square > wanted: above = one
-            else: below = one
-        return below
 
-    def jacobian(self, x):
-        base = self.predict(x)[1]
-        known = self._seen.known
-        cols = []
-        for n in range(len(x)):
-            y = x.copy(); y[n] += DIFFERENCE
-            cols.append((self.predict(y)[1] - base)[known] / (DIFFERENCE * self._sigma))
-        return np.stack(cols, 1)
+def _first(adjoint: Adjoint, sight: Sight, fields: Fields, start: Array, seen: Observations, given: Scene) -> Array:
+    """Give where the points are at the start [m], shape (N, T, 3); SceneError: what was seen is beside that."""
+    position = adjoint.run(fields.factors(start))
+    every = Sight(given, replace(seen, time=np.arange(len(position)) / given.time.frames_per_second), len(position))
+    rest = places_at_rest(seen.coordinates, given.sheet)[:, None]
+    motion = np.linalg.norm(every.points(position) - rest, axis=2).max(axis=0)
+    points = sight.points(position)
+    first = Predicted(sight.seen(points), np.empty((0, 3)), 0, motion)
+    if wrong := list(faults_beside(seen, given, first)):
+        raise SceneError(wrong)
+    return points
+
+
+def _for_factors(plan: Plan, high: float) -> Plan:
+    """Take steps that the largest factor allows; SceneError: the scene's own step does not."""
+    if plan.scene.time.at_rest:
+        return plan
+    stiff = replace(plan.material, factors=np.full(_cells(plan), high))
+    limit = stable_step(stiff, plan.scene.sheet, plan.scene.time.damping_difference)
+    if plan.scene.time.step == "auto":
+        least = math.ceil(2 / (plan.grid.frames_per_second * limit))
+        return plan.with_grid(steps_per_frame=max(plan.grid.steps_per_frame, least))
+    if plan.grid.step > limit:
+        said = f"{plan.grid.step:g} s is too long for a factor of {high:g}; take {limit:.3g} s or less, or auto"
+        raise SceneError([f"time.step: {said}, or smaller --bounds {KEY}=LOW,HIGH"])
+    return plan
+
+
+def _start(plan: Plan, resolution: int) -> Array:
+    """Give the factors of the fields where the search begins: those of the scene's map, else 1."""
+    tissue, image = plan.scene.tissue, plan.maps.get("map")
+    if tissue is None or tissue.map is None or image is None:
+        return np.ones((resolution, resolution))
+    return map_factors(tissue.map, image, centres(resolution), centres(resolution))
+
+
+def _cells(plan: Plan) -> tuple[int, int]:
+    rows, cols = plan.scene.sheet.points
+    return rows - 1, cols - 1
+
+
+def _notes(
+    seen: Observations, solution: Solution, found: FittedMap, by_points: float, limits: tuple[float, float]
+) -> Iterator[str]:
+    """Tell what the user should know."""
+    assert seen.sigma is not None
+    if (unknown := int(found.unknown.sum())) > 0:
+        yield f"{unknown} of {found.factors.size} fields are unknown: nothing moves there that would tell; press there"
+    if by_points > seen.sigma / 2:
+        said = (
+            f"about {rounded(by_points)} {seen.unit}, and sigma is {rounded(seen.sigma)}: the map is as smooth as both"
+        )
+        yield f"the number of points changes what is seen by {said} require; take more sheet.points"
+    if solution.excess > 1.5:
+        times = rounded(math.sqrt(solution.excess))
+        yield f"what is left is {times} times what is expected with any map, and the errors are widened by as much"
+    if bound := int((np.minimum(solution.x - limits[0], limits[1] - solution.x) < AT_BOUND).sum()):
+        yield f"{bound} fields ended at a bound, {math.exp(limits[0]):.3g} or {math.exp(limits[1]):.3g}; see --bounds"
