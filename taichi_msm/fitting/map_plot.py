@@ -8,7 +8,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.colors import LogNorm, Normalize
 from matplotlib.figure import Figure
-from matplotlib.patches import Patch
+from matplotlib.patches import Rectangle
 from matplotlib.ticker import LogLocator, MaxNLocator, NullFormatter, ScalarFormatter
 from numpy.typing import NDArray
 
@@ -44,15 +44,12 @@ def _plot_fields(
     image = axes.imshow(
         np.where(found.unknown, np.nan, values), colours, norm=norm, extent=(0, 1, 1, 0), interpolation="nearest"
     )
-    if found.unknown.any():
-        axes.contourf(
-            np.kron(found.unknown, np.ones((8, 8))), [0.5, 1.5], colors="none", hatches=["////"],
-            extent=(0, 1, 0, 1), origin="upper",
-        )  # fmt: skip
-        patch = Patch(facecolor="white", edgecolor=SILVER, hatch="////", label="unknown")
-        axes.legend(handles=[patch], loc="upper left", bbox_to_anchor=(0, -0.18), borderaxespad=0)
+    side = 1 / len(values)
+    for row, col in np.argwhere(found.unknown) * side:
+        axes.add_patch(Rectangle((col, row), side, side, facecolor="none", edgecolor=SILVER, hatch="////", linewidth=0))
     height, width = sheet.size
-    axes.set(title=title, xlabel="across", ylabel="down", aspect=height / width)
+    across = "across; hatched: unknown" if found.unknown.any() else "across"
+    axes.set(title=title, xlabel=across, ylabel="down", aspect=height / width)
     axes.grid(visible=False)
     assert isinstance(axes.figure, Figure)
     bar = axes.figure.colorbar(image, ax=axes, label=label, shrink=0.8)
