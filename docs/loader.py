@@ -46,8 +46,9 @@ class Clip(TypedDict):
 class _Part:
     """The runs of a part of a data set, cut into items of so many frames that begin every so many frames."""
 
-    def __init__(self, directory: str | Path, part: str, length: int, every: int) -> None:
+    def __init__(self, directory: str | Path, part: str, length: int, every: int, camera: str) -> None:
         self.directory = Path(directory)
+        self._camera = camera
         content = json.loads((self.directory / "dataset.json").read_text(encoding="utf-8"))
         # Of each its number, folder, part, and under "values" what varied.
         self.runs: list[dict[str, Any]] = [run for run in content["runs"] if run["part"] == part]
@@ -61,16 +62,19 @@ class _Part:
         return len(self.runs) * self._items
 
     def _find(self, index: int) -> tuple[Path, int]:
-        """Give the folder of an item's run, and the item's first frame."""
+        """Give the folder of what the camera saw of an item's run, and the item's first frame."""
         run, item = divmod(range(len(self))[index], self._items)
-        return self.directory / self.runs[run]["folder"], item * self._every
+        return self.directory / self.runs[run]["folder"] / self._camera, item * self._every
 
 
 class Pairs(_Part):
-    """All pairs of successive frames of a part, such as train, val or test, of the data set in a folder."""
+    """All pairs of successive frames of a part, such as train, val or test, of the data set in a folder.
 
-    def __init__(self, directory: str | Path, part: str) -> None:
-        super().__init__(directory, part, length=2, every=1)
+    Of several cameras it takes the one of a name.
+    """
+
+    def __init__(self, directory: str | Path, part: str, camera: str = "") -> None:
+        super().__init__(directory, part, length=2, every=1, camera=camera)
 
     def __getitem__(self, index: int) -> Pair:
         folder, frame = self._find(index)
@@ -87,10 +91,10 @@ class Pairs(_Part):
 
 
 class Clips(_Part):
-    """Clips of so many successive frames, one after the other, of a part of the data set in a folder."""
+    """Clips of so many successive frames, one after the other, of a part of the data set in a folder; as `Pairs`."""
 
-    def __init__(self, directory: str | Path, part: str, frames: int = 24) -> None:
-        super().__init__(directory, part, length=frames, every=frames)
+    def __init__(self, directory: str | Path, part: str, frames: int = 24, camera: str = "") -> None:
+        super().__init__(directory, part, length=frames, every=frames, camera=camera)
 
     def __getitem__(self, index: int) -> Clip:
         folder, first = self._find(index)

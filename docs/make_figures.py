@@ -1,4 +1,4 @@
-"""Make the pictures of the README and of the pages on scenes, sweeps and live sessions, from what is shipped.
+"""Make the pictures of the README and of the pages on scenes, labels, sweeps and live sessions, from what is shipped.
 
     python docs/make_figures.py
 
@@ -7,6 +7,7 @@ Needs the extras `test` and `bench`, for the plots and the photograph. Takes abo
 
 from __future__ import annotations
 
+import json
 import shutil
 import tempfile
 from pathlib import Path
@@ -19,6 +20,7 @@ from PIL import Image
 
 from taichi_msm import Simulation, load_scene, run
 from taichi_msm.cli import main as main_of_program
+from taichi_msm.scene import Camera
 from taichi_msm.scenefile.load import plan_file
 from taichi_msm.sweeps.sweepfile import load_sweep
 from taichi_msm.viewer.captures import Captures
@@ -58,6 +60,69 @@ def animation(name: str, scene: str, size: int, *overrides: str, image: Path | N
     with tempfile.TemporaryDirectory() as directory:
         run(load_scene(SCENES / f"{scene}.yaml", settings, image), directory, overrides=settings)
         shutil.copy(Path(directory) / "animation.gif", IMAGES / f"{name}.gif")
+
+
+def endoscope(size: int) -> None:
+    """Keep the GIF of the scene endoscope, in another size, with every second frame."""
+    given = load_scene(SCENES / "endoscope.yaml")
+    assert isinstance(given.render.camera, Camera)
+    assert given.render.camera.intrinsics is not None
+    share = size / given.render.size[0]
+    # The principal point, from the picture's corner, is half a pixel more.
+    values = {
+        name: round((value + 0.5) * share - 0.5 if name in ("cx", "cy") else value * share, 2)
+        for name, value in given.render.camera.intrinsics.model_dump().items()
+    }
+    rate = given.time.frames_per_second / 2
+    smaller = (f"render.camera.intrinsics={json.dumps(values)}", f"time.frames_per_second={rate:g}")
+    animation("endoscope", "endoscope", size, *smaller)
+
+
+def four_pixels() -> None:
+    """Draw the upper left pixels of a picture, and what the two conventions call their centres and corners."""
+    figure, axes = plt.subplots(figsize=(5.6, 3.9), layout="constrained")
+    axes.set(xlim=(-0.75, 2.75), ylim=(2.5, -0.75), aspect="equal")
+    axes.axis("off")
+    axes.imshow([[0.93, 0.87], [0.87, 0.93]], cmap="gray", vmin=0, vmax=1, extent=(0, 2, 2, 0))
+    for edge in range(3):
+        axes.plot([0, 2.2], [edge, edge], color="0.6", linewidth=1)
+        axes.plot([edge, edge], [0, 2.2], color="0.6", linewidth=1)
+        axes.annotate(f"{edge}", (edge, -0.08), ha="center", va="bottom", color="firebrick")
+        axes.annotate(f"{edge}", (-0.08, edge), ha="right", va="center", color="firebrick")
+    for across in range(2):
+        for down in range(2):
+            centre = across + 0.5, down + 0.5
+            axes.plot(*centre, "o", color="black", markersize=4)
+            axes.annotate(f"({centre[0]}, {centre[1]})", (centre[0], down + 0.34), ha="center", color="firebrick")
+            axes.annotate(f"({across}, {down})", (centre[0], down + 0.78), ha="center", color="navy")
+    for text, colour, at in (("from the corner of the picture", "firebrick", -0.42), ("OpenCV", "navy", 2.42)):
+        axes.annotate(text, (1, at), ha="center", color=colour)
+    figure.savefig(IMAGES / "pixels.png", dpi=110)
+
+
+def stereo(moment: float, size: int) -> None:
+    """Show what two cameras see of the scene grasp at a moment [s], and the disparity of the left one."""
+    right = {"beside": "left", "baseline": 0.005}
+    camera = load_scene(SCENES / "grasp.yaml").render.camera
+    assert isinstance(camera, Camera)
+    cameras = {"left": camera.model_dump(mode="json", exclude_unset=True), "right": right}
+    changes = {"render.camera": None, "render.cameras": cameras, "render.size": [size, size]}
+    scene = load_scene(SCENES / "grasp.yaml", {**changes, "output": ["png", "disparity"]})
+    frame = round(moment * scene.time.frames_per_second)
+    with tempfile.TemporaryDirectory() as directory:
+        run(scene, directory)
+        pair = [Image.open(Path(directory, name, "frames", f"{frame:04}.png")).convert("RGB") for name in cameras]
+        disparity = np.array(Image.open(Path(directory, "left", "disparity", f"{frame:04}.tiff")))
+    figure, axes = plt.subplots(1, 3, figsize=(10.4, 3.2), layout="constrained")
+    shown = np.where(disparity > 0, disparity, np.nan)
+    axes[0].imshow(pair[0])
+    axes[1].imshow(pair[1])
+    image = axes[2].imshow(shown, cmap="viridis")
+    for axis, title in zip(axes, ("left", "right", "disparity of left [px]"), strict=True):
+        axis.set_title(title)
+        axis.axis("off")
+    figure.colorbar(image, ax=axes[2])
+    figure.savefig(IMAGES / "stereo.jpg", dpi=110, pil_kwargs={"quality": 90})
 
 
 def forces_of(name: str) -> tuple[Floats, Floats, Floats]:
@@ -160,6 +225,9 @@ def main() -> None:
     IMAGES.mkdir(exist_ok=True)
     animation("press", "press", 320)
     animation("grasp", "grasp", 320)
+    endoscope(288)
+    four_pixels()
+    stereo(0.8, 400)
     animation("retina", "press", 320, "render.camera=top", image=RETINA)
     indentation()
     palpation()

@@ -92,7 +92,7 @@ TABLES: dict[tuple[str, str], Callable[[], str]] = {
     ("sweep", "sweep keys"): partial(model_keys, SweepSettings, "key", "meaning", "value", "default"),
     ("sweep", "distributions"): partial(model_keys, Distribution, "way", "how the key varies", "value"),
     ("command-line", "outputs"): partial(outputs, "picture", "positions", "forces"),
-    ("labels", "labels"): partial(outputs, "labels", "flow", "tracks"),
+    ("labels", "labels"): partial(outputs, "labels", "flow", "stereo", "tracks"),
 }
 
 

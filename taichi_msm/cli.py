@@ -22,6 +22,7 @@ import click
 
 from taichi_msm import __version__
 from taichi_msm.errors import (
+    ArgumentError,
     DeviceError,
     DivergedError,
     ExecutorError,
@@ -451,9 +452,12 @@ def view(
     metavar="DIR2",
     help="Directory for the files.  [default: DIR/export-FORMAT; of several DIR, output/export-FORMAT]",
 )
+@click.option("--camera", metavar="NAME", help="Of runs with several cameras, the one whose files are taken.")
 @click.option("--quiet", is_flag=True, help="Print no progress and no summary.")
 @json_option
-def export(directories: tuple[str, ...], name: str, out: str | None, quiet: bool, as_json: bool) -> int:
+def export(
+    directories: tuple[str, ...], name: str, out: str | None, camera: str | None, quiet: bool, as_json: bool
+) -> int:
     """Convert the results of runs and sweeps, each in a DIR, to the formats of other programs."""
     runs = [result_directory(directory, option="DIR") for directory in directories]
     folder = None if out is None else result_directory(out)
@@ -464,7 +468,7 @@ def export(directories: tuple[str, ...], name: str, out: str | None, quiet: bool
     interruption = Interruption()
     try:
         with Progress(quiet=quiet or as_json) as bar:
-            done = convert.export(runs, name, folder, partial(interruptible(bar, interruption), "export"))
+            done = convert.export(runs, name, folder, partial(interruptible(bar, interruption), "export"), camera)
     except KeyboardInterrupt:
         return interrupted(interruption, as_json)
     if as_json:
@@ -798,7 +802,7 @@ def _run(words: list[str]) -> tuple[int, Sequence[str]]:
         raise BrokenPipeError from None
     except SceneError as error:
         return WRONG_INPUT, error.lines
-    except (DeviceError, ExecutorError, NotInstalledError) as error:
+    except (ArgumentError, DeviceError, ExecutorError, NotInstalledError) as error:
         return WRONG_INPUT, [str(error)]
     except FilesError as error:
         return FILES, [str(error)]

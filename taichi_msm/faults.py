@@ -27,9 +27,9 @@ MAX_SHOWN = 60
 MAX_FAULTS = 1000
 
 
-def refused(message: str, key: str | int | None = None) -> PydanticCustomError:
-    """Make the error that a validator raises: the user reads this message, at a key or item below the value, if any."""
-    return PydanticCustomError(REFUSED, message, None if key is None else {"key": key})
+def refused(message: str, *below: str | int) -> PydanticCustomError:
+    """Make the error that a validator raises: the user reads this message, at the value or a key or item below it."""
+    return PydanticCustomError(REFUSED, message, {"below": below})
 
 
 def flow(value: Any) -> str:
@@ -57,45 +57,56 @@ class _Fault(NamedTuple):
     context: dict[str, Any]  # the numbers and names in the text
     section: type[BaseModel]  # that the key belongs to
     expects: str  # what the key may hold
-    choice: Key | None  # the key, or the nearest one above it, that may hold values of several kinds
-    branch: str  # the kind that was tried
+    # The keys above it that may hold several kinds of value, each with the kind that was tried.
+    choices: tuple[tuple[Key, str], ...]
     words: tuple[str, ...]  # those that the value may be
 
 
 def _fault(error: Any, section: type[BaseModel]) -> _Fault:
     """Follow an error's location through the models, skipping pydantic's names for the kinds of a value."""
     path: Key = ()
-    expects, choice, branch = "", None, ""
+    expects = ""
+    choices: tuple[tuple[Key, str], ...] = ()
     words: tuple[tuple[str, ...], ...] = (), ()
     parts = iter(error["loc"])
     for part in parts:
         path += (part,)
         if part in section.model_fields:
-            section, expects, has_choice, words = _describe(section, part)
+            section, expects, has_names, has_choice, words = _describe(section, part)
+            path += (name,) if has_names and (name := next(parts, None)) is not None else ()
             if has_choice:
-                choice, branch = path, next(parts, "")
+                choices += ((path, next(parts, "")),)
     context = error.get("ctx", {})
-    if "key" in context:
-        path += (context["key"],)
+    path += context.get("below", ())
     in_list = bool(path) and isinstance(path[-1], int)
-    return _Fault(path, error["type"], error["msg"], context, section, expects, choice, branch, words[in_list])
+    return _Fault(path, error["type"], error["msg"], context, section, expects, choices, words[in_list])
 
 
 @cache
-def _describe(section: type[BaseModel], name: str) -> tuple[type[BaseModel], str, bool, tuple[tuple[str, ...], ...]]:
+def _describe(
+    section: type[BaseModel], name: str
+) -> tuple[type[BaseModel], str, bool, bool, tuple[tuple[str, ...], ...]]:
     """Describe a key.
 
     Returns:
-        Its section, or the one below it; what it may hold; whether that may be of several kinds; the words that it may
-        be, and those that the items of its list may be.
+        Its section, or the one below it; what it may hold; whether that has values by names; whether it, or such a
+        value, may be of several kinds; the words that it may be, and those that the items of its list may be.
     """
     field = section.model_fields[name]
     extra = field.json_schema_extra
     assert isinstance(extra, dict)
-    kinds = [kind for kind in get_args(field.annotation) if kind is not type(None)]
-    has_choice = get_origin(field.annotation) in (Union, UnionType) and len(kinds) > 1
+    kinds = _kinds(field.annotation)
+    if has_names := get_origin(kinds[0]) is dict:
+        kinds = _kinds(get_args(kinds[0])[1])
     words = tuple(tuple(_words(field.annotation, depth)) for depth in (0, 1))
-    return next(_sections(field.annotation), section), str(extra["expects"]), has_choice, words
+    return next(_sections(field.annotation), section), str(extra["expects"]), has_names, len(kinds) > 1, words
+
+
+def _kinds(annotation: Any) -> list[Any]:
+    """List the kinds of value that an annotation allows, but for None."""
+    if get_origin(annotation) not in (Union, UnionType):
+        return [annotation]
+    return [kind for kind in get_args(annotation) if kind is not type(None)]
 
 
 def _words(annotation: Any, depth: int) -> Iterator[str]:
@@ -120,17 +131,20 @@ def _choose_kinds(faults: Sequence[_Fault]) -> Iterator[_Fault]:
 
     That is the kind whose check got furthest into the value; if two got equally far, the whole value is at fault.
     """
-    reached: dict[Key | None, dict[str, int]] = defaultdict(dict)
+    reached: dict[Key, dict[str, int]] = defaultdict(dict)
     for fault in faults:
-        reached[fault.choice][fault.branch] = max(reached[fault.choice].get(fault.branch, 0), len(fault.path))
+        for choice, branch in fault.choices:
+            reached[choice][branch] = max(reached[choice].get(branch, 0), len(fault.path))
     for fault in faults:
-        branches = reached[fault.choice]
-        furthest = max(branches.values())
-        if fault.choice is None:
-            yield fault
-        elif list(branches.values()).count(furthest) > 1:
-            yield fault._replace(path=fault.choice, kind="choice")
-        elif branches[fault.branch] == furthest:
+        for choice, branch in fault.choices:
+            branches = reached[choice]
+            furthest = max(branches.values())
+            if list(branches.values()).count(furthest) > 1:
+                yield fault._replace(path=choice, kind="choice")
+                break
+            if branches[branch] != furthest:
+                break
+        else:
             yield fault
 
 

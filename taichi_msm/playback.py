@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from taichi_msm.errors import ArgumentError
-from taichi_msm.render.labels import Flow, Labels
+from taichi_msm.render.labels import Flow, Labels, Sight
 from taichi_msm.render.renderer import CameraLike
 from taichi_msm.results.finished_run import read_run
 from taichi_msm.scene import Scene
@@ -68,9 +68,17 @@ class Playback:
         """Give what each pixel of a frame shows; as `Simulation.labels`."""
         return self._simulation.labels(camera, *self._at(frame))
 
-    def flow(self, first: int, second: int, camera: CameraLike = None) -> Flow:
-        """Give the flow from one frame to another, before or after it, and which of its material is hidden there."""
-        return self._simulation.flow(self.labels(first, camera), camera, *self._at(second))
+    def flow(self, first: int, second: int, camera: CameraLike = None, camera_then: CameraLike = None) -> Flow:
+        """Give the flow from one frame to another, before or after it, and which of its material is hidden there.
+
+        `camera` sees the first and `camera_then` the second, which may be the same frame; None: the same camera.
+        """
+        then = camera if camera_then is None else camera_then
+        return self._simulation.flow(self.labels(first, camera), then, *self._at(second))
+
+    def locate(self, frame: int, coordinates: NDArray[np.floating], camera: CameraLike = None) -> Sight:
+        """Find where material points are seen in a frame, and whether anything hides them; as `Simulation.locate`."""
+        return self._simulation.locate(coordinates, camera, *self._at(frame))
 
     def close(self) -> None:
         """Free the memory."""

@@ -92,7 +92,8 @@ def run(
 
     Args:
         scene: what `load_scene` returned, or the same as a mapping.
-        directory: where frames/, animation.gif, trajectory.npz, forces.csv and run.json go.
+        directory: where frames/, animation.gif, animation.mp4, trajectory.npz, forces.csv and run.json go; of several
+            cameras, what each sees goes to a folder there that has its name.
         arch: cpu, cuda or vulkan.
         threads: number of CPU threads; None takes every core. With 1, pictures are encoded in this process too.
         overrides: the overrides that made the scene, for the record.
@@ -278,7 +279,7 @@ class _Run:
         """Simulate, draw and write every frame that is missing, and finish the results."""
         writer, simulation, scene = self._writer, self._simulation, self._task.plan.scene
         stage, rest = self._watch.stage, rest_positions(scene.sheet)
-        observed = Observed()
+        observed = dict.fromkeys(scene.render.all_cameras, Observed())
         # Frames that need no step are told apart, as they say nothing of the time that the others will take.
         without_steps = max(self._resumed, 1)
         for frame in range(writer.frames, self._frames):
@@ -289,7 +290,9 @@ class _Run:
                 simulation.advance(max(0, frame - simulation.frame), self._pause)
             position = writer.position(frame) if frame < self._resumed else simulation.positions()
             with stage("render"):
-                observed = simulation.observe(observed.labels, position, frame / scene.time.frames_per_second)
+                time = frame / scene.time.frames_per_second
+                for camera, before in observed.items():
+                    observed[camera] = simulation.observe(before.labels, camera, position, time)
             writer.add(position, observed, simulation.forces(), told)
             if self._error and frame > 0:
                 with stage("pilot"):
@@ -429,7 +432,7 @@ def free_cores(plan: Plan) -> int:
     """Count the cores that are free for stepping: all but one for the encoder, unless that mostly waits for frames."""
     width, height = plan.scene.render.size
     rows, cols = plan.scene.sheet.points
-    encoding = width * height * ENCODING if plan.scene.draws else 0
+    encoding = width * height * len(plan.scene.render.all_cameras) * ENCODING if plan.scene.draws else 0
     busy = encoding > rows * cols * plan.grid.steps_per_frame
     return max(1, resources.available_threads() - busy)
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable, Mapping
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
@@ -17,12 +18,14 @@ from pydantic import (
     model_serializer,
     model_validator,
 )
+from pydantic_core import PydanticCustomError
 from typing_extensions import Self
 
 from taichi_msm import faults
-from taichi_msm.errors import ArgumentError, SceneError
+from taichi_msm.camera_files import CameraFileError, read_calibration, read_poses
+from taichi_msm.errors import ArgumentError, SceneError, did_you_mean
 from taichi_msm.faults import LARGEST, SMALLEST, refused
-from taichi_msm.outputs.table import OUTPUTS
+from taichi_msm.outputs.table import CAMERA_NAME, EXPORTS, FOLDERS, MAX_NAME, OUTPUTS
 
 MAX_POINTS = 4096
 MAX_PROBES = 16
@@ -456,17 +459,229 @@ class Time(Section):
         return self
 
 
-class Camera(Section):
-    """A pinhole camera."""
+# The coefficients of OpenCV's models of distortion, in its order.
+COEFFICIENTS = {
+    "pinhole": ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6"),
+    "fisheye": ("k1", "k2", "k3", "k4"),
+}
 
-    eye: Vector = key(..., "where the camera is [m]", "three numbers: [x, y, z] in metres")
-    target: Vector = key((0.0, 0.0, 0.0), "the point it looks at [m]", "three numbers: [x, y, z] in metres")
-    up: Vector = key((0.0, 1.0, 0.0), "the direction that is up in the picture", "three numbers: [x, y, z]")
+_MOST = 1e6
+_COEFFICIENT = f"a number, {-_MOST:g} to {_MOST:g}"
+Coefficient = Annotated[Number, Field(ge=-_MOST, le=_MOST)]
+
+
+class Intrinsics(Section):
+    """The focal lengths and the principal point of a calibrated camera, in OpenCV's pixels."""
+
+    fx: Positive = key(..., "focal length across [px]", "a number above 0, in pixels")
+    fy: Positive = key(..., "focal length down [px]", "a number above 0, in pixels")
+    cx: Coefficient = key(..., "principal point across [px]; the centre of the first pixel is 0", _COEFFICIENT)
+    cy: Coefficient = key(..., "principal point down [px]; the centre of the first pixel is 0", _COEFFICIENT)
+
+
+class Distortion(Section):
+    """How a lens bends lines: OpenCV's rational model, or its fisheye."""
+
+    model: Literal["pinhole", "fisheye"] = key(
+        "pinhole", "pinhole: OpenCV's rational model; fisheye: its fisheye, with k1 to k4", "pinhole or fisheye"
+    )
+    k1: Coefficient = key(0.0, "radial coefficient", _COEFFICIENT)
+    k2: Coefficient = key(0.0, "radial coefficient", _COEFFICIENT)
+    k3: Coefficient = key(0.0, "radial coefficient", _COEFFICIENT)
+    k4: Coefficient = key(0.0, "radial coefficient; of a pinhole in the denominator", _COEFFICIENT)
+    k5: Coefficient = key(0.0, "radial coefficient in the denominator", _COEFFICIENT)
+    k6: Coefficient = key(0.0, "radial coefficient in the denominator", _COEFFICIENT)
+    p1: Coefficient = key(0.0, "tangential coefficient", _COEFFICIENT)
+    p2: Coefficient = key(0.0, "tangential coefficient", _COEFFICIENT)
+
+    @property
+    def coefficients(self) -> tuple[float, ...]:
+        """The coefficients of the model, in OpenCV's order."""
+        return tuple(getattr(self, name) for name in COEFFICIENTS[self.model])
+
+    @model_validator(mode="after")
+    def _of_its_model(self) -> Self:
+        for name in sorted(self.model_fields_set - {"model", *COEFFICIENTS[self.model]}):
+            if getattr(self, name):
+                raise refused("goes with model: pinhole; a fisheye has k1, k2, k3 and k4", name)
+        return self
+
+
+class Pose(Section):
+    """Where a camera is, in OpenCV's axes: x right, y down, z forward."""
+
+    rotation: tuple[Vector, Vector, Vector] = key(
+        ..., "from the world's axes to the camera's", "three rows of three numbers: an orthonormal matrix"
+    )
+    translation: Vector = key(..., "the world's origin in the camera's axes [m]", "three numbers: [x, y, z] in metres")
+
+
+Times = Annotated[tuple[tuple[Number, Number, Number, Number], ...], Field(min_length=1)]
+Quaternions = tuple[tuple[Number, Number, Number, Number, Number, Number, Number, Number], ...]
+
+_KEYS = " or keys [[t, x, y, z], ...], t in seconds"
+
+
+class Camera(Section):
+    """A pinhole camera, which may be calibrated, have a lens that bends lines, and move."""
+
+    calibration: FilePath | None = key(
+        None,
+        "in place of fov and distortion: a calibration of OpenCV, ROS or STIR, relative to the scene file",
+        "the path of a file",
+    )
+    scale: StrictBool = key(
+        False, "whether a calibration of pictures of another size is scaled to this one", "true or false"
+    )
+    intrinsics: Intrinsics | None = key(
+        None, "in place of fov: as calibrated, in OpenCV's pixels", "a mapping with fx, fy, cx and cy"
+    )
+    distortion: Distortion | None = key(
+        None, "how the lens bends lines, in OpenCV's terms", "a mapping with k1, k2, p1, p2, k3, k4, k5, k6"
+    )
+    outside: Literal["refuse", "background"] = key(
+        "refuse",
+        "what to do where the distortion folds back within the picture: refuse the scene, or draw the background there",
+        "refuse or background",
+    )
+    pose: Pose | None = key(
+        None, "in place of eye, target and up: from the world to the camera", "a mapping with rotation and translation"
+    )
+    poses: FilePath | Quaternions | None = key(
+        None,
+        "in place of eye, target and up: the camera's place over time, a file in TUM's format, relative to the scene "
+        "file, or its rows [t, tx, ty, tz, qx, qy, qz, qw], from the camera to the world",
+        "the path of a file",
+    )
+    beside: Annotated[str, Field(strict=True, min_length=1)] | None = key(
+        None,
+        "in `cameras`, in place of all else but baseline: the name of another camera, which this one is like",
+        "the name of another camera",
+    )
+    baseline: Number | None = key(
+        None,
+        "how far it is from the camera that it is beside, along the x axis of that [m]",
+        "a number but 0, in metres",
+    )
+    eye: Vector | Times | None = key(
+        None,
+        "where the camera is [m], or keys of it, linear between, held outside; required unless there is pose, poses or "
+        "beside",
+        "three numbers: [x, y, z] in metres," + _KEYS,
+    )
+    target: Vector | Times = key(
+        (0.0, 0.0, 0.0), "the point it looks at [m], or keys of it", "three numbers: [x, y, z] in metres," + _KEYS
+    )
+    up: Vector | Times = key(
+        (0.0, 1.0, 0.0),
+        "the direction that is up in the picture, or keys of it",
+        "three numbers: [x, y, z]," + _KEYS,
+    )
     fov: Annotated[Number, Field(ge=MIN_FOV, lt=180)] = key(
         40.0,
-        "angle from the picture's bottom to its top [degrees]",
+        "angle from the picture's bottom to its top, without distortion [degrees]",
         f"a number from {MIN_FOV:g} to below 180, in degrees",
     )
+
+    @property
+    def moves(self) -> bool:
+        """Whether the camera is not in the same place at all times."""
+        return any(isinstance(value[0], tuple) for value in (self.poses, self.eye, self.target, self.up) if value)
+
+    @field_validator("poses", mode="after")
+    @classmethod
+    def _read_poses(cls, poses: str | Quaternions | None) -> Quaternions | None:
+        if not isinstance(poses, str):
+            return poses
+        try:
+            return read_poses(poses)  # type: ignore[return-value]
+        except CameraFileError as error:
+            raise refused(str(error)) from None
+
+    @field_validator("eye", "target", "up", mode="after")
+    @classmethod
+    def _in_order(cls, keys: Any, info: ValidationInfo) -> Any:
+        if info.field_name == "eye" and keys is None and not {"beside", "pose", "poses"} & _given(info):
+            raise refused("missing; expected " + cls.model_fields["eye"].json_schema_extra["expects"])  # type: ignore
+        if keys is None or not isinstance(keys[0], tuple):
+            return keys
+        for n in range(1, len(keys)):
+            if keys[n][0] <= keys[n - 1][0]:
+                raise refused(f"is at {keys[n][0]:g} s, after one at {keys[n - 1][0]:g} s; sort the keys by time", n)
+        return keys
+
+    @model_validator(mode="after")
+    def _said_once(self) -> Self:
+        given = {name for name in self.model_fields_set if getattr(self, name) is not None}
+        if self.beside is not None:
+            for name in sorted(given - {"beside", "baseline"}):
+                raise refused(
+                    "is given together with beside, and a camera beside another is like that; remove it", name
+                )
+            if self.baseline is None or abs(self.baseline) < SMALLEST:
+                what = "missing" if self.baseline is None else f"{self.baseline:g} puts it where {self.beside} is"
+                raise refused(f"{what}; expected a number but 0, in metres", "baseline")
+        elif self.baseline is not None:
+            raise refused("goes with beside, the name of another camera; add it or remove this", "baseline")
+        for ways in (("calibration", "intrinsics", "fov"), ("pose", "poses", "eye"), ("calibration", "distortion")):
+            if len(both := [name for name in ways if name in given]) > 1:
+                raise refused(f"is given together with {both[0]}; remove one of them", both[1])
+        for name in {"target", "up"} & given if {"pose", "poses"} & given else ():
+            raise refused("goes with eye; a pose has a direction of its own", name)
+        return self
+
+    @model_serializer(mode="wrap")
+    def _own_keys(self, dump: SerializerFunctionWrapHandler) -> dict[str, Any]:
+        """Leave out what was not given and has no meaning beside what was."""
+        if self.beside is not None:
+            return {name: value for name, value in dump(self).items() if name in ("beside", "baseline")}
+        needed = {"eye", "target", "up"} if self.eye is not None else {"pose", "poses"} & self.model_fields_set
+        needed |= {"intrinsics"} if self.intrinsics is not None else {"fov"}
+        needed |= {name for name in ("distortion", "outside") if name in self.model_fields_set}
+        return {name: value for name, value in dump(self).items() if name in needed}
+
+    def calibrated(self, size: tuple[int, int]) -> Self:
+        """Read the calibration for pictures of a width and height [px]; raises pydantic's error of a key."""
+        if self.calibration is None:
+            return self
+        try:
+            found = read_calibration(self.calibration)
+        except CameraFileError as error:
+            raise refused(str(error), "calibration") from None
+        across, down = (new / old for new, old in zip(size, found.size or size, strict=True))
+        if (across, down) != (1, 1) and not self.scale:
+            assert found.size is not None
+            raise refused(
+                f"{self.calibration}: of pictures of {found.size[0]} x {found.size[1]} pixels, not of {size[0]} x "
+                f"{size[1]}; set render.size to these, or scale: true",
+                "calibration",
+            )
+        # Edges of pictures are scaled to edges; they are half a pixel from the centres of pixels.
+        (fx, fy), (cx, cy) = found.focal, found.centre
+        intrinsics = {"fx": fx * across, "fy": fy * down}
+        intrinsics |= {"cx": (cx + 0.5) * across - 0.5, "cy": (cy + 0.5) * down - 0.5}
+        update: dict[str, Any] = {"calibration": None, "scale": False, "intrinsics": intrinsics}
+        if any(found.coefficients):
+            model = "fisheye" if found.fisheye else "pinhole"
+            # OpenCV lets the last ones of a pinhole out.
+            names = zip(COEFFICIENTS[model], found.coefficients, strict=False)
+            update["distortion"] = {"model": model, **dict(names)}
+        elif found.fisheye:
+            update["distortion"] = {"model": "fisheye"}
+        kept = {name: getattr(self, name) for name in self.model_fields_set - {"calibration", "scale"}}
+        return self.model_validate(kept | update)
+
+
+def _given(info: ValidationInfo) -> set[str]:
+    """Give the names of the keys before this one that have a value, or one at fault."""
+    before = list(Camera.model_fields)
+    names = before[: before.index(str(info.field_name))]
+    return {name for name in names if info.data.get(name, name) is not None}
+
+
+# A camera as a scene has it.
+AnyCamera = Literal["top", "oblique"] | Camera
+PRESETS = ("top", "oblique")
 
 
 class Light(Section):
@@ -491,10 +706,16 @@ class Render(Section):
     refine: Annotated[Whole, Field(ge=0, le=MAX_REFINE)] = key(
         10, "points inserted between two neighbours when drawing", f"a whole number, 0 to {MAX_REFINE}"
     )
-    camera: Literal["top", "oblique"] | Camera = key(
+    camera: AnyCamera = key(
         "top",
         "top: straight down, to scale; oblique: tilted, shows depth; or a pinhole camera",
         "top, oblique, or {eye: [x, y, z], target: [x, y, z], up: [x, y, z], fov: degrees}",
+    )
+    cameras: dict[str, AnyCamera] | None = key(
+        None,
+        "in place of camera: several by name, each with files in a folder of its own; the first is the main one, whose "
+        "light is in all pictures",
+        "names of a-z, 0-9, _ and -, each with top, oblique, {eye: [x, y, z], ...} or {beside: NAME, baseline: metres}",
     )
     shading: Literal["none", "headlight", "tissue"] = key(
         "headlight",
@@ -513,6 +734,115 @@ class Render(Section):
     tracks: Annotated[Whole, Field(ge=1, le=MAX_TRACKS)] = key(
         16, "material points along each side of the grid of tracks", f"a whole number, 1 to {MAX_TRACKS}"
     )
+
+    @field_validator("camera", mode="after")
+    @classmethod
+    def _calibrated(cls, camera: AnyCamera, info: ValidationInfo) -> AnyCamera:
+        if isinstance(camera, Camera) and camera.beside is not None:
+            raise refused("goes with render.cameras, where the other camera has its name", "beside")
+        # A size at fault is reported by itself.
+        return camera.calibrated(info.data["size"]) if isinstance(camera, Camera) and "size" in info.data else camera
+
+    @field_validator("cameras", mode="after")
+    @classmethod
+    def _known_by_name(cls, cameras: dict[str, AnyCamera] | None, info: ValidationInfo) -> dict[str, AnyCamera] | None:
+        if cameras is None:
+            return None
+        if not cameras:
+            raise refused("has no camera; add one by its name")
+        for name, camera in cameras.items():
+            if not re.fullmatch(CAMERA_NAME, name):
+                raise refused(f"is no name of a camera; take up to {MAX_NAME} of a-z, 0-9, _ and -", name)
+            if name in FOLDERS or name.startswith(EXPORTS):
+                raise refused("is the name of a folder that is not a camera's; take another name", name)
+            if isinstance(camera, Camera) and camera.beside is not None:
+                _require_beside(name, cameras)
+        if "size" not in info.data:
+            return cameras
+        calibrated = {}
+        for name, camera in cameras.items():
+            try:
+                calibrated[name] = camera.calibrated(info.data["size"]) if isinstance(camera, Camera) else camera
+            except PydanticCustomError as error:
+                raise refused(error.message(), name, *(error.context or {}).get("below", ())) from None
+        return calibrated
+
+    @model_validator(mode="before")
+    @classmethod
+    def _without_null(cls, data: Any) -> Any:
+        """Take `camera: null` for none, as an override cannot remove a key."""
+        if isinstance(data, Mapping) and data.get("camera", "") is None:
+            return {name: value for name, value in data.items() if name != "camera"}
+        return data
+
+    @model_validator(mode="after")
+    def _one_way_to_the_cameras(self) -> Self:
+        if self.cameras is not None and "camera" in self.model_fields_set:
+            raise refused("is given together with cameras; remove one of them, or set it to null", "camera")
+        return self
+
+    @model_serializer(mode="wrap")
+    def _one_kind(self, dump: SerializerFunctionWrapHandler) -> dict[str, Any]:
+        """Leave out `camera` beside `cameras`, or the latter if there is none."""
+        unused = "cameras" if self.cameras is None else "camera"
+        return {name: value for name, value in dump(self).items() if name != unused}
+
+    @property
+    def all_cameras(self) -> dict[str, AnyCamera]:
+        """The cameras by the folders for what they see: the run's own, which is "", for one without a name."""
+        return {"": self.camera} if self.cameras is None else self.cameras
+
+    @property
+    def main(self) -> str:
+        """The name of the main camera, which has the light; "": the only one, without a name."""
+        return next(iter(self.all_cameras))
+
+    @property
+    def main_camera(self) -> AnyCamera:
+        """The main camera."""
+        return self.all_cameras[self.main]
+
+    def with_main(self, camera: AnyCamera) -> Self:
+        """Replace the main camera; those beside it follow."""
+        if self.cameras is None:
+            return self.model_copy(update={"camera": camera})
+        return self.model_copy(update={"cameras": {**self.cameras, self.main: camera}})
+
+    def origin(self, name: str) -> tuple[AnyCamera, float]:
+        """Give the camera that a named one is like, itself or one that it is beside, and how far that is away [m]."""
+        camera, away = self.all_cameras[name], 0.0
+        while isinstance(camera, Camera) and camera.beside is not None:
+            away += camera.baseline or 0.0
+            camera = self.all_cameras[camera.beside]
+        return camera, away
+
+    def baseline(self, name: str) -> float:
+        """Tell how far the first camera beside a named one is from it [m]; 0: there is none."""
+        for camera in self.all_cameras.values():
+            if isinstance(camera, Camera) and camera.beside == name and camera.baseline is not None:
+                return camera.baseline
+        return 0.0
+
+
+def _require_beside(name: str, cameras: Mapping[str, AnyCamera]) -> None:
+    """Make sure that a camera is beside another one that has a place."""
+    if name == next(iter(cameras)):
+        raise refused("the first camera is the main one, beside no other; put another one first", name, "beside")
+    way, camera = [name], cameras[name]
+    while isinstance(camera, Camera) and camera.beside is not None:
+        other = camera.beside
+        if other in way:
+            if len(way) == 1:
+                raise refused(f"{other} is this camera itself; name another one", name, "beside")
+            raise refused(f"goes round, {', '.join([*way, other])}; give one of them an eye", name, "beside")
+        if other not in cameras:
+            if len(way) > 1:
+                return  # It is reported where it is named.
+            others = [one for one in cameras if one != name]
+            near = did_you_mean(other, others) or f"; the others are {', '.join(others)}"
+            raise refused(f"{other}: no camera has this name{near}", name, "beside")
+        way.append(other)
+        camera = cameras[other]
 
 
 class Scene(Section):
@@ -557,6 +887,17 @@ class Scene(Section):
         f"a list of {', '.join(OUTPUTS)}",
     )
 
+    @property
+    def folders(self) -> dict[str, tuple[str, ...]]:
+        """The entries of output by their folders: what a camera sees goes to its own, the rest to that of the run."""
+        wanted = [output for name, output in OUTPUTS.items() if name in self.output]
+        folders = {"": tuple(output.name for output in wanted if not output.is_seen)}
+        for camera in self.render.all_cameras:
+            has_pair = bool(self.render.baseline(camera))
+            seen = (output.name for output in wanted if output.is_seen and (has_pair or not output.of_pair))
+            folders[camera] = (*folders.get(camera, ()), *seen)
+        return folders
+
     def asks_for(self, *sources: str) -> bool:
         """Tell whether the values of any output are in one of these fields of `Observed`."""
         return any(OUTPUTS[name].source in sources for name in self.output)
@@ -569,12 +910,12 @@ class Scene(Section):
     @property
     def labels_pixels(self) -> bool:
         """Whether any output is a label of every pixel."""
-        return self.asks_for("labels", "flow")
+        return self.asks_for("labels", "flow", "stereo")
 
     @property
     def renders(self) -> bool:
         """Whether any output depends on what the camera sees."""
-        return self.asks_for("picture", "labels", "flow", "tracks")
+        return any(OUTPUTS[name].is_seen for name in self.output)
 
     @property
     def has_instruments(self) -> bool:
@@ -614,6 +955,6 @@ class Scene(Section):
     def _picture_given(self) -> Scene:
         if self.draws and self.image is None:
             raise refused(
-                "a picture is needed to draw png or gif; name one, or set output to [trajectory] or []", "image"
+                "a picture is needed to draw png, gif or mp4; name one, or set output to [trajectory] or []", "image"
             )
         return self

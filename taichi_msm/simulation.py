@@ -296,7 +296,8 @@ class Simulation:
         """Draw the sheet as it is now, and the probes' instruments.
 
         Args:
-            camera: "top", "oblique", a `Camera` or its keys; None: the scene's.
+            camera: the name of one of the scene's cameras, "top", "oblique", a `Camera` or its keys; None: the scene's,
+                of several the main one.
             positions: other positions of the points [m], such as those of an earlier frame, shape (rows, cols, 3).
             time: time of these positions [s], for control points that move; None: now.
 
@@ -310,7 +311,7 @@ class Simulation:
         return self.renderer.draw(self._shot(camera, positions, time))
 
     def labels(self, camera: CameraLike = None, positions: Array | None = None, time: float | None = None) -> Labels:
-        """Give what each pixel shows at its centre: the material point, the depth, whether it is an instrument.
+        """Give what each pixel shows at its centre: the material point, depth, normal, whether it is an instrument.
 
         `camera`, `positions` and `time` are as for `draw`, here and in the methods below, and so are the errors.
         """
@@ -321,7 +322,8 @@ class Simulation:
     ) -> Flow:
         """Give the optical flow from an earlier or later frame to this one, and which of its material is now hidden.
 
-        `before` is what `labels` returned for the other frame, with the same size of the picture.
+        `before` is what `labels` returned for the other frame, with the same size of the picture; if another `camera`
+        saw it, the flow is from that one's picture to this one's.
         """
         return self.renderer.flow(before, self._shot(camera, positions, time))
 
@@ -347,11 +349,17 @@ class Simulation:
         if not (are_numbers(point, (2,)) and np.isfinite(point).all()):
             raise ArgumentError(f"pixel: {pixel!r}; take two numbers, x to the right and y down")
         x, y = point.tolist()
-        return pick(self._position, self.scene.render.refine, self.renderer.set_up(camera), (x, y))
+        return pick(self._position, self.scene.render.refine, self.renderer.set_up(camera, self.time), (x, y))
 
-    def observe(self, before: Labels | None, positions: Array, time: float) -> Observed:
+    def observe(
+        self,
+        before: Labels | None,
+        camera: CameraLike = None,
+        positions: Array | None = None,
+        time: float | None = None,
+    ) -> Observed:
         """Give all that the scene's output asks for of a frame; `before`: the labels of the frame before, if any."""
-        return self.renderer.observe(before, self._shot(None, positions, time))
+        return self.renderer.observe(before, self._shot(camera, positions, time))
 
     def play(self, frames: int, camera: CameraLike = None) -> Player:
         """Draw the present frame, simulate and draw that many more, and show them in a notebook."""
@@ -385,8 +393,9 @@ class Simulation:
         pause()
         if self.scene.renders and (kernels := self.renderer.kernels()) not in _compiled:
             position = to_positions(self._dynamics.displacement(), self.scene.sheet)
-            first = self.observe(None, position, self.time)
-            self.observe(first.labels, position, self.time)
+            for camera in self.scene.render.all_cameras:
+                first = self.observe(None, camera, position)
+                self.observe(first.labels, camera, position)
             _compiled.add(kernels)
 
     def close(self) -> None:
@@ -453,7 +462,7 @@ class Simulation:
             time = self.time
         elif not (are_numbers(as_array(time, "time"), ()) and math.isfinite(time)):
             raise ArgumentError(f"time: {time!r}; take a number, in seconds, or None for now")
-        return Shot(positions, self.renderer.set_up(camera), rods(self.scene, positions, time))
+        return Shot(positions, self.renderer.set_up(camera, time), rods(self.scene, positions, time))
 
     def _require_good(self, reading: Reading, fault: str) -> None:
         """Raise the error of a divergence, if there is a fault."""

@@ -64,6 +64,25 @@ def results(ran: Path, tmp_path: Path) -> Path:
     return Path(shutil.copytree(ran, tmp_path / "results"))
 
 
+@pytest.fixture(scope="session")
+def seen_by_two(device: runtime.Device, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A run as two cameras beside each other have seen it, in `left` and `right`, to be read only; of 320 x 256 px."""
+    here = tmp_path_factory.mktemp("stereo")
+    Image.fromarray(speckle(60, 80)).save(here / "speckle.png")
+    (here / "small.yaml").write_text(SMALL)
+    left = "{eye: [-0.004, -0.1, 0.5], target: [-0.004, 0, 0], fov: 38}"
+    cameras = f"render.cameras={{left: {left}, right: {{beside: left, baseline: 0.008}}}}"
+    overrides = [cameras, "render.size=[320, 256]", "render.tracks=6", "output=[png, trajectory, forces, tracks]"]
+    run(load_scene(here / "small.yaml", overrides), here / "stereo", threads=device.threads, estimate_error=False)
+    return here / "stereo"
+
+
+@pytest.fixture
+def stereo(seen_by_two: Path, tmp_path: Path) -> Path:
+    """A copy of these results, to be changed."""
+    return Path(shutil.copytree(seen_by_two, tmp_path / "stereo"))
+
+
 Program = Callable[..., subprocess.CompletedProcess[str]]
 
 

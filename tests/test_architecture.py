@@ -16,6 +16,7 @@ LAYERS = [
     {"errors", "outputs", "plot_style", "progress", "timegrid"},
     {"arguments", "faults", "notebook", "system"},
     {"picture"},
+    {"camera_files"},
     {"scene"},
     {"physics"},
     {"render"},

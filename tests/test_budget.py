@@ -106,20 +106,21 @@ def test_disk(output: list[str], of_a_frame: float) -> None:
 @pytest.mark.parametrize("size", [(65, 47), (1, 90), (90, 1)])
 def test_a_run_takes_no_more_disk_than_was_said(size: tuple[int, int], device: Device, tmp_path: Path) -> None:
     """Whatever the picture, and the hardest is one of noise at its own scale."""
-    width, height = size
+    (width, height), cameras = size, {"one": "top", "other": {"beside": "one", "baseline": 0.1}}
     Image.fromarray(speckle(height, width)).save(tmp_path / "noise.png")
     made = scene(
         image=str(tmp_path / "noise.png"),
         sheet={"points": [4, 5], "size": [height, width], "mass": 1},
         time={"duration": 1},
         probes=[{"force": [3, 2, 0], "falloff": 0}],
-        render={"size": size, "camera": "top", "shading": "none", "tracks": 3},
+        render={"size": size, "cameras": cameras, "shading": "none", "tracks": 3},
         output=[*OUTPUTS],
     )
     run(made, tmp_path / "out", threads=device.threads)
     sizes = {path: path.stat().st_size for path in (tmp_path / "out").rglob("*") if path.is_file()}
-    # Four kinds of labels and the pictures at 11 frames, two kinds between them, and six files.
-    assert len(sizes) == 4 * 11 + 2 * 10 + 6
+    # Of each camera four kinds of labels and the pictures at 11 frames, two kinds between them, and four files; the
+    # disparity of one; three files of the run.
+    assert len(sizes) == 2 * (5 * 11 + 2 * 10 + 4) + 11 + 3
     need = estimate(made)
     assert sum(sizes.values()) <= need.disk_bytes
     pictures = sum(size for path, size in sizes.items() if path.parent.name == "frames")
@@ -129,7 +130,7 @@ def test_a_run_takes_no_more_disk_than_was_said(size: tuple[int, int], device: D
 def test_tracks() -> None:
     # Of 10 x 10 points in 21 frames: two coordinates in f32, and whether it is hidden.
     need = estimate(scene(render={"tracks": 10}, output=["tracks"]))
-    assert need.track_bytes == 100 * (21 * 9 + 16) + 1024
+    assert need.track_bytes == 100 * (21 * 21 + 16) + 1024
     assert need.disk_bytes == need.track_bytes + need.record_bytes
 
 
@@ -165,7 +166,7 @@ def test_an_ordinary_scene_has_no_problems() -> None:
         ),
         (
             {"render": {"size": [9, 9], "tracks": 256}, "output": ["tracks"], "time": {"duration": 2000}},
-            "render.tracks: the scene needs 11 GiB of memory, 11 GiB of it for tracks of 256 x 256 points in "
+            "render.tracks: the scene needs 25.6 GiB of memory, 25.6 GiB of it for tracks of 256 x 256 points in "
             "20001 frames, but 512 MiB is free; reduce it",
         ),
     ],

@@ -440,13 +440,13 @@ def call(capsys: pytest.CaptureFixture[str], *arguments: str) -> tuple[int, str,
         ),
         (
             ["export", "results"],
-            "taichi-msm: Missing option '--format'. Choose from: kitti, tapvid, vtk, gltf, obj (see taichi-msm --help)"
-            "\n",
+            "taichi-msm: Missing option '--format'. Choose from: kitti, tapvid, tapvid3d, stir, vtk, gltf, obj, csv "
+            "(see taichi-msm --help)\n",
         ),
         (
             ["export", "results", "--format", "glft"],
-            "taichi-msm: Invalid value for '--format': 'glft' is not one of 'kitti', 'tapvid', 'vtk', 'gltf', 'obj'; "
-            "did you mean 'gltf'? (see taichi-msm --help)\n",
+            "taichi-msm: Invalid value for '--format': 'glft' is not one of 'kitti', 'tapvid', 'tapvid3d', 'stir', "
+            "'vtk', 'gltf', 'obj', 'csv'; did you mean 'gltf'? (see taichi-msm --help)\n",
         ),
         (
             ["run", "small.yaml", "--arch", "cuda1"],

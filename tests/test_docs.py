@@ -250,7 +250,7 @@ def test_the_python_shown_runs(tmp_path: Path) -> None:
     subprocess.run(command, cwd=tmp_path, check=True, capture_output=True)
     (tmp_path / "example.py").write_text(labels)
     done = subprocess.run([sys.executable, "example.py"], cwd=tmp_path, check=True, capture_output=True, text=True)
-    assert done.stdout == "(512, 512, 2) (512, 512) (512, 512, 2) (512, 512)\n"
+    assert done.stdout == "(512, 512, 2) (512, 512) (512, 512, 2) (512, 512) (512, 512, 3)\n"
     (tmp_path / "example.py").write_text(blocks(DOCS / "export.md", "python")[0])
     done = subprocess.run([sys.executable, "example.py"], cwd=tmp_path, check=True, capture_output=True, text=True)
     written = ["000000/surface.glb", "000001/surface.glb", "index.csv"]

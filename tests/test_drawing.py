@@ -107,6 +107,29 @@ def test_picture_is_like_the_twin(render: dict[str, Any], device: Device) -> Non
     assert (apart == 1).mean() < 0.01
 
 
+@pytest.mark.parametrize("distortion", [None, {"k1": -0.1}])
+def test_what_passes_behind_the_camera_is_looked_for_only_where_it_may_be_seen(
+    distortion: Any, device: Device, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    lists: list[float] = []
+
+    def counted(*arguments: Any) -> bins.Bins:
+        found = bins.binned(*arguments)
+        lists.append(found.lengths.mean())
+        return found
+
+    monkeypatch.setattr(rasterizer_gpu, "binned", counted)
+    for eye in ([0, 0, 0.1], [0, -0.9, 0.1]):
+        camera = {"eye": eye, "target": [eye[0], eye[1] + 0.1, 0], "fov": 60, "distortion": distortion}
+        made = drawable((40, 40), camera=camera)
+        Drawing(made, speckle(13, 17), drawing_config(made)._replace(lanes=1)).draw(rest_positions(made.sheet))
+    # The first stands over the sheet, so that a row of cells crosses the camera's plane. 2 x 3^2 triangles of each of
+    # the 39 would be everywhere. All that the second could see is above the picture.
+    among, before = lists
+    assert among < 39
+    assert before == 0
+
+
 @pytest.mark.parametrize("lanes", [1, 4, 8])
 def test_the_shape_of_a_tile_does_not_change_the_bits(lanes: int, device: Device) -> None:
     # One lane is the form for GPUs; 31 x 57 pixels are whole tiles of no shape.
@@ -117,7 +140,7 @@ def test_the_shape_of_a_tile_does_not_change_the_bits(lanes: int, device: Device
     ]
     for render in renders:
         made, texture = with_instruments(drawable(**render)), speckle(300, 200)
-        position, config = dented(made), drawing_config(made, labels="supersample" not in render)
+        position, config = dented(made), drawing_config(made, labels="supersample" not in render, normals=True)
         placed = rods(made, position, 0)
         expected = Drawing(made, texture, config).look(position, rods=placed)
         alone = Drawing(made, texture, config._replace(lanes=lanes)).look(position, rods=placed)

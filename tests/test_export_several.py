@@ -209,7 +209,7 @@ def test_what_a_sweep_lacks_is_named_with_the_remedy(sweep: Path, program: Progr
 
 
 def test_wrong_arguments_are_told_of(results: Path) -> None:
-    known = "take one of kitti, tapvid, vtk, gltf, obj"
+    known = "take one of kitti, tapvid, tapvid3d, stir, vtk, gltf, obj, csv"
     wrong: list[tuple[tuple[Any, ...], str]] = [
         ((results, "glft"), f"format: 'glft'; {known}; did you mean 'gltf'?"),
         ((results, ["obj"]), f"format: ['obj']; {known}; did you mean 'obj'?"),

@@ -17,10 +17,10 @@ from taichi_msm import SceneError, Simulation, fit, load_scene, run
 from taichi_msm.fitting.fit import Method
 from taichi_msm.fitting.observations import read_observations
 from taichi_msm.fitting.parameters import make_parameters
-from taichi_msm.fitting.prediction import Job, Predictor, runnable, surface_weights
+from taichi_msm.fitting.prediction import Job, Predictor, runnable, seen_by_camera, surface_weights
 from taichi_msm.fitting.result import FitResult
 from taichi_msm.fitting.suspicions import MOVES, faults, moved
-from taichi_msm.physics.deformed import touched
+from taichi_msm.physics.deformed import on_surface, touched
 from taichi_msm.scene import Scene
 from taichi_msm.system import resources
 from taichi_msm.system.runtime import Device
@@ -112,6 +112,16 @@ def test_points_are_on_the_surface_that_is_drawn(motion: Array) -> None:
         for place, point in zip(PLACES, points, strict=True):
             rest = np.array([(place[0] - 0.5) * 0.1, (0.5 - place[1]) * 0.1])
             np.testing.assert_allclose(point, touched(position, refine, sheet, rest)[0], atol=1e-15)
+
+
+def test_a_camera_that_moves_and_bends_lines_sees_what_is_predicted(motion: Array, device: Device) -> None:
+    eye = [[0, 0, -0.06, 0.09], [0.4, 0.02, -0.05, 0.1]]
+    made = changed(render__camera={"eye": eye, "fov": 40, "distortion": {"k1": -0.3, "k2": 0.1}})
+    with Simulation(made, threads=device.threads) as simulation:
+        pixels = [simulation.locate(PLACES, positions=motion[n], time=n / 25).pixels for n in range(11)]
+    points = np.stack([on_surface(each, made.render.refine, PLACES) for each in motion], axis=1)
+    seen = seen_by_camera(made, points, np.arange(11) / 25)
+    np.testing.assert_allclose(seen, np.stack(pixels, axis=1), atol=1e-4)
 
 
 def test_the_truth_comes_back_from_a_start_that_is_far_off(motion: Array) -> None:

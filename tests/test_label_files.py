@@ -18,9 +18,10 @@ from taichi_msm.scenefile.load import load_scene
 from taichi_msm.system.runtime import Device
 from tests.outputs import files, results
 from tests.reference import labels as twin
+from tests.reference.drawing import refine as refined
 from tests.test_resume import interrupted, published
 
-ALL = "output=[png, coordinates, depth, flow, occlusion, instrument, tracks, trajectory]"
+ALL = "output=[png, coordinates, depth, normals, flow, occlusion, instrument, tracks, trajectory]"
 OBLIQUE = "render.camera=oblique"
 ROD = "probes.0.instrument={radius: 0.01, shaft: [1, -0.5, 0.6], length: 0.2}"
 
@@ -87,6 +88,22 @@ def test_tracks_are_those_of_the_twin(small: Path, device: Device) -> None:
         pixels, hidden = twin.find(small_scene(OBLIQUE), tracks["coordinates"].astype(float), position)
         np.testing.assert_allclose(tracks["points"][:, frame], pixels, atol=1e-3)
         np.testing.assert_array_equal(tracks["occluded"][:, frame], hidden)
+
+
+@pytest.mark.parametrize("refine", [0, 3])
+def test_tracks_are_on_the_drawn_surface(refine: int, small: Path, device: Device) -> None:
+    """Also within cells: 7 points across are not on the edges of 10 cells."""
+    done, trajectory = made("out", device, OBLIQUE, f"render.refine={refine}", "render.tracks=7")
+    with np.load(done / "tracks.npz") as archive:
+        tracks = dict(archive)
+    assert (tracks["position"].dtype, tracks["position"].shape) == (np.float32, (49, 5, 3))
+    projection = np.array(json.loads((done / "camera.json").read_text())["projection"])
+    for frame, position in enumerate(trajectory["position"].astype(float)):
+        expected = twin.between(refined(position, refine), tracks["coordinates"].astype(float))
+        # Rounded once to single precision, of at most half a metre.
+        np.testing.assert_allclose(tracks["position"][:, frame], expected, rtol=0, atol=2**-25)
+        seen = np.concatenate([tracks["position"][:, frame], np.ones((49, 1))], axis=-1) @ projection.T
+        np.testing.assert_allclose(seen[:, :2] / seen[:, 2:], tracks["points"][:, frame], atol=1e-4)
 
 
 @pytest.mark.parametrize("camera", ["top", "oblique", "{eye: [0.1, -0.3, 0.3], fov: 60, up: [0.2, 1, 0]}"])

@@ -8,24 +8,30 @@ from pathlib import Path
 import pytest
 
 from taichi_msm.outputs.table import OUTPUTS, PATTERNS, file_names, results
-from taichi_msm.render.labels import Flow, Labels, Observed
+from taichi_msm.render.labels import Flow, Labels, Observed, Stereo
 from taichi_msm.results.labels import _WRITERS
+
+FIELDS = {"labels": Labels._fields, "flow": Flow._fields, "stereo": Stereo._fields}
 
 
 def test_every_label_has_its_field_and_a_format() -> None:
     for output in OUTPUTS.values():
         assert output.source in (*Observed._fields, "positions", "forces")
-        if output.source in ("labels", "flow"):
-            assert output.name in (Labels if output.source == "labels" else Flow)._fields
+        if output.source in FIELDS:
+            assert output.name in FIELDS[output.source]
             assert Path(output.file).suffix in _WRITERS
             assert output.is_series
             assert output.pixel_bytes > 0
 
 
 def test_the_files_of_a_run_in_the_order_of_its_record() -> None:
-    assert results(["tracks", "flow", "gif", "png"]) == [
+    assert results({"": ["tracks", "flow", "gif", "png"]}) == [
         *("frames", "flow", "animation.gif", "tracks.npz", "camera.json", "run.json")
     ]
+    assert results({"": ["forces"], "left": ["flow", "gif"], "right": ["gif"]}) == [
+        *("left/flow", "left/animation.gif", "right/animation.gif", "forces.csv", "left/camera.json", "run.json")
+    ]
+    assert file_names(["left/flow", "left/camera.json"], 2) == ["left/flow/0000.flo", "left/camera.json"]
     assert file_names(["frames", "flow", "run.json"], 2) == [
         *("frames/0000.png", "frames/0001.png", "flow/0000.flo", "run.json")
     ]
@@ -34,9 +40,20 @@ def test_the_files_of_a_run_in_the_order_of_its_record() -> None:
 
 
 @pytest.mark.parametrize(
-    "name", ["frames/00001.png", "frames/12.png", "frames/0000.npy", "frames", "run_json", "a/run.json"]
+    "name",
+    [
+        "frames/00001.png",
+        "frames/12.png",
+        "frames/0000.npy",
+        "frames",
+        "run_json",
+        "a/run.json",
+        "a/b/camera.json",
+        "a/trajectory.npz",
+    ],
 )
 def test_no_other_file_is_taken_for_one_of_a_run(name: str) -> None:
-    every = file_names(results(OUTPUTS), 3)
+    seen = [output.name for output in OUTPUTS.values() if output.is_seen]
+    every = file_names(results({"": OUTPUTS, "left": seen}), 3)
     assert all(re.fullmatch("|".join(PATTERNS), file) for file in every)
     assert not re.fullmatch("|".join(PATTERNS), name)

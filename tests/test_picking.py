@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from taichi_msm.physics.lattice import rest_positions
 from taichi_msm.render.camera import pinhole, turned, view
+from taichi_msm.render.camera_path import placed
 from taichi_msm.render.picking import on_rest_plane, pick
 from taichi_msm.render.rasterizer import Drawing
 from taichi_msm.scene import Scene
@@ -104,16 +105,16 @@ def test_above_the_horizon_there_is_no_rest_plane() -> None:
 def test_a_camera_turned_keeps_its_target_and_distance() -> None:
     camera = pinhole(sheet("oblique"))
     moved = turned(camera, 0.4, -0.2)
-    apart = np.subtract(camera.eye, camera.target)
-    assert np.linalg.norm(np.subtract(moved.eye, moved.target)) == pytest.approx(np.linalg.norm(apart))
+    apart = placed(camera, 0).eye - camera.target
+    assert np.linalg.norm(placed(moved, 0).eye - moved.target) == pytest.approx(np.linalg.norm(apart))
     assert moved.target == camera.target
     back = turned(turned(camera, 0.4, 0), -0.4, 0)
-    assert back.eye == pytest.approx(camera.eye)
+    assert placed(back, 0).eye == pytest.approx(placed(camera, 0).eye)
     # Over the sheet: higher.
-    assert turned(camera, 0, 0.2).eye[2] > camera.eye[2]
+    assert placed(turned(camera, 0, 0.2), 0).eye[2] > placed(camera, 0).eye[2]
     # About the normal: as high as it was, and counter-clockwise seen from above.
-    assert turned(camera, 0.2, 0).eye[2] == pytest.approx(camera.eye[2])
-    assert turned(camera, 0.2, 0).eye[0] > camera.eye[0]
+    assert placed(turned(camera, 0.2, 0), 0).eye[2] == pytest.approx(placed(camera, 0).eye[2])
+    assert placed(turned(camera, 0.2, 0), 0).eye[0] > placed(camera, 0).eye[0]
 
 
 def test_the_pinhole_above_shows_the_sheet_as_large_as_from_the_top() -> None:

@@ -48,7 +48,7 @@ def write(directory: Path, *, resumes: bool = False) -> None:
     made = small_scene()
     with ResultWriter(directory, *scene_and_grid(made), {}, resumes=resumes) as writer:
         for frame in range(made.time.frames + 1):
-            writer.add(np.zeros((3, 4, 3)), Observed(speckle(6, 8, frame)))
+            writer.add(np.zeros((3, 4, 3)), {"": Observed(speckle(6, 8, frame))})
         writer.publish({"status": "complete"})
 
 

@@ -26,7 +26,7 @@ FOREIGN = [
     "frames/0000 copy.png",
     "frames/12.png",
     "frames/00001.png",
-    "a/frames/0000.png",
+    "A/frames/0000.png",
 ]
 
 # For every number n that it reads it forks a process that publishes files and dies before the n-th operation on a path,

@@ -49,12 +49,16 @@ A_PROBE_KEY = "expected keys [[t, percent], ...], t in seconds"
 AN_AT = "expected [across, down], fractions from -1 to 2, or keys [[t, across, down], ...]"
 A_CAMERA = "expected top, oblique, or {eye: [x, y, z], target: [x, y, z], up: [x, y, z], fov: degrees}"
 VECTOR_M = "expected three numbers: [x, y, z] in metres"
-NO_PICTURE = "image: a picture is needed to draw png or gif; name one, or set output to [trajectory] or []"
+EYE = f"{VECTOR_M}, or keys [[t, x, y, z], ...], t in seconds"
+CAMERA_KEYS = "calibration, scale, intrinsics, distortion, outside, pose, poses, beside, baseline, eye, target, up, fov"
+NO_PICTURE = "image: a picture is needed to draw png, gif or mp4; name one, or set output to [trajectory] or []"
 
 Load = Callable[..., Scene]
 
 # The kinds of output, as errors list them.
-OUTPUTS = "png, gif, trajectory, forces, coordinates, depth, flow, occlusion, instrument, tracks"
+OUTPUTS = (
+    "png, gif, mp4, trajectory, forces, coordinates, depth, normals, flow, occlusion, disparity, instrument, tracks"
+)
 
 
 @pytest.fixture
@@ -136,8 +140,8 @@ WRONG_KEYS = {
     "unknown and named as the kind of value": (
         GOOD + "render: {camera: {Camera: {eye: 1}}}\n",
         [
-            f"s.yaml:11:10: render.camera.eye: missing; {VECTOR_M}",
-            "s.yaml:11:19: render.camera.Camera: unknown key; allowed: eye, target, up, fov",
+            f"s.yaml:11:10: render.camera.eye: missing; {EYE}",
+            f"s.yaml:11:19: render.camera.Camera: unknown key; allowed: {CAMERA_KEYS}",
         ],
     ),
     "missing": (
@@ -154,7 +158,7 @@ WRONG_KEYS = {
     ),
     "missing in a camera": (
         GOOD + "render:\n  camera: {fov: 30}\n",
-        [f"s.yaml:12:3: render.camera.eye: missing; {VECTOR_M}"],
+        [f"s.yaml:12:3: render.camera.eye: missing; {EYE}"],
     ),
     "duplicate": (
         GOOD.replace("size:", "mass: 1\n  size:"),
@@ -287,8 +291,8 @@ WRONG_VALUES = {
         [f's.yaml:10:1: output: "png" is not allowed; expected a list of {OUTPUTS}'],
     ),
     "unknown output": (
-        GOOD.replace("[]", "[trajectory, mp4]"),
-        [f's.yaml:10:22: output.1: "mp4" is not allowed; expected a list of {OUTPUTS}'],
+        GOOD.replace("[]", "[trajectory, avi]"),
+        [f's.yaml:10:22: output.1: "avi" is not allowed; expected a list of {OUTPUTS}'],
     ),
     "an instrument without a direction": (
         GOOD + "probes: [{force: [0, 0, 1], instrument: {radius: 0.01, shaft: [0, 0, 0], length: 0.1}}]\n",
@@ -354,7 +358,7 @@ SEVERAL_KINDS = {
     ),
     "camera, a number in it": (
         GOOD + "render: {camera: {eye: [0, 0, z]}}\n",
-        [f's.yaml:11:31: render.camera.eye.2: "z" is not allowed; {VECTOR_M}'],
+        [f's.yaml:11:19: render.camera.eye: [0, 0, "z"] is not allowed; {EYE}'],
     ),
     "at, one of two numbers": (
         GOOD + PROBE.replace("0.5, 0.5", "0.5, x"),
@@ -733,7 +737,7 @@ def test_an_override_mends_a_fault_of_the_file(load: Load) -> None:
         ),
         (
             ["render.camera={fov: 30}"],
-            f"--set render.camera={{fov: 30}}: render.camera.eye: missing; {VECTOR_M}",
+            f"--set render.camera={{fov: 30}}: render.camera.eye: missing; {EYE}",
         ),
         (
             ["probes.0.load.1=[-1, 0]"],
@@ -1030,7 +1034,7 @@ def test_the_schema_rejects_what_is_wrong(validator: jsonschema.Draft202012Valid
         {"damping": "1"},
         {"probes": [{}]},
         {"render": {"camera": "side"}},
-        {"output": ["mp4"]},
+        {"output": ["avi"]},
     ):
         assert not validator.is_valid(good | wrong), wrong
     for key in ("sheet", "springs", "time"):

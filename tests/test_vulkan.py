@@ -135,9 +135,9 @@ LOOKS = """
 import sys
 import numpy as np
 from taichi_msm.system import runtime
-from tests.test_vulkan import looks
+from tests.test_vulkan import bent_looks, looks
 runtime.start("vulkan")
-np.savez(sys.argv[1], **looks())
+np.savez(sys.argv[1], **(bent_looks() if "bent" in sys.argv else looks()))
 """
 
 # Prints by how much the process grows while it draws and finds as often as before [bytes].
@@ -200,6 +200,28 @@ def looks() -> dict[str, NDArray[Any]]:
     return seen
 
 
+def bent_looks() -> dict[str, NDArray[Any]]:
+    """Draw and find what lenses bend, on the device that was started; one shows nothing beyond its limit."""
+    seen: dict[str, NDArray[Any]] = {}
+    intrinsics = {"fx": 240, "fy": 248, "cx": 148, "cy": 124}
+    for model, k1 in (("pinhole", -0.5), ("fisheye", -0.05)):
+        camera = {"eye": [0.05, -0.2, 0.3], "target": [0, 0, 0], "intrinsics": intrinsics, "outside": "background"}
+        camera["distortion"] = {"model": model, "k1": k1, "k2": 0.01}
+        made = with_instruments(drawable((41, 41), size=[320, 240], camera=camera, shading="tissue", wireframe=True))
+        position, view_now, texture = draped(made), view(made), speckle(300, 400)
+        placed = rods(made, position, 0)
+        drawn = Drawing(made, texture, drawing_config(made, labels=True)).look(position, rods=placed)
+        assert drawn.labels is not None
+        seen[f"{model}_picture"] = np.asarray(drawn.picture)
+        seen |= {f"{model}_{name}": value for name, value in drawn.labels._asdict().items()}
+        moved = position + np.array([0.002, 0.001, 0])
+        placed_then = rods(made, moved, 0)
+        flow = find_flow(made, drawn.labels.coordinates, moved, view_now, placed_then)
+        seen[f"{model}_flow"], seen[f"{model}_occlusion"] = flow
+        seen[f"{model}_pixels"], seen[f"{model}_hidden"] = find(made, track_grid(60), position, view_now, placed)
+    return seen
+
+
 def draped(made: Scene) -> NDArray[np.float64]:
     """A sheet with a dent, whose right third is folded over the middle."""
     position = rest_positions(made.sheet)
@@ -216,16 +238,41 @@ def test_large_pictures_labels_and_tracks_are_those_of_the_cpu(tmp_path: Path, r
     # f32 has a place in 512 pixels to 2^-15 px. So of all outlines, some 5,000 px long, less than a pixel's centre lies
     # where they may be drawn otherwise, and in the picture four samples; 26 pixels are allowed.
     for name in ("picture", "row", "dot"):
-        assert here[name].std() > 20, "something is drawn"
-        apart = np.abs(there[name].astype(int) - here[name].astype(int)).max(axis=-1)
-        assert (apart > 1).mean() < 1e-4, name
-        assert (apart == 1).mean() < 1e-3, name
+        same_picture(there[name], here[name])
     for name in ("label_coordinates", "label_depth", "flow", "pixels"):
-        # NaN where no sheet is seen.
-        assert (~np.isclose(there[name], here[name], rtol=1e-5, atol=1e-5, equal_nan=True)).mean() < 1e-4, name
+        same_numbers(there[name], here[name])
     for name in ("label_instrument", "occlusion", "hidden"):
-        assert 0 < (here[name] > 0).mean() < 1, "some are, some are not"
-        assert (there[name] != here[name]).mean() < 1e-4, name
+        same_mask(there[name], here[name])
+
+
+def test_bent_pictures_labels_and_tracks_are_those_of_the_cpu(tmp_path: Path, root: Path, device: Device) -> None:
+    done = vulkan(str(DRIVERS[0]), "-c", LOOKS, str(tmp_path / "seen.npz"), "bent", root=root)
+    assert done.returncode == 0, done.stderr
+    there, here = np.load(tmp_path / "seen.npz"), bent_looks()
+    for model in ("pinhole", "fisheye"):
+        same_picture(there[f"{model}_picture"], here[f"{model}_picture"])
+        for name in ("coordinates", "depth", "flow", "pixels"):
+            same_numbers(there[f"{model}_{name}"], here[f"{model}_{name}"])
+        for name in ("instrument", "occlusion", "hidden"):
+            same_mask(there[f"{model}_{name}"], here[f"{model}_{name}"])
+    assert np.isnan(here["pinhole_coordinates"][0, 0]).all(), "beyond the limit"
+
+
+def same_picture(there: NDArray[Any], here: NDArray[Any]) -> None:
+    assert here.std() > 20, "something is drawn"
+    apart = np.abs(there.astype(int) - here.astype(int)).max(axis=-1)
+    assert (apart > 1).mean() < 1e-4
+    assert (apart == 1).mean() < 1e-3
+
+
+def same_numbers(there: NDArray[Any], here: NDArray[Any]) -> None:
+    # NaN where no sheet is seen.
+    assert (~np.isclose(there, here, rtol=1e-5, atol=1e-5, equal_nan=True)).mean() < 1e-4
+
+
+def same_mask(there: NDArray[Any], here: NDArray[Any]) -> None:
+    assert 0 < (here > 0).mean() < 1, "some are, some are not"
+    assert (there != here).mean() < 1e-4
 
 
 def test_what_a_picture_takes_is_given_back(root: Path) -> None:

@@ -7,8 +7,10 @@ import io
 import json
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
+from dataclasses import replace
 from functools import partial
 from importlib import import_module
+from itertools import chain
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -16,7 +18,7 @@ import numpy as np
 
 from taichi_msm.arguments import require_path
 from taichi_msm.errors import ArgumentError, FilesError, SceneError, did_you_mean, writing
-from taichi_msm.exports.formats import FORMATS
+from taichi_msm.exports.formats import ANY, FORMATS
 from taichi_msm.exports.sources import Source, Write, read_runs
 from taichi_msm.outputs.table import numbered
 from taichi_msm.progress import Count
@@ -56,6 +58,7 @@ def export(
     format: str,  # noqa: A002
     out: str | Path | None = None,
     progress: Count = lambda done, total: None,
+    camera: str | None = None,
 ) -> Exported:
     """Convert the results of runs for another program, whole or not at all.
 
@@ -64,10 +67,11 @@ def export(
 
     Args:
         runs: the folder of a run, or that of a sweep, of which all complete runs are taken; or several of them.
-        format: kitti, tapvid, vtk, gltf or obj.
+        format: kitti, tapvid, tapvid3d, stir, vtk, gltf, obj or csv.
         out: where the files go; None: into export-FORMAT, in the folder if it is one, in output if they are several.
         progress: called often, with the frames done and the frames in all; what it raises stops the export, and no file
             changes.
+        camera: of runs with several cameras, the name of the one whose pictures, labels and tracks are taken.
 
     Returns:
         The `directory` where the files are; the names of the `files` in it; and `notes`, a line each, on what is left
@@ -91,9 +95,12 @@ def export(
         raise ArgumentError("runs: []; take the folder of a run or of a sweep, or several")
     if format not in list(FORMATS):
         raise ArgumentError(f"format: {format!r}; take one of {', '.join(FORMATS)}{did_you_mean(str(format), FORMATS)}")
+    if camera is not None and FORMATS[format].cameras != ANY:
+        raise ArgumentError(f"camera: {camera!r}; {format} has no choice of a camera; leave it out")
     directory = _default(directories, format) if out is None else Path(out)
     finished, left_out = read_runs(directories)
-    exported = _convert(finished, format, directory, progress)
+    views = [_views(run, format, camera) for run in finished]
+    exported = _convert(views, format, directory, progress)
     if left_out:
         of_all = f"{left_out} of {left_out + len(finished)} runs"
         exported.notes.insert(0, f"left out, as not complete: {of_all}; table.csv of the sweep tells why")
@@ -105,10 +112,29 @@ def _default(directories: Sequence[str | Path], name: str) -> Path:
     return without_link(folder / f"export-{name}", "--out")
 
 
-def _convert(runs: Sequence[FinishedRun], name: str, directory: Path, progress: Count) -> Exported:
-    """Convert runs, one or more."""
+def _views(run: FinishedRun, name: str, camera: str | None) -> list[FinishedRun]:
+    """Find the results of each camera that a format shows; of the run alone if it shows none, or one without a name."""
+    shown, known = FORMATS[name].cameras, run.cameras()
+    if not shown or (shown == ANY and camera is None and not known):
+        return [run]
+    wanted = shown if shown != ANY else () if camera is None else (camera,)
+    if wanted and set(wanted) <= set(known):
+        return [replace(run, camera=each) for each in wanted]
+    said = f"its cameras are {', '.join(known)}" if known else "it has one camera, without a name"
+    if shown != ANY:
+        said = f"{name} needs the cameras {' and '.join(wanted)}; {said}; run the scene with `cameras` of these names"
+    elif camera is None:
+        said = f"{said}; choose one with --camera"
+    else:
+        said = f"no camera {camera!r}; {said}{did_you_mean(camera, known)}"
+    raise FilesError(f"{run.directory}: {said}")
+
+
+def _convert(views: Sequence[Sequence[FinishedRun]], name: str, directory: Path, progress: Count) -> Exported:
+    """Convert runs, one or more, as the cameras have seen them that the format shows."""
+    runs = [run for run, *_ in views]
     wanted, total, done = FORMATS[name], sum(run.frames for run in runs), 0
-    write: Write = import_module(f"taichi_msm.exports.{name}").write
+    write: Write = import_module(f"taichi_msm.exports.{wanted.module or name}").write
     sources = []
     for number, run in enumerate(runs):
         own = partial(_count, progress, done, run.frames, total)
@@ -117,11 +143,11 @@ def _convert(runs: Sequence[FinishedRun], name: str, directory: Path, progress: 
     progress(0, total)
     notes: dict[str, list[Path]] = {}
     with writing(directory), Publication(directory, EXPORT) as publication:
-        for run in runs:
+        for run in chain.from_iterable(views):
             with run.unchanged():
                 if missing := [key for key in wanted.needs if not run.has(key)]:
                     remedy = run.remedy(*wanted.needs, *wanted.uses)
-                    raise FilesError(f"{run.directory}: {name} needs {' and '.join(missing)}; {remedy}")
+                    raise FilesError(f"{run.directory / run.camera}: {name} needs {' and '.join(missing)}; {remedy}")
         writer = write(sources, publication.staged)
         for run in runs:
             with _naming(run, name), run.unchanged():

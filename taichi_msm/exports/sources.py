@@ -18,7 +18,7 @@ from taichi_msm.results.finished_run import FinishedRun, read_run, reading
 class Source(NamedTuple):
     """A run that is exported."""
 
-    run: FinishedRun
+    run: FinishedRun  # as the first camera that the format shows has seen it
     name: str  # its number among the runs; empty if it is the only one
     progress: Count  # of this run
 

@@ -5,7 +5,8 @@ One pickle like that of TAP-Vid-DAVIS: a dictionary from the name of each video,
     video      frames, uint8, shape (frames, height, width, 3)
     points     where each point is, float32, shape (tracks, frames, 2): x / width and y / height, 0 at the left and the
                upper edge of the picture, so that the centre of the first pixel is at (0.5 / width, 0.5 / height)
-    occluded   whether it is hidden or outside the picture, bool, shape (tracks, frames)
+    occluded   whether it is hidden or outside the picture, bool, shape (tracks, frames);
+               behind the eye it is at (0, 0)
 
 Its readers multiply `points` by width and height to get pixels, with the origin at the picture's upper left corner.
 
@@ -16,7 +17,6 @@ from __future__ import annotations
 
 import math
 import pickle
-import zipfile
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
@@ -26,9 +26,9 @@ from numpy.typing import NDArray
 
 from taichi_msm.errors import FilesError
 from taichi_msm.exports.sources import Source
-from taichi_msm.outputs.npz import read_rows
+from taichi_msm.exports.tracks import read_tracks
 from taichi_msm.progress import Count
-from taichi_msm.results.finished_run import FinishedRun, damaged, reading
+from taichi_msm.results.finished_run import FinishedRun
 from taichi_msm.results.whole import create
 from taichi_msm.system.resources import available_memory
 
@@ -71,23 +71,9 @@ def _video(run: FinishedRun, progress: Count) -> dict[str, NDArray[Any]]:
     """Read the frames and tracks of a run."""
     width, height = run.scene.render.size
     points, occluded = read_tracks(run)
+    points = np.nan_to_num(points)
     video = np.empty((run.frames, height, width, 3), np.uint8)
     for frame in range(run.frames):
         progress(frame, run.frames)
         video[frame] = run.picture("png", frame)
     return {"video": video, "points": (points / (width, height)).astype(np.float32), "occluded": occluded}
-
-
-def read_tracks(run: FinishedRun) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
-    """Read where each point is [px], shape (tracks, frames, 2), and whether it is hidden, shape (tracks, frames).
-
-    A point behind the eye has no place in the picture's plane; it is hidden and at (0, 0).
-    """
-    path = run.result("tracks")
-    with reading(path), zipfile.ZipFile(path) as archive:
-        points = read_rows(archive, "points", np.float32, (run.frames, 2))
-        occluded = read_rows(archive, "occluded", np.bool_, (run.frames,))
-    somewhere = np.isfinite(points).all(axis=-1)
-    if points.shape[:2] != occluded.shape or not (somewhere | occluded).all():
-        raise damaged(path)
-    return np.where(somewhere[..., None], points, np.float32(0)), occluded

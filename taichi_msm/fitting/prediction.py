@@ -33,7 +33,7 @@ SMOOTH, ROUGH = 1e-5, 1e-2
 class Predicted(NamedTuple):
     """What would be seen."""
 
-    values: Array  # as in the observations, shape (N, T, 3 or 2); NaN: behind the eye
+    values: Array  # as in the observations, shape (N, T, 3 or 2); NaN: not seen by the camera
     forces: Array  # shape (rows, 3)
     steps: int  # of a frame
     motion: Array  # the farthest that any of the points is from rest, at every frame that was simulated [m]
@@ -147,7 +147,7 @@ class Predictor:
         motion = np.linalg.norm(np.array(points) - rest, axis=2).max(axis=1)
         values = between(np.array(points), self._place).swapaxes(0, 1)
         if seen.kind == "pixel":
-            values = seen_by_camera(scene, values)
+            values = seen_by_camera(scene, values, seen.time)
         felt = np.empty((0, 3))
         if seen.forces is not None:
             felt = between(np.array(forces), self._force_place)[np.arange(len(self._force_place)), seen.forces.probe]
@@ -206,21 +206,19 @@ def places_at_rest(coordinates: Array, sheet: Sheet) -> Array:
     return np.stack([(across - 0.5) * width, (0.5 - down) * height, np.zeros_like(across)], axis=1)
 
 
-def seen_by_camera(scene: Scene, points: Array) -> Array:
-    """Find where the scene's camera sees points [m], shape (N, T, 3); NaN: behind the eye.
+def seen_by_camera(scene: Scene, points: Array, time: Array) -> Array:
+    """Find where the scene's main camera sees points [m], shape (N, T, 3), at T times [s].
 
-    Returns pixels from the picture's upper left corner, shape (N, T, 2).
+    Returns pixels from the picture's upper left corner, shape (N, T, 2); NaN: behind the eye, or beyond the lens.
     """
-    camera = view(scene)
-    x, y, w, _ = np.moveaxis(camera.project(points), -1, 0)
-    w = np.where(w > camera.near, w, np.nan)
-    return np.stack([x / w, y / w], axis=-1)
+    seen = [view(scene, each).pixels(points[:, n]) for n, each in enumerate(time.tolist())]
+    return np.stack(seen, axis=1)
 
 
 def seen_at_rest(scene: Scene, seen: Observations) -> Array:
     """Give what would be seen if the sheet stayed at rest, shape (N, T, 3 or 2)."""
     rest = np.repeat(places_at_rest(seen.coordinates, scene.sheet)[:, None], len(seen.time), axis=1)
-    return rest if seen.kind == "position" else seen_by_camera(scene, rest)
+    return rest if seen.kind == "position" else seen_by_camera(scene, rest, seen.time)
 
 
 # The predictor of the job that this process was given last.

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Collection, Iterable, Iterator
+from collections.abc import Collection, Iterable, Iterator, Mapping
 from typing import Literal, NamedTuple
 
 # Of a run's files these two belong to no entry of `output`: the record, and the matrices of the camera.
@@ -13,23 +13,36 @@ RECORD, CAMERA = "run.json", "camera.json"
 SWEEP, RUNS = "sweep.json", "runs"
 NUMBERED = r"[0-9]{6,}"
 
+# What the names of folders begin with that exports go to by default.
+EXPORTS = "export-"
+
+# The names of cameras, of which each has a folder.
+MAX_NAME = 64
+CAMERA_NAME = rf"[a-z0-9_-]{{1,{MAX_NAME}}}"
+
 # The number in the name of a frame's file.
 FIRST, NUMBER = "0000", r"(?:[0-9]{4}|[1-9][0-9]{4,14})"
+
+
+# The columns of the table of forces.
+FORCES_HEADER = ("time", "probe", "tip_x", "tip_y", "tip_z", "force_x", "force_y", "force_z")
 
 
 class Output(NamedTuple):
     """An entry of a scene's `output`.
 
-    Of labels and flow, the field of `Labels` or `Flow` with the output's name is written, in the format of the suffix.
+    Of labels, flow and stereo, the field of `Labels`, `Flow` or `Stereo` with the output's name is written, in the
+    format of the suffix.
     """
 
     name: str
     file: str  # with a folder, that of the first frame of a series
     # Field of `Observed`; positions and forces: none.
-    source: Literal["picture", "labels", "flow", "tracks", "positions", "forces"]
+    source: Literal["picture", "labels", "flow", "stereo", "tracks", "positions", "forces"]
     means: str  # what the file holds, for users
     pixel_bytes: float = 0  # the most that a pixel takes in a file, as one of noise; 0: the size is not by pixels
     needs_camera: bool = False  # whether it can be used only with the camera's matrices
+    of_pair: bool = False  # whether only a camera that others are beside has it
 
     @property
     def result(self) -> str:
@@ -40,6 +53,11 @@ class Output(NamedTuple):
     def is_series(self) -> bool:
         """Whether there is a file for every frame."""
         return "/" in self.file
+
+    @property
+    def is_seen(self) -> bool:
+        """Whether it depends on what a camera sees; in a run with several cameras each has its own."""
+        return self.source not in ("positions", "forces")
 
     @property
     def until_next(self) -> bool:
@@ -63,11 +81,15 @@ class Output(NamedTuple):
 def _rows() -> Iterator[Output]:
     """Give the table, in the order in which errors and help name the outputs.
 
-    PNGs store pixels of noise, codes of a GIF have 12 bits, and masks have two values; most pictures take a half or a
-    third of that.
+    PNGs store pixels of noise, codes of a GIF have 12 bits, films in yuv420p 12 bits a pixel before they are encoded,
+    and masks two values; most pictures take a half or a third of that.
     """
     yield Output("png", "frames/0000.png", "picture", "the picture", pixel_bytes=3.01)
     yield Output("gif", "animation.gif", "picture", "the pictures as an animation", pixel_bytes=1.51)
+    means = (
+        "the pictures as a film, H.264 in yuv420p; an odd last row or column is repeated; needs PyAV (`pip install av`)"
+    )
+    yield Output("mp4", "animation.mp4", "picture", means, pixel_bytes=1.6)
     means = "`time` [s], shape (frames,), and `position` of the mass points [m], shape (frames, rows, cols, 3)"
     yield Output("trajectory", "trajectory.npz", "positions", means)
     means = (
@@ -87,17 +109,28 @@ def _rows() -> Iterator[Output]:
     )
     yield Output("depth", "depth/0000.tiff", "labels", means, pixel_bytes=4, needs_camera=True)
     means = (
+        "float32 (height, width, 3): the unit normal of what is seen, of the drawn triangle without relief or of the "
+        "instrument, toward the camera, in its axes (x right, y down, z forward); NaN: background"
+    )
+    yield Output("normals", "normals/0000.npy", "labels", means, pixel_bytes=12, needs_camera=True)
+    means = (
         "Middlebury's format: how far what is seen moves until the next frame, right and down [px], hidden there or "
-        "not; 1e10: no sheet, or it goes behind the eye"
+        "not; 1e10: no sheet, or it goes behind the eye or beyond the lens's limit"
     )
     yield Output("flow", "flow/0000.flo", "flow", means, pixel_bytes=8, needs_camera=True)
     means = "255 where what is seen is hidden or outside the picture in the next frame, else 0"
     yield Output("occlusion", "occlusion/0000.png", "flow", means, pixel_bytes=0.5)
+    means = (
+        "of a camera that another one is beside: float32, how far to the left what is seen is in the picture of the "
+        "first of those [px], fx × baseline / depth; 0: background"
+    )
+    yield Output("disparity", "disparity/0000.tiff", "stereo", means, pixel_bytes=4, needs_camera=True, of_pair=True)
     means = "255 where an instrument is seen, else 0"
     yield Output("instrument", "instrument/0000.png", "labels", means, pixel_bytes=0.5)
     means = (
         "of `render.tracks` × `render.tracks` points in the middle of equal fields of the sheet: `coordinates` (N, 2), "
-        "`points` (N, frames, 2) [px] from the picture's upper left corner, NaN behind the eye, `occluded` (N, frames)"
+        "`points` (N, frames, 2) [px] from the picture's upper left corner, NaN behind the eye, `occluded` (N, frames) "
+        "and `position` (N, frames, 3) [m] in the world, on the drawn surface"
     )
     yield Output("tracks", "tracks.npz", "tracks", means, needs_camera=True)
 
@@ -109,23 +142,45 @@ def numbered(number: int) -> str:
 
 OUTPUTS = {output.name: output for output in _rows()}
 
-# The names of all files that a run writes, as regular expressions.
-PATTERNS = (*(output.pattern for output in OUTPUTS.values()), re.escape(CAMERA), re.escape(RECORD))
+# The folders with a file for every frame, each with its output.
+FOLDERS = {output.result: output for output in OUTPUTS.values() if output.is_series}
+
+# The names of all files that a run writes, as regular expressions. What a camera with a name sees is in its folder.
+_SEEN = [*(output.pattern for output in OUTPUTS.values() if output.is_seen), re.escape(CAMERA)]
+PATTERNS = (
+    *_SEEN,
+    *(f"{CAMERA_NAME}/{pattern}" for pattern in _SEEN),
+    *(output.pattern for output in OUTPUTS.values() if not output.is_seen),
+    re.escape(RECORD),
+)
 
 
-def results(names: Collection[str]) -> list[str]:
-    """Name the results of a run with these outputs as run.json does: folders, files, the camera, the record."""
-    chosen = [output for name, output in OUTPUTS.items() if name in names]
-    chosen.sort(key=lambda output: not output.is_series)
-    camera = [CAMERA] if any(output.needs_camera for output in chosen) else []
-    return [*(output.result for output in chosen), *camera, RECORD]
+def results(folders: Mapping[str, Collection[str]]) -> list[str]:
+    """Name the results of a run, whose outputs go to these folders, as run.json does.
+
+    They are: folders with a file for every frame; files; those of the cameras; the record.
+    """
+    chosen = [(folder, output) for output in OUTPUTS.values() for folder in folders if output.name in folders[folder]]
+    chosen.sort(key=lambda each: not each[1].is_series)
+    described = dict.fromkeys(folder for folder, output in chosen if output.needs_camera)
+    names = [*((folder, output.result) for folder, output in chosen), *((folder, CAMERA) for folder in described)]
+    return [*(f"{folder}/{name}" if folder else name for folder, name in names), RECORD]
 
 
 def file_names(results: Iterable[str], frames: int) -> list[str]:
     """List the files of a run with this many frames, by the names of its results."""
-    outputs = {output.result: output for output in OUTPUTS.values() if output.is_series}
     names: list[str] = []
     for result in results:
-        output = outputs.get(result)
-        names += [output.path(n) for n in range(output.count(frames))] if output else [result]
+        folder, slash, name = result.rpartition("/")
+        output = FOLDERS.get(name)
+        names += [f"{folder}{slash}{output.path(n)}" for n in range(output.count(frames))] if output else [result]
     return names
+
+
+def listed(results: Collection[str], frames: int, name: str) -> bool:
+    """Tell whether a file is one of a run with these results and so many frames."""
+    folder, _, file = name.rpartition("/")
+    output, number = FOLDERS.get(folder.rpartition("/")[2]), file.partition(".")[0]
+    if output is None or not number.isdecimal():
+        return name in results
+    return folder in results and int(number) < output.count(frames)

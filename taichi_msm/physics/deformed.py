@@ -32,17 +32,33 @@ def touched(position: NDArray[np.floating], refine: int, sheet: Sheet, rest: Arr
     Returns:
         The point [m], and the unit normal of its cell there, upward at rest; both of shape (3,).
     """
-    (height, width), (rows, cols), parts = sheet.size, sheet.points, refine + 1
+    height, width = sheet.size
     across = min(1.0, max(0.0, rest[0] / width + 0.5))
     down = min(1.0, max(0.0, 0.5 - rest[1] / height))
-    j, i = min(int(across * (cols - 1)), cols - 2), min(int(down * (rows - 1)), rows - 2)
-    a, right, below, far = (position[i + n // 2, j + n % 2].astype(np.float64) for n in range(4))
-    b, c, d = right - a, below - a, far - right - below + a
-    s, t = across * (cols - 1) - j, down * (rows - 1) - i
-    normal = np.cross(b + d * t, -(c + d * s))
-    s0, t0 = min(int(s * parts), parts - 1) / parts, min(int(t * parts), parts - 1) / parts
-    s1, t1 = s - s0, t - t0
-    # In the small quad, D s t is replaced by a function that is linear on either side of the diagonal.
-    point = a + b * s + c * t + d * (s0 * t0 + s1 * t0 + s0 * t1 + min(s1, t1) / parts)
+    point, normal = (each[0] for each in _on_cells(position, refine, np.array([[across, down]])))
     beside = np.array([rest[0] - (across - 0.5) * width, rest[1] - (0.5 - down) * height, 0.0])
     return point + beside, normal / max(float(np.linalg.norm(normal)), 1e-300)
+
+
+def on_surface(position: NDArray[np.floating], refine: int, coordinates: NDArray[np.floating]) -> Array:
+    """Place material points on the refined surface [m], shape (n, 3).
+
+    `coordinates` are fractions of the sheet's width from its left and of its height from its top, shape (n, 2);
+    `position` and `refine` as for `touched`.
+    """
+    return _on_cells(position, refine, coordinates.astype(np.float64))[0]
+
+
+def _on_cells(position: NDArray[np.floating], refine: int, coordinates: Array) -> tuple[Array, Array]:
+    """Give the points at some coordinates, and normals of their cells there, of any length; both of shape (n, 3)."""
+    (rows, cols), parts = position.shape[:2], refine + 1
+    s, t = (coordinates * (cols - 1, rows - 1)).T[..., None]
+    j, i = np.minimum(s.astype(int), cols - 2), np.minimum(t.astype(int), rows - 2)
+    a, right, below, far = (position[i[:, 0] + n // 2, j[:, 0] + n % 2].astype(np.float64) for n in range(4))
+    b, c, d = right - a, below - a, far - right - below + a
+    s, t = s - j, t - i
+    normal = np.cross(b + d * t, -(c + d * s))
+    s0, t0 = (np.minimum((each * parts).astype(int), parts - 1) / parts for each in (s, t))
+    s1, t1 = s - s0, t - t0
+    # In the small quad, D s t is replaced by a function that is linear on either side of the diagonal.
+    return a + b * s + c * t + d * (s0 * t0 + s1 * t0 + s0 * t1 + np.minimum(s1, t1) / parts), normal

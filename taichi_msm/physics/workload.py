@@ -75,5 +75,5 @@ def _steps(plan: Plan) -> float:
 
 def _other(scene: Scene) -> float:
     """Count the work of everything but stepping."""
-    pixels = (scene.time.frames + 1) * math.prod(scene.render.size) if scene.renders else 0
+    pixels = (scene.time.frames + 1) * math.prod(scene.render.size) * len(scene.render.all_cameras) * scene.renders
     return START + pixels * (ENCODING + SAMPLE * scene.render.supersample**2)

@@ -4,8 +4,8 @@ from typing import Any, NamedTuple
 
 from taichi_msm.render import style
 from taichi_msm.render import uniforms as uni
-from taichi_msm.render.geometry import POINT_NUMBERS, on_triangle
-from taichi_msm.render.samples import keep
+from taichi_msm.render.geometry import POINT_NUMBERS, facet, on_triangle
+from taichi_msm.render.samples import keep, keep_unit, steps
 from taichi_msm.system.runtime import ti
 
 # The numbers of the unit normal at a mass point; normals are stored after the other numbers of all mass points.
@@ -24,6 +24,7 @@ class DrawnSheet(NamedTuple):
     parts: Any  # small quads along a side of a cell
     texture_width: Any  # [texels]
     texture_height: Any
+    bent: Any  # entry of `point` where what `store_bent` stored begins, if there is a lens
 
 
 class Cell(NamedTuple):
@@ -107,7 +108,7 @@ def absolute(values):
 def headlight(normal: ti.template(), numbers: ti.template()):
     """Share of the headlight that is reflected: the cosine between the normal and the direction to the light."""
     length = ti.sqrt(normal[0] * normal[0] + normal[1] * normal[1] + normal[2] * normal[2])
-    toward = uni.AXES + 6
+    toward = uni.HEADLIGHT
     cosine = absolute(normal[0] * numbers[toward] + normal[1] * numbers[toward + 1] + normal[2] * numbers[toward + 2])
     cosine = cosine / ti.max(length, 1e-30)
     # Where a point is infinite or NaN, so is its normal.
@@ -115,7 +116,7 @@ def headlight(normal: ti.template(), numbers: ti.template()):
 
 
 @ti.func
-def footprint(x, y, s, t, texels_x, texels_y, triangle: ti.template()):
+def footprint(at, x, y, s, t, texels_x, texels_y, triangle: ti.template(), band: ti.template()):
     """Square of the larger of a sample's width and height on the texture, in units of style.SHARP texels.
 
     With x = X / w the derivatives of (x, y) with respect to (s, t) are (R_1, D_1; R_2, D_2) / w, where
@@ -130,6 +131,10 @@ def footprint(x, y, s, t, texels_x, texels_y, triangle: ti.template()):
     # Written as in `on_triangle`, so that the compiler computes it once.
     share = 1.0 / (r_1 * d_2 - r_2 * d_1)
     scale = (p[2] + r[2] * s + d[2] * t) * share
+    if ti.static(band.config.place_steps):
+        step = steps(at, band)
+        d_2, d_1 = d_2 * step[0] - d_1 * step[1], d_1 * step[3] - d_2 * step[2]
+        r_2, r_1 = r_2 * step[0] - r_1 * step[1], r_1 * step[3] - r_2 * step[2]
     across_1, across_2, down_1, down_2 = d_1 * texels_x, d_2 * texels_x, r_1 * texels_y, r_2 * texels_y
     largest = ti.max(across_1 * across_1 + down_1 * down_1, across_2 * across_2 + down_2 * down_2)
     square = largest * (scale * scale) * (1.0 / (style.SHARP * style.SHARP))
@@ -163,11 +168,13 @@ def store(
     if ti.static(config.labels):
         keep(at + plane.across, visible, (cell.j + across) / cell.across, samples)
         keep(at + plane.down, visible, (cell.i + along) / cell.down, samples)
+    if ti.static(config.normals):
+        keep_unit(at + plane.facet_x, visible, facet(x, y, triangle, band.numbers), samples)
     if ti.static(config.headlit):
         normal = normal_at(across, along, cell, sheet)
         keep(at + plane.light, visible, headlight(normal, band.numbers), samples)
     if ti.static(config.tissue):
-        size, front = footprint(x, y, s, t, cell.step_x * part, cell.step_y * part, triangle)
+        size, front = footprint(at, x, y, s, t, cell.step_x * part, cell.step_y * part, triangle, band)
         # On the side that is seen of the triangle: at a fold, the interpolated normal may lean the other way.
         normal = normal_at(across, along, cell, sheet)
         keep(at + plane.normal_x, visible, normal[0] * front, samples)
@@ -175,8 +182,12 @@ def store(
         keep(at + plane.normal_z, visible, normal[2] * front, samples)
         keep(at + plane.footprint, visible, size, samples)
     if ti.static(config.wireframe):
-        s_right, t_right = on_triangle(x + 1.0, y, triangle)
-        s_below, t_below = on_triangle(x, y + 1.0, triangle)
+        right_x, right_y, below_x, below_y = x + 1.0, y, x, y + 1.0
+        if ti.static(config.place_steps):
+            step = steps(at, band)
+            right_x, right_y, below_x, below_y = x + step[0], y + step[1], x + step[2], y + step[3]
+        s_right, t_right = on_triangle(right_x, right_y, triangle)
+        s_below, t_below = on_triangle(below_x, below_y, triangle)
         distance = ti.min(
             distance_to_line(across, (column + s_right) * part, (column + s_below) * part),
             distance_to_line(along, (line + t_right) * part, (line + t_below) * part),

@@ -4,14 +4,16 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from taichi_msm.errors import Problem, SceneError
+from taichi_msm.errors import Key, Problem, SceneError
 from taichi_msm.faults import SMALLEST
-from taichi_msm.scene import MAX_SUPERSAMPLE, Camera, Scene
+from taichi_msm.render.camera_path import OPENCV, at_time, placed, unit
+from taichi_msm.render.lens import WIDEST, Lens
+from taichi_msm.scene import MAX_SUPERSAMPLE, WHOLE, Camera, Scene
 
 Array = NDArray[np.float64]
 
@@ -26,106 +28,283 @@ NEAR = 1e-6
 # The largest number of a camera's matrix that kernels can hold, in f32 and multiplied by the samples along a pixel.
 LARGEST_NUMBER = float(np.finfo(np.float32).max) / MAX_SUPERSAMPLE
 
+# A camera may be this many times the sheet's larger side away from the one that it is beside.
+FARTHEST = 1e6
+
+# A matrix that is farther from orthonormal than this is no rotation.
+ORTHONORMAL = 1e-3
+
+# The lens that bends no lines.
+UNBENT = Lens(fisheye=False, coefficients=(0.0,) * 8)
+
+# The keys of a camera that do not tell where it is.
+OPTICS = {"fov", "intrinsics", "distortion", "outside"}
+
 
 class View(NamedTuple):
     """A camera that was set up: the map from points to pixels.
 
-    A point's place in the camera's frame is (right, up, -depth) [m] from the eye. It is seen at
+    A point's place in the camera's frame is (right, up, -depth) [m] from the eye. Without distortion it is seen at
 
-        x = centre_x + right / w scale,    y = centre_y - up / w scale    [px]
+        x = centre_x + right / w scale_x,    y = centre_y - up / w scale_y    [px]
 
     from the top-left corner, with w = depth for a pinhole camera, and w = 1 for the orthographic one, whose eye may be
-    anywhere on its plane.
+    anywhere on its plane. A lens moves it from there.
     """
 
     matrix: Array  # maps (x, y, z, 1) [m] to (X, Y, w, depth) with x = X / w, y = Y / w, shape (4, 4)
     near: float  # only what has a larger w than this is drawn [m]
     axes: Array  # unit vectors right, up and toward the camera and its headlight, as rows, shape (3, 3)
     eye: Array  # origin of depth and of the camera's frame [m], shape (3,)
-    scale: float  # pixels per metre at w = 1
-    centre: Array  # the middle of the picture [px], shape (2,)
-    distance: float  # from the eye to the point that it looks at [m]
+    scale: Array  # pixels per metre at w = 1, across and down, shape (2,)
+    centre: Array  # where the axis of view is seen [px], shape (2,)
+    size: Array  # width and height of the picture [px], shape (2,)
+    distance: float  # from the eye to the point that it looks at, of a moving camera when it begins [m]
     pinhole: bool
+    lens: Lens | None = None  # None: it bends no lines
+    baseline: float = 0.0  # to the first camera beside it, along its x axis [m]; 0: there is none
+    lamp: View | None = None  # the camera that has the light; None: itself
+
+    @property
+    def model(self) -> str:
+        """The model of the lens, pinhole or fisheye; empty if it bends no lines."""
+        return "" if self.lens is None else "fisheye" if self.lens.fisheye else "pinhole"
+
+    @property
+    def optics(self) -> tuple[object, ...]:
+        """The lens, and what the places of samples depend on besides; empty if it bends no lines."""
+        return () if self.lens is None else (self.lens, *self.scale, *self.centre)
 
     def project(self, points: Array) -> Array:
-        """Map points [m], shape (..., 3), to (X, Y, w, depth), shape (..., 4)."""
+        """Map points [m], shape (..., 3), to (X, Y, w, depth), without distortion, shape (..., 4)."""
         return points @ self.matrix[:, :3].T + self.matrix[:, 3]
+
+    def pixels(self, points: Array) -> Array:
+        """Find where points [m], shape (..., 3), are seen [px], shape (..., 2).
+
+        NaN for those behind the eye, or beyond the limit of the lens.
+        """
+        x, y, w, _ = np.moveaxis(self.project(points), -1, 0)
+        w = np.where(w > self.near, w, np.nan)
+        return self.distorted(np.stack([x / w, y / w], axis=-1))
+
+    def distorted(self, pixels: Array) -> Array:
+        """Give the places of the picture that a camera without its lens has at these; NaN beyond the lens's limit."""
+        if self.lens is None:
+            return pixels
+        place = (pixels - self.centre) / self.scale
+        # Written so that NaN is found too.
+        within = np.linalg.norm(place, axis=-1, keepdims=True) < self.lens.limit
+        return self.centre + self.scale * self.lens.distort(np.where(within, place, np.nan))
+
+    def undistorted(self, pixels: Array) -> Array:
+        """Give the inverse of `distorted`, to 1e-6 px; NaN where the lens shows nothing."""
+        if self.lens is None:
+            return pixels
+        return self.centre + self.scale * self.lens.undistort((pixels - self.centre) / self.scale)
+
+    def disparity(self, depth: NDArray[np.float32]) -> NDArray[np.float32]:
+        """Tell how far to the left what is seen at depths [m] is for the camera beside this one [px]; 0 for depth 0.
+
+        Neither may have a lens that bends lines.
+        """
+        w = np.where(depth == 0, np.inf, depth if self.pinhole else 1.0)
+        return (self.scale[0] * self.baseline / w).astype(np.float32)
 
     def sight(self, pixel: tuple[float, float]) -> View:
         """Give a view in which what is seen at the centre of a pixel, right and down from (0, 0), has X = Y = 0."""
-        matrix = self.matrix.copy()
+        matrix, place = self.matrix.copy(), self.undistorted(np.array(pixel) + 0.5)
         for row in (0, 1):
-            matrix[row] -= (pixel[row] + 0.5) * matrix[2]
+            matrix[row] -= place[row] * matrix[2]
         return self._replace(matrix=matrix)
 
 
-def calibration(camera: View) -> dict[str, list[list[float]]]:
+def calibration(camera: View) -> dict[str, Any]:
     """Describe a camera by the matrices that other programs use.
 
     Returns:
-        projection: 3 x 4, with pixel = (P [x y z 1])_12 / (P [x y z 1])_3 from the picture's upper left corner. For a
-        pinhole also, in OpenCV's convention (x right, y down, z forward): intrinsics, 3 x 3; pose, 3 x 4, from the
-        world to the camera.
+        projection: 3 x 4, with pixel = (P [x y z 1])_12 / (P [x y z 1])_3 from the picture's upper left corner,
+        without distortion. For a pinhole also, in OpenCV's axes (x right, y down, z forward): intrinsics, 3 x 3; pose,
+        3 x 4, from the world to the camera; and in OpenCV's pixels, where the centre of the first one is (0, 0):
+        calibration, 3 x 3, with model and distortion, the coefficients in OpenCV's order.
     """
-    matrices = {"projection": camera.matrix[:3].tolist()}
+    matrices: dict[str, Any] = {"projection": camera.matrix[:3].tolist()}
     if camera.pinhole:
-        turn = camera.axes * np.array([[1.0], [-1.0], [-1.0]])
-        x, y = camera.centre.tolist()
-        matrices["intrinsics"] = [[camera.scale, 0.0, x], [0.0, camera.scale, y], [0.0, 0.0, 1.0]]
-        matrices["pose"] = np.concatenate([turn, -turn @ camera.eye[:, None]], axis=1).tolist()
+        (across, down), (x, y) = camera.scale.tolist(), camera.centre.tolist()
+        matrices["intrinsics"] = [[across, 0.0, x], [0.0, down, y], [0.0, 0.0, 1.0]]
+        matrices["pose"] = pose(camera)
+        lens = camera.lens or UNBENT
+        matrices["calibration"] = [[across, 0.0, x - 0.5], [0.0, down, y - 0.5], [0.0, 0.0, 1.0]]
+        matrices["model"] = "fisheye" if lens.fisheye else "pinhole"
+        matrices["distortion"] = list(lens.coefficients)
     return matrices
 
 
-def view(scene: Scene) -> View:
-    """Set up the scene's camera; raises a SceneError when it sees nothing."""
+def pose(camera: View) -> list[list[float]]:
+    """Give rotation and translation from the world to the camera, in OpenCV's axes, 3 x 4."""
+    turn = camera.axes * OPENCV
+    return np.concatenate([turn, -turn @ camera.eye[:, None]], axis=1).tolist()
+
+
+def view(scene: Scene, time: float = 0.0) -> View:
+    """Set up the scene's main camera at a time [s]; raises a SceneError when any of its cameras sees nothing."""
     if blind := [str(problem) for problem in camera_problems(scene)]:
         raise SceneError(blind)
-    camera = scene.render.camera
+    return view_at(scene, time)
+
+
+def view_at(scene: Scene, time: float, name: str = "") -> View:
+    """Set up the camera of a name, which is in order, of a scene at a time [s]; without a name the main one."""
+    render = scene.render
+    name = name or render.main
+    camera, away = render.origin(name)
     if camera == "top":
-        return _top(scene)
-    if isinstance(camera, Camera):
-        return _pinhole(camera, scene)
-    return _pinhole(_oblique(scene), scene)
+        seen = _top(scene)
+    else:
+        seen = _pinhole(camera if isinstance(camera, Camera) else _oblique(scene), scene, time)
+    if away:
+        shift, matrix = away * seen.axes[0], seen.matrix.copy()
+        matrix[:, 3] -= matrix[:, :3] @ shift
+        seen = seen._replace(matrix=matrix, eye=seen.eye + shift)
+    lamp = None if name == render.main else view_at(scene, time)
+    return seen._replace(baseline=render.baseline(name), lamp=lamp)
+
+
+def moves(scene: Scene, name: str = "") -> bool:
+    """Tell whether the camera of a name moves; without a name the main one."""
+    camera, _ = scene.render.origin(name or scene.render.main)
+    return isinstance(camera, Camera) and camera.moves
 
 
 def camera_problems(scene: Scene) -> Iterator[Problem]:
-    """Say why a pinhole camera sees nothing, or cannot be computed, if so."""
-    camera = scene.render.camera
-    if not isinstance(camera, Camera):
+    """Say why cameras see nothing, or cannot be computed, if so, and why there is no disparity that is asked for."""
+    sound = True
+    for name, camera in scene.render.all_cameras.items():
+        problem = next(_problems_of(camera, scene, name), None) if isinstance(camera, Camera) else None
+        if problem is not None:
+            at: Key = ("render", "cameras", name) if name else ("render", "camera")
+            yield Problem(at + problem.path, problem.message)
+            sound = False
+    if sound and scene.asks_for("stereo"):
+        yield from _disparity_problems(scene)
+
+
+def _problems_of(camera: Camera, scene: Scene, name: str) -> Iterator[Problem]:
+    """Find what is wrong with a camera; keys are those of its section."""
+    if camera.beside is None:
+        yield from _place_problems(camera, scene)
+        if camera.distortion is not None and camera.outside == "refuse":
+            yield from _lens_problems(view_at(scene, 0.0, name))
+    elif abs(scene.render.origin(name)[1]) > FARTHEST * max(scene.sheet.size):
+        said = f"puts it more than {FARTHEST:g} times the size of the sheet away; take a smaller number, in metres"
+        yield Problem(("baseline",), said)
+
+
+def _disparity_problems(scene: Scene) -> Iterator[Problem]:
+    """Find why there is no disparity."""
+    pairs = [name for name in scene.render.all_cameras if scene.render.baseline(name)]
+    if not pairs:
+        said = "disparity needs a camera beside another one; take render.cameras with {beside: NAME, baseline: metres}"
+        yield Problem(("output",), f"{said}, or leave it out")
+    for name in pairs:
+        if view_at(scene, 0.0, name).lens is not None:
+            said = f"disparity is along rows only without distortion, and {name} has one; leave out one of them"
+            yield Problem(("output",), said)
+            return
+
+
+def _place_problems(camera: Camera, scene: Scene) -> Iterator[Problem]:
+    """Find what is wrong with a camera's place, at any frame; keys are those of its section."""
+    if camera.pose is not None:
+        turn = np.array(camera.pose.rotation)
+        if not (np.abs(turn @ turn.T - np.eye(3)).max() <= ORTHONORMAL and np.linalg.det(turn) > 0):
+            said = "is no rotation; its rows are three unit vectors, right, down and forward, across each other"
+            yield Problem(("pose", "rotation"), said)
+            return
+    if camera.poses is not None:
+        begin, end, last = camera.poses[0][0], camera.poses[-1][0], scene.time.duration
+        slack = WHOLE / scene.time.frames_per_second
+        if begin > slack or end < last - slack:  # type: ignore[operator]
+            said = f"covers {begin:g} s to {end:g} s, but the scene goes from 0 s to {last:g} s; shorten time.duration"
+            yield Problem(("poses",), f"{said} or give the poses of all of it")
+            return
+    rate = scene.time.frames_per_second
+    for time in [frame / rate for frame in range(scene.time.frames + 1)] if camera.moves else [0.0]:
+        when = f" at {time:g} s" if camera.moves else ""
+        if camera.eye is not None:
+            eye, target, up = (list(at_time(value, time)) for value in (camera.eye, camera.target, camera.up))
+            sight = unit(np.subtract(eye, target))
+            if math.dist(eye, target) < SMALLEST:
+                yield Problem(("eye",), f"{eye} is also the target{when}; move one of them")
+                return
+            if not np.linalg.norm(np.cross(sight, unit(np.array(up)))) > 1e-9:
+                said = f"{up} is zero or along the line of sight{when}; take a direction across it"
+                yield Problem(("up",), said)
+                return
+        if np.abs(_pinhole(camera, scene, time).matrix).max() > LARGEST_NUMBER:
+            if camera.eye is not None and camera.intrinsics is None:
+                said = f"{eye} is too far away for {camera.fov:g} degrees{when}; move it nearer or widen fov"
+            else:
+                said = f"is too far away for its focal length{when}; move it nearer"
+            yield Problem((_place_key(camera),), said)
+            return
+
+
+def _place_key(camera: Camera) -> str:
+    """Name the key that gives the place of a camera."""
+    return next(name for name in ("eye", "pose", "poses") if getattr(camera, name) is not None)
+
+
+def _lens_problems(camera: View) -> Iterator[Problem]:
+    """Find where a lens folds back within the picture; keys are those of the camera's section."""
+    if camera.lens is None or not np.isnan(camera.undistorted(border(camera.size))).any():
         return
-    sight, up = _unit(np.subtract(camera.eye, camera.target)), _unit(np.array(camera.up))
-    if math.dist(camera.eye, camera.target) < SMALLEST:
-        yield Problem(("render", "camera", "eye"), f"{list(camera.eye)} is also the target; move one of them")
-    elif not np.linalg.norm(np.cross(sight, up)) > 1e-9:
-        yield Problem(
-            ("render", "camera", "up"),
-            f"{list(camera.up)} is zero or along the line of sight; take a direction across it",
-        )
-    elif np.abs(_pinhole(camera, scene).matrix).max() > LARGEST_NUMBER:
-        yield Problem(
-            ("render", "camera", "eye"),
-            f"{list(camera.eye)} is too far away for {camera.fov:g} degrees; move it nearer or widen fov",
-        )
+    end = "folds back" if camera.lens.limit < WIDEST else "reaches 88 degrees"
+    good = math.floor(camera.lens.rim * float(camera.scale.min()))
+    far = math.ceil(float(np.linalg.norm(border(camera.size) - camera.centre, axis=-1).max()))
+    said = f"{end} at {good} px from the principal point, and the picture reaches {far} px; take coefficients"
+    yield Problem(("distortion",), f"{said} that are good to there, or set outside: background")
 
 
-def pinhole(scene: Scene) -> Camera:
-    """Give the scene's camera as a pinhole camera; the orthographic one becomes one above the sheet, at equal scale."""
-    camera = scene.render.camera
+def border(size: Array) -> Array:
+    """List places along the edges of a picture of this width and height, one a pixel [px], shape (n, 2)."""
+    width, height = (int(side) for side in size)
+    across, down = np.arange(width + 1.0), np.arange(height + 1.0)
+    sides = [(across, 0 * across), (across, 0 * across + height), (0 * down, down), (0 * down + width, down)]
+    return np.concatenate([np.stack(side, axis=-1) for side in sides])
+
+
+def pinhole(scene: Scene, time: float = 0.0) -> Camera:
+    """Give the scene's main camera at a time [s] as a pinhole camera that stays there.
+
+    The orthographic one becomes one above the sheet, at equal scale.
+    """
+    camera = scene.render.main_camera
     if isinstance(camera, Camera):
-        return camera
+        return held(camera, time)
     if camera == "oblique":
         return _oblique(scene)
     half_height = scene.render.size[1] / 2 / _top_scale(scene)
     return Camera(eye=(0.0, 0.0, half_height / math.tan(math.radians(OBLIQUE_FOV) / 2)), fov=OBLIQUE_FOV)
 
 
+def held(camera: Camera, time: float) -> Camera:
+    """Give a camera that stays where another one is at a time [s], with an eye, a target and a direction up."""
+    if camera.pose is None and not camera.moves:
+        return camera
+    eye, axes, distance = placed(camera, time)
+    optics = {name: getattr(camera, name) for name in camera.model_fields_set & OPTICS}
+    target = eye - distance * axes[2]
+    return Camera(eye=tuple(eye.tolist()), target=tuple(target.tolist()), up=tuple(axes[1].tolist()), **optics)
+
+
 def turned(camera: Camera, right: float, up: float) -> Camera:
-    """Orbit a camera around its target: right about the sheet's normal, up about its own horizontal axis [rad]."""
-    across, _, toward = _axes(camera)
+    """Orbit a camera that stays in its place: right about the sheet's normal, up about its horizontal axis [rad]."""
+    eye, (across, _, toward), _ = placed(camera, 0.0)
     turn = _rotation(np.array([0.0, 0.0, 1.0]), right) @ _rotation(across, -up)
-    eye = np.array(camera.target) + turn @ np.subtract(camera.eye, camera.target)
+    moved = np.array(camera.target) + turn @ np.subtract(eye, camera.target)
     above = turn @ np.cross(toward, across)
-    return camera.model_copy(update={"eye": tuple(eye.tolist()), "up": tuple(above.tolist())})
+    return camera.model_copy(update={"eye": tuple(moved.tolist()), "up": tuple(above.tolist())})
 
 
 def _rotation(axis: Array, angle: float) -> Array:
@@ -148,46 +327,39 @@ def _top(scene: Scene) -> View:
     """
     (columns, lines), scale, distance = scene.render.size, _top_scale(scene), max(scene.sheet.size)
     rows = [[scale, 0, 0, columns / 2], [0, -scale, 0, lines / 2], [0, 0, 0, 1], [0, 0, -1, distance]]
-    centre, eye = np.array([columns / 2, lines / 2]), np.array([0.0, 0.0, distance])
-    return View(np.array(rows, dtype=float), 0.0, np.eye(3), eye, scale, centre, distance, pinhole=False)
+    size, eye = np.array([columns, lines], float), np.array([0.0, 0.0, distance])
+    scales = np.array([scale, scale])
+    return View(np.array(rows, dtype=float), 0.0, np.eye(3), eye, scales, size / 2, size, distance, pinhole=False)
 
 
-def _axes(camera: Camera) -> Array:
-    """Give the camera's unit vectors right, up and toward the eye, as rows, shape (3, 3)."""
-    toward = _unit(np.subtract(camera.eye, camera.target))
-    right = _unit(np.cross(_scaled(np.array(camera.up)), toward))
-    return np.stack([right, np.cross(toward, right), toward])
-
-
-def _unit(vector: Array) -> Array:
-    """Give a vector the length 1; a vector of zeros stays."""
-    scaled = _scaled(vector)
-    return scaled / (float(np.linalg.norm(scaled)) or 1.0)
-
-
-def _scaled(vector: Array) -> Array:
-    """Multiply a vector by a power of 2, which is exact, so that squares of it neither overflow nor vanish."""
-    return np.ldexp(vector, -math.frexp(float(np.abs(vector).max()))[1])
-
-
-def _pinhole(camera: Camera, scene: Scene) -> View:
+def _pinhole(camera: Camera, scene: Scene, time: float) -> View:
     """Look from the eye to the target; fov is the angle from the picture's bottom to its top."""
     columns, lines = scene.render.size
-    axes = _axes(camera)
+    eye, axes, distance = placed(camera, time)
+    # The light does not change while the camera moves.
+    distance = placed(camera, 0.0).distance if camera.moves else distance
     right, up, depth = axes * np.array([[1.0], [1.0], [-1.0]])
-    eye = np.array(camera.eye)
-    focal = lines / 2 / np.tan(np.radians(camera.fov) / 2)
-    rows = [focal * right + columns / 2 * depth, -focal * up + lines / 2 * depth, depth, depth]
+    if (given := camera.intrinsics) is not None:
+        # Here the centre of the first pixel is at (0.5, 0.5).
+        across, down, x, y = given.fx, given.fy, given.cx + 0.5, given.cy + 0.5
+    else:
+        across = down = lines / 2 / np.tan(np.radians(camera.fov) / 2)
+        x, y = columns / 2, lines / 2
+    rows = [across * right + x * depth, -down * up + y * depth, depth, depth]
     matrix = np.array([[*row, -row @ eye] for row in rows])
-    near, distance = NEAR * math.hypot(*scene.sheet.size), math.dist(camera.eye, camera.target)
-    return View(matrix, near, axes, eye, focal, np.array([columns / 2, lines / 2]), distance, pinhole=True)
+    near, size = NEAR * math.hypot(*scene.sheet.size), np.array([columns, lines], float)
+    bent = camera.distortion
+    lens = None if bent is None else Lens(bent.model == "fisheye", bent.coefficients)
+    scale, centre = np.array([across, down]), np.array([x, y])
+    lens = None if lens == UNBENT else lens
+    return View(matrix, near, axes, eye, scale, centre, size, distance, pinhole=True, lens=lens)
 
 
 def _oblique(scene: Scene) -> Camera:
     """Tilt the camera and move it as near as the whole rest rectangle allows."""
     (height, width), (columns, lines) = scene.sheet.size, scene.render.size
     toward = OBLIQUE_DIRECTION / np.linalg.norm(OBLIQUE_DIRECTION)
-    axes = _axes(Camera(eye=tuple(toward), fov=OBLIQUE_FOV))
+    axes = placed(Camera(eye=tuple(toward), fov=OBLIQUE_FOV), 0.0).axes
     corners = np.array([[x, y, 0.0] for x in (-width / 2, width / 2) for y in (-height / 2, height / 2)]) @ axes.T
     half_height = np.tan(np.radians(OBLIQUE_FOV) / 2)
     half = np.array([half_height * columns / lines, half_height])

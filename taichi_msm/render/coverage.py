@@ -9,7 +9,9 @@ from typing import Any, NamedTuple
 
 from taichi_msm.render import geometry
 from taichi_msm.render.attributes import cell_at, store
-from taichi_msm.render.samples import centres, clip, keep, tiles_of
+from taichi_msm.render.bending import BENT_NUMBERS
+from taichi_msm.render.places import BEYOND
+from taichi_msm.render.samples import centres, clip, keep, places, places_of, tiles_of
 from taichi_msm.system.runtime import ti
 
 
@@ -104,8 +106,12 @@ def cover(i, j, drawn: ti.template(), sheet: ti.template(), band: ti.template())
         overstep = geometry.OVERSTEP
         if not whole:
             low_x, high_x, low_y, high_y, overstep = geometry.triangle_bounds(
-                quad_s, quad_t, lower, 1.0 / sheet.parts, band.near, band.width, band.height, patch
-            )
+                quad_s, quad_t, lower, 1.0 / sheet.parts, band.near, band.width, band.height,
+                patch, band.numbers, config.lens,
+            )  # fmt: skip
+        elif ti.static(config.bends):
+            bent = sheet.bent + (i * sheet.cols + j) * BENT_NUMBERS
+            low_x, high_x, low_y, high_y = geometry.cell_bounds(bent, sheet.cols, outline, band.numbers, sheet.point)
         first_column, end_column, first_row, end_row = clip(low_x - 0.5, high_x + 0.5, low_y - 0.5, high_y + 0.5, band)
         first_tile, end_tile, first_line, end_line = tiles_of(first_column, end_column, first_row, end_row, band)
         tiles = ti.max(end_line - first_line, 0) * ti.max(end_tile - first_tile, 0)
@@ -118,35 +124,44 @@ def cover(i, j, drawn: ti.template(), sheet: ti.template(), band: ti.template())
         for n in range(tiles + 1):
             tile_x = ti.cast(tile * config.tile_width, ti.f32)
             tile_y = ti.cast(band.top + tile_line * config.tile_height, ti.f32)
+            at = band.first + (tile_line * band.across + tile) * config.planes
             x, y = centres(tile_x, tile_y, config)
             inside = floats(1) > 0.0
             column, line = floats(quad_s), floats(quad_t)
             # The last round only covers the tile that still waits.
             reached = True
             if n < tiles:
+                if ti.static(config.bends):
+                    x, y = places(tile_x, tile_y, places_of(at, band), band.samples, config)
                 if whole:
-                    reached = reaches(tile_x + 0.5, tile_y + 0.5, outline.side, outline, config)
+                    if ti.static(not config.bends):
+                        reached = reaches(tile_x + 0.5, tile_y + 0.5, outline.side, outline, config)
                     if reached:
                         # Left and upper edges belong to a cell, right and lower ones do not.
                         of_left, of_right, of_top, of_bottom = geometry.edges(x, y, outline.side, outline)
                         inside = (of_left >= 0.0) & (of_right > 0.0) & (of_top >= 0.0) & (of_bottom > 0.0)
+                        if ti.static(config.bends):
+                            reached = ti.select(inside, 1.0, 0.0).max() > 0.0
                         if ti.static(config.refined):
                             column, line = geometry.small_quad(x, y, inside, sheet.parts, patch)
                 else:
                     # Outside its bounds rounding would decide, in samples that depend on the tiles' shape.
+                    column_x, row_y = centres(tile_x, tile_y, config)
                     inside = (
-                        (x > ti.cast(first_column, ti.f32))
-                        & (x < ti.cast(end_column, ti.f32))
-                        & (y > ti.cast(first_row, ti.f32))
-                        & (y < ti.cast(end_row, ti.f32))
+                        (column_x > ti.cast(first_column, ti.f32))
+                        & (column_x < ti.cast(end_column, ti.f32))
+                        & (row_y > ti.cast(first_row, ti.f32))
+                        & (row_y < ti.cast(end_row, ti.f32))
                     )
+                    if ti.static(config.bends):
+                        inside = inside & (x < BEYOND)
             if reached:
                 if held >= 0:
                     cover_tile(
                         held, held_x, held_y, held_inside > 0.0, held_column, held_line, lower, overstep,
                         cell, sheet, band,
                     )  # fmt: skip
-                held = band.first + (tile_line * band.across + tile) * config.planes
+                held = at
                 held_x, held_y, held_inside = x, y, ti.select(inside, 1.0, 0.0)
                 held_column, held_line = column, line
             tile += 1

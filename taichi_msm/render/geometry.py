@@ -12,17 +12,21 @@ listed row by row: upper left and right, lower left and right.
 
 from typing import Any, NamedTuple
 
+from taichi_msm.render import bending
 from taichi_msm.render import uniforms as uni
 from taichi_msm.render.samples import INFINITY
 from taichi_msm.system.runtime import ti
 
-# The numbers of a mass point: (X, Y, w, depth), its place in the picture [samples].
-SEEN, POINT_NUMBERS = 4, 6
+# The numbers of a mass point: (X, Y, w, depth), its place in the picture [samples], at SEEN.
+SEEN, POINT_NUMBERS = uni.SEEN, 6
 
 # A triangle that is drawn by itself is enlarged a little, so that no gap is left beside it: by this fraction of its
 # side, and by this fraction of the picture's, which is what f32 resolves.
 OVERSTEP = 1e-5
 OVERSTEP_OF_PICTURE = 2e-6
+
+# By this fraction of its size a triangle must be beyond an edge of the picture to be left out.
+BESIDE = 1e-3
 
 # In f32, a cell is drawn as a whole only if its outline stays within this distance [samples].
 FARTHEST = float(1 << 16)
@@ -86,7 +90,7 @@ def w_at(depth, numbers: ti.template()):
 @ti.func
 def line_of_sight(x, y, numbers: ti.template()):
     """Give how far points that are seen at (x, y) are to the right and above the axis of view, at w = 1 [m]."""
-    return (x - numbers[uni.CENTRE_X]) * numbers[uni.SPREAD], (numbers[uni.CENTRE_Y] - y) * numbers[uni.SPREAD]
+    return (x - numbers[uni.CENTRE_X]) * numbers[uni.SPREAD_X], (numbers[uni.CENTRE_Y] - y) * numbers[uni.SPREAD_Y]
 
 
 @ti.func
@@ -255,8 +259,87 @@ def depth_at(s, t, triangle: ti.template()):
 
 
 @ti.func
-def triangle_bounds(column, line, lower, part, near, width, height, patch: ti.template()):
+def facet(x, y, triangle: ti.template(), numbers: ti.template()):
+    """Give the normal of a triangle on the side that is seen at (x, y), of any length, in OpenCV's axes, a list."""
+    sides = [
+        [
+            (k[0] - k[2] * numbers[uni.CENTRE_X]) * numbers[uni.SPREAD_X],
+            (k[1] - k[2] * numbers[uni.CENTRE_Y]) * numbers[uni.SPREAD_Y],
+            k[3],
+        ]
+        for k in ti.static((triangle.r, triangle.d))
+    ]
+    r, d = ti.static(sides)
+    normal = [r[1] * d[2] - r[2] * d[1], r[2] * d[0] - r[0] * d[2], r[0] * d[1] - r[1] * d[0]]
+    right, up = line_of_sight(x, y, numbers)
+    along = (normal[0] * right - normal[1] * up) * numbers[uni.PINHOLE] + normal[2]
+    toward = ti.select(along > 0.0, -1.0, 1.0)
+    return [normal[n] * toward for n in ti.static(range(3))]
+
+
+@ti.func
+def may_reach(corner, at, cols, top, bottom, numbers: ti.template(), point: ti.template()):
+    """Tell whether a cell may be seen between two rows of a picture that a lens has bent: what saves `cell_bounds`.
+
+    The numbers of its upper left mass point begin at `corner`, and what `store_bent` stored of it at `at`.
+    """
+    below, under = corner + cols * POINT_NUMBERS, at + cols * bending.BENT_NUMBERS
+    bent_corners = ti.static((at, at + bending.BENT_NUMBERS, under, under + bending.BENT_NUMBERS))
+    within = [point[here + 2] for here in bent_corners]
+    seen = [point[here + 1] for here in bent_corners]
+    corners = ti.static((corner, corner + POINT_NUMBERS, below, below + POINT_NUMBERS))
+    x = [point[here + SEEN] for here in corners]
+    y = [point[here + SEEN + 1] for here in corners]
+    longest = ti.max(
+        bending.side(x, y, 0, 1), bending.side(x, y, 1, 3), bending.side(x, y, 3, 2), bending.side(x, y, 2, 0)
+    )
+    far = numbers[uni.BEND] * longest + 2.0
+    lowest, highest = ti.max(seen[0], seen[1], seen[2], seen[3]), ti.min(seen[0], seen[1], seen[2], seen[3])
+    partly = within[0] + within[1] + within[2] + within[3] < 3.5
+    return partly or (lowest + far > top and highest - far < bottom)
+
+
+@ti.func
+def cell_bounds(at, cols, outline: ti.template(), numbers: ti.template(), point: ti.template()):
+    """Find the bounds of a cell in a picture that a lens has bent.
+
+    What `store_bent` stored of its upper left mass point is at `at`, in a sheet of so many columns.
+    """
+    below = at + cols * bending.BENT_NUMBERS
+    corners = ti.static((at, at + bending.BENT_NUMBERS, below, below + bending.BENT_NUMBERS))
+    x, y = ti.static((outline.x, outline.y))
+    longest = ti.max(
+        bending.side(x, y, 0, 1), bending.side(x, y, 1, 3), bending.side(x, y, 3, 2), bending.side(x, y, 2, 0)
+    )
+    within = point[corners[0] + 2] + point[corners[1] + 2] + point[corners[2] + 2] + point[corners[3] + 2] > 3.5
+    seen_x = [point[here] for here in corners]
+    seen_y = [point[here + 1] for here in corners]
+    return bending.bent_bounds(x, y, seen_x, seen_y, within, longest, numbers)
+
+
+@ti.func
+def is_beside(p, q, r, left, right, top, bottom):
+    """Tell whether a triangle that may reach behind the camera is beyond an edge of the picture.
+
+    X = x w is a plane for each edge x, behind the camera too; a point beyond it has a larger X, or a smaller one.
+    """
+    beside = False
+    for axis, way, edge in ti.static(((0, -1.0, left), (0, 1.0, right), (1, -1.0, top), (1, 1.0, bottom))):
+        beyond = [(k[axis] - edge * k[2]) * way for k in ti.static((p, q, r))]
+        size = ti.max(*[ti.abs(k[axis]) + ti.abs(edge * k[2]) for k in ti.static((p, q, r))])
+        # By more than it is enlarged, and than f32 can tell.
+        beside = beside or ti.min(*beyond) > BESIDE * size
+    return beside
+
+
+@ti.func
+def triangle_bounds(
+    column, line, lower, part, near, width, height,
+    patch: ti.template(), numbers: ti.template(), lens: ti.template(),
+):  # fmt: skip
     """Find the bounds of a small triangle in a picture of this width and height; other arguments as for `triangle_at`.
+
+    `lens` is the model of the camera's lens, empty if it bends no lines.
 
     Returns:
         Least and largest x, least and largest y; and by what fraction of its side it is enlarged.
@@ -277,7 +360,26 @@ def triangle_bounds(column, line, lower, part, near, width, height, patch: ti.te
         low_y = ti.min(p[1] / p[2], q[1] / q[2], r[1] / r[2])
         high_y = ti.max(p[1] / p[2], q[1] / q[2], r[1] / r[2])
         extent = ti.max(high_x - low_x, high_y - low_y, 1e-3)
-        overstep += OVERSTEP_OF_PICTURE * (width + height) / extent
+        if ti.static(lens != ""):
+            box = uni.VISIBLE
+            around = numbers[box + 1] - numbers[box] + numbers[box + 3] - numbers[box + 2]
+            overstep += OVERSTEP_OF_PICTURE * around / extent
+            x = [k[0] / k[2] for k in ti.static((p, q, r))]
+            y = [k[1] / k[2] for k in ti.static((p, q, r))]
+            longest = ti.max(bending.side(x, y, 0, 1), bending.side(x, y, 1, 2), bending.side(x, y, 2, 0))
+            seen = [bending.bent(x[n], y[n], numbers, lens) for n in ti.static(range(3))]
+            low_x, high_x, low_y, high_y = bending.bent_bounds(
+                x, y, [one[0] for one in seen], [one[1] for one in seen], seen[0][2] and seen[1][2] and seen[2][2],
+                longest, numbers,
+            )  # fmt: skip
+        else:
+            overstep += OVERSTEP_OF_PICTURE * (width + height) / extent
     elif p[2] <= near and q[2] <= near and r[2] <= near:
         high_x = -1.0
+    else:
+        left, right, top, bottom = 0.0, high_x, 0.0, ti.cast(height, ti.f32)
+        if ti.static(lens != ""):
+            left, right, top, bottom = [numbers[uni.VISIBLE + n] for n in ti.static(range(4))]
+        if is_beside(p, q, r, left, right, top, bottom):
+            high_x = -1.0
     return low_x, high_x, low_y, high_y, overstep

@@ -8,7 +8,8 @@ beyond an end of the segment, the line of sight is intersected with the sphere a
 
 from taichi_msm.render import uniforms as uni
 from taichi_msm.render.geometry import line_of_sight, w_at
-from taichi_msm.render.samples import INFINITY, centres, clip, keep, tiles_of
+from taichi_msm.render.places import BEYOND
+from taichi_msm.render.samples import INFINITY, clip, keep, keep_unit, places, places_of, tiles_of
 from taichi_msm.system.runtime import ti
 
 
@@ -67,12 +68,17 @@ def cover_tile_with_rod(at, x, y, n, band: ti.template()):
     plane, samples = ti.static((band.config.plane, band.samples))
     depth, n_x, n_y, n_z = meet(x, y, n, band.numbers)
     visible = (w_at(depth, band.numbers) > band.near) & (depth < samples[at + plane.depth])
+    if ti.static(band.config.bends):
+        visible = visible & (x < BEYOND)
     keep(at + plane.depth, visible, depth, samples)
     keep(at + plane.instrument, visible, 255.0, samples)
     if ti.static(band.config.metal):
         keep(at + plane.normal_x, visible, n_x, samples)
         keep(at + plane.normal_y, visible, n_y, samples)
         keep(at + plane.normal_z, visible, n_z, samples)
+    if ti.static(band.config.normals):
+        # In OpenCV's axes.
+        keep_unit(at + plane.facet_x, visible, [n_x, n_y * (-1.0), n_z * (-1.0)], samples)
 
 
 @ti.func
@@ -87,5 +93,7 @@ def cover_with_rods(count, band: ti.template()):
             first_tile, end_tile, first_line, end_line = tiles_of(left, right, upper, lower, band)
             for line in range(first_line, end_line):
                 for tile in range(first_tile, end_tile):
-                    x, y = centres(tile * config.tile_width, band.top + line * config.tile_height, config)
-                    cover_tile_with_rod(band.first + (line * band.across + tile) * config.planes, x, y, n, band)
+                    at = band.first + (line * band.across + tile) * config.planes
+                    left_x, top_y = tile * config.tile_width, band.top + line * config.tile_height
+                    x, y = places(left_x, top_y, places_of(at, band), band.samples, config)
+                    cover_tile_with_rod(at, x, y, n, band)

@@ -23,11 +23,15 @@ class Labels(NamedTuple):
             The orthographic camera's eye is as far above the sheet at rest as the sheet's larger side is long; what
             is above the eye has a depth below 0.
         instrument: 255 where an instrument is seen, else 0, shape (height, width).
+        normals: unit, of the drawn triangle or the instrument's surface, toward the camera, in OpenCV's axes of the
+            camera (x right, y down, z forward), shape (height, width, 3); NaN where nothing is seen. Of a frame that
+            is observed for a scene whose output has no normals: of shape (0, 0, 3).
     """
 
     coordinates: NDArray[np.float32]
     depth: NDArray[np.float32]
     instrument: NDArray[np.uint8]
+    normals: NDArray[np.float32] = np.empty((0, 0, 3), np.float32)
 
 
 class Label(NamedTuple):
@@ -46,13 +50,18 @@ def _in_turn(**labels: Label) -> dict[str, Label]:
     return {name: label._replace(first=first) for (name, label), first in zip(labels.items(), taken, strict=False)}
 
 
-# The fields of `Labels`, and the numbers that all of them take per pixel.
+# The fields of `Labels`. Normals are last, as they are written only where they are asked for.
 LABELS = _in_turn(
     coordinates=Label(("across", "down"), math.nan, of_sheet=True, dtype=np.float32),
     depth=Label(("depth",), 0.0, of_sheet=False, dtype=np.float32),
     instrument=Label(("instrument",), 0.0, of_sheet=False, dtype=np.uint8),
+    normals=Label(("facet_x", "facet_y", "facet_z"), math.nan, of_sheet=False, dtype=np.float32),
 )
-LABEL_NUMBERS = sum(len(label.planes) for label in LABELS.values())
+
+
+def label_numbers(*, normals: bool) -> int:
+    """Count the numbers per pixel that the kernel writes."""
+    return LABELS["normals"].first + normals * len(LABELS["normals"].planes)
 
 
 def label_channels(plane: Any) -> list[tuple[int, int, int, Label]]:
@@ -73,8 +82,9 @@ def labels_of(numbers: NDArray[np.float32], size: tuple[int, int]) -> Labels:
     (width, height), arrays = size, {}
     for name, label in LABELS.items():
         count = len(label.planes)
-        values = numbers.reshape(LABEL_NUMBERS, -1)[label.first : label.first + count]
-        arrays[name] = values.reshape((height, width, count)[: 2 + (count > 1)]).astype(label.dtype, copy=False)
+        values = numbers.reshape(-1, width * height)[label.first : label.first + count]
+        if len(values):
+            arrays[name] = values.reshape((height, width, count)[: 2 + (count > 1)]).astype(label.dtype, copy=False)
     return Labels(**arrays)
 
 
@@ -90,6 +100,17 @@ class Flow(NamedTuple):
 
     flow: NDArray[np.float32]
     occlusion: NDArray[np.uint8]
+
+
+class Stereo(NamedTuple):
+    """What a pair of cameras that are beside each other see differently.
+
+    Attributes:
+        disparity: how far to the left what a pixel shows is in the other picture [px], shape (height, width); 0 where
+            nothing is seen.
+    """
+
+    disparity: NDArray[np.float32]
 
 
 class Sight(NamedTuple):
@@ -110,6 +131,7 @@ class Observed(NamedTuple):
     picture: NDArray[np.uint8] | None = None  # colours, shape (height, width, 3)
     labels: Labels | None = None
     flow: Flow | None = None  # from the frame before to this one
+    stereo: Stereo | None = None
     tracks: Sight | None = None  # where the tracked points are
 
 

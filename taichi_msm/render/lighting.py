@@ -1,5 +1,7 @@
 """The light of an endoscope on wet tissue and on metal: it comes from beside the camera and weakens with distance.
 
+Of several cameras it is that of the main one.
+
 All vectors are in the camera's frame: the eye at 0, x right, y up, z toward the camera. P is the point that a sample
 shows, N its normal on the camera's side, L the unit vector from P to the light, V that from P to the eye, and
 M = 2 (N L) N - L the direction into which light from L is reflected:
@@ -28,14 +30,14 @@ def illuminate(x, y, depth, normal: ti.template(), numbers: ti.template()):
     across, above = line_of_sight(x, y, numbers)
     w = w_at(depth, numbers)
     right, up = across * w, above * w
-    l_x, l_y = numbers[uni.LIGHT_X] - right, numbers[uni.LIGHT_Y] - up
+    l_x, l_y, l_z = numbers[uni.LIGHT_X] - right, numbers[uni.LIGHT_Y] - up, numbers[uni.LIGHT_Z] + depth
     v_x, v_y, v_z = right * (numbers[uni.PINHOLE] * (-1.0)), up * (numbers[uni.PINHOLE] * (-1.0)), w
     # Scalar products of vectors that are not normalised yet.
-    n_l = n_x * l_x + n_y * l_y + n_z * depth
+    n_l = n_x * l_x + n_y * l_y + n_z * l_z
     n_v = n_x * v_x + n_y * v_y + n_z * v_z
-    l_v = l_x * v_x + l_y * v_y + depth * v_z
+    l_v = l_x * v_x + l_y * v_y + l_z * v_z
     n_n = ti.max(n_x * n_x + n_y * n_y + n_z * n_z, 1e-30)
-    l_l = ti.max(l_x * l_x + l_y * l_y + depth * depth, 1e-30)
+    l_l = ti.max(l_x * l_x + l_y * l_y + l_z * l_z, 1e-30)
     v_v = ti.max(v_x * v_x + v_y * v_y + v_z * v_z, 1e-30)
     to_n = 1.0 / n_n
     # One division for both roots.
@@ -94,8 +96,11 @@ def tilt(normal: ti.template(), rise_x, rise_y, numbers: ti.template()):
 
 
 @ti.func
-def light_tissue(x, y, depth, normal: ti.template(), rise_x, rise_y, appearance: ti.template()):
-    """Light wet tissue, whose relief rises by so much from texel to texel: give the colours' factor and summand."""
+def light_tissue(x, y, depth, normal: ti.template(), rise_x, rise_y, column, row, appearance: ti.template()):
+    """Light wet tissue, whose relief rises by so much from texel to texel: give the colours' factor and summand.
+
+    Samples are in these columns and rows of the picture; without distortion they would be at (x, y).
+    """
     config, numbers = ti.static((appearance.config, appearance.numbers))
     tilted = [normal[n] for n in ti.static(range(3))]
     if ti.static(config.relief):
@@ -109,8 +114,8 @@ def light_tissue(x, y, depth, normal: ti.template(), rise_x, rise_y, appearance:
         share, gloss = share * left, gloss * left
     if ti.static(config.vignette):
         # The distance from the middle of the picture is in units of half its diagonal.
-        off_x, off_y = x - numbers[uni.CENTRE_X], y - numbers[uni.CENTRE_Y]
-        diagonal = numbers[uni.CENTRE_X] * numbers[uni.CENTRE_X] + numbers[uni.CENTRE_Y] * numbers[uni.CENTRE_Y]
+        off_x, off_y = column - numbers[uni.MIDDLE_X], row - numbers[uni.MIDDLE_Y]
+        diagonal = numbers[uni.MIDDLE_X] * numbers[uni.MIDDLE_X] + numbers[uni.MIDDLE_Y] * numbers[uni.MIDDLE_Y]
         rim = 1.0 - numbers[uni.VIGNETTE] * (off_x * off_x + off_y * off_y) / diagonal
         share, gloss = share * rim, gloss * rim
     # Where a point is infinite or NaN, so is its normal.

@@ -16,8 +16,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from taichi_msm.render import uniforms as uni
-from taichi_msm.render.camera import View, view
+from taichi_msm.render.camera import View, view, view_at
 from taichi_msm.render.labels import Observed, labels_of
+from taichi_msm.render.places import sample_places
 from taichi_msm.render.rasterizer_cpu import Bands
 from taichi_msm.render.rasterizer_gpu import Threads
 from taichi_msm.render.samples import DrawingConfig
@@ -27,8 +28,18 @@ from taichi_msm.scene import Scene
 from taichi_msm.system.runtime import lanes
 
 
-def drawing_config(scene: Scene, *, picture: bool = True, labels: bool = False) -> DrawingConfig:
-    """Decide what the kernel must be compiled for; `picture` and `labels` together take one sample per pixel."""
+def drawing_config(
+    scene: Scene, *, picture: bool = True, labels: bool = False, normals: bool = False, lens: str | None = None
+) -> DrawingConfig:
+    """Decide what the kernel must be compiled for; `picture` and `labels` together take one sample per pixel.
+
+    Args:
+        scene: the scene.
+        picture: whether colours are drawn.
+        labels: whether labels are written.
+        normals: whether normals are among them.
+        lens: the model of the camera's lens, `View.model`; None: of the scene's own camera.
+    """
     render = scene.render
     tissue = picture and render.shading == "tissue"
     return DrawingConfig(
@@ -43,6 +54,8 @@ def drawing_config(scene: Scene, *, picture: bool = True, labels: bool = False) 
         metal=picture and scene.has_instruments,
         picture=picture,
         labels=labels,
+        normals=labels and normals,
+        lens=view_at(scene, 0.0).model if lens is None else lens,
         lanes=lanes("f32"),
     )
 
@@ -55,6 +68,7 @@ class Drawing:
         self.config = config or drawing_config(scene)
         self._view = view(scene)
         self._known: tuple[View, NDArray[np.float32]] | None = None
+        self._optics: tuple[object, ...] = ()
         self._texture_size = texture.shape[1], texture.shape[0]
         texels, levels = pyramid(texture, minified=self.config.tissue)
         self._sizes = uni.sizes_of(scene, levels)
@@ -73,12 +87,22 @@ class Drawing:
         The scene's own camera is taken if none is given.
         """
         self._sizes[uni.ROD_COUNT] = len(rods)
-        numbers = self._numbers(camera or self._view, rods)
+        camera = camera or self._view
+        numbers = self._numbers(camera, rods)
+        self._place(camera)
         picture, labels = self._form.draw(np.ascontiguousarray(position, np.float32), numbers, self._sizes)
         return Observed(
             np.ascontiguousarray(picture) if self.config.picture else None,
             labels_of(labels, self.scene.render.size) if self.config.labels else None,
         )
+
+    def _place(self, camera: View) -> None:
+        """Find the places of the samples, where a lens bends lines, again only if its view of them changes."""
+        if not self.config.lens:
+            return
+        if camera.optics != self._optics:
+            self._optics = camera.optics
+            self._form.place(sample_places(camera, self.config.supersample, steps=self.config.place_steps))
 
     def _numbers(self, camera: View, rods: Sequence[Rod]) -> NDArray[np.float32]:
         """Give the numbers of a view; without instruments they are computed again only when the camera changes."""

@@ -12,17 +12,19 @@ from numpy.typing import NDArray
 
 from taichi_msm.render import uniforms as uni
 from taichi_msm.render.attributes import NORMAL_NUMBERS, DrawnSheet, store_normal
+from taichi_msm.render.bending import BENT_NUMBERS, store_bent
 from taichi_msm.render.coverage import cover
-from taichi_msm.render.geometry import POINT_NUMBERS, SEEN, project
+from taichi_msm.render.geometry import POINT_NUMBERS, SEEN, may_reach, project
 from taichi_msm.render.instrument_coverage import cover_with_rods
-from taichi_msm.render.labels import LABEL_NUMBERS
+from taichi_msm.render.labels import label_numbers
+from taichi_msm.render.places import bounds, tiled
 from taichi_msm.render.samples import INFINITY, Band, Bytes, DrawingConfig, Floats, Integers, clear
 from taichi_msm.render.shading import PixelArrays, resolve
 from taichi_msm.render.texture_filter import Appearance
-from taichi_msm.system.runtime import ITERATIONS_PER_THREAD, Memory, our_compilation, started, ti
+from taichi_msm.system.runtime import ITERATIONS_PER_THREAD, Memory, our_compilation, started, ti, write
 
 # The numbers that are stored of all mass points come first; then, for every row of them, its highest and its lowest
-# place in the picture.
+# place in the picture, without distortion.
 STORED = POINT_NUMBERS + NORMAL_NUMBERS
 
 
@@ -40,9 +42,20 @@ class Bands:
         (rows, cols), (width, height) = points, size
         self._workers = min(-(-height // config.band_rows), started().threads)
         self._memory = memory = Memory()
-        self._point = memory.array("f32", 0, rows * (cols * STORED + 2))
+        self._point = memory.array("f32", 0, rows * (cols * (STORED + BENT_NUMBERS * config.bends) + 2))
         band_vectors = config.band_lines * config.tiles_across(width) * config.planes
-        self._samples = memory.array("f32", config.lanes, self._workers * band_vectors)
+        # Before the bands are the places of all samples, if there is a lens.
+        self._table = -(-height // config.band_rows) * _places_of_band(config, width)
+        self._samples = memory.array("f32", config.lanes, self._table + self._workers * band_vectors)
+
+    def place(self, places: NDArray[np.float32]) -> None:
+        """Take the places of the samples of the pictures that follow, as of `sample_places`."""
+        config, bands = self._config, tiled(places, self._config)
+        rows = config.band_rows * config.supersample
+        known = [bounds(places[first : first + rows, :, :2]) for first in range(0, len(places), rows)]
+        last = np.pad(known, ((0, 0), (0, config.lanes - len(known[0]))))
+        table = np.concatenate([bands, last[:, None].astype(np.float32)], axis=1)
+        write(self._samples, table.reshape(-1, config.lanes))
 
     def draw(
         self, position: NDArray[np.float32], numbers: NDArray[np.float32], sizes: NDArray[np.int32]
@@ -57,7 +70,9 @@ class Bands:
         stride = config.tiles_across(width) * config.tile_width if config.in_words else width
         picture = np.empty((height, stride, 3) if config.picture else (1, 4, 3), np.uint8)
         # Without labels nothing is written there; an array of Taichi's is passed in half the time of one of NumPy's.
-        labels: Any = np.zeros(LABEL_NUMBERS * width * height, np.float32) if config.labels else self._point
+        labels: Any = self._point
+        if config.labels:
+            labels = np.zeros(label_numbers(normals=config.normals) * width * height, np.float32)
         sizes[[uni.ROWS_TAKEN, uni.ROWS_PROJECTED, uni.BANDS_TAKEN]] = 0
         with our_compilation(optimised=False):
             self._draw(
@@ -65,6 +80,11 @@ class Bands:
                 picture.ravel().view(np.int32) if config.in_words else picture.ravel(), labels,
             )  # fmt: skip
         return picture[:, :width], labels
+
+
+def _places_of_band(config: DrawingConfig, width: int) -> int:
+    """Count the vectors that hold a band's places, and their bounds, in a picture of this width [px]."""
+    return config.band_places * config.tiles_across(width) + 1 if config.lens else 0
 
 
 @ti.func
@@ -77,13 +97,17 @@ def project_row(
         project(position, i, j, cols, numbers, point, False)
         store_normal(position, i, j, rows, cols, config, numbers, point)
         here = (i * cols + j) * POINT_NUMBERS
+        if ti.static(config.bends):
+            bent = rows * cols * STORED + (i * cols + j) * BENT_NUMBERS
+            store_bent(bent, here, numbers, point, config.lens)
         if point[here + 2] > numbers[uni.NEAR]:
             low = ti.min(low, point[here + SEEN + 1])
             high = ti.max(high, point[here + SEEN + 1])
         else:
             low, high = -INFINITY, INFINITY
-    point[rows * cols * STORED + 2 * i] = low
-    point[rows * cols * STORED + 2 * i + 1] = high
+    reach = rows * cols * (STORED + BENT_NUMBERS * config.bends) + 2 * i
+    point[reach] = low
+    point[reach + 1] = high
 
 
 @ti.func
@@ -114,14 +138,25 @@ def cover_band(sheet: ti.template(), band: ti.template()):
     lines = (band.bottom - band.top + config.tile_height - 1) // config.tile_height
     for tile in range(lines * band.across):
         clear(band.first + tile * config.planes, band)
-    reach = sheet.rows * sheet.cols * STORED
+    reach = sheet.rows * sheet.cols * (STORED + BENT_NUMBERS * config.bends)
+    # The rows of samples that the band shows, which without distortion are others.
+    top, bottom = ti.cast(band.top, ti.f32), ti.cast(band.bottom, ti.f32)
+    if ti.static(config.bends):
+        known = band.samples[band.places + config.band_places * band.across]
+        top, bottom = known[2] - 1.0, known[3] + 1.0
     for i in range(sheet.rows - 1):
         row = reach + 2 * i
         low = ti.min(point[row], point[row + 2])
         high = ti.max(point[row + 1], point[row + 3])
-        if low < band.bottom and high > band.top:
+        if low < bottom and high > top:
             for j in range(sheet.cols - 1):
-                cover(i, j, (), sheet, band)
+                if ti.static(config.bends):
+                    cell = i * sheet.cols + j
+                    bent = sheet.bent + cell * BENT_NUMBERS
+                    if may_reach(cell * POINT_NUMBERS, bent, sheet.cols, band.top, band.bottom, band.numbers, point):
+                        cover(i, j, (), sheet, band)
+                else:
+                    cover(i, j, (), sheet, band)
 
 
 @cache
@@ -144,7 +179,12 @@ def _kernel(config: DrawingConfig) -> Callable[..., None]:
                 rod_count, parts, near = sizes[uni.ROD_COUNT], numbers[uni.PARTS], numbers[uni.NEAR]
                 across = (width * factor + config.tile_width - 1) // config.tile_width
                 first = index // ITERATIONS_PER_THREAD * across * (config.band_lines * config.planes)
-                sheet = ti.static(DrawnSheet(point, rows, cols, parts, texture_width, texture_height))
+                band_places = 0
+                if ti.static(config.bends):
+                    band_places = across * config.band_places + 1
+                    first += (height + config.band_rows - 1) // config.band_rows * band_places
+                bent = rows * cols * STORED
+                sheet = ti.static(DrawnSheet(point, rows, cols, parts, texture_width, texture_height, bent))
                 appearance = ti.static(
                     Appearance(config, texels, sizes, texture_width, texture_height, numbers, rod_count)
                 )
@@ -159,15 +199,16 @@ def _kernel(config: DrawingConfig) -> Callable[..., None]:
                     if taking:
                         end_row = ti.min(row + config.band_rows, height)
                         top, bottom = row * factor, end_row * factor
+                        places = row // config.band_rows * band_places
                         band = ti.static(
                             Band(
                                 config, samples, first, across, 0.0, samples_width, top, bottom,
-                                samples_width, samples_height, near, numbers,
+                                samples_width, samples_height, near, numbers, places,
                             )
                         )  # fmt: skip
                         cover_band(sheet, band)
                         if ti.static(config.instruments):
                             cover_with_rods(rod_count, band)
-                        resolve(first, row, end_row, 0, width, across, width, samples, appearance, output)
+                        resolve(first, row, end_row, 0, width, across, width, places, samples, appearance, output)
 
     return draw

@@ -14,10 +14,12 @@ from numpy.typing import NDArray
 
 from taichi_msm.render import uniforms as uni
 from taichi_msm.render.attributes import NORMAL_NUMBERS, DrawnSheet, store_normal
+from taichi_msm.render.bending import BENT_NUMBERS, store_bent
 from taichi_msm.render.bins import BOUNDS, ROUNDS_OF_SEARCH, binned, owner, reaches, store_bounds
 from taichi_msm.render.coverage import Part, cover
 from taichi_msm.render.geometry import (
     POINT_NUMBERS,
+    cell_bounds,
     corner_of,
     is_whole,
     outlined,
@@ -26,12 +28,12 @@ from taichi_msm.render.geometry import (
     triangle_bounds,
 )
 from taichi_msm.render.instrument_coverage import cover_with_rods
-from taichi_msm.render.labels import LABEL_NUMBERS
+from taichi_msm.render.labels import label_numbers
 from taichi_msm.render.samples import INFINITY, Band, Bytes, DrawingConfig, Floats, Integers, clear
 from taichi_msm.render.shading import PixelArrays, resolve
 from taichi_msm.render.texture_filter import Appearance
 from taichi_msm.system.launches import THREADS, Launches, end_thread
-from taichi_msm.system.runtime import our_compilation, ti
+from taichi_msm.system.runtime import our_compilation, ti, write
 
 # The smallest width of a bin [samples].
 SMALLEST_BIN = 8
@@ -41,6 +43,11 @@ MARGIN = 1.5
 
 # The largest number of parts. If cells would have more, several of their triangles make one.
 MOST_PARTS = 1 << 22
+
+
+# Where the numbers of bent mass points begin, per mass point, and how many numbers it has in all.
+BENT = POINT_NUMBERS + NORMAL_NUMBERS
+STORED = BENT + BENT_NUMBERS
 
 
 class Threads:
@@ -59,11 +66,18 @@ class Threads:
         # Rows of pixels in a strip.
         self._rows = min(max(1, THREADS // (across * config.supersample)), height)
         self._texels = launches.give(texels)
-        self._point = launches.array(np.float32, rows * cols * (POINT_NUMBERS + NORMAL_NUMBERS))
+        self._point = launches.array(np.float32, rows * cols * STORED)
         self._pieces = launches.array(np.int32, self._cells)
-        self._samples = ti.ndarray(config.floats, self._rows * config.supersample * across * config.planes)
+        strip = self._rows * config.supersample * across * config.planes
+        # Before the strip are the places of all samples, if there is a lens.
+        self._samples = ti.ndarray(config.floats, height * config.supersample * across * config.place_planes + strip)
         self._colours = launches.array(np.uint8, 3 * width * height if config.picture else 1)
-        self._labels = launches.array(np.float32, LABEL_NUMBERS * width * height if config.labels else 1)
+        numbers = label_numbers(normals=config.normals) if config.labels else 0
+        self._labels = launches.array(np.float32, max(numbers * width * height, 1))
+
+    def place(self, places: NDArray[np.float32]) -> None:
+        """Take the places of the samples of the pictures that follow, as `rasterizer_cpu.Bands.place` does."""
+        write(self._samples, places.reshape(-1, 1))
 
     def draw(
         self, position: NDArray[np.float32], numbers: NDArray[np.float32], sizes: NDArray[np.int32]
@@ -132,6 +146,10 @@ def _sheet_kernels(config: DrawingConfig) -> tuple[Callable[..., None], Callable
             rows, cols = sizes[uni.ROWS], sizes[uni.COLS]
             project(position, index // cols, index % cols, cols, numbers, point, False)
             store_normal(position, index // cols, index % cols, rows, cols, config, numbers, point)
+            if ti.static(config.bends):
+                store_bent(
+                    rows * cols * BENT + index * BENT_NUMBERS, index * POINT_NUMBERS, numbers, point, config.lens
+                )
 
         for cell in range((sizes[uni.ROWS] - 1) * (sizes[uni.COLS] - 1)):
             cols, parts = sizes[uni.COLS], ti.cast(numbers[uni.PARTS], ti.i32)
@@ -152,6 +170,9 @@ def _sheet_kernels(config: DrawingConfig) -> tuple[Callable[..., None], Callable
             owners[2 * item], owners[2 * item + 1] = cell, piece
             outline = ti.static(outlined(corner_of(cell, cols), cols, numbers[uni.NEAR], point))
             left, right, top, bottom = outline.left, outline.right, outline.top, outline.bottom
+            if ti.static(config.bends):
+                at = sizes[uni.ROWS] * cols * BENT + corner_of(cell, cols) // POINT_NUMBERS * BENT_NUMBERS
+                left, right, top, bottom = cell_bounds(at, cols, outline, numbers, point)
             if pieces[cell] != 1:
                 left, right, top, bottom = INFINITY, -INFINITY, INFINITY, -INFINITY
                 patch = ti.static(patch_of(corner_of(cell, cols), cols, outline.side, False, point, False))
@@ -159,8 +180,9 @@ def _sheet_kernels(config: DrawingConfig) -> tuple[Callable[..., None], Callable
                 for n in range(piece, ti.min(piece + together, pieces[cell])):
                     s, t = ti.cast(n // 2 % per_side, ti.f32), ti.cast(n // 2 // per_side, ti.f32)
                     low_x, high_x, low_y, high_y, _ = triangle_bounds(
-                        s, t, n % 2 == 0, 1.0 / numbers[uni.PARTS], numbers[uni.NEAR], width, height, patch
-                    )
+                        s, t, n % 2 == 0, 1.0 / numbers[uni.PARTS], numbers[uni.NEAR], width, height,
+                        patch, numbers, config.lens,
+                    )  # fmt: skip
                     if not high_x < low_x:
                         # Where it is NaN it may be anywhere.
                         if not (low_x <= high_x and low_y <= high_y):
@@ -189,12 +211,16 @@ def _picture_kernels(config: DrawingConfig) -> tuple[Callable[..., None], Callab
             rows, cols, parts = sizes[uni.ROWS], sizes[uni.COLS], numbers[uni.PARTS]
             width, height = sizes[uni.WIDTH] * factor, sizes[uni.HEIGHT] * factor
             x, y = index % width, top + index // width
-            line, near = index // width * width * planes, numbers[uni.NEAR]
+            table = width * height * config.place_planes
+            line, near = table + index // width * width * planes, numbers[uni.NEAR]
+            placed, bent = y * width * config.place_planes, rows * cols * BENT
             texture_width, texture_height = sizes[uni.LEVELS + 1], sizes[uni.LEVELS + 2]
-            sheet = ti.static(DrawnSheet(point, rows, cols, parts, texture_width, texture_height))
-            band = ti.static(Band(config, samples, line, width, x, x + 1, y, y + 1, width, height, near, numbers))
+            sheet = ti.static(DrawnSheet(point, rows, cols, parts, texture_width, texture_height, bent))
+            band = ti.static(
+                Band(config, samples, line, width, x, x + 1, y, y + 1, width, height, near, numbers, placed)
+            )
             if listed == 0:
-                clear(index * planes, band)
+                clear(table + index * planes, band)
             square = y // sizes[uni.BIN_SIZE] * sizes[uni.BINS_ACROSS] + x // sizes[uni.BIN_SIZE]
             begin = starts[square] + listed
             for n in range(begin, ti.min(begin + count, starts[square + 1])):
@@ -215,12 +241,13 @@ def _picture_kernels(config: DrawingConfig) -> tuple[Callable[..., None], Callab
             width, height, rod_count = sizes[uni.WIDTH], sizes[uni.HEIGHT], sizes[uni.ROD_COUNT]
             x, y = index % width, row + index // width
             left, top, across = x * factor, y * factor, width * factor
-            line = (y - row) * factor * across * planes
+            table = across * height * factor * config.place_planes
+            line, placed = table + (y - row) * factor * across * planes, top * across * config.place_planes
             if ti.static(config.instruments):
                 band = ti.static(
                     Band(
                         config, samples, line, across, left, left + factor, top, top + factor,
-                        across, height * factor, numbers[uni.NEAR], numbers,
+                        across, height * factor, numbers[uni.NEAR], numbers, placed,
                     )
                 )  # fmt: skip
                 cover_with_rods(rod_count, band)
@@ -229,7 +256,7 @@ def _picture_kernels(config: DrawingConfig) -> tuple[Callable[..., None], Callab
             )
             pixels = width * height
             output = ti.static(PixelArrays(colours, labels, pixels))
-            resolve(line, y, y + 1, x, x + 1, across, width, samples, appearance, output)
+            resolve(line, y, y + 1, x, x + 1, across, width, placed, samples, appearance, output)
             end_thread(ended)
 
     return cover_samples, resolve_pixels

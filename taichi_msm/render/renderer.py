@@ -3,23 +3,25 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from functools import partial
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from taichi_msm.arguments import are_numbers, as_array
-from taichi_msm.errors import ArgumentError
-from taichi_msm.render.camera import View, view
-from taichi_msm.render.labels import Flow, Labels, Observed, Sight, track_grid
+from taichi_msm.errors import ArgumentError, did_you_mean
+from taichi_msm.render.camera import View, moves, view, view_at
+from taichi_msm.render.labels import Flow, Labels, Observed, Sight, Stereo, track_grid
 from taichi_msm.render.surface import Rod
 from taichi_msm.render.texture import load_texture
-from taichi_msm.scene import Camera, Render, Scene
+from taichi_msm.scene import PRESETS, Camera, Render, Scene
 
 if TYPE_CHECKING:
     from taichi_msm.render.rasterizer import Drawing
 
-# A camera in one of the forms that a scene may have; or a `View`, which was set up already; None: the scene's own.
+# A camera in one of the forms that a scene may have, or the name of one of its own; or a `View`, which was set up
+# already; None: the scene's main one.
 CameraLike = str | Mapping[str, Any] | Camera | View | None
 
 Array = NDArray[Any]
@@ -41,7 +43,7 @@ class Renderer:
 
     Attributes:
         scene: the scene; may be replaced by one that differs in its probes alone.
-        view: the scene's own camera.
+        view: the scene's main camera, when it begins.
     """
 
     def __init__(self, scene: Scene, texture: NDArray[np.uint8] | None = None) -> None:
@@ -54,36 +56,46 @@ class Renderer:
         """Draw another scene from here on."""
         self._drawings.clear()
         self.scene, self.view = scene, view(scene)
+        names = scene.render.all_cameras
+        self._moving = any(moves(scene, name) for name in names)
+        self._views = {name: self.view if name == scene.render.main else view_at(scene, 0.0, name) for name in names}
 
-    def set_up(self, camera: CameraLike) -> View:
-        """Set up a camera; raises a SceneError if it is not valid, or sees nothing."""
+    def set_up(self, camera: CameraLike, time: float = 0.0) -> View:
+        """Set up a camera at a time [s]; raises a SceneError if it is not valid, or sees nothing."""
         if isinstance(camera, View):
             return camera
-        if camera is None:
-            return self.view
+        render = self.scene.render
+        name = render.main if camera is None else camera
+        if isinstance(name, str) and name in self._views:
+            return view_at(self.scene, time, name) if self._moving else self._views[name]
+        if isinstance(name, str) and render.cameras and name not in PRESETS:
+            known = [*render.cameras, *PRESETS]
+            said = f"camera: {name!r}; the cameras are {', '.join(known)}{did_you_mean(name, known)}"
+            raise ArgumentError(said)
         # The scene is checked as a whole, so that an error names the key as a scene has it.
-        render = {**dict(self.scene.render), "camera": camera}
-        return view(self.scene.model_copy(update={"render": render}))
+        alone = {**dict(render), "camera": camera}
+        alone.pop("cameras")
+        return view(self.scene.model_copy(update={"render": alone, "output": ()}), time)
 
     def draw(self, shot: Shot, style: Render | None = None) -> NDArray[np.uint8]:
         """Draw a picture; `style`: the scene's `render` with another shading, or with the mesh shown or hidden."""
-        return self._drawing(style, picture=True, labels=False).draw(*shot)
+        return self._drawing(style, picture=True, labels=False, camera=shot.view).draw(*shot)
 
-    def is_compiled(self, style: Render) -> bool:
-        """Tell whether a picture in a style, as for `draw`, has been drawn before."""
-        return self._key(style, picture=True, labels=False) in self._drawings
+    def is_compiled(self, style: Render, camera: View) -> bool:
+        """Tell whether a picture in a style, as for `draw`, has been drawn before from such a camera."""
+        return self._key(style, picture=True, labels=False, camera=camera) in self._drawings
 
     def kernels(self) -> tuple[object, ...]:
         """Give all that the kernels of `observe` are compiled for."""
         from taichi_msm.render.rasterizer import drawing_config
 
-        return drawing_config(self.scene, picture=self.scene.draws, labels=self.scene.labels_pixels), self.scene.output
+        scene, lenses = self.scene, [view.model for view in self._views.values()]
+        wanted = partial(drawing_config, scene, picture=scene.draws, labels=scene.labels_pixels)
+        return (*(wanted(lens=lens) for lens in lenses), scene.output)
 
     def labels(self, shot: Shot) -> Labels:
         """Give what each pixel shows at its centre."""
-        labels = self._drawing(picture=False, labels=True).look(*shot).labels
-        assert labels is not None
-        return labels
+        return self._labels(shot, normals=True)
 
     def flow(self, before: Labels, shot: Shot) -> Flow:
         """Give the optical flow to a shot from another one, whose labels are given."""
@@ -112,11 +124,15 @@ class Renderer:
         scene = self.scene
         # Labels need one sample, at the pixel's centre; with several samples per pixel, none is there.
         together = scene.render.supersample == 1
+        normals = "normals" in scene.output
         observed = Observed()
         if scene.draws:
-            observed = self._drawing(picture=True, labels=scene.labels_pixels and together).look(*shot)
+            labels = scene.labels_pixels and together
+            observed = self._drawing(picture=True, labels=labels, normals=normals, camera=shot.view).look(*shot)
         if scene.labels_pixels and observed.labels is None:
-            observed = observed._replace(labels=self.labels(shot))
+            observed = observed._replace(labels=self._labels(shot, normals=normals))
+        if observed.labels is not None and scene.asks_for("stereo") and shot.view.baseline:
+            observed = observed._replace(stereo=Stereo(shot.view.disparity(observed.labels.depth)))
         if before is not None and scene.asks_for("flow"):
             observed = observed._replace(flow=self.flow(before, shot))
         if scene.asks_for("tracks"):
@@ -127,19 +143,30 @@ class Renderer:
         """Free the memory."""
         self._drawings.clear()
 
-    def _drawing(self, style: Render | None = None, *, picture: bool, labels: bool) -> Drawing:
-        key = self._key(style or self.scene.render, picture=picture, labels=labels)
+    def _labels(self, shot: Shot, *, normals: bool) -> Labels:
+        labels = self._drawing(picture=False, labels=True, normals=normals, camera=shot.view).look(*shot).labels
+        assert labels is not None
+        return labels
+
+    def _drawing(
+        self, style: Render | None = None, *, picture: bool, labels: bool, camera: View, normals: bool = False
+    ) -> Drawing:
+        key = self._key(style or self.scene.render, picture=picture, labels=labels, camera=camera, normals=normals)
         if key not in self._drawings:
             from taichi_msm.render.rasterizer import Drawing, drawing_config
 
             scene = self.scene if style is None else self.scene.model_copy(update={"render": style})
             texture = self._texture() if picture else np.zeros((1, 1, 3), np.uint8)
-            self._drawings[key] = Drawing(scene, texture, drawing_config(scene, picture=picture, labels=labels))
+            config = drawing_config(scene, picture=picture, labels=labels, normals=normals, lens=camera.model)
+            self._drawings[key] = Drawing(scene, texture, config)
         return self._drawings[key]
 
-    def _key(self, style: Render, *, picture: bool, labels: bool) -> tuple[object, ...]:
+    def _key(
+        self, style: Render, *, picture: bool, labels: bool, camera: View, normals: bool = False
+    ) -> tuple[object, ...]:
         """Give all that tells the drawings of this scene apart."""
-        return picture, labels, style.shading, style.wireframe, self.scene.has_instruments
+        wanted = picture, labels, labels and normals
+        return *wanted, camera.optics, style.shading, style.wireframe, self.scene.has_instruments
 
     def _texture(self) -> NDArray[np.uint8]:
         """Give the picture on the sheet, which is read again only if the scene names another one."""

@@ -47,6 +47,8 @@ class DrawingConfig(NamedTuple):
     metal: bool  # whether they are shaded
     picture: bool  # whether colours are written
     labels: bool  # whether labels are written; needs one sample per pixel
+    normals: bool  # whether normals are among them
+    lens: str  # the model of the lens, pinhole or fisheye; empty if it bends no lines
     lanes: int  # samples in a tile
 
     @property
@@ -73,6 +75,26 @@ class DrawingConfig(NamedTuple):
     def planes(self) -> int:
         """Vectors stored per tile."""
         return len(self.plane)
+
+    @property
+    def bends(self) -> bool:
+        """Whether there is a lens that bends lines."""
+        return self.lens != ""
+
+    @property
+    def place_planes(self) -> int:
+        """Vectors of the table of places per tile: x and y, and what changes them (places.py); 0 without a lens."""
+        return 0 if not self.lens else 6 if self.place_steps else 2
+
+    @property
+    def place_steps(self) -> bool:
+        """Whether the table has the way to the next samples."""
+        return bool(self.lens) and (self.tissue or self.wireframe)
+
+    @property
+    def band_places(self) -> int:
+        """Vectors of the table of places per row of tiles and tile across, in a band on a CPU, less its bounds."""
+        return self.band_lines * self.place_planes
 
     @property
     def band_rows(self) -> int:
@@ -109,6 +131,7 @@ def _planes(config: DrawingConfig) -> Any:
     """Number the planes that a config needs."""
     needed = {
         **{name: config.labels for label in LABELS.values() for name in label.planes},
+        **dict.fromkeys(LABELS["normals"].planes, config.normals),
         **dict.fromkeys(("depth", "texel_x", "texel_y"), True),  # of what is seen; its place in the texture [texels]
         "light": config.headlit,  # share of the headlight that comes back
         "wire": config.wireframe,  # share of the mesh's lines in the colour
@@ -137,6 +160,7 @@ class Band(NamedTuple):
     height: Any
     near: Any  # only what is farther than this is drawn
     numbers: Any
+    places: Any  # entry of `samples` where the band's places begin, if there is a lens
 
 
 @ti.func
@@ -172,6 +196,28 @@ def centres(left, top, config: ti.template()):
 
 
 @ti.func
+def places(left, top, at, samples: ti.template(), config: ti.template()):
+    """Give x and y of the samples of a tile, as `centres`, without distortion; `at` is the entry of its places."""
+    x, y = centres(left, top, config)
+    if ti.static(config.bends):
+        x, y = samples[at], samples[at + 1]
+    return x, y
+
+
+@ti.func
+def places_of(at, band: ti.template()):
+    """Give the entry of the places of a tile that begins at entry `at` of the samples."""
+    return band.places + (at - band.first) // band.config.planes * band.config.place_planes
+
+
+@ti.func
+def steps(at, band: ti.template()):
+    """Give the ways from the samples of a tile to the next on the right and to the next below, without distortion."""
+    way = places_of(at, band) + 2
+    return [band.samples[way + n] for n in ti.static(range(4))]
+
+
+@ti.func
 def clear(at, band: ti.template()):
     """Empty a tile."""
     band.samples[at + band.config.plane.depth] = band.config.floats(INFINITY)
@@ -183,3 +229,11 @@ def clear(at, band: ti.template()):
 def keep(at, visible, value, samples: ti.template()):
     """Store a plane's value for the samples where it is visible."""
     samples[at] = ti.select(visible, value, samples[at])
+
+
+@ti.func
+def keep_unit(at, visible, vector: ti.template(), samples: ti.template()):
+    """Store the direction of a vector in three planes, as `keep` stores one value."""
+    length = ti.sqrt(vector[0] * vector[0] + vector[1] * vector[1] + vector[2] * vector[2])
+    for n in ti.static(range(3)):
+        keep(at + n, visible, vector[n] / length, samples)

@@ -6,7 +6,7 @@ from taichi_msm.render import style
 from taichi_msm.render import uniforms as uni
 from taichi_msm.render.labels import label_channels
 from taichi_msm.render.lighting import light_metal, light_tissue
-from taichi_msm.render.samples import INFINITY, centres
+from taichi_msm.render.samples import INFINITY, centres, places
 from taichi_msm.render.texture_filter import filtered
 from taichi_msm.system.runtime import ti
 
@@ -20,8 +20,10 @@ class PixelArrays(NamedTuple):
 
 
 @ti.func
-def shade(at, left, top, samples: ti.template(), appearance: ti.template()):
+def shade(at, left, top, place, samples: ti.template(), appearance: ti.template()):
     """Shade the tile whose first sample is at (left, top): light the texture, then draw the mesh and the instruments.
+
+    `place` is the entry of its places, if there is a lens.
 
     Returns:
         Red, green and blue.
@@ -34,10 +36,11 @@ def shade(at, left, top, samples: ti.template(), appearance: ti.template()):
     if ti.static(config.headlit):
         for n in ti.static(range(3)):
             colour[n] *= samples[at + plane.light]
-    x, y = centres(left, top, config)
+    x, y = places(left, top, place, samples, config)
     normal = [samples[at + (plane.normal_x + n)] for n in ti.static(range(3 * (config.tissue or config.metal)))]
     if ti.static(config.tissue):
-        share, gloss = light_tissue(x, y, depth, normal, rise_x, rise_y, appearance)
+        column, row = centres(left, top, config)
+        share, gloss = light_tissue(x, y, depth, normal, rise_x, rise_y, column, row, appearance)
         for n in ti.static(range(3)):
             colour[n] = ti.min(colour[n] * share + gloss, 255.0)
     if ti.static(config.wireframe):
@@ -117,12 +120,13 @@ def write_labels(
 
 @ti.func
 def resolve(
-    first, row, end_row, left, right, across, width,
+    first, row, end_row, left, right, across, width, placed,
     samples: ti.template(), appearance: ti.template(), output: ti.template(),
 ):  # fmt: skip
     """Shade the samples of a band, or of a part of one, and write its pixels.
 
-    The band begins at entry `first`, from the left edge of the picture, and has `across` tiles in a row. The pixels are
+    The band begins at entry `first`, its places at entry `placed` if there is a lens, both from the left edge of the
+    picture, and it has `across` tiles in a row. The pixels are
     those in columns `left` to `right` of rows `row` to `end_row`, without the latter, of a picture of this `width`.
     """
     config = ti.static(appearance.config)
@@ -135,7 +139,8 @@ def resolve(
             if ti.static(config.labels):
                 write_labels(at, column, row + top, end_row, width, samples, output, config)
             if ti.static(config.picture):
-                colour = shade(at, column, row * factor + top, samples, appearance)
+                place = placed + (line * across + tile) * config.place_planes
+                colour = shade(at, column, row * factor + top, place, samples, appearance)
                 if ti.static(factor == 1):
                     write_colours(colour, row + top, end_row, tile, across, output.colours, config)
                 else:

@@ -5,18 +5,20 @@ nearer on the same line of sight. Bins tell which cells may be there.
 """
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from functools import cache
 
 import numpy as np
 from numpy.typing import NDArray
 
-from taichi_msm.render import geometry
+from taichi_msm.render import bending, geometry
 from taichi_msm.render import uniforms as uni
 from taichi_msm.render.bins import BOUNDS, binned, store_bounds
 from taichi_msm.render.camera import View
 from taichi_msm.render.geometry import POINT_NUMBERS
 from taichi_msm.render.instrument_coverage import meet
 from taichi_msm.render.labels import NO_FLOW, Flow, Sight
+from taichi_msm.render.places import window
 from taichi_msm.render.samples import INFINITY, Bytes, Doubles, Floats, Integers
 from taichi_msm.render.surface import Rod
 from taichi_msm.scene import Scene
@@ -68,20 +70,26 @@ def _search(
     total = len(coordinates)
     if total == 0:
         return np.empty((0, 2), np.float32), np.empty(0, np.uint8)
-    (rows, cols), (width, height) = scene.sheet.points, scene.render.size
+    rows, cols = scene.sheet.points
     cells = (rows - 1) * (cols - 1)
+    # What hides what is found without the lens.
+    straight = view if view.lens is None else window(view)
+    width, height = (int(side) for side in straight.size)
     # If a bin is half as wide as a cell, the cells of most bins are around one mass point only.
     bin_size = max(SMALLEST_BIN, round((width * height / cells) ** 0.5 / 2))
     launches = Launches(bounded=lanes("f64") == 1)
-    numbers = launches.give(uni.view_numbers(view, scene.render, 1, scene.sheet.size, (1, 1), rods))
+    told = uni.view_numbers(straight, scene.render, 1, scene.sheet.size, (1, 1), rods)
+    if view.lens is not None:
+        uni.tell_lens(told, view, 1, view.lens.limit)
+    numbers = launches.give(told)
     sizes = uni.sizes_of(scene, np.empty((0, 3), np.int32))
-    sizes[uni.ROD_COUNT] = len(rods)
+    sizes[[uni.ROD_COUNT, uni.WIDTH, uni.HEIGHT]] = len(rods), width, height
     point, cell = (launches.array(np.float64, n) for n in (rows * cols * POINT_NUMBERS, cells * CELL_NUMBERS))
     bounds = launches.array(np.int32, cells * BOUNDS)
     with our_compilation(optimised=False):
         _outline(np.ascontiguousarray(position, np.float64), numbers, launches.give(sizes), point, cell, bounds)
     bins = binned(launches, bounds, cells, (width, height), bin_size)
-    sizes[[uni.BIN_SIZE, uni.BINS_ACROSS]] = bins.size, bins.across
+    sizes[[uni.BIN_SIZE, uni.BINS_ACROSS, uni.WIDTH, uni.HEIGHT]] = bins.size, bins.across, *scene.render.size
     simple = launches.array(np.uint8, bins.lengths.size)
     launches.launch(_judge, bins.lengths.size, cell, cols, bins.starts, bins.entries, simple, rounds=3 * AROUND)
     pixels, hidden = launches.array(np.float32, 2 * total), launches.array(np.uint8, total)
@@ -92,7 +100,7 @@ def _search(
     # A point takes one round for a cell, and one for each of its triangles.
     rounds = 1 + 2 * (scene.render.refine + 1) ** 2
     for listed, count in launches.parts(int(bins.lengths.max()), rounds):
-        launches.launch(_find, total, listed, count, *arguments, rounds=count * rounds + len(rods))
+        launches.launch(_finding(view.model), total, listed, count, *arguments, rounds=count * rounds + len(rods))
     launches.require_ended()
     return launches.take(pixels).reshape(-1, 2), launches.take(hidden)
 
@@ -219,59 +227,80 @@ def _is_behind_rod(x, y, depth, numbers: ti.template(), sizes: ti.template()):
     return hides
 
 
-@ti.kernel
-def _find(
-    first: ti.i32, end: ti.i32, ended: Integers, listed: ti.i32, count: ti.i32, coordinates: Floats, moved: ti.i32,
-    numbers: Doubles, sizes: Integers, point: Doubles, cell: Doubles, starts: Integers, entries: Integers,
-    simple: Bytes, pixels: Floats, hidden: Bytes,
-):  # fmt: skip
-    """Find where material points are seen, and which are hidden by `count` cells of their lists from `listed` on.
+@cache
+def _finding(lens: str) -> Callable[..., None]:
+    """Make the kernel that finds points, for a model of the lens, empty if it bends no lines."""
 
-    If `moved` is 0, `pixels` gets their places [px]. Otherwise they are what the pixels of another frame showed, and
-    `pixels` gets how far each has moved from its pixel's centre [px].
-    """
-    for k in range(first, end):
-        rows, cols, width, height = sizes[uni.ROWS], sizes[uni.COLS], sizes[uni.WIDTH], sizes[uni.HEIGHT]
-        near, parts = numbers[uni.NEAR], numbers[uni.PARTS]
-        u, v = coordinates[2 * k], coordinates[2 * k + 1]
-        x, y, out_of_sight = ti.cast(NOWHERE, ti.f64), ti.cast(NOWHERE, ti.f64), False
-        if abs(u) < 2.0:  # False for NaN
-            s = ti.math.clamp(ti.cast(u, ti.f64), 0.0, 1.0) * (cols - 1)
-            t = ti.math.clamp(ti.cast(v, ti.f64), 0.0, 1.0) * (rows - 1)
-            j, i = ti.min(ti.cast(s, ti.i32), cols - 2), ti.min(ti.cast(t, ti.i32), rows - 2)
-            s, t = s - j, t - i
-            own, part = i * (cols - 1) + j, 1.0 / parts
-            column, line = ti.min(ti.floor(s * parts), parts - 1.0), ti.min(ti.floor(t * parts), parts - 1.0)
-            s0, t0 = column * part, line * part
-            s1, t1 = s - s0, t - t0
-            own_triangle = 2 * ti.cast(line * parts + column, ti.i32) + ti.cast(t1 > s1, ti.i32)
-            patch = ti.static(geometry.patch_of(geometry.corner_of(own, cols), cols, 0.0, True, point, True))
-            # In the small quad, D s t is replaced by a function that is linear on either side of the diagonal.
-            twist = s0 * t0 + s1 * t0 + s0 * t1 + ti.min(s1, t1) * part
-            p = patch.a + patch.b * s + patch.c * t + patch.d * twist
-            out_of_sight = True
-            if p[2] > near:
-                x, y = p[0] / p[2], p[1] / p[2]
-                if x >= 0.0 and y >= 0.0 and x < width and y < height:
-                    out_of_sight = False
-                    depth = p[3] - numbers[uni.TOUCHING]
-                    square = ti.cast(y, ti.i32) // sizes[uni.BIN_SIZE] * sizes[uni.BINS_ACROSS]
-                    square += ti.cast(x, ti.i32) // sizes[uni.BIN_SIZE]
-                    if simple[square] == 0:
-                        begin = starts[square] + listed
-                        for n in range(begin, ti.min(begin + count, starts[square + 1])):
-                            if not out_of_sight:
-                                out_of_sight = _hides(
-                                    x, y, depth, entries[n], own, own_triangle, cols, parts, near, point, cell
-                                )
-                    out_of_sight = out_of_sight or _is_behind_rod(x, y, depth, numbers, sizes)
-        if moved > 0:
-            seen = x > -INFINITY  # False for NaN
-            x = ti.select(seen, x - ti.cast(k % width, ti.f64) - 0.5, NO_FLOW)
-            y = ti.select(seen, y - ti.cast(k // width, ti.f64) - 0.5, NO_FLOW)
-        pixels[2 * k] = ti.cast(x, ti.f32)
-        pixels[2 * k + 1] = ti.cast(y, ti.f32)
-        if listed > 0:
-            out_of_sight = out_of_sight or hidden[k] > 0
-        hidden[k] = ti.cast(out_of_sight, ti.u8)
-        end_thread(ended)
+    @ti.kernel
+    def find_points(
+        first: ti.i32, end: ti.i32, ended: Integers, listed: ti.i32, count: ti.i32, coordinates: Floats, moved: ti.i32,
+        numbers: Doubles, sizes: Integers, point: Doubles, cell: Doubles, starts: Integers, entries: Integers,
+        simple: Bytes, pixels: Floats, hidden: Bytes,
+    ):  # fmt: skip
+        """Find where material points are seen, and which are hidden by `count` cells of their lists from `listed` on.
+
+        If `moved` is 0, `pixels` gets their places [px]. Otherwise they are what the pixels of another frame showed,
+        and `pixels` gets how far each has moved from its pixel's centre [px].
+        """
+        for k in range(first, end):
+            rows, cols, width, height = sizes[uni.ROWS], sizes[uni.COLS], sizes[uni.WIDTH], sizes[uni.HEIGHT]
+            near, parts = numbers[uni.NEAR], numbers[uni.PARTS]
+            u, v = coordinates[2 * k], coordinates[2 * k + 1]
+            x, y, out_of_sight = ti.cast(NOWHERE, ti.f64), ti.cast(NOWHERE, ti.f64), False
+            if abs(u) < 2.0:  # False for NaN
+                s = ti.math.clamp(ti.cast(u, ti.f64), 0.0, 1.0) * (cols - 1)
+                t = ti.math.clamp(ti.cast(v, ti.f64), 0.0, 1.0) * (rows - 1)
+                j, i = ti.min(ti.cast(s, ti.i32), cols - 2), ti.min(ti.cast(t, ti.i32), rows - 2)
+                s, t = s - j, t - i
+                own, part = i * (cols - 1) + j, 1.0 / parts
+                column, line = ti.min(ti.floor(s * parts), parts - 1.0), ti.min(ti.floor(t * parts), parts - 1.0)
+                s0, t0 = column * part, line * part
+                s1, t1 = s - s0, t - t0
+                own_triangle = 2 * ti.cast(line * parts + column, ti.i32) + ti.cast(t1 > s1, ti.i32)
+                patch = ti.static(geometry.patch_of(geometry.corner_of(own, cols), cols, 0.0, True, point, True))
+                # In the small quad, D s t is replaced by a function that is linear on either side of the diagonal.
+                twist = s0 * t0 + s1 * t0 + s0 * t1 + ti.min(s1, t1) * part
+                p = patch.a + patch.b * s + patch.c * t + patch.d * twist
+                out_of_sight = True
+                if p[2] > near:
+                    x, y = p[0] / p[2], p[1] / p[2]
+                    place_x, place_y, within = x, y, True
+                    if ti.static(lens != ""):
+                        x, y, within = bending.bent(place_x, place_y, numbers, lens)
+                    if within and x >= 0.0 and y >= 0.0 and x < width and y < height:
+                        out_of_sight = False
+                        depth = p[3] - numbers[uni.TOUCHING]
+                        square = ti.cast(place_y, ti.i32) // sizes[uni.BIN_SIZE] * sizes[uni.BINS_ACROSS]
+                        square += ti.cast(place_x, ti.i32) // sizes[uni.BIN_SIZE]
+                        if simple[square] == 0:
+                            begin = starts[square] + listed
+                            for n in range(begin, ti.min(begin + count, starts[square + 1])):
+                                if not out_of_sight:
+                                    out_of_sight = _hides(
+                                        place_x,
+                                        place_y,
+                                        depth,
+                                        entries[n],
+                                        own,
+                                        own_triangle,
+                                        cols,
+                                        parts,
+                                        near,
+                                        point,
+                                        cell,
+                                    )
+                        out_of_sight = out_of_sight or _is_behind_rod(place_x, place_y, depth, numbers, sizes)
+                    if not within:
+                        x, y = ti.cast(NOWHERE, ti.f64), ti.cast(NOWHERE, ti.f64)
+            if moved > 0:
+                seen = x > -INFINITY  # False for NaN
+                x = ti.select(seen, x - ti.cast(k % width, ti.f64) - 0.5, NO_FLOW)
+                y = ti.select(seen, y - ti.cast(k // width, ti.f64) - 0.5, NO_FLOW)
+            pixels[2 * k] = ti.cast(x, ti.f32)
+            pixels[2 * k + 1] = ti.cast(y, ti.f32)
+            if listed > 0:
+                out_of_sight = out_of_sight or hidden[k] > 0
+            hidden[k] = ti.cast(out_of_sight, ti.u8)
+            end_thread(ended)
+
+    return find_points

@@ -13,10 +13,14 @@ from numpy.typing import NDArray
 
 from taichi_msm.render import style
 from taichi_msm.render.camera import View
+from taichi_msm.render.places import visible
 from taichi_msm.render.surface import Rod
 from taichi_msm.scene import Render, Scene
 
 Array = NDArray[np.float64]
+
+# Sides of an instrument's outline are bent piece by piece.
+PIECES = 16
 
 # Indices into the array of sizes: of the sheet, the picture and its bins. Three are counters: rows of mass points that
 # workers have taken, rows projected, bands taken. Last come the levels of the texture, each with its first texel, its
@@ -29,24 +33,35 @@ LEVEL_SIZES = 3
 # drawn. Then the number of small quads along a side of a cell, and the background's colour.
 MATRIX, AXES, NEAR, PARTS, BACKGROUND = 0, 16, 25, 26, 27
 
-# The middle of the picture [samples]; metres per sample at w = 1; 1 for a pinhole camera, else 0.
-CENTRE_X, CENTRE_Y, SPREAD, PINHOLE = range(30, 34)
+# Where the axis of view is seen without distortion [samples]; metres per sample at w = 1, across and down; 1 for a
+# pinhole camera, else 0. The middle of the picture [samples].
+CENTRE_X, CENTRE_Y, SPREAD_X, SPREAD_Y, PINHOLE, MIDDLE_X, MIDDLE_Y = range(30, 37)
 
-# The light's place [m]; its distance from the point in the middle of the picture [m]; the factor that makes the light 1
-# there; the scene's numbers.
-LIGHT_X, LIGHT_Y, FARNESS, UNIT, AMBIENT, GLOSS, VIGNETTE = range(34, 41)
+# The light's place to the right and up, in the camera's frame [m]; its distance from the point in the middle of the
+# picture of the main camera [m]; the factor that makes the light 1 there; the scene's numbers.
+LIGHT_X, LIGHT_Y, FARNESS, UNIT, AMBIENT, GLOSS, VIGNETTE = range(37, 44)
 
 # The sheet's axes to the right and up, in the camera's frame; the slope of the relief for a step of one grey from texel
 # to texel.
-ACROSS, UP, SLOPE_X, SLOPE_Y = 41, 44, 47, 48
+ACROSS, UP, SLOPE_X, SLOPE_Y = 44, 47, 50, 51
+
+# A mass point's place in the picture is after its X, Y, w and depth.
+SEEN = 4
 
 # Whatever is in front of a point by less than this counts as the point's own place [m].
-TOUCHING = 49
+TOUCHING = 52
 TOUCHING_SHARE = 1e-9  # this distance as a fraction of the sheet's larger side
+
+# The lens: its coefficients; how far from the axis of view it is taken [m], at w = 1; where the axis is seen [samples],
+# and samples per metre at w = 1; the numbers of `places.Visible`, in samples.
+LENS, LENS_RADIUS, PICTURE_X, PICTURE_Y, FOCAL_X, FOCAL_Y, VISIBLE, BEND, STRETCH = 53, *range(61, 67), 70, 71
+
+# The light's place toward the camera, in its frame [m]; the direction to the headlight, in the world.
+LIGHT_Z, HEADLIGHT = 72, 73
 
 # Then the instruments, each with the middle of its tip and its axis in the camera's frame; its length and radius; and
 # its bounds in the picture [samples].
-RODS, ROD_NUMBERS = 50, 12
+RODS, ROD_NUMBERS = 76, 12
 TIP, AXIS, LENGTH, RADIUS, LEFT, TOP, RIGHT, BOTTOM = 0, 3, 6, 7, 8, 9, 10, 11
 
 
@@ -65,24 +80,41 @@ def view_numbers(
 
     The sheet has this height and width [m], its texture this width and height [texels].
     """
-    numbers = np.empty(RODS + len(rods) * ROD_NUMBERS)
+    numbers = np.zeros(RODS + len(rods) * ROD_NUMBERS)
     numbers[MATRIX:AXES] = (view.matrix * np.array([[factor], [factor], [1], [1]])).ravel()
     numbers[AXES:NEAR] = view.axes.ravel()
     numbers[NEAR:BACKGROUND] = view.near, render.refine + 1
     numbers[BACKGROUND:CENTRE_X] = render.background
-    centre_x, centre_y = view.centre
-    numbers[CENTRE_X:LIGHT_X] = centre_x * factor, centre_y * factor, 1 / (view.scale * factor), view.pinhole
-    x, y = style.LIGHT_RIGHT * view.distance, style.LIGHT_UP * view.distance
-    far, light = math.hypot(x, y, view.distance), render.light
-    unit = (1 + style.WRAP) / (view.distance / far + style.WRAP)
-    numbers[LIGHT_X:ACROSS] = x, y, far, unit, light.ambient, light.gloss, light.vignette
+    numbers[CENTRE_X:SPREAD_X], numbers[SPREAD_X:PINHOLE] = view.centre * factor, 1 / (view.scale * factor)
+    numbers[PINHOLE], numbers[MIDDLE_X:LIGHT_X] = view.pinhole, view.size / 2 * factor
+    lamp, light = view.lamp or view, render.light
+    place = np.array([style.LIGHT_RIGHT, style.LIGHT_UP, 0.0]) * lamp.distance
+    far = math.hypot(place[0], place[1], lamp.distance)
+    unit = (1 + style.WRAP) / (lamp.distance / far + style.WRAP)
+    if lamp is not view:
+        place = view.axes @ (lamp.eye + place @ lamp.axes - view.eye)
+    numbers[[LIGHT_X, LIGHT_Y, LIGHT_Z]], numbers[HEADLIGHT:RODS] = place, lamp.axes[2]
+    numbers[FARNESS:ACROSS] = far, unit, light.ambient, light.gloss, light.vignette
     numbers[ACROSS:UP], numbers[UP:SLOPE_X] = view.axes[:, 0], view.axes[:, 1]
     height = light.relief / 100 / 255 * max(sheet)
     numbers[SLOPE_X:TOUCHING] = height * texture[0] / sheet[1], -height * texture[1] / sheet[0]
     numbers[TOUCHING] = TOUCHING_SHARE * max(sheet)
+    if view.lens is not None:
+        seen = visible(view)
+        tell_lens(numbers, view, factor, seen.radius)
+        numbers[VISIBLE:BEND] = np.array(seen.box) * factor
+        numbers[BEND], numbers[STRETCH] = seen.bend / factor, seen.stretch
     for n, rod in enumerate(rods):
         numbers[RODS + n * ROD_NUMBERS : RODS + (n + 1) * ROD_NUMBERS] = _rod_numbers(rod, view, factor)
     return numbers
+
+
+def tell_lens(numbers: Array, view: View, factor: int, radius: float) -> None:
+    """Add the numbers of a lens, which is taken up to a radius."""
+    assert view.lens is not None
+    numbers[LENS : LENS + len(view.lens.coefficients)] = view.lens.coefficients
+    numbers[LENS_RADIUS] = radius
+    numbers[PICTURE_X:FOCAL_X], numbers[FOCAL_X:VISIBLE] = view.centre * factor, view.scale * factor
 
 
 def _rod_numbers(rod: Rod, view: View, factor: int) -> Array:
@@ -95,9 +127,24 @@ def _rod_numbers(rod: Rod, view: View, factor: int) -> Array:
     corner = np.array(np.meshgrid(*[(-rod.radius, rod.radius)] * 3)).reshape(3, -1).T @ view.axes
     boxes = (ends[:, None] + corner).reshape(-1, 3)
     x, y, w, _ = view.project(boxes).T
-    size = 2 * view.centre
-    bounds = np.array([0, 0, *size])
+    bounds = np.array([0, 0, *view.size])
     if (w > view.near).all():
-        bounds = np.array([(x / w).min(), (y / w).min(), (x / w).max(), (y / w).max()])
-    numbers[LEFT:] = np.clip(bounds, 0, np.tile(size, 2)) * factor
+        seen = np.stack([x / w, y / w], axis=-1)
+        bounds = np.concatenate([seen.min(axis=0), seen.max(axis=0)]) if view.lens is None else _bent(seen, view)
+    numbers[LEFT:] = np.clip(bounds, 0, np.tile(view.size, 2)) * factor
     return numbers
+
+
+def _bent(corners: Array, view: View) -> Array:
+    """Bound what shows the convex hull of corners [px], of which a lens bends every side: left, top, right, bottom."""
+    assert view.lens is not None
+    lens, known = view.lens, visible(view)
+    first, second = np.triu_indices(len(corners), 1)
+    share = np.linspace(0, 1, PIECES + 1)[:, None, None]
+    sides = corners[first] * (1 - share) + corners[second] * share
+    place = (sides - view.centre) / view.scale
+    place *= np.minimum(1, known.radius / np.maximum(np.linalg.norm(place, axis=-1, keepdims=True), known.radius))
+    seen = lens.distort(place) * view.scale + view.centre
+    length = float(np.linalg.norm(corners[first] - corners[second], axis=-1).max()) / PIECES
+    far = known.stretch * length
+    return np.concatenate([seen.min(axis=(0, 1)) - far, seen.max(axis=(0, 1)) + far])

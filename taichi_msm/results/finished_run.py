@@ -48,6 +48,7 @@ class FinishedRun:
     sha256: Mapping[str, str]  # of the files of its pictures, by the keys that name them
     overrides: list[str]  # that made the scene from its file
     _record: bytes = field(repr=False)
+    camera: str = ""  # of which what is seen is read; "": the only one, without a name
 
     @property
     def time(self) -> NDArray[np.float64]:
@@ -119,9 +120,17 @@ class FinishedRun:
 
     def has(self, key: str) -> bool:
         """Tell whether the results have what an entry of `output` asks for."""
-        path = self.directory / OUTPUTS[key].result
+        path = self._folder(key) / OUTPUTS[key].result
         with reading(path):
             return path.exists()
+
+    def cameras(self) -> list[str]:
+        """Name the cameras; none: it has one, without a name."""
+        return list(self.scene.render.cameras or ())
+
+    def _folder(self, key: str) -> Path:
+        """Give the folder of what was written for an entry of `output`."""
+        return self.directory / self.camera if OUTPUTS[key].is_seen else self.directory
 
     def remedy(self, *keys: str) -> str:
         """Say how to get the results of further entries of a scene's `output`."""
@@ -135,13 +144,14 @@ class FinishedRun:
 
         Raises a FilesError when it is not there.
         """
-        result, path = OUTPUTS[key].result, self.directory / OUTPUTS[key].path(frame)
+        result, folder = OUTPUTS[key].result, self._folder(key)
+        path = folder / OUTPUTS[key].path(frame)
         if not self.has(key):
-            raise FilesError(f"{result}: not among the results of {self.directory}; {self.remedy(key)}")
+            raise FilesError(f"{result}: not among the results of {folder}; {self.remedy(key)}")
         if not path.is_file():
             raise FilesError(f"{path}: no such file; {self.remedy(key)}")
         # The results may come from anybody, and what is read here may be given to others.
-        if (self.directory / result).is_symlink() or path.is_symlink():
+        if (folder / result).is_symlink() or path.is_symlink():
             raise FilesError(f"{path}: a symbolic link, which no run writes; {self.remedy(key)}")
         return path
 
@@ -166,7 +176,7 @@ def read_run(directory: str | Path) -> FinishedRun:
         chosen = scene.time.precision != "auto" and scene.sheet.tolerance is scene.time.tolerance is None
         if not isinstance(frames, int) or not 1 <= frames <= scene.time.frames + 1 or not chosen:
             raise damaged(path)
-    return FinishedRun(path.parent, record["status"], scene, frames, sha256, overrides, data)
+    return FinishedRun(path.parent, record["status"], scene, frames, sha256, overrides, data, scene.render.main)
 
 
 @contextmanager

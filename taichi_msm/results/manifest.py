@@ -70,7 +70,14 @@ class Manifest:
     def _deciding(self) -> tuple[Any, ...]:
         """Give all that decides bits. Pictures count by what is in them, wherever they are."""
         scene = self.scene.with_pictures(lambda path: "any")
-        return scene, self.arch, self.sha256, what_decides_bits(self.versions, self.arch)
+        # Dictionaries are equal in any order, but the first camera has the light.
+        return (
+            scene,
+            list(scene.render.all_cameras),
+            self.arch,
+            self.sha256,
+            what_decides_bits(self.versions, self.arch),
+        )
 
 
 _MANIFEST = TypeAdapter(Manifest)

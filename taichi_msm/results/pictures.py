@@ -1,4 +1,4 @@
-"""Write pictures as PNG and GIF."""
+"""Write pictures as PNG, GIF and MP4."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import os
 import time
 import zlib
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from concurrent.futures import CancelledError, Future, ThreadPoolExecutor, wait
 from contextlib import ExitStack, suppress
 from pathlib import Path
@@ -16,6 +16,7 @@ from typing import NamedTuple
 from PIL import Image
 
 from taichi_msm.outputs.gif import GifWriter, Palette, Picture, shades
+from taichi_msm.outputs.mp4 import Mp4Writer
 from taichi_msm.outputs.table import OUTPUTS
 from taichi_msm.progress import Pause
 from taichi_msm.results.whole import create
@@ -29,18 +30,19 @@ PATIENCE = 0.1
 
 
 class Job(NamedTuple):
-    """What to encode: as `frames/0000.png` and so on, as `animation.gif`, or as both."""
+    """What to encode: as `frames/0000.png` and so on, as `animation.gif`, as `animation.mp4`, or as several of them."""
 
-    folder: Path  # where the files go
+    folders: tuple[Path, ...]  # where the files go; of several cameras, those of each
     size: tuple[int, int]  # width, height of the pictures [px]
     rate: float  # frames per second
     png: bool
     gif: bool
-    background: tuple[int, int, int]  # a colour that the animation keeps exactly
+    background: tuple[int, int, int]  # a colour that the GIF keeps exactly
+    mp4: bool = False
 
-    def still(self, number: int) -> Path:
-        """Name the PNG of a frame."""
-        return self.folder / OUTPUTS["png"].path(number)
+    def stills(self, number: int) -> list[Path]:
+        """Name the PNGs of a frame."""
+        return [folder / OUTPUTS["png"].path(number) for folder in self.folders]
 
 
 class Report(NamedTuple):
@@ -65,20 +67,21 @@ class PictureWriter:
         self._job, self._waiting, self._hurry = job, waiting, hurry or Event()
         self._frames = self._begun = 0
         self._seconds = 0.0
-        self._gif: GifWriter | None = None
+        self._films: list[list[GifWriter | Mp4Writer]] = []
         self._files = ExitStack()
         self._pending: deque[Future[None]] = deque()
         self._stills = ThreadPoolExecutor(max(1, min(waiting, os.cpu_count() or 1)))
         self._reel = ThreadPoolExecutor(1)
 
-    def add(self, picture: Picture, pause: Pause = lambda: None) -> None:
-        """Encode the next picture, shape (height, width, 3), which must not change; `pause`: as for `Encoder.add`."""
+    def add(self, pictures: Picture, pause: Pause = lambda: None) -> None:
+        """Encode the pictures of the next frame, which must not change; arguments as for `Encoder.add`."""
         number = self._begun
         self._begun += 1
-        if self._job.png and number == 0:
-            self._job.still(0).parent.mkdir()
-        still = self._stills.submit(self._shoot, picture, number) if self._job.png else None
-        self._pending.append(self._reel.submit(self._complete, picture, number, still))
+        paths = self._job.stills(number) if self._job.png else []
+        for path in paths if number == 0 else ():
+            path.parent.mkdir()
+        stills = [self._stills.submit(self._shoot, *each, number) for each in zip(pictures, paths, strict=False)]
+        self._pending.append(self._reel.submit(self._complete, pictures, number, stills))
         while len(self._pending) > self._waiting and not self._hurry.is_set():
             with suppress(CancelledError):
                 _await(self._pending[0], pause)
@@ -94,7 +97,8 @@ class PictureWriter:
         self._stills.shutdown()
         _await(self._reel.submit(self._close), pause)
         for number in range(self._frames, self._begun) if self._job.png else ():
-            self._job.still(number).unlink(missing_ok=True)
+            for path in self._job.stills(number):
+                path.unlink(missing_ok=True)
         return Report(self._frames, self._seconds)
 
     def abort(self) -> None:
@@ -105,16 +109,16 @@ class PictureWriter:
         with suppress(OSError):
             self._files.close()
 
-    def _shoot(self, picture: Picture, number: int) -> float:
+    def _shoot(self, picture: Picture, path: Path, number: int) -> float:
         """Write a PNG; returns the processor time [s]."""
         self._give_up_in_a_hurry(number)
-        return _seconds(_write_png, picture, self._job.still(number))
+        return _seconds(_write_png, picture, path)
 
-    def _complete(self, picture: Picture, number: int, still: Future[float] | None) -> None:
-        """Complete a frame: first its still, then its place in the film, which so has no frame without a still."""
+    def _complete(self, pictures: Picture, number: int, stills: Sequence[Future[float]]) -> None:
+        """Complete a frame: first its stills, then its place in the films, which so have no frame without a still."""
         self._give_up_in_a_hurry(number)
-        spent = still.result() if still else 0.0
-        self._seconds += spent + (_seconds(self._film, picture) if self._job.gif else 0.0)
+        spent = sum(still.result() for still in stills)
+        self._seconds += spent + _seconds(self._film, pictures)
         self._frames += 1
 
     def _give_up_in_a_hurry(self, number: int) -> None:
@@ -122,18 +126,30 @@ class PictureWriter:
         if self._hurry.is_set() and number > 0:
             raise CancelledError
 
-    def _film(self, picture: Picture) -> None:
+    def _film(self, pictures: Picture) -> None:
+        if self._frames == 0:
+            self._films = [self._begin(*each) for each in zip(self._job.folders, pictures, strict=True)]
+        for films, picture in zip(self._films, pictures, strict=True):
+            for film in films:
+                film.add(picture)
+
+    def _begin(self, folder: Path, picture: Picture) -> list[GifWriter | Mp4Writer]:
+        """Begin the films of a camera, whose first picture shows the colours that the animation needs."""
         job = self._job
-        if self._gif is None:  # The first frame shows the colours that the animation needs.
-            file = self._files.enter_context(create(job.folder / OUTPUTS["gif"].path()))
-            self._gif = GifWriter(file, job.size, job.rate, Palette(shades(picture), job.background))
-        self._gif.add(picture)
+        films: list[GifWriter | Mp4Writer] = []
+        if job.gif:
+            file = self._files.enter_context(create(folder / OUTPUTS["gif"].path()))
+            films.append(GifWriter(file, job.size, job.rate, Palette(shades(picture), job.background)))
+        if job.mp4:
+            file = self._files.enter_context(create(folder / OUTPUTS["mp4"].path()))
+            films.append(Mp4Writer(file, job.size, job.rate))
+        return films
 
     def _close(self) -> None:
-        """Complete the film, once."""
-        if self._gif is not None:
-            self._seconds += _seconds(self._gif.close)
-            self._gif = None
+        """Complete the films, once."""
+        while self._films:
+            for film in self._films.pop():
+                self._seconds += _seconds(film.close)
 
 
 def _await(task: Future[None], pause: Pause) -> None:

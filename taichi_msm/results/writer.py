@@ -1,4 +1,4 @@
-"""Write the results of a run: frames, animation, trajectory, forces and record, whole or not at all."""
+"""Write the results of a run: frames, animations, trajectory, forces and record, whole or not at all."""
 
 from __future__ import annotations
 
@@ -7,6 +7,7 @@ import io
 import json
 from collections.abc import Mapping, Sequence
 from contextlib import ExitStack
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -28,19 +29,10 @@ from taichi_msm.results.whole import add, create
 from taichi_msm.scene import Scene
 from taichi_msm.timegrid import TimeGrid
 
-FORCES_HEADER = ("time", "probe", "tip_x", "tip_y", "tip_z", "force_x", "force_y", "force_z")
-
 
 def _listed(record: Mapping[str, Any]) -> Listed:
     """Tell of a file whether it is one of the run with this record."""
-    results, frames = set(record["outputs"]), int(record["frames"])
-    counts = {output.result: output.count(frames) for output in table.OUTPUTS.values() if output.is_series}
-
-    def is_listed(name: str) -> bool:
-        result, _, file = name.partition("/")
-        return result in results and (not file or int(Path(file).stem) < counts[result])
-
-    return is_listed
+    return partial(table.listed, set(record["outputs"]), int(record["frames"]))
 
 
 # The results of a run, and beside them the checkpoint from which it can go on.
@@ -83,11 +75,12 @@ class ResultWriter:
         self._manifest = manifest
         self._resumes = resumes
         self._beside = beside
-        names = table.file_names(table.results(scene.output), scene.time.frames + 1)
+        names = table.file_names(table.results(scene.folders), scene.time.frames + 1)
         self._publication = Publication(directory, RUN, names)
         folder = self._publication.staging / CHECKPOINT
         self._checkpoint = Checkpoint(folder, scene, grid)
-        self._labels = LabelWriter(self._publication.staged, scene)
+        staged = self._publication.staged
+        self._labels = {name: LabelWriter(staged / name, scene, name) for name in scene.render.all_cameras}
         self._encoder: Encoder | PictureWriter | None = None
         self._open = ExitStack()
         self._finished = False
@@ -105,7 +98,7 @@ class ResultWriter:
     def add(
         self,
         position: NDArray[Any],
-        observed: Observed,
+        observed: Mapping[str, Observed],
         forces: Sequence[TipForce] = (),
         pause: Pause = lambda: None,
     ) -> None:
@@ -113,7 +106,7 @@ class ResultWriter:
 
         Args:
             position: of the points [m], shape (rows, cols, 3).
-            observed: what else is wanted.
+            observed: what else is wanted, by the names of the cameras.
             forces: of the probes; of a frame that is stored already they are not needed.
             pause: as for `Encoder.add`.
         """
@@ -125,9 +118,11 @@ class ResultWriter:
             if self.frames == self.stored:
                 self._checkpoint.add(position, forces)
                 self._publication.keep = self._manifest is not None
-            self._labels.add(self.frames, observed)
-            if self._encoder and observed.picture is not None:
-                self._encoder.add(observed.picture, pause)
+            for name, labels in self._labels.items():
+                labels.add(self.frames, observed[name], position)
+            if self._encoder:
+                pictures = [seen.picture for seen in observed.values() if seen.picture is not None]
+                self._encoder.add(np.stack(pictures) if len(pictures) > 1 else pictures[0][None], pause)
             self.frames += 1
 
     @property
@@ -152,7 +147,8 @@ class ResultWriter:
         with writing(self._directory):
             if self._encoder:
                 self.frames, self.encode_seconds = self._encoder.finish(pause, hurry=hurry)
-            self._labels.finish(self.frames)
+            for labels in self._labels.values():
+                labels.finish(self.frames)
             if self.frames and "trajectory" in self._scene.output:
                 self._write_trajectory()
             if self.frames and "forces" in self._scene.output:
@@ -166,7 +162,7 @@ class ResultWriter:
         """
         self.finish()
         with writing(self._directory):
-            results = table.results(self._scene.output if self.frames else ())
+            results = table.results(self._scene.folders if self.frames else {})
             # By these names the next run into the directory recognises our files.
             facts = {**record, "frames": self.frames, "outputs": results}
             text = json.dumps(facts, indent=2, ensure_ascii=False, allow_nan=False) + "\n"
@@ -196,7 +192,7 @@ class ResultWriter:
             io.TextIOWrapper(file, encoding="ascii", newline="") as text,
         ):
             rows = csv.writer(text, lineterminator="\n")
-            rows.writerow(FORCES_HEADER)
+            rows.writerow(table.FORCES_HEADER)
             for frame in range(self.frames):
                 time = frame / self._scene.time.frames_per_second
                 rows.writerows((time, one.probe, *one.tip, *one.force) for one in self._checkpoint.forces(frame))
@@ -205,14 +201,17 @@ class ResultWriter:
         scene = self._scene
         with writing(self._directory), ExitStack() as opened:
             opened.enter_context(self._publication)
+            for name in scene.render.all_cameras if scene.renders else ():
+                (self._publication.staged / name).mkdir(exist_ok=True)
             if scene.draws:
                 job = Job(
-                    folder=self._publication.staged,
+                    folders=tuple(self._publication.staged / name for name in scene.render.all_cameras),
                     size=scene.render.size,
                     rate=scene.time.frames_per_second,
                     png="png" in scene.output,
                     gif="gif" in scene.output,
                     background=scene.render.background,
+                    mp4="mp4" in scene.output,
                 )
                 locks = self._publication.lock_descriptors
                 self._encoder = Encoder(job, locks) if self._beside else PictureWriter(job)

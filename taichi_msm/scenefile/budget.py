@@ -17,7 +17,7 @@ from taichi_msm.physics.pilots import choose_pilots
 from taichi_msm.physics.plan import Plan
 from taichi_msm.physics.terms.contact import contact_fields
 from taichi_msm.render import texture
-from taichi_msm.scene import Scene
+from taichi_msm.scene import Camera, Scene
 from taichi_msm.system.resources import available_memory
 
 MAX_STEPS = 10**12
@@ -29,13 +29,21 @@ BAND_ROWS = 16  # rows of samples that a thread holds at a time
 PIXEL_BYTES = 3 * 12  # per pixel of the frame: its colours, from sums to bytes
 PICTURE_PIXEL_BYTES = 20  # per pixel of the picture's file, while it is decoded and converted; its texture takes less
 
+# Bytes of a sample's place where a lens bends lines, while these are found and copied.
+PLACE_BYTES = 100
+
+# Bytes of a pixel while a film is encoded, most of them in the frames that the encoder looks ahead.
+FILM_PIXEL_BYTES = 80
+
 # The most that a file takes besides [bytes], but for a byte for every row of a PNG; and run.json besides its scene.
 FILE_BYTES = 1024
 RECORD_BYTES = 1 << 16
 
-# Bytes of a pixel while its labels are found and written; and of a tracked point in a frame, held until the end.
+# Bytes of a pixel while its labels are found and written, and its normal; and of a tracked point in a frame, held until
+# the end.
 LABEL_PIXEL_BYTES = 60
-TRACK_BYTES = 9
+NORMAL_PIXEL_BYTES = 24
+TRACK_BYTES = 21
 
 # Bytes of a row of the table of forces, at most, and of what is kept of one until the run ends.
 FORCE_ROW_BYTES = 180
@@ -82,10 +90,12 @@ def estimate(plan: Plan) -> Budget:
     rows, cols = scene.sheet.points
     points, number_bytes = rows * cols, 4 if grid.precision == "f32" else 8
     frames, (width, height) = grid.frames + 1, scene.render.size
-    pixel_bytes = [output.pixel_bytes for name, output in OUTPUTS.items() if name in scene.output]
+    pixel_bytes = [OUTPUTS[name].pixel_bytes for folder in scene.folders.values() for name in folder]
+    cameras = len(scene.render.all_cameras)
     picture = sum(width * height * each + height + FILE_BYTES for each in pixel_bytes if each)
     positions = frames * points * 3 * number_bytes
     tracks = scene.render.tracks**2 * (frames * TRACK_BYTES + 16) + FILE_BYTES if "tracks" in scene.output else 0
+    tracks *= cameras
     forces = frames * len(scene.probes) if "forces" in scene.output else 0
     contact = contact_fields(scene.probes)
     loads = sum(not probe.moved for probe in scene.probes)
@@ -169,8 +179,14 @@ def drawing_bytes(scene: Scene) -> int:
     factor = scene.render.supersample
     band_rows = min(height * factor, BAND_ROWS * (os.cpu_count() or 1))
     samples = band_rows * width * factor * SAMPLE_BYTES
+    cameras = scene.render.all_cameras.values()
+    bent = sum(isinstance(camera, Camera) and camera.distortion is not None for camera in cameras)
+    samples += width * height * factor**2 * PLACE_BYTES * bent
     pixel = PIXEL_BYTES + (LABEL_PIXEL_BYTES if scene.labels_pixels else 0)
-    return rows * cols * POINT_BYTES + samples + width * height * pixel + picture * PICTURE_PIXEL_BYTES
+    pixel += NORMAL_PIXEL_BYTES if "normals" in scene.output else 0
+    pixel += FILM_PIXEL_BYTES if "mp4" in scene.output else 0
+    pixels = width * height * len(cameras)
+    return rows * cols * POINT_BYTES + samples + pixels * pixel + picture * PICTURE_PIXEL_BYTES
 
 
 def _free_disk(directory: Path) -> int:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import codecs
 import json
 import re
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from copy import deepcopy
 from itertools import chain, starmap
 from pathlib import Path
@@ -25,6 +25,9 @@ MAX_BYTES = 2**20
 IMAGE: Key = ("image",)
 MAPS: tuple[Key, ...] = (("tissue", "map", "image"), ("tissue", "foundation_map", "image"), ("springs", "map", "image"))
 PICTURES = (IMAGE, *MAPS)
+
+# The keys of a camera that name files.
+CAMERA_FILES = ("calibration", "poses")
 
 # The largest number of lines in an error: nobody reads more, and a broken file may have tens of thousands of problems.
 MAX_LINES = 100
@@ -102,8 +105,8 @@ def plan_file(file: File, overrides: Sequence[str] | Mapping[str, Any] = (), ima
     )
     for override in parsed:
         draft.override(override)
-    for key in PICTURES if image is None else MAPS:
-        draft.find_picture(key, file.folder)
+    for key in (*(PICTURES if image is None else MAPS), *_camera_files(draft.data)):
+        draft.find_file(key, file.folder)
     if image is not None:
         draft.override(_Override(f"--image {cut(str(image))}", IMAGE, str(image)))
     plan, problems = validate(draft.data)
@@ -111,6 +114,15 @@ def plan_file(file: File, overrides: Sequence[str] | Mapping[str, Any] = (), ima
     if plan is None or draft.problems:
         raise SceneError(draft.lines())
     return plan
+
+
+def _camera_files(data: Mapping[str, Any]) -> Iterator[Key]:
+    """List the keys of a scene's cameras that name files."""
+    render = data.get("render")
+    cameras = render.get("cameras") if isinstance(render, dict) else None
+    for name in (None, *(cameras if isinstance(cameras, dict) else ())):
+        camera: Key = ("camera",) if name is None else ("cameras", name)
+        yield from (("render", *camera, key) for key in CAMERA_FILES)
 
 
 def schema() -> dict[str, Any]:
@@ -196,8 +208,8 @@ class Draft:
         elif problem := self._put(override.path, override.value, place):
             self.problems.append((place, problem))
 
-    def find_picture(self, key: Key, folder: Path) -> None:
-        """Change the path of a picture, given relative to a folder, to one from the current directory."""
+    def find_file(self, key: Key, folder: Path) -> None:
+        """Change the path of a file, given relative to a folder, to one from the current directory."""
         holder: Any = self.data
         for part in key[:-1]:
             holder = holder.get(part) if isinstance(holder, dict) else None
@@ -209,8 +221,8 @@ class Draft:
         given = any(key[:n] in self._overridden for n in range(1, len(key) + 1))
         if not given and not is_below(folder / image, folder):
             remedy = ", or name it with --image" if key == IMAGE else ""
-            said = f"{image} is not below the scene's folder; put the picture there{remedy}"
-            self.problems.append((self._place(key), Problem(key, said)))
+            said = f"{image} is not below the scene's folder; put {'the picture' if key in PICTURES else 'it'} there"
+            self.problems.append((self._place(key), Problem(key, said + remedy)))
             del holder[key[-1]]
 
     def report(self, problems: Iterable[Problem]) -> None:

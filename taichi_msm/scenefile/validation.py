@@ -9,6 +9,7 @@ from pydantic import ValidationError
 
 from taichi_msm import faults
 from taichi_msm.errors import ArgumentError, Problem, SceneError
+from taichi_msm.outputs import mp4
 from taichi_msm.physics.material import Maps
 from taichi_msm.physics.plan import Plan
 from taichi_msm.physics.planning import try_plan
@@ -55,6 +56,8 @@ def _joint_check(scene: Scene, maps: Maps | None = None, *, picture: bool = True
     """Plan a scene whose keys are valid each by itself, and find what is wrong with several keys together."""
     plan, problems = try_plan(scene, maps)
     problems += camera_problems(scene)
+    if "mp4" in scene.output and not mp4.is_installed():
+        problems.append(Problem(("output",), mp4.NOT_INSTALLED))
     if picture:
         problems += image_problems(scene)
     if plan is not None:

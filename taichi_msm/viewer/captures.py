@@ -47,7 +47,7 @@ class Film:
         self._parts, self._begin, self._place = parts, begin, (folder, option)
         with writing(*self._place), ExitStack() as opened:
             self._hidden = opened.enter_context(staged(folder))
-            job = Job(self._hidden, render.size, rate, png=False, gif=True, background=render.background)
+            job = Job((self._hidden,), render.size, rate, png=False, gif=True, background=render.background)
             self._encoder = Encoder(job)
             opened.callback(self._encoder.abort)
             self._opened = opened.pop_all()
@@ -56,7 +56,7 @@ class Film:
         """Film a picture of a frame of the session; one that comes late is taken several times. `pause`: as Encoder."""
         with writing(*self._place):
             while self.pictures * self._parts <= frame - self._begin:
-                self._encoder.add(picture, pause)
+                self._encoder.add(picture[None], pause)
                 self.pictures += 1
 
     def encoded(self, pause: Pause = lambda: None) -> Path:

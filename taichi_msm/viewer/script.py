@@ -105,7 +105,7 @@ class Script(Section):
 
 def _refused(key: str | int, message: str, **values: str) -> PydanticCustomError:
     """Make the error of a key."""
-    return PydanticCustomError(REFUSED, message, {"key": key, **values})
+    return PydanticCustomError(REFUSED, message, {"below": (key,), **values})
 
 
 def load_script(path: str | Path, size: tuple[int, int]) -> Script:

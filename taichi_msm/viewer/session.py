@@ -125,7 +125,7 @@ class Session:
         self._simulation = Simulation(plan, arch, threads, texture)
         self._simulation.compile(lambda: progress("compile"))
         self._beginning = self._simulation.save()
-        self.viewport = Viewport(self._simulation.renderer)
+        self.viewport = Viewport(self._simulation.renderer, play=play)
         self._controller = Controller(self.tool, self.viewport, self._simulation)
         self._draw()
 
@@ -159,7 +159,9 @@ class Session:
         frames = max(1, self.frame + bool(self.fault))
         time = self.scene.time.model_copy(update={"duration": frames / self.rate, "tolerance": None})
         probes = (*self._others, self.tool.recorded(frames))
-        return self.scene.model_copy(update={"probes": probes, "time": time, "render": self.viewport.render})
+        return self.scene.model_copy(
+            update={"probes": probes, "time": time, "render": self.viewport.recorded(time.duration)}
+        )
 
     def handle(self, event: events.Event) -> None:
         """Do what an event asks for, from the next frame on; raises a FilesError when a file cannot be saved."""
@@ -200,6 +202,8 @@ class Session:
                 self._simulation.steer((*self._others, probe))
             self._simulation.advance()
             self._hardest = max(self._hardest, self.felt())
+            if self.viewport.follow(self._simulation.time):
+                self._controller.hold_on()
         except DivergedError as error:
             self.fault = str(error)
         spent = time.perf_counter() - begun
@@ -277,7 +281,7 @@ class Session:
             case "down":
                 self.handle(events.Harder(-events.NOTCH))
             case "c" | "t" | "o":
-                self.viewport.look({"c": self.scene.render.camera, "t": "top", "o": "oblique"}[key])
+                self.viewport.look({"c": self.scene.render.main_camera, "t": "top", "o": "oblique"}[key])
                 self._controller.hold_on()
             case "m":
                 self.viewport.mesh()
@@ -291,6 +295,7 @@ class Session:
                 self._controller.forget()
                 self._simulation.restore(self._beginning)
                 self._simulation.steer((*self._others, self.tool.recorded(0)))
+                self.viewport.follow(0.0)
                 self._begin()
             case "f":
                 self._switch()

@@ -10,40 +10,62 @@ import numpy as np
 from numpy.typing import NDArray
 
 from taichi_msm.outputs.gif import Picture
-from taichi_msm.render.camera import View, pinhole, turned
+from taichi_msm.render.camera import View, held, pinhole, turned, view
 from taichi_msm.render.renderer import Renderer, Shot
 from taichi_msm.render.surface import Rod
-from taichi_msm.scene import Camera, Render
+from taichi_msm.scene import AnyCamera, Camera, Render
 
 
 class Viewport:
     """Shows what a renderer draws in the way chosen now, at first as its scene says.
+
+    Of a scene that is played, a camera that moves is followed; otherwise it stays where it is at first.
 
     Attributes:
         render: how the sheet is drawn now.
         view: the camera now.
     """
 
-    def __init__(self, renderer: Renderer) -> None:
-        self._renderer = renderer
+    def __init__(self, renderer: Renderer, *, play: bool = False) -> None:
+        self._renderer, self._plays, self._time = renderer, play, 0.0
         self.render: Render = renderer.scene.render
         self.view: View = renderer.view
+        self.look(self.render.main_camera)
 
     @property
     def compiled(self) -> bool:
         """Whether the next picture can be drawn without compiling a kernel."""
-        return self._renderer.is_compiled(self.render)
+        return self._renderer.is_compiled(self.render, self.view)
 
-    def look(self, camera: str | Camera) -> None:
-        """Choose another camera."""
-        self.view = self._renderer.set_up(camera)
-        self._change(camera=camera)
+    def look(self, camera: AnyCamera) -> None:
+        """Choose another camera; those beside it follow."""
+        if isinstance(camera, Camera) and not self._plays:
+            camera = held(camera, 0.0)
+        self.render = self.render.with_main(camera)
+        self.view = view(self._renderer.scene.model_copy(update={"render": self.render, "output": ()}), self._time)
+
+    def follow(self, time: float) -> bool:
+        """Go where a moving camera is at a time [s]; returns whether it moves."""
+        self._time = time
+        camera = self.render.main_camera
+        moving = isinstance(camera, Camera) and camera.moves
+        if moving:
+            self.view = self._renderer.set_up(None, time)
+        return moving
+
+    def recorded(self, duration: float) -> Render:
+        """Give how it is drawn for a scene of some duration [s], to the end of which the last pose is held."""
+        camera = self.render.main_camera
+        if isinstance(camera, Camera) and isinstance(camera.poses, tuple) and camera.poses[-1][0] < duration:
+            last = (duration, *camera.poses[-1][1:])
+            return self.render.with_main(camera.model_copy(update={"poses": (*camera.poses, last)}))
+        return self.render
 
     def turn(self, right: float, down: float) -> None:
         """Turn the picture as if its nearest side were pushed by this many pixels; its height is half a turn."""
         angle = math.pi / self.render.size[1]
         seen = self._renderer.scene.model_copy(update={"render": self.render})
-        self.look(turned(pinhole(seen), -right * angle, down * angle))
+        self.look(turned(pinhole(seen, self._time), -right * angle, down * angle))
 
     def light(self) -> None:
         """Switch the light off or on; on is the scene's shading if it has one, else the headlight."""
@@ -61,8 +83,8 @@ class Viewport:
 
     def pixel(self, point: NDArray[np.floating]) -> tuple[float, float] | None:
         """Find where a point [m] is seen; None if it is behind the camera."""
-        x, y, w, _ = self.view.matrix @ [*point, 1.0]
-        return (x / w, y / w) if w > self.view.near else None
+        x, y = self.view.pixels(point.astype(float)).tolist()
+        return (x, y) if math.isfinite(x) else None
 
     def _change(self, **changes: Any) -> None:
         self.render = self.render.model_copy(update=changes)

@@ -2,19 +2,22 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from functools import cache
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from taichi_msm.render import style
-from taichi_msm.render.camera import view
+from taichi_msm.render.camera import View, view
 from taichi_msm.render.surface import Rod
 from taichi_msm.scene import Scene
+from tests.reference.lens import undistorted
 from tests.reference.shading import headlight, meet, metal, normals, normals_at, sample, tissue
 
 Array = NDArray[np.float64]
+Sampled = Callable[[float, float], tuple[Array, Array]]
 
 
 def refine(values: Array, n: int) -> Array:
@@ -57,17 +60,16 @@ def weights(triangle: Array, x: Array, y: Array) -> Array:
         return np.asarray(cross / cross.sum(axis=0))
 
 
-def wire_share(scene: Scene, triangle: Array, x: Array, y: Array) -> Array:
+def wire_share(scene: Scene, triangle: Array, at: Sampled) -> Array:
     """Give the share of the mesh lines in the colour of the pixels of a triangle.
 
     Args:
         scene: the scene.
         triangle: corners (X, Y, w, depth, u, v, ...), shape (3, k).
-        x: pixel, right [px of the supersampled picture], any shape.
-        y: pixel, down, the same shape.
+        at: gives the places of the pixels, shifted by so many pixels.
 
     Returns:
-        Share 0 to 1, the shape of x.
+        Share 0 to 1, of the pixels' shape.
     """
     rows, cols = scene.sheet.points
 
@@ -75,8 +77,13 @@ def wire_share(scene: Scene, triangle: Array, x: Array, y: Array) -> Array:
         u, v = np.tensordot(triangle[:, 4:6].T, weights(triangle, x, y), 1)
         return np.array([u * (cols - 1), v * (rows - 1)])
 
-    here = mesh(x, y)
-    slope = np.hypot(mesh(x + 1, y) - here, mesh(x, y + 1) - here)
+    here, (x, y) = mesh(*at(0, 0)), at(0, 0)
+    # A lens bends the way to the next pixel, which is taken as straight.
+    right, below = (
+        [middle + (far - near) / 2e-3 for middle, far, near in zip((x, y), at(*way), at(*back), strict=True)]
+        for way, back in (((1e-3, 0), (-1e-3, 0)), ((0, 1e-3), (0, -1e-3)))
+    )
+    slope = np.hypot(mesh(*right) - here, mesh(*below) - here)
     distance = np.abs(here - np.round(here)) / np.maximum(slope, 1e-12)
     half = style.WIRE_WIDTH / 2 * scene.render.supersample
     return np.asarray(style.WIRE_OPACITY * np.clip(half + 0.5 - distance.min(axis=0), 0, 1))
@@ -91,6 +98,7 @@ class Seen(NamedTuple):
         wire: share of the mesh lines in the colour.
         footprint: the larger of a sample's width and height on the texture, in units of style.SHARP texels.
         front: 1 where the front of the triangle is seen, else -1.
+        facet: normal of the triangle's front in the world [m^2], shape (height, width, 3); NaN where none is.
     """
 
     depth: Array
@@ -99,9 +107,12 @@ class Seen(NamedTuple):
     wire: Array
     footprint: Array
     front: Array
+    facet: Array
 
 
-def look(scene: Scene, position: Array, factor: int = 1, texels: tuple[int, int] = (1, 1)) -> Seen:
+def look(
+    scene: Scene, position: Array, factor: int = 1, texels: tuple[int, int] = (1, 1), camera: View | None = None
+) -> Seen:
     """Find what every sample shows: refine, project, and keep the nearest triangle at every sample.
 
     Args:
@@ -109,34 +120,49 @@ def look(scene: Scene, position: Array, factor: int = 1, texels: tuple[int, int]
         position: positions of the mass points [m], shape (rows, cols, 3).
         factor: samples per pixel along each axis.
         texels: width and height of the texture.
+        camera: another camera than the scene's.
     """
     rows, cols = scene.sheet.points
     width, height = (size * factor for size in scene.render.size)
-    camera = view(scene)
+    camera = camera or view(scene)
     matrix = camera.matrix * np.array([[factor], [factor], [1], [1]])
     projected = np.concatenate([position, np.ones((rows, cols, 1))], axis=-1) @ matrix.T
     u, v = np.meshgrid(np.arange(cols) / (cols - 1), np.arange(rows) / (rows - 1))
-    surface = refine(np.concatenate([projected, u[..., None], v[..., None]], axis=-1), scene.render.refine)
+    surface = refine(np.concatenate([projected, u[..., None], v[..., None], position], axis=-1), scene.render.refine)
 
-    seen = Seen(*(np.full((height, width), value) for value in (np.inf, np.nan, np.nan, 0.0, 0.0, 1.0)))
+    @cache
+    def places(right: float, down: float) -> tuple[Array, Array]:
+        y, x = np.mgrid[:height, :width] + 0.5
+        x, y = undistorted(camera, (x + right) / factor, (y + down) / factor)
+        return x * factor, y * factor
+
+    nothing = (np.inf, np.nan, np.nan, 0.0, 0.0, 1.0, [np.nan] * 3)
+    seen = Seen(*(np.full((height, width, *np.shape(value)), value) for value in nothing))
     for triangle in triangles(surface):
+        left, top, right, bottom = 0, 0, width - 1, height - 1
         if (triangle[:, 2] > camera.near).all():
-            corner = triangle[:, :2] / triangle[:, 2:3] - 0.5
-            left, top = np.maximum(np.floor(corner.min(axis=0)), 0).astype(int)
-            right, bottom = np.minimum(np.ceil(corner.max(axis=0)), [width - 1, height - 1]).astype(int)
-        else:
-            left, top, right, bottom = 0, 0, width - 1, height - 1
-        if right < left or bottom < top:
-            continue
+            corner = triangle[:, :2] / triangle[:, 2:3]
+            x, y = places(0, 0)
+            low, high = corner.min(axis=0) - 1, corner.max(axis=0) + 1
+            near = (x > low[0]) & (x < high[0]) & (y > low[1]) & (y < high[1])
+            if not near.any():
+                continue
+            (top, bottom), (left, right) = (np.flatnonzero(near.any(axis=axis))[[0, -1]] for axis in (1, 0))
         box = np.s_[top : bottom + 1, left : right + 1]
-        y, x = np.mgrid[box].astype(float) + 0.5
+
+        def at(right: float, down: float, box: tuple[slice, slice] = box) -> tuple[Array, Array]:
+            x, y = places(right, down)
+            return x[box], y[box]
+
+        x, y = at(0, 0)
         share = weights(triangle, x, y)
-        w, depth, u, v = np.tensordot(triangle[:, 2:].T, share, 1)
+        w, depth, u, v = np.tensordot(triangle[:, 2:6].T, share, 1)
         here = (share >= -1e-12).all(axis=0) & (w > camera.near) & (depth < seen.depth[box])
-        wire = wire_share(scene, triangle, x, y) if scene.render.wireframe else np.zeros_like(x)
+        wire = wire_share(scene, triangle, at) if scene.render.wireframe else np.zeros_like(x)
         # From the upper left the corners go down and around: counter-clockwise where the front is seen.
         front = np.full_like(x, -np.sign(np.linalg.det(triangle[:, :3])))
-        found = Seen(depth, u, v, wire, footprint(triangle, x, y, texels), front)
+        facet = np.broadcast_to(np.cross(*np.diff(triangle[:, 6:], axis=0)), (*x.shape, 3))
+        found = Seen(depth, u, v, wire, footprint(triangle, at, texels), front, facet)
         for kept, new in zip(seen, found, strict=True):
             kept[box][here] = new[here]
     return seen
@@ -150,15 +176,14 @@ def triangles(surface: Array) -> Iterator[Array]:
         yield np.array([corners[0], *corners[2:]])
 
 
-def footprint(triangle: Array, x: Array, y: Array, texels: tuple[int, int]) -> Array:
+def footprint(triangle: Array, at: Sampled, texels: tuple[int, int]) -> Array:
     """Give the larger of a sample's width and height on the texture, in units of style.SHARP texels.
 
     It is found by finite differences over a thousandth of a sample.
 
     Args:
         triangle: corners (X, Y, w, depth, u, v), shape (3, 6).
-        x: sample, right, any shape.
-        y: sample, down, the same shape.
+        at: gives the places of the samples, shifted by so many samples.
         texels: width and height of the texture.
     """
     step = 1e-3
@@ -167,12 +192,14 @@ def footprint(triangle: Array, x: Array, y: Array, texels: tuple[int, int]) -> A
         u, v = np.tensordot(triangle[:, 4:6].T, weights(triangle, x, y), 1)
         return np.array([u * texels[0], v * texels[1]])
 
-    right = place(x + step, y) - place(x - step, y)
-    down = place(x, y + step) - place(x, y - step)
+    right = place(*at(step, 0)) - place(*at(-step, 0))
+    down = place(*at(0, step)) - place(*at(0, -step))
     return np.asarray(np.maximum(np.hypot(*right), np.hypot(*down)) / (2 * step * style.SHARP))
 
 
-def draw(scene: Scene, position: Array, texture: NDArray[np.uint8], rods: Sequence[Rod] = ()) -> NDArray[np.uint8]:
+def draw(
+    scene: Scene, position: Array, texture: NDArray[np.uint8], rods: Sequence[Rod] = (), camera: View | None = None
+) -> NDArray[np.uint8]:
     """Draw one frame.
 
     Args:
@@ -180,12 +207,13 @@ def draw(scene: Scene, position: Array, texture: NDArray[np.uint8], rods: Sequen
         position: positions of the mass points [m], shape (rows, cols, 3).
         texture: the picture on the sheet, shape (height, width, 3).
         rods: the instruments.
+        camera: another camera than the scene's.
 
     Returns:
         Colours, shape (height, width, 3).
     """
-    factor, camera = scene.render.supersample, view(scene)
-    seen = look(scene, position, factor, (texture.shape[1], texture.shape[0]))
+    factor, camera = scene.render.supersample, camera or view(scene)
+    seen = look(scene, position, factor, (texture.shape[1], texture.shape[0]), camera)
     sheet = np.isfinite(seen.depth)
     u, v = np.where(sheet, seen.u, 0), np.where(sheet, seen.v, 0)
     normal = normals_at(normals(position), u, v) * seen.front[..., None]
@@ -194,7 +222,7 @@ def draw(scene: Scene, position: Array, texture: NDArray[np.uint8], rods: Sequen
     else:
         lit = sample(texture, u, v)
     if scene.render.shading == "headlight":
-        lit *= headlight(normal, camera.axes[2])[..., None]
+        lit *= headlight(normal, (camera.lamp or camera).axes[2])[..., None]
     wire = seen.wire[..., None]
     lit = lit * (1 - wire) + np.array(style.WIRE_COLOUR) * wire
     colour = np.where(sheet[..., None], lit, np.array(scene.render.background, float))

@@ -11,6 +11,7 @@ from taichi_msm.render import style
 from taichi_msm.render.camera import View
 from taichi_msm.render.surface import Rod
 from taichi_msm.scene import Scene
+from tests.reference.lens import undistorted
 
 Array = NDArray[np.float64]
 
@@ -157,10 +158,11 @@ def points(camera: View, factor: int, depth: Array) -> Array:
     """
     right, up, toward = camera.axes
     y, x = (np.mgrid[: depth.shape[0], : depth.shape[1]] + 0.5) / factor
+    x, y = undistorted(camera, x, y)
     depth = np.where(np.isfinite(depth), depth, camera.distance)
     w = (depth if camera.pinhole else np.ones_like(depth))[..., None]
-    across = ((x - camera.centre[0]) / camera.scale)[..., None] * right
-    along = ((camera.centre[1] - y) / camera.scale)[..., None] * up
+    across = ((x - camera.centre[0]) / camera.scale[0])[..., None] * right
+    along = ((camera.centre[1] - y) / camera.scale[1])[..., None] * up
     return np.asarray(camera.eye + (across + along) * w - depth[..., None] * toward)
 
 
@@ -175,13 +177,14 @@ def illuminate(camera: View, factor: int, depth: Array, normal: Array) -> tuple[
 
     Returns:
         Unit vectors: the normal, the direction to the light, the direction to the eye; and the
-        distance from the light to the point in the middle of the picture over that to the sample.
+        distance from the light to the point in the middle of the main camera's picture over that to the sample.
     """
-    right, up, toward = camera.axes
+    lamp = camera.lamp or camera
+    right, up, toward = lamp.axes
     point = points(camera, factor, depth)
-    light = camera.eye + camera.distance * (style.LIGHT_RIGHT * right + style.LIGHT_UP * up)
-    to_eye = unit(camera.eye - point) if camera.pinhole else np.broadcast_to(toward, point.shape)
-    middle = np.linalg.norm(light - (camera.eye - camera.distance * toward))
+    light = lamp.eye + lamp.distance * (style.LIGHT_RIGHT * right + style.LIGHT_UP * up)
+    to_eye = unit(camera.eye - point) if camera.pinhole else np.broadcast_to(camera.axes[2], point.shape)
+    middle = np.linalg.norm(light - (lamp.eye - lamp.distance * toward))
     nearness = np.minimum(middle / np.linalg.norm(light - point, axis=-1), 4)
     return unit(normal), unit(light - point), to_eye, nearness
 
@@ -235,14 +238,15 @@ def tissue(
         ratio = np.maximum(np.linalg.norm(away - foot, axis=-1) / rod.radius, 1)
         share, gloss = (value * (1 - style.SHADE / ratio**2) for value in (share, gloss))
     y, x = (np.mgrid[: depth.shape[0], : depth.shape[1]] + 0.5) / factor
-    off = np.hypot(x - camera.centre[0], y - camera.centre[1]) / np.hypot(*camera.centre)
+    middle = camera.size / 2
+    off = np.hypot(x - middle[0], y - middle[1]) / np.hypot(*middle)
     rim = (1 - light.vignette * off**2)[..., None]
     return np.asarray(np.minimum((colour * share[..., None] + gloss[..., None]) * rim, 255))
 
 
 def metal(camera: View, factor: int, depth: Array, normal: Array) -> Array:
     """Shade metal, which reflects a room that is bright above and dark below; colours, shape (height, width, 3)."""
-    far = camera.distance * np.hypot(1, np.hypot(style.LIGHT_RIGHT, style.LIGHT_UP))
+    far = (camera.lamp or camera).distance * np.hypot(1, np.hypot(style.LIGHT_RIGHT, style.LIGHT_UP))
     below = np.maximum(np.where(np.isfinite(depth), depth, far), style.METAL_NEAREST * far)
     facing, to_light, to_eye, _ = illuminate(camera, factor, below, normal)
     cosine = np.maximum((facing * to_light).sum(axis=-1), 0)
@@ -269,7 +273,9 @@ def meet(rods: Sequence[Rod], camera: View, size: tuple[int, int], factor: int) 
     width, height = size[0] * factor, size[1] * factor
     y, x = (np.mgrid[:height, :width] + 0.5) / factor
     right, up, toward = camera.axes
-    aside = ((x - camera.centre[0])[..., None] * right + (camera.centre[1] - y)[..., None] * up) / camera.scale
+    x, y = undistorted(camera, x, y)
+    across, along = (x - camera.centre[0]) / camera.scale[0], (camera.centre[1] - y) / camera.scale[1]
+    aside = across[..., None] * right + along[..., None] * up
     nearest, normal = np.full((height, width), np.inf), np.zeros((height, width, 3))
 
     def sight(depth: Array) -> Array:

@@ -1,0 +1,54 @@
+"""A camera that other programs can compute with, from what a run has written of it."""
+
+from __future__ import annotations
+
+import json
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from taichi_msm.errors import FilesError
+from taichi_msm.outputs.table import CAMERA
+from taichi_msm.results.finished_run import FinishedRun, damaged, reading
+
+Array = NDArray[np.float64]
+
+# OpenCV counts from the centre of the first pixel, this program from the picture's corner.
+FIRST_CENTRE = 0.5
+
+# The largest camera.json that is read [bytes]: of 100,000 poses.
+MAX_BYTES = 1 << 25
+
+
+class Pinhole(NamedTuple):
+    """A pinhole camera without distortion, in OpenCV's axes: x right, y down, z forward."""
+
+    focal: Array  # along x and y [px], shape (2,)
+    centre: Array  # the principal point, from the picture's upper left corner [px], shape (2,)
+    poses: Array  # from the world to the camera [m], of every frame, shape (frames, 3, 4)
+
+
+def read_pinhole(run: FinishedRun, name: str) -> Pinhole:
+    """Read the camera of a run for a format; a FilesError if there is none, or one that the format cannot describe."""
+    path = run.directory / run.camera / CAMERA
+    with reading(path):
+        if path.is_symlink() or not path.is_file():
+            raise FilesError(f"{path}: no such file; {run.remedy('tracks')}")
+        with path.open("rb") as file:
+            described = json.loads(file.read(MAX_BYTES))
+        if "intrinsics" not in described:
+            said = f"{name} needs a pinhole, and {path} has none"
+            raise FilesError(f"{said}; run the scene with another render.camera than top")
+        # A fisheye is one with any coefficients.
+        if described.get("model") == "fisheye" or np.any(described.get("distortion", ())):
+            said = f"{path}: the camera has a distortion, which {name} cannot describe"
+            raise FilesError(f"{said}; run the scene without it")
+        matrix = np.array(described["intrinsics"], float)
+        poses = np.array(described.get("poses", [described["pose"]] * run.frames), float)[: run.frames]
+        if matrix.shape != (3, 3) or poses.shape != (run.frames, 3, 4) or not np.isfinite(poses).all():
+            raise damaged(path)
+        focal, centre = matrix[[0, 1], [0, 1]], matrix[:2, 2]
+        if not (np.isfinite(matrix).all() and (focal > 0).all()):
+            raise damaged(path)
+    return Pinhole(focal, centre, poses)

@@ -1,0 +1,402 @@
+"""How far the files of a run contradict each other: found from them alone, in float64, with OpenCV's cameras.
+
+Nothing of the program is used but `run` and, for a second camera, `Simulation`. Pixels are OpenCV's: the centre of the
+first one is at (0, 0). What hides a point is found by trying all triangles on its line of sight.
+"""
+
+from __future__ import annotations
+
+import csv
+import json
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+from PIL import Image
+
+from taichi_msm import Simulation
+from taichi_msm.scene import Scene
+
+Array = NDArray[np.float64]
+Mask = NDArray[np.bool_]
+Found = Iterator[tuple[str, float]]
+
+
+class Agreement(NamedTuple):
+    """Two things that must agree."""
+
+    said: str
+    unit: str
+    bound: float  # how far they may be apart
+
+
+# Single precision leaves 2^-24 of a number: 4e-6 px in 64 to 128 px, 9e-9 m in 0.15 m; more where the sheet is seen
+# nearly edge-on.
+AGREEMENTS = {
+    "coordinates": Agreement("`coordinates`, projected, and the pixel's centre", "px", 1e-3),
+    "depth": Agreement("`depth`, back through the lens, and the point at those coordinates", "m", 1e-6),
+    "normals": Agreement("`normals` and the gradient of depth, within a triangle", "°", 1e-2),
+    "flow": Agreement("`flow` and the moved point, projected in the next frame", "px", 1e-5),
+    "occlusion": Agreement("`occlusion` and the line of sight among all triangles", "share of pixels", 0.0),
+    "tracks": Agreement("`tracks`: `points` and `position`, projected", "px", 2e-5),
+    "occluded": Agreement("`tracks`: `occluded` and the line of sight", "share of tracks", 0.0),
+    "position": Agreement("`tracks`: `position` and depth, back through the lens", "m", 1e-6),
+    "chain": Agreement("`tracks`: `points` and ten flows in turn", "px", 0.1),
+    "stereo": Agreement("flow to a second camera and the point, projected there", "px", 1e-5),
+    "disparity": Agreement("flow to a second camera and -fx baseline / depth, without distortion", "px", 1e-4),
+    "stereo occlusion": Agreement("occlusion in a second camera and the line of sight", "share of pixels", 0.0),
+}
+
+WIDTH, HEIGHT, POINTS, REFINE, SIDE = 120, 90, 13, 1, 0.1
+RADIUS, LENGTH, SHAFT = 0.007, 0.08, np.array([0.3, 0.5, 0.9])
+BASELINE = 0.005
+
+PLACE = {"eye": [0.03, -0.06, 0.1], "target": [0, 0, 0.01]}
+INTRINSICS = {"fx": 97.0, "fy": 96.0, "cx": 58.2, "cy": 45.6}
+RATIONAL = {"k1": -0.34, "k2": 0.12, "p1": 0.001, "p2": -0.002, "k3": -0.01, "k4": 0.02}
+SWAY = [[0, 0.03, -0.06, 0.1], [0.25, 0.0, -0.07, 0.11], [0.5, 0.02, -0.05, 0.1]]
+CAMERAS: dict[str, Any] = {
+    "top": "top",
+    "pinhole": {**PLACE, "fov": 50},
+    "intrinsics": {**PLACE, "intrinsics": INTRINSICS},
+    "rational": {**PLACE, "intrinsics": INTRINSICS, "distortion": RATIONAL},
+    "fisheye": {**PLACE, "intrinsics": INTRINSICS, "distortion": {"model": "fisheye", "k1": -0.05, "k2": 0.01}},
+    "moving": {**PLACE, "eye": SWAY, "intrinsics": INTRINSICS, "distortion": RATIONAL},
+}
+
+# Those whose flow to the same camera beside it is compared.
+STEREO = ("intrinsics", "rational")
+
+# The frames that are compared, while the sheet is pulled over itself; there is one after each.
+FRAMES = (5, 9)
+LAST = 10
+
+# What is in front of a point by less than this counts as the point's own place [m].
+TOUCHING = 1e-9 * SIDE
+
+
+def scene(camera: Any) -> Scene:
+    """A sheet that is held on the left; a tool grips its right, lifts it and pulls it over to the left."""
+    tool = {
+        "path": [[0, 0.8, 0.5, 0.002], [0.1, 0.8, 0.5, -0.003], [0.2, 0.75, 0.5, 0.03], [0.5, 0.1, 0.5, 0.03]],
+        "grip": [[0.1, 1]],
+        "instrument": {"radius": RADIUS, "length": LENGTH, "shaft": SHAFT.tolist()},
+    }
+    tissue = {"young": 3e4, "thickness": 3e-3, "density": 1050, "foundation": 3e3, "damping": 500}
+    return Scene.model_validate(
+        {
+            "sheet": {"points": [POINTS, POINTS], "size": [SIDE, SIDE], "fixed": ["left"]},
+            "tissue": {**tissue, "foundation_active": "always"},
+            "probes": [tool],
+            "time": {"duration": 0.5, "frames_per_second": 20, "precision": "f64"},
+            "render": {"size": [WIDTH, HEIGHT], "refine": REFINE, "camera": camera, "tracks": 19},
+            "output": [
+                *("trajectory", "forces", "coordinates", "depth", "normals", "flow", "occlusion", "instrument"),
+                "tracks",
+            ],
+        }
+    )
+
+
+class Camera(NamedTuple):
+    """A camera of camera.json in one frame; of the orthographic one the eye is as documented, above the sheet."""
+
+    turn: Array  # right, down and forward, as rows
+    shift: Array  # the world's origin [m]
+    project: Callable[[Array], Array]  # places, shape (n, 2), to pixels
+    unproject: Callable[[Array], Array]  # and back
+    pinhole: bool
+
+    def within(self, points: Array) -> Array:
+        """Points of the world in its axes [m], shape (n, 3)."""
+        return points @ self.turn.T + self.shift
+
+    def places(self, points: Array) -> Array:
+        """Points in its axes, at depth 1 if it is a pinhole, shape (n, 2)."""
+        return points[:, :2] / points[:, 2:] if self.pinhole else points[:, :2]
+
+    def pixels(self, points: Array) -> Array:
+        """Where points of the world are seen [px], shape (n, 2)."""
+        return np.asarray(self.project(self.places(self.within(points))))
+
+    def points(self, pixels: Array, depth: Array) -> Array:
+        """The points of the world at a depth [m] that pixels show [m], shape (n, 3)."""
+        place = self.unproject(pixels)
+        there = np.concatenate([place * depth[:, None] if self.pinhole else place, depth[:, None]], axis=1)
+        return np.asarray((there - self.shift) @ self.turn)
+
+    def beside(self, baseline: float) -> Camera:
+        """The same camera, moved along its x axis [m]."""
+        return self._replace(shift=self.shift - [baseline, 0, 0])
+
+
+def read_camera(written: dict[str, Any], frame: int) -> Camera:
+    """Read what camera.json says of a frame."""
+    if "pose" not in written:
+        rows = np.array(written["projection"])
+        scale, centre = np.linalg.norm(rows[:2, :3], axis=1), rows[:2, 3] - 0.5
+        right, down = rows[:2, :3] / scale[:, None]
+        turn, shift = np.array([right, down, np.cross(right, down)]), np.array([0, 0, SIDE])
+        return Camera(turn, shift, lambda place: place * scale + centre, lambda at: (at - centre) / scale, False)
+    pose = np.array(written["poses"][frame] if "poses" in written else written["pose"])
+    matrix, lens, none = np.array(written["calibration"]), np.array(written["distortion"]), np.zeros(3)
+
+    def project(place: Array) -> Array:
+        points = np.concatenate([place, np.ones((len(place), 1))], axis=1)[:, None]
+        opencv = cv2.fisheye.projectPoints if written["model"] == "fisheye" else cv2.projectPoints
+        return np.asarray(opencv(points, none, none, matrix, lens)[0][:, 0])
+
+    def unproject(pixels: Array) -> Array:
+        focal, place = matrix.diagonal()[:2], np.zeros_like(pixels)
+        for _ in range(60):  # A lens bends a place by less than its distance, so that this converges.
+            place += (pixels - project(place)) / focal
+        assert far(project(place), pixels) < 1e-9
+        return place
+
+    return Camera(pose[:, :3], pose[:, 3], project, unproject, True)
+
+
+def surface(position: Array) -> Array:
+    """The vertices between the mass points, shape (n, n, 3)."""
+    count = (POINTS - 1) * (REFINE + 1) + 1
+    hats = np.maximum(0, 1 - np.abs(np.arange(count)[:, None] / (REFINE + 1) - np.arange(POINTS)))
+    return np.asarray(np.einsum("ai,ijk,bj->abk", hats, position, hats))
+
+
+def triangles(vertices: Array) -> Array:
+    """All triangles, shape (n, 3, 3)."""
+    a, b, c, d = vertices[:-1, :-1], vertices[:-1, 1:], vertices[1:, :-1], vertices[1:, 1:]
+    return np.concatenate([np.stack(three, axis=2).reshape(-1, 3, 3) for three in ((a, c, d), (a, d, b))])
+
+
+def material(vertices: Array, coordinates: Array) -> Array:
+    """The points of the surface at coordinates, shape (n, 3)."""
+    place = coordinates * (len(vertices) - 1)
+    j, i = np.minimum(place.astype(int), len(vertices) - 2).T
+    s, t = (place - np.stack([j, i], axis=1)).T[:, :, None]
+    a, b, c, d = vertices[i, j], vertices[i, j + 1], vertices[i + 1, j], vertices[i + 1, j + 1]
+    return np.where(t > s, a * (1 - t) + c * (t - s) + d * s, a * (1 - s) + b * (s - t) + d * t)
+
+
+def triangle_of(coordinates: Array) -> Array:
+    """A number for the triangle that coordinates are on; NaN for none."""
+    place = coordinates * ((POINTS - 1) * (REFINE + 1))
+    corner = np.floor(place)
+    s, t = np.moveaxis(place - corner, -1, 0)
+    return np.asarray(corner @ [2.0, 1000.0] + (t > s))
+
+
+def behind_sheet(places: Array, depth: Array, camera: Camera, vertices: Array) -> Mask:
+    """Tell which points are behind a triangle, given their places and depths, by trying all triangles.
+
+    With corners c_i in the camera's axes, a ray of places p meets the triangle where sum b_i c_i = depth (p, 1), or
+    without an eye where sum b_i c_i = (p, depth), with sum b_i = 1.
+    """
+    found, rays = np.zeros(len(places), bool), np.concatenate([places, np.ones((len(places), 1))], axis=1)
+    corners = triangles(vertices)
+    seen = camera.within(corners.reshape(-1, 3))
+    outlines = camera.places(seen).reshape(-1, 3, 2)
+    seen = seen.reshape(corners.shape)
+    low, high = outlines.min(axis=1), outlines.max(axis=1)
+    columns = np.moveaxis(seen if camera.pinhole else np.insert(outlines, 2, 1, axis=2), 1, 2)
+    # One that is seen edge-on hides nothing.
+    flat = np.linalg.det(columns) == 0
+    inverses = np.linalg.inv(np.where(flat[:, None, None], np.eye(3), columns))
+    for triangle in np.flatnonzero(~flat):
+        near = np.flatnonzero(((places >= low[triangle]) & (places <= high[triangle])).all(axis=1))
+        if len(near):
+            shares = inverses[triangle] @ rays[near].T
+            with np.errstate(divide="ignore"):
+                met = 1 / shares.sum(axis=0) if camera.pinhole else seen[triangle, :, 2] @ shares
+            found[near] |= (shares >= 0).all(axis=0) & (met < depth[near] - TOUCHING)
+    return found
+
+
+def behind_rod(points: Array, eye: Array, middle: Array) -> Mask:
+    """Tell which lines from points to their eyes come nearer than RADIUS to the rod's middle line."""
+    axis = SHAFT / np.linalg.norm(SHAFT)
+    low, high = np.zeros(len(points)), np.full(len(points), LENGTH)
+
+    def distance(along: Array) -> Array:
+        away = middle + along[:, None] * axis - points
+        way = eye - points
+        share = np.clip((away * way).sum(axis=1) / (way * way).sum(axis=1), 0, 1)
+        return np.asarray(np.linalg.norm(away - share[:, None] * way, axis=1))
+
+    for _ in range(60):  # Between two lines the distance is convex: its least is found by thirds.
+        left, right = low + (high - low) / 3, high - (high - low) / 3
+        nearer = distance(left) < distance(right)
+        low, high = np.where(nearer, low, left), np.where(nearer, right, high)
+    return distance(low) < RADIUS
+
+
+class Files:
+    """The results of a run."""
+
+    def __init__(self, folder: Path) -> None:
+        self.folder = folder
+        self.written = json.loads((folder / "camera.json").read_text())
+        with np.load(folder / "trajectory.npz") as archive:
+            self.time, self.positions = archive["time"], archive["position"]
+        self.vertices = [surface(position) for position in self.positions]
+        with np.load(folder / "tracks.npz") as archive:
+            self.tracks = dict(archive)
+        with (folder / "forces.csv").open() as file:
+            tips = [[float(row[f"tip_{axis}"]) for axis in "xyz"] for row in csv.DictReader(file)]
+        # A tip is the lowest point of the round end.
+        self.middles = np.add(tips, [0, 0, RADIUS])
+
+    def camera(self, frame: int) -> Camera:
+        return read_camera(self.written, frame)
+
+    def read(self, name: str, frame: int) -> Array:
+        (path,) = (self.folder / name).glob(f"{frame:04}.*")
+        if path.suffix == ".npy":
+            return np.asarray(np.load(path), float)
+        if path.suffix == ".flo":
+            return np.asarray(cv2.readOpticalFlow(str(path)), float)
+        with Image.open(path) as image:
+            return np.asarray(image, float)
+
+    def hidden(self, points: Array, frame: int, camera: Camera) -> Mask:
+        """Tell which points of the surface a camera does not see in a frame."""
+        pixels, there = camera.pixels(points), camera.within(points)
+        outside = ((pixels < -0.5) | (pixels >= [WIDTH - 0.5, HEIGHT - 0.5])).any(axis=1)
+        eye = np.broadcast_to(-camera.shift @ camera.turn, points.shape)
+        if not camera.pinhole:
+            eye = points - (there[:, 2:] + 1) * camera.turn[2]
+        behind = behind_sheet(camera.places(there), there[:, 2], camera, self.vertices[frame])
+        return np.asarray(outside | behind | behind_rod(points, eye, self.middles[frame]))
+
+
+def centres() -> Array:
+    """The pixels, shape (height, width, 2)."""
+    y, x = np.mgrid[:HEIGHT, :WIDTH].astype(float)
+    return np.stack([x, y], axis=-1)
+
+
+def far(a: Any, b: Any) -> float:
+    """The largest distance between points."""
+    return float(np.linalg.norm(np.subtract(a, b), axis=-1).max())
+
+
+def of_pixels(files: Files) -> Found:
+    """What pixels show, and how it moves, against the surface under the poses of both frames."""
+    for frame in FRAMES:
+        now, then = files.camera(frame), files.camera(frame + 1)
+        coordinates, flow = files.read("coordinates", frame), files.read("flow", frame)
+        sheet = np.isfinite(coordinates[..., 0])
+        pixels, coordinates = centres()[sheet], coordinates[sheet]
+        shown, moved = (material(files.vertices[n], coordinates) for n in (frame, frame + 1))
+        yield "coordinates", far(now.pixels(shown), pixels)
+        yield "depth", far(now.points(pixels, files.read("depth", frame)[sheet]), shown)
+        yield "flow", far(pixels + flow[sheet], then.pixels(moved))
+        hidden = files.hidden(moved, frame + 1, then)
+        yield "occlusion", float(np.mean((files.read("occlusion", frame)[sheet] == 255) != hidden))
+        assert 0.01 < hidden.mean() < 0.2, "the sheet folds"
+        assert np.linalg.norm(flow[sheet], axis=1).max() > 5, "it moves"
+        assert (files.read("instrument", frame) == 255).mean() > 0.01
+
+
+def of_normals(files: Files) -> Found:
+    """Normals against the gradient of depth, where a pixel and the next ones are on one triangle."""
+    for frame in FRAMES:
+        triangle = triangle_of(files.read("coordinates", frame))
+        middle, right, below = np.s_[:-1, :-1], np.s_[:-1, 1:], np.s_[1:, :-1]
+        one = (triangle[middle] == triangle[right]) & (triangle[middle] == triangle[below])
+        assert one.sum() > 300
+        depth, camera = files.read("depth", frame), files.camera(frame)
+        a, b, c = (camera.points(centres()[part][one], depth[part][one]) for part in (middle, right, below))
+        across = np.cross(c - a, b - a) @ camera.turn.T
+        across /= np.linalg.norm(across, axis=1, keepdims=True)
+        yield "normals", float(np.degrees(far(across, files.read("normals", frame)[middle][one])))
+
+
+def of_tracks(files: Files) -> Found:
+    """Tracks against the projection, the line of sight, and depth and normal of the pixel around them."""
+    coordinates = files.tracks["coordinates"].astype(float)
+    for frame in FRAMES:
+        camera = files.camera(frame)
+        points, position = (files.tracks[name][:, frame].astype(float) for name in ("points", "position"))
+        occluded = files.tracks["occluded"][:, frame]
+        pixels = points - 0.5
+        yield "tracks", far(pixels, camera.pixels(position))
+        hidden = files.hidden(material(files.vertices[frame], coordinates), frame, camera)
+        yield "occluded", float(np.mean(occluded != hidden))
+        # The line of sight meets the plane of the triangle, of which depth and normal of the pixel tell.
+        x, y = np.round(pixels).astype(int).clip(0, [WIDTH - 1, HEIGHT - 1]).T
+        same = ~occluded & (triangle_of(files.read("coordinates", frame))[y, x] == triangle_of(coordinates))
+        assert same.sum() > 50
+        x, y = x[same], y[same]
+        shown = camera.points(np.stack([x, y], axis=1).astype(float), files.read("depth", frame)[y, x])
+        normal = files.read("normals", frame)[y, x] @ camera.turn
+        near, beyond = (camera.points(pixels[same], np.full(len(x), depth)) for depth in (0.0, 1.0))
+        share = ((shown - near) * normal).sum(axis=1) / ((beyond - near) * normal).sum(axis=1)
+        yield "position", far(near + share[:, None] * (beyond - near), position[same])
+
+
+def of_chains(files: Files) -> Found:
+    """Tracks against flow, fetched bilinearly and added up, while four pixels show the track's own small quad.
+
+    In a triangle flow is linear but for perspective; the bound is for its bend at the quad's diagonal, ten times.
+    """
+    points, parts = files.tracks["points"].astype(float) - 0.5, (POINTS - 1) * (REFINE + 1)
+    quad = np.floor(files.tracks["coordinates"].astype(float) * parts)
+    pixels, alive = points[:, 0].copy(), ~files.tracks["occluded"][:, 0]
+    for frame in range(LAST):
+        alive &= ((pixels >= 0) & (pixels <= [WIDTH - 1, HEIGHT - 1])).all(axis=1)
+        _, shown = fetched(files.read("coordinates", frame), pixels)
+        alive &= (np.floor(shown * parts) == quad).all(axis=(0, 2))
+        moved, _ = fetched(files.read("flow", frame), pixels)
+        pixels[alive] += moved[alive]
+        yield "chain", far(pixels[alive], points[alive, frame + 1])
+    assert alive.sum() > 5
+
+
+def fetched(values: Array, pixels: Array) -> tuple[Array, Array]:
+    """Values between pixels, bilinear, shape (n, k); and those of the four pixels around, shape (4, n, k)."""
+    height, width = values.shape[:2]
+    j, i = np.floor(pixels).astype(int).clip(0, [width - 2, height - 2]).T
+    s, t = (pixels - np.stack([j, i], axis=1)).T[:, :, None]
+    four = np.array([values[i, j], values[i, j + 1], values[i + 1, j], values[i + 1, j + 1]])
+    shares = np.array([(1 - s) * (1 - t), s * (1 - t), (1 - s) * t, s * t])
+    return (four * shares).sum(axis=0), four
+
+
+def of_stereo(files: Files, name: str, threads: int) -> Found:
+    """Flow from one camera of CAMERAS to the same one beside it, within one frame."""
+    optics = {key: value for key, value in CAMERAS[name].items() if key not in PLACE}
+    pose = np.array(files.written["pose"])
+    both = [
+        {**optics, "pose": {"rotation": pose[:, :3].tolist(), "translation": (pose[:, 3] - [away, 0, 0]).tolist()}}
+        for away in (0, BASELINE)
+    ]
+    with Simulation(scene(CAMERAS[name]), threads=threads) as simulation:
+        for frame in FRAMES:
+            at = {"positions": files.positions[frame], "time": float(files.time[frame])}
+            left = simulation.labels(both[0], **at)
+            flow, occlusion = simulation.flow(left, both[1], **at)
+            sheet, right = np.isfinite(left.coordinates[..., 0]), files.camera(frame).beside(BASELINE)
+            shown = material(files.vertices[frame], left.coordinates[sheet].astype(float))
+            yield "stereo", far(centres()[sheet] + flow[sheet], right.pixels(shown))
+            hidden = files.hidden(shown, frame, right)
+            assert hidden.any()
+            yield "stereo occlusion", float(np.mean((occlusion[sheet] == 255) != hidden))
+            if "distortion" not in optics:
+                across = files.written["calibration"][0][0] * BASELINE / left.depth[sheet].astype(float)
+                yield "disparity", far(flow[sheet], np.stack([-across, 0 * across], axis=1))
+
+
+def measured(folder: Path, name: str, threads: int) -> dict[str, float]:
+    """How far things are apart at most in the results of a run with a camera of CAMERAS, by the names of AGREEMENTS."""
+    files = Files(folder)
+    worst: dict[str, float] = {}
+    parts = [of_pixels(files), of_normals(files), of_tracks(files), of_chains(files)]
+    for part in [*parts, *([of_stereo(files, name, threads)] if name in STEREO else [])]:
+        for what, apart in part:
+            # Written so that NaN is kept.
+            worst[what] = apart if not apart <= worst.get(what, 0.0) else worst.get(what, 0.0)
+    return worst
