@@ -70,7 +70,7 @@ def gradient(scene: Scene | Mapping[str, Any], loss: Loss, threads: int | None =
         >>> found = gradient(scene, depth)
         >>> sorted(found.maps)
         ['tissue.foundation_map', 'tissue.map']
-        >>> found.numbers["tissue.young"] < 0 < found.numbers["probes.0.load"][1]
+        >>> bool(found.numbers["tissue.young"] < 0 < found.numbers["probes.0.load"][1])
         True
     """
     plan = checked(scene)

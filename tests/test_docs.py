@@ -236,16 +236,18 @@ def test_the_shipped_script_is_valid() -> None:
 
 
 def test_the_python_shown_runs(tmp_path: Path) -> None:
-    first, second, third = blocks(DOCS / "python.md", "python")
+    first, second, third, fourth = blocks(DOCS / "python.md", "python")
     (labels,) = blocks(DOCS / "labels.md", "python")
     shown = "print(position.shape, picture.shape, record['status'])\n"
     (tmp_path / "scenes").symlink_to(ROOT / "scenes")
-    (tmp_path / "example.py").write_text(first + shown + second + third)
+    (tmp_path / "example.py").write_text(first + shown + second + third + fourth)
     done = subprocess.run([sys.executable, "example.py"], cwd=tmp_path, check=True, capture_output=True, text=True)
-    shapes, result, felt = done.stdout.splitlines()
+    shapes, result, felt, *slopes = done.stdout.splitlines()
     assert shapes == "(41, 41, 3) (512, 512, 3) complete"
     assert result.startswith("6.00 mm deep with 1.")
     assert felt == "0.52 N at a depth of 5.0 mm, 0.40 s"
+    assert len(slopes) == 3
+    assert slopes[2] == "by the stiffness of every cell: (30, 30)"
     command = [sys.executable, "-m", "taichi_msm", "run", "scenes/grasp.yaml", "--set", "output=[trajectory]"]
     subprocess.run(command, cwd=tmp_path, check=True, capture_output=True)
     (tmp_path / "example.py").write_text(labels)
@@ -259,7 +261,7 @@ def test_the_python_shown_runs(tmp_path: Path) -> None:
 
 
 # Those whose examples stand in their docstrings. Those of Playback, export and fit read what that of run writes.
-WITH_EXAMPLES = ["run", "Playback", "export", "fit", "load_scene", "Scene", "Simulation"]
+WITH_EXAMPLES = ["run", "Playback", "export", "fit", "gradient", "load_scene", "Scene", "Simulation"]
 
 
 @pytest.mark.parametrize("name", WITH_EXAMPLES)
