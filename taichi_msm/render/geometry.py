@@ -25,7 +25,7 @@ SEEN, POINT_NUMBERS = uni.SEEN, 6
 OVERSTEP = 1e-5
 OVERSTEP_OF_PICTURE = 2e-6
 
-# By this fraction of its size a triangle must be beyond an edge of the picture to be left out.
+# By this fraction of its size a triangle or a cell must be beyond an edge of the picture to be left out.
 BESIDE = 1e-3
 
 # In f32, a cell is drawn as a whole only if its outline stays within this distance [samples].
@@ -318,15 +318,15 @@ def cell_bounds(at, cols, outline: ti.template(), numbers: ti.template(), point:
 
 
 @ti.func
-def is_beside(p, q, r, left, right, top, bottom):
-    """Tell whether a triangle that may reach behind the camera is beyond an edge of the picture.
+def is_beside(corners: ti.template(), left, right, top, bottom):
+    """Tell whether all between corners, some of which may be behind the camera, is beyond an edge of the picture.
 
     X = x w is a plane for each edge x, behind the camera too; a point beyond it has a larger X, or a smaller one.
     """
     beside = False
     for axis, way, edge in ti.static(((0, -1.0, left), (0, 1.0, right), (1, -1.0, top), (1, 1.0, bottom))):
-        beyond = [(k[axis] - edge * k[2]) * way for k in ti.static((p, q, r))]
-        size = ti.max(*[ti.abs(k[axis]) + ti.abs(edge * k[2]) for k in ti.static((p, q, r))])
+        beyond = [(k[axis] - edge * k[2]) * way for k in ti.static(corners)]
+        size = ti.max(*[ti.abs(k[axis]) + ti.abs(edge * k[2]) for k in ti.static(corners)])
         # By more than it is enlarged, and than f32 can tell.
         beside = beside or ti.min(*beyond) > BESIDE * size
     return beside
@@ -380,6 +380,6 @@ def triangle_bounds(
         left, right, top, bottom = 0.0, high_x, 0.0, ti.cast(height, ti.f32)
         if ti.static(lens != ""):
             left, right, top, bottom = [numbers[uni.VISIBLE + n] for n in ti.static(range(4))]
-        if is_beside(p, q, r, left, right, top, bottom):
+        if is_beside([p, q, r], left, right, top, bottom):
             high_x = -1.0
     return low_x, high_x, low_y, high_y, overstep

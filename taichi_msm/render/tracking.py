@@ -121,10 +121,17 @@ def _outline(
         below = corner + cols * POINT_NUMBERS
         outline = ti.static(geometry.outlined(corner, cols, numbers[uni.NEAR], point))
         left, right, top, bottom, side = outline.left, outline.right, outline.top, outline.bottom, outline.side
+        corners = [
+            [point[at + n] for n in ti.static(range(3))]
+            for at in ti.static((corner, corner + POINT_NUMBERS, below, below + POINT_NUMBERS))
+        ]
         if outline.behind:
             left, right, top, bottom = 1.0, -1.0, 1.0, -1.0
         elif not outline.in_front:
             left, right, top, bottom, side = -ANYWHERE, ANYWHERE, -ANYWHERE, ANYWHERE, 0.0
+            width, height = ti.cast(sizes[uni.WIDTH], ti.f64), ti.cast(sizes[uni.HEIGHT], ti.f64)
+            if geometry.is_beside(corners, 0.0, width, 0.0, height):
+                left, right = 1.0, -1.0
         cell[here + MIN_X], cell[here + MAX_X], cell[here + MIN_Y], cell[here + MAX_Y] = left, right, top, bottom
         cell[here + NEAREST] = ti.min(
             point[corner + 3], point[corner + POINT_NUMBERS + 3], point[below + 3], point[below + POINT_NUMBERS + 3]
