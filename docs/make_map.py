@@ -94,7 +94,7 @@ def draw(truth: Scene, result: FitResult) -> None:
     both, errors = LogNorm(0.7, 2.2), 100 * result.map.errors
     with plt.style.context(STYLE, after_reset=True):
         figure, panels = plt.subplots(1, 3, figsize=(8.0, 2.5), layout="constrained")
-        shown = (
+        shown: tuple[tuple[Floats, str, dict[str, Any]], ...] = (
             (factors(truth), "The truth", {"norm": both}),
             (result.map.factors, "What was found", {"norm": both}),
             (errors, "How well it is known", {"cmap": "cividis", "vmin": 0}),

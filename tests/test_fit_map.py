@@ -108,6 +108,7 @@ def test_the_files_give_what_was_fitted(result: FitResult, folder: Path) -> None
     low, high = result.map.range
     assert written.tissue.map.range == pytest.approx((low, high), rel=1e-12)
     found = checked(written).material.factors
+    assert found is not None
     fields = Fields(4, (8, 8)).factors(np.log(result.map.factors).ravel())
     np.testing.assert_allclose(found, fields, atol=(high - low) / 65535)
     assert read_map(written.tissue.map).grey.dtype == np.uint16
