@@ -119,6 +119,20 @@ def test_the_files_give_what_was_fitted(result: FitResult, folder: Path) -> None
     assert {"map.png", "map-error.png", "fit.png", "scene.yaml"} <= set(record["files"])
 
 
+def test_a_map_is_as_smooth_as_the_errors_allow(device: Device) -> None:
+    """Of a lump and of even tissue with large errors, no more is followed than there is."""
+    spreads = []
+    for factors in (TRUTH, np.ones((4, 4))):
+        observed = seen_in(scene(), device, factors, np.array([1.0, 2.0]), 1e-4)
+        found = fit(scene(), observed, ["tissue.map"], resolution=4).map
+        assert found is not None
+        off = np.log(found.factors / factors)[~found.unknown] / found.errors[~found.unknown]
+        assert np.sqrt((off**2).mean()) < 1.6
+        spreads.append(np.log(found.factors).std())
+    # Errors alone explain the even tissue, so that it is as even as the coarsest weight makes it.
+    assert 100 * spreads[1] < spreads[0]
+
+
 def test_fields_that_do_not_move_are_unknown(device: Device, tmp_path: Path) -> None:
     # On so stiff a ground, exp(-distance / 5 mm) of a pull is felt: nothing on the other side.
     data = scene().model_dump(mode="json", exclude_none=True)

@@ -38,7 +38,7 @@ UNKNOWN = 0.5
 WEIGHTS = 10.0 ** np.arange(2, -9, -0.1)
 
 # The weight stays if it changes by less than this factor; it and the map are found in turn at most so many times.
-STAYS, ROUNDS = 1.6, 4
+STAYS, ROUNDS = 2.0, 4
 
 # By how much the log of a field is changed at most from where J was found to where a search starts.
 FAR = 1.0
