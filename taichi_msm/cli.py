@@ -613,10 +613,6 @@ def fit(
 
     # Both options take several words.
     free = (*free, *(word for word in more if "=" not in word))
-    if resolution is not None:
-        raise click.BadParameter(
-            "a map cannot be fitted yet; leave it out, and name numbers", param_hint="--resolution"
-        )
     limits = dict(map(read_bounds, (*bounds, *(word for word in more if "=" in word))))
     loaded = load_scene(scene, overrides)
     directory = result_directory(out, f"{Path(scene).stem}-fit")
@@ -640,6 +636,7 @@ def fit(
                 robust=robust,
                 profile=profile,
                 correlation=correlation,
+                resolution=resolution,
             )
     except KeyboardInterrupt:
         return interrupted(interruption, as_json)

@@ -26,6 +26,7 @@ from taichi_msm.fitting.profiles import Place, Profile, Profiler
 from taichi_msm.fitting.report import publication, write_report
 from taichi_msm.fitting.result import Estimate, FitResult
 from taichi_msm.fitting.runs import Runs
+from taichi_msm.fitting.stiffness_map import KEY, fit_map, map_task
 from taichi_msm.fitting.suspicions import faults, faults_beside, moved
 from taichi_msm.fitting.uncertainty import Uncertainty, likeness, uncertainty
 from taichi_msm.physics.mesh_error import WITH_CONTACT
@@ -47,6 +48,7 @@ class Method(TypedDict, total=False):
     robust: bool  # whether what is far off counts less
     profile: bool  # whether the intervals are found by profiles
     correlation: float | None  # how far in the picture errors of tracks are alike [px]
+    resolution: int | None  # fields along a side of the map that is fitted
 
 
 def fit(
@@ -70,16 +72,17 @@ def fit(
             down, shape (N, 2); `position` [m], shape (N, T, 3), or `pixel` [px] of the scene's camera, shape (N, T, 2);
             NaN where not seen; `sigma`, the standard deviation of their errors, may be left out. Or a run's
             trajectory.npz or tracks.npz.
-        free: the keys that are fitted, by their dotted paths, such as tissue.young or probes.0.total.2.
-        bounds: smallest and largest values of keys.
+        free: the keys that are fitted, by their dotted paths, such as tissue.young or probes.0.total.2; or tissue.map
+            alone: a map of R x R fields.
+        bounds: smallest and largest values of keys; of tissue.map, of the factors.
         forces: a forces.csv of the same motion, and the standard deviation of its forces [N].
-        directory: where fit.json, scene.yaml and fit.png go; None: nothing is written.
+        directory: where fit.json, scene.yaml, fit.png and a map's pictures go; None: nothing is written.
         workers: processes that take runs side by side; None: as many as pay.
         progress: called often, with the stage, the runs done and about how many there will be; what it raises stops the
             fit, and nothing is written.
         **method: sigma, in place of the file's; robust: whether numbers that are far off count less; profile: whether
             the intervals are found by going there; correlation: how far apart in the picture errors of tracks are alike
-            [px].
+            [px]; resolution: R of a map.
 
     Returns:
         What was found; also where the data do not tell a parameter: then `identifiable` is False.
@@ -106,7 +109,12 @@ def fit(
             said = "is for one run, and a fit compares many; remove it, and take what `run` chose for it"
             raise SceneError([f"{section}.tolerance: {tolerance:g} {said}"])
     seen = with_sigma(read_observations(observed, given.time.frames_per_second), method.get("sigma"))
-    parameters = make_parameters(given, [free] if isinstance(free, str) else free, bounds or {})
+    names = [free] if isinstance(free, str) else free
+    task = map_task(given, names, bounds or {}, method.get("resolution"))
+    other = {"forces": forces, **{name: method.get(name) for name in ("robust", "profile", "correlation")}}
+    if task is not None and (given_too := [name for name, value in other.items() if value]):
+        raise SceneError([f"--free {KEY}: --{given_too[0]} is of fits of numbers; leave it out"])
+    parameters = () if task is not None else make_parameters(given, names, bounds or {})
     if forces is not None:
         seen = replace(seen, forces=read_forces(forces[0], forces[1], len(given.probes)))
     if (correlation := method.get("correlation")) is not None:
@@ -114,16 +122,20 @@ def fit(
             raise SceneError([f"--correlation {correlation:g}: take a number of pixels above 0"])
         if seen.kind != "pixel":
             raise SceneError([f"{seen.name}: --correlation is in pixels, and these are positions; leave it out"])
-    if wrong := list(faults(seen, given, len(parameters))):
+    if task is None and (wrong := list(faults(seen, given, len(parameters)))):
         raise SceneError(wrong)
     with ExitStack() as opened:
         if directory is not None:
             require_path(directory)
             opened.enter_context(writing(directory))
             published = opened.enter_context(publication(Path(directory)))
-        job = Job(secrets.token_hex(8), runnable(given), parameters, seen)
-        runs = opened.enter_context(Runs(job, workers, progress))
-        result = replace(_fit(runs, given, method), seconds=time.perf_counter() - begun)
+        if task is not None:
+            result = fit_map(given, seen, task, progress)
+        else:
+            job = Job(secrets.token_hex(8), runnable(given), parameters, seen)
+            runs = opened.enter_context(Runs(job, workers, progress))
+            result = _fit(runs, given, method)
+        result = replace(result, seconds=time.perf_counter() - begun)
         if directory is not None:
             progress("write", 0, 0)
             write_report(result, published)

@@ -114,7 +114,7 @@ def _parameter(scene: Scene, data: dict[str, Any], key: str, bounds: Bounds | No
     named = f"--free {key}"
     if path and path[-1] in MAPS:
         raise SceneError(
-            [f"{named}: a map cannot be fitted yet; name numbers, such as {scene.kind}.{path[-1]}.range.1"]
+            [f"{named}: of maps only tissue.map is fitted; name numbers, such as {scene.kind}.{path[-1]}.range.1"]
         )
     value = _look_up(named, data, path)
     inside = any(key == section or key.startswith(f"{section}.") for section in SECTIONS)

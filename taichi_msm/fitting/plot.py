@@ -15,6 +15,7 @@ from matplotlib.layout_engine import ConstrainedLayoutEngine
 from matplotlib.ticker import MaxNLocator
 
 from taichi_msm.errors import printable
+from taichi_msm.fitting.map_plot import plot_map
 from taichi_msm.fitting.result import FitResult
 from taichi_msm.plot_style import BLUE, DPI, GREY, ORANGE, STYLE, VERMILION, WIDE
 
@@ -34,13 +35,16 @@ def plot(result: FitResult, file: BinaryIO) -> None:
 
 def _figure(result: FitResult) -> Figure:
     forces = result.observations.forces is not None
-    count = 3 + forces + len(result.parameters)
+    count = 3 + forces + len(result.parameters) + 3 * (result.map is not None)
     rows = math.ceil(count / COLUMNS)
     engine = ConstrainedLayoutEngine(w_pad=0.1, h_pad=0.1)
     figure = Figure(figsize=(WIDE, HEIGHT * rows + 0.5), dpi=DPI, layout=engine)
     FigureCanvasAgg(figure)
     figure.suptitle(f"Fit to {printable(result.observations.name)}", x=0.01, ha="left", parse_math=False)
     panels = list(figure.subplots(rows, COLUMNS, squeeze=False).ravel())
+    if result.map is not None:
+        plot_map(panels[:COLUMNS], result.map, result.scene.sheet)
+        panels, count = panels[COLUMNS:], count - COLUMNS
     _plot_motion(panels[0], result)
     _plot_match(panels[1], result)
     _plot_left(panels[2], result)

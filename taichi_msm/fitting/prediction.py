@@ -145,12 +145,12 @@ class Predictor:
                 forces.append([one.force for one in simulation.forces()])
         rest = places_at_rest(seen.coordinates, scene.sheet)
         motion = np.linalg.norm(np.array(points) - rest, axis=2).max(axis=1)
-        values = _between(np.array(points), self._place).swapaxes(0, 1)
+        values = between(np.array(points), self._place).swapaxes(0, 1)
         if seen.kind == "pixel":
             values = seen_by_camera(scene, values, seen.time)
         felt = np.empty((0, 3))
         if seen.forces is not None:
-            felt = _between(np.array(forces), self._force_place)[np.arange(len(self._force_place)), seen.forces.probe]
+            felt = between(np.array(forces), self._force_place)[np.arange(len(self._force_place)), seen.forces.probe]
         return Predicted(values, felt, plan.grid.steps_per_frame, motion)
 
     def close(self) -> None:
@@ -173,7 +173,7 @@ def _with_margin(plan: Plan) -> int:
     return math.ceil(2 * frame / plan.stable_step * (1 + difference(plan.scene)))
 
 
-def _between(frames: Array, place: Array) -> Array:
+def between(frames: Array, place: Array) -> Array:
     """Interpolate what is given for each frame, shape (frames, ...), linearly at places between them."""
     from scipy.interpolate import make_interp_spline
 

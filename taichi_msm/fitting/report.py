@@ -8,10 +8,13 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import yaml
+from numpy.typing import NDArray
+from PIL import Image
 
 from taichi_msm.errors import printable
-from taichi_msm.fitting.result import FitResult
+from taichi_msm.fitting.result import FitResult, FittedMap
 from taichi_msm.results.entries import files
 from taichi_msm.results.publication import Contents, Listed, Publication
 from taichi_msm.results.whole import add, create
@@ -20,7 +23,9 @@ from taichi_msm.system.versions import versions
 
 RECORD, SCENE, PLOT, PICTURES = "fit.json", "scene.yaml", "fit.png", "pictures"
 
-PATTERNS = (r"fit\.json", r"scene\.yaml", r"fit\.png", rf"{PICTURES}/.+")
+MAP, ERRORS = FittedMap.FILE, "map-error.png"
+
+PATTERNS = (r"fit\.json", r"scene\.yaml", r"fit\.png", r"map\.png", r"map-error\.png", rf"{PICTURES}/.+")
 
 # What fit.png needs, and is left out without.
 NO_PLOT = 'fit.png is left out, as matplotlib is not installed; pip install "taichi-msm[report]"'
@@ -32,13 +37,18 @@ def _listed(record: Mapping[str, Any]) -> Listed:
 
 def publication(directory: Path) -> Publication:
     """Begin to replace the fit in a directory."""
-    return Publication(directory, Contents("fit", RECORD, PATTERNS, _listed), [RECORD, SCENE, PLOT])
+    return Publication(directory, Contents("fit", RECORD, PATTERNS, _listed), [RECORD, SCENE, PLOT, MAP, ERRORS])
 
 
 def write_report(result: FitResult, published: Publication) -> None:
     """Write the files of a fit, and put them in place."""
     folder = published.staged
     add(folder / SCENE, _scene_text(result, folder).encode())
+    if result.map is not None:
+        low, high = result.map.range
+        _write_grey((result.map.factors - low) / ((high - low) or 1.0), folder / MAP)
+        # White: unknown, or not even known to 100 %.
+        _write_grey(np.nan_to_num(result.map.errors, nan=1.0).clip(0, 1), folder / ERRORS)
     try:
         from taichi_msm.fitting.plot import plot
     except ImportError:
@@ -52,11 +62,19 @@ def write_report(result: FitResult, published: Publication) -> None:
     published.publish([*written, RECORD])
 
 
+def _write_grey(shares: NDArray[np.float64], path: Path) -> None:
+    """Write shares, 0 to 1, as a picture of 16 bits."""
+    with create(path) as file:
+        Image.fromarray((65535 * shares).round().astype(np.uint16)).save(file, "PNG")
+
+
 def _scene_text(result: FitResult, folder: Path) -> str:
     """Write the fitted scene, and copy its pictures beside it."""
     names: dict[str, str] = {}
 
     def copied(path: str) -> str:
+        if result.map is not None and path == MAP:
+            return MAP
         if path not in names:
             name, number = Path(path).name, 1
             while f"{PICTURES}/{name}" in names.values():
@@ -70,5 +88,5 @@ def _scene_text(result: FitResult, folder: Path) -> str:
     scene: Scene = result.scene.with_pictures(copied)
     data = scene.model_dump(mode="json", exclude_none=True)
     text = yaml.safe_dump(data, sort_keys=False, default_flow_style=None, width=120, allow_unicode=True)
-    found = ", ".join(f"{key} {one.value:.6g}" for key, one in result.parameters.items())
+    found = ", ".join(f"{key} {one.value:.6g}" for key, one in result.parameters.items()) or f"tissue.map, {MAP}"
     return f"# Fitted to {printable(result.observations.name)}: {printable(found)}; more in {RECORD}.\n{text}"

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, field
-from typing import Any, NamedTuple
+from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,6 +13,7 @@ from taichi_msm.fitting.identifiability import Unseen
 from taichi_msm.fitting.observations import Observations
 from taichi_msm.fitting.parameters import rounded
 from taichi_msm.fitting.profiles import Place
+from taichi_msm.fitting.tikhonov import Choice
 from taichi_msm.scene import Scene
 
 Array = NDArray[np.float64]
@@ -36,6 +37,54 @@ class Estimate(NamedTuple):
     start: float
     identifiable: bool
     mesh_error: float | None
+
+
+@dataclass(frozen=True, eq=False)
+class FittedMap:
+    """A map of the stiffness that was found.
+
+    Attributes:
+        factors: of young, from the upper left corner of the sheet, shape (R, R).
+        errors: relative standard error of each; NaN: unknown, as what was seen does not tell it.
+        choice: the weight of the smoothness, and how it was chosen.
+        sigma: the standard deviation of what was seen, with the error of the number of points [m] or [px].
+    """
+
+    FILE: ClassVar = "map.png"
+
+    factors: Array
+    errors: Array
+    choice: Choice = field(repr=False)
+    sigma: float
+
+    @property
+    def unknown(self) -> NDArray[np.bool_]:
+        """Which fields are unknown, shape (R, R)."""
+        return np.isnan(self.errors)
+
+    @property
+    def range(self) -> tuple[float, float]:
+        """The smallest and the largest factor, black and white in map.png."""
+        return float(self.factors.min()), float(self.factors.max())
+
+    def as_json(self) -> dict[str, Any]:
+        """Give it as plain data, as in fit.json."""
+        errors = [[None if math.isnan(one) else one for one in row] for row in self.errors.tolist()]
+        return {
+            **{"resolution": len(self.factors), "range": self.range, "factors": self.factors.tolist()},
+            **{"standard_error": errors, "unknown": int(self.unknown.sum())},
+            **{"weight": self.choice.weight, "sigma": self.sigma},
+        }
+
+    def summary(self) -> str:
+        """Say in a line what was found."""
+        low, high = self.range
+        size, known = len(self.factors), self.errors[~self.unknown]
+        errors = "all unknown"
+        if known.size:
+            middle, ends = 100 * np.median(known), 100 * np.array([known.min(), known.max()])
+            errors = f"known to {rounded(middle)} % in the middle, {rounded(ends[0])} to {rounded(ends[1])} %"
+        return f"tissue.map: {size} x {size} fields, {low:.3g} to {high:.3g} times young, {errors}"
 
 
 @dataclass(frozen=True, eq=False)
@@ -63,6 +112,7 @@ class FitResult:
         fitted_forces: the forces in the fitted scene, as in the observations [N], shape (rows, 3).
         curves: by key, the root of twice the rise of the cost, signed, at values of a parameter while the others
             follow: its profile, or else what follows from the curvature at the best value.
+        map: the map that was fitted, in the place of parameters; None: numbers were.
     """
 
     parameters: dict[str, Estimate]
@@ -84,6 +134,7 @@ class FitResult:
     fitted: Array = field(repr=False)
     fitted_forces: Array = field(repr=False)
     curves: dict[str, list[Place]] = field(repr=False)
+    map: FittedMap | None = None
 
     def as_json(self) -> dict[str, Any]:
         """Give it as plain data, as in fit.json."""
@@ -93,6 +144,7 @@ class FitResult:
             "parameters": {key: one._asdict() for key, one in self.parameters.items()},
             **{name: getattr(self, name) for name in (*plain.split(), "runs", "seconds", "notes")},
             "unseen": [one.as_json() for one in self.unseen],
+            **({} if self.map is None else {"map": self.map.as_json()}),
         }
 
     def summary(self) -> list[str]:
@@ -100,6 +152,7 @@ class FitResult:
         seen = self.observations
         lines = [f"{key}: {_in_words(one)}" for key, one in self.parameters.items()]
         lines += [one.text for one in self.unseen]
+        lines += [] if self.map is None else [self.map.summary()]
         points, times = seen.there.shape
         chi = ""
         if self.chi_square is not None:

@@ -1,0 +1,226 @@
+"""Fit the map of a tissue's stiffness: from a scene and what was seen to a picture of factors, and of their errors."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from taichi_msm.errors import SceneError
+from taichi_msm.fitting.fields import Fields, centres
+from taichi_msm.fitting.observations import Observations
+from taichi_msm.fitting.parameters import Bounds, rounded
+from taichi_msm.fitting.prediction import Predicted, places_at_rest, runnable
+from taichi_msm.fitting.result import FitResult, FittedMap
+from taichi_msm.fitting.sight import Sight
+from taichi_msm.fitting.suspicions import faults, faults_beside
+from taichi_msm.fitting.tikhonov import Search, Solution
+from taichi_msm.physics.adjoint import Adjoint, require_differentiable
+from taichi_msm.physics.material import map_factors
+from taichi_msm.physics.mesh_error import coarser
+from taichi_msm.physics.plan import Plan
+from taichi_msm.physics.planning import stable_step
+from taichi_msm.progress import Progress
+from taichi_msm.scene import Scene, StiffnessMap
+from taichi_msm.scenefile.validation import checked
+from taichi_msm.system import runtime
+
+Array = NDArray[np.float64]
+
+KEY = "tissue.map"
+
+# The factors of a map without bounds.
+LOW, HIGH = 0.1, 10.0
+
+# A factor stays so far above the one with which a spring would have no length without its pretension.
+TAUT = 1.05
+
+# What half the cells a side make different is so many times the error of the cells: 2^2 - 1.
+RICHARDSON = 3.0
+
+# How many runs a search takes, about: for the progress.
+USUAL = 150
+
+# A field has ended at a bound if its log is as near.
+AT_BOUND = 1e-3
+
+
+@dataclass(frozen=True)
+class MapTask:
+    """What map is asked for."""
+
+    resolution: int
+    limits: Bounds  # of the factors
+
+
+def map_task(scene: Scene, free: Sequence[str], bounds: Mapping[str, Bounds], resolution: int | None) -> MapTask | None:
+    """Say what map is to be fitted; None: numbers are; SceneError: what was asked for cannot be."""
+    if KEY not in free:
+        if resolution is not None:
+            raise SceneError([f"--resolution {resolution}: is that of a map; add --free {KEY}"])
+        return None
+    named = f"--free {KEY}"
+    if others := [key for key in free if key != KEY]:
+        raise SceneError(
+            [f"{named}: a map is found alone, as its level and {others[0]} can look alike; leave that out"]
+        )
+    if scene.tissue is None:
+        raise SceneError([f"{named}: the scene has springs; describe them as tissue"])
+    cells = min(scene.sheet.points) - 1
+    if resolution is None:
+        raise SceneError([f"{named}: add --resolution R, the fields along a side, such as {min(16, cells)}"])
+    if not 2 <= resolution <= cells:
+        said = f"take 2 to {cells}, as the sheet has {cells} cells along a side, or more sheet.points"
+        raise SceneError([f"--resolution {resolution}: {said}"])
+    if wrong := [key for key in bounds if key != KEY]:
+        raise SceneError([f"--bounds {wrong[0]}: not among --free; take {KEY}=LOW,HIGH, factors of young"])
+    low, high = bounds.get(KEY, (LOW, HIGH))
+    low, high = (LOW if low == -math.inf else low), (HIGH if high == math.inf else high)
+    if not 0 < low < high:
+        raise SceneError([f"--bounds {KEY}={low:g},{high:g}: take factors of young above 0, the smaller one first"])
+    return MapTask(resolution, (low, high))
+
+
+def fit_map(given: Scene, seen: Observations, task: MapTask, progress: Progress) -> FitResult:
+    """Find a map.
+
+    Raises:
+        SceneError: when the scene or what was seen cannot be used.
+        DivergedError: when a run diverges.
+    """
+    plan = _for_factors(checked(runnable(given)), task.limits[1])
+    require_differentiable(plan)
+    if wrong := list(_unusable(seen, given, task)):
+        raise SceneError(wrong)
+    assert seen.sigma is not None
+    low = max(task.limits[0], TAUT * plan.material.tension)
+    limits = math.log(low), math.log(task.limits[1])
+    fields = Fields(task.resolution, _cells(plan))
+    start = np.clip(np.log(_start(plan, task.resolution)), *limits).ravel()
+    device = runtime.start("cpu")
+    adjoint, sight = Adjoint(plan, device), Sight(plan.scene, seen, plan.grid.frames + 1)
+
+    def tell() -> None:
+        done = search.runs if search is not None else 0
+        progress("fit", done, max(USUAL + 2 * len(start), done + 1))
+
+    search: Search | None = None
+    tell()
+    points = _first(adjoint, sight, fields, start, seen, given)
+    by_points, mesh_error = 0.0, None
+    if (half := coarser(plan)) is not None:
+        few = Fields(task.resolution, _cells(half)).factors(start)
+        other = Sight(half.scene, seen, half.grid.frames + 1)
+        moved = other.points(Adjoint(half, device).run(few))
+        apart = (other.seen(moved) - sight.seen(points))[seen.known] / RICHARDSON
+        by_points = float(np.sqrt(np.mean(apart**2)))
+        motion = np.linalg.norm(points - places_at_rest(seen.coordinates, given.sheet)[:, None], axis=2).max()
+        mesh_error = float(np.linalg.norm(moved - points, axis=2).max() / RICHARDSON / motion)
+    sigma = math.hypot(seen.sigma, by_points)
+    search = Search(adjoint, sight, seen, sigma, fields, limits, tell)
+    solution = search.best(start)
+    side = task.resolution, task.resolution
+    found = FittedMap(np.exp(solution.x).reshape(side), solution.errors.reshape(side), solution.choice, sigma)
+    fitted = search.predict(solution.x)[1]
+    left = (fitted - seen.values)[seen.known]
+    tissue = given.tissue
+    assert tissue is not None
+    drawn = StiffnessMap(image=FittedMap.FILE, range=found.range)
+    return FitResult(
+        parameters={},
+        correlation=[],
+        residual=float(np.sqrt(np.mean(left**2))),
+        residual_force=None,
+        sigma=seen.sigma,
+        unit=seen.unit,
+        chi_square=float(np.sum((left / seen.sigma) ** 2)),
+        degrees_of_freedom=left.size,
+        identifiable=not found.unknown.any(),
+        unseen=[],
+        mesh_error=mesh_error,
+        runs=search.runs + 1,
+        seconds=0.0,
+        notes=list(_notes(seen, solution, found, by_points, limits)),
+        scene=given.model_copy(update={"tissue": tissue.model_copy(update={"map": drawn})}),
+        observations=seen,
+        fitted=fitted,
+        fitted_forces=np.empty((0, 3)),
+        curves={},
+        map=found,
+    )
+
+
+def _unusable(seen: Observations, scene: Scene, task: MapTask) -> Iterator[str]:
+    """Say why a map cannot be found from what was seen, before anything is run."""
+    if seen.sigma is None:
+        said = "a map is found as smooth as the errors of what was seen allow; give their standard deviation by --sigma"
+        yield f"{seen.name}: sigma: missing: {said}"
+        return
+    if (known := int(seen.known.sum())) <= (needed := task.resolution**2):
+        said = f"{known} numbers were seen, too few for {needed} fields; observe more points, or take fewer fields"
+        yield f"{seen.name}: {said}: --resolution {max(2, math.isqrt(max(known - 1, 0)))}"
+        return
+    yield from faults(seen, scene, task.resolution**2)
+
+
+def _first(adjoint: Adjoint, sight: Sight, fields: Fields, start: Array, seen: Observations, given: Scene) -> Array:
+    """Give where the points are at the start [m], shape (N, T, 3); SceneError: what was seen is beside that."""
+    position = adjoint.run(fields.factors(start))
+    every = Sight(given, replace(seen, time=np.arange(len(position)) / given.time.frames_per_second), len(position))
+    rest = places_at_rest(seen.coordinates, given.sheet)[:, None]
+    motion = np.linalg.norm(every.points(position) - rest, axis=2).max(axis=0)
+    points = sight.points(position)
+    first = Predicted(sight.seen(points), np.empty((0, 3)), 0, motion)
+    if wrong := list(faults_beside(seen, given, first)):
+        raise SceneError(wrong)
+    return points
+
+
+def _for_factors(plan: Plan, high: float) -> Plan:
+    """Take steps that the largest factor allows; SceneError: the scene's own step does not."""
+    if plan.scene.time.at_rest:
+        return plan
+    stiff = replace(plan.material, factors=np.full(_cells(plan), high))
+    limit = stable_step(stiff, plan.scene.sheet, plan.scene.time.damping_difference)
+    if plan.scene.time.step == "auto":
+        least = math.ceil(2 / (plan.grid.frames_per_second * limit))
+        return plan.with_grid(steps_per_frame=max(plan.grid.steps_per_frame, least))
+    if plan.grid.step > limit:
+        said = f"{plan.grid.step:g} s is too long for a factor of {high:g}; take {limit:.3g} s or less, or auto"
+        raise SceneError([f"time.step: {said}, or smaller --bounds {KEY}=LOW,HIGH"])
+    return plan
+
+
+def _start(plan: Plan, resolution: int) -> Array:
+    """Give the factors of the fields where the search begins: those of the scene's map, else 1."""
+    tissue, image = plan.scene.tissue, plan.maps.get("map")
+    if tissue is None or tissue.map is None or image is None:
+        return np.ones((resolution, resolution))
+    return map_factors(tissue.map, image, centres(resolution), centres(resolution))
+
+
+def _cells(plan: Plan) -> tuple[int, int]:
+    rows, cols = plan.scene.sheet.points
+    return rows - 1, cols - 1
+
+
+def _notes(
+    seen: Observations, solution: Solution, found: FittedMap, by_points: float, limits: tuple[float, float]
+) -> Iterator[str]:
+    """Tell what the user should know."""
+    assert seen.sigma is not None
+    if (unknown := int(found.unknown.sum())) > 0:
+        yield f"{unknown} of {found.factors.size} fields are unknown: nothing moves there that would tell; press there"
+    if by_points > seen.sigma / 2:
+        said = (
+            f"about {rounded(by_points)} {seen.unit}, and sigma is {rounded(seen.sigma)}: the map is as smooth as both"
+        )
+        yield f"the number of points changes what is seen by {said} require; take more sheet.points"
+    if solution.excess > 1.5:
+        times = rounded(math.sqrt(solution.excess))
+        yield f"what is left is {times} times what is expected with any map, and the errors are widened by as much"
+    if bound := int((np.minimum(solution.x - limits[0], limits[1] - solution.x) < AT_BOUND).sum()):
+        yield f"{bound} fields ended at a bound, {math.exp(limits[0]):.3g} or {math.exp(limits[1]):.3g}; see --bounds"

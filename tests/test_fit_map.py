@@ -1,0 +1,226 @@
+"""A map of stiffness from what was seen: it comes back, as well known as is said, and is written as it was found."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+from PIL import Image
+
+from taichi_msm import FitResult, SceneError, fit, load_scene
+from taichi_msm.fitting.fields import Fields
+from taichi_msm.fitting.observations import Observations, read_observations
+from taichi_msm.fitting.sight import Sight
+from taichi_msm.fitting.tikhonov import Search
+from taichi_msm.physics.adjoint import Adjoint
+from taichi_msm.physics.lattice import rest_positions
+from taichi_msm.physics.material import read_map
+from taichi_msm.scene import Scene
+from taichi_msm.scenefile.validation import checked
+from taichi_msm.system import resources
+from taichi_msm.system.runtime import Device
+from tests.conftest import Program
+
+Array = NDArray[np.float64]
+
+GRID = np.linspace(0.03, 0.97, 12)
+PLACES = np.stack([axis.ravel() for axis in np.meshgrid(GRID, GRID)], axis=1)
+
+# A stiff field in soft ones.
+TRUTH = np.ones((4, 4))
+TRUTH[1, 2] = 2.0
+
+
+def scene(**more: Any) -> Scene:
+    """Two tools pull across, then down; the sheet is at rest in each of two pictures."""
+    pulls = [
+        {"at": at, "total": total, "load": load, "radius": 0.01, "falloff": 100}
+        for at in ([0.35, 0.6], [0.7, 0.35])
+        for total, load in (([0.5, 0, 0], [[0, 0], [1, 100], [2, 0]]), ([0, 0.5, 0], [[0, 0], [1, 0], [2, 100]]))
+    ]
+    data = {
+        "sheet": {"points": [9, 9], "size": [0.1, 0.1], "fixed": "border"},
+        "tissue": {"young": 2e4, "thickness": 3e-3, "foundation": 5e4, "foundation_active": "always", "pretension": 5},
+        "probes": pulls,
+        "time": {"duration": 2, "frames_per_second": 1, "motion": "quasistatic", "precision": "f64"},
+        "render": {"camera": {"eye": [0, -0.06, 0.09]}},
+        "output": [],
+    }
+    return Scene.model_validate(data | more)
+
+
+def seen_in(truth: Scene, device: Device, factors: Array, times: Array, error: float) -> dict[str, Any]:
+    """Positions of the places in a scene with a map, with errors of that standard deviation [m]."""
+    plan = checked(truth)
+    position = Adjoint(plan, device).run(Fields(len(factors), (8, 8)).factors(np.log(factors).ravel()))
+    empty = Observations("", "position", times, PLACES, np.zeros((len(PLACES), len(times), 3)), None)
+    points = Sight(truth, empty, len(position)).points(position)
+    noise = np.random.default_rng(1).normal(0, error, points.shape)
+    return {"time": times, "coordinates": PLACES, "position": points + noise, "sigma": error}
+
+
+@pytest.fixture(scope="module", autouse=True)
+def one_device(device: Device) -> Iterator[None]:
+    """A fit takes every core, and a process has one device."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("taichi_msm.system.runtime.resources.available_threads", lambda: device.threads)
+        patch.setattr(resources, "available_threads", lambda: device.threads)
+        yield
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return tmp_path_factory.mktemp("fit")
+
+
+@pytest.fixture(scope="module")
+def result(device: Device, folder: Path) -> FitResult:
+    """The map that is found from errors of 10 um, with its files."""
+    observed = seen_in(scene(), device, TRUTH, np.array([1.0, 2.0]), 1e-5)
+    # Half the cells a side would say little of these.
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("taichi_msm.fitting.stiffness_map.coarser", lambda plan: None)
+        return fit(scene(), observed, ["tissue.map"], resolution=4, directory=folder)
+
+
+def test_the_map_comes_back_as_well_known_as_is_said(result: FitResult) -> None:
+    assert result.map is not None
+    assert result.identifiable
+    off = np.log(result.map.factors / TRUTH) / result.map.errors
+    # Chi-square of 16 numbers is below 3.9, or above 39, once in a thousand times each.
+    assert np.abs(off).max() < 4
+    assert 3.9 < (off**2).sum() < 39
+    assert result.map.factors.argmax() == TRUTH.argmax()
+    assert np.median(result.map.errors) < 0.05
+    assert result.chi_square == pytest.approx(result.degrees_of_freedom, rel=0.15)
+
+
+def test_the_files_give_what_was_fitted(result: FitResult, folder: Path) -> None:
+    assert result.map is not None
+    written = load_scene(folder / "scene.yaml")
+    assert written.tissue is not None
+    assert written.tissue.map is not None
+    low, high = result.map.range
+    assert written.tissue.map.range == pytest.approx((low, high), rel=1e-12)
+    found = checked(written).material.factors
+    assert found is not None
+    fields = Fields(4, (8, 8)).factors(np.log(result.map.factors).ravel())
+    np.testing.assert_allclose(found, fields, atol=(high - low) / 65535)
+    assert read_map(written.tissue.map).grey.dtype == np.uint16
+    errors = np.asarray(Image.open(folder / "map-error.png"), np.float64) / 65535
+    np.testing.assert_allclose(errors, result.map.errors, atol=1 / 65535)
+    record = json.loads((folder / "fit.json").read_text())
+    assert record["map"]["factors"] == result.map.factors.tolist()
+    assert {"map.png", "map-error.png", "fit.png", "scene.yaml"} <= set(record["files"])
+
+
+def test_a_map_is_as_smooth_as_the_errors_allow(device: Device) -> None:
+    """Of a lump and of even tissue with large errors, no more is followed than there is."""
+    spreads = []
+    for factors in (TRUTH, np.ones((4, 4))):
+        observed = seen_in(scene(), device, factors, np.array([1.0, 2.0]), 1e-4)
+        found = fit(scene(), observed, ["tissue.map"], resolution=4).map
+        assert found is not None
+        off = np.log(found.factors / factors)[~found.unknown] / found.errors[~found.unknown]
+        assert np.sqrt((off**2).mean()) < 1.6
+        spreads.append(np.log(found.factors).std())
+    # Errors alone explain the even tissue, so that it is as even as the coarsest weight makes it.
+    assert 100 * spreads[1] < spreads[0]
+
+
+def test_fields_that_do_not_move_are_unknown(device: Device, tmp_path: Path) -> None:
+    # On so stiff a ground, exp(-distance / 5 mm) of a pull is felt: nothing on the other side.
+    data = scene().model_dump(mode="json", exclude_none=True)
+    tissue, probes = data["tissue"] | {"foundation": 2.4e6}, [one | {"at": [0.2, 0.5]} for one in data["probes"][:2]]
+    local = scene(tissue=tissue, probes=probes)
+    observed = seen_in(local, device, np.ones((4, 4)), np.array([1.0, 2.0]), 1e-6)
+    found = fit(local, observed, ["tissue.map"], resolution=4, directory=tmp_path).map
+    assert found is not None
+    assert found.unknown[:, 3].all()
+    assert not found.unknown[1:3, 0].any()
+    assert (np.asarray(Image.open(tmp_path / "map-error.png"))[:, 3] == 65535).all()
+
+
+@pytest.mark.parametrize("kind", ["position", "pixel"])
+def test_the_slope_of_the_misfit_is_that_of_differences(device: Device, kind: str) -> None:
+    seen = read_observations(seen_in(scene(), device, TRUTH, np.array([0.7, 2.0]), 1e-4), 1)
+    seen = Observations("", kind, seen.time, PLACES, seen.values[..., : 3 if kind == "position" else 2], 1e-4)  # type: ignore[arg-type]
+    plan, fields = checked(scene()), Fields(4, (8, 8))
+    search = Search(Adjoint(plan, device), Sight(plan.scene, seen, 3), seen, 1.0, fields, (-2, 2), lambda: None)
+    rng = np.random.default_rng(0)
+    x, change = rng.normal(0, 0.2, (2, 16))
+    after, before = (search.misfit(x + sign * 1e-3 * change)[0] for sign in (1, -1))
+    # The shapes at rest are known to 1e-6, and the second difference is 1e-6 of the first.
+    assert (after - before) / 2e-3 == pytest.approx(search.misfit(x)[1] @ change, rel=1e-3)
+
+
+def test_going_back_is_the_transpose_of_seeing(device: Device) -> None:
+    seen = Observations("", "pixel", np.array([0.3, 1.0]), PLACES, np.zeros((len(PLACES), 2, 2)), None)
+    rng = np.random.default_rng(0)
+    flat = rest_positions(scene().sheet)
+    position, change = flat + rng.normal(0, 2e-3, (3, *flat.shape)), rng.normal(0, 1, (3, *flat.shape))
+    slope, sight = rng.normal(0, 1, (len(PLACES), 2, 2)), Sight(scene(), seen, 3)
+    back = sight.backward(sight.points(position), slope)
+    after, before = (sight.seen(sight.points(position + sign * 1e-7 * change)) for sign in (1, -1))
+    assert (back * change).sum() == pytest.approx((slope * (after - before)).sum() / 2e-7, rel=1e-7)
+
+
+def test_a_map_is_found_in_motion(device: Device) -> None:
+    data = scene().model_dump(mode="json", exclude_none=True)
+    time = {"duration": 0.2, "frames_per_second": 25, "precision": "f64"}
+    moving = [one | {"load": [[0, 0], [0.1, 100], [0.2, 0]]} for one in data["probes"]]
+    swinging = scene(time=time, tissue=data["tissue"] | {"density": 1050, "damping": 50}, probes=moving)
+    factors = np.array([[1.0, 1.5], [0.7, 1.0]])
+    observed = seen_in(swinging, device, factors, np.arange(1, 6) / 25, 1e-6)
+    found = fit(swinging, observed, ["tissue.map"], resolution=2, bounds={"tissue.map": (0.3, 3)}).map
+    assert found is not None
+    np.testing.assert_allclose(found.factors, factors, rtol=0.02)
+
+
+@pytest.mark.parametrize(
+    ("options", "said"),
+    [
+        (["--free", "tissue.young", "--resolution", "4"], "--resolution 4: is that of a map; add --free tissue.map"),
+        (["--free", "tissue.map"], "--free tissue.map: add --resolution R"),
+        (["--free", "tissue.map", "--free", "tissue.young", "--resolution", "4"], "a map is found alone"),
+        (["--free", "tissue.map", "--resolution", "9"], "--resolution 9: take 2 to 8, as the sheet has 8 cells"),
+        (["--free", "tissue.map", "--resolution", "4"], "sigma: missing"),
+        (
+            ["--free", "tissue.map", "--resolution", "8", "--sigma", "1e-5"],
+            "6 numbers were seen, too few for 64 fields",
+        ),
+        (["--free", "tissue.map", "--resolution", "4", "--profile"], "--profile is of fits of numbers; leave it out"),
+        (["--free", "tissue.map", "--resolution", "4", "--bounds", "tissue.map=2,1"], "the smaller one first"),
+        (["--free", "tissue.foundation_map"], "of maps only tissue.map is fitted"),
+    ],
+)
+def test_what_cannot_be_is_said_in_a_sentence(
+    options: list[str], said: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, program: Program
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    text = json.dumps(scene().model_dump(mode="json", exclude_none=True))
+    (tmp_path / "scene.yaml").write_text(text, encoding="utf-8")
+    rest = [[-0.02, 0, 0], [0.02, 0, 0]]
+    np.savez(tmp_path / "seen.npz", time=[1.0], coordinates=[[0.3, 0.5], [0.7, 0.5]], position=np.array(rest)[:, None])
+    done = program("fit", "scene.yaml", "seen.npz", *options)
+    assert done.returncode == 2
+    assert said in done.stderr
+    assert len(done.stderr.splitlines()) == 1
+
+
+def test_springs_and_contact_are_refused(device: Device) -> None:
+    observed = seen_in(scene(), device, TRUTH, np.array([1.0]), 1e-5)
+    springs = {**scene().model_dump(mode="json", exclude_none=True), "springs": {"structural": 20}}
+    del springs["tissue"]
+    springs["probes"] = []
+    with pytest.raises(SceneError, match="the scene has springs"):
+        fit(springs, observed, ["tissue.map"], resolution=4)
+    rod = {"radius": 0.006, "shaft": [0, 0, 1], "length": 0.1}
+    path = [[0, 0.5, 0.5, 0.001], [2, 0.5, 0.5, -0.003]]
+    with pytest.raises(SceneError, match="a tool with a path has no gradient"):
+        fit(scene(probes=[{"path": path, "instrument": rod}]), observed, ["tissue.map"], resolution=4)
