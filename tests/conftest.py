@@ -18,6 +18,14 @@ from taichi_msm.system.compiler import chosen
 from taichi_msm.system.signals import SIGNALS
 from tests.scenes import SMALL, speckle
 
+# These files take longest.
+LONGEST = {f"test_{name}" for name in ("docs", "vulkan", "lens", "rest", "cluster", "sweep", "contact", "study", "fit")}
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Begin with the files that take longest, so that no worker ends long before the other."""
+    items.sort(key=lambda item: item.path.stem not in LONGEST)
+
 
 @pytest.fixture(scope="session")
 def device() -> runtime.Device:

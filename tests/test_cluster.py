@@ -157,6 +157,7 @@ def test_the_same_command_goes_on_after_the_scheduler_was_lost(lab: Path, machin
     assert earlier == {path: path.stat().st_mtime_ns for path in earlier}
 
 
+@pytest.mark.slow
 def test_a_run_whose_workers_die_is_a_row(lab: Path, machines: Machines) -> None:
     address = machines.schedule(DASK_DISTRIBUTED__SCHEDULER__ALLOWED_FAILURES="0")
     doomed = machines.work(address)
@@ -173,6 +174,7 @@ def test_a_run_whose_workers_die_is_a_row(lab: Path, machines: Machines) -> None
     assert "its workers died, 1 one after another" in died
 
 
+@pytest.mark.slow
 def test_ctrl_c_frees_the_workers(lab: Path, machines: Machines) -> None:
     address = machines.schedule()
     machines.work(address)

@@ -55,7 +55,7 @@ def assert_like_twin(made: Scene, device: Device, layout: SheetLayout | None = N
     np.testing.assert_allclose(simulate(made, device, layout), twin, rtol=0, atol=tolerance)
 
 
-# Each of terms of its own, so that all take long: these, and others as fuzz and slow ones.
+# Each of terms of its own, so that all take long.
 QUICK_SCENES = [(0, "f32"), (1, "f64"), (2, "f32"), (3, "f32"), (3, "f64"), (4, "f64"), (5, "f64")]
 
 
@@ -65,7 +65,7 @@ QUICK_SCENES = [(0, "f32"), (1, "f64"), (2, "f32"), (3, "f32"), (3, "f64"), (4, 
         pytest.param(
             seed,
             precision,
-            marks=() if (seed, precision) in QUICK_SCENES else pytest.mark.slow if seed > 5 else pytest.mark.fuzz,
+            marks=() if (seed, precision) in QUICK_SCENES else pytest.mark.slow,
         )
         for seed in range(8)
         for precision in ("f32", "f64")

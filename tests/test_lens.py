@@ -40,6 +40,11 @@ LENSES: dict[str, dict[str, Any]] = {
 }
 EVERY_LENS = pytest.mark.parametrize("lens", LENSES)
 
+# Kernels of pictures take long to compile.
+A_LENS_OF_EACH_MODEL = pytest.mark.parametrize(
+    "lens", [pytest.param(lens, marks=() if lens in ("fold", "fisheye") else pytest.mark.slow) for lens in LENSES]
+)
+
 
 def seen_through(lens: str, points: tuple[int, int] = (9, 11), **render: Any) -> Scene:
     camera = {"eye": [0.05, -0.2, 0.3], "target": [0, 0, 0], "intrinsics": INTRINSICS, **LENSES[lens]}
@@ -113,10 +118,10 @@ def test_beyond_the_fold_there_is_nothing() -> None:
     ("lens", "render"),
     [
         ("endoscope", {}),
-        ("endoscope", {"wireframe": True, "supersample": 2}),
+        pytest.param("endoscope", {"wireframe": True, "supersample": 2}, marks=pytest.mark.slow),
         ("fold", {"shading": "tissue", "light": {"relief": -0.2, "vignette": 0.3}}),
         ("fisheye", {"shading": "tissue", "wireframe": True}),
-        ("pincushion", {"supersample": 2}),
+        pytest.param("pincushion", {"supersample": 2}, marks=pytest.mark.slow),
     ],
 )
 def test_pictures_are_like_the_twins(lens: str, render: dict[str, Any], device: Device) -> None:
@@ -132,7 +137,7 @@ def test_pictures_are_like_the_twins(lens: str, render: dict[str, Any], device: 
         assert 0.2 < (drawn.max(axis=-1) > 0).mean() < 0.95
 
 
-@EVERY_LENS
+@A_LENS_OF_EACH_MODEL
 def test_large_cells_are_bent(lens: str, device: Device) -> None:
     """Sides of cells 90 pixels long bend by up to 8 px, more than a tile, outward and inward."""
     intrinsics = {"fx": 150, "fy": 150, "cx": 99.5, "cy": 74.5}
@@ -144,8 +149,8 @@ def test_large_cells_are_bent(lens: str, device: Device) -> None:
         np.testing.assert_allclose(found.coordinates, coordinates, atol=1e-5)
 
 
-@EVERY_LENS
-@pytest.mark.parametrize("lanes", [1, 4])
+@A_LENS_OF_EACH_MODEL
+@pytest.mark.parametrize("lanes", [pytest.param(1, marks=pytest.mark.slow), 4])
 def test_the_shape_of_a_tile_does_not_change_the_bits(lens: str, lanes: int, device: Device) -> None:
     renders: list[dict[str, Any]] = [{"shading": "tissue", "size": [79, 57]}, {"wireframe": True, "supersample": 3}]
     for render in renders:

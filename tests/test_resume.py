@@ -314,9 +314,7 @@ def killed(arguments: list[str], seconds: float) -> bool:
 
 
 @pytest.mark.skipif(sys.platform == "win32", reason="kills with SIGKILL")
-@pytest.mark.parametrize(
-    "kills", [2, pytest.param(5, marks=pytest.mark.fuzz), pytest.param(50, marks=pytest.mark.slow)]
-)
+@pytest.mark.parametrize("kills", [2, *(pytest.param(kills, marks=pytest.mark.slow) for kills in (5, 50))])
 def test_a_run_that_is_killed_at_any_moment_goes_on_to_the_same_bits(kills: int, small: Path) -> None:
     begin = ["small.yaml", *(word for setting in SETTINGS for word in ("--set", setting)), "--out"]
     for _ in range(2):

@@ -123,6 +123,7 @@ def test_a_series_halves_its_steps_though_they_miss_a_jump(device: Device) -> No
     assert counts == [9, 18, 36]
 
 
+@pytest.mark.slow
 def test_dop853_solves_moving_and_jumping_probes() -> None:
     at = [[0, 0.2, 0.3], [0.2, 0.6, 0.5], [0.2, 0.4, 0.4], [0.3, 0.5, 0.7]]
     probe = {"at": at, "force": [200, 100, -500], "load": [[0.05, 50], [0.3, 100], [0.3, 0]], "falloff": 20}

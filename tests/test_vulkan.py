@@ -275,6 +275,7 @@ def same_mask(there: NDArray[Any], here: NDArray[Any]) -> None:
     assert (there != here).mean() < 1e-4
 
 
+@pytest.mark.slow
 def test_what_a_picture_takes_is_given_back(root: Path) -> None:
     done = vulkan(str(DRIVERS[0]), "-c", AGAIN, root=root)
     assert done.returncode == 0, done.stderr
