@@ -138,6 +138,7 @@ def test_workers_need_no_inputs_and_one_may_die(lab: Path, machines: Machines, p
     assert files(lab / "again") == files(lab / "near" / "runs" / "000003")
 
 
+@pytest.mark.slow
 def test_the_same_command_goes_on_after_the_scheduler_was_lost(lab: Path, machines: Machines) -> None:
     address = machines.schedule()
     machines.work(address)

@@ -133,7 +133,7 @@ def test_what_passes_behind_the_camera_is_looked_for_only_where_it_may_be_seen(
     assert lists[2:] == [0, 0]
 
 
-@pytest.mark.parametrize("lanes", [pytest.param(1, marks=pytest.mark.slow), 4, 8])
+@pytest.mark.parametrize("lanes", [*(pytest.param(lanes, marks=pytest.mark.slow) for lanes in (1, 4)), 8])
 def test_the_shape_of_a_tile_does_not_change_the_bits(lanes: int, device: Device) -> None:
     # One lane is the form for GPUs; 31 x 57 pixels are whole tiles of no shape.
     renders: list[dict[str, Any]] = [

@@ -149,7 +149,9 @@ def test_large_cells_are_bent(lens: str, device: Device) -> None:
         np.testing.assert_allclose(found.coordinates, coordinates, atol=1e-5)
 
 
-@A_LENS_OF_EACH_MODEL
+@pytest.mark.parametrize(
+    "lens", [pytest.param(lens, marks=() if lens == "fisheye" else pytest.mark.slow) for lens in LENSES]
+)
 @pytest.mark.parametrize("lanes", [pytest.param(1, marks=pytest.mark.slow), 4])
 def test_the_shape_of_a_tile_does_not_change_the_bits(lens: str, lanes: int, device: Device) -> None:
     renders: list[dict[str, Any]] = [{"shading": "tissue", "size": [79, 57]}, {"wireframe": True, "supersample": 3}]

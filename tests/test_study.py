@@ -403,6 +403,7 @@ def test_an_interruption_leaves_the_points_that_were_timed(device: Device) -> No
     assert made.points[0].error is not None
 
 
+@pytest.mark.slow
 def test_pictures_are_judged_by_a_finer_one(device: Device, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(pictures, "REFINES", (0, 3))
     monkeypatch.setattr(pictures, "SUPERSAMPLES", (1, 4))

@@ -231,6 +231,7 @@ def draped(made: Scene) -> NDArray[np.float64]:
     return position
 
 
+@pytest.mark.slow
 def test_large_pictures_labels_and_tracks_are_those_of_the_cpu(tmp_path: Path, root: Path, device: Device) -> None:
     done = vulkan(str(DRIVERS[0]), "-c", LOOKS, str(tmp_path / "seen.npz"), root=root)
     assert done.returncode == 0, done.stderr
