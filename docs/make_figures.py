@@ -225,7 +225,7 @@ def main() -> None:
     IMAGES.mkdir(exist_ok=True)
     animation("press", "press", 320)
     animation("grasp", "grasp", 320)
-    endoscope(288)
+    endoscope(224)
     four_pixels()
     stereo(0.8, 400)
     animation("retina", "press", 320, "render.camera=top", image=RETINA)

@@ -95,6 +95,7 @@ arch_option = click.option(
 threads_option = click.option(
     "--threads", type=click.IntRange(1, 1024), metavar="N", help="CPU threads.  [default: every core]"
 )
+workers_option = partial(click.option, "--workers", type=click.IntRange(1, 1024), metavar="N")
 json_option = click.option("--json", "as_json", is_flag=True, help="Print one JSON object on stdout and nothing else.")
 
 
@@ -484,12 +485,7 @@ def export(
 @program.command()
 @click.argument("file", metavar="SWEEP")
 @click.option("--out", metavar="DIR", help="Directory for the runs.  [default: output/<name of the sweep file>]")
-@click.option(
-    "--workers",
-    type=click.IntRange(1, 1024),
-    metavar="N",
-    help="Processes that take the runs.  [default: one for each core, as far as memory goes]",
-)
+@workers_option(help="Processes that take the runs.  [default: one for each core, as far as memory goes]")
 @click.option("--dask", metavar="ADDRESS", help="Let the workers of a dask scheduler take the runs.")
 @click.option("--shard", type=Shard(), metavar="I/N", help="Take only part I of N of the runs; write no table.")
 @click.option("--dry-run", is_flag=True, help="Print the values of all runs, and what they take; run nothing.")
@@ -584,12 +580,7 @@ def sweep(
 @click.option("--profile", is_flag=True, help="Find intervals by going to their ends; takes more runs.")
 @click.option("--resolution", type=int, metavar="R", help="Fields along a side of a map that is fitted.")
 @click.option("--out", metavar="DIR", help="Directory for the fit.  [default: output/<name of the scene file>-fit]")
-@click.option(
-    "--workers",
-    type=click.IntRange(1, 1024),
-    metavar="N",
-    help="Processes that take runs side by side.  [default: as many as pay]",
-)
+@workers_option(help="Processes that take runs side by side.  [default: as many as pay]")
 @json_option
 def fit(
     scene: str,

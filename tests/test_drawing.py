@@ -133,6 +133,17 @@ def test_what_passes_behind_the_camera_is_looked_for_only_where_it_may_be_seen(
     assert lists[2:] == [0, 0]
 
 
+def assert_alike_in_other_tiles(made: Scene, texture: NDArray[np.uint8], position: NDArray[Any], lanes: int) -> None:
+    """Pictures and labels have the same bits if so many pixels are drawn at a time; labels have one sample a pixel."""
+    config = drawing_config(made, labels=made.render.supersample == 1, normals=True)
+    placed = rods(made, position, 0)
+    expected = Drawing(made, texture, config).look(position, rods=placed)
+    other = Drawing(made, texture, config._replace(lanes=lanes)).look(position, rods=placed)
+    np.testing.assert_array_equal(other.picture, expected.picture)
+    for label, same in zip(other.labels or (), expected.labels or (), strict=True):
+        np.testing.assert_array_equal(label, same)
+
+
 @pytest.mark.parametrize("lanes", [*(pytest.param(lanes, marks=pytest.mark.slow) for lanes in (1, 4)), 8])
 def test_the_shape_of_a_tile_does_not_change_the_bits(lanes: int, device: Device) -> None:
     # One lane is the form for GPUs; 31 x 57 pixels are whole tiles of no shape.
@@ -143,13 +154,7 @@ def test_the_shape_of_a_tile_does_not_change_the_bits(lanes: int, device: Device
     ]
     for render in renders:
         made, texture = with_instruments(drawable(**render)), speckle(300, 200)
-        position, config = dented(made), drawing_config(made, labels="supersample" not in render, normals=True)
-        placed = rods(made, position, 0)
-        expected = Drawing(made, texture, config).look(position, rods=placed)
-        alone = Drawing(made, texture, config._replace(lanes=lanes)).look(position, rods=placed)
-        np.testing.assert_array_equal(alone.picture, expected.picture)
-        for label, other in zip(alone.labels or (), expected.labels or (), strict=True):
-            np.testing.assert_array_equal(label, other)
+        assert_alike_in_other_tiles(made, texture, dented(made), lanes)
 
 
 @pytest.mark.parametrize("parts", [rasterizer_gpu.MOST_PARTS, 100])

@@ -17,10 +17,10 @@ from taichi_msm import SceneError, Simulation, fit, load_scene, run
 from taichi_msm.fitting.fit import Method
 from taichi_msm.fitting.observations import read_observations
 from taichi_msm.fitting.parameters import make_parameters
-from taichi_msm.fitting.prediction import Job, Predictor, runnable, seen_by_camera, surface_weights
+from taichi_msm.fitting.prediction import Job, Predictor, runnable, seen_by_camera
 from taichi_msm.fitting.result import FitResult
 from taichi_msm.fitting.suspicions import MOVES, faults, moved
-from taichi_msm.physics.deformed import on_surface, touched
+from taichi_msm.physics.deformed import on_surface, surface_weights, touched
 from taichi_msm.scene import Scene
 from taichi_msm.system import resources
 from taichi_msm.system.runtime import Device

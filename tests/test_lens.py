@@ -23,7 +23,7 @@ from taichi_msm.system.runtime import Device
 from tests import reference
 from tests.reference import labels as twin
 from tests.scenes import speckle
-from tests.test_drawing import dented, difference, drawable, with_instruments
+from tests.test_drawing import assert_alike_in_other_tiles, dented, difference, drawable, with_instruments
 from tests.test_labels import crumpled, folded, look
 
 Array = NDArray[np.float64]
@@ -157,13 +157,7 @@ def test_the_shape_of_a_tile_does_not_change_the_bits(lens: str, lanes: int, dev
     renders: list[dict[str, Any]] = [{"shading": "tissue", "size": [79, 57]}, {"wireframe": True, "supersample": 3}]
     for render in renders:
         made, texture = seen_through(lens, **render), speckle(30, 20)
-        position, config = folded(made), drawing_config(made, labels="supersample" not in render, normals=True)
-        placed = rods(made, position, 0)
-        expected = Drawing(made, texture, config).look(position, rods=placed)
-        alone = Drawing(made, texture, config._replace(lanes=lanes)).look(position, rods=placed)
-        np.testing.assert_array_equal(alone.picture, expected.picture)
-        for label, other in zip(alone.labels or (), expected.labels or (), strict=True):
-            np.testing.assert_array_equal(label, other)
+        assert_alike_in_other_tiles(made, texture, folded(made), lanes)
 
 
 @EVERY_LENS

@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from taichi_msm.errors import DivergedError, SceneError
 from taichi_msm.fitting.observations import Observations
 from taichi_msm.fitting.parameters import Parameter, as_data, with_values
+from taichi_msm.physics.deformed import surface_weights
 from taichi_msm.physics.mesh_error import coarser
 from taichi_msm.physics.plan import Plan
 from taichi_msm.progress import Pause
@@ -178,25 +179,6 @@ def between(frames: Array, place: Array) -> Array:
     from scipy.interpolate import make_interp_spline
 
     return cast("Array", make_interp_spline(np.arange(len(frames)), frames, k=1)(place))
-
-
-def surface_weights(coordinates: Array, sheet: Sheet, refine: int) -> tuple[NDArray[np.intp], Array]:
-    """Give the four mass points around each point of the surface that is drawn, and their weights, shapes (N, 4).
-
-    coordinates: across and down, shape (N, 2). The points are numbered row after row; the same place on the surface as
-    `physics.deformed.touched`.
-    """
-    (rows, cols), parts = sheet.points, refine + 1
-    place = coordinates * (cols - 1, rows - 1)
-    j, i = np.minimum(place.astype(int), (cols - 2, rows - 2)).T
-    s, t = place[:, 0] - j, place[:, 1] - i
-    column, line = (np.minimum((share * parts).astype(int), parts - 1) / parts for share in (s, t))
-    s1, t1 = s - column, t - line
-    # In the small quad, s t is replaced by a function that is linear on either side of the diagonal.
-    twist = column * line + s1 * line + column * t1 + np.minimum(s1, t1) / parts
-    first = i * cols + j
-    corners = np.stack([first, first + 1, first + cols, first + cols + 1], axis=1)
-    return corners, np.stack([1 - s - t + twist, s - twist, t - twist, twist], axis=1)
 
 
 def places_at_rest(coordinates: Array, sheet: Sheet) -> Array:

@@ -11,7 +11,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from taichi_msm.fitting.observations import Observations
-from taichi_msm.fitting.prediction import between, seen_by_camera, surface_weights
+from taichi_msm.fitting.prediction import between, seen_by_camera
+from taichi_msm.physics.deformed import surface_weights
 from taichi_msm.scene import Scene
 
 Array = NDArray[np.float64]

@@ -49,6 +49,25 @@ def on_surface(position: NDArray[np.floating], refine: int, coordinates: NDArray
     return _on_cells(position, refine, coordinates.astype(np.float64))[0]
 
 
+def surface_weights(coordinates: Array, sheet: Sheet, refine: int) -> tuple[NDArray[np.intp], Array]:
+    """Give the four mass points around each point of the surface that is drawn, and their weights, shapes (N, 4).
+
+    coordinates: across and down, shape (N, 2). The points are numbered row after row; the same place on the surface as
+    that of `on_surface`.
+    """
+    (rows, cols), parts = sheet.points, refine + 1
+    place = coordinates * (cols - 1, rows - 1)
+    j, i = np.minimum(place.astype(int), (cols - 2, rows - 2)).T
+    s, t = place[:, 0] - j, place[:, 1] - i
+    column, line = (np.minimum((share * parts).astype(int), parts - 1) / parts for share in (s, t))
+    s1, t1 = s - column, t - line
+    # In the small quad, s t is replaced by a function that is linear on either side of the diagonal.
+    twist = column * line + s1 * line + column * t1 + np.minimum(s1, t1) / parts
+    first = i * cols + j
+    corners = np.stack([first, first + 1, first + cols, first + cols + 1], axis=1)
+    return corners, np.stack([1 - s - t + twist, s - twist, t - twist, twist], axis=1)
+
+
 def _on_cells(position: NDArray[np.floating], refine: int, coordinates: Array) -> tuple[Array, Array]:
     """Give the points at some coordinates, and normals of their cells there, of any length; both of shape (n, 3)."""
     (rows, cols), parts = position.shape[:2], refine + 1

@@ -154,15 +154,24 @@ def _storing(code: StepCode) -> list[Callable[..., None]]:
     return [store_moments]
 
 
+def _clearing(code: StepCode) -> Callable[..., None]:
+    """Make Taichi's function clear(sheet, row), for a row of u."""
+    vector = code.vector
+
+    @ti.func
+    def clear(sheet: ti.template(), row):
+        for b in range(1, sheet.width - 1):
+            for c in ti.static(range(3)):
+                sheet.u[c][row * sheet.width + b] = vector(0)
+
+    return clear
+
+
 def _recording(code: StepCode, *, parallel: bool) -> Callable[..., None]:
     """Make the kernel that takes steps, each from one shape to the next."""
     real, vector, vectors = code.real, code.vector, code.vectors
-    count_of_numbers, join_strips, storing, step = (
-        code.first_number(None),
-        joining(code),
-        _storing(code),
-        point_step(code),
-    )
+    count_of_numbers, join_strips, step = code.first_number(None), joining(code), point_step(code)
+    clear, storing = _clearing(code), _storing(code)
 
     @ti.func
     def move(sheet: ti.template(), entry: ti.template(), target, force: ti.template(), now: ti.template()):
@@ -180,9 +189,7 @@ def _recording(code: StepCode, *, parallel: bool) -> Callable[..., None]:
         moments = ti.cast(sizes[MOMENT_ROW], ti.i32) + MOMENTS * worker
         band = ti.static(Strip(low, high, shape, shape, shape, carry, moments, k, 0))
         if low == 0:
-            for b in range(1, sheet.width - 1):
-                for c in ti.static(range(3)):
-                    sheet.u[c][carry * sheet.width + b] = vector(0)
+            clear(sheet, carry)
         for i in range(ti.max(low - 1, 0), high):
             for store_moments in ti.static(storing):
                 if i >= low:
@@ -351,7 +358,7 @@ def _sweeping(code: StepCode, *, parallel: bool) -> Callable[..., None]:
     """Make the kernel that takes steps of the adjoint, from the last to the first."""
     real, vector, vectors = code.real, code.vector, code.vectors
     count_of_numbers, join_strips, storing = code.first_number(None), joining(code), _storing(code)
-    sweep_row = _row_sweeping(code)
+    clear, sweep_row = _clearing(code), _row_sweeping(code)
 
     @ti.func
     def take(sheet: ti.template(), tables: ti.template(), sizes: ti.template(), worker, k):
@@ -367,9 +374,7 @@ def _sweeping(code: StepCode, *, parallel: bool) -> Callable[..., None]:
         before, after = buffer * sheet.rows, (1 - buffer) * sheet.rows
         band = ti.static(Strip(low, high, before, after, shape, carry, moments, n, with_loss))
         if low == 0:
-            for b in range(1, sheet.width - 1):
-                for c in ti.static(range(3)):
-                    sheet.u[c][carry * sheet.width + b] = vector(0)
+            clear(sheet, carry)
         for i in range(ti.max(low - 1, 0), high):
             for store_moments in ti.static(storing):
                 if i >= low:
