@@ -320,6 +320,11 @@ def test_errors_name_the_camera_and_the_key(name: str, small: Path) -> None:
     assert fails_with(cameras) == [said]
 
 
+def test_an_output_is_not_blamed_for_a_faulty_camera(small: Path) -> None:
+    cameras, said = WRONG["baseline 0"]
+    assert fails_with(cameras, "output=[png, disparity]") == [said]
+
+
 def test_what_does_not_go_together_is_refused(small: Path) -> None:
     both = (
         "--set render.camera=top: render.camera: is given together with cameras; remove one of them, or set it to null"

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import pickle
 import shutil
 from pathlib import Path
 from typing import Any
@@ -51,21 +52,31 @@ def test_a_camera_is_chosen_by_its_name(name: str, stereo: Path, program: Progra
 
 def test_a_choice_that_is_none_is_told_of(stereo: Path, program: Program) -> None:
     wrong = {
-        (): "its cameras are left, right; choose one with --camera",
-        ("--camera", "lift"): "no camera 'lift'; its cameras are left, right; did you mean 'left'?",
+        (): f"camera: none is chosen; take one of those of {stereo}: left, right",
+        ("--camera", "lift"): f"camera: 'lift'; take one of those of {stereo}: left, right; did you mean 'left'?",
     }
     for options, said in wrong.items():
         done = program("export", str(stereo), "--format", "tapvid", *options)
-        assert (done.returncode, done.stdout, done.stderr) == (4, "", f"{stereo}: {said}\n")
+        assert (done.returncode, done.stdout, done.stderr) == (2, "", f"{said}\n")
     single = alone(stereo, "left")
     done = program("export", str(single), "--format", "tapvid", "--camera", "left")
-    said = "no camera 'left'; it has one camera, without a name"
-    assert (done.returncode, done.stderr) == (4, f"{single}: {said}\n")
+    said = f"camera: 'left'; {single} has one camera, without a name; leave it out"
+    assert (done.returncode, done.stderr) == (2, f"{said}\n")
     done = program("export", str(stereo), "--format", "gltf", "--camera", "left")
     said = "camera: 'left'; gltf has no choice of a camera; leave it out"
     assert (done.returncode, done.stderr) == (2, f"{said}\n")
     with pytest.raises(ArgumentError, match="stir has no choice of a camera"):
         export(stereo, "stir", camera="left")
+
+
+def test_of_runs_with_one_camera_that_is_taken(stereo: Path) -> None:
+    """A choice concerns only those that have several."""
+    single = alone(stereo, "left")
+    done = export([single, stereo], "tapvid", camera="left")
+    videos = pickle.loads((done.directory / "tapvid.pkl").read_bytes())
+    assert len(videos) == 2
+    points = [video["points"] for video in videos.values()]
+    np.testing.assert_array_equal(*points)
 
 
 def test_what_a_camera_lacks_is_named(stereo: Path) -> None:

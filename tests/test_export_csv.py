@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import json
 import shutil
 from pathlib import Path
 from typing import Any
@@ -73,6 +74,15 @@ def test_runs_are_told_apart_by_their_numbers(single: Path) -> None:
         for run in ("000000", "000001") if name == "tracks.csv" else ("000001",):
             part = [row for row in found if row["run"] == run]
             assert [{**row, "run": "000000"} for row in part] == expected
+
+
+def test_forces_have_no_camera_to_choose(stereo: Path) -> None:
+    record = json.loads((stereo / "run.json").read_text())
+    record["scene"]["output"].remove("tracks")
+    (stereo / "run.json").write_text(json.dumps(record))
+    for side in ("left", "right"):
+        (stereo / side / "tracks.npz").unlink()
+    assert export(stereo, "csv").files == ["forces.csv", "index.csv"]
 
 
 def test_one_of_both_is_needed(single: Path) -> None:

@@ -20,7 +20,7 @@ from taichi_msm.arguments import require_path
 from taichi_msm.errors import ArgumentError, FilesError, SceneError, did_you_mean, writing
 from taichi_msm.exports.formats import ANY, FORMATS
 from taichi_msm.exports.sources import Source, Write, read_runs
-from taichi_msm.outputs.table import numbered
+from taichi_msm.outputs.table import OUTPUTS, numbered
 from taichi_msm.progress import Count
 from taichi_msm.results.entries import files, without_link
 from taichi_msm.results.finished_run import PUT_BACK, FinishedRun
@@ -99,6 +99,8 @@ def export(
         raise ArgumentError(f"camera: {camera!r}; {format} has no choice of a camera; leave it out")
     directory = _default(directories, format) if out is None else Path(out)
     finished, left_out = read_runs(directories)
+    if camera is not None and not any(run.cameras() for run in finished):
+        raise ArgumentError(f"camera: {camera!r}; {finished[0].directory} has one camera, without a name; leave it out")
     views = [_views(run, format, camera) for run in finished]
     exported = _convert(views, format, directory, progress)
     if left_out:
@@ -114,19 +116,20 @@ def _default(directories: Sequence[str | Path], name: str) -> Path:
 
 def _views(run: FinishedRun, name: str, camera: str | None) -> list[FinishedRun]:
     """Find the results of each camera that a format shows; of the run alone if it shows none, or one without a name."""
-    shown, known = FORMATS[name].cameras, run.cameras()
-    if not shown or (shown == ANY and camera is None and not known):
+    wanted, known = FORMATS[name], run.cameras()
+    shown = wanted.cameras
+    if shown == ANY and camera is not None and camera in known:
+        return [replace(run, camera=camera)]
+    seen = [key for key in (*wanted.needs, *wanted.uses) if OUTPUTS[key].is_seen and key in run.scene.output]
+    if not shown or (shown == ANY and not (known and seen)):
         return [run]
-    wanted = shown if shown != ANY else () if camera is None else (camera,)
-    if wanted and set(wanted) <= set(known):
-        return [replace(run, camera=each) for each in wanted]
     said = f"its cameras are {', '.join(known)}" if known else "it has one camera, without a name"
-    if shown != ANY:
-        said = f"{name} needs the cameras {' and '.join(wanted)}; {said}; run the scene with `cameras` of these names"
-    elif camera is None:
-        said = f"{said}; choose one with --camera"
-    else:
-        said = f"no camera {camera!r}; {said}{did_you_mean(camera, known)}"
+    if shown == ANY:
+        given, near = ("none is chosen", "") if camera is None else (repr(camera), did_you_mean(camera, known))
+        raise ArgumentError(f"camera: {given}; take one of those of {run.directory}: {', '.join(known)}{near}")
+    if set(shown) <= set(known):
+        return [replace(run, camera=each) for each in shown]
+    said = f"{name} needs the cameras {' and '.join(shown)}; {said}; run the scene with `cameras` of these names"
     raise FilesError(f"{run.directory}: {said}")
 
 

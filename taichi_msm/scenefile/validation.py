@@ -10,6 +10,7 @@ from pydantic import ValidationError
 from taichi_msm import faults
 from taichi_msm.errors import ArgumentError, Problem, SceneError
 from taichi_msm.outputs import mp4
+from taichi_msm.outputs.table import OUTPUTS
 from taichi_msm.physics.material import Maps
 from taichi_msm.physics.plan import Plan
 from taichi_msm.physics.planning import try_plan
@@ -90,6 +91,10 @@ def _spare(data: dict[str, Any], problems: list[Problem]) -> dict[str, Any]:
     faulty = {problem.path[0] for problem in problems}
     if "image" in faulty:
         faulty.add("output")
+    output = data.get("output")
+    if "render" in faulty and isinstance(output, list):
+        # Which cameras there are is not known.
+        data = {**data, "output": [name for name in output if name not in OUTPUTS or not OUTPUTS[name].of_pair]}
     spared = {name: value for name, value in data.items() if name not in faulty} | {
         name: value for name, value in _STAND_INS.items() if name in faulty
     }
