@@ -71,6 +71,12 @@ def read_calibration(path: str) -> Calibration:
     if size is not None and min(size) < 1:
         said = f"of pictures of {size[0]} x {size[1]} pixels; write the size of those that were calibrated with"
         raise CameraFileError(f"{path}: {said}")
+    # ROS lets pictures be smaller than those that its camera matrix is of.
+    region = data["roi"] if isinstance(data.get("roi"), dict) else {}
+    cut = any(region.get(name) for name in ("x_offset", "y_offset")) or region.get("width") not in (None, 0, *width)
+    if cut or any(data.get(name) not in (None, 0, 1) for name in ("binning_x", "binning_y")):
+        said = "of pictures that are binned or cut, while its camera matrix is of whole ones"
+        raise CameraFileError(f"{path}: {said}; write that of the pictures, without binning_x, binning_y and roi")
     return Calibration((matrix[0], matrix[4]), (matrix[2], matrix[5]), fisheye, tuple(values[:KNOWN]), size)
 
 
@@ -157,7 +163,8 @@ def _yaml(text: str) -> Any:
     # Aliases of aliases take any time, and no calibration has one.
     if any(isinstance(event, yaml.AliasEvent) for event in yaml.parse(text)):
         raise ValueError
-    return yaml.load(text, _Loader)
+    # What ROS prints of a topic is a document for each message, and all are alike.
+    return next(yaml.load_all(text, _Loader))
 
 
 def _xml(text: str) -> dict[str, Any]:

@@ -633,6 +633,8 @@ class Camera(Section):
             raise refused("goes with beside, the name of another camera; add it or remove this", "baseline")
         if self.scale and self.calibration is None:
             raise refused("goes with calibration; remove it", "scale")
+        if self.outside == "background" and self.distortion is None and self.calibration is None:
+            raise refused("goes with distortion; remove it", "outside")
         for ways in (("calibration", "intrinsics", "fov"), ("pose", "poses", "eye"), ("calibration", "distortion")):
             if len(both := [name for name in ways if name in given]) > 1:
                 raise refused(f"is given together with {both[0]}; remove one of them", both[1])
@@ -681,7 +683,8 @@ class Camera(Section):
             update["distortion"] = {"model": model, **dict(names)}
         elif found.fisheye:
             update["distortion"] = {"model": "fisheye"}
-        kept = {name: getattr(self, name) for name in self.model_fields_set - {"calibration", "scale"}}
+        unused = {"calibration", "scale"} if "distortion" in update else {"calibration", "scale", "outside"}
+        kept = {name: getattr(self, name) for name in self.model_fields_set - unused}
         return self.model_validate(kept | update)
 
 
@@ -722,7 +725,8 @@ class Render(Section):
     camera: AnyCamera = key(
         "top",
         "top: straight down, to scale; oblique: tilted, shows depth; or a pinhole camera",
-        "top, oblique, or {eye: [x, y, z], target: [x, y, z], up: [x, y, z], fov: degrees}",
+        "top, oblique, or a mapping: {eye: [x, y, z], target: [x, y, z], up: [x, y, z], fov: degrees}, with pose or "
+        "poses in place of eye, and intrinsics or calibration in place of fov",
     )
     cameras: dict[str, AnyCamera] | None = key(
         None,

@@ -83,6 +83,37 @@ def test_ros_and_stir_are_read(small: Path) -> None:
     assert camera.distortion is None
 
 
+PRINTED = """\
+header: {seq: 7, frame_id: "camera"}
+height: 30
+width: 40
+distortion_model: "plumb_bob"
+D: [0.01, 0.002, 0.0003, -0.0004, 0.0]
+K: [61.5, 0.0, 19.25, 0.0, 60.5, 14.75, 0.0, 0.0, 1.0]
+binning_x: 0
+binning_y: 1
+roi: {x_offset: 0, y_offset: 0, height: 0, width: 0, do_rectify: False}
+---
+"""
+
+
+def test_what_ros_prints_of_a_topic_is_read(small: Path) -> None:
+    for text in (PRINTED, 2 * PRINTED, PRINTED.replace("width: 0", "width: 40")):
+        Path("ros.yaml").write_text(text)
+        camera = camera_of("ros.yaml")
+        assert camera.intrinsics is not None
+        assert camera.intrinsics.cx == 19.25
+
+
+@pytest.mark.parametrize("change", [("g_x: 0", "g_x: 2"), ("x_offset: 0", "x_offset: 4"), ("width: 0", "width: 20")])
+def test_pictures_that_ros_has_made_smaller_are_refused(change: tuple[str, str], small: Path) -> None:
+    Path("ros.yaml").write_text(PRINTED.replace(*change))
+    assert refused("ros.yaml") == (
+        "calibration: ros.yaml: of pictures that are binned or cut, while its camera matrix is of whole ones; "
+        "write that of the pictures, without binning_x, binning_y and roi"
+    )
+
+
 def test_pictures_of_another_size_are_refused_or_scaled(small: Path) -> None:
     write_opencv("camera.yml")
     said = refused("camera.yml", "render.size=[80, 90]")

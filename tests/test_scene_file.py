@@ -47,7 +47,10 @@ NO_FORCE = (
 POINTS = "expected two whole numbers, 2 to 4096: [rows, cols]"
 A_PROBE_KEY = "expected keys [[t, percent], ...], t in seconds"
 AN_AT = "expected [across, down], fractions from -1 to 2, or keys [[t, across, down], ...]"
-A_CAMERA = "expected top, oblique, or {eye: [x, y, z], target: [x, y, z], up: [x, y, z], fov: degrees}"
+A_CAMERA = (
+    "expected top, oblique, or a mapping: {eye: [x, y, z], target: [x, y, z], up: [x, y, z], fov: degrees}, with pose "
+    "or poses in place of eye, and intrinsics or calibration in place of fov"
+)
 VECTOR_M = "expected three numbers: [x, y, z] in metres"
 EYE = f"{VECTOR_M}, or keys [[t, x, y, z], ...], t in seconds"
 CAMERA_KEYS = "calibration, scale, intrinsics, distortion, outside, pose, poses, beside, baseline, eye, target, up, fov"
