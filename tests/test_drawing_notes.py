@@ -136,3 +136,42 @@ def test_check_and_run_say_it(tmp_path: Path, program: Program) -> None:
     (note,) = json.loads(program("check", str(tmp_path / "scene.yaml"), "--json").stdout)["notes"]
     assert note.startswith(said)
     assert said in program("run", str(tmp_path / "scene.yaml"), "--out", str(tmp_path / "out")).stdout
+
+
+@pytest.mark.parametrize(
+    "camera",
+    [
+        {"pose": {"rotation": [[1, 0, 0], [0, -1, 0], [0, 0, -1]], "translation": [0, 300, 400]}},
+        {"eye": [0, 0, 0.4], "target": [0, 0, 1]},
+        {"eye": [[0, 0, 0.1, 0.3], [1, 0.1, 0, 0.4]], "target": [3, 0, 0.4]},
+        {
+            "eye": [0.6, 0, 0.4],
+            "target": [0.6, 0, 0],
+            "intrinsics": {"fx": 900, "fy": 900, "cx": 256, "cy": 256},
+            "distortion": {"k1": -0.1},
+        },
+    ],
+    ids=["millimetres", "upward", "moving", "lens"],
+)
+def test_a_camera_that_shows_nothing(tmp_path: Path, camera: dict[str, Any]) -> None:
+    said = "shows nothing of the sheet at rest, in no frame; lengths are in metres"
+    (note,) = drawing_notes(carrying(tmp_path, (400, 300), render={"camera": camera}))
+    assert note == f"render.camera {said}"
+    cameras = {"left": "top", "right": camera}
+    (note,) = drawing_notes(carrying(tmp_path, (400, 300), render={"cameras": cameras}))
+    assert note == f"render.cameras.right {said}"
+    blind = carrying(tmp_path, (400, 300), render={"camera": camera}).model_copy(update={"output": ("trajectory",)})
+    assert not list(drawing_notes(blind))
+
+
+@pytest.mark.parametrize(
+    "camera",
+    [
+        {"eye": [0.013, 0.017, 0.4], "target": [0.013, 0.017, 0], "fov": 0.01},
+        {"eye": [[0, 9, 9, 1], [0.3, 9, 9, 1], [0.4, 0, 0, 1]], "target": [[0.3, 9, 9, 9], [0.4, 0, 0, 0]]},
+        {"eye": [0, 0, 1e-4], "target": [0.2, 0, 0]},
+    ],
+    ids=["narrow", "at last", "close"],
+)
+def test_a_camera_that_shows_little_is_enough(tmp_path: Path, camera: dict[str, Any]) -> None:
+    assert not list(drawing_notes(carrying(tmp_path, (400, 300), render={"camera": camera})))

@@ -4,11 +4,19 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 
+import numpy as np
+from numpy.typing import NDArray
+
 from taichi_msm.render import texture
+from taichi_msm.render.camera import View, moves, view_at
+from taichi_msm.render.places import visible
 from taichi_msm.scene import Light, Scene
 
 # A picture whose proportions differ from those of the sheet by this factor is visibly stretched.
 STRETCHED = 1.02
+
+# Cells along each side of the sheet whose bounds are compared with the picture.
+CELLS = 16
 
 # The radius of an instrument is rarely above this share of the sheet's larger side.
 WIDEST = 0.25
@@ -24,6 +32,8 @@ def drawing_notes(scene: Scene) -> Iterator[str]:
             )
         if scene.render.light != Light() and scene.render.shading != "tissue":
             yield f"render.light has no effect with shading: {scene.render.shading}; take render.shading: tissue"
+    if scene.renders:
+        yield from _blind(scene)
     for index, probe in enumerate(scene.probes):
         if (instrument := probe.instrument) is None:
             continue
@@ -37,6 +47,28 @@ def drawing_notes(scene: Scene) -> Iterator[str]:
                 f"probes.{index}.instrument: {instrument.radius:g} m is a wide rod for a sheet of "
                 f"{max(scene.sheet.size):g} m; the radius is in metres"
             )
+
+
+def _blind(scene: Scene) -> Iterator[str]:
+    """Warn of cameras that show nothing of the sheet at rest in any frame."""
+    (height, width), rate = scene.sheet.size, scene.time.frames_per_second
+    x, y = np.meshgrid(np.linspace(-width / 2, width / 2, CELLS + 1), np.linspace(-height / 2, height / 2, CELLS + 1))
+    points = np.stack([x, y, 0 * x], axis=-1)
+    for name in scene.render.all_cameras:
+        frames = range(scene.time.frames + 1 if moves(scene, name) else 1)
+        if not any(_shows(view_at(scene, frame / rate, name), points) for frame in frames):
+            key = f"cameras.{name}" if name else "camera"
+            yield f"render.{key} shows nothing of the sheet at rest, in no frame; lengths are in metres"
+
+
+def _shows(camera: View, points: NDArray[np.float64]) -> bool:
+    """Tell whether a camera may show any cell between points, shape (n, n, 3): whether their bounds meet."""
+    left, right, top, bottom = (0, camera.size[0], 0, camera.size[1]) if camera.lens is None else visible(camera).box
+    x, y, w, _ = np.moveaxis(camera.project(points), -1, 0)
+    corners = [np.s_[:-1, :-1], np.s_[:-1, 1:], np.s_[1:, :-1], np.s_[1:, 1:]]
+    # As in `is_beside`: what is behind the eye is not divided by its w.
+    beyond = [left * w - x, x - right * w, top * w - y, y - bottom * w, camera.near - w]
+    return bool(np.all([np.any([side[corner] <= 0 for corner in corners], axis=0) for side in beyond], axis=0).any())
 
 
 def _stretched(scene: Scene) -> Iterator[str]:
