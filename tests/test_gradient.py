@@ -40,6 +40,12 @@ KINDS = ("tissue", "tissue, free edges", "springs", "springs, bare")
 TISSUE = {"young": 900, "thickness": 0.015, "density": 1000, "damping": 3.0}
 
 
+@pytest.fixture(autouse=True)
+def _short_segments(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Of small sheets, one segment would hold all steps."""
+    monkeypatch.setattr(adjoint_motion, "SEGMENT_BYTES", 0)
+
+
 @pytest.fixture(scope="module")
 def image(tmp_path_factory: pytest.TempPathFactory) -> str:
     path = tmp_path_factory.mktemp("maps") / "map.png"
@@ -283,7 +289,9 @@ def test_any_number_of_steps(steps: int, image: str, device: Device) -> None:
             assert (changed(step) - changed(-step)) / (2 * step) == pytest.approx(by, rel=1e-9, abs=1e-12)
 
 
-def test_the_bits_do_not_depend_on_the_workers(image: str, device: Device, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_bits_depend_neither_on_workers_nor_on_segments(
+    image: str, device: Device, monkeypatch: pytest.MonkeyPatch
+) -> None:
     made = described("tissue", image)
     # With bending a worker needs two rows that move.
     made["sheet"] |= {"points": [9, 11], "size": [0.16, 0.19]}
@@ -298,6 +306,9 @@ def test_the_bits_do_not_depend_on_the_workers(image: str, device: Device, monke
 
     alone = bits(1)
     assert bits(2) == bits(3) == alone
+    with monkeypatch.context() as patched:
+        patched.setattr(adjoint_motion, "SEGMENT_BYTES", 2**20)
+        assert bits(2) == alone
     # Workers that give up at once.
     monkeypatch.setattr(adjoint_motion, "PATIENCE", 0)
     assert bits(3) == alone

@@ -1,7 +1,8 @@
 """The derivatives of a loss by what the steps of a moving sheet are made of.
 
-A forward run keeps the state every so many steps, about the root of their number. Backward, each segment between two
-such states is run again, all of its shapes are kept, and the adjoint is swept over them (`kernel_adjoint`).
+A forward run keeps the state every so many steps, about the root of their number, or more if the sheet is small.
+Backward, each segment between two such states is run again, all of its shapes are kept, and the adjoint is swept over
+them (`kernel_adjoint`).
 """
 
 from __future__ import annotations
@@ -46,6 +47,9 @@ from taichi_msm.physics.terms.probes import ProbeTerm
 from taichi_msm.physics.terms.term import GAIN
 from taichi_msm.system.runtime import Memory, our_compilation, write
 
+# A segment may take so much, as each costs some launches, and this much stays in a cache.
+SEGMENT_BYTES = 16 * 2**20
+
 # A launch of the adjoint takes no more steps times points than this, about 0.1 s of one core.
 POINT_STEPS_PER_LAUNCH = 10_000_000
 
@@ -84,10 +88,11 @@ class MotionAdjoint(Dynamics):
     def _allocate(self) -> None:
         """Take memory for a layout, a number of steps and of standing slots."""
         plan = self.plan
-        # Segments and their beginnings, which are two shapes each, then take about the same memory.
-        self._segment = math.ceil(math.sqrt(2 * plan.grid.steps))
         layout, memory = self.structure, Memory()
         row_bytes = layout.width * layout.code.lanes * 8
+        # A segment and all beginnings, which are two shapes each, then take about the same memory.
+        least, shape_bytes = math.ceil(math.sqrt(2 * plan.grid.steps)), 3 * layout.rows * row_bytes
+        self._segment = min(plan.grid.steps, max(least, SEGMENT_BYTES // shape_bytes))
         # No two workers write to one page of what they carry.
         self._carried_rows = 1 - (-PAGE // row_bytes)
         self._extra = (MOMENTS + self._carried_rows) * layout.workers
