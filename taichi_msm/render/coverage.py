@@ -11,7 +11,7 @@ from taichi_msm.render import geometry
 from taichi_msm.render.attributes import cell_at, store
 from taichi_msm.render.bending import BENT_NUMBERS
 from taichi_msm.render.places import BEYOND
-from taichi_msm.render.samples import centres, clip, keep, places, places_of, tiles_of
+from taichi_msm.render.samples import box_of, centres, clip, keep, places, places_of, tiles_of
 from taichi_msm.system.runtime import ti
 
 
@@ -24,25 +24,26 @@ class Part(NamedTuple):
 
 
 @ti.func
-def largest_edge(p_x, p_y, q_x, q_y, x, y, side, config: ti.template()):
-    """The largest `edge` of the samples of a tile whose upper left sample is at (x, y).
+def largest_edge(p_x, p_y, q_x, q_y, box: ti.template(), side):
+    """The largest `edge` of samples within a box, its left, right, top and bottom.
 
     It is rounded as `edge` is, so that no tile with a sample inside is left out.
     """
-    x += ti.select((q_y - p_y) * side > 0.0, 0.0, config.tile_width - 1.0)
-    y += ti.select((q_x - p_x) * side > 0.0, config.tile_height - 1.0, 0.0)
+    left, right, top, bottom = ti.static(box)
+    x = ti.select((q_y - p_y) * side > 0.0, left, right)
+    y = ti.select((q_x - p_x) * side > 0.0, bottom, top)
     return geometry.edge(p_x, p_y, q_x, q_y, x, y, side)
 
 
 @ti.func
-def reaches(x, y, side, outline: ti.template(), config: ti.template()):
-    """Tell whether a cell may cover samples of the tile whose upper left sample is at (x, y)."""
+def reaches(box: ti.template(), side, outline: ti.template()):
+    """Tell whether a cell may cover samples within a box."""
     p, q = ti.static((outline.x, outline.y))
     return (
-        largest_edge(p[0], q[0], p[2], q[2], x, y, -side, config) >= 0.0
-        and largest_edge(p[1], q[1], p[3], q[3], x, y, side, config) > 0.0
-        and largest_edge(p[0], q[0], p[1], q[1], x, y, side, config) >= 0.0
-        and largest_edge(p[2], q[2], p[3], q[3], x, y, -side, config) > 0.0
+        largest_edge(p[0], q[0], p[2], q[2], box, -side) >= 0.0
+        and largest_edge(p[1], q[1], p[3], q[3], box, side) > 0.0
+        and largest_edge(p[0], q[0], p[1], q[1], box, side) >= 0.0
+        and largest_edge(p[2], q[2], p[3], q[3], box, -side) > 0.0
     )
 
 
@@ -134,14 +135,11 @@ def cover(i, j, drawn: ti.template(), sheet: ti.template(), band: ti.template())
                 if ti.static(config.bends):
                     x, y = places(tile_x, tile_y, places_of(at, band), band.samples, config)
                 if whole:
-                    if ti.static(not config.bends):
-                        reached = reaches(tile_x + 0.5, tile_y + 0.5, outline.side, outline, config)
+                    reached = reaches(box_of(at, tile_x, tile_y, band), outline.side, outline)
                     if reached:
                         # Left and upper edges belong to a cell, right and lower ones do not.
                         of_left, of_right, of_top, of_bottom = geometry.edges(x, y, outline.side, outline)
                         inside = (of_left >= 0.0) & (of_right > 0.0) & (of_top >= 0.0) & (of_bottom > 0.0)
-                        if ti.static(config.bends):
-                            reached = ti.select(inside, 1.0, 0.0).max() > 0.0
                         if ti.static(config.refined):
                             column, line = geometry.small_quad(x, y, inside, sheet.parts, patch)
                 else:

@@ -124,7 +124,7 @@ def bounds(places: NDArray[np.float32]) -> Array:
 
 
 def tiled(places: NDArray[np.float32], config: DrawingConfig) -> NDArray[np.float32]:
-    """Arrange places in the bands and tiles of kernel 2, shape (bands, vectors of each, lanes)."""
+    """Arrange places in the bands and tiles of kernel 2, with bounds; shape (bands, vectors of each, lanes)."""
     rows, columns, planes = places.shape
     height, lines = config.band_rows * config.supersample, config.band_lines
     tile_height, tile_width = config.tile_height, config.tile_width
@@ -133,4 +133,10 @@ def tiled(places: NDArray[np.float32], config: DrawingConfig) -> NDArray[np.floa
     cut = np.pad(places, padding, constant_values=BEYOND).reshape(bands, height, -1, planes)
     cut = np.pad(cut, ((0, 0), (0, lines * tile_height - height), (0, 0), (0, 0)), constant_values=BEYOND)
     tiles = cut.reshape(bands, lines, tile_height, across, tile_width, planes).transpose(0, 1, 3, 5, 2, 4)
-    return tiles.reshape(bands, -1, config.lanes)
+    tiles = tiles.reshape(bands, lines, across, planes, config.lanes)
+    # Where a tile has no place, its bounds are far away too.
+    least = tiles[..., :2, :].min(axis=-1)
+    most = np.where(tiles[..., :2, :] < BEYOND, tiles[..., :2, :], least[..., None]).max(axis=-1)
+    box = np.stack([least, most], axis=-1).reshape(bands, lines, across, 1, 4)
+    box = np.pad(box, ((0, 0), (0, 0), (0, 0), (0, 0), (0, config.lanes - 4)))
+    return np.concatenate([tiles, box], axis=3).reshape(bands, -1, config.lanes)

@@ -83,8 +83,8 @@ class DrawingConfig(NamedTuple):
 
     @property
     def place_planes(self) -> int:
-        """Vectors of the table of places per tile: x and y, and what changes them (places.py); 0 without a lens."""
-        return 0 if not self.lens else 6 if self.place_steps else 2
+        """Vectors of the table of places per tile: x and y, what changes them (places.py), a box; 0 without a lens."""
+        return (6 if self.place_steps else 2) + (not self.unordered) if self.lens else 0
 
     @property
     def place_steps(self) -> bool:
@@ -208,6 +208,19 @@ def places(left, top, at, samples: ti.template(), config: ti.template()):
 def places_of(at, band: ti.template()):
     """Give the entry of the places of a tile that begins at entry `at` of the samples."""
     return band.places + (at - band.first) // band.config.planes * band.config.place_planes
+
+
+@ti.func
+def box_of(at, left, top, band: ti.template()):
+    """Give the left, right, top and bottom of the samples of a tile, without distortion; `left`, `top`: its corner."""
+    config = ti.static(band.config)
+    x, y = left + 0.5, top + 0.5
+    box = [x, x + (config.tile_width - 1.0), y, y + (config.tile_height - 1.0)]
+    if ti.static(config.bends and not config.unordered):
+        known = places_of(at, band) + config.place_planes - 1
+        for n in ti.static(range(4)):
+            box[n] = band.samples[known][n]
+    return ti.static(box)
 
 
 @ti.func

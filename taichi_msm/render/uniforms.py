@@ -130,21 +130,27 @@ def _rod_numbers(rod: Rod, view: View, factor: int) -> Array:
     bounds = np.array([0, 0, *view.size])
     if (w > view.near).all():
         seen = np.stack([x / w, y / w], axis=-1)
-        bounds = np.concatenate([seen.min(axis=0), seen.max(axis=0)]) if view.lens is None else _bent(seen, view)
+        bounds = np.concatenate([seen.min(axis=0), seen.max(axis=0)])
+        if view.lens is not None:
+            bounds = _bent(seen.reshape(2, -1, 2), view)
     numbers[LEFT:] = np.clip(bounds, 0, np.tile(view.size, 2)) * factor
     return numbers
 
 
-def _bent(corners: Array, view: View) -> Array:
-    """Bound what shows the convex hull of corners [px], of which a lens bends every side: left, top, right, bottom."""
+def _bent(ends: Array, view: View) -> Array:
+    """Bound what shows the convex hull of what is at both ends [px], shape (2, n, 2): left, top, right, bottom.
+
+    A lens bends its sides.
+    """
     assert view.lens is not None
     lens, known = view.lens, visible(view)
-    first, second = np.triu_indices(len(corners), 1)
+    (left, top), (right, bottom) = ends.min(axis=1).T, ends.max(axis=1).T
+    # The corners of a rectangle around each end. The hull of both has sides of theirs, and lines between like corners.
+    near, far = np.moveaxis(np.array([[left, right, right, left], [top, top, bottom, bottom]]), 0, -1).swapaxes(0, 1)
+    first, second = np.concatenate([near, near, far]), np.concatenate([far, np.roll(near, 1, 0), np.roll(far, 1, 0)])
     share = np.linspace(0, 1, PIECES + 1)[:, None, None]
-    sides = corners[first] * (1 - share) + corners[second] * share
-    place = (sides - view.centre) / view.scale
+    place = (first * (1 - share) + second * share - view.centre) / view.scale
     place *= np.minimum(1, known.radius / np.maximum(np.linalg.norm(place, axis=-1, keepdims=True), known.radius))
     seen = lens.distort(place) * view.scale + view.centre
-    length = float(np.linalg.norm(corners[first] - corners[second], axis=-1).max()) / PIECES
-    far = known.stretch * length
-    return np.concatenate([seen.min(axis=(0, 1)) - far, seen.max(axis=(0, 1)) + far])
+    beyond = known.stretch * float(np.linalg.norm(first - second, axis=-1).max()) / PIECES
+    return np.concatenate([seen.min(axis=(0, 1)) - beyond, seen.max(axis=(0, 1)) + beyond])
