@@ -220,7 +220,7 @@ def test_every_command_is_understood(page: Path) -> None:
 
 
 def test_the_commands_work(small_scenes: Path, program: Program) -> None:
-    for arguments in (arguments for page in WITH_COMMANDS for arguments in commands(page)):
+    for arguments in dict.fromkeys(tuple(arguments) for page in WITH_COMMANDS for arguments in commands(page)):
         opens_a_window = arguments[0] == "view" and "--record" not in arguments
         needs_a_session = any("session-1" in word for word in arguments)
         needs_vtk = "vtk" in arguments and importlib.util.find_spec("vtk") is None

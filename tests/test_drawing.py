@@ -209,8 +209,14 @@ def test_the_bound_of_a_thread_is_asserted(device: Device, monkeypatch: pytest.M
         drawing.draw(position, rods=rods(made, position, 0))
 
 
-@pytest.mark.parametrize("camera", ["top", "oblique", NEAR])
-@pytest.mark.parametrize("shading", ["none", "headlight", "tissue"])
+@pytest.mark.parametrize(
+    ("shading", "camera"),
+    [
+        pytest.param(shading, camera, marks=() if m == n else pytest.mark.slow)
+        for m, shading in enumerate(("none", "headlight", "tissue"))
+        for n, camera in enumerate(("top", "oblique", NEAR))
+    ],
+)
 def test_instruments_are_like_the_twin(shading: str, camera: Any, device: Device) -> None:
     made = with_instruments(drawable(camera=camera, shading=shading))
     position, texture = dented(made), np.full((9, 9, 3), 120, np.uint8)

@@ -298,7 +298,7 @@ def test_a_record_that_names_a_picture_elsewhere_gets_nothing_of_it(name: str, r
     assert not (results / f"export-{name}").exists()
 
 
-def test_a_record_that_names_a_map_elsewhere_gets_nothing_of_it(results: Path, program: Program) -> None:
+def test_a_record_that_names_a_map_elsewhere_gets_nothing_of_it_for_vtk(results: Path, program: Program) -> None:
     pytest.importorskip("vtkmodules")
     path = secret(results)
     change_scene(results, springs={"map": {"image": path, "range": [1.0, 2.0]}})

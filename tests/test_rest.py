@@ -86,7 +86,7 @@ CASES = (
 )  # fmt: skip
 
 # These have every term, and most ways to fix a sheet.
-QUICK = ("springs, one side", "tension", "plate, map", "one side, map", "moving")
+QUICK = ("springs, one side", "plate, map", "moving")
 
 
 def shape_of(plan: Plan, device: Device, frames: int = 1, layout: SheetLayout | None = None) -> Array:
