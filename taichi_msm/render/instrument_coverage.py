@@ -9,7 +9,7 @@ beyond an end of the segment, the line of sight is intersected with the sphere a
 from taichi_msm.render import uniforms as uni
 from taichi_msm.render.geometry import line_of_sight, w_at
 from taichi_msm.render.places import BEYOND
-from taichi_msm.render.samples import INFINITY, clip, keep, keep_unit, places, places_of, tiles_of
+from taichi_msm.render.samples import INFINITY, box_of, clip, keep, keep_unit, places, places_of, tiles_of
 from taichi_msm.system.runtime import ti
 
 
@@ -87,13 +87,23 @@ def cover_with_rods(count, band: ti.template()):
     config, numbers = ti.static((band.config, band.numbers))
     for n in range(count):
         rod = uni.RODS + n * uni.ROD_NUMBERS
+        left, right = numbers[rod + uni.LEFT], numbers[rod + uni.RIGHT]
         top, bottom = numbers[rod + uni.TOP], numbers[rod + uni.BOTTOM]
-        if top < band.bottom and bottom > band.top:
-            left, right, upper, lower = clip(numbers[rod + uni.LEFT], numbers[rod + uni.RIGHT], top, bottom, band)
-            first_tile, end_tile, first_line, end_line = tiles_of(left, right, upper, lower, band)
+        low_x, high_x, low_y, high_y = left, right, top, bottom
+        if ti.static(config.bends):
+            # Which tiles show what is within these bounds is known of each tile alone.
+            low_x, high_x, low_y, high_y = band.left, band.right, band.top, band.bottom
+        if low_y < band.bottom and high_y > band.top:
+            first_column, end_column, first_row, end_row = clip(low_x, high_x, low_y, high_y, band)
+            first_tile, end_tile, first_line, end_line = tiles_of(first_column, end_column, first_row, end_row, band)
             for line in range(first_line, end_line):
                 for tile in range(first_tile, end_tile):
                     at = band.first + (line * band.across + tile) * config.planes
-                    left_x, top_y = tile * config.tile_width, band.top + line * config.tile_height
-                    x, y = places(left_x, top_y, places_of(at, band), band.samples, config)
-                    cover_tile_with_rod(at, x, y, n, band)
+                    tile_x, tile_y = tile * config.tile_width, band.top + line * config.tile_height
+                    reached = True
+                    if ti.static(config.bends):
+                        box = ti.static(box_of(at, tile_x, tile_y, band))
+                        reached = box[0] <= right and box[1] >= left and box[2] <= bottom and box[3] >= top
+                    if reached:
+                        x, y = places(tile_x, tile_y, places_of(at, band), band.samples, config)
+                        cover_tile_with_rod(at, x, y, n, band)

@@ -216,10 +216,13 @@ def box_of(at, left, top, band: ti.template()):
     config = ti.static(band.config)
     x, y = left + 0.5, top + 0.5
     box = [x, x + (config.tile_width - 1.0), y, y + (config.tile_height - 1.0)]
-    if ti.static(config.bends and not config.unordered):
-        known = places_of(at, band) + config.place_planes - 1
+    if ti.static(config.bends):
+        known = places_of(at, band)
         for n in ti.static(range(4)):
-            box[n] = band.samples[known][n]
+            if ti.static(config.unordered):
+                box[n] = band.samples[known + n // 2][0]
+            else:
+                box[n] = band.samples[known + config.place_planes - 1][n]
     return ti.static(box)
 
 

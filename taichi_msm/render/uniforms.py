@@ -19,9 +19,6 @@ from taichi_msm.scene import Render, Scene
 
 Array = NDArray[np.float64]
 
-# Sides of an instrument's outline are bent piece by piece.
-PIECES = 16
-
 # Indices into the array of sizes: of the sheet, the picture and its bins. Three are counters: rows of mass points that
 # workers have taken, rows projected, bands taken. Last come the levels of the texture, each with its first texel, its
 # width and its height.
@@ -127,30 +124,11 @@ def _rod_numbers(rod: Rod, view: View, factor: int) -> Array:
     corner = np.array(np.meshgrid(*[(-rod.radius, rod.radius)] * 3)).reshape(3, -1).T @ view.axes
     boxes = (ends[:, None] + corner).reshape(-1, 3)
     x, y, w, _ = view.project(boxes).T
-    bounds = np.array([0, 0, *view.size])
+    # Without distortion, as all places are in kernels.
+    left, right, top, bottom = (0, view.size[0], 0, view.size[1]) if view.lens is None else visible(view).box
+    low, high = np.array([left, top]), np.array([right, bottom])
     if (w > view.near).all():
         seen = np.stack([x / w, y / w], axis=-1)
-        bounds = np.concatenate([seen.min(axis=0), seen.max(axis=0)])
-        if view.lens is not None:
-            bounds = _bent(seen.reshape(2, -1, 2), view)
-    numbers[LEFT:] = np.clip(bounds, 0, np.tile(view.size, 2)) * factor
+        low, high = np.clip([seen.min(axis=0), seen.max(axis=0)], low, high)
+    numbers[LEFT:] = np.concatenate([low, high]) * factor
     return numbers
-
-
-def _bent(ends: Array, view: View) -> Array:
-    """Bound what shows the convex hull of what is at both ends [px], shape (2, n, 2): left, top, right, bottom.
-
-    A lens bends its sides.
-    """
-    assert view.lens is not None
-    lens, known = view.lens, visible(view)
-    (left, top), (right, bottom) = ends.min(axis=1).T, ends.max(axis=1).T
-    # The corners of a rectangle around each end. The hull of both has sides of theirs, and lines between like corners.
-    near, far = np.moveaxis(np.array([[left, right, right, left], [top, top, bottom, bottom]]), 0, -1).swapaxes(0, 1)
-    first, second = np.concatenate([near, near, far]), np.concatenate([far, np.roll(near, 1, 0), np.roll(far, 1, 0)])
-    share = np.linspace(0, 1, PIECES + 1)[:, None, None]
-    place = (first * (1 - share) + second * share - view.centre) / view.scale
-    place *= np.minimum(1, known.radius / np.maximum(np.linalg.norm(place, axis=-1, keepdims=True), known.radius))
-    seen = lens.distort(place) * view.scale + view.centre
-    beyond = known.stretch * float(np.linalg.norm(first - second, axis=-1).max()) / PIECES
-    return np.concatenate([seen.min(axis=(0, 1)) - beyond, seen.max(axis=(0, 1)) + beyond])
