@@ -1,4 +1,4 @@
-"""What a picture costs with every shading, with an instrument, and with labels; all in turn in one process.
+"""What a picture costs with every shading, an instrument, labels, and through a lens; all in turn in one process.
 
 And how many frames a second a run writes with labels, from the first step to the last file.
 """
@@ -21,7 +21,7 @@ from taichi_msm.render.camera import view
 from taichi_msm.render.rasterizer import Drawing, drawing_config
 from taichi_msm.render.surface import rods
 from taichi_msm.render.tracking import find_flow
-from taichi_msm.scene import Scene
+from taichi_msm.scene import Camera, Scene
 from taichi_msm.system import runtime
 from taichi_msm.system.resources import available_threads
 
@@ -33,7 +33,12 @@ REFINE = 10
 # What others are compared with.
 HEADLIGHT = "headlight"
 
+INSTRUMENTED = "tissue, instrument"
 LABELS = "labels alone"
+
+# Pinholes without and with a lens, at a height [m] from which either picture shows nothing but the sheet.
+PINHOLES: dict[str, dict[str, Any]] = {"pinhole": {}, "lens": {"distortion": {"k1": -0.3}}}
+HEIGHT = 0.22
 
 # Pictures of every kind in a round.
 PICTURES = 8
@@ -63,18 +68,29 @@ def variants(problem: Problem) -> dict[str, Callable[[], Any]]:
         drawing = Drawing(made, problem.texture, drawing_config(made, picture=picture, labels=labels))
         return lambda: drawing.look(position, None, rods(made, position, 0.2))
 
-    held = problem.scene.probes[0].model_copy(update={"instrument": INSTRUMENT})
+    def pinhole(lens: dict[str, Any]) -> Scene:
+        focal, middle = 1.2 * problem.pixels, (problem.pixels - 1) / 2
+        intrinsics = {"fx": focal, "fy": focal, "cx": middle, "cy": middle}
+        return held(scene("tissue", camera=Camera(eye=(0, 0, HEIGHT), intrinsics=intrinsics, **lens)))
+
+    def held(made: Scene) -> Scene:
+        probe = made.probes[0].model_copy(update={"instrument": INSTRUMENT})
+        return made.model_copy(update={"probes": [probe]})
+
     plain, tissue = scene(HEADLIGHT), scene("tissue")
+    pinholes = {name: pinhole(lens) for name, lens in PINHOLES.items()}
     seen = picture(plain, picture=False, labels=True)().labels.coordinates
     return {
         HEADLIGHT: picture(plain),
         "none": picture(scene("none")),
         "tissue": picture(tissue),
         "tissue, relief": picture(scene("tissue", light={"relief": -0.2})),
-        "tissue, instrument": picture(tissue.model_copy(update={"probes": [held]})),
+        INSTRUMENTED: picture(held(tissue)),
         "headlight and labels": picture(plain, labels=True),
         LABELS: picture(plain, picture=False, labels=True),
         "flow and occlusion": lambda: find_flow(plain, seen, problem.rest, camera),
+        **{f"{INSTRUMENTED}, {name}": picture(made) for name, made in pinholes.items()},
+        **{f"{LABELS}, {name}": picture(made, picture=False, labels=True) for name, made in pinholes.items()},
     }
 
 

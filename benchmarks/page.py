@@ -80,6 +80,7 @@ def tables(results: Results) -> dict[str, str]:
         "terms_table": ("terms", lambda: terms_table(results["terms"])),
         "gradient_table": ("gradient", lambda: gradient_table(results["gradient"])),
         "looks_table": ("looks", lambda: looks_table(results["looks"]["pictures"])),
+        "lens_ratios": ("looks", lambda: lens_ratios(results["looks"]["pictures"])),
         "rates_table": ("looks", lambda: rates_table(results["looks"]["rates"])),
         "compilers_table": ("compilers", lambda: compilers_table(results["compilers"])),
         "size_table": ("size", lambda: size_table(results["size"])),
@@ -277,6 +278,16 @@ def looks_table(measured: dict[str, dict[str, list[float]]]) -> str:
         for name in names
     ]
     return table(["a picture", *(f"{size} × {size}" for size in medians)], rows)
+
+
+def lens_ratios(measured: dict[str, dict[str, list[float]]]) -> str:
+    """Say how many times as long pictures and labels take through a lens."""
+    ratios = [
+        Timing.of(own[f"{kind}, lens"]).median / Timing.of(own[f"{kind}, pinhole"]).median
+        for own in measured.values()
+        for kind in (looks.INSTRUMENTED, looks.LABELS)
+    ]
+    return f"{min(ratios):.2f} to {max(ratios):.2f}"
 
 
 def rates_table(measured: dict[str, list[float]]) -> str:
