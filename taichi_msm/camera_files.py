@@ -20,9 +20,9 @@ from taichi_msm.picture import irregular
 MAX_BYTES = 2**22
 
 # The names that programs give to a number or a matrix.
-MATRIX = ("camera_matrix", "cameraMatrix", "Camera_Matrix", "K", "leftcameramat")
+MATRIX = ("camera_matrix", "cameraMatrix", "Camera_Matrix", "K", "k", "leftcameramat")
 COEFFICIENTS = (
-    "distortion_coefficients", "dist_coeffs", "distCoeffs", "Distortion_Coefficients", "D", "leftdistortioncoeffs",
+    "distortion_coefficients", "dist_coeffs", "distCoeffs", "Distortion_Coefficients", "D", "d", "leftdistortioncoeffs",
 )  # fmt: skip
 WIDTH, HEIGHT = ("image_width", "image_Width", "width"), ("image_height", "image_Height", "height")
 
@@ -107,7 +107,7 @@ def read_poses(path: str) -> tuple[tuple[float, ...], ...]:
 def pose_fault(row: Sequence[float], before: Sequence[float] | None) -> str:
     """Say what is wrong with a row of a trajectory after another one; nothing: an empty text."""
     if before is not None and row[0] <= before[0]:
-        return f"is at {row[0]:.9g} s, and the pose before it at {before[0]:.9g} s; sort them, each later than the last"
+        return f"is at {row[0]:.15g} s, the pose before it at {before[0]:.15g} s; sort them, each later than the last"
     if abs(math.hypot(*row[4:]) - 1) > UNIT:
         return f"its quaternion has the length {math.hypot(*row[4:]):g}, so it is no rotation; scale it to 1"
     return ""

@@ -98,11 +98,14 @@ roi: {x_offset: 0, y_offset: 0, height: 0, width: 0, do_rectify: False}
 
 
 def test_what_ros_prints_of_a_topic_is_read(small: Path) -> None:
-    for text in (PRINTED, 2 * PRINTED, PRINTED.replace("width: 0", "width: 40")):
+    second = PRINTED.replace("D:", "d:").replace("K:", "k:")
+    for text in (PRINTED, 2 * PRINTED, second, PRINTED.replace("width: 0", "width: 40")):
         Path("ros.yaml").write_text(text)
         camera = camera_of("ros.yaml")
         assert camera.intrinsics is not None
         assert camera.intrinsics.cx == 19.25
+        assert camera.distortion is not None
+        assert camera.distortion.k2 == 0.002
 
 
 @pytest.mark.parametrize("change", [("g_x: 0", "g_x: 2"), ("x_offset: 0", "x_offset: 4"), ("width: 0", "width: 20")])
@@ -140,7 +143,7 @@ def test_pictures_of_another_size_are_refused_or_scaled(small: Path) -> None:
             "camera.yml: of pictures of 0 x 0 pixels; write the size of those that were calibrated with",
         ),
         ("K: [1, 0, 1e9, 0, 1, 1, 0, 0, 1]", "camera.yml: K: not numbers up to 1e+06; write them as OpenCV does"),
-        ("k: 3", "camera.yml: has no camera_matrix; name a calibration of OpenCV, ROS or STIR"),
+        ("f: 3", "camera.yml: has no camera_matrix; name a calibration of OpenCV, ROS or STIR"),
         ("K: [x]", "camera.yml: K: not numbers up to 1e+06; write them as OpenCV does"),
         (
             "K: [1, 0, 1, 0, 1, 1, 0, 0, 1]\nD: [1, 2, 3]",
@@ -198,7 +201,7 @@ def test_a_trajectory_is_read(small: Path) -> None:
     [
         (
             TUM.replace("0.4 0.1", "0.2 0.1"),
-            "poses.txt:4: is at 0.2 s, and the pose before it at 0.2 s; sort them, each later than the last",
+            "poses.txt:4: is at 0.2 s, the pose before it at 0.2 s; sort them, each later than the last",
         ),
         (
             TUM.replace("0.6 0.8", "0.6 0.9"),

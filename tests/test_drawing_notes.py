@@ -142,6 +142,7 @@ def test_check_and_run_say_it(tmp_path: Path, program: Program) -> None:
     "camera",
     [
         {"pose": {"rotation": [[1, 0, 0], [0, -1, 0], [0, 0, -1]], "translation": [0, 300, 400]}},
+        {"eye": [0, -30, 400]},
         {"eye": [0, 0, 0.4], "target": [0, 0, 1]},
         {"eye": [[0, 0, 0.1, 0.3], [1, 0.1, 0, 0.4]], "target": [3, 0, 0.4]},
         {
@@ -151,10 +152,10 @@ def test_check_and_run_say_it(tmp_path: Path, program: Program) -> None:
             "distortion": {"k1": -0.1},
         },
     ],
-    ids=["millimetres", "upward", "moving", "lens"],
+    ids=["beside in millimetres", "millimetres", "upward", "moving", "lens"],
 )
 def test_a_camera_that_shows_nothing(tmp_path: Path, camera: dict[str, Any]) -> None:
-    said = "shows nothing of the sheet at rest, in no frame; lengths are in metres"
+    said = "shows nothing of the sheet at rest, or only a dot, in all frames; lengths are in metres"
     (note,) = drawing_notes(carrying(tmp_path, (400, 300), render={"camera": camera}))
     assert note == f"render.camera {said}"
     cameras = {"left": "top", "right": camera}

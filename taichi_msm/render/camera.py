@@ -222,15 +222,17 @@ def _place_problems(camera: Camera, scene: Scene) -> Iterator[Problem]:
         turn = np.array(camera.pose.rotation)
         if not (np.abs(turn @ turn.T - np.eye(3)).max() <= ORTHONORMAL and np.linalg.det(turn) > 0):
             apart = np.abs(turn @ turn.T - np.eye(3)).max()
-            what = "a mirror" if np.linalg.det(turn) < 0 else f"{apart:.2g} from orthonormal"
+            what = f"no rotation: products of its rows are off by {apart:.2g}"
+            if np.linalg.det(turn) < 0:
+                what = "a mirror, no rotation"
             said = "its rows are the directions to the right, down and forward, of length 1 and across each other"
-            yield Problem(("pose", "rotation"), f"is no rotation but {what}; {said}")
+            yield Problem(("pose", "rotation"), f"is {what}; {said}")
             return
     if camera.poses is not None:
         begin, end, last = camera.poses[0][0], camera.poses[-1][0], scene.time.duration
         slack = WHOLE / scene.time.frames_per_second
         if begin > slack or end < last - slack:  # type: ignore[operator]
-            said = f"covers {begin:.9g} s to {end:.9g} s, but the scene goes from 0 s to {last:g} s"
+            said = f"covers {begin:.12g} s to {end:.12g} s, but the scene goes from 0 s to {last:g} s"
             remedy = "its times are those of the scene: subtract the first one from all"
             if begin <= slack:  # type: ignore[operator]
                 remedy = "shorten time.duration or give the poses of all of it"

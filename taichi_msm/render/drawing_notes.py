@@ -21,6 +21,9 @@ CELLS = 16
 # The radius of an instrument is rarely above this share of the sheet's larger side.
 WIDEST = 0.25
 
+# What is smaller than this share of the picture is a dot, as the sheet is to a camera that is placed in millimetres.
+DOT = 0.01
+
 
 def drawing_notes(scene: Scene) -> Iterator[str]:
     """List warnings about how a scene is drawn, each in a line."""
@@ -50,25 +53,32 @@ def drawing_notes(scene: Scene) -> Iterator[str]:
 
 
 def _blind(scene: Scene) -> Iterator[str]:
-    """Warn of cameras that show nothing of the sheet at rest in any frame."""
+    """Warn of cameras that show nothing of the sheet at rest, or only a dot, in all frames."""
     (height, width), rate = scene.sheet.size, scene.time.frames_per_second
     x, y = np.meshgrid(np.linspace(-width / 2, width / 2, CELLS + 1), np.linspace(-height / 2, height / 2, CELLS + 1))
     points = np.stack([x, y, 0 * x], axis=-1)
     for name in scene.render.all_cameras:
         frames = range(scene.time.frames + 1 if moves(scene, name) else 1)
         if not any(_shows(view_at(scene, frame / rate, name), points) for frame in frames):
-            key = f"cameras.{name}" if name else "camera"
-            yield f"render.{key} shows nothing of the sheet at rest, in no frame; lengths are in metres"
+            key = f"render.cameras.{name}" if name else "render.camera"
+            yield f"{key} shows nothing of the sheet at rest, or only a dot, in all frames; lengths are in metres"
 
 
 def _shows(camera: View, points: NDArray[np.float64]) -> bool:
-    """Tell whether a camera may show any cell between points, shape (n, n, 3): whether their bounds meet."""
+    """Tell whether a camera may show any cell between points, shape (n, n, 3), and all of them as more than a dot.
+
+    It may show a cell if their bounds meet.
+    """
     left, right, top, bottom = (0, camera.size[0], 0, camera.size[1]) if camera.lens is None else visible(camera).box
     x, y, w, _ = np.moveaxis(camera.project(points), -1, 0)
     corners = [np.s_[:-1, :-1], np.s_[:-1, 1:], np.s_[1:, :-1], np.s_[1:, 1:]]
     # As in `is_beside`: what is behind the eye is not divided by its w.
     beyond = [left * w - x, x - right * w, top * w - y, y - bottom * w, camera.near - w]
-    return bool(np.all([np.any([side[corner] <= 0 for corner in corners], axis=0) for side in beyond], axis=0).any())
+    if not np.all([np.any([side[corner] <= 0 for corner in corners], axis=0) for side in beyond], axis=0).any():
+        return False
+    if (w <= camera.near).any():
+        return True
+    return bool(max(np.ptp(x / w), np.ptp(y / w)) > DOT * camera.size.max())
 
 
 def _stretched(scene: Scene) -> Iterator[str]:
