@@ -604,7 +604,11 @@ def fit(
 
     # Both options take several words.
     free = (*free, *(word for word in more if "=" not in word))
-    limits = dict(map(read_bounds, (*bounds, *(word for word in more if "=" in word))))
+    limits: dict[str, tuple[float, float]] = {}
+    for key, ends in map(read_bounds, (*bounds, *(word for word in more if "=" in word))):
+        if key in limits:
+            raise click.BadParameter(f"{key}: given twice; leave one of them out", param_hint="--bounds")
+        limits[key] = ends
     loaded = load_scene(scene, overrides)
     directory = result_directory(out, f"{Path(scene).stem}-fit")
 

@@ -13,8 +13,8 @@ import yaml
 from numpy.typing import NDArray
 from scipy.stats import t as student
 
-from taichi_msm import SceneError, Simulation, fit, load_scene, run
-from taichi_msm.fitting.fit import Method
+from taichi_msm import ArgumentError, SceneError, Simulation, fit, load_scene, run
+from taichi_msm.fitting.arguments import Method
 from taichi_msm.fitting.observations import read_observations
 from taichi_msm.fitting.parameters import make_parameters
 from taichi_msm.fitting.prediction import Job, Predictor, runnable, seen_by_camera
@@ -46,6 +46,8 @@ TRUTH: dict[str, Any] = {
     "render": {"camera": {"eye": [0, -0.06, 0.09]}, "tracks": 6},
     "output": [],
 }
+
+FORCES = "time,probe,force_x,force_y,force_z\n"
 
 GRID = (np.arange(6) + 0.5) / 6
 PLACES = np.stack([axis.ravel() for axis in np.meshgrid(GRID, GRID)], axis=1)
@@ -448,6 +450,8 @@ def test_values_that_make_no_scene_give_no_run(device: Device, tracks: dict[str,
         (["--free", "tissue.young", "--bounds", "tissue.damping=1,2"], "--bounds tissue.damping: not among --free"),
         (["--free", "tissue.young", "--forces", "none.csv,0.1"], "none.csv: no such file; name a forces.csv"),
         (["--free", "tissue.young", "--forces", "none.csv"], "expected FILE,SIGMA"),
+        (["--free", "tissue.young", "--free", "tissue.young"], "--free tissue.young: given twice; leave one of them"),
+        (["--free", "tissue.young", "--bounds", "tissue.young=1,1e5", "tissue.young=2,1e5"], "--bounds: tissue.young"),
         (["--free", "tissue.young", "--set", "sheet.tolerance=0.1"], "sheet.tolerance: 0.1 is for one run"),
         (["--free", "tissue.young", "--sigma", "0"], "seen.npz: sigma: 0; take one number above 0"),
         (["--free", "tissue.young", "--correlation", "0"], "--correlation 0: take a number of pixels above 0"),
@@ -473,6 +477,58 @@ def test_a_file_that_is_none_is_refused(small: Path, program: Program, text: byt
     assert done.returncode == 2
     assert done.stderr.startswith("seen.npz: ")
     assert len(done.stderr.splitlines()) == 1
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("", "is empty; name a forces.csv"),
+        (FORCES, "no row; name a forces.csv"),
+        (FORCES + "0.1,0,,,\n", "no force; name a forces.csv"),
+        (FORCES + ",,,,\n", "a row without a time; name a forces.csv"),
+    ],
+)
+def test_a_table_without_forces_is_refused(tracks: dict[str, Array], tmp_path: Path, text: str, message: str) -> None:
+    (tmp_path / "forces.csv").write_text(text)
+    with pytest.raises(SceneError, match=f"forces.csv: {message}") as caught:
+        fit(changed(), tracks, ["tissue.young"], forces=(tmp_path / "forces.csv", 0.1))
+    assert len(caught.value.lines) == 1
+
+
+@pytest.mark.parametrize("name", ["seen.npy", "seen.npz"])
+def test_a_single_array_is_refused(tracks: dict[str, Array], tmp_path: Path, name: str) -> None:
+    np.save(tmp_path / "seen.npy", tracks["pixel"])
+    (tmp_path / "seen.npy").rename(tmp_path / name)
+    with pytest.raises(SceneError, match=f"{name}: a single array, as np.save writes; name an .npz with time"):
+        fit(changed(), tmp_path / name, ["tissue.young"])
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ({"free": "tissue.young"}, r"free: 'tissue.young'; take a list of keys"),
+        ({"free": [0]}, r"free: \[0\]; take a list of keys"),
+        ({"observed": 5}, "observed: 5; take the path of an .npz"),
+        ({"scene": 5}, "int is no scene"),
+        ({"bounds": [("tissue.young", 1, 2)]}, "bounds: .*; take a mapping"),
+        ({"bounds": {"tissue.young": 5}}, "bounds: .*; take a mapping"),
+        ({"bounds": {"tissue.young": ("1", 2)}}, "bounds: .*; take a mapping"),
+        ({"forces": "forces.csv"}, "forces: 'forces.csv'; take a forces.csv and the standard deviation"),
+        ({"directory": 5}, "directory: 5; take a path"),
+        ({"workers": 0}, "workers: 0; take a whole number, 1 or more"),
+        ({"sigma": "0.5"}, "sigma: '0.5'; take a number"),
+        ({"correlation": "5"}, "correlation: '5'; take a number"),
+        ({"resolution": 4.0}, "resolution: 4.0; take a whole number"),
+        ({"robust": "yes"}, "robust: 'yes'; take True or False"),
+        ({"profiles": True}, "profiles: unknown; take .*; did you mean 'profile'"),
+    ],
+)
+def test_arguments_of_a_wrong_type_are_answered_in_a_line(
+    tracks: dict[str, Array], arguments: dict[str, Any], message: str
+) -> None:
+    given: dict[str, Any] = {"scene": changed(), "observed": tracks, "free": ["tissue.young"], **arguments}
+    with pytest.raises(ArgumentError, match=message):
+        fit(given.pop("scene"), given.pop("observed"), given.pop("free"), **given)
 
 
 def test_methods_are_those_that_are_described() -> None:

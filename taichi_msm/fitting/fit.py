@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import secrets
 import time
 from collections.abc import Mapping, Sequence
@@ -12,11 +13,11 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from typing_extensions import TypedDict, Unpack
+from typing_extensions import Unpack
 
-from taichi_msm.arguments import require_path
-from taichi_msm.errors import ArgumentError, DivergedError, SceneError, writing
+from taichi_msm.errors import DivergedError, SceneError, writing
 from taichi_msm.fitting import notes
+from taichi_msm.fitting.arguments import Method, require_types
 from taichi_msm.fitting.estimation import Search, Solution
 from taichi_msm.fitting.identifiability import MOST_ERROR, unseen
 from taichi_msm.fitting.observations import read_forces, read_observations, with_sigma
@@ -39,16 +40,6 @@ Array = NDArray[np.float64]
 
 # Where a parameter's curvature is drawn, in standard deviations; they are at most so large, in units of x.
 CURVE, WIDEST = np.linspace(-3, 3, 25), 3.0
-
-
-class Method(TypedDict, total=False):
-    """How a fit is made."""
-
-    sigma: float | None  # standard deviation of what was seen, in place of that in the file [m] or [px]
-    robust: bool  # whether what is far off counts less
-    profile: bool  # whether the intervals are found by profiles
-    correlation: float | None  # how far in the picture errors of tracks are alike [px]
-    resolution: int | None  # fields along a side of the map that is fitted
 
 
 def fit(
@@ -88,7 +79,7 @@ def fit(
         What was found; also where the data do not tell a parameter: then `identifiable` is False.
 
     Raises:
-        ArgumentError: when a keyword is unknown.
+        ArgumentError: when an argument is not what it must be.
         SceneError: when the scene, the keys or what was seen cannot be used, each with the remedy.
         DivergedError: when the scene diverges where it begins.
         FilesError: when the directory cannot be written.
@@ -101,24 +92,24 @@ def fit(
         ('3e+04 Pa', True)
     """
     begun = time.perf_counter()
-    if unknown := set(method) - set(Method.__annotations__):
-        raise ArgumentError(f"{unknown.pop()}: unknown; take {', '.join(Method.__annotations__)}")
+    require_types(observed, free, method, bounds=bounds, forces=forces, directory=directory, workers=workers)
     given = load_scene(scene) if isinstance(scene, (str, Path)) else checked(scene).scene
     for section in ("sheet", "time"):
         if (tolerance := getattr(given, section).tolerance) is not None:
             said = "is for one run, and a fit compares many; remove it, and take what `run` chose for it"
             raise SceneError([f"{section}.tolerance: {tolerance:g} {said}"])
     seen = with_sigma(read_observations(observed, given.time.frames_per_second), method.get("sigma"))
-    names = [free] if isinstance(free, str) else free
-    task = map_task(given, names, bounds or {}, method.get("resolution"))
+    if twice := [key for n, key in enumerate(free) if key in free[:n]]:
+        raise SceneError([f"--free {twice[0]}: given twice; leave one of them out"])
+    task = map_task(given, free, bounds or {}, method.get("resolution"))
     other = {"forces": forces, **{name: method.get(name) for name in ("robust", "profile", "correlation")}}
     if task is not None and (given_too := [name for name, value in other.items() if value]):
         raise SceneError([f"--free {KEY}: --{given_too[0]} is of fits of numbers; leave it out"])
-    parameters = () if task is not None else make_parameters(given, names, bounds or {})
+    parameters = () if task is not None else make_parameters(given, free, bounds or {})
     if forces is not None:
         seen = replace(seen, forces=read_forces(forces[0], forces[1], len(given.probes)))
     if (correlation := method.get("correlation")) is not None:
-        if not 0 < correlation < np.inf:
+        if not 0 < correlation < math.inf:
             raise SceneError([f"--correlation {correlation:g}: take a number of pixels above 0"])
         if seen.kind != "pixel":
             raise SceneError([f"{seen.name}: --correlation is in pixels, and these are positions; leave it out"])
@@ -126,7 +117,6 @@ def fit(
         raise SceneError(wrong)
     with ExitStack() as opened:
         if directory is not None:
-            require_path(directory)
             opened.enter_context(writing(directory))
             published = opened.enter_context(publication(Path(directory)))
         if task is not None:

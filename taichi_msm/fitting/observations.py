@@ -87,14 +87,20 @@ def with_sigma(seen: Observations, sigma: float | None) -> Observations:
 def _arrays(name: str) -> dict[str, NDArray[Any]]:
     """Read the arrays of a file."""
     path, remedy = Path(name), f"name an .npz with {NEEDS}, or a run's trajectory.npz or tracks.npz"
+    reason = "not an .npz"
     try:
         if not path.is_file():
             raise SceneError([f"{name}: {'a folder' if path.is_dir() else 'no such file'}; {remedy}"])
-        with np.load(path, allow_pickle=False) as archive:
-            return {key: archive[key] for key in archive.files}
-    except (OSError, ValueError, EOFError, zipfile.BadZipFile) as error:
-        reason = (error.strerror or "cannot be read").lower() if isinstance(error, OSError) else "not an .npz"
-        raise SceneError([f"{name}: {reason}; {remedy}"]) from None
+        archive = np.load(path, allow_pickle=False)
+        if not isinstance(archive, np.ndarray):
+            with archive:
+                return {key: archive[key] for key in archive.files}
+        reason = "a single array, as np.save writes"
+    except OSError as error:
+        reason = (error.strerror or "cannot be read").lower()
+    except (ValueError, EOFError, zipfile.BadZipFile):
+        pass
+    raise SceneError([f"{name}: {reason}; {remedy}"])
 
 
 def _checked(name: str, arrays: dict[str, NDArray[Any]], rate: float) -> Observations:
@@ -171,16 +177,20 @@ def read_forces(path: str | Path, sigma: float, probes: int) -> Forces:
     columns = ("time", "probe", "force_x", "force_y", "force_z")
     expected = f"name a forces.csv, with the columns {', '.join(columns)}"
     try:
-        table: Any = np.genfromtxt(name, delimiter=",", names=True, encoding="utf-8", ndmin=1)
+        if not (text := Path(name).read_text("utf-8")).strip():
+            raise SceneError([f"{name}: is empty; {expected}"])
+        table: Any = np.genfromtxt(text.splitlines(), delimiter=",", names=True, ndmin=1)
     except OSError as error:
-        raise SceneError([f"{name}: {(error.strerror or 'no such file').lower()}; {expected}"]) from None
+        reason = "no such file" if isinstance(error, FileNotFoundError) else str(error.strerror).lower()
+        raise SceneError([f"{name}: {reason}; {expected}"]) from None
     except ValueError:
         raise SceneError([f"{name}: no table of numbers; {expected}"]) from None
     if missing := [column for column in columns if column not in (table.dtype.names or ())]:
         raise SceneError([f"{name}: {missing[0]}: missing; {expected}"])
     time, probe, force = table["time"], table["probe"], np.stack([table[column] for column in columns[2:]], axis=1)
     if not (np.isfinite(force).any() and np.isfinite(time).all()):
-        raise SceneError([f"{name}: no force, or no time in a row; {expected}, and numbers in them"])
+        what = "no row" if not len(time) else "no force" if np.isfinite(time).all() else "a row without a time"
+        raise SceneError([f"{name}: {what}; {expected}, and numbers in them"])
     if wrong := [one for one in probe.tolist() if one not in range(probes)]:
         raise SceneError([f"{name}: probe: {wrong[0]:g}; the scene has {probes}, numbered from 0"])
     return Forces(name, time, probe.astype(np.intp), force, sigma)
