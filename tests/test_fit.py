@@ -495,6 +495,82 @@ def test_a_table_without_forces_is_refused(tracks: dict[str, Array], tmp_path: P
     assert len(caught.value.lines) == 1
 
 
+@pytest.mark.parametrize("robust", [False, True])
+@pytest.mark.filterwarnings("error:::taichi_msm")
+def test_an_exact_fit_has_errors_next_to_0(device: Device, robust: bool) -> None:
+    free = ["tissue.young", "tissue.foundation"]
+    empty = read_observations({"time": np.arange(11) / 25, "coordinates": PLACES, "position": np.ones((36, 11, 3))}, 25)
+    job = Job("token", runnable(changed()), make_parameters(changed(), free, {}), empty)
+    predictor = Predictor(job, device.threads)
+    seen = {"time": empty.time, "coordinates": PLACES, "position": predictor.predict(np.zeros(2), whole=True).values}
+    predictor.close()
+    found = fit(changed(), seen, free, robust=robust, profile=True, workers=1)
+    assert found.residual == 0
+    assert values(found) == [2e4, 3e5]
+    assert found.identifiable
+    assert all(0 < one.standard_error < 1e-6 * one.value for one in found.parameters.values())
+    assert any("next to nothing is left" in note and "--sigma" in note for note in found.notes)
+    assert not any("nan" in line or "inf" in line for line in found.summary()[:-1])
+    told = fit(changed(), seen, free, robust=robust, sigma=1e-5, workers=1)
+    assert told.chi_square == 0
+    assert not any("next to nothing" in note for note in told.notes)
+
+
+def near_the_sheet(motion: Array, device: Device) -> tuple[Scene, dict[str, Array]]:
+    """A camera that a third of the places are behind, and what it sees."""
+    scene = changed(render__camera={"eye": [0, -0.02, 0.01], "target": [0, 0.05, 0]})
+    with Simulation(scene, threads=device.threads) as simulation:
+        pixels = [simulation.locate(PLACES, positions=positions).pixels for positions in motion]
+    pixel = np.stack(pixels, axis=1).astype(np.float64)
+    assert np.isnan(pixel).any(axis=(1, 2)).sum() == 12
+    return scene, {"time": np.arange(11) / 25, "coordinates": PLACES, "pixel": pixel}
+
+
+def test_points_that_the_camera_does_not_see_have_no_part_in_a_correlation(motion: Array, device: Device) -> None:
+    scene, seen = near_the_sheet(motion, device)
+    seen = noisy(seen, 0.1, sigma=0.1)
+    seen["pixel"][30, 2:5] = np.nan
+    there = np.isfinite(seen["pixel"]).any(axis=(1, 2))
+    fewer = {**seen, "coordinates": PLACES[there], "pixel": seen["pixel"][there]}
+    whole, part = (
+        fit(scene, each, ["tissue.foundation"], correlation=50, workers=1).parameters["tissue.foundation"]
+        for each in (seen, fewer)
+    )
+    assert 0 < whole.standard_error < 0.1 * whole.value
+    assert whole.standard_error == pytest.approx(part.standard_error, rel=1e-9)
+
+
+def test_points_behind_the_eye_are_refused_where_they_were_seen(motion: Array, device: Device) -> None:
+    scene, seen = near_the_sheet(motion, device)
+    seen["pixel"][np.isnan(seen["pixel"])] = 100
+    with pytest.raises(SceneError, match="pixel: 12 of the points that were seen are behind the eye") as caught:
+        fit(scene, seen, ["tissue.young"], workers=1)
+    assert len(caught.value.lines) == 1
+
+
+def test_a_calibrated_camera_comes_back(motion: Array, device: Device) -> None:
+    camera = {"eye": [0, -0.06, 0.09], "intrinsics": {"fx": 700, "fy": 710, "cx": 255.5, "cy": 250.5}}
+    with Simulation(changed(render__camera=camera), threads=device.threads) as simulation:
+        pixels = [simulation.locate(PLACES, positions=positions).pixels for positions in motion]
+    seen = {"time": np.arange(11) / 25, "coordinates": PLACES, "pixel": np.stack(pixels, axis=1), "sigma": 1.0}
+    start = changed(render__camera={**camera, "intrinsics": {"fx": 702, "fy": 708, "cx": 254.5, "cy": 251.5}})
+    keys = [f"render.camera.intrinsics.{name}" for name in ("fx", "fy", "cx", "cy")]
+    parameters = make_parameters(start, keys, {})
+    # Focal lengths by their logs, the principal point in widths and heights of the picture.
+    assert [one.scale for one in parameters] == [0, 0, 512, 512]
+    found = fit(start, seen, keys, workers=1)
+    np.testing.assert_allclose(values(found), [700, 710, 255.5, 250.5], atol=1e-3)
+    assert found.identifiable
+
+
+def test_a_number_of_a_named_camera_is_found(tracks: dict[str, Array]) -> None:
+    data = changed().model_dump(mode="json", exclude_none=True)
+    cameras = {"left": {"eye": [0.001, -0.06, 0.09]}, "right": {"beside": "left", "baseline": 0.004}}
+    data["render"] = {"tracks": 6, "cameras": cameras}
+    found = fit(data, tracks, ["render.cameras.left.eye.0"], workers=1)
+    np.testing.assert_allclose(values(found), [0], atol=1e-6)
+
+
 @pytest.mark.parametrize("name", ["seen.npy", "seen.npz"])
 def test_a_single_array_is_refused(tracks: dict[str, Array], tmp_path: Path, name: str) -> None:
     np.save(tmp_path / "seen.npy", tracks["pixel"])

@@ -15,11 +15,13 @@ from PIL import Image
 from taichi_msm import FitResult, SceneError, fit, load_scene
 from taichi_msm.fitting.fields import Fields
 from taichi_msm.fitting.observations import Observations, read_observations
+from taichi_msm.fitting.prediction import runnable
 from taichi_msm.fitting.sight import Sight
 from taichi_msm.fitting.tikhonov import Search
 from taichi_msm.physics.adjoint import Adjoint
 from taichi_msm.physics.lattice import rest_positions
 from taichi_msm.physics.material import read_map
+from taichi_msm.physics.mesh_error import estimate_points
 from taichi_msm.scene import Scene
 from taichi_msm.scenefile.validation import checked
 from taichi_msm.system import resources
@@ -144,6 +146,60 @@ def test_fields_that_do_not_move_are_unknown(device: Device, tmp_path: Path) -> 
     assert found.unknown[:, 3].all()
     assert not found.unknown[1:3, 0].any()
     assert (np.asarray(Image.open(tmp_path / "map-error.png"))[:, 3] == 65535).all()
+
+
+def test_pictures_that_have_the_name_of_the_map_are_kept(
+    device: Device, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    for name, grey in (("map.png", 100), ("other/map.png", 200)):
+        Path(name).parent.mkdir(exist_ok=True)
+        Image.fromarray(np.full((8, 8), grey, np.uint8)).save(name)
+    tissue = scene().model_dump(mode="json", exclude_none=True)["tissue"]
+    ground = tissue | {"foundation_map": {"image": "map.png", "range": [0.9, 1.1]}}
+    observed = seen_in(scene(tissue=ground), device, np.ones((2, 2)), np.array([1.0, 2.0]), 1e-5)
+    begin = ground | {"map": {"image": "other/map.png", "range": [1, 2]}}
+    found = fit(scene(tissue=begin, image="map.png"), observed, ["tissue.map"], resolution=2, directory="found")
+    for fitted in (load_scene("found/scene.yaml"), found.scene):
+        assert fitted.tissue is not None
+        assert fitted.tissue.map is not None
+        assert fitted.tissue.foundation_map is not None
+        assert fitted.tissue.map.image == str(Path("found/map.png"))
+    fitted = load_scene("found/scene.yaml")
+    assert fitted.image == str(Path("found/pictures/map.png"))
+    assert Path("found/pictures/map.png").read_bytes() == Path("map.png").read_bytes()
+    assert np.asarray(Image.open("found/map.png")).shape == (2, 2)
+
+
+def test_bounds_must_leave_springs_a_length(device: Device) -> None:
+    # Pretension shortens springs by 0.3 at a factor of 1.
+    tissue = scene().model_dump(mode="json", exclude_none=True)["tissue"] | {"pretension": 0.3 * 1.5 * 2e4 * 3e-3}
+    taut = scene(tissue=tissue)
+    observed = seen_in(taut, device, np.ones((2, 2)), np.array([1.0, 2.0]), 1e-5)
+    message = r"--bounds tissue.map=0.05,0.2: tissue.pretension leaves springs no length below 0.3; take a HIGH"
+    with pytest.raises(SceneError, match=message):
+        fit(taut, observed, ["tissue.map"], resolution=2, bounds={"tissue.map": (0.05, 0.2)})
+    found = fit(taut, observed, ["tissue.map"], resolution=2, bounds={"tissue.map": (0.05, 2)}).map
+    assert found is not None
+    assert np.abs(np.log(found.factors)).max() < 4 * found.errors.max()
+
+
+def test_the_mesh_error_is_that_of_the_map_that_was_found(result: FitResult, folder: Path, device: Device) -> None:
+    # The lump of the truth, where the search begins with none, changes it by more than the last digit.
+    found, even = (
+        estimate_points(checked(runnable(each)), device, lambda done, total: None).error
+        for each in (load_scene(folder / "scene.yaml"), scene())
+    )
+    assert result.mesh_error == pytest.approx(found, rel=1e-6)
+    assert result.mesh_error != pytest.approx(even, rel=1e-2)
+
+
+def test_points_that_get_behind_the_eye_are_refused(device: Device) -> None:
+    low = scene(render={"camera": {"eye": [0, -0.02, 0.01], "target": [0, 0.05, 0]}})
+    pixel = np.full((len(PLACES), 1, 2), 100.0)
+    seen = {"time": [1.0], "coordinates": PLACES, "pixel": pixel, "sigma": 1.0}
+    with pytest.raises(SceneError, match="of the points that were seen are behind the eye of the scene's camera"):
+        fit(low, seen, ["tissue.map"], resolution=2)
 
 
 @pytest.mark.parametrize("kind", ["position", "pixel"])

@@ -67,11 +67,17 @@ class Solution:
 class Misfit:
     """The differences between what is predicted and what was seen, as one row of numbers: the values, then the forces.
 
+    Args:
+        seen: what was seen.
+        motion: of that, the root mean square [m] or [px].
+        robust: whether what is far off counts less.
+
     Attributes:
         count: how many of the numbers are values, and how many are forces.
     """
 
-    def __init__(self, seen: Observations) -> None:
+    def __init__(self, seen: Observations, motion: float, *, robust: bool) -> None:
+        self.seen, self.motion, self.robust = seen, motion, robust
         self._known = seen.known
         self._values = seen.values[self._known]
         forces = np.empty((0, 3)) if seen.forces is None else seen.forces.force
@@ -92,17 +98,26 @@ class Misfit:
         by = np.repeat(scales, self.count)
         return rows / by.reshape(-1, *(1,) * (rows.ndim - 1))
 
-    def cost(self, divided: Array, *, robust: bool) -> float:
-        """Give half the sum of rho of such rows, as SciPy does."""
-        square = divided**2
-        return float(np.sum(2 * FAR**2 * (np.sqrt(1 + square / FAR**2) - 1) if robust else square)) / 2
+    def residuals(self, predicted: Predicted, scales: Scales) -> Array:
+        """Give r."""
+        return self.divided(self.of(predicted), scales)
 
-    def sigma(self, predicted: Predicted, parameters: int, *, robust: bool) -> float:
-        """Estimate the standard deviation of the values' errors from what is left of them."""
+    def far(self, residuals: Array) -> Array:
+        """Give d with which the derivatives of rho / 2 are r / d^(1/2) and d^(-3/2)."""
+        return 1 + (residuals / FAR) ** 2 if self.robust else np.ones_like(residuals)
+
+    def cost(self, residuals: Array) -> float:
+        """Give half the sum of rho, as SciPy does."""
+        rho = 2 * FAR**2 * (np.sqrt(self.far(residuals)) - 1) if self.robust else residuals**2
+        return float(np.sum(rho)) / 2
+
+    def sigma(self, predicted: Predicted, parameters: int) -> float:
+        """Estimate the standard deviation of the values' errors from what is left of them, at least LEAST_SIGMA."""
         left = self.of(predicted)[: self.count[0]]
-        if robust:
-            return PER_MEDIAN * float(np.median(np.abs(left)))
-        return float(np.sqrt(np.sum(left**2) / max(1, len(left) - parameters)))
+        found = PER_MEDIAN * np.median(np.abs(left)) if self.robust else 0.0
+        if not self.robust:
+            found = np.sqrt(np.sum(left**2) / max(1, len(left) - parameters))
+        return max(float(found), LEAST_SIGMA * self.motion)
 
 
 class Search:
@@ -110,13 +125,11 @@ class Search:
 
     Args:
         runs: that predict.
-        motion: of what was seen, the root mean square [m] or [px], for which sigma stands at first if it is not known.
-        robust: whether what is far off counts less.
+        misfit: what is minimised; if sigma is not known, its motion stands for it at first.
     """
 
-    def __init__(self, runs: Runs, motion: float, *, robust: bool) -> None:
-        self.misfit = Misfit(runs.job.observations)
-        self._runs, self._motion, self._robust = runs, motion, robust
+    def __init__(self, runs: Runs, misfit: Misfit) -> None:
+        self._runs, self._misfit = runs, misfit
         self._delta = difference(runs.job.scene)
         limits = np.array([one.limits for one in runs.job.parameters])
         self._limits = limits[:, 0], limits[:, 1]
@@ -146,13 +159,13 @@ class Search:
 
     def fits(self, solution: Solution) -> bool:
         """Tell whether what is left is small."""
-        seen = self._runs.job.observations
+        seen = self._misfit.seen
         if seen.forces is not None:
             left, most = solution.predicted.forces - seen.forces.force, POOR_SHARE**2 * np.nanmean(seen.forces.force**2)
             if np.nanmean(left**2) > max(most, (POOR_SIGMAS * seen.forces.sigma) ** 2):
                 return False
-        of_values = self.misfit.sigma(solution.predicted, len(solution.x), robust=self._robust)
-        return of_values <= (POOR_SIGMAS * seen.sigma if seen.sigma is not None else POOR_SHARE * self._motion)
+        of_values = self._misfit.sigma(solution.predicted, len(solution.x))
+        return of_values <= (POOR_SHARE * self._misfit.motion if seen.sigma is None else POOR_SIGMAS * seen.sigma)
 
     def derivatives(self, solution: Solution) -> Array:
         """Give the derivatives of what is predicted by x, by central differences, shape (numbers, parameters)."""
@@ -167,40 +180,33 @@ class Search:
 
     def _settled(self, start: Array) -> Solution:
         """Find the best values from a start, and sigma where it is not known."""
-        seen = self._runs.job.observations
-        scales = Scales(seen.sigma or self._motion, seen.forces.sigma if seen.forces else 1.0)
-        if self._robust and seen.sigma is None and (predicted := self._predict(start)) is not None:
-            scales = scales._replace(values=self._sigma(predicted))
+        seen, robust = self._misfit.seen, self._misfit.robust
+        scales = Scales(seen.sigma or self._misfit.motion, seen.forces.sigma if seen.forces else 1.0)
+        if robust and seen.sigma is None and (predicted := self._predict(start)) is not None:
+            scales = scales._replace(values=self._misfit.sigma(predicted, len(start)))
         solution = self._from(start, scales)
-        for _ in range(MOST_ROUNDS if seen.sigma is None and (seen.forces is not None or self._robust) else 0):
-            sigma = self._sigma(solution.predicted)
+        for _ in range(MOST_ROUNDS if seen.sigma is None and (seen.forces is not None or robust) else 0):
+            sigma = self._misfit.sigma(solution.predicted, len(start))
             if abs(sigma / solution.scales.values - 1) < SIGMA_KNOWN:
                 break
             solution = self._from(solution.x, scales._replace(values=sigma))
         return solution
 
-    def _sigma(self, predicted: Predicted) -> float:
-        """Estimate sigma, at least as large as makes sense."""
-        left = self.misfit.sigma(predicted, len(self._limits[0]), robust=self._robust)
-        return max(left, LEAST_SIGMA * self._motion)
-
     def _from(self, start: Array, scales: Scales) -> Solution:
         """Find the best values from a start."""
         from scipy.optimize import least_squares
-
-        numbers = sum(self.misfit.count)
 
         def residuals(x: Array) -> Array:
             predicted = self._predict(x)
             # SciPy comes nearer to the last place where it finds no number.
             if predicted is None:
-                return np.full(numbers, np.nan)
-            return self.misfit.divided(self.misfit.of(predicted), scales)
+                return np.full(sum(self._misfit.count), np.nan)
+            return self._misfit.residuals(predicted, scales)
 
         def jacobian(x: Array) -> Array:
             predicted = self._predict(x)
             assert predicted is not None
-            return self.misfit.divided(self._derivatives(x, predicted, signs=(1,)), scales)
+            return self._misfit.divided(self._derivatives(x, predicted, signs=(1,)), scales)
 
         with np.errstate(all="ignore"):  # SciPy divides by slopes that are 0.
             found = least_squares(
@@ -211,7 +217,7 @@ class Search:
                 ftol=ENOUGH_COST,
                 xtol=ENOUGH,
                 gtol=FLAT,
-                loss="soft_l1" if self._robust else "linear",
+                loss="soft_l1" if self._misfit.robust else "linear",
                 f_scale=FAR,
                 max_nfev=MOST_TRIALS,
             )
@@ -236,7 +242,7 @@ class Search:
                 remedy = "give --bounds or another start by --set"
                 raise SceneError([f"{parameter.key}: no run close to its value succeeds; {remedy}"])
             (one, first), (other, second) = [*known, (x[n], predicted)][:2]
-            columns.append((self.misfit.row(first) - self.misfit.row(second)) / (one - other))
+            columns.append((self._misfit.row(first) - self._misfit.row(second)) / (one - other))
         return np.stack(columns, axis=1)
 
     def _inside(self, x: Array, n: int) -> bool:
@@ -250,7 +256,7 @@ class Search:
         return place
 
     def _cost(self, predicted: Predicted, scales: Scales) -> float:
-        return self.misfit.cost(self.misfit.divided(self.misfit.of(predicted), scales), robust=self._robust)
+        return self._misfit.cost(self._misfit.residuals(predicted, scales))
 
     def _other_starts(self) -> list[Array]:
         """Choose other starts, spread evenly over the bounds, at most a factor of 10 from the first."""

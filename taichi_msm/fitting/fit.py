@@ -15,21 +15,21 @@ import numpy as np
 from numpy.typing import NDArray
 from typing_extensions import Unpack
 
-from taichi_msm.errors import DivergedError, SceneError, writing
+from taichi_msm.errors import SceneError, writing
 from taichi_msm.fitting import notes
 from taichi_msm.fitting.arguments import Method, require_types
-from taichi_msm.fitting.estimation import Search, Solution
+from taichi_msm.fitting.estimation import Misfit, Search, Solution
 from taichi_msm.fitting.identifiability import MOST_ERROR, unseen
 from taichi_msm.fitting.observations import read_forces, read_observations, with_sigma
 from taichi_msm.fitting.parameters import Bounds, Parameter, as_data, make_parameters, with_values
-from taichi_msm.fitting.prediction import Job, runnable, seen_at_rest
+from taichi_msm.fitting.prediction import Job, runnable
 from taichi_msm.fitting.profiles import Place, Profile, Profiler
 from taichi_msm.fitting.report import publication, write_report
-from taichi_msm.fitting.result import Estimate, FitResult
+from taichi_msm.fitting.result import Estimate, FitResult, FittedMap
 from taichi_msm.fitting.runs import Runs
 from taichi_msm.fitting.stiffness_map import KEY, fit_map, map_task
 from taichi_msm.fitting.suspicions import faults, faults_beside, moved
-from taichi_msm.fitting.uncertainty import Uncertainty, likeness, uncertainty
+from taichi_msm.fitting.uncertainty import Uncertainty, uncertainty
 from taichi_msm.physics.mesh_error import WITH_CONTACT
 from taichi_msm.progress import Progress
 from taichi_msm.scene import Scene
@@ -120,7 +120,7 @@ def fit(
             opened.enter_context(writing(directory))
             published = opened.enter_context(publication(Path(directory)))
         if task is not None:
-            result = fit_map(given, seen, task, progress)
+            result = fit_map(given, seen, task, str(Path(directory or "", FittedMap.FILE)), progress)
         else:
             job = Job(secrets.token_hex(8), runnable(given), parameters, seen)
             runs = opened.enter_context(Runs(job, workers, progress))
@@ -135,26 +135,22 @@ def fit(
 def _fit(runs: Runs, given: Scene, method: Method) -> FitResult:
     """Search, and say how well the best values are known."""
     parameters, seen = runs.job.parameters, runs.job.observations
-    robust, correlation = method.get("robust", False), method.get("correlation")
-    start = np.zeros(len(parameters))
+    correlation, start = method.get("correlation"), np.zeros(len(parameters))
     runs.expected = 8 * len(start) + 4
     first = runs.first(start)
     if wrong := list(faults_beside(seen, given, first)):
         raise SceneError(wrong)
     motion = moved(seen, given) or 1.0
-    search = Search(runs, motion, robust=robust)
+    misfit = Misfit(seen, motion, robust=method.get("robust", False))
+    search = Search(runs, misfit)
     solution = search.best(start)
-    alike = None if correlation is None else likeness(seen_at_rest(given, seen)[:, 0], correlation)
-    uncertain = uncertainty(search.misfit, seen, solution, search.derivatives(solution), alike, robust=robust)
-    profiles = None
-    if method.get("profile"):
-        profiles = Profiler(search.misfit, solution, uncertain, robust=robust).profiles(runs)
-    mesh, shifts = _mesh(runs, search, solution, uncertain)
+    uncertain = uncertainty(misfit, solution, search.derivatives(solution), correlation)
+    profiles = Profiler(misfit, solution, uncertain).profiles(runs) if method.get("profile") else None
+    mesh, shifts = _mesh(runs, misfit, solution, uncertain)
     places = enumerate(solution.x.tolist())
     estimates = [_estimate(parameters[n], x, n, uncertain, profiles, shifts) for n, x in places]
     blind = unseen(parameters, solution.x, uncertain, forces=seen.forces is not None)
-    left = search.misfit.of(solution.predicted)
-    values, forces = left[: search.misfit.count[0]], left[search.misfit.count[0] :]
+    values, forces = np.split(misfit.of(solution.predicted), misfit.count[:1])
     return FitResult(
         parameters={one.key: estimate for one, estimate in zip(parameters, estimates, strict=True)},
         correlation=uncertain.correlation.tolist(),
@@ -183,18 +179,14 @@ def _fit(runs: Runs, given: Scene, method: Method) -> FitResult:
     )
 
 
-def _mesh(runs: Runs, search: Search, solution: Solution, uncertain: Uncertainty) -> tuple[float | None, Array | None]:
+def _mesh(runs: Runs, misfit: Misfit, solution: Solution, uncertain: Uncertainty) -> tuple[float | None, Array | None]:
     """Estimate the error of the points, and how far it moves every parameter, in units of x."""
-    try:
-        estimate = runs.mesh_error(solution.x)
-        if estimate is None or not np.isfinite(estimate.error):
-            return None, None
-        coarse = runs.coarse(solution.x)
-    except (DivergedError, SceneError):  # with fewer points
+    error = runs.mesh_error(solution.x)
+    if error is None or (coarse := runs.coarse(solution.x)) is None:
         return None, None
     order = WITH_CONTACT if any(probe.moved for probe in runs.job.scene.probes) else 2.0
-    rows = search.misfit.row(coarse) - search.misfit.row(solution.predicted)
-    return estimate.error, np.abs(uncertain.shift(search.misfit.divided(rows, uncertain.scales))) / (2**order - 1)
+    rows = misfit.row(coarse) - misfit.row(solution.predicted)
+    return error, np.abs(uncertain.shift(misfit.divided(rows, uncertain.scales))) / (2**order - 1)
 
 
 def _estimate(

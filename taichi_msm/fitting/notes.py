@@ -74,6 +74,8 @@ def of_what_is_left(
         yield f"what is left is {times} times sigma, and the intervals are widened by as much"
     left = solution.predicted.values - seen.values
     if np.sqrt(np.nanmean(left**2)) < NOTHING_LEFT * motion:
+        if seen.sigma is None:
+            yield "next to nothing is left, and the intervals are those of so small errors; give their size by --sigma"
         return
     beside, after = _alike(left, seen.coordinates)
     if beside > ALIKE and independent:

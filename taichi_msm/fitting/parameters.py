@@ -23,11 +23,15 @@ from taichi_msm.scenefile.load import parse_key
 Array = NDArray[np.float64]
 
 # Where a number must be to be free; in these there are choices, sizes of arrays, or what the tissue does not feel.
-SECTIONS = ("tissue", "springs", "damping", "sheet", "probes", "render.camera")
+SECTIONS = ("tissue", "springs", "damping", "sheet", "probes", "render.camera", "render.cameras")
 HELD = ("tolerance", "grip", "shaft", "points")
 
-# Keys of places and times, and a tool's offset, which are fitted as they are.
-PLACES = ("at", "path", "camera", "offset", "load")
+# Keys of places and times, and a tool's offset, which are fitted as they are; so is all of a camera but what follows.
+PLACES = ("at", "path", "offset", "load")
+FOCAL_LENGTHS = ("fx", "fy")
+
+# Keys of a camera whose range is 1: degrees, coefficients and directions.
+UNITS = ("fov", "distortion", "rotation", "up")
 
 # Without bounds, a number that is fitted in the log stays within a factor of 1000 from where it starts.
 WIDEST = math.log(1000)
@@ -155,18 +159,20 @@ def _look_up(named: str, data: Any, path: Key) -> Any:
 
 def _is_place(path: Key) -> bool:
     """Tell whether a number is a place, a time or a percent, which may pass through 0."""
-    return any(part in PLACES for part in path)
+    return path[-1] not in FOCAL_LENGTHS if path[0] == "render" else any(part in PLACES for part in path)
 
 
 def _natural(scene: Scene, path: Key) -> float:
     """Give the range of a place that has no bounds."""
     time, last = scene.time.duration, path[-1]
+    if path[0] == "render":
+        if last in ("cx", "cy"):
+            return float(scene.render.size[last == "cy"])
+        return 1.0 if any(part in UNITS for part in path[2:]) else max(scene.sheet.size)
     if "offset" in path:
         return 1.0
     if "load" in path:
         return 100.0 if last == 1 else time
-    if "camera" in path:
-        return max(scene.sheet.size) if "fov" not in path else 1.0
     if "path" in path:
         return (time, 1.0, 1.0, 0.1 * max(scene.sheet.size))[int(last)]
     # Of `at`, which may have a time before the place.

@@ -117,10 +117,12 @@ class Predictor:
         self._simulation = Simulation(self.plan(x), threads=self._threads)
         self._simulation.compile(pause)
 
-    def attempt(self, x: Array, steps: int | None = None, pause: Pause = lambda: None) -> Predicted | None:
+    def attempt(
+        self, x: Array, steps: int | None = None, *, coarse: bool = False, pause: Pause = lambda: None
+    ) -> Predicted | None:
         """Predict; None where the values give no run, or a point that was seen would be behind the eye."""
         try:
-            predicted = self.predict(x, steps, pause=pause)
+            predicted = self.predict(x, steps, coarse=coarse, pause=pause)
         except (SceneError, DivergedError):
             return None
         return predicted if np.isfinite(predicted.values[self.job.observations.known]).all() else None

@@ -14,7 +14,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from taichi_msm.fitting.estimation import FAR, Misfit, Solution
+from taichi_msm.fitting.estimation import Misfit, Solution
 from taichi_msm.fitting.prediction import Predicted
 from taichi_msm.fitting.runs import Runs
 from taichi_msm.fitting.uncertainty import Uncertainty
@@ -48,9 +48,9 @@ class Profile(NamedTuple):
 class Profiler:
     """Draws the profiles of a solution's parameters."""
 
-    def __init__(self, misfit: Misfit, solution: Solution, uncertain: Uncertainty, *, robust: bool) -> None:
-        self._misfit, self._solution, self._uncertain, self._robust = misfit, solution, uncertain, robust
-        self._least = misfit.cost(uncertain.left, robust=robust)
+    def __init__(self, misfit: Misfit, solution: Solution, uncertain: Uncertainty) -> None:
+        self._misfit, self._solution, self._uncertain = misfit, solution, uncertain
+        self._least = misfit.cost(uncertain.left)
 
     def profiles(self, runs: Runs) -> list[Profile]:
         """Draw the profile of every parameter, all sides at once."""
@@ -113,14 +113,13 @@ class Profiler:
             predicted = yield place
             if predicted is None:
                 break
-            left = self._misfit.divided(self._misfit.of(predicted), self._uncertain.scales)
-            cost = self._misfit.cost(left, robust=self._robust)
+            left = self._misfit.residuals(predicted, self._uncertain.scales)
+            cost = self._misfit.cost(left)
             if cost > least:
                 break
             least = cost
-            # Of a robust cost, the pull of what is far off, over the root of its weight.
-            pull = left * (1 + (left / FAR) ** 2) ** 0.25 if self._robust else left
-            step = -np.linalg.lstsq(slope, pull, rcond=None)[0]
+            # The first derivatives over the roots of the second.
+            step = -np.linalg.lstsq(slope, left * self._misfit.far(left) ** 0.25, rcond=None)[0]
             if np.all(np.abs(step) < AT_REST * deviations):
                 break
             place = place.copy()

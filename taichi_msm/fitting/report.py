@@ -14,11 +14,10 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from taichi_msm.errors import printable
-from taichi_msm.fitting.result import FitResult, FittedMap
+from taichi_msm.fitting.result import FitResult, FittedMap, sixteen_bits
 from taichi_msm.results.entries import files
 from taichi_msm.results.publication import Contents, Listed, Publication
 from taichi_msm.results.whole import add, create
-from taichi_msm.scene import Scene
 from taichi_msm.system.versions import versions
 
 RECORD, SCENE, PLOT, PICTURES = "fit.json", "scene.yaml", "fit.png", "pictures"
@@ -45,10 +44,9 @@ def write_report(result: FitResult, published: Publication) -> None:
     folder = published.staged
     add(folder / SCENE, _scene_text(result, folder).encode())
     if result.map is not None:
-        low, high = result.map.range
-        _write_grey((result.map.factors - low) / ((high - low) or 1.0), folder / MAP)
+        _write(result.map.grey, folder / MAP)
         # White: unknown, or not even known to 100 %.
-        _write_grey(np.nan_to_num(result.map.errors, nan=1.0).clip(0, 1), folder / ERRORS)
+        _write(sixteen_bits(np.nan_to_num(result.map.errors, nan=1.0).clip(0, 1)), folder / ERRORS)
     try:
         from taichi_msm.fitting.plot import plot
     except ImportError:
@@ -62,10 +60,9 @@ def write_report(result: FitResult, published: Publication) -> None:
     published.publish([*written, RECORD])
 
 
-def _write_grey(shares: NDArray[np.float64], path: Path) -> None:
-    """Write shares, 0 to 1, as a picture of 16 bits."""
+def _write(grey: NDArray[np.uint16], path: Path) -> None:
     with create(path) as file:
-        Image.fromarray((65535 * shares).round().astype(np.uint16)).save(file, "PNG")
+        Image.fromarray(grey).save(file, "PNG")
 
 
 def _scene_text(result: FitResult, folder: Path) -> str:
@@ -73,8 +70,6 @@ def _scene_text(result: FitResult, folder: Path) -> str:
     names: dict[str, str] = {}
 
     def copied(path: str) -> str:
-        if result.map is not None and path == MAP:
-            return MAP
         if path not in names:
             name, number = Path(path).name, 1
             while f"{PICTURES}/{name}" in names.values():
@@ -85,8 +80,13 @@ def _scene_text(result: FitResult, folder: Path) -> str:
             names[path] = f"{PICTURES}/{name}"
         return names[path]
 
-    scene: Scene = result.scene.with_pictures(copied)
-    data = scene.model_dump(mode="json", exclude_none=True)
+    scene, drawn = result.scene, {}
+    if result.map is not None and scene.tissue is not None and scene.tissue.map is not None:
+        # This is no copy; another picture may have its name.
+        drawn = {"map": {"image": MAP, "range": list(scene.tissue.map.range)}}
+        scene = scene.model_copy(update={"tissue": scene.tissue.model_copy(update={"map": None})})
+    data = scene.with_pictures(copied).model_dump(mode="json", exclude_none=True)
+    data |= {"tissue": data["tissue"] | drawn} if drawn else {}
     text = yaml.safe_dump(data, sort_keys=False, default_flow_style=None, width=120, allow_unicode=True)
     found = ", ".join(f"{key} {one.value:.6g}" for key, one in result.parameters.items()) or f"tissue.map, {MAP}"
     return f"# Fitted to {printable(result.observations.name)}: {printable(found)}; more in {RECORD}.\n{text}"

@@ -39,6 +39,11 @@ class Estimate(NamedTuple):
     mesh_error: float | None
 
 
+def sixteen_bits(shares: Array) -> NDArray[np.uint16]:
+    """Turn shares, 0 to 1, into greys."""
+    return np.asarray((65535 * shares).round(), np.uint16)
+
+
 @dataclass(frozen=True, eq=False)
 class FittedMap:
     """A map of the stiffness that was found.
@@ -66,6 +71,12 @@ class FittedMap:
     def range(self) -> tuple[float, float]:
         """The smallest and the largest factor, black and white in map.png."""
         return float(self.factors.min()), float(self.factors.max())
+
+    @property
+    def grey(self) -> NDArray[np.uint16]:
+        """The picture map.png, 16 bits, shape (R, R)."""
+        low, high = self.range
+        return sixteen_bits((self.factors - low) / ((high - low) or 1.0))
 
     def as_json(self) -> dict[str, Any]:
         """Give it as plain data, as in fit.json."""
@@ -106,7 +117,7 @@ class FitResult:
         runs: how many there were.
         seconds: that they took.
         notes: what the user should know, a line each.
-        scene: the scene with the best values.
+        scene: the scene with the best values; of a map, its picture is map.png in the directory that was given.
         observations: what was seen.
         fitted: where the points are in the fitted scene, as in the observations.
         fitted_forces: the forces in the fitted scene, as in the observations [N], shape (rows, 3).

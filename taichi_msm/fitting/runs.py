@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import time
 from collections.abc import Sequence
 from concurrent.futures import Future, wait
@@ -10,10 +11,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from taichi_msm.errors import ExecutorError
+from taichi_msm.errors import DivergedError, ExecutorError, SceneError
 from taichi_msm.fitting.prediction import Job, Predicted, Predictor, predict
-from taichi_msm.physics.mesh_error import MeshEstimate, coarser, estimate_points
-from taichi_msm.progress import Progress
+from taichi_msm.physics.mesh_error import coarser, estimate_points
+from taichi_msm.physics.plan import Plan
+from taichi_msm.progress import Pause, Progress
 from taichi_msm.scenefile import budget
 from taichi_msm.scenefile.validation import checked
 from taichi_msm.sweeps.cost import PROCESS_BYTES
@@ -28,6 +30,20 @@ RUNS_EACH, WORTHWHILE = 8, 8.0
 
 # How long until the progress is told again while processes work [s].
 PATIENCE = 0.1
+
+
+def points_error(plan: Plan, pause: Pause) -> float | None:
+    """Estimate the error that the number of points makes, as a fraction of the largest displacement.
+
+    None: no tissue, too few points to tell, or no run with fewer points.
+    """
+    if coarser(plan) is None:
+        return None
+    try:
+        error = estimate_points(plan, runtime.started(), lambda done, total: pause()).error
+    except (DivergedError, SceneError):
+        return None
+    return error if math.isfinite(error) else None
 
 
 class Runs:
@@ -54,22 +70,19 @@ class Runs:
         self._seconds, self.count = time.perf_counter() - begun, self.count + 1
         return predicted
 
-    def coarse(self, x: Array) -> Predicted:
-        """Run the scene with half the cells a side; raises as `Predictor.predict` does."""
+    def coarse(self, x: Array) -> Predicted | None:
+        """Predict with half the cells a side; None where that gives no run."""
         self.count += 1
-        return self._predictor.predict(x, coarse=True, pause=self._tell)
+        return self._predictor.attempt(x, coarse=True, pause=self._tell)
 
-    def mesh_error(self, x: Array) -> MeshEstimate | None:
-        """Estimate the error that the number of points makes; None: no tissue, or too few points to tell."""
-        plan = self._predictor.plan(x)
-        if coarser(plan) is None:
-            return None
-        return estimate_points(plan, runtime.started(), lambda done, total: self._tell())
+    def mesh_error(self, x: Array) -> float | None:
+        """Estimate the error that the number of points makes, as `points_error`."""
+        return points_error(self._predictor.plan(x), self._tell)
 
     def one(self, x: Array, steps: int | None = None) -> Predicted | None:
         """Predict; None where the parameters give no run."""
         self._tell()
-        predicted = self._predictor.attempt(x, steps, self._tell)
+        predicted = self._predictor.attempt(x, steps, pause=self._tell)
         self.count += 1
         return predicted
 

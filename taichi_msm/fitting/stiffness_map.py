@@ -15,11 +15,12 @@ from taichi_msm.fitting.observations import Observations
 from taichi_msm.fitting.parameters import Bounds, rounded
 from taichi_msm.fitting.prediction import Predicted, places_at_rest, runnable
 from taichi_msm.fitting.result import FitResult, FittedMap
+from taichi_msm.fitting.runs import points_error
 from taichi_msm.fitting.sight import Sight
 from taichi_msm.fitting.suspicions import faults, faults_beside
 from taichi_msm.fitting.tikhonov import Search, Solution
 from taichi_msm.physics.adjoint import Adjoint, require_differentiable
-from taichi_msm.physics.material import map_factors
+from taichi_msm.physics.material import MapImage, map_factors
 from taichi_msm.physics.mesh_error import coarser
 from taichi_msm.physics.plan import Plan
 from taichi_msm.physics.planning import stable_step
@@ -84,8 +85,8 @@ def map_task(scene: Scene, free: Sequence[str], bounds: Mapping[str, Bounds], re
     return MapTask(resolution, (low, high))
 
 
-def fit_map(given: Scene, seen: Observations, task: MapTask, progress: Progress) -> FitResult:
-    """Find a map.
+def fit_map(given: Scene, seen: Observations, task: MapTask, image: str, progress: Progress) -> FitResult:
+    """Find a map; image: the path of its picture in the scene that is given back.
 
     Raises:
         SceneError: when the scene or what was seen cannot be used.
@@ -97,6 +98,10 @@ def fit_map(given: Scene, seen: Observations, task: MapTask, progress: Progress)
         raise SceneError(wrong)
     assert seen.sigma is not None
     low = max(task.limits[0], TAUT * plan.material.tension)
+    if low >= task.limits[1]:
+        said = f"{given.kind}.pretension leaves springs no length below {plan.material.tension:.3g}"
+        remedy = f"take a HIGH well above {low:.3g}, or less pretension"
+        raise SceneError([f"--bounds {KEY}={task.limits[0]:g},{task.limits[1]:g}: {said}; {remedy}"])
     limits = math.log(low), math.log(task.limits[1])
     fields = Fields(task.resolution, _cells(plan))
     start = np.clip(np.log(_start(plan, task.resolution)), *limits).ravel()
@@ -110,15 +115,13 @@ def fit_map(given: Scene, seen: Observations, task: MapTask, progress: Progress)
     search: Search | None = None
     tell()
     points = _first(adjoint, sight, fields, start, seen, given)
-    by_points, mesh_error = 0.0, None
+    by_points = 0.0
     if (half := coarser(plan)) is not None:
         few = Fields(task.resolution, _cells(half)).factors(start)
         other = Sight(half.scene, seen, half.grid.frames + 1)
         moved = other.points(Adjoint(half, device).run(few))
         apart = (other.seen(moved) - sight.seen(points))[seen.known] / RICHARDSON
-        by_points = float(np.sqrt(np.mean(apart**2)))
-        motion = np.linalg.norm(points - places_at_rest(seen.coordinates, given.sheet)[:, None], axis=2).max()
-        mesh_error = float(np.linalg.norm(moved - points, axis=2).max() / RICHARDSON / motion)
+        by_points = float(np.sqrt(np.nanmean(apart**2)))
     sigma = math.hypot(seen.sigma, by_points)
     search = Search(adjoint, sight, seen, sigma, fields, limits, tell)
     solution = search.best(start)
@@ -128,7 +131,9 @@ def fit_map(given: Scene, seen: Observations, task: MapTask, progress: Progress)
     left = (fitted - seen.values)[seen.known]
     tissue = given.tissue
     assert tissue is not None
-    drawn = StiffnessMap(image=FittedMap.FILE, range=found.range)
+    drawn = StiffnessMap(image=image, range=found.range)
+    scene = given.model_copy(update={"tissue": tissue.model_copy(update={"map": drawn})})
+    mapped = checked(runnable(scene), {**plan.maps, "map": MapImage(found.grey, "")})
     return FitResult(
         parameters={},
         correlation=[],
@@ -140,11 +145,11 @@ def fit_map(given: Scene, seen: Observations, task: MapTask, progress: Progress)
         degrees_of_freedom=left.size,
         identifiable=not found.unknown.any(),
         unseen=[],
-        mesh_error=mesh_error,
+        mesh_error=points_error(mapped, tell),
         runs=search.runs + 1,
         seconds=0.0,
         notes=list(_notes(seen, solution, found, by_points, limits)),
-        scene=given.model_copy(update={"tissue": tissue.model_copy(update={"map": drawn})}),
+        scene=scene,
         observations=seen,
         fitted=fitted,
         fitted_forces=np.empty((0, 3)),

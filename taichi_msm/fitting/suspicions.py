@@ -61,19 +61,27 @@ def faults_beside(seen: Observations, scene: Scene, first: Predicted) -> Iterato
             f"{1000 * whole:.3g} mm, and at these times by {1000 * observed:.3g} mm; observe between "
             f"{moving[0]:g} and {moving[-1]:g} s too"
         )
+    if lost := int((seen.known & ~np.isfinite(first.values)).any(axis=(1, 2)).sum()):
+        said = "are behind the eye of the scene's camera, or beyond its lens, where the search begins"
+        remedy = "give the scene the camera that saw them, or NaN in their place"
+        yield f"{seen.name}: {seen.kind}: {lost} of the points that were seen {said}; {remedy}"
+        return
     yield from _elsewhere(seen, scene, first)
 
 
 def moved(seen: Observations, scene: Scene) -> float:
     """Give the motion of the point that moves most: root mean square over time, or from rest [m] or [px]."""
-    return float(np.sqrt(np.nanmean(_motion(seen, scene) ** 2, axis=(1, 2)).max()))
+    motion = _motion(seen, scene)
+    return float(np.sqrt(np.nanmean(motion**2, axis=(1, 2)).max())) if len(motion) else math.inf
 
 
 def _motion(seen: Observations, scene: Scene) -> Array:
     """Give the points that were seen from their means in time, or, if each was seen once, from rest."""
     known = seen.there.any(axis=1)
     values, several = seen.values[known], seen.there.sum(axis=1).max() > 1
-    return values - (np.nanmean(values, axis=1, keepdims=True) if several else seen_at_rest(scene, seen)[known])
+    motion = values - (np.nanmean(values, axis=1, keepdims=True) if several else seen_at_rest(scene, seen)[known])
+    # At rest a camera may not see all of them.
+    return motion[np.isfinite(motion).any(axis=(1, 2))]
 
 
 def _is_still(seen: Observations, scene: Scene) -> bool:

@@ -24,6 +24,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from taichi_msm.errors import SceneError
 from taichi_msm.fitting.fields import Fields
 from taichi_msm.fitting.observations import Observations
 from taichi_msm.fitting.sight import Sight
@@ -141,7 +142,11 @@ class Search:
         self._tell()
         self.runs += 1
         points = self._sight.points(self._adjoint.run(self._fields.factors(x)))
-        return points, self._sight.seen(points)
+        predicted = self._sight.seen(points)
+        if not np.isfinite(predicted[self._seen.known]).all():
+            said = "a point that was seen gets behind the eye of the camera with some maps"
+            raise SceneError([f"{self._seen.name}: pixel: {said}; give NaN in its place, or narrower --bounds"])
+        return points, predicted
 
     def misfit(self, x: Array) -> tuple[float, Array]:
         """Give chi-square and its derivative by x."""

@@ -16,8 +16,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from taichi_msm.fitting.estimation import FAR, Misfit, Scales, Solution
-from taichi_msm.fitting.observations import Observations
+from taichi_msm.fitting.estimation import Misfit, Scales, Solution
 
 Array = NDArray[np.float64]
 
@@ -81,34 +80,28 @@ class Uncertainty:
         return seen @ np.linalg.lstsq(self.weighted @ seen, rows, rcond=None)[0]
 
 
-def uncertainty(
-    misfit: Misfit, seen: Observations, solution: Solution, derivatives: Array, alike: Array | None, *, robust: bool
-) -> Uncertainty:
+def uncertainty(misfit: Misfit, solution: Solution, derivatives: Array, correlation: float | None) -> Uncertainty:
     """Work out the uncertainty of a solution.
 
     Args:
-        misfit: of what was seen.
-        seen: what was seen.
+        misfit: that was minimised.
         solution: the best values.
         derivatives: of what is predicted by x, shape (numbers, parameters).
-        alike: K for every two points, shape (N, N); None: errors are independent.
-        robust: whether what is far off counts less.
+        correlation: how far apart errors of tracks are alike [px]; None: they are independent.
     """
     parameters = len(solution.x)
     freedom = max(1, sum(misfit.count) - parameters)
     scales = solution.scales
-    if seen.sigma is None:
-        found = misfit.sigma(solution.predicted, parameters, robust=robust)
-        scales = scales._replace(values=max(found, np.finfo(float).tiny))
-    left = misfit.divided(misfit.of(solution.predicted), scales)
-    slope = misfit.divided(derivatives, scales)
-    far = 1 + (left / FAR) ** 2 if robust else np.ones_like(left)
+    if misfit.seen.sigma is None:
+        scales = scales._replace(values=misfit.sigma(solution.predicted, parameters))
+    left, slope = misfit.residuals(solution.predicted, scales), misfit.divided(derivatives, scales)
+    far = misfit.far(left)
     weighted = slope * far[:, None] ** (-0.75)
     factor = max(1.0, float(np.sum(left**2 / far)) / freedom / float(np.mean(far**-1.5)))
     singular = np.linalg.svd(weighted, full_matrices=False)
     blind = UNSEEN * max(1.0, singular.S[0]) >= singular.S
     held = np.where(blind, UNSEEN, singular.S)
-    middle = weighted.T @ weighted if alike is None else _with_neighbours(seen, misfit, slope, alike)
+    middle = weighted.T @ weighted if correlation is None else _with_neighbours(misfit, slope, correlation)
     # In the singular directions; those that are not seen at all have an error, as if they were just seen.
     values, vectors = np.linalg.eigh(factor * singular.Vh @ middle @ singular.Vh.T + np.diag(blind * held**2))
     root = singular.Vh.T @ (held[:, None] ** -2 * vectors * np.sqrt(np.maximum(values, 0.0)))
@@ -117,19 +110,18 @@ def uncertainty(
     return Uncertainty(scales, factor, freedom, left, weighted, singular.Vh.T, root, wider)
 
 
-def likeness(pixels: Array, correlation: float) -> Array:
-    """Tell how alike the errors of two tracks are, by where they are in the picture [px]; shape (N, N)."""
+def _with_neighbours(misfit: Misfit, slope: Array, correlation: float) -> Array:
+    """Give J^T K J, frame by frame and coordinate by coordinate; forces are independent."""
     from scipy.spatial.distance import cdist
 
-    return np.exp(-cdist(pixels, pixels) / correlation)
-
-
-def _with_neighbours(seen: Observations, misfit: Misfit, slope: Array, alike: Array) -> Array:
-    """Give J^T K J, frame by frame and coordinate by coordinate; forces are independent."""
-    values = misfit.count[0]
+    values, seen = misfit.count[0], misfit.seen
+    # Tracks are where they were seen on the mean; those that never were have no errors.
+    ever = seen.there.any(axis=1)
+    pixels = np.nanmean(seen.values[ever], axis=1)
+    alike = np.exp(-cdist(pixels, pixels) / correlation)
     whole = np.zeros((*seen.values.shape, slope.shape[1]))
     whole[seen.known] = slope[:values]
-    total = slope[values:].T @ slope[values:]
+    whole, total = whole[ever], slope[values:].T @ slope[values:]
     for frame in range(whole.shape[1]):
         for coordinate in range(whole.shape[2]):
             one = whole[:, frame, coordinate]
