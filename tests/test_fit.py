@@ -17,8 +17,9 @@ from taichi_msm import ArgumentError, SceneError, Simulation, fit, load_scene, r
 from taichi_msm.fitting.arguments import Method
 from taichi_msm.fitting.observations import read_observations
 from taichi_msm.fitting.parameters import make_parameters
-from taichi_msm.fitting.prediction import Job, Predictor, runnable, seen_by_camera
+from taichi_msm.fitting.prediction import Job, Predictor, runnable
 from taichi_msm.fitting.result import FitResult
+from taichi_msm.fitting.sight import seen_by_camera
 from taichi_msm.fitting.suspicions import MOVES, faults, moved
 from taichi_msm.physics.deformed import on_surface, surface_weights, touched
 from taichi_msm.scene import Scene

@@ -1,14 +1,13 @@
 """What a scene with certain numbers lets one see: where the observed points are at the observed times, and the forces.
 
-Points lie on the surface that is drawn, so each is a weighted mean of the four mass points around it; between frames
-they, and the forces, go in straight lines. All runs are in f64 on one compiled kernel.
+All runs are in f64 on one compiled kernel.
 """
 
 from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import NamedTuple, cast
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,12 +15,11 @@ from numpy.typing import NDArray
 from taichi_msm.errors import DivergedError, SceneError
 from taichi_msm.fitting.observations import Observations
 from taichi_msm.fitting.parameters import Parameter, as_data, with_values
-from taichi_msm.physics.deformed import surface_weights
+from taichi_msm.fitting.sight import Sight, between, in_frames
 from taichi_msm.physics.mesh_error import coarser
 from taichi_msm.physics.plan import Plan
 from taichi_msm.progress import Pause
-from taichi_msm.render.camera import view
-from taichi_msm.scene import Scene, Sheet
+from taichi_msm.scene import Scene
 from taichi_msm.scenefile.validation import checked
 from taichi_msm.simulation import Simulation
 
@@ -72,11 +70,9 @@ class Predictor:
         plan = checked(job.scene)
         self._maps, self._threads = plan.maps, threads
         self._simulation: Simulation | None = None
-        # Times in frames, without the rounding of their product.
-        rate, seen = plan.grid.frames_per_second, job.observations
-        self._place = np.round(seen.time * rate, 6)
-        self._force_place = np.round((seen.forces.time if seen.forces else np.empty(0)) * rate, 6)
-        self._last = math.ceil(max(1.0, *self._place, *self._force_place))
+        seen = job.observations
+        times = seen.time if seen.forces is None else np.concatenate([seen.time, seen.forces.time])
+        self._frames = max(2, math.ceil(in_frames(job.scene, times).max()) + 1)
 
     def predict(
         self,
@@ -138,23 +134,19 @@ class Predictor:
     def _run(self, simulation: Simulation, plan: Plan, whole: bool, pause: Pause) -> Predicted:
         seen, scene = self.job.observations, plan.scene
         # A coarse run has other points than the others.
-        corners, weights = surface_weights(seen.coordinates, scene.sheet, scene.render.refine)
-        points, forces = [], []
-        for frame in range((plan.grid.frames if whole else self._last) + 1):
+        sight, points, forces = Sight(scene, seen, self._frames), [], []
+        for frame in range(max(self._frames, plan.grid.frames + 1) if whole else self._frames):
             simulation.advance(min(frame, 1), pause)
-            position = simulation.positions().reshape(-1, 3)
-            points.append(np.einsum("nk,nkc->nc", weights, position[corners]))
+            points.append(sight.on_sheet(simulation.positions()))
             if seen.forces is not None:
                 forces.append([one.force for one in simulation.forces()])
-        rest = places_at_rest(seen.coordinates, scene.sheet)
-        motion = np.linalg.norm(np.array(points) - rest, axis=2).max(axis=1)
-        values = between(np.array(points), self._place).swapaxes(0, 1)
-        if seen.kind == "pixel":
-            values = seen_by_camera(scene, values, seen.time)
-        felt = np.empty((0, 3))
+        values, felt = sight.seen(sight.at_times(np.array(points[: self._frames]))), np.empty((0, 3))
         if seen.forces is not None:
-            felt = between(np.array(forces), self._force_place)[np.arange(len(self._force_place)), seen.forces.probe]
-        return Predicted(values, felt, plan.grid.steps_per_frame, motion)
+            rows, probes = len(seen.forces.time), len(scene.probes)
+            shares = between(scene, seen.forces.time, self._frames)
+            every = shares @ np.array(forces[: self._frames]).reshape(self._frames, -1)
+            felt = every.reshape(rows, probes, 3)[np.arange(rows), seen.forces.probe]
+        return Predicted(values, felt, plan.grid.steps_per_frame, sight.motion(np.array(points)))
 
     def close(self) -> None:
         """Free the memory."""
@@ -174,35 +166,6 @@ def _with_margin(plan: Plan) -> int:
     """Count the steps of a frame for this scene and for those with slightly other values."""
     frame = 1 / plan.grid.frames_per_second
     return math.ceil(2 * frame / plan.stable_step * (1 + difference(plan.scene)))
-
-
-def between(frames: Array, place: Array) -> Array:
-    """Interpolate what is given for each frame, shape (frames, ...), linearly at places between them."""
-    from scipy.interpolate import make_interp_spline
-
-    return cast("Array", make_interp_spline(np.arange(len(frames)), frames, k=1)(place))
-
-
-def places_at_rest(coordinates: Array, sheet: Sheet) -> Array:
-    """Give where points are at rest [m], shape (N, 3)."""
-    height, width = sheet.size
-    across, down = coordinates.T
-    return np.stack([(across - 0.5) * width, (0.5 - down) * height, np.zeros_like(across)], axis=1)
-
-
-def seen_by_camera(scene: Scene, points: Array, time: Array) -> Array:
-    """Find where the scene's main camera sees points [m], shape (N, T, 3), at T times [s].
-
-    Returns pixels from the picture's upper left corner, shape (N, T, 2); NaN: behind the eye, or beyond the lens.
-    """
-    seen = [view(scene, each).pixels(points[:, n]) for n, each in enumerate(time.tolist())]
-    return np.stack(seen, axis=1)
-
-
-def seen_at_rest(scene: Scene, seen: Observations) -> Array:
-    """Give what would be seen if the sheet stayed at rest, shape (N, T, 3 or 2)."""
-    rest = np.repeat(places_at_rest(seen.coordinates, scene.sheet)[:, None], len(seen.time), axis=1)
-    return rest if seen.kind == "position" else seen_by_camera(scene, rest, seen.time)
 
 
 # The predictor of the job that this process was given last.

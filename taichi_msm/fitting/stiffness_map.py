@@ -13,7 +13,7 @@ from taichi_msm.errors import SceneError
 from taichi_msm.fitting.fields import Fields, centres
 from taichi_msm.fitting.observations import Observations
 from taichi_msm.fitting.parameters import Bounds, rounded
-from taichi_msm.fitting.prediction import Predicted, places_at_rest, runnable
+from taichi_msm.fitting.prediction import Predicted, runnable
 from taichi_msm.fitting.result import FitResult, FittedMap
 from taichi_msm.fitting.runs import points_error
 from taichi_msm.fitting.sight import Sight
@@ -174,11 +174,9 @@ def _unusable(seen: Observations, scene: Scene, task: MapTask) -> Iterator[str]:
 def _first(adjoint: Adjoint, sight: Sight, fields: Fields, start: Array, seen: Observations, given: Scene) -> Array:
     """Give where the points are at the start [m], shape (N, T, 3); SceneError: what was seen is beside that."""
     position = adjoint.run(fields.factors(start))
-    every = Sight(given, replace(seen, time=np.arange(len(position)) / given.time.frames_per_second), len(position))
-    rest = places_at_rest(seen.coordinates, given.sheet)[:, None]
-    motion = np.linalg.norm(every.points(position) - rest, axis=2).max(axis=0)
-    points = sight.points(position)
-    first = Predicted(sight.seen(points), np.empty((0, 3)), 0, motion)
+    at_frames = np.array([sight.on_sheet(frame) for frame in position])
+    points = sight.at_times(at_frames)
+    first = Predicted(sight.seen(points), np.empty((0, 3)), 0, sight.motion(at_frames))
     if wrong := list(faults_beside(seen, given, first)):
         raise SceneError(wrong)
     return points

@@ -9,7 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from taichi_msm.fitting.observations import Observations
-from taichi_msm.fitting.prediction import Predicted, places_at_rest, seen_at_rest
+from taichi_msm.fitting.prediction import Predicted
+from taichi_msm.fitting.sight import places_at_rest, seen_at_rest
 from taichi_msm.scene import WHOLE, Scene
 
 Array = NDArray[np.float64]
@@ -109,7 +110,7 @@ def _times(time: Array, name: str, scene: Scene) -> Iterator[str]:
 def _units(seen: Observations, scene: Scene) -> Iterator[str]:
     """Compare how wide the points are spread with how wide they are at rest."""
     known = seen.there
-    rest = places_at_rest(seen.coordinates, scene.sheet)[known.any(axis=1)]
+    rest = places_at_rest(scene, seen)[known.any(axis=1)]
     if seen.kind != "position" or len(rest) < 2:
         return
     values = seen.values[known.any(axis=1)]

@@ -55,14 +55,8 @@ def surface_weights(coordinates: Array, sheet: Sheet, refine: int) -> tuple[NDAr
     coordinates: across and down, shape (N, 2). The points are numbered row after row; the same place on the surface as
     that of `on_surface`.
     """
-    (rows, cols), parts = sheet.points, refine + 1
-    place = coordinates * (cols - 1, rows - 1)
-    j, i = np.minimum(place.astype(int), (cols - 2, rows - 2)).T
-    s, t = place[:, 0] - j, place[:, 1] - i
-    column, line = (np.minimum((share * parts).astype(int), parts - 1) / parts for share in (s, t))
-    s1, t1 = s - column, t - line
-    # In the small quad, s t is replaced by a function that is linear on either side of the diagonal.
-    twist = column * line + s1 * line + column * t1 + np.minimum(s1, t1) / parts
+    cols = sheet.points[1]
+    i, j, s, t, twist = _in_cells(coordinates, sheet.points, refine)
     first = i * cols + j
     corners = np.stack([first, first + 1, first + cols, first + cols + 1], axis=1)
     return corners, np.stack([1 - s - t + twist, s - twist, t - twist, twist], axis=1)
@@ -70,14 +64,23 @@ def surface_weights(coordinates: Array, sheet: Sheet, refine: int) -> tuple[NDAr
 
 def _on_cells(position: NDArray[np.floating], refine: int, coordinates: Array) -> tuple[Array, Array]:
     """Give the points at some coordinates, and normals of their cells there, of any length; both of shape (n, 3)."""
-    (rows, cols), parts = position.shape[:2], refine + 1
-    s, t = (coordinates * (cols - 1, rows - 1)).T[..., None]
-    j, i = np.minimum(s.astype(int), cols - 2), np.minimum(t.astype(int), rows - 2)
-    a, right, below, far = (position[i[:, 0] + n // 2, j[:, 0] + n % 2].astype(np.float64) for n in range(4))
+    rows, cols = position.shape[:2]
+    i, j, *shares = _in_cells(coordinates, (rows, cols), refine)
+    s, t, twist = (share[:, None] for share in shares)
+    a, right, below, far = (position[i + n // 2, j + n % 2].astype(np.float64) for n in range(4))
     b, c, d = right - a, below - a, far - right - below + a
+    return a + b * s + c * t + d * twist, np.cross(b + d * t, -(c + d * s))
+
+
+def _in_cells(coordinates: Array, points: tuple[int, int], refine: int) -> tuple[NDArray[Any], ...]:
+    """Give the row i and the column j of each coordinate's cell, s and t across and down in it, and a twist.
+
+    That takes the place of s t: in a small quad of the refined surface it is linear on either side of the diagonal.
+    """
+    (rows, cols), parts = points, refine + 1
+    s, t = (coordinates * (cols - 1, rows - 1)).T
+    j, i = np.minimum(s.astype(int), cols - 2), np.minimum(t.astype(int), rows - 2)
     s, t = s - j, t - i
-    normal = np.cross(b + d * t, -(c + d * s))
     s0, t0 = (np.minimum((each * parts).astype(int), parts - 1) / parts for each in (s, t))
     s1, t1 = s - s0, t - t0
-    # In the small quad, D s t is replaced by a function that is linear on either side of the diagonal.
-    return a + b * s + c * t + d * (s0 * t0 + s1 * t0 + s0 * t1 + np.minimum(s1, t1) / parts), normal
+    return i, j, s, t, s0 * t0 + s1 * t0 + s0 * t1 + np.minimum(s1, t1) / parts
