@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     )
     from taichi_msm.exports.convert import export
     from taichi_msm.fitting.fit import fit
-    from taichi_msm.fitting.result import FitResult
+    from taichi_msm.fitting.result import FitResult, FittedMap
     from taichi_msm.gradients import Gradient, gradient
     from taichi_msm.physics.state import TipForce
     from taichi_msm.playback import Playback
@@ -58,7 +58,7 @@ _HOMES = {
     "Playback": "playback",
     "TipForce": "physics.state",
     "Simulation": "simulation",
-    "FitResult": "fitting.result",
+    **dict.fromkeys(("FitResult", "FittedMap"), "fitting.result"),
     "Surface": "render.surface",
     "Outcome": "sweeps.outcome",
     "export": "exports.convert",
@@ -75,6 +75,7 @@ __all__ = [
     "DivergedError",
     "FilesError",
     "FitResult",
+    "FittedMap",
     "Flow",
     "Foundation",
     "Gradient",

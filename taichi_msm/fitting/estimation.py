@@ -2,8 +2,8 @@
 
 The trust region method of SciPy, with differences of runs as derivatives: forward ones on the way, central ones where
 it ends. What is minimised is the sum of rho(r^2) over all r = (predicted - seen) / sigma, with rho(z) = z, or for
-robust fits SciPy's soft_l1, under which a number that is far off counts by |r|. Where sigma is not known, it is found
-in turn with the parameters.
+robust fits SciPy's soft_l1, under which a number that is far off counts by |r|. Beside forces and in robust fits, a
+sigma that is not known is found in turn with the parameters.
 """
 
 from __future__ import annotations
@@ -114,9 +114,8 @@ class Misfit:
     def sigma(self, predicted: Predicted, parameters: int) -> float:
         """Estimate the standard deviation of the values' errors from what is left of them, at least LEAST_SIGMA."""
         left = self.of(predicted)[: self.count[0]]
-        found = PER_MEDIAN * np.median(np.abs(left)) if self.robust else 0.0
-        if not self.robust:
-            found = np.sqrt(np.sum(left**2) / max(1, len(left) - parameters))
+        mean_square = np.sum(left**2) / max(1, len(left) - parameters)
+        found = PER_MEDIAN * np.median(np.abs(left)) if self.robust else np.sqrt(mean_square)
         return max(float(found), LEAST_SIGMA * self.motion)
 
 

@@ -17,7 +17,7 @@ from taichi_msm.fitting.uncertainty import NOT_SEEN, Uncertainty
 
 Array = NDArray[np.float64]
 
-# A parameter is not identifiable if its standard error is above this share of its value.
+# A parameter is not identifiable if its standard error is above this share of its value, of a place of its range.
 MOST_ERROR = 1.0
 
 # Parameters whose part in a direction is above this belong to it.

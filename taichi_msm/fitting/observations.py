@@ -79,9 +79,17 @@ def read_observations(observed: str | Path | Mapping[str, Any], rate: float) -> 
     return _checked(str(observed), _arrays(str(observed)), rate)
 
 
-def with_sigma(seen: Observations, sigma: float | None) -> Observations:
-    """Give the errors another standard deviation, unless that is None."""
-    return seen if sigma is None else replace(seen, sigma=_as_sigma(seen.name, sigma, seen.unit))
+def with_sigma(seen: Observations, sigma: Any) -> Observations:
+    """Give the errors another standard deviation, unless that is None; SceneError: it is none."""
+    if sigma is None:
+        return seen
+    array = np.asarray(sigma)
+    is_number = array.dtype.kind in "fiu" and array.size == 1
+    if not (is_number and 0 < (value := float(array.ravel()[0])) < math.inf):
+        shown = f"{value:g}" if is_number else f"{array.dtype} of shape {array.shape}"
+        said = f"take one number above 0, the standard deviation of the errors [{seen.unit}], or leave it out"
+        raise SceneError([f"{seen.name}: sigma: {shown}; {said}"])
+    return replace(seen, sigma=value)
 
 
 def _arrays(name: str) -> dict[str, NDArray[Any]]:
@@ -135,18 +143,7 @@ def _checked(name: str, arrays: dict[str, NDArray[Any]], rate: float) -> Observa
     if not np.isfinite(values).any():
         why = "is NaN or occluded"
         raise SceneError([f"{name}: every one of the {points} points {why} at all {times} times; nothing was seen"])
-    unit = "m" if kind == "position" else "px"
-    sigma = arrays.get("sigma")
-    return Observations(name, kind, time, coordinates, values, None if sigma is None else _as_sigma(name, sigma, unit))
-
-
-def _as_sigma(name: str, sigma: Any, unit: str) -> float:
-    array = np.asarray(sigma)
-    if array.dtype.kind not in "fiu" or array.size != 1 or not 0 < float(array.ravel()[0]) < math.inf:
-        shown = f"{float(array.ravel()[0]):g}" if array.size == 1 and array.dtype.kind in "fiu" else str(array.shape)
-        said = f"take one number above 0, the standard deviation of the errors [{unit}], or leave it out"
-        raise SceneError([f"{name}: sigma: {shown}; {said}"])
-    return float(array.ravel()[0])
+    return with_sigma(Observations(name, kind, time, coordinates, values, None), arrays.get("sigma"))
 
 
 def _in_one_form(arrays: dict[str, NDArray[Any]], rate: float) -> dict[str, NDArray[Any]]:

@@ -80,13 +80,13 @@ def _scene_text(result: FitResult, folder: Path) -> str:
             names[path] = f"{PICTURES}/{name}"
         return names[path]
 
-    scene, drawn = result.scene, {}
-    if result.map is not None and scene.tissue is not None and scene.tissue.map is not None:
-        # This is no copy; another picture may have its name.
-        drawn = {"map": {"image": MAP, "range": list(scene.tissue.map.range)}}
+    scene = result.scene
+    if result.map is not None and scene.tissue is not None:
+        # The map that was found is no copy; another picture may have its name.
         scene = scene.model_copy(update={"tissue": scene.tissue.model_copy(update={"map": None})})
     data = scene.with_pictures(copied).model_dump(mode="json", exclude_none=True)
-    data |= {"tissue": data["tissue"] | drawn} if drawn else {}
+    if result.map is not None:
+        data["tissue"]["map"] = {"image": MAP, "range": list(result.map.range)}
     text = yaml.safe_dump(data, sort_keys=False, default_flow_style=None, width=120, allow_unicode=True)
     found = ", ".join(f"{key} {one.value:.6g}" for key, one in result.parameters.items()) or f"tissue.map, {MAP}"
     return f"# Fitted to {printable(result.observations.name)}: {printable(found)}; more in {RECORD}.\n{text}"

@@ -27,7 +27,7 @@ class Estimate(NamedTuple):
         standard_error: of the value.
         interval: both ends of the 95 % interval; None: there is none within the bounds.
         start: where the search began.
-        identifiable: whether the standard error is at most the value.
+        identifiable: whether the standard error is at most the value, or of a place or a time its range.
         mesh_error: how far, about, the number of points moves the value; None: not known.
     """
 
@@ -110,7 +110,7 @@ class FitResult:
         sigma: the standard deviation of the coordinates, as given, else as found.
         unit: of residual and sigma, m or px.
         chi_square: the sum of (predicted - seen)^2 / sigma^2, where sigma is given.
-        degrees_of_freedom: how many numbers were seen, less the parameters.
+        degrees_of_freedom: how many numbers were seen, less the parameters, but not less the fields of a map.
         identifiable: whether all parameters are.
         unseen: the combinations of parameters that the data cannot tell.
         mesh_error: of the fitted scene, as a fraction of its largest displacement; None: not known.

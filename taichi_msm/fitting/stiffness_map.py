@@ -125,14 +125,13 @@ def fit_map(given: Scene, seen: Observations, task: MapTask, image: str, progres
     sigma = math.hypot(seen.sigma, by_points)
     search = Search(adjoint, sight, seen, sigma, fields, limits, tell)
     solution = search.best(start)
-    side = task.resolution, task.resolution
-    found = FittedMap(np.exp(solution.x).reshape(side), solution.errors.reshape(side), solution.choice, sigma)
+    factors, errors = (each.reshape(task.resolution, -1) for each in (np.exp(solution.x), solution.errors))
+    found = FittedMap(factors, errors, solution.choice, sigma)
     fitted = search.predict(solution.x)[1]
     left = (fitted - seen.values)[seen.known]
-    tissue = given.tissue
-    assert tissue is not None
-    drawn = StiffnessMap(image=image, range=found.range)
-    scene = given.model_copy(update={"tissue": tissue.model_copy(update={"map": drawn})})
+    assert given.tissue is not None
+    drawn = {"map": StiffnessMap(image=image, range=found.range)}
+    scene = given.model_copy(update={"tissue": given.tissue.model_copy(update=drawn)})
     mapped = checked(runnable(scene), {**plan.maps, "map": MapImage(found.grey, "")})
     return FitResult(
         parameters={},

@@ -169,15 +169,12 @@ class Search:
         return Solution(x, near.errors(before, self._rough), near.excess, choice._replace(weight=before))
 
     def _linear(self, x: Array) -> Linear:
-        """Find the differences that the fields make."""
+        """Find the differences that the fields make: J, which takes 8 bytes for each field and number that was seen."""
         known, before = self._seen.known, self.predict(x)[1]
-        columns = []
-        for n in range(len(x)):
-            beside = x.copy()
-            beside[n] += DIFFERENCE
-            columns.append((self.predict(beside)[1] - before)[known])
-        jacobian = np.stack(columns, axis=1) / (DIFFERENCE * self._sigma)
         left = (before - self._seen.values)[known] / self._sigma
+        jacobian = np.empty((left.size, len(x)))
+        for n, change in enumerate(DIFFERENCE * np.eye(len(x))):
+            jacobian[:, n] = (self.predict(x + change)[1] - before)[known] / (DIFFERENCE * self._sigma)
         told, slope = jacobian.T @ jacobian, jacobian.T @ left
         least = float(left @ left - slope @ np.linalg.pinv(told, hermitian=True) @ slope)
         excess = max(1.0, least / max(1, left.size - len(x)))
