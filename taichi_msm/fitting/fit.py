@@ -164,7 +164,6 @@ def _fit(runs: Runs, given: Scene, method: Method) -> FitResult:
         unseen=blind,
         mesh_error=mesh,
         runs=runs.count,
-        seconds=0.0,
         notes=[
             *notes.of_the_search(solution, parameters, fits=search.fits(solution)),
             *notes.of_the_points(parameters, solution.x, uncertain, shifts),

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -113,12 +113,10 @@ class Predictor:
         self._simulation = Simulation(self.plan(x), threads=self._threads)
         self._simulation.compile(pause)
 
-    def attempt(
-        self, x: Array, steps: int | None = None, *, coarse: bool = False, pause: Pause = lambda: None
-    ) -> Predicted | None:
+    def attempt(self, x: Array, steps: int | None = None, **how: Any) -> Predicted | None:
         """Predict; None where the values give no run, or a point that was seen would be behind the eye."""
         try:
-            predicted = self.predict(x, steps, coarse=coarse, pause=pause)
+            predicted = self.predict(x, steps, **how)
         except (SceneError, DivergedError):
             return None
         return predicted if np.isfinite(predicted.values[self.job.observations.known]).all() else None
@@ -142,10 +140,9 @@ class Predictor:
                 forces.append([one.force for one in simulation.forces()])
         values, felt = sight.seen(sight.at_times(np.array(points[: self._frames]))), np.empty((0, 3))
         if seen.forces is not None:
-            rows, probes = len(seen.forces.time), len(scene.probes)
-            shares = between(scene, seen.forces.time, self._frames)
+            rows, shares = len(seen.forces.time), between(scene, seen.forces.time, self._frames)
             every = shares @ np.array(forces[: self._frames]).reshape(self._frames, -1)
-            felt = every.reshape(rows, probes, 3)[np.arange(rows), seen.forces.probe]
+            felt = every.reshape(rows, -1, 3)[np.arange(rows), seen.forces.probe]
         return Predicted(values, felt, plan.grid.steps_per_frame, sight.motion(np.array(points)))
 
     def close(self) -> None:

@@ -98,7 +98,7 @@ class FittedMap:
         return f"tissue.map: {size} x {size} fields, {low:.3g} to {high:.3g} times young, {errors}"
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, kw_only=True)
 class FitResult:
     """What a fit found.
 
@@ -126,25 +126,25 @@ class FitResult:
         map: the map that was fitted, in the place of parameters; None: numbers were.
     """
 
-    parameters: dict[str, Estimate]
-    correlation: list[list[float]]
+    parameters: dict[str, Estimate] = field(default_factory=dict)
+    correlation: list[list[float]] = field(default_factory=list)
     residual: float
-    residual_force: float | None
+    residual_force: float | None = None
     sigma: float
     unit: str
     chi_square: float | None
     degrees_of_freedom: int
     identifiable: bool
-    unseen: list[Unseen]
+    unseen: list[Unseen] = field(default_factory=list)
     mesh_error: float | None
     runs: int
-    seconds: float
+    seconds: float = 0.0
     notes: list[str]
     scene: Scene = field(repr=False)
     observations: Observations = field(repr=False)
     fitted: Array = field(repr=False)
-    fitted_forces: Array = field(repr=False)
-    curves: dict[str, list[Place]] = field(repr=False)
+    fitted_forces: Array = field(repr=False, default_factory=lambda: np.empty((0, 3)))
+    curves: dict[str, list[Place]] = field(repr=False, default_factory=dict)
     map: FittedMap | None = None
 
     def as_json(self) -> dict[str, Any]:

@@ -134,25 +134,18 @@ def fit_map(given: Scene, seen: Observations, task: MapTask, image: str, progres
     scene = given.model_copy(update={"tissue": given.tissue.model_copy(update=drawn)})
     mapped = checked(runnable(scene), {**plan.maps, "map": MapImage(found.grey, "")})
     return FitResult(
-        parameters={},
-        correlation=[],
         residual=float(np.sqrt(np.mean(left**2))),
-        residual_force=None,
         sigma=seen.sigma,
         unit=seen.unit,
         chi_square=float(np.sum((left / seen.sigma) ** 2)),
         degrees_of_freedom=left.size,
         identifiable=not found.unknown.any(),
-        unseen=[],
         mesh_error=points_error(mapped, tell),
         runs=search.runs + 1,
-        seconds=0.0,
         notes=list(_notes(seen, solution, found, by_points, limits)),
         scene=scene,
         observations=seen,
         fitted=fitted,
-        fitted_forces=np.empty((0, 3)),
-        curves={},
         map=found,
     )
 
@@ -217,10 +210,9 @@ def _notes(
     if (unknown := int(found.unknown.sum())) > 0:
         yield f"{unknown} of {found.factors.size} fields are unknown: nothing moves there that would tell; press there"
     if by_points > seen.sigma / 2:
-        said = (
-            f"about {rounded(by_points)} {seen.unit}, and sigma is {rounded(seen.sigma)}: the map is as smooth as both"
-        )
-        yield f"the number of points changes what is seen by {said} require; take more sheet.points"
+        said = f"about {rounded(by_points)} {seen.unit}, and sigma is {rounded(seen.sigma)}"
+        remedy = "the map is as smooth as both require; take more sheet.points"
+        yield f"the number of points changes what is seen by {said}: {remedy}"
     if solution.excess > 1.5:
         times = rounded(math.sqrt(solution.excess))
         yield f"what is left is {times} times what is expected with any map, and the errors are widened by as much"
