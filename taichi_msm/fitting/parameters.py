@@ -100,7 +100,7 @@ def make_parameters(scene: Scene, free: Sequence[str], bounds: Mapping[str, Boun
     data, faults, parameters = as_data(scene), [], []
     if not free:
         faults.append("--free: names no key; take one or more, such as --free tissue.young")
-    for key in dict.fromkeys(free):
+    for key in free:
         try:
             parameters.append(_parameter(scene, data, key, bounds.get(key)))
         except SceneError as error:

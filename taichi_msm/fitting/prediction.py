@@ -47,10 +47,6 @@ class Job:
     parameters: tuple[Parameter, ...]
     observations: Observations
 
-    def values(self, x: Array) -> Array:
-        """Give the values of the parameters at x."""
-        return np.array([one.value(each) for one, each in zip(self.parameters, x.tolist(), strict=True)])
-
 
 def runnable(scene: Scene) -> Scene:
     """Give the scene that is run for a fit: in f64, and without anything that is drawn or written."""
@@ -123,10 +119,10 @@ class Predictor:
 
     def plan(self, x: Array) -> Plan:
         """Plan the scene with the parameters at x; SceneError: it is not valid."""
-        values = self.job.values(x)
+        values = [one.value(each) for one, each in zip(self.job.parameters, x.tolist(), strict=True)]
         if not np.isfinite(values).all():
             raise SceneError(["the values are out of range"])
-        data = with_values(self._data, self.job.parameters, values.tolist())
+        data = with_values(self._data, self.job.parameters, values)
         return checked(Scene(**data), self._maps)
 
     def _run(self, simulation: Simulation, plan: Plan, whole: bool, pause: Pause) -> Predicted:
