@@ -194,12 +194,18 @@ def test_the_mesh_error_is_that_of_the_map_that_was_found(result: FitResult, fol
     assert result.mesh_error != pytest.approx(even, rel=1e-2)
 
 
-def test_points_that_get_behind_the_eye_are_refused(device: Device) -> None:
+def test_points_behind_the_eye_are_refused(device: Device) -> None:
     low = scene(render={"camera": {"eye": [0, -0.02, 0.01], "target": [0, 0.05, 0]}})
     pixel = np.full((len(PLACES), 1, 2), 100.0)
     seen = {"time": [1.0], "coordinates": PLACES, "pixel": pixel, "sigma": 1.0}
     with pytest.raises(SceneError, match="of the points that were seen are behind the eye of the scene's camera"):
         fit(low, seen, ["tissue.map"], resolution=2)
+    # As where they get there while the map changes.
+    there = read_observations(seen, 1)
+    plan, fields = checked(low), Fields(2, (8, 8))
+    search = Search(Adjoint(plan, device), Sight(plan.scene, there, 3), there, 1.0, fields, (-2, 2), lambda: None)
+    with pytest.raises(SceneError, match="pixel: a point that was seen gets behind the eye of the camera"):
+        search.predict(np.zeros(4))
 
 
 @pytest.mark.parametrize("kind", ["position", "pixel"])
