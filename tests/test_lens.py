@@ -13,6 +13,7 @@ from taichi_msm.errors import SceneError
 from taichi_msm.physics.lattice import rest_positions
 from taichi_msm.render import tracking
 from taichi_msm.render.camera import calibration, view
+from taichi_msm.render.labels import track_grid
 from taichi_msm.render.lens import Lens
 from taichi_msm.render.picking import pick
 from taichi_msm.render.rasterizer import Drawing, drawing_config
@@ -112,6 +113,28 @@ def test_beyond_the_fold_there_is_nothing() -> None:
     np.testing.assert_allclose(lens.undistort(lens.distort(place)), place, atol=1e-9)
     # t - t^3 / 2 is largest at t = sqrt(2 / 3).
     assert Lens(True, (-0.5, 0, 0, 0)).limit == pytest.approx(np.tan(np.sqrt(2 / 3)))
+
+
+@pytest.mark.parametrize(
+    "coefficients",
+    [
+        (0, 0, 0.05, 0, 0, 0, 0, 0),
+        (-0.5, 0, 0.02, 0.01, 0, 0, 0, 0),
+        (0.1, 0.2, 0.01, -0.3, 0.1, 0.5, 0, 0.1),
+        (0, 0, 2, 1e6, 0, 0, 0, 0),
+        (-0.2, 0.1, 0.2, 0, 0, 0.3, 0, -0.4),
+    ],
+)
+def test_tangential_distortion_folds_too(coefficients: tuple[float, ...]) -> None:
+    """Where the determinant of the derivatives gets 0, at some angle, and not before."""
+    lens = Lens(False, coefficients)
+    angle = np.linspace(0, 2 * np.pi, 721)
+    circle = np.stack([np.cos(angle), np.sin(angle)], axis=-1)
+    least = [np.linalg.det(lens.jacobian(share * lens.limit * circle)).min() for share in np.linspace(0.01, 1.01, 101)]
+    assert min(least[:-2]) > 0
+    assert least[-1] < 0
+    # Of y + 3 p1 y^2, the distorted place below the axis without all else, the derivative is 0 at y = -1 / (6 p1).
+    assert Lens(False, (0, 0, 0.05, 0, 0, 0, 0, 0)).limit == pytest.approx(1 / 0.3)
 
 
 @pytest.mark.parametrize(
@@ -230,6 +253,18 @@ def test_what_is_beyond_the_limit_is_outside_the_picture(device: Device) -> None
     found = find(made, np.array([[0.5, 0.5], [0.99, 0.5]]), position, view(made))
     np.testing.assert_array_equal(np.isnan(found.pixels[:, 0]), [False, True])
     np.testing.assert_array_equal(found.hidden, [False, True])
+
+
+def test_what_tangential_distortion_folds_back_is_outside_the_picture(device: Device) -> None:
+    # From 3 mm above the sheet, much of it is farther from the axis than the fold.
+    camera = {"eye": [0, 0, 0.003], "target": [0, 0.03, 0.003], "up": [0, 0, -1], "intrinsics": INTRINSICS}
+    made = drawable((9, 9), camera={**camera, "distortion": {"p1": 0.05}})
+    places, (height, width) = track_grid(100), made.sheet.size
+    points = np.stack([(places[:, 0] - 0.5) * width, (0.5 - places[:, 1]) * height, np.zeros(len(places))], axis=-1)
+    away = (view(made)._replace(lens=None).pixels(points) - [37.5, 31.5]) / [60, 62]
+    found = find(made, places, rest_positions(made.sheet), view(made))
+    np.testing.assert_array_equal(np.isnan(found.pixels[:, 0]), ~(np.linalg.norm(away, axis=-1) < 1 / 0.3))
+    assert 0.1 < np.isnan(found.pixels).mean() < 0.9
 
 
 @EVERY_LENS

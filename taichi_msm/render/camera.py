@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from bisect import bisect_left
 from collections.abc import Iterator
 from typing import Any, NamedTuple
 
@@ -273,8 +274,11 @@ def _lens_problems(camera: View) -> Iterator[Problem]:
     far = math.ceil(float(np.linalg.norm(border(camera.size) - camera.centre, axis=-1).max()))
     angle = np.linspace(0, 2 * np.pi, DIRECTIONS)
     circle = np.stack([np.cos(angle), np.sin(angle)], axis=-1)
-    radii = (radius for radius in range(far + 1) if np.isnan(camera.undistorted(camera.centre + radius * circle)).any())
-    good = max(0, next(radii, far) - 1)
+
+    def folds(radius: int) -> bool:
+        return bool(np.isnan(camera.undistorted(camera.centre + radius * circle)).any())
+
+    good = max(0, bisect_left(range(far), True, key=folds) - 1)
     said = f"{end} at {good} px from the principal point, and the picture reaches {far} px; take coefficients"
     yield Problem(("distortion",), f"{said} that are good to there, or set outside: background")
 

@@ -15,7 +15,7 @@ from __future__ import annotations
 
 import math
 from functools import lru_cache
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.polynomial import Polynomial
@@ -29,6 +29,9 @@ WIDEST = math.tan(math.radians(88))
 # The inverse is exact to this, where the focal length is 1: well below 1e-6 px.
 EXACT = 1e-11
 MOST_ROUNDS = 50
+
+# Radii at which is looked for the first fold that tangential distortion makes.
+RADII = 4096
 
 # Below this distance from the axis a fisheye's quotient t / r is 1 to rounding.
 CENTRAL = 1e-8
@@ -129,14 +132,38 @@ def _angular(lens: Lens) -> Polynomial:
 
 @lru_cache(maxsize=16)
 def _limit(lens: Lens) -> float:
-    """Find the first place where the distorted radius no longer increases, or has a pole."""
+    """Find the first distance from the axis where distorted places no longer increase, or have a pole."""
     if lens.fisheye:
         folds = _positive(_angular(lens).deriv())
         return min(WIDEST, math.tan(min([*folds, math.radians(88)])))
     above, below = _rational(lens)
     q = Polynomial([0, 1])
     growth = (above + 2 * q * above.deriv()) * below - 2 * q * above * below.deriv()
-    return min([WIDEST, *np.sqrt([*_positive(growth), *_positive(below)])])
+    radial = float(min([WIDEST, *np.sqrt([*_positive(growth), *_positive(below)])]))
+    tangential = math.hypot(*lens.coefficients[2:4])
+    if tangential == 0:
+        return radial
+    radii = radial * np.linspace(0, 1, RADII + 1)[:-1]
+    folded = np.flatnonzero(_least_determinant(lens, radii, tangential) <= 0)
+    if not len(folded):
+        return radial
+    from scipy.optimize import brentq
+
+    return float(brentq(lambda r: _least_determinant(lens, r, tangential), radii[folded[0] - 1], radii[folded[0]]))
+
+
+def _least_determinant(lens: Lens, r: Any, tangential: float) -> Any:
+    """Give the least determinant of the jacobian among all places at a distance r from the axis.
+
+    With a = `tangential` r, and g the derivative of R r, it is g R - 4 a^2 + 2 a (g + 3 R) c + 16 a^2 c^2, where c is
+    the cosine of the angle between the place and (p2, p1). As the jacobian is symmetric, and I on the axis, the lens
+    does not fold within a circle where this is above 0.
+    """
+    r = np.maximum(r, CENTRAL)
+    reach, g = lens._radial(r)
+    ratio, a = reach / r, tangential * r
+    c = np.maximum(-(g + 3 * ratio) / (16 * a), -1)
+    return g * ratio - 4 * a * a + 2 * a * (g + 3 * ratio) * c + 16 * a * a * c * c
 
 
 def _positive(polynomial: Polynomial) -> list[float]:
