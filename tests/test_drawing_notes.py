@@ -151,8 +151,14 @@ def test_check_and_run_say_it(tmp_path: Path, program: Program) -> None:
             "intrinsics": {"fx": 900, "fy": 900, "cx": 256, "cy": 256},
             "distortion": {"k1": -0.1},
         },
+        {
+            "eye": [0, 0, 0.4],
+            "intrinsics": {"fx": 15, "fy": 15, "cx": 2000, "cy": 256},
+            "distortion": {"model": "fisheye"},
+            "outside": "background",
+        },
     ],
-    ids=["beside in millimetres", "millimetres", "upward", "moving", "lens"],
+    ids=["beside in millimetres", "millimetres", "upward", "moving", "lens", "beyond the lens"],
 )
 def test_a_camera_that_shows_nothing(tmp_path: Path, camera: dict[str, Any]) -> None:
     said = "shows nothing of the sheet at rest, or only a dot, in all frames; lengths are in metres"

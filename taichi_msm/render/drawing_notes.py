@@ -9,20 +9,17 @@ from numpy.typing import NDArray
 
 from taichi_msm.render import texture
 from taichi_msm.render.camera import View, moves, view_at
-from taichi_msm.render.places import visible
 from taichi_msm.scene import Light, Scene
 
 # A picture whose proportions differ from those of the sheet by this factor is visibly stretched.
 STRETCHED = 1.02
 
-# Cells along each side of the sheet whose bounds are compared with the picture.
-CELLS = 16
-
 # The radius of an instrument is rarely above this share of the sheet's larger side.
 WIDEST = 0.25
 
-# What is smaller than this share of the picture is a dot, as the sheet is to a camera that is placed in millimetres.
-DOT = 0.01
+# Whether a camera shows the sheet is found at so many places across and down. What is between them is a dot, as the
+# sheet is to a camera that is placed in millimetres.
+DOTS = 100
 
 
 def drawing_notes(scene: Scene) -> Iterator[str]:
@@ -54,31 +51,29 @@ def drawing_notes(scene: Scene) -> Iterator[str]:
 
 def _blind(scene: Scene) -> Iterator[str]:
     """Warn of cameras that show nothing of the sheet at rest, or only a dot, in all frames."""
-    (height, width), rate = scene.sheet.size, scene.time.frames_per_second
-    x, y = np.meshgrid(np.linspace(-width / 2, width / 2, CELLS + 1), np.linspace(-height / 2, height / 2, CELLS + 1))
-    points = np.stack([x, y, 0 * x], axis=-1)
+    rate = scene.time.frames_per_second
     for name in scene.render.all_cameras:
+        camera = view_at(scene, 0.0, name)
+        middle = (np.arange(DOTS) + 0.5) / DOTS
+        places = camera.undistorted(np.stack(np.meshgrid(*(middle * side for side in camera.size)), axis=-1))
         frames = range(scene.time.frames + 1 if moves(scene, name) else 1)
-        if not any(_shows(view_at(scene, frame / rate, name), points) for frame in frames):
+        if not any(_shows(view_at(scene, frame / rate, name), places, scene.sheet.size) for frame in frames):
             key = f"render.cameras.{name}" if name else "render.camera"
             yield f"{key} shows nothing of the sheet at rest, or only a dot, in all frames; lengths are in metres"
 
 
-def _shows(camera: View, points: NDArray[np.float64]) -> bool:
-    """Tell whether a camera may show any cell between points, shape (n, n, 3), and all of them as more than a dot.
-
-    It may show a cell if their bounds meet.
-    """
-    left, right, top, bottom = (0, camera.size[0], 0, camera.size[1]) if camera.lens is None else visible(camera).box
-    x, y, w, _ = np.moveaxis(camera.project(points), -1, 0)
-    corners = [np.s_[:-1, :-1], np.s_[:-1, 1:], np.s_[1:, :-1], np.s_[1:, 1:]]
-    # As in `is_beside`: what is behind the eye is not divided by its w.
-    beyond = [left * w - x, x - right * w, top * w - y, y - bottom * w, camera.near - w]
-    if not np.all([np.any([side[corner] <= 0 for corner in corners], axis=0) for side in beyond], axis=0).any():
+def _shows(camera: View, places: NDArray[np.float64], size: tuple[float, float]) -> bool:
+    """Tell whether a camera shows a sheet of this height and width, at rest, at any of some places [px], (..., 2)."""
+    try:
+        # From the plane of the sheet to the picture, and back.
+        back = np.linalg.inv(camera.matrix[:3][:, [0, 1, 3]])
+    except np.linalg.LinAlgError:
         return False
-    if (w <= camera.near).any():
-        return True
-    return bool(max(np.ptp(x / w), np.ptp(y / w)) > DOT * camera.size.max())
+    x, y, per_w = np.moveaxis(places @ back[:, :2].T + back[:, 2], -1, 0)
+    height, width = size
+    # Where nothing is shown they are NaN.
+    seen = (per_w > 0) & (np.abs(x) <= width / 2 * per_w) & (np.abs(y) <= height / 2 * per_w)
+    return bool((seen & (per_w * camera.near < 1)).any())
 
 
 def _stretched(scene: Scene) -> Iterator[str]:
