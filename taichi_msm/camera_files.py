@@ -15,6 +15,7 @@ from typing import Any, NamedTuple
 
 import yaml
 
+from taichi_msm.faults import LARGEST as MOST
 from taichi_msm.picture import irregular
 
 MAX_BYTES = 2**22
@@ -57,17 +58,19 @@ def read_calibration(path: str) -> Calibration:
     """Read a calibration; raises a CameraFileError."""
     data = _parse(path, _read(path))
     matrix, values = _numbers(path, data, MATRIX), _numbers(path, data, COEFFICIENTS, required=False)
-    if len(matrix) != 9 or matrix[1] or matrix[8] != 1 or min(matrix[0], matrix[4]) <= 0:
+    if len(matrix) != 9 or [matrix[n] for n in (1, 3, 6, 7, 8)] != [0, 0, 0, 0, 1] or min(matrix[0], matrix[4]) <= 0:
         raise CameraFileError(f"{path}: its camera matrix is not [fx, 0, cx, 0, fy, cy, 0, 0, 1]; write it like that")
     model = data.get("distortion_model", "")
     if model and model not in MODELS:
         raise CameraFileError(f"{path}: distortion_model: {model} is not known; expected one of: {', '.join(MODELS)}")
     fisheye = model in MODELS[2:] or any(_numbers(path, data, ("fisheye_model",), required=False))
     if len(values) not in ((4,) if fisheye else COUNTS) or any(values[KNOWN:]):
-        expected = "4 of a fisheye" if fisheye else "k1, k2, p1, p2, k3, k4, k5, k6"
+        expected = "4 of a fisheye" if fisheye else "k1, k2, p1, p2, k3, k4, k5, k6, and 0 after them"
         raise CameraFileError(f"{path}: {len(values)} distortion coefficients that are not known; expected {expected}")
     width, height = (_numbers(path, data, names, required=False) for names in (WIDTH, HEIGHT))
-    size = (round(width[0]), round(height[0])) if width and height else None
+    if bool(width) != bool(height):
+        raise CameraFileError(f"{path}: has only one of {WIDTH[0]} and {HEIGHT[0]}; write both")
+    size = (round(width[0]), round(height[0])) if width else None
     if size is not None and min(size) < 1:
         said = f"of pictures of {size[0]} x {size[1]} pixels; write the size of those that were calibrated with"
         raise CameraFileError(f"{path}: {said}")
@@ -94,8 +97,9 @@ def read_poses(path: str) -> tuple[tuple[float, ...], ...]:
             row = tuple(float(word) for word in words)
         except ValueError:
             row = ()
-        if len(row) != 8 or not all(math.isfinite(number) for number in row):
-            raise CameraFileError(f"{path}:{n}: not a pose; expected eight numbers: t tx ty tz qx qy qz qw")
+        if len(row) != 8 or not all(abs(number) <= MOST for number in row):
+            said = f"not a pose; expected eight numbers up to {MOST:g}: t tx ty tz qx qy qz qw"
+            raise CameraFileError(f"{path}:{n}: {said}")
         if fault := pose_fault(row, rows[-1] if rows else None):
             raise CameraFileError(f"{path}:{n}: {fault}")
         rows.append(row)
@@ -109,7 +113,7 @@ def pose_fault(row: Sequence[float], before: Sequence[float] | None) -> str:
     if before is not None and row[0] <= before[0]:
         return f"is at {row[0]:.15g} s, the pose before it at {before[0]:.15g} s; sort them, each later than the last"
     if abs(math.hypot(*row[4:]) - 1) > UNIT:
-        return f"its quaternion has the length {math.hypot(*row[4:]):g}, so it is no rotation; scale it to 1"
+        return f"its quaternion has the length {math.hypot(*row[4:]):g}, so it is no rotation; write one of length 1"
     return ""
 
 
@@ -134,7 +138,15 @@ def _parse(path: str, text: str) -> Mapping[str, Any]:
     """Parse YAML, XML or JSON into a mapping."""
     try:
         data = _xml(text) if text.lstrip().startswith("<") else _yaml(text)
-    except (ValueError, yaml.YAMLError, RecursionError, SyntaxError) as error:
+    except (
+        ArithmeticError,
+        AttributeError,
+        LookupError,
+        RecursionError,
+        SyntaxError,
+        ValueError,
+        yaml.YAMLError,
+    ) as error:
         mark = getattr(error, "problem_mark", None)
         where = f":{mark.line + 1}" if mark else ""
         raise CameraFileError(f"{path}{where}: neither YAML, XML nor JSON; name a calibration") from None
@@ -164,7 +176,7 @@ def _yaml(text: str) -> Any:
     if any(isinstance(event, yaml.AliasEvent) for event in yaml.parse(text)):
         raise ValueError
     # What ROS prints of a topic is a document for each message, and all are alike.
-    return next(yaml.load_all(text, _Loader))
+    return next(yaml.load_all(text, _Loader), None)
 
 
 def _xml(text: str) -> dict[str, Any]:
@@ -194,7 +206,7 @@ def _numbers(path: str, data: Mapping[str, Any], names: Sequence[str], *, requir
     flat = _flat(value)
     try:
         numbers = [float(one) for one in flat]
-    except (TypeError, ValueError):
+    except (TypeError, ValueError, OverflowError):
         numbers = [math.nan]
     # Written so that NaN is found too.
     if not all(abs(number) <= LARGEST for number in numbers):

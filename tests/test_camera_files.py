@@ -144,10 +144,22 @@ def test_pictures_of_another_size_are_refused_or_scaled(small: Path) -> None:
         ),
         ("K: [1, 0, 1e9, 0, 1, 1, 0, 0, 1]", "camera.yml: K: not numbers up to 1e+06; write them as OpenCV does"),
         ("f: 3", "camera.yml: has no camera_matrix; name a calibration of OpenCV, ROS or STIR"),
+        ("", "camera.yml: has no keys; expected camera_matrix and distortion_coefficients"),
+        ('width: !!int ""', "camera.yml: neither YAML, XML nor JSON; name a calibration"),
+        (f"K: [1{400 * '0'}]", "camera.yml: K: not numbers up to 1e+06; write them as OpenCV does"),
+        (
+            "K: [1, 0, 1, 2, 1, 1, 0, 0, 1]",
+            "camera.yml: its camera matrix is not [fx, 0, cx, 0, fy, cy, 0, 0, 1]; write it like that",
+        ),
+        (
+            "K: [1, 0, 1, 0, 1, 1, 0, 0, 1]\nwidth: 40",
+            "camera.yml: has only one of image_width and image_height; write both",
+        ),
         ("K: [x]", "camera.yml: K: not numbers up to 1e+06; write them as OpenCV does"),
         (
             "K: [1, 0, 1, 0, 1, 1, 0, 0, 1]\nD: [1, 2, 3]",
-            "camera.yml: 3 distortion coefficients that are not known; expected k1, k2, p1, p2, k3, k4, k5, k6",
+            "camera.yml: 3 distortion coefficients that are not known; expected k1, k2, p1, p2, k3, k4, k5, k6, and 0 "
+            "after them",
         ),
         (
             "K: [1, 0, 1, 0, 1, 1, 0, 0, 1]\ndistortion_model: fov",
@@ -205,9 +217,12 @@ def test_a_trajectory_is_read(small: Path) -> None:
         ),
         (
             TUM.replace("0.6 0.8", "0.6 0.9"),
-            "poses.txt:4: its quaternion has the length 1.08167, so it is no rotation; scale it to 1",
+            "poses.txt:4: its quaternion has the length 1.08167, so it is no rotation; write one of length 1",
         ),
-        (TUM.replace("0.6 0.8", "0.6"), "poses.txt:4: not a pose; expected eight numbers: t tx ty tz qx qy qz qw"),
+        (
+            TUM.replace("0.6 0.8", "0.6"),
+            "poses.txt:4: not a pose; expected eight numbers up to 1e+30: t tx ty tz qx qy qz qw",
+        ),
         ("# nothing\n", "poses.txt: no poses; expected lines t tx ty tz qx qy qz qw"),
         (
             TUM.replace("0.0 0.0 0.0", "0.1 0.0 0.0"),
