@@ -773,7 +773,7 @@ class Render(Section):
             if name in FOLDERS or name.startswith(EXPORTS):
                 raise refused("is the name of a folder that is not a camera's; take another name", name)
             if name in PRESETS and camera != name:
-                raise refused("is the name of another camera; take another name", name)
+                raise refused("is the name of a camera that any scene has; take another name", name)
             if isinstance(camera, Camera) and camera.beside is not None:
                 _require_beside(name, cameras)
         if "size" not in info.data:

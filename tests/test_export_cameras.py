@@ -100,11 +100,13 @@ def test_another_folder_is_no_camera(stereo: Path) -> None:
     [
         (
             {"distortion": [-0.3, 0.1, 0, 0, 0, 0, 0, 0], "model": "pinhole"},
-            "the camera has a distortion, which tapvid3d cannot describe; run the scene without it",
+            "the camera has a distortion, which tapvid3d cannot describe; choose another camera by "
+            "--camera, or run the scene without it",
         ),
         (
             {"distortion": [0, 0, 0, 0], "model": "fisheye"},
-            "the camera has a distortion, which tapvid3d cannot describe; run the scene without it",
+            "the camera has a distortion, which tapvid3d cannot describe; choose another camera by "
+            "--camera, or run the scene without it",
         ),
         ({"intrinsics": [[1, 0], [0, 1]]}, "damaged, or not of this run; run the scene again"),
         ({"intrinsics": [[0, 0, 1], [0, 1, 0], [0, 0, 1]]}, "damaged, or not of this run; run the scene again"),
@@ -128,7 +130,8 @@ def test_a_camera_without_perspective_is_refused(stereo: Path) -> None:
     single = alone(stereo, "left")
     describe(single, intrinsics=None, pose=None)
     with pytest.raises(
-        FilesError, match=r"^tapvid3d needs a pinhole, and .*/camera\.json has none; run the scene with"
+        FilesError,
+        match=r"^tapvid3d needs a pinhole, and .*/camera\.json has none; choose another camera by --camera, or",
     ):
         export(single, "tapvid3d")
 

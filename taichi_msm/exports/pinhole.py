@@ -39,11 +39,13 @@ def read_pinhole(run: FinishedRun, name: str) -> Pinhole:
             described = json.loads(file.read(MAX_BYTES))
         if "intrinsics" not in described:
             said = f"{name} needs a pinhole, and {path} has none"
-            raise FilesError(f"{said}; run the scene with another render.camera than top")
+            raise FilesError(
+                f"{said}; choose another camera by --camera, or run the scene with one that has perspective"
+            )
         # A fisheye is one with any coefficients.
         if described.get("model") == "fisheye" or np.any(described.get("distortion", ())):
             said = f"{path}: the camera has a distortion, which {name} cannot describe"
-            raise FilesError(f"{said}; run the scene without it")
+            raise FilesError(f"{said}; choose another camera by --camera, or run the scene without it")
         matrix = np.array(described["intrinsics"], float)
         poses = np.array(described.get("poses", [described["pose"]] * run.frames), float)[: run.frames]
         if matrix.shape != (3, 3) or poses.shape != (run.frames, 3, 4) or not np.isfinite(poses).all():
