@@ -28,26 +28,39 @@ Floats = NDArray[np.float64]
 ROOT = Path(__file__).parent.parent
 IMAGES = ROOT / "docs" / "images"
 
-# Eight tools that stick to the surface, around its middle, and the percents of their forces across and down in each of
-# four pictures: all to the right, all down, and by turns.
+# Eight tools that stick to the surface, around its middle.
 PLACES = [(x, y) for y in (0.2, 0.5, 0.8) for x in (0.2, 0.5, 0.8) if (x, y) != (0.5, 0.5)]
-ACROSS, DOWN = ((1, 0, 1, 0), (1, 0, -1, 0)), ((0, 1, 0, 1), (0, 1, 0, -1))
 
 RESOLUTION = 16
 
 
+def directions() -> Floats:
+    """Give where the tools pull, across and down, shape (8, 8, 2): in every picture each tool.
+
+    They pull all to the right, all down, to the right and down by turns, to the right and up by turns; outward, around
+    the middle, and both again, every other tool the other way.
+    """
+    turns, right, down = np.arange(8)[:, None] % 2, np.array([[1, 0]] * 8), np.array([[0, 1]] * 8)
+    outward = np.array(PLACES) - 0.5
+    outward /= np.linalg.norm(outward, axis=1, keepdims=True)
+    around, other = outward[:, ::-1] * (-1, 1), 1 - 2 * turns
+    alike = [right, down, np.where(turns, down, right), np.where(turns, -down, right)]
+    return np.array([*alike, outward, around, outward * other, around * other])
+
+
 def pulled(newtons: float) -> list[dict[str, Any]]:
     """Make the tools: a probe for each of their two directions."""
+    shares = directions()
     return [
         {
             "at": at,
             "total": total,
-            "load": [[0, 0], *([frame + 1, 100 * percent] for frame, percent in enumerate(percents[n % 2]))],
+            "load": [[0, 0], *([frame, 100 * share] for frame, share in enumerate(shares[:, n, axis].tolist(), 1))],
             "radius": 0.008,
             "falloff": 150,
         }
         for n, at in enumerate(PLACES)
-        for total, percents in (((newtons, 0, 0), ACROSS), ((0, -newtons, 0), DOWN))
+        for axis, total in enumerate(((newtons, 0, 0), (0, -newtons, 0)))
     ]
 
 
@@ -61,7 +74,7 @@ def scene_of(points: int, **more: Any) -> Scene:
             "tissue.foundation_map": None,
             "tissue.pretension": 2,
             "probes": pulled(0.1),
-            "time": {"duration": 4, "frames_per_second": 1, "motion": "quasistatic"},
+            "time": {"duration": 8, "frames_per_second": 1, "motion": "quasistatic"},
             "render": {"size": [1024, 1024], "camera": "top", "tracks": 30},
             "output": ["tracks"],
             **more,
@@ -76,7 +89,7 @@ def found(truth: Scene, error: float) -> FitResult:
         with np.load(Path(directory) / "tracks.npz") as seen:
             pixel, coordinates = seen["points"].astype(np.float64)[:, 1:], seen["coordinates"]
     pixel += np.random.default_rng(1).normal(0, error, pixel.shape)
-    observed = {"time": np.arange(1, 5), "coordinates": coordinates, "pixel": pixel, "sigma": error}
+    observed = {"time": np.arange(1, 9), "coordinates": coordinates, "pixel": pixel, "sigma": error}
     return fit(scene_of(31, **{"tissue.map": None}), observed, ["tissue.map"], resolution=RESOLUTION)
 
 
