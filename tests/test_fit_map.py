@@ -133,6 +133,9 @@ def test_a_map_is_as_smooth_as_the_errors_allow(device: Device) -> None:
         spreads.append(np.log(found.factors).std())
     # Errors alone explain the even tissue, so that it is as even as the coarsest weight makes it.
     assert 100 * spreads[1] < spreads[0]
+    # With a sigma four times too large little is followed, which is said.
+    notes = fit(scene(), observed, ["tissue.map"], resolution=4, sigma=4e-4).notes
+    assert "what is left is only 0.25 times sigma: with a smaller one the map shows more" in notes
 
 
 def test_fields_that_do_not_move_are_unknown(device: Device, tmp_path: Path) -> None:

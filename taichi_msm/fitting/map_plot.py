@@ -70,4 +70,4 @@ def _plot_choice(axes: Axes, choice: Choice) -> None:
     axes.plot(choice.weights[taken], choice.left[taken], "o", color=VERMILION, label="taken")
     axes.set(title="How smooth it is", xlabel="weight of the smoothness", ylabel="chi-square")
     axes.set(xscale="log", yscale="log")
-    axes.legend()
+    axes.legend(loc="upper left")

@@ -45,6 +45,9 @@ RICHARDSON = 3.0
 # How many runs a search takes, about: for the progress.
 USUAL = 150
 
+# Errors are smaller than sigma if what is left is less than this share of it.
+LITTLE = 0.5
+
 # A field has ended at a bound if its log is as near.
 AT_BOUND = 1e-3
 
@@ -142,7 +145,7 @@ def fit_map(given: Scene, seen: Observations, task: MapTask, image: str, progres
         identifiable=not found.unknown.any(),
         mesh_error=points_error(mapped, tell),
         runs=search.runs + 1,
-        notes=list(_notes(seen, solution, found, by_points, limits)),
+        notes=list(_notes(seen, solution, found, by_points, limits, left)),
         scene=scene,
         observations=seen,
         fitted=fitted,
@@ -203,9 +206,14 @@ def _cells(plan: Plan) -> tuple[int, int]:
 
 
 def _notes(
-    seen: Observations, solution: Solution, found: FittedMap, by_points: float, limits: tuple[float, float]
+    seen: Observations,
+    solution: Solution,
+    found: FittedMap,
+    by_points: float,
+    limits: tuple[float, float],
+    left: Array,
 ) -> Iterator[str]:
-    """Tell what the user should know."""
+    """Tell what the user should know; left: predicted minus seen."""
     assert seen.sigma is not None
     if (unknown := int(found.unknown.sum())) > 0:
         yield f"{unknown} of {found.factors.size} fields are unknown: nothing moves there that would tell; press there"
@@ -213,6 +221,8 @@ def _notes(
         said = f"about {rounded(by_points)} {seen.unit}, and sigma is {rounded(seen.sigma)}"
         remedy = "the map is as smooth as both require; take more sheet.points"
         yield f"the number of points changes what is seen by {said}: {remedy}"
+    if (share := float(np.sqrt(np.mean(left**2))) / seen.sigma) < LITTLE:
+        yield f"what is left is only {rounded(share)} times sigma: with a smaller one the map shows more"
     if solution.excess > 1.5:
         times = rounded(math.sqrt(solution.excess))
         yield f"what is left is {times} times what is expected with any map, and the errors are widened by as much"
