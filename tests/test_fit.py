@@ -220,6 +220,73 @@ def test_a_product_is_known_where_its_factors_are_not(motion: Array) -> None:
     assert not found.identifiable
 
 
+def test_a_pair_that_is_not_seen_leaves_the_others_as_they_are(tracks: dict[str, Array]) -> None:
+    """Young and depth of the foundation act only as their quotient, at any size of the errors."""
+    layer = {"young": 1.5e4, "depth": 0.05}
+    for sigma in (0.2, 0.02, 0.002):
+        seen = noisy(tracks, sigma, sigma=sigma)
+        start = changed(tissue__foundation=layer)
+        alone = fit(start, seen, ["tissue.young", "tissue.foundation.young"], workers=1)
+        found = fit(start, seen, ["tissue.young", "tissue.foundation.young", "tissue.foundation.depth"], workers=1)
+        error = alone.parameters["tissue.young"].standard_error
+        assert found.parameters["tissue.young"].standard_error == pytest.approx(error, rel=0.05)
+        assert [one.identifiable for one in found.parameters.values()] == [True, False, False]
+        (unseen,) = found.unseen
+        (known,) = unseen.known
+        assert sorted(known.exponents.values()) == [-1, 1]
+        known_alone = alone.parameters["tissue.foundation.young"].standard_error / 1.5e4
+        assert known.standard_error == pytest.approx(known_alone, rel=0.05)
+
+
+def test_forces_and_stiffnesses_together_are_not_seen_from_anywhere(tracks: dict[str, Array]) -> None:
+    start = changed(
+        tissue__young=1.5e4,
+        tissue__foundation=2.5e5,
+        tissue__density=900,
+        tissue__pretension=8,
+        probes__0__total=[0, 0, -1.6],
+    )
+    names = ("young", "foundation", "density", "pretension")
+    found = fit(
+        start, noisy(tracks, 0.02, sigma=0.02), [*(f"tissue.{n}" for n in names), "probes.0.total.2"], workers=1
+    )
+    assert not any(one.identifiable for one in found.parameters.values())
+    assert {one.interval for one in found.parameters.values()} == {(None, None)}
+
+
+def test_a_profile_stays_within_the_bounds_of_the_others(tracks: dict[str, Array]) -> None:
+    seen, free = noisy(tracks, 0.1, sigma=0.1), ["tissue.young", "tissue.foundation"]
+    bounds = {"tissue.foundation": (2.995e5, 3.005e5)}
+    best = fit(changed(), seen, free, bounds=bounds, profile=True, workers=1)
+    assert best.chi_square is not None
+    quantile = student.ppf(0.975, best.degrees_of_freedom)
+    for end in best.parameters["tissue.young"].interval:
+        assert end is not None
+        held = fit(changed(tissue__young=end), seen, free[1:], bounds=bounds, workers=1)
+        assert held.chi_square is not None
+        assert held.chi_square - best.chi_square == pytest.approx(quantile**2, rel=0.04)
+
+
+def test_a_camera_is_found_from_a_start_that_is_far_off(tracks: dict[str, Array]) -> None:
+    found = fit(changed(render__camera={"eye": [0, -0.06, 0.09], "fov": 33}), tracks, ["render.camera.fov"], workers=1)
+    assert values(found) == pytest.approx([40], rel=1e-6)
+
+
+def test_a_number_that_can_change_to_one_side_only_is_found(tracks: dict[str, Array]) -> None:
+    # The load's third key may not be later than its fourth.
+    load = [[0, 0], [0.1, 100], [0.2 - 1e-6, 100], [0.2, 0]]
+    found = fit(changed(probes__0__load=load), tracks, ["probes.0.load.2.0"], workers=1)
+    assert values(found) == pytest.approx([0.2], abs=1e-4)
+
+
+def test_what_a_mask_hides_is_not_seen(tracks: dict[str, Array]) -> None:
+    pixel = np.ma.array(tracks["pixel"].copy(), mask=np.zeros(tracks["pixel"].shape, bool))
+    pixel[3] = 5000
+    pixel[3] = np.ma.masked
+    seen = read_observations({**tracks, "pixel": pixel}, 25)
+    np.testing.assert_array_equal(np.flatnonzero(~seen.there.any(axis=1)), [3])
+
+
 def test_an_occluded_track_is_not_used() -> None:
     points, occluded = np.zeros((2, 3, 2), np.float32), np.zeros((2, 3), np.bool_)
     occluded[1, 2] = True
@@ -273,6 +340,25 @@ def test_a_robust_fit_of_good_tracks_is_nearly_the_same(tracks: dict[str, Array]
     plain, robust = (fit(changed(), seen, [key], robust=one, profile=one).parameters[key] for one in (False, True))
     assert robust.standard_error == pytest.approx(plain.standard_error, rel=0.01)
     np.testing.assert_allclose(np.array(robust.interval, float), np.array(plain.interval, float), rtol=1e-3)
+
+
+@pytest.mark.parametrize("robust", [False, True])
+def test_tracks_that_are_far_apart_for_their_errors_are_independent(tracks: dict[str, Array], robust: bool) -> None:
+    errors = [
+        [one.standard_error for one in found.parameters.values()]
+        for correlation in (None, 1e-6)
+        for found in [
+            fit(
+                changed(),
+                noisy(tracks, 0.1, sigma=0.1),
+                ["tissue.young", "tissue.foundation"],
+                robust=robust,
+                correlation=correlation,
+                workers=1,
+            )
+        ]
+    ]
+    np.testing.assert_allclose(errors[0], errors[1], rtol=1e-9)
 
 
 def test_errors_that_are_alike_widen_the_intervals_and_are_told(tracks: dict[str, Array]) -> None:
@@ -377,6 +463,10 @@ def bad(tracks: dict[str, Array], motion: Array) -> Iterator[tuple[str, dict[str
     yield "hidden", {**tracks, "pixel": hidden}, "every one of the 36 points is NaN or occluded at all 11 times"
     still = np.repeat(tracks["pixel"][:, :1], 11, axis=1)
     yield "still", {**tracks, "pixel": still}, "no point moves at all; observe while a tool acts"
+    rounded = still * (1 + 1e-13 * np.random.default_rng(1).normal(size=still.shape))
+    yield "rounded", {**tracks, "pixel": rounded}, "no point moves at all; observe while a tool acts"
+    yield "huge", {**tracks, "pixel": 1e40 * tracks["pixel"]}, "e\\+42; take NaN for what was not seen"
+    yield "tiny", {**tracks, "sigma": 1e-300}, "sigma: 1e-300; take one number above 0"
     yield "noise", {**tracks, "sigma": 50.0}, "no point moves by more than its error, sigma 50 px"
     late = {**tracks, "time": np.linspace(0, 0.004, 11)}
     yield "missed", late, "its 11 times miss the motion: .*; observe between 0.08 and 0.2 s too"

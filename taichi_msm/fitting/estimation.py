@@ -237,6 +237,9 @@ class Search:
         columns = []
         for n, parameter in enumerate(self._runs.job.parameters):
             known = [(place[n], one) for place in places[n] if (one := self._beside[place.tobytes()]) is not None]
+            if not known and len(signs) == 1:
+                # Perhaps downward.
+                return self._derivatives(x, predicted, signs=(1, -1))
             if not known:
                 remedy = "give --bounds or another start by --set"
                 raise SceneError([f"{parameter.key}: no run close to its value succeeds; {remedy}"])

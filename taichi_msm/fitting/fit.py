@@ -138,14 +138,15 @@ def _fit(runs: Runs, given: Scene, method: Method) -> FitResult:
     correlation, start = method.get("correlation"), np.zeros(len(parameters))
     runs.expected = 8 * len(start) + 4
     first = runs.first(start)
-    if wrong := list(faults_beside(seen, given, first)):
+    same_camera = not any(one.key.startswith("render.") for one in parameters)
+    if wrong := list(faults_beside(seen, given, first, same_camera=same_camera)):
         raise SceneError(wrong)
     motion = moved(seen, given) or 1.0
     misfit = Misfit(seen, motion, robust=method.get("robust", False))
     search = Search(runs, misfit)
     solution = search.best(start)
     uncertain = uncertainty(misfit, solution, search.derivatives(solution), correlation)
-    profiles = Profiler(misfit, solution, uncertain).profiles(runs) if method.get("profile") else None
+    profiles = Profiler(parameters, misfit, solution, uncertain).profiles(runs) if method.get("profile") else None
     mesh, shifts = _mesh(runs, misfit, solution, uncertain)
     places = enumerate(solution.x.tolist())
     estimates = [_estimate(parameters[n], x, n, uncertain, profiles, shifts) for n, x in places]

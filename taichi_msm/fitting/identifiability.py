@@ -100,6 +100,8 @@ def _in_words(
         return Unseen(keys, [], f"{names} cannot be told apart by what was seen: fix one{remedy}")
     if not known:
         it = "it" if len(keys) == 1 else "them"
+        if alone[group].max() <= MOST_ERROR:
+            return Unseen(keys, [], f"{names}: known only to {rounded(100 * float(alone[group].max()))} %: fix {it}")
         return Unseen(keys, [], f"{names}: what was seen does not tell {it}: fix {it}")
     said = ", ".join(f"{one} is known to {rounded(100 * one.standard_error)} %" for one in known)
     most = float(alone[group].max())

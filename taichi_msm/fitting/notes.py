@@ -25,6 +25,9 @@ TIED, ALIKE = 0.95, 0.3
 # What is left is too small to say anything of below this share of the motion.
 NOTHING_LEFT = 1e-6
 
+# Nor below this share of a sigma that is given.
+LITTLE_LEFT = 0.1
+
 
 def of_the_search(solution: Solution, parameters: Sequence[Parameter], *, fits: bool) -> Iterator[str]:
     """Note what is wrong with the place where the search ended; fits: whether little is left there."""
@@ -73,7 +76,7 @@ def of_what_is_left(
         times = rounded(math.sqrt(uncertain.factor))
         yield f"what is left is {times} times sigma, and the intervals are widened by as much"
     left = solution.predicted.values - seen.values
-    if np.sqrt(np.nanmean(left**2)) < NOTHING_LEFT * motion:
+    if np.sqrt(np.nanmean(left**2)) < max(NOTHING_LEFT * motion, LITTLE_LEFT * (seen.sigma or 0.0)):
         if seen.sigma is None:
             yield "next to nothing is left, and the intervals are those of so small errors; give their size by --sigma"
         return

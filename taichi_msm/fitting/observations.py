@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 
 from taichi_msm.arguments import as_array
 from taichi_msm.errors import SceneError
+from taichi_msm.faults import LARGEST, SMALLEST
 
 Array = NDArray[np.float64]
 
@@ -75,7 +76,10 @@ def read_observations(observed: str | Path | Mapping[str, Any], rate: float) -> 
     Raises a SceneError when it cannot be used by itself, whatever the scene is.
     """
     if isinstance(observed, Mapping):
-        return _checked("observed", {str(key): as_array(value, str(key)) for key, value in observed.items()}, rate)
+        filled = {
+            key: np.ma.filled(1.0 * value, np.nan) if np.ma.isMA(value) else value for key, value in observed.items()
+        }
+        return _checked("observed", {str(key): as_array(value, str(key)) for key, value in filled.items()}, rate)
     return _checked(str(observed), _arrays(str(observed)), rate)
 
 
@@ -85,7 +89,7 @@ def with_sigma(seen: Observations, sigma: Any) -> Observations:
         return seen
     array = np.asarray(sigma)
     is_number = array.dtype.kind in "fiu" and array.size == 1
-    if not (is_number and 0 < (value := float(array.ravel()[0])) < math.inf):
+    if not (is_number and SMALLEST <= (value := float(array.ravel()[0])) <= LARGEST):
         shown = f"{value:g}" if is_number else f"{array.dtype} of shape {array.shape}"
         said = f"take one number above 0, the standard deviation of the errors [{seen.unit}], or leave it out"
         raise SceneError([f"{seen.name}: sigma: {shown}; {said}"])
@@ -115,7 +119,8 @@ def _checked(name: str, arrays: dict[str, NDArray[Any]], rate: float) -> Observa
     """Make observations of arrays; SceneError: they are none."""
     arrays = _in_one_form(arrays, rate)
     kinds = [kind for kind in ("position", "pixel") if kind in arrays]
-    if missing := [key for key in ("time", "coordinates") if key not in arrays] + ([] if kinds else ["position"]):
+    missing = [key for key in ("time", "coordinates") if key not in arrays]
+    if missing := missing + ([] if kinds else ["position or pixel"]):
         raise SceneError([f"{name}: {missing[0]}: missing; expected {NEEDS}"])
     if len(kinds) == 2:
         raise SceneError([f"{name}: has both position and pixel; leave one of them out"])
@@ -143,6 +148,8 @@ def _checked(name: str, arrays: dict[str, NDArray[Any]], rate: float) -> Observa
     if not np.isfinite(values).any():
         why = "is NaN or occluded"
         raise SceneError([f"{name}: every one of the {points} points {why} at all {times} times; nothing was seen"])
+    if (most := np.nanmax(np.abs(values))) > LARGEST:
+        raise SceneError([f"{name}: {kind}: {most:g}; take NaN for what was not seen"])
     return with_sigma(Observations(name, kind, time, coordinates, values, None), arrays.get("sigma"))
 
 

@@ -123,8 +123,9 @@ def _parameter(scene: Scene, data: dict[str, Any], key: str, bounds: Bounds | No
     value = _look_up(named, data, path)
     inside = any(key == section or key.startswith(f"{section}.") for section in SECTIONS)
     if not inside or not isinstance(value, float) or any(part in HELD for part in path):
-        what = "a list; name one of its numbers by its index" if isinstance(value, list) else f"{value!r}"
-        what = "a section; name a number in it" if isinstance(value, dict) else what
+        if isinstance(value, list):
+            raise SceneError([f"{named}: a list; name one of its numbers by its index, such as {key}.0"])
+        what = "a section" if isinstance(value, dict) else f"{value!r}"
         raise SceneError([f"{named}: {what}, which cannot be free; take a number of {', '.join(SECTIONS)}"])
     low, high = bounds or (-math.inf, math.inf)
     if not low < high:

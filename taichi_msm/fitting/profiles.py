@@ -1,20 +1,21 @@
 """Intervals by profile: how far a parameter can go until the others can no longer make up for it.
 
-The value of a parameter is held, and the others follow to where the cost is least. The interval ends where the cost
-has risen by t^2 f / 2, as many standard deviations as Student's t asks for, or farther by as much as errors that are
-alike widen them. With J from the solution, the others take one run a step.
+The value of a parameter is held, and the others follow, within their bounds, to where the cost is least. The interval
+ends where the cost has risen by t^2 f / 2, as many standard deviations as Student's t asks for, or farther by as much
+as errors that are alike widen them. With J from the solution, the others take one run a step.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Generator
+from collections.abc import Generator, Sequence
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from taichi_msm.fitting.estimation import Misfit, Solution
+from taichi_msm.fitting.parameters import Parameter
 from taichi_msm.fitting.prediction import Predicted
 from taichi_msm.fitting.runs import Runs
 from taichi_msm.fitting.uncertainty import Uncertainty
@@ -48,14 +49,17 @@ class Profile(NamedTuple):
 class Profiler:
     """Draws the profiles of a solution's parameters."""
 
-    def __init__(self, misfit: Misfit, solution: Solution, uncertain: Uncertainty) -> None:
+    def __init__(
+        self, parameters: Sequence[Parameter], misfit: Misfit, solution: Solution, uncertain: Uncertainty
+    ) -> None:
         self._misfit, self._solution, self._uncertain = misfit, solution, uncertain
         self._least = misfit.cost(uncertain.left)
+        self._low, self._high = np.array([one.limits for one in parameters]).T
 
     def profiles(self, runs: Runs) -> list[Profile]:
         """Draw the profile of every parameter, all sides at once."""
-        limits = [one.limits for one in runs.job.parameters]
-        sides = {(n, sign): self._side(n, sign, limits[n][sign > 0]) for n in range(len(limits)) for sign in (-1, 1)}
+        number = len(self._low)
+        sides = {(n, sign): self._side(n, sign) for n in range(number) for sign in (-1, 1)}
         places: dict[tuple[int, int], list[Place]] = {which: [] for which in sides}
         asked: dict[tuple[int, int], Array | None] = {which: next(side, None) for which, side in sides.items()}
         while waiting := [(which, place) for which, place in asked.items() if place is not None]:
@@ -66,7 +70,7 @@ class Profiler:
                     asked[which] = sides[which].send(one)
                 except StopIteration as stop:
                     asked[which], places[which] = None, stop.value
-        return [self._profile(n, places[n, -1], places[n, 1]) for n in range(len(limits))]
+        return [self._profile(n, places[n, -1], places[n, 1]) for n in range(number)]
 
     def _profile(self, n: int, below: list[Place], above: list[Place]) -> Profile:
         quantile = self._uncertain.quantile
@@ -77,18 +81,18 @@ class Profiler:
         places = [*below, Place(float(self._solution.x[n]), 0.0), *above]
         return Profile(sorted(place for place in places if math.isfinite(place.deviations)), ends[0], ends[1])
 
-    def _side(self, n: int, sign: int, limit: float) -> Side:
+    def _side(self, n: int, sign: int) -> Side:
         """Go from the best values to where the interval ends, or to a bound."""
         x, root, quantile = self._solution.x, self._uncertain.root, self._uncertain.quantile
         variance = float(root[n] @ root[n])
         valley = root @ root[n] / variance
-        most = abs(limit - x[n])
+        most = float((self._high if sign > 0 else self._low)[n] - x[n]) * sign
         places: list[Place] = []
         # The end lies between distances, with the rise at each, which is nearly proportional to the distance.
         near, far = (0.0, 0.0), (math.inf, math.inf)
         away = min(quantile * math.sqrt(variance), most)
         while away > 0 and len(places) < MOST_PLACES:
-            place = x + sign * away * valley
+            place = np.clip(x + sign * away * valley, self._low, self._high)
             place[n] = x[n] + sign * away
             least = yield from self._least_at(n, place)
             rise = math.sqrt(max(0.0, 2 * (least - self._least) / self._uncertain.factor)) / self._uncertain.wider[n]
@@ -106,6 +110,8 @@ class Profiler:
 
     def _least_at(self, n: int, place: Array) -> Generator[Array, Predicted | None, float]:
         """Let the other parameters follow; returns the least cost, infinite where there is no run."""
+        from scipy.optimize import lsq_linear
+
         others = np.delete(np.arange(len(place)), n)
         slope, deviations = self._uncertain.weighted[:, others], self._uncertain.deviations[others]
         least = math.inf
@@ -119,7 +125,8 @@ class Profiler:
                 break
             least = cost
             # The first derivatives over the roots of the second.
-            step = -np.linalg.lstsq(slope, left * self._misfit.far(left) ** 0.25, rcond=None)[0]
+            bounds = (self._low - place)[others], (self._high - place)[others]
+            step = lsq_linear(slope, -left * self._misfit.far(left) ** 0.25, bounds).x
             if np.all(np.abs(step) < AT_REST * deviations):
                 break
             place = place.copy()

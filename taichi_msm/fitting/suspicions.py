@@ -22,6 +22,9 @@ OFF = 30.0
 # sigma^2 is so many of its standard deviations above what errors alone give.
 MOVES, SIGNIFICANT = 1.5, 5.0
 
+# Without a sigma, and in the scene, what moves by less than this share of where it is moves by rounding.
+ROUNDING = 1e-9
+
 # Frames miss the motion if the points move less at the observed times than this share of their motion.
 MISSED = 0.1
 
@@ -47,10 +50,13 @@ def faults(seen: Observations, scene: Scene, parameters: int) -> Iterator[str]:
         yield f"{name}: no point moves {said}; observe while a tool acts, at points near it"
 
 
-def faults_beside(seen: Observations, scene: Scene, first: Predicted) -> Iterator[str]:
-    """Say what is wrong beside a run of the scene to its end: times that miss its motion, another camera."""
+def faults_beside(seen: Observations, scene: Scene, first: Predicted, *, same_camera: bool = True) -> Iterator[str]:
+    """Say what is wrong beside a run of the scene to its end: times that miss its motion, another camera.
+
+    same_camera: whether the scene has the camera that saw, and not one that is to be found.
+    """
     rate, whole = scene.time.frames_per_second, float(first.motion.max())
-    if whole == 0:
+    if whole <= ROUNDING * max(scene.sheet.size):
         yield f"{seen.name}: none of its points moves in the scene; give the scene probes that press near them"
         return
     times = seen.time if seen.forces is None else np.concatenate([seen.time, seen.forces.time])
@@ -67,7 +73,8 @@ def faults_beside(seen: Observations, scene: Scene, first: Predicted) -> Iterato
         remedy = "give the scene the camera that saw them, or NaN in their place"
         yield f"{seen.name}: {seen.kind}: {lost} of the points that were seen {said}; {remedy}"
         return
-    yield from _elsewhere(seen, scene, first)
+    if same_camera:
+        yield from _elsewhere(seen, scene, first)
 
 
 def moved(seen: Observations, scene: Scene) -> float:
@@ -88,7 +95,7 @@ def _motion(seen: Observations, scene: Scene) -> Array:
 def _is_still(seen: Observations, scene: Scene) -> bool:
     """Tell whether nothing was seen but errors."""
     if seen.sigma is None:
-        return moved(seen, scene) == 0
+        return moved(seen, scene) <= ROUNDING * float(np.nanmax(np.abs(seen.values)))
     square = float(np.nansum((_motion(seen, scene) / seen.sigma) ** 2))
     freedom = seen.known.sum() - seen.known.any(axis=1).sum()
     is_significant = square > freedom + SIGNIFICANT * math.sqrt(2 * freedom) > 0

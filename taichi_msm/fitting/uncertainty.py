@@ -2,11 +2,15 @@
 
 With J the derivatives of r = (predicted - seen) / sigma by x, the covariance of x is
 
-    C = f (J^T W J)^-1 M (J^T W J)^-1,    M = J^T W J
+    C = f (J^T W J)^-1 M (J^T W J)^-1,    M = J^T W^(1/2) K W^(1/2) J
 
-where W = 1, and f is the mean of r^2 per degree of freedom, but at least 1. In a robust fit W is the second derivative
-of half of rho, and f the mean of the squares of its first over that of W. If errors of neighbouring tracks are alike,
-M = J^T K J, with K = exp(-distance / correlation) for two tracks in one frame.
+where W = 1 and K = 1, and f is the mean of r^2 per degree of freedom, but at least 1. In a robust fit W is the second
+derivative of half of rho, and f the mean of the squares of its first over that of W. If errors of neighbouring tracks
+are alike, K = exp(-distance / correlation) for two tracks in one frame. With the singular values W^(1/2) J = U S V^T,
+
+    C = f V S^-1 (U^T K U) S^-1 V^T
+
+which holds however little some direction is seen: nothing is squared.
 """
 
 from __future__ import annotations
@@ -20,8 +24,9 @@ from taichi_msm.fitting.estimation import Misfit, Scales, Solution
 
 Array = NDArray[np.float64]
 
-# Of singular values, as a share of the largest: what is smaller is not seen at all.
-UNSEEN = 1e-9
+# Of singular values, as a share of the largest: what is smaller, which differences hardly tell from 0, is not seen at
+# all. In such a direction the smallest parts of parameters are none, and this is its standard deviation.
+UNSEEN, LEAST_PART, AT_LARGE = 1e-8, 1e-3, 1e4
 
 # A direction with a larger standard deviation than this is not seen.
 NOT_SEEN = 0.5
@@ -100,18 +105,18 @@ def uncertainty(misfit: Misfit, solution: Solution, derivatives: Array, correlat
     factor = max(1.0, float(np.sum(left**2 / far)) / freedom / float(np.mean(far**-1.5)))
     singular = np.linalg.svd(weighted, full_matrices=False)
     blind = UNSEEN * max(1.0, singular.S[0]) >= singular.S
-    held = np.where(blind, UNSEEN, singular.S)
-    middle = weighted.T @ weighted if correlation is None else _with_neighbours(misfit, slope, correlation)
-    # In the singular directions; those that are not seen at all have an error, as if they were just seen.
-    values, vectors = np.linalg.eigh(factor * singular.Vh @ middle @ singular.Vh.T + np.diag(blind * held**2))
-    root = singular.Vh.T @ (held[:, None] ** -2 * vectors * np.sqrt(np.maximum(values, 0.0)))
-    plain = np.sqrt(factor) * np.linalg.norm(singular.Vh.T / held, axis=1)
-    wider = np.linalg.norm(root, axis=1) / plain
+    held = np.where(blind, 1 / AT_LARGE, singular.S)
+    parts = np.where(blind & (np.abs(singular.Vh.T) < LEAST_PART), 0.0, singular.Vh.T)
+    plain = root = np.sqrt(factor) * parts / held
+    if correlation is not None:
+        values, vectors = np.linalg.eigh(_with_neighbours(misfit, singular.U, correlation))
+        root = plain @ (vectors * np.sqrt(np.maximum(values, 0.0)))
+    wider = np.linalg.norm(root, axis=1) / np.linalg.norm(plain, axis=1)
     return Uncertainty(scales, factor, freedom, left, weighted, singular.Vh.T, root, wider)
 
 
-def _with_neighbours(misfit: Misfit, slope: Array, correlation: float) -> Array:
-    """Give J^T K J, frame by frame and coordinate by coordinate; forces are independent."""
+def _with_neighbours(misfit: Misfit, rows: Array, correlation: float) -> Array:
+    """Give U^T K U, frame by frame and coordinate by coordinate; forces are independent."""
     from scipy.spatial.distance import cdist
 
     values, seen = misfit.count[0], misfit.seen
@@ -119,9 +124,9 @@ def _with_neighbours(misfit: Misfit, slope: Array, correlation: float) -> Array:
     ever = seen.there.any(axis=1)
     pixels = np.nanmean(seen.values[ever], axis=1)
     alike = np.exp(-cdist(pixels, pixels) / correlation)
-    whole = np.zeros((*seen.values.shape, slope.shape[1]))
-    whole[seen.known] = slope[:values]
-    whole, total = whole[ever], slope[values:].T @ slope[values:]
+    whole = np.zeros((*seen.values.shape, rows.shape[1]))
+    whole[seen.known] = rows[:values]
+    whole, total = whole[ever], rows[values:].T @ rows[values:]
     for frame in range(whole.shape[1]):
         for coordinate in range(whole.shape[2]):
             one = whole[:, frame, coordinate]

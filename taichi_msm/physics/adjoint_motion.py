@@ -47,8 +47,8 @@ from taichi_msm.physics.terms.probes import ProbeTerm
 from taichi_msm.physics.terms.term import GAIN
 from taichi_msm.system.runtime import Memory, our_compilation, write
 
-# A segment may take so much, as each costs some launches, and this much stays in a cache.
-SEGMENT_BYTES = 16 * 2**20
+# A segment may take so much, as each costs some launches.
+SEGMENT_BYTES = 64 * 2**20
 
 # A launch of the adjoint takes no more steps times points than this, about 0.1 s of one core.
 POINT_STEPS_PER_LAUNCH = 10_000_000
