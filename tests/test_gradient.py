@@ -310,7 +310,7 @@ def test_the_bits_depend_neither_on_workers_nor_on_segments(
         patched.setattr(adjoint_motion, "SEGMENT_BYTES", 2**20)
         assert bits(2) == alone
     # Workers that give up at once.
-    monkeypatch.setattr(adjoint_motion, "PATIENCE", 0)
+    monkeypatch.setattr(adjoint_motion, "LONG_PATIENCE", 0)
     assert bits(3) == alone
 
 

@@ -50,6 +50,10 @@ from taichi_msm.system.runtime import Memory, our_compilation, write
 # A segment may take so much, as each costs some launches.
 SEGMENT_BYTES = 64 * 2**20
 
+# How many times a worker looks for its neighbour before it gives up: longer than forward, as one alone takes all the
+# rest of the launch, and its kernel may have to be compiled.
+LONG_PATIENCE = 8 * PATIENCE
+
 # A launch of the adjoint takes no more steps times points than this, about 0.1 s of one core.
 POINT_STEPS_PER_LAUNCH = 10_000_000
 
@@ -259,7 +263,7 @@ class MotionAdjoint(Dynamics):
         layout = self.structure
         carry = extra + MOMENTS * layout.workers
         return np.array([
-            count, layout.workers, layout.rows, layout.strip, shape, extra, carry, self._carried_rows, PATIENCE,
+            count, layout.workers, layout.rows, layout.strip, shape, extra, carry, self._carried_rows, LONG_PATIENCE,
             self._buffer if extra == ADJOINT_PARTS * layout.rows else 0, with_loss,
         ])  # fmt: skip
 
