@@ -4,6 +4,7 @@ import gc
 import io
 import os
 import sys
+import warnings
 
 from taichi_msm.system import signals, streams
 
@@ -15,6 +16,10 @@ BETWEEN_SEARCHES = 100_000
 def main() -> int:
     """Run the command line of the process."""
     gc.set_threshold(BETWEEN_SEARCHES)
+    # PYTHONWARNINGS=error is for a user's own code; a warning in a library ends no command, here or in a child process.
+    if any(option.startswith("error") for option in sys.warnoptions):
+        warnings.simplefilter("ignore")
+        os.environ.pop("PYTHONWARNINGS", None)
     # OpenBLAS starts a thread for every core, each of which spins for a while; what we multiply is too small for two.
     # NumPy loads it later, here and in the encoder's process.
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")

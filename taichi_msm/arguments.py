@@ -34,7 +34,7 @@ def require_frame_count(frames: int) -> None:
         raise ArgumentError(f"{frames!r} frames cannot be simulated; take a whole number, 0 or more")
 
 
-def require_path(directory: str | Path) -> None:
-    """Make sure that an argument can be the path of a directory; ArgumentError: it cannot."""
-    if not isinstance(directory, (str, Path)) or "\0" in str(directory):
-        raise ArgumentError(f"directory: {directory!r}; take a path")
+def require_path(path: str | Path, name: str = "directory", remedy: str = "take a path") -> None:
+    """Check that an argument can be a path; ArgumentError: it cannot, with the remedy."""
+    if not isinstance(path, (str, Path)) or "\0" in str(path):
+        raise ArgumentError(f"{name}: {path!r}; {remedy}")

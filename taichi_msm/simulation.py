@@ -152,15 +152,15 @@ class Simulation:
         for _ in range(frames):
             self._go_to(self.frame + 1, pause)
 
-    def steer(self, probes: Sequence[Probe | Mapping[str, Any]]) -> None:
+    def steer(self, probes: Sequence[Probe | Mapping[str, Any] | None]) -> None:
         """Replace the loads, and where tools are moved to, from here on.
 
         Args:
-            probes: the scene's probes with other numbers. Each control point must move, jump or stand as before; for a
-                tool that is to move later, give `at` as keys from the start, be it a single one. Of a tool that has a
-                path take `{"path": [[t, across, down, height], ...]}` with times after `time`: it goes straight from
-                where it is to the first of them. Its instrument, friction and grips stay, unless they are given too; a
-                grip that has begun goes on if its beginning is among them.
+            probes: the scene's probes with other numbers, or None for one that stays as it is. Each control point must
+                move, jump or stand as before; for a tool that is to move later, give `at` as keys from the start, be it
+                a single one. Of a tool that has a path take `{"path": [[t, across, down, height], ...]}` with times
+                after `time`: it goes straight from where it is to the first of them. Its instrument, friction and grips
+                stay, unless they are given too; a grip that has begun goes on if its beginning is among them.
 
         Raises:
             ArgumentError: when the kernel was not compiled for such probes.

@@ -17,7 +17,7 @@ from taichi_msm.scene import Scene
 from taichi_msm.scenefile import budget
 from taichi_msm.scenefile.budget import FORCE_ROW_BYTES, Budget, require_disk, size_problems
 from taichi_msm.system import resources
-from taichi_msm.system.resources import available_memory
+from taichi_msm.system.resources import available_memory, available_threads
 from taichi_msm.system.runtime import Device
 from tests.scenes import plan_of, speckle
 
@@ -212,36 +212,54 @@ def test_free_memory(tmp_path: Path) -> None:
     assert resources._free_memory(tmp_path / "meminfo") == 300 * 1024
 
 
-def control_group(folder: Path, limit: str, used: int, cached: int) -> None:
-    folder.mkdir(parents=True, exist_ok=True)
-    (folder / "memory.max").write_text(f"{limit}\n")
-    (folder / "memory.current").write_text(f"{used}\n")
-    (folder / "memory.stat").write_text(f"anon 7\ninactive_file {cached}\n")
-
-
-def test_the_narrowest_control_group_counts(tmp_path: Path) -> None:
+@pytest.fixture
+def groups(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """The folder of all control groups, of which this process is in outer/inner."""
     root, membership = tmp_path / "cgroup", tmp_path / "membership"
-    root.mkdir()
-    membership.write_text("4:memory:/elsewhere\n0::/outer/inner\n")
-    assert resources._control_group_rest(membership, root) == sys.maxsize
-    control_group(root / "outer" / "inner", "max", 10, 0)
-    assert resources._control_group_rest(membership, root) == sys.maxsize
-    control_group(root / "outer", "1000", 300, 100)
-    assert resources._control_group_rest(membership, root) == 800
-    control_group(root / "outer" / "inner", "400", 500, 50)
-    assert resources._control_group_rest(membership, root) == 0
-    control_group(root / "elsewhere", "1", 0, 0)
-    membership.write_text("0::/\n")
-    control_group(root, "90", 20, 0)
-    assert resources._control_group_rest(membership, root) == 70
+    membership.write_text("4:memory:/v1\n3:cpu,cpuacct:/v1\n2:cpuset:/\n0::/outer/inner\n")
+    monkeypatch.setattr(resources, "CONTROL_GROUPS", root)
+    monkeypatch.setattr(resources, "MEMBERSHIP", membership)
+    monkeypatch.setattr(resources, "_free_memory", lambda _: 2000)
+    return root
 
 
-def test_a_limit_below_the_free_memory_counts(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(resources, "_free_memory", lambda _: 500)
-    monkeypatch.setattr(resources, "_control_group_rest", lambda *_: 400)
-    assert available_memory() == 400
-    monkeypatch.setattr(resources, "_control_group_rest", lambda *_: 600)
-    assert available_memory() == 500
+def group(folder: Path, **files: str) -> None:
+    folder.mkdir(parents=True, exist_ok=True)
+    for name, text in files.items():
+        (folder / name.replace("__", ".")).write_text(text)
+
+
+def test_the_narrowest_limit_of_memory_counts(groups: Path) -> None:
+    assert available_memory() == 2000
+    stat = "anon 7\ninactive_file 100\n"
+    group(groups / "outer" / "inner", memory__max="max\n", memory__current="10", memory__stat=stat)
+    assert available_memory() == 2000
+    group(groups / "outer", memory__max="1000\n", memory__current="300\n", memory__stat=stat)
+    assert available_memory() == 800
+    group(groups / "outer" / "inner", memory__max="400", memory__current="550", memory__stat=stat)
+    assert available_memory() == 0
+
+
+def test_version_1_of_control_groups_counts(groups: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """In a container the group's own folder is the root, whatever its name outside."""
+    stat = "total_inactive_file 7\n"
+    group(groups / "memory", memory__limit_in_bytes="512", memory__usage_in_bytes="100", memory__stat=stat)
+    assert available_memory() == 419
+    monkeypatch.setattr(os, "sched_getaffinity", lambda _: set(range(8)), raising=False)
+    group(groups / "cpu" / "v1", cpu__cfs_quota_us="-1", cpu__cfs_period_us="100000")
+    assert available_threads() == 8
+    group(groups / "cpu", cpu__cfs_quota_us="250000", cpu__cfs_period_us="100000")
+    assert available_threads() == 2
+
+
+@pytest.mark.parametrize(("outer", "inner", "threads"), [("max", "max", 8), ("350000", "max", 3), ("90000", "max", 1)])
+def test_the_narrowest_quota_of_cores_counts(
+    outer: str, inner: str, threads: int, groups: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(os, "sched_getaffinity", lambda _: set(range(8)), raising=False)
+    group(groups / "outer", cpu__max=f"{outer} 100000\n")
+    group(groups / "outer" / "inner", cpu__max=f"{inner} 100000\n")
+    assert available_threads() == threads
 
 
 def test_systems_without_proc(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -643,3 +643,10 @@ def test_a_bug_is_one_line(small: Path, capsys: pytest.CaptureFixture[str], monk
         "taichi-msm: a bug: ZeroDivisionError: by zero in two lines; "
         "please report it with what TAICHI_MSM_TRACEBACK=1 prints\n"
     )
+
+
+def test_warnings_of_libraries_end_no_command(small: Path, root: Path) -> None:
+    environment = {**os.environ, "PYTHONPATH": str(root), "PYTHONWARNINGS": "error"}
+    command = [sys.executable, "-m", "taichi_msm", "run", "small.yaml", "--quiet", "--set", "output=[gif]"]
+    done = subprocess.run(command, capture_output=True, text=True, env=environment)
+    assert (done.returncode, done.stdout, done.stderr) == (0, "", "")

@@ -24,6 +24,12 @@ def carrying(tmp_path: Path, size: tuple[int, int], **changes: Any) -> Scene:
     return scene(image=str(tmp_path / "picture.png"), sheet={**SHEET, "size": [0.3, 0.4]}, output=["png"], **changes)
 
 
+def test_a_sheet_in_millimetres_is_asked_about() -> None:
+    notes = drawing_notes(scene(sheet={**SHEET, "size": [75, 100]}))
+    assert "sheet.size: 75 x 100 m is large for tissue; if these are millimetres, take [0.075, 0.1]" in notes
+    assert not any("sheet.size" in note for note in drawing_notes(scene(sheet={**SHEET, "size": [0.075, 5]})))
+
+
 @pytest.mark.parametrize(
     ("instrument", "said"),
     [

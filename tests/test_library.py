@@ -350,6 +350,11 @@ def test_sections_take_keys_by_name_and_stay_as_they_are(simulation: Simulation)
             made.model_copy(update=update)  # type: ignore[arg-type]
 
 
+def test_a_mapping_is_no_path_of_a_scene() -> None:
+    with pytest.raises(ArgumentError, match=r"^path: a mapping; Scene\(\*\*mapping\)"):
+        load_scene({"sheet": {}})  # type: ignore[arg-type]
+
+
 @pytest.mark.parametrize("overrides", [None, 3, {3: 3}, [3], "damping=1"])
 def test_overrides_are_texts(overrides: Any, small: Path) -> None:
     with pytest.raises(ArgumentError, match="overrides: "):

@@ -182,6 +182,50 @@ def test_other_threads_and_forked_processes_are_refused(tmp_path: Path, root: Pa
     assert done.stderr == ""
 
 
+# Two threads start at once, while a third one prints.
+AT_ONCE = """
+import os, threading
+from concurrent.futures import ThreadPoolExecutor
+from taichi_msm import MsmError
+from taichi_msm.system import runtime
+
+done = threading.Event()
+def count():
+    n = 0
+    while not done.wait(0.001):
+        print(n, flush=True)
+        n += 1
+    print("end", n)
+def start(barrier):
+    barrier.wait()
+    try:
+        return runtime.start("cpu", 2).threads
+    except MsmError as error:
+        return str(error)
+counter = threading.Thread(target=count)
+counter.start()
+with ThreadPoolExecutor(2) as pool:
+    results = sorted(map(str, pool.map(start, [threading.Barrier(2)] * 2)))
+done.set()
+counter.join()
+print(*results, runtime.ti.lang.impl.current_cfg().debug, sorted(os.environ.items() & given.items()), sep="; ")
+"""
+
+
+def test_environment_and_other_threads_change_nothing_at_the_start(tmp_path: Path, root: Path) -> None:
+    """The compiler's variables for its arch, its threads and its types would come before our arguments."""
+    script, prefix = tmp_path / "at_once.py", chosen().prefix
+    given = {f"{prefix}_ARCH": "opengl", f"{prefix}_DEBUG": "1", f"{prefix}_CPU_MAX_NUM_THREADS": "1"}
+    script.write_text(f"given = {given}\n{AT_ONCE}")
+    environment = {**os.environ, **given, "PYTHONPATH": str(root)}
+    done = subprocess.run([sys.executable, str(script)], capture_output=True, text=True, timeout=60, env=environment)
+    *lines, last = done.stdout.splitlines()
+    refused = f"{chosen().title} works in the thread that started it; simulate and draw there"
+    assert last == f"2; {refused}; False; {sorted(given.items())}"
+    assert lines == [*map(str, range(len(lines) - 1)), f"end {len(lines) - 1}"]
+    assert (done.returncode, done.stderr) == (0, "")
+
+
 # Starts after a stop; an object that was made before a stop is dropped after it.
 AGAIN = """
 from taichi_msm.physics.lattice import rest_positions

@@ -76,6 +76,7 @@ def test_what_stays_as_it_is_goes_on(device: Device) -> None:
             steered.advance()
             expected.advance()
             steered.steer(steered.scene.probes)
+            steered.steer([None, None])
         assert steered.positions().tobytes() == expected.positions().tobytes()
 
 

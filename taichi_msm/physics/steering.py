@@ -19,11 +19,11 @@ from taichi_msm.scene import WHOLE, Probe
 Key = tuple[float, float, float, float]
 
 
-def steered(plan: Plan, probes: Sequence[Probe | Mapping[str, Any]], now: float) -> Plan:
+def steered(plan: Plan, probes: Sequence[Probe | Mapping[str, Any] | None], now: float) -> Plan:
     """Replace the probes of a plan from a time on [s].
 
-    A tool that has a path and is to stay on it is given as it is. Any other gets the keys of its path from `now` on;
-    in a mapping, what is not given of its instrument, friction and grips stays.
+    A tool that stays as it is, also on its path, is None or given as it is. Any other with a path gets the keys of its
+    path from `now` on; in a mapping, what is not given of its instrument, friction and grips stays.
 
     Raises:
         ArgumentError: when they are more or fewer.
@@ -56,7 +56,9 @@ def with_paths_of(plan: Plan, probes: Sequence[Probe]) -> Plan:
     return plan.with_probes([other if own.moved and other.moved else own for own, other in pairs])
 
 
-def _completed(before: Probe, given: Probe | Mapping[str, Any]) -> Probe | Mapping[str, Any]:
+def _completed(before: Probe, given: Probe | Mapping[str, Any] | None) -> Probe | Mapping[str, Any]:
+    if given is None:
+        return before
     if not (before.moved and isinstance(given, Mapping) and "path" in given):
         return given
     return {"instrument": before.instrument, "friction": before.friction, "grip": before.grip, **given}

@@ -17,6 +17,9 @@ STRETCHED = 1.02
 # The radius of an instrument is rarely above this share of the sheet's larger side.
 WIDEST = 0.25
 
+# No sheet of tissue has a larger side [m]; one of 75 m is meant in millimetres.
+LARGEST_SHEET = 5.0
+
 # Whether a camera shows the sheet is found at so many places across and down. What is between them is a dot, as the
 # sheet is to a camera that is placed in millimetres.
 DOTS = 100
@@ -24,6 +27,12 @@ DOTS = 100
 
 def drawing_notes(scene: Scene) -> Iterator[str]:
     """List warnings about how a scene is drawn, each in a line."""
+    height, width = scene.sheet.size
+    if max(height, width) > LARGEST_SHEET:
+        yield (
+            f"sheet.size: {height:g} x {width:g} m is large for tissue; if these are millimetres, take "
+            f"[{height / 1000:g}, {width / 1000:g}]"
+        )
     if scene.draws:
         yield from _stretched(scene)
         if texture.is_see_through(scene):

@@ -88,6 +88,8 @@ def load_plan(
     path: str | Path, overrides: Sequence[str] | Mapping[str, Any] = (), image: str | Path | None = None
 ) -> Plan:
     """Read and check a scene as `load_scene` does, and plan it for a CPU."""
+    if isinstance(path, Mapping):
+        raise ArgumentError("path: a mapping; Scene(**mapping) is its scene, and load_scene reads a file")
     return plan_file(read_file(str(path), SCENE), overrides, image)
 
 

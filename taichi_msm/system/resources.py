@@ -3,21 +3,44 @@
 from __future__ import annotations
 
 import contextlib
+import math
 import os
 import platform
 import sys
+from collections.abc import Iterator
 from pathlib import Path
 
-CONTROL_GROUPS = Path("/sys/fs/cgroup")
+CONTROL_GROUPS, MEMBERSHIP = Path("/sys/fs/cgroup"), Path("/proc/self/cgroup")
 
 
 def available_threads() -> int:
-    """Count the cores that this process may use, by its affinity and the quota of its control group."""
+    """Count the cores that this process may use, by its affinity and the quotas of its control groups."""
     cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    quotas = [quota for group in _control_groups("cpu") if (quota := _quota(group)) is not None]
+    return max(1, min([cores, *map(math.floor, quotas)]))
+
+
+def _quota(group: Path) -> float | None:
+    """Read the cores that a control group may use, of version 2 or 1; None: no limit."""
     with contextlib.suppress(OSError, ValueError):
-        quota, period = (CONTROL_GROUPS / "cpu.max").read_text().split()
-        cores = min(cores, max(1, int(quota) // int(period)))
-    return cores
+        quota, period = (group / "cpu.max").read_text().split()
+        return int(quota) / int(period)
+    with contextlib.suppress(OSError, ValueError):
+        quota = int((group / "cpu.cfs_quota_us").read_text())
+        return quota / int((group / "cpu.cfs_period_us").read_text()) if quota > 0 else None
+    return None
+
+
+def _control_groups(controller: str) -> Iterator[Path]:
+    """List the control groups of this process and those above them, of version 2 and of a controller of version 1."""
+    with contextlib.suppress(OSError):
+        for line in MEMBERSHIP.read_text().splitlines():
+            number, controllers, own = line.split(":", 2)
+            if number != "0" and controller not in controllers.split(","):
+                continue
+            root = CONTROL_GROUPS if number == "0" else CONTROL_GROUPS / controller
+            group = root / own.lstrip("/")
+            yield from (each for each in (group, *group.parents) if each.is_relative_to(root))
 
 
 def waited_for_cores(tasks: Path = Path("/proc/self/task")) -> float | None:
@@ -45,7 +68,7 @@ def available_memory() -> int:
     """
     with contextlib.suppress(OSError, KeyError, ValueError, IndexError):
         free = _free_memory(Path("/proc/meminfo"))
-        return min(free, _control_group_rest(Path("/proc/self/cgroup"), CONTROL_GROUPS))
+        return min([free, *map(_group_rest, _control_groups("memory"))])
     try:
         return os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
     except (AttributeError, OSError, ValueError):
@@ -58,20 +81,15 @@ def _free_memory(meminfo: Path) -> int:
     return int(fields["MemAvailable"].split()[0]) * 1024
 
 
-def _control_group_rest(membership: Path, root: Path) -> int:
-    """Find the memory that this process's control groups (version 2) still allow [bytes]; sys.maxsize: no limit."""
-    lines = membership.read_text().splitlines()
-    own = next((line[len("0::/") :] for line in lines if line.startswith("0::/")), "")
-    group = root / own
-    return min(_group_rest(each) for each in (group, *group.parents) if each.is_relative_to(root))
-
-
 def _group_rest(group: Path) -> int:
-    try:
-        limit = (group / "memory.max").read_text().strip()
-        used = int((group / "memory.current").read_text())
-        cached = dict(line.split() for line in (group / "memory.stat").read_text().splitlines())
-    except OSError:
-        return sys.maxsize
-    # Cached files count as used, but are dropped when memory is needed.
-    return sys.maxsize if limit == "max" else max(0, int(limit) - used + int(cached.get("inactive_file", 0)))
+    """Read the memory that a control group still allows [bytes], of version 2 or 1; sys.maxsize: no limit."""
+    for limit, usage, cache in (
+        ("memory.max", "memory.current", "inactive_file"),
+        ("memory.limit_in_bytes", "memory.usage_in_bytes", "total_inactive_file"),
+    ):
+        with contextlib.suppress(OSError, ValueError):
+            most, used = (int((group / name).read_text()) for name in (limit, usage))
+            cached = dict(line.split() for line in (group / "memory.stat").read_text().splitlines())
+            # Cached files count as used, but are dropped when memory is needed.
+            return max(0, most - used + int(cached.get(cache, 0)))
+    return sys.maxsize

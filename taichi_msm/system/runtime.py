@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import contextlib
 import errno
-import io
 import os
 import re
 import tempfile
@@ -104,6 +103,8 @@ def _give_back(taken: list[tuple[tuple[str, int], Any]], free: dict[tuple[str, i
 _device: Device | None = None
 # The process and the thread that started Taichi.
 _home = (0, 0)
+# Held while Taichi starts, which two threads must not do at once.
+_starting = threading.Lock()
 
 
 def lanes(precision: str) -> int:
@@ -132,19 +133,23 @@ def start(arch: str = "cpu", threads: int | None = None) -> Device:
         DeviceError: when the arch is not supported or not available, or Taichi already runs on another device.
         MsmError: as for `require_here`.
     """
-    global _device, _home
-    if _device is not None:
-        require_here()
     if threads is not None and not (type(threads) is int and 1 <= threads <= MOST_THREADS):
         raise ArgumentError(f"threads: {threads!r}; take a whole number, 1 to {MOST_THREADS}, or None for every core")
     if arch not in ARCHS:
         near = did_you_mean(str(arch), ARCHS)
         raise DeviceError(f"--arch {arch}: not supported; take one of: {', '.join(ARCHS)}{near}")
     wanted = Device(arch, resources.available_threads() if threads is None else threads)
+    with _starting:
+        return _start(wanted)
+
+
+def _start(wanted: Device) -> Device:
+    global _device, _home
     if _device is None:
         _device = replace(wanted, name=_initialise(wanted))
         _home = os.getpid(), threading.get_ident()
-    elif wanted != _device:
+    require_here()
+    if wanted != _device:
         raise DeviceError(
             f"{chosen().title} already runs on {_device.arch} with {_device.threads} threads in this process; "
             f"start another process for {wanted.arch} with {wanted.threads}"
@@ -260,6 +265,27 @@ def _pin(pool: list[int]) -> None:
                 os.sched_setaffinity(thread, {core})
 
 
+@contextlib.contextmanager
+def _alone() -> Iterator[None]:
+    """Keep settings of the environment away from `ti.init`, where they come before ours, and its line from stdout.
+
+    Other threads may print meanwhile, so that stdout itself stays as it is.
+    """
+    prefix, said = f"{chosen().prefix}_", vars(ti.lang.misc)
+    hidden = {name: os.environ.pop(name) for name in list(os.environ) if _overrides(name.removeprefix(prefix), name)}
+    said["print"] = lambda *_: None
+    try:
+        yield
+    finally:
+        del said["print"]
+        os.environ.update(hidden)
+
+
+def _overrides(setting: str, name: str) -> bool:
+    """Return whether a variable of the environment changes how Taichi starts, other than its cache and its GPU."""
+    return setting != name and not setting.startswith(("OFFLINE_CACHE", "VISIBLE_DEVICE", "LIB_DIR", "SKIP_"))
+
+
 def _initialise(device: Device) -> str:
     """Start Taichi, and name what it runs on."""
     _require_address_space()
@@ -270,7 +296,7 @@ def _initialise(device: Device) -> str:
         # Taichi prints the arch and, if a driver is missing, its search for it, which our error says in a line. Only
         # its log has the name of a GPU.
         with tempfile.NamedTemporaryFile("r", errors="replace") as told:
-            with contextlib.redirect_stdout(io.StringIO()), silenced(*(() if on_cpu else (2,)), into=told.name):
+            with _alone(), silenced(*(() if on_cpu else (2,)), into=told.name):
                 ti.init(
                     arch=getattr(ti, device.arch),
                     cpu_max_num_threads=device.threads,

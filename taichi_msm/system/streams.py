@@ -5,12 +5,16 @@ from __future__ import annotations
 import io
 import os
 import sys
+import threading
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import TextIO
 
 from taichi_msm.errors import printable
+
+# Held while descriptors are redirected, which belong to all threads.
+_redirecting = threading.Lock()
 
 
 def open_missing() -> None:
@@ -48,7 +52,7 @@ def mute(stream: TextIO) -> None:
 @contextmanager
 def silenced(*descriptors: int, into: str = os.devnull) -> Iterator[None]:
     """Discard, or write into a file, what libraries write to some file descriptors; a closed one stays closed."""
-    with Path(into).open("wb") as nowhere:
+    with _redirecting, Path(into).open("wb") as nowhere:
         kept = {}
         for descriptor in descriptors:
             with suppress(OSError):
