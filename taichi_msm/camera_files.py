@@ -129,8 +129,8 @@ def _is_fisheye(keys: _Keys, values: Sequence[float] | None) -> bool:
     if len(said) > 1:
         raise CameraFileError(f"{keys.path}: {said[True]} is a fisheye's, {said[False]} is not; keep the right one")
     if any(keys.numbers(XI) or ()):
-        said = "xi: of OpenCV's omnidirectional model, which is not read; calibrate with cv2.fisheye"
-        raise CameraFileError(f"{keys.path}: {said}")
+        why = "xi: of OpenCV's omnidirectional model, which is not read; calibrate with cv2.fisheye"
+        raise CameraFileError(f"{keys.path}: {why}")
     return True in said
 
 
@@ -246,7 +246,7 @@ class _Columns(NamedTuple):
     """Where a line of a trajectory has the numbers of a pose."""
 
     places: tuple[int, ...]  # of t, tx, ty, tz, qx, qy, qz, qw
-    count: int  # of all columns
+    width: int  # the number of all columns
     second: float  # a second in the unit of t
 
 
@@ -304,10 +304,10 @@ def _row(place: str, words: Sequence[str], columns: _Columns | None, *, separate
         numbers = [float(word) for word in words]
     except ValueError:
         numbers = []
-    if len(numbers) != expected.count or not all(abs(number) <= MOST for number in numbers):
+    if len(numbers) != expected.width or not all(abs(number) <= MOST for number in numbers):
         said = f"eight numbers up to {MOST:g}: {' '.join(ROLES)}"
-        if expected.count != len(TUM.places):
-            said = f"{expected.count} numbers up to {MOST:g}, one a column of the header"
+        if expected.width != len(TUM.places):
+            said = f"{expected.width} numbers up to {MOST:g}, one a column of the header"
         shape = SHAPES.get(len(words), "") if columns is None else ""
         raise CameraFileError(f"{place}: not a pose{shape}; expected {said}")
     if separated and columns is None:
@@ -400,7 +400,7 @@ def _mapping(loader: _Loader, node: yaml.MappingNode) -> dict[Any, Any]:
 
 _Loader.add_constructor("tag:yaml.org,2002:opencv-matrix", _mapping)
 # Python's yaml writes tuples so.
-_Loader.add_constructor("tag:yaml.org,2002:python/tuple", yaml.SafeLoader.construct_yaml_seq)
+_Loader.add_constructor("tag:yaml.org,2002:python/tuple", _Loader.construct_yaml_seq)
 
 
 def _yaml(text: str) -> Any:
