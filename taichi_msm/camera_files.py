@@ -398,9 +398,13 @@ def _mapping(loader: _Loader, node: yaml.MappingNode) -> dict[Any, Any]:
     return loader.construct_mapping(node, deep=True)
 
 
+def _sequence(loader: _Loader, node: yaml.SequenceNode) -> list[Any]:
+    return loader.construct_sequence(node, deep=True)
+
+
 _Loader.add_constructor("tag:yaml.org,2002:opencv-matrix", _mapping)
 # Python's yaml writes tuples so.
-_Loader.add_constructor("tag:yaml.org,2002:python/tuple", _Loader.construct_yaml_seq)
+_Loader.add_constructor("tag:yaml.org,2002:python/tuple", _sequence)
 
 
 def _yaml(text: str) -> Any:
