@@ -4,6 +4,7 @@
 
 What frame i + 1 shows where flow leads from a pixel of frame i is what frame i shows there, but for light, which is
 switched off for that. What is left comes from filtering, and beside outlines from pixels that show both sides of them.
+Light is then switched on again, at first without highlights and the lamp's direction, which leaves the tool's shadow.
 """
 
 from __future__ import annotations
@@ -51,6 +52,16 @@ def warped(later: Image8, flow: Flow) -> tuple[NDArray[np.float64], NDArray[np.b
     t, s = (y - i)[..., None], (x - j)[..., None]
     upper = later[i, j] * (1 - s) + later[i, j + 1] * s
     return upper * (1 - t) + (later[i + 1, j] * (1 - s) + later[i + 1, j + 1] * s) * t, known
+
+
+def left_over(*settings: str) -> float:
+    """Return the mean difference between a frame and the next one, warped, of the scene with some settings [grey]."""
+    with Simulation(load_scene(ROOT / "scenes" / f"{SCENE}.yaml", settings)) as simulation:
+        simulation.advance(FRAME)
+        first, labels = simulation.draw(), simulation.labels()
+        simulation.advance()
+        back, known = warped(simulation.draw(), simulation.flow(labels))
+    return float(np.abs(back - first)[known].mean())
 
 
 def coloured(flow: Flow) -> Image8:
@@ -115,6 +126,8 @@ def main() -> None:
         flow, second = simulation.flow(labels), unlit.draw()
     back, known = warped(second, flow)
     before, after = (np.abs(one.astype(float) - first)[known].mean() for one in (second, back))
+    dull, even = "render.light.gloss=0", "render.light.ambient=1"
+    whole, matt, shadow = (left_over(*settings, *off) for off in ([], [dull], [dull, even]))
     panels = {
         f"frame {FRAME}": picture,
         "depth, light is near": shades(labels.depth),
@@ -127,9 +140,12 @@ def main() -> None:
     said = (
         f"The top picture shows it: frame {FRAME} of `{SCENE}.yaml` and the next, drawn without light at\n"
         f"{SIZE} × {SIZE} pixels of {SAMPLES} × {SAMPLES} samples, differ by {before:.2f} grey levels on average\n"
-        f"where the next one shows the same; fetched from where flow leads, by {after:.2f}, due to filtering. In lit\n"
-        "frames more is left, as highlights do not move with the tissue. (`docs/make_labels.py` makes the picture\n"
-        "and these lines.)\n"
+        f"where the next one shows the same; fetched from where flow leads, by {after:.2f}, due to filtering.\n"
+        f"Lit frames differ by {whole:.2f} then. Light is not carried along by the tissue: how bright a point is\n"
+        "depends on how it is turned to the lamp and how near it is, the tool's shadow moves over it, and highlights\n"
+        f"change with the line of sight. {matt:.2f} are left without highlights (`light.gloss: 0`), and {shadow:.2f}\n"
+        "if light comes from everywhere, too (`light.ambient: 1`): the shadow, and filtering. To compare frames by\n"
+        "their colours, draw them with `shading: none`. (`docs/make_labels.py` makes the picture and these lines.)\n"
     )
     begin, rest = PAGE.read_text(encoding="utf-8").split(START)
     PAGE.write_text(begin + START + said + END + rest.split(END)[1], encoding="utf-8")

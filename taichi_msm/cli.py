@@ -218,12 +218,15 @@ def check(scene: str, image: str | None, overrides: tuple[str, ...], as_json: bo
     from taichi_msm.physics.paths import path_notes
     from taichi_msm.physics.probe_force import in_words, probe_records
     from taichi_msm.render.drawing_notes import drawing_notes
+    from taichi_msm.render.texture import load_texture
     from taichi_msm.scenefile import budget, duration
     from taichi_msm.scenefile.load import load_plan
 
     plan = load_plan(scene, overrides, image)
     with naming(scene):
         budget.require_disk(plan, Path("output"))
+        if plan.scene.draws:
+            load_texture(plan.scene)
     loaded, grid, limit = plan.scene, plan.grid, plan.stable_step
     steps = {
         "step": grid.step,

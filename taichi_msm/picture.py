@@ -27,6 +27,12 @@ _MODES = ("1", "L", "LA", "P", "PA", "RGB", "RGBA", "RGBa", "RGBX", "CMYK", "YCb
 # The longest side of a picture. Pillow needs memory and time for every row, and a picture of one column has many.
 MAX_SIDE = 65535
 
+# The largest file: as many pixels as Pillow takes, with 16 bits of four channels, are smaller.
+MAX_BYTES = 2**31
+
+# Colour profiles that change no 8-bit colour by more than this are sRGB, and pictures keep their bits.
+SRGB_ROUNDING = 2
+
 # Every scan of a JPEG goes over all pixels. Encoders make about ten; more are allowed up to a few seconds of decoding.
 USUAL_SCANS = 16
 SCANNED_PIXELS = 2 * 10**8
@@ -57,19 +63,20 @@ def copied(copies: Mapping[str, Path]) -> Iterator[None]:
 def read_rgb(path: str, background: tuple[int, int, int], sha256: str | None = None) -> Image.Image:
     """Read a picture, upright, in 8-bit RGB; a transparent one is laid over the background.
 
-    If a file has several pictures, the first is taken. PictureError: it cannot be used, or has not this SHA-256, in
-    hexadecimal.
+    Colours are converted from the file's colour profile to sRGB. If a file has several pictures, the first is taken.
+    PictureError: it cannot be used, or has not this SHA-256, in hexadecimal.
     """
     from PIL import ImageOps
 
     with _open(path, sha256) as opened:
-        return _to_rgb(ImageOps.exif_transpose(opened), background)
+        image = ImageOps.exif_transpose(opened)
+        return _to_rgb(_to_srgb(path, _to_8_bit(image), image.info.get("icc_profile")), background)
 
 
 def read_grey(path: str, sha256: str | None = None) -> NDArray[Any]:
     """Read the greys of a picture, upright, shape (height, width): of 16 bits where it has them, else of 8.
 
-    Otherwise as `read_rgb`, over black.
+    They are numbers, so they are read as stored, whatever the colour profile. Otherwise as `read_rgb`, over black.
     """
     import numpy as np
     from PIL import ImageOps
@@ -202,22 +209,71 @@ def _require_file(path: str) -> None:
         raise _unreadable(path, error) from None
     if kind:
         raise PictureError(f"{path} is {kind}; name a picture")
+    if _place(path).stat().st_size > MAX_BYTES:
+        raise PictureError(f"{path} is larger than {MAX_BYTES >> 30} GiB; scale it down")
 
 
 def _unreadable(path: str, error: OSError) -> PictureError:
     return PictureError(f"{path}: {(error.strerror or str(error)).lower()}; name a picture that can be read")
 
 
-def _to_rgb(image: Image.Image, background: tuple[int, int, int]) -> Image.Image:
-    """Convert pixels of any kind in `_MODES`."""
+def _to_8_bit(image: Image.Image) -> Image.Image:
+    """Convert 16-bit greys, 65535 to 255, rounded to the nearest; Pillow's own conversion clips at 255."""
+    if image.mode not in _MODES_16_BIT:
+        return image
+    import numpy as np
     from PIL import Image
 
-    if image.mode in _MODES_16_BIT:
-        import numpy as np
+    grey = np.asarray(image).astype(np.uint32)
+    return Image.fromarray(((grey * 255 + 32767) // 65535).astype(np.uint8))
 
-        # 16-bit grey, 65535 to 255, rounded to the nearest; Pillow's own conversion clips at 255.
-        grey = np.asarray(image).astype(np.uint32)
-        image = Image.fromarray(((grey * 255 + 32767) // 65535).astype(np.uint8))
+
+def _to_srgb(path: str, image: Image.Image, profile: bytes | None) -> Image.Image:
+    """Convert 8-bit colours from a colour profile, perceptually, to RGB or RGBA; raises PictureError."""
+    if not profile:
+        return image
+    import io
+
+    from PIL import ImageCms
+
+    try:
+        source = ImageCms.ImageCmsProfile(io.BytesIO(profile))
+        space = source.profile.xcolor_space.strip()
+        # Greys are kept as those of the profile where it is of greys; all else that is no CMYK is red, green and blue.
+        mode = {"GRAY": "L", "CMYK": "CMYK"}.get(space, "RGB")
+        pixels = {"L": ("1", "L", "LA"), "CMYK": ("CMYK",)}.get(mode, tuple(m for m in _MODES if m != "CMYK"))
+        if image.mode not in pixels:
+            raise PictureError(
+                f"{path} has pixels of kind {image.mode} and a colour profile of {space}; save it as sRGB"
+            )
+        change = ImageCms.buildTransform(source, ImageCms.createProfile("sRGB"), mode, "RGB")
+    except (OSError, ImageCms.PyCMSError) as error:
+        said = str(error).strip() or "unknown"
+        raise PictureError(f"{path} has a colour profile that cannot be used ({said}); save it as sRGB") from None
+    if mode == "RGB" and _is_srgb(change):
+        return image
+    clear = image.convert("RGBA") if image.has_transparency_data else None
+    found = ImageCms.applyTransform((clear or image).convert(mode), change)
+    assert found is not None
+    if clear is not None:
+        found.putalpha(clear.getchannel("A"))
+    return found
+
+
+def _is_srgb(change: Any) -> bool:
+    """Return whether a transform from RGB to sRGB keeps every colour, by 16 values of each channel."""
+    import numpy as np
+    from PIL import Image, ImageCms
+
+    colours = np.stack(np.meshgrid(*3 * [np.arange(0, 256, 17, dtype=np.uint8)]), axis=-1).reshape(1, -1, 3)
+    changed = np.asarray(ImageCms.applyTransform(Image.fromarray(colours), change))
+    return int(np.abs(changed.astype(int) - colours).max()) <= SRGB_ROUNDING
+
+
+def _to_rgb(image: Image.Image, background: tuple[int, int, int]) -> Image.Image:
+    """Convert pixels of any kind in `_MODES` but those of 16 bits."""
+    from PIL import Image
+
     if not image.has_transparency_data:
         return image.convert("RGB")
     below = Image.new("RGBA", image.size, (*background, 255))

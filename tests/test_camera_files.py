@@ -143,7 +143,11 @@ def test_pictures_of_another_size_are_refused_or_scaled(small: Path) -> None:
             "camera.yml: of pictures of 0 x 0 pixels; write the size of those that were calibrated with",
         ),
         ("K: [1, 0, 1e9, 0, 1, 1, 0, 0, 1]", "camera.yml: K: not numbers up to 1e+06; write them as OpenCV does"),
-        ("f: 3", "camera.yml: has no camera_matrix; name a calibration of OpenCV, ROS or STIR"),
+        (
+            "f: 3",
+            "camera.yml: has no camera matrix that is known; found f; write camera_matrix: [fx, 0, cx, 0, fy, cy, 0, "
+            "0, 1], distortion_coefficients: [k1, k2, p1, p2]",
+        ),
         ("", "camera.yml: has no keys; expected camera_matrix and distortion_coefficients"),
         ('width: !!int ""', "camera.yml: neither YAML, XML nor JSON; name a calibration"),
         (f"K: [1{400 * '0'}]", "camera.yml: K: not numbers up to 1e+06; write them as OpenCV does"),
@@ -163,14 +167,163 @@ def test_pictures_of_another_size_are_refused_or_scaled(small: Path) -> None:
         ),
         (
             "K: [1, 0, 1, 0, 1, 1, 0, 0, 1]\ndistortion_model: fov",
-            "camera.yml: distortion_model: fov is not known; expected one of: plumb_bob, rational_polynomial, "
-            "equidistant, fisheye",
+            "camera.yml: distortion_model: fov is not known; expected one of: plumb_bob, radtan, rational_polynomial, "
+            "equidistant, fisheye, or none without coefficients",
         ),
     ],
 )
 def test_what_is_no_calibration_is_refused(text: str, said: str, small: Path) -> None:
     Path("camera.yml").write_text(text)
     assert refused("camera.yml") == f"calibration: {said}"
+
+
+K = "K: [61.5, 0, 19.25, 0, 60.5, 14.75, 0, 0, 1]\n"
+D = "D: [-0.3, 0.1, 0.001, -0.002, 0.03]\n"
+
+
+@pytest.mark.parametrize(
+    "name",
+    [
+        "dist_coeff", "DistCoeff", "distortion_coeffs", "distortion_coeff", "distortion_coefs", "dist", "dist_coefs",
+        "distCoeffs", "distortion", "DISTORTION_PARAMETERS", "dist-coefficients", "distortion_vector", "d",
+    ],
+)  # fmt: skip
+def test_spellings_of_distortion_are_understood(name: str, small: Path) -> None:
+    Path("camera.yml").write_text(K + f"{name}: [[-0.3, 0.1, 0.001, -0.002, 0.03]]\n")
+    camera = camera_of("camera.yml")
+    assert camera.distortion is not None
+    assert camera.distortion.coefficients == (-0.3, 0.1, 0.001, -0.002, 0.03, 0, 0, 0)
+
+
+@pytest.mark.parametrize("name", ["mtx", "camera_mtx", "intrinsic_matrix", "cameraMatrix", "M", "intrinsics"])
+def test_spellings_of_the_matrix_are_understood(name: str, small: Path) -> None:
+    Path("camera.yml").write_text(K.replace("K", name) + D)
+    camera = camera_of("camera.yml")
+    assert camera.intrinsics is not None
+    assert camera.intrinsics.fy == 60.5
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "image_size: [80, 90]",
+        "resolution: [80, 90]",
+        "imageSize: !!python/tuple [80, 90]",
+        "img_width: 80\nimg_height: 90",
+        "w: 80\nh: 90",
+        "image_size: [80, 90]\nwidth: 80\nheight: 90",
+        "DIM: 80 90",
+    ],
+)
+def test_spellings_of_the_size_are_understood(text: str, small: Path) -> None:
+    Path("camera.yml").write_text(K + D + text)
+    assert "of pictures of 80 x 90 pixels, not of 40 x 30" in refused("camera.yml")
+
+
+def test_models_are_honoured(small: Path) -> None:
+    four = "D: [0.01, 0.002, 0.0003, -0.0004]\n"
+    for text in ("camera_model: fisheye", "camera_model: pinhole\ndistortion_model: equidistant", "fisheye: true"):
+        Path("camera.yml").write_text(K + four + text)
+        camera = camera_of("camera.yml")
+        assert camera.distortion is not None
+        assert camera.distortion.model == "fisheye"
+    for text in ("distortion_model: radtan", "camera_model: pinhole", "xi: 0.0", "skew: 0"):
+        Path("camera.yml").write_text(K + four + text)
+        camera = camera_of("camera.yml")
+        assert camera.distortion is not None
+        assert camera.distortion.model == "pinhole"
+    Path("camera.yml").write_text(K + "distortion_model: none")
+    assert camera_of("camera.yml").distortion is None
+
+
+def test_values_spelled_twice_agree(small: Path) -> None:
+    Path("camera.yml").write_text(
+        K + D + "mtx: [61.5, 0, 19.25, 0, 60.50000001, 14.75, 0, 0, 1]\ndist: [[-0.3, 0.1, 0.001, -0.002, 0.03]]"
+    )
+    assert camera_of("camera.yml").intrinsics is not None
+    Path("camera.yml").write_text(K + D + "dist: [-0.31, 0.1, 0.001, -0.002, 0.03]")
+    assert refused("camera.yml") == "calibration: camera.yml: D and dist are not the same; keep the right one"
+
+
+REST = "write camera_matrix: [fx, 0, cx, 0, fy, cy, 0, 0, 1], distortion_coefficients: [k1, k2, p1, p2]"
+
+
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        (
+            K + "note: 3",
+            "has a camera matrix, and no distortion that is known; found K, note; write distortion_coefficients, "
+            "[0, 0, 0, 0] where there is none",
+        ),
+        (
+            K + D + "radial_distortion: [0.1]\nrms: 0.2",
+            "radial_distortion: not understood, and may change what the camera sees; found K, D, radial_distortion, "
+            f"rms; {REST}, or remove what does not matter",
+        ),
+        (
+            K + D + "image_shape: [30, 40]",
+            "image_shape: not understood, and may change what the camera sees; found K, D, image_shape; "
+            f"{REST}, or remove what does not matter",
+        ),
+        (
+            K + D + "xi: 1.27",
+            "xi: of OpenCV's omnidirectional model, which is not read; calibrate with cv2.fisheye",
+        ),
+        (
+            K + D + "camera_model: ds",
+            "camera_model: ds is not known; expected one of: plumb_bob, radtan, rational_polynomial, equidistant, "
+            "fisheye, or none without coefficients",
+        ),
+        (
+            K + D + "distortion_model: none",
+            "distortion_model: none is not known; expected one of: plumb_bob, radtan, rational_polynomial, "
+            "equidistant, fisheye, or none without coefficients",
+        ),
+        (
+            K + "D: [0, 0, 0, 0]\nfisheye_model: 1\ndistortion_model: plumb_bob",
+            "fisheye_model is a fisheye's, distortion_model is not; keep the right one",
+        ),
+        (
+            K + D + "width: 40\nheight: 30\nimage_size: [80, 60]",
+            "its size is [40, 30] and [80, 60]; write one [width, height] of the pictures",
+        ),
+        (
+            K.replace("60.5", "1e-300") + D,
+            "its focal length is 1e-300; write it in pixels, 0.001 or more",
+        ),
+        (
+            "M1: 3\nD1: 3\nM2: 3\nD2: 3",
+            "of a stereo pair, as OpenCV's stereoCalibrate and SCARED, which is not read; found M1, D1, M2, D2; "
+            f"{REST}",
+        ),
+        (
+            "cam0: {camera_model: pinhole, intrinsics: [1, 1, 1, 1], distortion_coeffs: [0, 0, 0, 0]}",
+            f"a camchain of Kalibr, which is not read; found cam0; {REST}",
+        ),
+        ("; of two\n[StereoLeft]\nfc_x = 3\n", f"an ini file, which is not read; {REST}, in YAML"),
+        (
+            "# Camera list\n1 PINHOLE 640 480 5e2 5e2 3e2 2e2\n",
+            f"a cameras.txt of COLMAP, which is not read; {REST}, in YAML",
+        ),
+        ("K: " + 400 * "[" + 400 * "]", None),
+        ('{"K": ' + 600 * "[" + "1" + 600 * "]" + "}", "K: not numbers up to 1e+06; write them as OpenCV does"),
+        ("K: !!python/object:numpy.ndarray {}", None),
+    ],
+)  # fmt: skip
+def test_what_bears_on_the_camera_and_is_not_understood_is_refused(text: str, said: str | None, small: Path) -> None:
+    Path("camera.yml").write_text(text)
+    found = refused("camera.yml")
+    if said is None:
+        assert ("neither YAML" in found) or ("not plain YAML" in found)
+    else:
+        assert found == f"calibration: camera.yml: {said}"
+
+
+def test_comments_may_precede_opencvs_first_line(small: Path) -> None:
+    write_opencv("camera.yml")
+    Path("camera.yml").write_text("# of the left camera\n\n" + Path("camera.yml").read_text())
+    assert camera_of("camera.yml").distortion is not None
 
 
 def test_files_are_beside_the_scene(small: Path) -> None:
@@ -208,6 +361,37 @@ def test_a_trajectory_is_read(small: Path) -> None:
     np.testing.assert_allclose(view(made, 0.3).axes[2], [0, 0, 1], atol=1e-12)
 
 
+EUROC = """\
+#timestamp [ns],p_RS_R_x [m],p_RS_R_y [m],p_RS_R_z [m],q_RS_w [],q_RS_x [],q_RS_y [],q_RS_z [],v_RS_R_x [m s^-1]
+0,0.0,0.0,0.4,0,1,0,0,7
+200000000,0.1,0.0,0.4,0,1,0,0,7
+400000000,0.1,0.0,0.5,0,0.6,0.8,0,7
+"""
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        EUROC,
+        "".join(
+            f"{line}\n"
+            for line in [
+                "# format: qw qx qy qz tx ty tz timestamp(ms)",
+                "0 1 0 0 0 0 0.4 0",
+                "0 1 0 0 0.1 0 0.4 200",
+                "0 0.6 0.8 0 0.1 0 0.5 400",
+            ]
+        ),
+        TUM.replace("# timestamp tx ty tz qx qy qz qw", "time,x,y,z,qx,qy,qz,qw").replace(" ", ","),
+    ],
+)
+def test_a_header_decides_on_the_columns(text: str, small: Path) -> None:
+    Path("tum.txt").write_text(TUM)
+    Path("poses.txt").write_text(text)
+    expected = load_scene("small.yaml", ["render.camera={poses: tum.txt}"])
+    assert load_scene("small.yaml", ["render.camera={poses: poses.txt}"]) == expected
+
+
 @pytest.mark.parametrize(
     ("lines", "said"),
     [
@@ -222,6 +406,39 @@ def test_a_trajectory_is_read(small: Path) -> None:
         (
             TUM.replace("0.6 0.8", "0.6"),
             "poses.txt:4: not a pose; expected eight numbers up to 1e+30: t tx ty tz qx qy qz qw",
+        ),
+        (
+            TUM.partition("\n")[2].replace(" ", ","),
+            "poses.txt:1: commas without a header, and w comes first in EuRoC's rows, last in TUM's; name the columns "
+            "in a first line: # t, tx, ty, tz, qx, qy, qz, qw",
+        ),
+        (
+            TUM.replace("qx qy qz qw", "w x y z"),
+            "poses.txt:1: columns timestamp, tx, ty, tz, w, x, y, z are not understood; name them t, tx, ty, tz, qx, "
+            "qy, qz, qw",
+        ),
+        (
+            EUROC.replace("x [m]", "x [mm]"),
+            "poses.txt:1: timestamp [ns], p_rs_r_x [mm], p_rs_r_y [m], p_rs_r_z [m]: units that are not understood; "
+            "write [s], [ms], [us] or [ns] for t, and metres, [m], for the others",
+        ),
+        (
+            "1 0 0 0 0 1 0 0 0 0 1 0\n",
+            "poses.txt:1: not a pose, but twelve numbers, as KITTI's, which are not read; expected eight numbers up to "
+            "1e+30: t tx ty tz qx qy qz qw",
+        ),
+        (
+            "# IMAGE_ID, QW, QX, QY, QZ, TX, TY, TZ, CAMERA_ID, NAME\n",
+            "poses.txt:1: an images.txt of COLMAP, which is not read; write lines t tx ty tz qx qy qz qw",
+        ),
+        (
+            TUM.replace("0.2 0.1", "2e8 0.1").replace("0.4 0.1", "4e8 0.1"),
+            "its first poses are 2e+08 s apart, and the scene lasts 0.4 s; write times in seconds, nanoseconds divided "
+            "by 1e9, or name the columns in a header, with t [ns]",
+        ),
+        (
+            TUM.replace("0.0 0.0 0.0 0.4", "0.0 0.0 0.0 0.0"),
+            "puts the eye on the middle of the sheet, which the light's strength depends on; move it away",
         ),
         ("# nothing\n", "poses.txt: no poses; expected lines t tx ty tz qx qy qz qw"),
         (

@@ -611,6 +611,16 @@ def test_check_prints_the_resolved_scene_and_what_it_takes(small: Path, capsys: 
     assert (facts["steps"], facts["frames"], facts["steps_per_frame"]) == (164, 5, 41)
 
 
+def test_check_decodes_the_picture_as_run_does(small: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    whole = Path("speckle.png").read_bytes()
+    Path("speckle.png").write_bytes(whole[: len(whole) // 2])
+    assert main(["check", "small.yaml"]) == 2
+    said = capsys.readouterr().err
+    assert said.startswith("small.yaml: image: speckle.png cannot be decoded (")
+    assert main(["run", "small.yaml", "--quiet"]) == 2
+    assert capsys.readouterr().err == said
+
+
 def test_check_without_springs_has_no_limit(small: Path, capsys: pytest.CaptureFixture[str]) -> None:
     code, out, _ = call(capsys, "check", "small.yaml", "--json", "--set", "springs={}")
     assert (code, json.loads(out)["stable_step"]) == (0, None)

@@ -15,6 +15,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, get_type_hints
 
+import numpy as np
 import pytest
 import yaml
 from PIL import Image
@@ -258,6 +259,19 @@ def test_the_python_shown_runs(tmp_path: Path) -> None:
     written = ["000000/surface.glb", "000001/surface.glb", "index.csv"]
     assert done.stdout == f"{Path('output', 'export-gltf')} {written}\n"
     assert (tmp_path / "output" / "from-python" / "animation.gif").exists()
+
+
+def test_the_way_from_pixels_to_points_is_exact(small: Path) -> None:
+    lens = "intrinsics: {fx: 40, fy: 40, cx: 20, cy: 15}, distortion: {k1: -0.3, k2: 0.1, p1: 0.001}"
+    settings = [f"render.camera={{eye: [0, 0, 0.25], {lens}}}", "output=[depth]", "render.supersample=1"]
+    run(load_scene("small.yaml", settings), "out")
+    (shown,) = [block for block in blocks(DOCS / "labels.md", "py") if "projectPoints" in block]
+    found: dict[str, Any] = {}
+    exec(shown.replace("output/grasp", "out"), found)
+    pixels = np.stack([found["columns"], found["rows"]], axis=-1)
+    assert len(pixels) > 500, "the sheet fills the picture"
+    # 2e-3 with OpenCV's five iterations.
+    assert np.linalg.norm(found["pixels"][:, 0] - pixels, axis=-1).max() < 1e-6
 
 
 # Those whose examples stand in their docstrings. Those of Playback, export and fit read what that of run writes.

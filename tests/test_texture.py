@@ -9,9 +9,10 @@ from typing import Any
 import numpy as np
 import pytest
 from numpy.typing import NDArray
-from PIL import Image
+from PIL import Image, ImageCms
 
 from taichi_msm.errors import SceneError
+from taichi_msm.picture import read_grey
 from taichi_msm.render.texture import image_problems, image_size, load_texture
 from taichi_msm.scene import Scene
 from tests.scenes import speckle
@@ -265,6 +266,70 @@ def test_a_link_is_followed() -> None:
     Image.fromarray(COLOURS).save("b.png")
     Path("a.png").symlink_to("b.png")
     assert_texture("a.png", COLOURS)
+
+
+def profile(**tags: str) -> bytes:
+    """The profile of sRGB, with tags of other names."""
+    found = ImageCms.ImageCmsProfile(ImageCms.createProfile("sRGB")).tobytes()
+    count = int.from_bytes(found[128:132], "big")
+    head = bytearray(found)
+    for at in range(132, 132 + 12 * count, 12):
+        name = found[at : at + 4].decode()
+        head[at : at + 4] = tags.get(name, name).encode()
+    return bytes(head)
+
+
+SWAPPED = {"rXYZ": "gXYZ", "gXYZ": "rXYZ"}
+
+
+@pytest.mark.parametrize("mode", ["RGB", "RGBA", "P"])
+def test_colours_of_a_profile_become_srgb(mode: str) -> None:
+    picture = Image.fromarray(COLOURS).convert(mode)
+    picture.save("srgb.png", icc_profile=profile())
+    assert_texture("srgb.png", COLOURS)
+    # What its profile says is red is sRGB's green.
+    picture.save("a.png", icc_profile=profile(**SWAPPED))
+    np.testing.assert_allclose(load_texture(scene("a.png")).astype(int), COLOURS[..., [1, 0, 2]], atol=2)
+
+
+def test_a_transparent_picture_keeps_its_alpha_through_a_profile() -> None:
+    picture = Image.fromarray(COLOURS).convert("RGBA")
+    picture.putalpha(0)
+    picture.save("a.png", icc_profile=profile(**SWAPPED))
+    assert_texture("a.png", np.broadcast_to(BACKGROUND, COLOURS.shape))
+
+
+def test_greys_of_a_profile_become_srgb_and_maps_stay() -> None:
+    # A profile of greys whose curve is 1.0: half the light is sRGB's 188.
+    white = b"XYZ \0\0\0\0" + b"".join(round(65536 * n).to_bytes(4, "big") for n in (0.9642, 1.0, 0.8249))
+    curve = b"curv" + bytes(8)
+    places = ((b"wtpt", 156, 20), (b"kTRC", 176, 12))
+    tags = b"".join(name + at.to_bytes(4, "big") + size.to_bytes(4, "big") for name, at, size in places)
+    head = bytearray(profile()[:128])
+    head[:4], head[16:20] = (188).to_bytes(4, "big"), b"GRAY"
+    linear = bytes(head) + (2).to_bytes(4, "big") + tags + white + curve
+    Image.new("L", (2, 2), 128).save("a.png", icc_profile=linear)
+    np.testing.assert_allclose(load_texture(scene("a.png")).astype(int), 188, atol=1)
+    np.testing.assert_array_equal(read_grey("a.png"), 128)
+
+
+@pytest.mark.parametrize("broken", [b"no profile", profile()[:300]])
+def test_a_broken_profile_is_refused(broken: bytes) -> None:
+    Image.fromarray(COLOURS).save("a.png", icc_profile=broken)
+    line = refusal("a.png")
+    assert line.startswith("image: a.png has a colour profile that cannot be used (cannot ")
+    assert line.endswith("); save it as sRGB")
+
+
+def test_a_profile_of_other_pixels_is_refused() -> None:
+    Image.new("CMYK", (2, 2)).save("a.tif", icc_profile=profile())
+    assert refusal("a.tif") == "image: a.tif has pixels of kind CMYK and a colour profile of RGB; save it as sRGB"
+
+
+def test_a_file_of_any_size_is_not_read() -> None:
+    with Path("a.png").open("wb") as file:
+        file.truncate(2**31 + 1)
+    assert faults("a.png") == ["image: a.png is larger than 2 GiB; scale it down"]
 
 
 @pytest.mark.parametrize("name", ["a.png", "a.jpg", "a.bmp", "a.tif", "a.webp"])

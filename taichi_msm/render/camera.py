@@ -32,6 +32,9 @@ LARGEST_NUMBER = float(np.finfo(np.float32).max) / MAX_SUPERSAMPLE
 # A camera may be this many times the sheet's larger side away from the one that it is beside.
 FARTHEST = 1e6
 
+# The first two of several poses are at most this many times the scene's duration apart, and of two this long [s].
+SPARSEST, LONGEST_GAP = 5, 1e5
+
 # In so many directions it is looked how far a lens is good.
 DIRECTIONS = 64
 
@@ -232,6 +235,13 @@ def _place_problems(camera: Camera, scene: Scene) -> Iterator[Problem]:
     if camera.poses is not None:
         begin, end, last = camera.poses[0][0], camera.poses[-1][0], scene.time.duration
         slack = WHOLE / scene.time.frames_per_second
+        gap = camera.poses[min(1, len(camera.poses) - 1)][0] - max(begin, 0.0)  # type: ignore[operator]
+        if gap > LONGEST_GAP or (len(camera.poses) > 2 and gap > SPARSEST * last):
+            said = f"its first poses are {gap:.6g} s apart, and the scene lasts {last:g} s; write times in seconds"
+            yield Problem(
+                ("poses",), f"{said}, nanoseconds divided by 1e9, or name the columns in a header, with t [ns]"
+            )
+            return
         if begin > slack or end < last - slack:  # type: ignore[operator]
             said = f"covers {begin:.12g} s to {end:.12g} s, but the scene goes from 0 s to {last:g} s"
             remedy = "its times are those of the scene: subtract the first one from all"
@@ -239,6 +249,10 @@ def _place_problems(camera: Camera, scene: Scene) -> Iterator[Problem]:
                 remedy = "shorten time.duration or give the poses of all of it"
             yield Problem(("poses",), f"{said}; {remedy}")
             return
+    if camera.eye is None and placed(camera, 0.0).distance < SMALLEST:
+        said = "puts the eye on the middle of the sheet, which the light's strength depends on; move it away"
+        yield Problem((_place_key(camera),), said)
+        return
     rate = scene.time.frames_per_second
     for time in [frame / rate for frame in range(scene.time.frames + 1)] if camera.moves else [0.0]:
         when = f" at {time:g} s" if camera.moves else ""
