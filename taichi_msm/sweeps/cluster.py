@@ -1,7 +1,7 @@
 """Workers of dask.distributed, on any machines, as an executor of `concurrent.futures`.
 
-A plugin brings the scene and its pictures to every worker once, also to those that come later. Besides, a worker needs
-only this package and the folder of the sweep.
+A plugin brings the scene and the files that it names to every worker once, also to those that come later. Besides, a
+worker needs only this package and the folder of the sweep.
 """
 
 from __future__ import annotations
@@ -50,15 +50,15 @@ class Inputs(WorkerPlugin):  # type: ignore[misc]  # that package has no types
         self.scene, self.directory = scene._replace(folder=scene.folder.absolute()), directory.absolute()
         self.home = Path.cwd()
         self.versions = what_decides_bits(versions(), "cpu")
-        self._digests = {str(Path(path).absolute()): digest for path, digest in described.pictures.items()}
+        self._digests = {str(Path(path).absolute()): digest for path, digest in described.files.items()}
         self._contents = {digest: Path(path).read_bytes() for path, digest in self._digests.items()}
         self.fault = ""
-        self.copies: dict[str, Path] = {}  # of the pictures, by their paths where the sweep was started
+        self.copies: dict[str, Path] = {}  # of the files, by their paths where the sweep was started
         self._folder = Path()  # of these copies
         self._ended = False
 
     def setup(self, worker: Any) -> None:
-        """Write the pictures into a temporary folder of the worker; ExecutorError: it cannot take runs."""
+        """Write the files into a temporary folder of the worker; ExecutorError: it cannot take runs."""
         self.fault = self._fault(worker)
         if self.fault:
             raise ExecutorError(self.fault)
@@ -138,7 +138,7 @@ def _cancel(answer: Future[Any]) -> None:
 
 
 def _call(name: str, function: Callable[..., Any], *arguments: Any) -> Any:
-    """Call a function in a worker, where the pictures are those that it was sent."""
+    """Call a function in a worker, where the files are those that it was sent."""
     with copied(_inputs(name).copies):
         return function(*arguments)
 

@@ -10,7 +10,6 @@ from typing import Any
 
 from taichi_msm.arguments import require_path
 from taichi_msm.errors import ArgumentError, NotInstalledError, writing
-from taichi_msm.outputs.table import RUNS, numbered
 from taichi_msm.progress import Progress
 from taichi_msm.sweeps.cost import choose_workers, estimate
 from taichi_msm.sweeps.folder import ENDED, UnderWay, alone, begin_sweep, ended
@@ -126,11 +125,12 @@ def go_on(under_way: UnderWay, executor: Executor, progress: Progress) -> Iterat
 
 def finish(under_way: UnderWay, executor: Executor, progress: Progress) -> tuple[list[str], list[str]]:
     """Write the table and the other files of a sweep; gives their names, and what the user should know."""
-    directory, total = under_way.directory, under_way.total
+    directory, total, sweep = under_way.directory, under_way.total, under_way.sweep
     with writing(directory), alone(directory, lambda: progress("runs", total, total)):
         # Another command may have taken a run that it kept from us.
+        tasks = {task.run: task for task in under_way.missing}
         rows = [
-            (None if row.status in ENDED else ended(row.run, directory / RUNS / numbered(row.run))) or row
+            (None if row.status in ENDED else ended(tasks[row.run], sweep)) or row
             for row in sorted(under_way.done, key=lambda row: row.run)
         ]
-        return write_reports(SweepResult(directory, under_way.sweep, under_way.values, rows), executor, progress)
+        return write_reports(SweepResult(directory, sweep, under_way.values, rows), executor, progress)
