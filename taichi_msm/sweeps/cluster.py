@@ -37,6 +37,14 @@ from taichi_msm.system.versions import versions
 # How long a scheduler may take to answer [s].
 PATIENCE = 10
 
+# What transports need besides dask.
+_CERTIFICATES = "certificates; name them in dask's configuration, under distributed.comm.tls"
+REQUIREMENTS = {
+    "tls": _CERTIFICATES,
+    "wss": _CERTIFICATES,
+    "ucx": "UCX, which is not installed; pip install distributed-ucxx, or use tcp://",
+}
+
 # How often we look whether a worker has come [s].
 LOOK = 0.2
 
@@ -189,7 +197,7 @@ def connected(address: str, described: Sweep, directory: Path, progress: Progres
             raise
         finally:
             if not lost:
-                with suppress(OSError):  # lost just now
+                with suppress(OSError, ValueError):  # lost just now; forgotten by another command for this folder
                     cluster.shutdown(cancel_futures=True)
                     client.unregister_worker_plugin(name)
             client.close()
@@ -204,10 +212,13 @@ def _client(address: str) -> Any:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # Workers compare versions.
             return Client(address, timeout=PATIENCE, set_as_default=False)
-    except ValueError as error:
-        raise ExecutorError(f"{address}: {error}; {remedy}") from None
     except (OSError, asyncio.TimeoutError):
         raise ExecutorError(f"{address}: no dask scheduler answers; {remedy}") from None
+    except TypeError as error:  # by a transport whose requirements are missing
+        needs = REQUIREMENTS.get(address.partition("://")[0], " ".join(str(error).split()))
+        raise ExecutorError(f"{address}: needs {needs}") from None
+    except Exception as error:
+        raise ExecutorError(f"{address}: {' '.join(str(error).split())}; {remedy}") from None
 
 
 async def _greet(address: str) -> None:
