@@ -342,6 +342,16 @@ def test_a_dry_run_writes_nothing(many: Path, program: Program) -> None:
     assert (answer["keys"], len(answer["values"])) == (["springs.structural", "probes.0.at", "time.step"], 4)
 
 
+def test_a_dry_run_of_a_shard_is_of_its_runs(many: Path, program: Program) -> None:
+    whole, part = (program("sweep", "many.yaml", "--dry-run", *more).stdout for more in ((), ("--shard", "2/3")))
+    assert part.splitlines()[:2] == [whole.splitlines()[n] for n in (0, 2)]
+    assert part.splitlines()[2].startswith("1 run: about ")
+    answer = json.loads(program("sweep", "many.yaml", "--dry-run", "--shard", "1/3", "--json").stdout)
+    assert (answer["runs"], len(answer["values"])) == ([0, 3], 2)
+    every = json.loads(program("sweep", "many.yaml", "--dry-run", "--json").stdout)
+    assert answer["disk_bytes"] == every["disk_bytes"] // 2
+
+
 def test_many_runs_must_be_meant(many: Path, program: Program) -> None:
     (many / "many.yaml").write_text(SWEEP.replace("samples: 4", "samples: 1000000"))
     done = program("sweep", "many.yaml")
@@ -371,7 +381,12 @@ def test_it_is_started_from_python_with_any_executor(many: Path, pool: Pool) -> 
         sweep("small.yaml", {"dampign": {"grid": [1]}}, "wrong")
     for arguments, named, message in (
         ((3, vary, "wrong"), {}, "^scene: 3; take the path of a scene file$"),
-        (("small.yaml", vary, "wrong"), {"workers": 0}, "^workers: 0; take a whole number, 1 or more, or None$"),
+        (("small.yaml", vary, "wrong"), {"workers": 0}, "^workers: 0; take a whole number, 1 to 1024, or None$"),
+        (
+            ("small.yaml", vary, "wrong"),
+            {"workers": 10**30},
+            "^workers: 10{30}; take a whole number, 1 to 1024, or None$",
+        ),
         (("small.yaml", {"damping": 1j}, "wrong"), {}, "^vary, overrides: Object of type complex"),
     ):
         with pytest.raises(ArgumentError, match=message):
@@ -479,7 +494,7 @@ def test_an_executor_that_takes_no_more_runs_is_an_error() -> None:
 
 
 def test_there_is_a_process_for_each_core_as_far_as_memory_goes(monkeypatch: pytest.MonkeyPatch) -> None:
-    need = cost.Cost(1.0, True, 0, 1 << 30, 1, 0, "")
+    need = cost.Cost(1.0, 0, 1 << 30, 1, 0, "")
     monkeypatch.setattr(cost, "available_threads", lambda: 8)
     for free, runs_, number in ((100 << 30, 1000, 8), (3 << 30, 1000, 3), (1 << 20, 1000, 1), (100 << 30, 5, 5)):
         monkeypatch.setattr(cost, "available_memory", lambda free=free: free)
@@ -489,7 +504,7 @@ def test_there_is_a_process_for_each_core_as_far_as_memory_goes(monkeypatch: pyt
 
 def test_the_cost_is_that_of_all_runs(many: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(cost, "available_threads", lambda: 2)
-    monkeypatch.setattr(duration, "estimate", lambda plan: duration.Duration(5.0, 3.0, True))
+    monkeypatch.setattr(duration, "estimate", lambda plan: duration.Duration(5.0, 3.0))
     for samples in (64, 6400):
         (many / "many.yaml").write_text(
             SWEEP.replace("[0.01, auto]", "[auto]").replace("samples: 4", f"samples: {samples}")

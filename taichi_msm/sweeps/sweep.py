@@ -8,7 +8,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
-from taichi_msm.arguments import require_path
+from taichi_msm.arguments import MAX_WORKERS, require_path
 from taichi_msm.errors import ArgumentError, NotInstalledError, writing
 from taichi_msm.progress import Progress
 from taichi_msm.sweeps.cost import choose_workers, estimate
@@ -71,8 +71,8 @@ def sweep(
     require_path(directory)
     if not isinstance(scene, (str, Path)):
         raise ArgumentError(f"scene: {scene!r}; take the path of a scene file")
-    if workers is not None and not (type(workers) is int and workers > 0):
-        raise ArgumentError(f"workers: {workers!r}; take a whole number, 1 or more, or None")
+    if workers is not None and not (type(workers) is int and 1 <= workers <= MAX_WORKERS):
+        raise ArgumentError(f"workers: {workers!r}; take a whole number, 1 to {MAX_WORKERS}, or None")
     settings = {"vary": vary, "seed": seed, "set": overrides or {}} | ({} if samples is None else {"samples": samples})
     described = make_sweep(scene, settings)
     # The caller may change the current directory meanwhile.
