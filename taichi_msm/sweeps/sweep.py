@@ -40,7 +40,7 @@ def sweep(
 
     Args:
         scene: the scene file.
-        vary: keys of the scene by their dotted paths, and how each varies, as in a sweep file. Pictures are relative
+        vary: keys of the scene by their dotted paths, and how each varies, as in a sweep file. Files are relative
             to the scene file, and below its folder.
         directory: where runs/, table.csv and the other files go.
         samples: number of runs; None: every combination of the keys' grids.

@@ -171,7 +171,7 @@ def load_sweep(path: str | Path) -> Sweep:
 
 
 def make_sweep(scene: str | Path, settings: Mapping[str, Any]) -> Sweep:
-    """Make a sweep without a file; its pictures are relative to the scene file. SceneError: with all its faults."""
+    """Build a sweep without a file; its paths are relative to the scene file. SceneError: with all its faults."""
     try:
         data = json.loads(json.dumps({**settings, "scene": Path(scene).name}))
     except (TypeError, ValueError) as error:
