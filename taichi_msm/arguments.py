@@ -12,6 +12,10 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
 
+# More processes or threads than this are refused.
+MAX_WORKERS = 1024
+
+
 def as_array(values: Any, name: str) -> NDArray[Any]:
     """Turn an argument into an array; ArgumentError: it is impossible, such as for rows of different lengths."""
     # Imported here, so that a scene can be checked without importing NumPy.

@@ -13,14 +13,13 @@ import math
 import re
 from collections.abc import Mapping, Sequence
 from itertools import zip_longest
-from pathlib import Path
 from typing import Any, NamedTuple
 
 import yaml
 
 from taichi_msm.faults import LARGEST as MOST
 from taichi_msm.faults import cut
-from taichi_msm.picture import irregular
+from taichi_msm.picture import irregular, location
 
 MAX_BYTES = 2**22
 
@@ -335,7 +334,7 @@ def pose_fault(row: Sequence[float], before: Sequence[float] | None) -> str:
 
 
 def _read(name: str) -> str:
-    path = Path(name)
+    path = location(name)
     try:
         if what := irregular(path):
             raise CameraFileError(f"{name}: {what}; name a file")

@@ -21,6 +21,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from taichi_msm import __version__
+from taichi_msm.arguments import MAX_WORKERS
 from taichi_msm.errors import (
     ArgumentError,
     DeviceError,
@@ -41,6 +42,8 @@ from taichi_msm.system.streams import mute, tell
 if TYPE_CHECKING:
     from taichi_msm.console import Progress
     from taichi_msm.physics.plan import Plan
+    from taichi_msm.sweeps.cost import Cost
+    from taichi_msm.sweeps.sweepfile import Sweep
 
 DONE, BUG, WRONG_INPUT, DIVERGED, FILES = 0, 1, 2, 3, 4
 # What may be given together with --resume, and with --again.
@@ -93,9 +96,9 @@ arch_option = click.option(
     "--arch", metavar="cpu|cuda|vulkan", default="cpu", show_default=True, help="Device to compute on."
 )
 threads_option = click.option(
-    "--threads", type=click.IntRange(1, 1024), metavar="N", help="CPU threads.  [default: every core]"
+    "--threads", type=click.IntRange(1, MAX_WORKERS), metavar="N", help="CPU threads.  [default: every core]"
 )
-workers_option = partial(click.option, "--workers", type=click.IntRange(1, 1024), metavar="N")
+workers_option = partial(click.option, "--workers", type=click.IntRange(1, MAX_WORKERS), metavar="N")
 json_option = click.option("--json", "as_json", is_flag=True, help="Print one JSON object on stdout and nothing else.")
 
 
@@ -173,7 +176,6 @@ def run(
 
     from taichi_msm import runner
     from taichi_msm.console import Progress, summary
-    from taichi_msm.scenefile import duration
 
     interruption, name = Interruption(), str(scene or resume or again)
     try:
@@ -194,8 +196,6 @@ def run(
                 )
     except KeyboardInterrupt:
         return interrupted(interruption, as_json, f"interrupted; nothing was written{going_on(directory)}")
-    if resume is None:
-        duration.learn(plan, record)
     if as_json:
         print_json({"directory": str(directory), **record})
     if record["status"] != "complete":
@@ -256,7 +256,6 @@ def check(scene: str, image: str | None, overrides: tuple[str, ...], as_json: bo
 
     from taichi_msm.console import rough_time
 
-    source = "by earlier runs here" if takes.measured else "a guess, as no run has been timed here yet"
     asking = [f"{name}.tolerance" for name in ("sheet", "time") if getattr(loaded, name).tolerance is not None]
     more, longer = (", or more", f", or longer, as {' and '.join(asking)} may ask for more") if asking else ("", "")
     click.echo(yaml.safe_dump(facts["scene"], sort_keys=False, default_flow_style=None), nl=False)
@@ -268,7 +267,7 @@ def check(scene: str, image: str | None, overrides: tuple[str, ...], as_json: bo
     )
     click.echo(
         f"\n{need.points} points, {need.frames} frames, {stepped}\n"
-        f"about {rough_time(takes.seconds)} to run{longer} ({source})\n"
+        f"about {rough_time(takes.seconds)} to run{longer} (estimated from its work)\n"
         f"about {need.memory_bytes / 2**20:.0f} MiB of memory, at most {need.disk_bytes / 2**20:.1f} MiB on disk, "
         f"{need.working_bytes / 2**20:.1f} MiB more while it runs"
     )
@@ -510,8 +509,7 @@ def sweep(
     from taichi_msm.sweeps.folder import begin_sweep
     from taichi_msm.sweeps.summary import cost_line, count, summary_lines
     from taichi_msm.sweeps.sweep import finish, go_on, opened
-    from taichi_msm.sweeps.sweepfile import cell, load_sweep
-    from taichi_msm.sweeps.table import csv_line
+    from taichi_msm.sweeps.sweepfile import load_sweep
 
     if workers is not None and dask is not None:
         raise click.UsageError("--workers are processes here, and --dask has its own; leave out one of them")
@@ -520,15 +518,7 @@ def sweep(
     cost = estimate(described)
     chosen = choose_workers(cost, described.runs, workers)
     if dry_run:
-        values = described.values()
-        if as_json:
-            print_json({"keys": described.keys, "values": values, **cost._asdict(), "workers": chosen.number})
-            return DONE
-        click.echo(csv_line(["run", *described.keys]))
-        for run, row in enumerate(values):
-            click.echo(printable(csv_line([run, *map(cell, row)])))
-        click.echo(cost_line(described.runs, cost, chosen))
-        return DONE
+        return print_plan(described, cost, shard or (1, 1), workers, as_json)
     if not yes and (described.runs > MANY_RUNS or cost.seconds > LONG):
         raise click.UsageError(f"{cost_line(described.runs, cost, chosen)}; add --yes if that is meant")
     under_way = begin_sweep(described, directory, shard or (1, 1))
@@ -671,6 +661,28 @@ def read_forces_option(text: str) -> tuple[str, float]:
     except ValueError:
         said = f"{text}: expected FILE,SIGMA, such as forces.csv,0.01"
         raise click.BadParameter(said, param_hint="--forces") from None
+
+
+def print_plan(described: Sweep, cost: Cost, shard: tuple[int, int], workers: int | None, as_json: bool) -> int:
+    """Print the values of the runs of a shard, and what they take."""
+    from taichi_msm.sweeps.cost import choose_workers
+    from taichi_msm.sweeps.summary import cost_line
+    from taichi_msm.sweeps.sweepfile import cell
+    from taichi_msm.sweeps.table import csv_line
+
+    (part, parts), values = shard, described.values()
+    runs = range(part - 1, len(values), parts)
+    cost = cost.of(len(runs) / len(values))
+    chosen = choose_workers(cost, len(runs), workers)
+    if as_json:
+        rows = {"keys": described.keys, "runs": list(runs), "values": [values[run] for run in runs]}
+        print_json({**rows, **cost._asdict(), "workers": chosen.number})
+        return DONE
+    click.echo(csv_line(["run", *described.keys]))
+    for run in runs:
+        click.echo(printable(csv_line([run, *map(cell, values[run])])))
+    click.echo(cost_line(len(runs), cost, chosen))
+    return DONE
 
 
 def so_far(done: int, total: int) -> str:

@@ -41,7 +41,7 @@ _ORIENTATION = 0x0112
 _LYING = (5, 6, 7, 8)
 
 
-# Where pictures are read instead of at the paths by which they are known.
+# Where files are read instead of at the paths by which they are known.
 _copies: Mapping[str, Path] = {}
 
 
@@ -51,7 +51,7 @@ class PictureError(Exception):
 
 @contextmanager
 def copied(copies: Mapping[str, Path]) -> Iterator[None]:
-    """In a block, read copies of some pictures, by the paths by which they are known."""
+    """In a block, read copies of some files, by the paths by which they are known."""
     global _copies
     around, _copies = _copies, copies
     try:
@@ -107,10 +107,10 @@ def has_transparency(path: str) -> bool:
 
 
 def file_sha256(path: str) -> str:
-    """Compute the SHA-256 of a picture's file, in hexadecimal."""
+    """Compute the SHA-256 of a file, in hexadecimal."""
     _require_file(path)
     try:
-        with _place(path).open("rb") as file:
+        with location(path).open("rb") as file:
             return _sha256(file)
     except OSError as error:
         raise _unreadable(path, error) from None
@@ -159,7 +159,7 @@ def _open(path: str, sha256: str | None = None) -> Iterator[Image.Image]:
 @contextmanager
 def _file(path: str, sha256: str | None) -> Iterator[BinaryIO]:
     """Open a file, which must have a SHA-256 if one is given; raises PictureError."""
-    with _place(path).open("rb") as file:
+    with location(path).open("rb") as file:
         if sha256 is not None:
             if _sha256(file) != sha256:
                 raise PictureError(f"{path} is not the file that was run, as its SHA-256 tells; put that one back")
@@ -196,13 +196,14 @@ def irregular(path: Path) -> str:
     return "a directory" if stat.S_ISDIR(mode) else "not a regular file"
 
 
-def _place(path: str) -> Path:
+def location(path: str) -> Path:
+    """Find where a file is that is known by a path: there, or its copy."""
     return _copies.get(path) or Path(path)
 
 
 def _require_file(path: str) -> None:
     try:
-        kind = irregular(_place(path))
+        kind = irregular(location(path))
     except ValueError:
         raise PictureError(f"{path} is not a path; name a picture") from None
     except OSError as error:

@@ -603,7 +603,7 @@ def test_check_prints_the_resolved_scene_and_what_it_takes(small: Path, capsys: 
     assert (code, err) == (0, "")
     assert "falloff: 20.0" in out
     assert "\n99 points, 5 frames, 164 steps of 0.00243902 s (limit 0.00499221 s), 41 a frame, in f64\n" in out
-    assert re.search(r"\nabout \d.* to run \((by earlier|a guess)", out)
+    assert re.search(r"\nabout \d.* to run \(estimated from", out)
     assert " of memory, at most 0.1 MiB on disk, " in out
     assert not (small / "output").exists()
     facts = json.loads(call(capsys, "check", "small.yaml", "--json")[1])

@@ -17,6 +17,7 @@ import pytest
 
 from taichi_msm import sweep
 from taichi_msm.errors import MsmError
+from taichi_msm.sweeps.folder import values_in
 from taichi_msm.sweeps.sweepfile import load_sweep
 from tests.conftest import Program
 
@@ -26,8 +27,10 @@ SWEEP = """\
 scene: small.yaml
 samples: 6
 vary: {damping: {uniform: [0.005, 0.02]}}
-set: {sheet.points: [5, 5], time.duration: 0.1, output: [trajectory]}
+set: {sheet.points: [5, 5], time.duration: 0.1, output: [trajectory], render.camera: {calibration: k.yml, poses: t.txt}}
 """
+CALIBRATION = "K: [50, 0, 20, 0, 50, 15, 0, 0, 1]\nwidth: 40\nheight: 30\n"
+POSES = "0 0 0 0.4 1 0 0 0\n999 0 0 0.5 1 0 0 0\n"
 
 # Until something happens that must [s].
 SOON = 60.0
@@ -87,7 +90,8 @@ def lab(small: Path) -> Path:
     (small / "here").mkdir()
     for name in ("small.yaml", "speckle.png"):
         (small / name).rename(small / "here" / name)
-    (small / "here" / "sweep.yaml").write_text(SWEEP)
+    for name, text in (("sweep.yaml", SWEEP), ("k.yml", CALIBRATION), ("t.txt", POSES)):
+        (small / "here" / name).write_text(text)
     return small
 
 
@@ -231,6 +235,32 @@ def test_no_scheduler(lab: Path, program: Program, monkeypatch: pytest.MonkeyPat
     tried = program("sweep", "here/sweep.yaml", "--out", "far", "--dask", "nowhere")
     assert tried.returncode == 2
     assert "nowhere: missing port number" in tried.stderr
+
+
+@pytest.mark.parametrize(
+    ("address", "said"),
+    [
+        ("tls://127.0.0.1:1", "needs certificates; name them in dask's configuration, under distributed.comm.tls"),
+        ("ucx://127.0.0.1:1", "needs UCX, which is not installed; pip install distributed-ucxx, or use tcp://"),
+    ],
+)
+def test_a_transport_whose_requirements_are_missing(address: str, said: str, lab: Path, program: Program) -> None:
+    tried = program("sweep", "here/sweep.yaml", "--out", "far", "--json", "--dask", address)
+    assert (tried.returncode, json.loads(tried.stdout)["errors"]) == (2, [f"{address}: {said}"])
+
+
+def test_a_command_whose_inputs_another_one_has_removed_ends_well(lab: Path, machines: Machines) -> None:
+    from taichi_msm.sweeps.cluster import connected
+
+    address, described = machines.schedule(), load_sweep("here/sweep.yaml")
+    machines.work(address)
+    values_in(lab / "out", described)
+    with connected(address, described, lab / "out", quiet), connected(address, described, lab / "out", quiet):
+        pass
+
+
+def quiet(stage: str, done: int, total: int) -> None:
+    """Report nothing."""
 
 
 def test_workers_are_here_or_there(lab: Path, program: Program) -> None:

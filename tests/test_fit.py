@@ -683,7 +683,7 @@ def test_a_single_array_is_refused(tracks: dict[str, Array], tmp_path: Path, nam
         ({"bounds": {"tissue.young": ("1", 2)}}, "bounds: .*; take a mapping"),
         ({"forces": "forces.csv"}, "forces: 'forces.csv'; take a forces.csv and the standard deviation"),
         ({"directory": 5}, "directory: 5; take a path"),
-        ({"workers": 0}, "workers: 0; take a whole number, 1 or more"),
+        ({"workers": 0}, "workers: 0; take a whole number, 1 to 1024"),
         ({"sigma": "0.5"}, "sigma: '0.5'; take a number"),
         ({"correlation": "5"}, "correlation: '5'; take a number"),
         ({"resolution": 4.0}, "resolution: 4.0; take a whole number"),

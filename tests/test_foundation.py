@@ -225,7 +225,7 @@ def test_it_varies_in_a_sweep() -> None:
         '  tissue.foundation_map.image: {grid: "../*.png"}\nset: {tissue.foundation_map.range: [1, 4]}\n'
     )
     sweep = load_sweep("sub/many.yaml")
-    assert [Path(path).name for path in sweep.pictures] == ["deep.png", "other.png"]
+    assert [Path(path).name for path in sweep.files] == ["deep.png", "other.png"]
     plans = [load_plan("s.yaml", sweep.overrides(values)) for values in sweep.values()]
     assert [(plan.scene.tissue.foundation.young, plan.scene.pictures) for plan in plans] == [  # type: ignore[union-attr]
         (young, {"tissue.foundation_map.image": name}) for young in (1e4, 2e4) for name in ("deep.png", "other.png")

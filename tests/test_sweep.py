@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import csv
+import hashlib
 import io
 import json
+import math
 import os
 import shutil
 import signal
@@ -21,9 +23,10 @@ import pytest
 
 from taichi_msm import sweep
 from taichi_msm.errors import ArgumentError, MsmError, SceneError
+from taichi_msm.picture import file_sha256
 from taichi_msm.scenefile import duration
 from taichi_msm.sweeps import cost
-from taichi_msm.sweeps.folder import begin_sweep, values_in
+from taichi_msm.sweeps.folder import UnderWay, begin_sweep, values_in
 from taichi_msm.sweeps.outcome import Outcome
 from taichi_msm.sweeps.pool import ORPHANED, DiedError, Pool
 from taichi_msm.sweeps.schedule import outcomes
@@ -192,30 +195,130 @@ def test_another_sweep_in_the_folder_is_refused(many: Path, program: Program) ->
     assert "the scene file differs" in refusal()
     (many / "small.yaml").write_text(SMALL)
     (many / "speckle.png").write_bytes((many / "speckle.png").read_bytes() + b"0")
-    assert "a picture differs" in refusal()
+    assert "another sweep: speckle.png differs" in refusal()
+    # Which has another number of keys, too.
+    (many / "many.yaml").write_text("scene: small.yaml\nvary: {damping: {grid: [0.01, 0.02]}}\n")
+    assert "holds the runs of another sweep: samples differs" in refusal()
     assert files(Path("out")) == before
 
 
-@pytest.mark.parametrize("values", [3, [], [[1]] * 4, {"a": 1}, [3] * 4])
-def test_a_damaged_record_is_told(many: Path, program: Program, values: Any) -> None:
+def test_a_sweep_with_another_calibration_is_another_one(many: Path, program: Program) -> None:
+    text = "K: [50, 0, 20, 0, 50, 15, 0, 0, 1]\nwidth: 40\nheight: 30\n"
+    (many / "camera.yml").write_text(text)
+    setting = "set: {render.camera: {eye: [0, 0, 1], calibration: camera.yml}, output: [], time.duration: 0.1}"
+    (many / "many.yaml").write_text(f"scene: small.yaml\nvary: {{damping: {{grid: [0.01]}}}}\n{setting}\n")
+    assert program("sweep", "many.yaml", "--out", "out").returncode == 0
+    sha256 = hashlib.sha256(text.encode()).hexdigest()
+    assert json.loads(Path("out/sweep.json").read_text())["files"]["camera.yml"] == sha256
+    assert json.loads(Path("out/runs/000000/run.json").read_text())["sha256"]["render.camera.calibration"] == sha256
+    (many / "camera.yml").write_text(text.replace("50", "51"))
+    done = program("sweep", "many.yaml", "--out", "out")
+    said = "out: holds the runs of another sweep: camera.yml differs; choose another --out\n"
+    assert (done.returncode, done.stderr) == (2, said)
+
+
+@pytest.mark.parametrize("content", ["", "[" * 4000, "3", "{}"])
+def test_a_damaged_record_is_told(many: Path, program: Program, content: str) -> None:
     values_in(Path("out"), load_sweep("many.yaml"))
-    record = json.loads(Path("out/sweep.json").read_text())
-    Path("out/sweep.json").write_text(json.dumps({**record, "values": values}))
+    Path("out/sweep.json").write_text(content)
     done = program("sweep", "many.yaml", "--out", "out")
     assert (done.returncode, done.stderr) == (4, "out/sweep.json: damaged; choose another --out\n")
 
 
-def test_a_run_that_diverged_is_not_taken_again(many: Path) -> None:
+def with_value(run: int, value: Any) -> Callable[[Any], Any]:
+    """Change the first value of a run."""
+    return lambda kept: [[value, *row[1:]] if n == run else row for n, row in enumerate(kept)]
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        *(lambda kept: 3, lambda kept: [], lambda kept: [[1]] * 4, lambda kept: {"a": 1}, lambda kept: kept[::-1]),
+        *(with_value(2, math.nan), with_value(0, "5"), lambda kept: with_value(1, kept[1][0] * (1 + 2**-52))(kept)),
+    ],
+    ids=range(8),
+)
+def test_values_that_are_not_those_of_the_sweep_file_are_refused(
+    many: Path, program: Program, change: Callable[[Any], Any]
+) -> None:
+    values_in(Path("out"), load_sweep("many.yaml"))
+    record = json.loads(Path("out/sweep.json").read_text())
+    Path("out/sweep.json").write_text(json.dumps({**record, "values": change(record["values"])}))
+    done = program("sweep", "many.yaml", "--out", "out")
+    assert (done.returncode, done.stderr) == (
+        4,
+        "out/sweep.json: its values are not those of the sweep file, as it is damaged or of another SciPy; choose "
+        "another --out\n",
+    )
+
+
+@pytest.mark.parametrize("name", ["sweep.json", "runs", "runs/000002"])
+def test_nothing_is_written_through_a_link(many: Path, program: Program, name: str) -> None:
+    (many / "far").mkdir()
+    link = many / "out" / name
+    link.parent.mkdir(parents=True)
+    if name == "runs/000002":
+        values_in(Path("out2"), load_sweep("many.yaml"))
+        shutil.copy("out2/sweep.json", "out")
+    link.symlink_to(many / "far")
+    done = program("sweep", "many.yaml", "--out", "out")
+    said = f"out/{name}: a symbolic link that no run has put there; move it away or choose another folder\n"
+    assert (done.returncode, done.stderr) == (4, said)
+    assert not list((many / "far").iterdir())
+
+
+@pytest.fixture
+def one_ended(many: Path) -> Callable[..., UnderWay]:
+    """Begin a sweep whose run 2 has diverged, with changes of its record."""
     record = {"status": "diverged", "error": "at 0.1 s", "max_displacement": 1.0, "shortest_spring": 0.5}
     rest: dict[str, Any] = {"error_estimate": None, "notes": ["not known"], "timings": {"total": 2.0}}
     rest["probes"] = [{"greatest_force": 3.0}]
-    values_in(Path("out"), load_sweep("many.yaml"))
+    described = load_sweep("many.yaml")
+    values = values_in(Path("out"), described)
+    rest |= {"overrides": list(described.overrides(values[2])), "sha256": {"image": file_sha256("speckle.png")}}
     Path("out/runs/000002").mkdir(parents=True)
-    Path("out/runs/000002/run.json").write_text(json.dumps({**record, **rest}))
-    under_way = begin_sweep(load_sweep("many.yaml"), Path("out"))
+    file = Path("out/runs/000002/run.json")
+
+    def begin(**changes: Any) -> UnderWay:
+        if not file.exists():
+            file.write_text(json.dumps({**record, **rest, **changes}))
+        return begin_sweep(load_sweep("many.yaml"), Path("out"))
+
+    return begin
+
+
+def test_a_run_that_diverged_is_not_taken_again(one_ended: Callable[..., UnderWay]) -> None:
+    under_way = one_ended()
     assert under_way.done == [Outcome(2, "diverged", "at 0.1 s", 1.0, 0.5, forces=(3.0,))]
     assert [task.run for task in under_way.missing] == [0, 1, 3]
     assert under_way.total == 4
+
+
+@pytest.mark.parametrize(
+    "changes",
+    [
+        {"overrides": ["time.duration=0.2"]},
+        {"overrides": None},
+        {"sha256": {"image": "0" * 64}},
+        {"max_displacement": math.nan},
+        {"max_displacement": "deep"},
+        {"probes": [{"greatest_force": math.inf}]},
+    ],
+    ids=str,
+)
+def test_a_record_of_another_run_does_not_count(changes: Any, one_ended: Callable[..., UnderWay]) -> None:
+    assert len(one_ended(**changes).missing) == 4
+
+
+def test_a_record_that_is_a_link_or_damaged_does_not_count(one_ended: Callable[..., UnderWay]) -> None:
+    file = Path("out/runs/000002/run.json")
+    assert len(one_ended().missing) == 3
+    file.rename("record.json")
+    file.symlink_to(Path("record.json").absolute())
+    assert len(one_ended().missing) == 4
+    file.unlink()
+    file.write_text("[" * 4000)
+    assert len(one_ended().missing) == 4
 
 
 def test_two_commands_for_a_folder_leave_one_table(many: Path, pool: Pool) -> None:
@@ -237,6 +340,16 @@ def test_a_dry_run_writes_nothing(many: Path, program: Program) -> None:
     assert not Path("output").exists()
     answer = json.loads(program("sweep", "many.yaml", "--dry-run", "--json").stdout)
     assert (answer["keys"], len(answer["values"])) == (["springs.structural", "probes.0.at", "time.step"], 4)
+
+
+def test_a_dry_run_of_a_shard_is_of_its_runs(many: Path, program: Program) -> None:
+    whole, part = (program("sweep", "many.yaml", "--dry-run", *more).stdout for more in ((), ("--shard", "2/3")))
+    assert part.splitlines()[:2] == [whole.splitlines()[n] for n in (0, 2)]
+    assert part.splitlines()[2].startswith("1 run: about ")
+    answer = json.loads(program("sweep", "many.yaml", "--dry-run", "--shard", "1/3", "--json").stdout)
+    assert (answer["runs"], len(answer["values"])) == ([0, 3], 2)
+    every = json.loads(program("sweep", "many.yaml", "--dry-run", "--json").stdout)
+    assert answer["disk_bytes"] == every["disk_bytes"] // 2
 
 
 def test_many_runs_must_be_meant(many: Path, program: Program) -> None:
@@ -268,7 +381,12 @@ def test_it_is_started_from_python_with_any_executor(many: Path, pool: Pool) -> 
         sweep("small.yaml", {"dampign": {"grid": [1]}}, "wrong")
     for arguments, named, message in (
         ((3, vary, "wrong"), {}, "^scene: 3; take the path of a scene file$"),
-        (("small.yaml", vary, "wrong"), {"workers": 0}, "^workers: 0; take a whole number, 1 or more, or None$"),
+        (("small.yaml", vary, "wrong"), {"workers": 0}, "^workers: 0; take a whole number, 1 to 1024, or None$"),
+        (
+            ("small.yaml", vary, "wrong"),
+            {"workers": 10**30},
+            "^workers: 10{30}; take a whole number, 1 to 1024, or None$",
+        ),
         (("small.yaml", {"damping": 1j}, "wrong"), {}, "^vary, overrides: Object of type complex"),
     ):
         with pytest.raises(ArgumentError, match=message):
@@ -376,7 +494,7 @@ def test_an_executor_that_takes_no_more_runs_is_an_error() -> None:
 
 
 def test_there_is_a_process_for_each_core_as_far_as_memory_goes(monkeypatch: pytest.MonkeyPatch) -> None:
-    need = cost.Cost(1.0, True, 0, 1 << 30, 1, 0, "")
+    need = cost.Cost(1.0, 0, 1 << 30, 1, 0, "")
     monkeypatch.setattr(cost, "available_threads", lambda: 8)
     for free, runs_, number in ((100 << 30, 1000, 8), (3 << 30, 1000, 3), (1 << 20, 1000, 1), (100 << 30, 5, 5)):
         monkeypatch.setattr(cost, "available_memory", lambda free=free: free)
@@ -386,7 +504,7 @@ def test_there_is_a_process_for_each_core_as_far_as_memory_goes(monkeypatch: pyt
 
 def test_the_cost_is_that_of_all_runs(many: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(cost, "available_threads", lambda: 2)
-    monkeypatch.setattr(duration, "estimate", lambda plan: duration.Duration(5.0, 3.0, True))
+    monkeypatch.setattr(duration, "estimate", lambda plan: duration.Duration(5.0, 3.0))
     for samples in (64, 6400):
         (many / "many.yaml").write_text(
             SWEEP.replace("[0.01, auto]", "[auto]").replace("samples: 4", f"samples: {samples}")

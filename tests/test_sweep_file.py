@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import hashlib
 import json
 import math
+import os
 from pathlib import Path
 from typing import Any
 
@@ -14,7 +16,8 @@ from scipy.special import ndtri
 from scipy.stats import qmc
 
 from taichi_msm.errors import SceneError
-from taichi_msm.scenefile.load import load_plan
+from taichi_msm.scene import MAX_PATH, Scene
+from taichi_msm.scenefile.load import ANY, CAMERA_FILES, PICTURES, load_plan
 from taichi_msm.sweeps.distribution import Distribution
 from taichi_msm.sweeps.samples import values_of_runs, values_of_some
 from taichi_msm.sweeps.sweepfile import cell, load_sweep
@@ -135,7 +138,61 @@ def test_pictures_are_found_from_the_sweep_file_and_given_from_the_scene(folder:
     )
     scene = load_plan("scenes/small.yaml", overrides).scene
     assert scene.pictures == {"image": "scenes/../textures/b.png", "springs.map.image": "scenes/../textures/a.png"}
-    assert {Path(path).name for path in sweep.pictures} == {"a.png", "b.png", "speckle.png"}
+    assert {Path(path).name for path in sweep.files} == {"a.png", "b.png", "speckle.png"}
+
+
+CALIBRATION = "K: [50, 0, 20, 0, 50, 15, 0, 0, 1]\nwidth: 40\nheight: 30\n"
+POSES = "0 0 0 0.4 1 0 0 0\n9 0 0 0.5 1 0 0 0\n"
+
+
+def test_files_of_cameras_are_found_from_the_sweep_file_and_given_from_the_scene(folder: Path) -> None:
+    (folder / "scenes").mkdir()
+    for name in ("small.yaml", "speckle.png"):
+        (folder / name).rename(folder / "scenes" / name)
+    (folder / "lab").mkdir()
+    for name, text in (("a.yml", CALIBRATION), ("b.yml", CALIBRATION), ("way.txt", POSES)):
+        (folder / "lab" / name).write_text(text)
+    cameras = {"left": {"calibration": "lab/a.yml", "poses": "lab/way.txt"}}
+    vary = {
+        "render.cameras.left.calibration": {"grid": "lab/*.yml"},
+        "render.cameras.7": {"grid": [{"poses": "lab/way.txt"}]},
+    }
+    data = {"scene": "scenes/small.yaml", "set": {"render.cameras": cameras}, "vary": vary}
+    (folder / "many.yaml").write_text(json.dumps(data))
+    sweep = load_sweep("many.yaml")
+    assert sweep.settings.set["render.cameras"]["left"]["poses"] == "../lab/way.txt"
+    assert [row[0] for row in sweep.values()] == ["../lab/a.yml", "../lab/b.yml"]
+    assert [row[1] for row in sweep.values()] == [{"poses": "../lab/way.txt"}] * 2
+    assert {os.path.relpath(path) for path in sweep.files} == {
+        *("lab/a.yml", "lab/b.yml", "lab/way.txt", "scenes/speckle.png"),
+    }
+    plan = load_plan("scenes/small.yaml", sweep.overrides(sweep.values()[0]))
+    assert plan.sha256 == {
+        "render.cameras.left.calibration": hashlib.sha256(CALIBRATION.encode()).hexdigest(),
+        "render.cameras.left.poses": hashlib.sha256(POSES.encode()).hexdigest(),
+        "render.cameras.7.poses": hashlib.sha256(POSES.encode()).hexdigest(),
+    }
+
+
+def test_every_key_of_a_scene_that_names_a_file_is_known() -> None:
+    schema = Scene.model_json_schema()
+    found = set()
+
+    def walk(part: dict[str, Any], key: tuple[str, ...]) -> None:
+        if part.get("maxLength") == MAX_PATH:
+            found.add(key)
+        for name, inner in part.get("properties", {}).items():
+            walk(inner, (*key, name))
+        for inner in (part.get("additionalProperties"), part.get("items")):
+            if isinstance(inner, dict):
+                walk(inner, (*key, ANY))
+        for inner in part.get("anyOf", []):
+            walk(inner, key)
+        if "$ref" in part:
+            walk(schema["$defs"][part["$ref"].rpartition("/")[2]], key)
+
+    walk(schema, ())
+    assert found == {*PICTURES, *CAMERA_FILES}
 
 
 GOOD = {"scene": "small.yaml", "samples": 2, "vary": {"damping": {"uniform": [0.01, 0.02]}}}
@@ -224,6 +281,20 @@ FAULTS: list[tuple[dict[str, Any], str]] = [
         {"vary": {"image": {"choice": ["/etc/hostname"]}}},
         "vary.image.choice.0: /etc/hostname is neither below the sweep file's folder nor below the scene's; "
         "put the picture there",
+    ),
+    (
+        {"set": {"render.camera": {"calibration": "/etc/hostname"}}},
+        "set.render.camera: /etc/hostname is neither below the sweep file's folder nor below the scene's; "
+        "put the file there",
+    ),
+    (
+        {"vary": {"render.cameras.left.poses": {"choice": ["../a.txt", [[0, 0, 0, 0, 0, 0, 0, 1]]]}}},
+        "vary.render.cameras.left.poses.choice.0: ../a.txt is neither below the sweep file's folder nor below the "
+        "scene's; put the file there",
+    ),
+    (
+        {"set": {"render.camera.calibration": "a.yml"}},
+        "set.render.camera.calibration: a.yml: no such file; name a file relative to the sweep file",
     ),
     (
         {"samples": None, "vary": {name: {"grid": list(range(4000))} for name in ("damping", "springs.shear")}},

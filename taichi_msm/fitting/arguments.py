@@ -9,6 +9,7 @@ from typing import Any
 
 from typing_extensions import TypedDict
 
+from taichi_msm.arguments import MAX_WORKERS
 from taichi_msm.errors import ArgumentError, did_you_mean
 
 
@@ -65,7 +66,10 @@ _TYPES: dict[str, tuple[Callable[[Any], bool], str]] = {
         "a forces.csv and the standard deviation of its forces, such as ('forces.csv', 0.01)",
     ),
     "directory": (_is_path, "a path, or None"),
-    "workers": (lambda it: _is_number(it, Integral) and it > 0, "a whole number, 1 or more, or None"),
+    "workers": (
+        lambda it: _is_number(it, Integral) and 1 <= it <= MAX_WORKERS,
+        f"a whole number, 1 to {MAX_WORKERS}, or None",
+    ),
     "sigma": (_is_number, "a number, or None"),
     "correlation": (_is_number, "a number of pixels, or None"),
     "resolution": (lambda it: _is_number(it, Integral), "a whole number, or None"),

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -92,6 +92,7 @@ class Plan:
     grid: TimeGrid  # the steps
     slots: tuple[ProbeSlot, ...]  # the places where probes act with a force
     tools: tuple[Tool, ...]  # the probes that are moved
+    sha256: Mapping[str, str] = field(default_factory=dict)  # of the files of its cameras, by the keys that name them
 
     @property
     def open_edges(self) -> bool:

@@ -41,7 +41,7 @@ class Manifest:
     asks_estimate: bool | None  # whether to estimate the error beside the run; None: if it is cheap
     folder: str  # the current directory, from which the paths of the scene's pictures start
     arch: str  # cpu, cuda or vulkan
-    sha256: Mapping[str, str]  # of the files of the picture and the maps, by the keys that name them
+    sha256: Mapping[str, str]  # of the files of the picture, the maps and the cameras, by the keys that name them
     versions: Mapping[str, str]  # of all that the results depend on
 
     def as_json(self) -> dict[str, Any]:
@@ -115,12 +115,12 @@ def read_manifest(directory: Path) -> tuple[Manifest, Plan]:
 
 
 def digests(plan: Plan) -> dict[str, str]:
-    """Compute the SHA-256 of the files of a scene's picture and maps, by the keys that name them.
+    """Compute the SHA-256 of the files of a scene's picture, maps and cameras, by the keys that name them.
 
-    There is none of a picture that cannot be read. That of a map is of the file as it was read for the plan.
+    There is none of a picture that cannot be read. Those of maps and cameras are of the files as the plan read them.
     """
     scene = plan.scene
-    sha256 = {f"{scene.kind}.{name}.image": image.sha256 for name, image in plan.maps.items()}
+    sha256 = {**plan.sha256} | {f"{scene.kind}.{name}.image": image.sha256 for name, image in plan.maps.items()}
     if scene.image is not None:
         with suppress(PictureError):
             sha256["image"] = file_sha256(scene.image)

@@ -5,8 +5,9 @@ from __future__ import annotations
 import codecs
 import json
 import re
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from copy import deepcopy
+from dataclasses import replace
 from itertools import chain, starmap
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -14,7 +15,7 @@ from typing import Any, NamedTuple
 from taichi_msm.errors import ArgumentError, Key, Problem, SceneError
 from taichi_msm.faults import cut, flow
 from taichi_msm.physics.plan import Plan
-from taichi_msm.picture import SUFFIXES, irregular
+from taichi_msm.picture import SUFFIXES, file_sha256, irregular
 from taichi_msm.scene import MAX_PATH, Scene
 from taichi_msm.scenefile.validation import validate
 from taichi_msm.scenefile.yaml_reader import MAX_DEPTH, Document, Mark, UnreadableError, mark_at, read
@@ -26,8 +27,11 @@ IMAGE: Key = ("image",)
 MAPS: tuple[Key, ...] = (("tissue", "map", "image"), ("tissue", "foundation_map", "image"), ("springs", "map", "image"))
 PICTURES = (IMAGE, *MAPS)
 
-# The keys of a camera that name files.
-CAMERA_FILES = ("calibration", "poses")
+# The keys that name other files; ANY is the name of a camera.
+ANY = "*"
+CAMERA_FILES: tuple[Key, ...] = tuple(
+    ("render", *camera, key) for camera in (("camera",), ("cameras", ANY)) for key in ("calibration", "poses")
+)
 
 # The largest number of lines in an error: nobody reads more, and a broken file may have tens of thousands of problems.
 MAX_LINES = 100
@@ -107,7 +111,7 @@ def plan_file(file: File, overrides: Sequence[str] | Mapping[str, Any] = (), ima
     )
     for override in parsed:
         draft.override(override)
-    for key in (*(PICTURES if image is None else MAPS), *_camera_files(draft.data)):
+    for key in (*(PICTURES if image is None else MAPS), *(key for key, _ in camera_files(draft.data))):
         draft.find_file(key, file.folder)
     if image is not None:
         draft.override(_Override(f"--image {cut(str(image))}", IMAGE, str(image)))
@@ -115,16 +119,35 @@ def plan_file(file: File, overrides: Sequence[str] | Mapping[str, Any] = (), ima
     draft.report(problems)
     if plan is None or draft.problems:
         raise SceneError(draft.lines())
-    return plan
+    return replace(plan, sha256={".".join(map(str, key)): file_sha256(path) for key, path in camera_files(draft.data)})
 
 
-def _camera_files(data: Mapping[str, Any]) -> Iterator[Key]:
-    """List the keys of a scene's cameras that name files."""
+def names_file(key: Key) -> bool:
+    """Return whether a key of a scene, whose value is a text, names a file."""
+    return any(
+        len(key) == len(pattern) and all(part in (str(one), ANY) for one, part in zip(key, pattern, strict=True))
+        for pattern in (*PICTURES, *CAMERA_FILES)
+    )
+
+
+def camera_files(data: Mapping[str, Any]) -> list[tuple[Key, str]]:
+    """List the keys of the cameras of a scene that name files, with their values."""
     render = data.get("render")
     cameras = render.get("cameras") if isinstance(render, dict) else None
-    for name in (None, *(cameras if isinstance(cameras, dict) else ())):
-        camera: Key = ("camera",) if name is None else ("cameras", name)
-        yield from (("render", *camera, key) for key in CAMERA_FILES)
+    names = list(cameras) if isinstance(cameras, dict) else []
+    keys = [
+        tuple(name if part == ANY else part for part in pattern)
+        for pattern in CAMERA_FILES
+        for name in (names if ANY in pattern else [ANY])
+    ]
+    return [(key, path) for key in keys if isinstance(path := _value(data, key), str)]
+
+
+def _value(data: Any, key: Key) -> Any:
+    """Find the value of a key; None: there is none."""
+    for part in key:
+        data = data.get(part) if isinstance(data, dict) else None
+    return data
 
 
 def schema() -> dict[str, Any]:
@@ -212,10 +235,7 @@ class Draft:
 
     def find_file(self, key: Key, folder: Path) -> None:
         """Change the path of a file, given relative to a folder, to one from the current directory."""
-        holder: Any = self.data
-        for part in key[:-1]:
-            holder = holder.get(part) if isinstance(holder, dict) else None
-        image = holder.get(key[-1]) if isinstance(holder, dict) else None
+        holder, image = _value(self.data, key[:-1]), _value(self.data, key)
         if not (isinstance(image, str) and 0 < len(image) <= MAX_PATH):
             return
         holder[key[-1]] = str(folder / image)

@@ -1,7 +1,7 @@
 """Workers of dask.distributed, on any machines, as an executor of `concurrent.futures`.
 
-A plugin brings the scene and its pictures to every worker once, also to those that come later. Besides, a worker needs
-only this package and the folder of the sweep.
+A plugin brings the scene and the files that it names to every worker once, also to those that come later. Besides, a
+worker needs only this package and the folder of the sweep.
 """
 
 from __future__ import annotations
@@ -37,6 +37,14 @@ from taichi_msm.system.versions import versions
 # How long a scheduler may take to answer [s].
 PATIENCE = 10
 
+# What transports need besides dask.
+_CERTIFICATES = "certificates; name them in dask's configuration, under distributed.comm.tls"
+REQUIREMENTS = {
+    "tls": _CERTIFICATES,
+    "wss": _CERTIFICATES,
+    "ucx": "UCX, which is not installed; pip install distributed-ucxx, or use tcp://",
+}
+
 # How often we look whether a worker has come [s].
 LOOK = 0.2
 
@@ -50,15 +58,15 @@ class Inputs(WorkerPlugin):  # type: ignore[misc]  # that package has no types
         self.scene, self.directory = scene._replace(folder=scene.folder.absolute()), directory.absolute()
         self.home = Path.cwd()
         self.versions = what_decides_bits(versions(), "cpu")
-        self._digests = {str(Path(path).absolute()): digest for path, digest in described.pictures.items()}
+        self._digests = {str(Path(path).absolute()): digest for path, digest in described.files.items()}
         self._contents = {digest: Path(path).read_bytes() for path, digest in self._digests.items()}
         self.fault = ""
-        self.copies: dict[str, Path] = {}  # of the pictures, by their paths where the sweep was started
+        self.copies: dict[str, Path] = {}  # of the files, by their paths where the sweep was started
         self._folder = Path()  # of these copies
         self._ended = False
 
     def setup(self, worker: Any) -> None:
-        """Write the pictures into a temporary folder of the worker; ExecutorError: it cannot take runs."""
+        """Write the files into a temporary folder of the worker; ExecutorError: it cannot take runs."""
         self.fault = self._fault(worker)
         if self.fault:
             raise ExecutorError(self.fault)
@@ -138,7 +146,7 @@ def _cancel(answer: Future[Any]) -> None:
 
 
 def _call(name: str, function: Callable[..., Any], *arguments: Any) -> Any:
-    """Call a function in a worker, where the pictures are those that it was sent."""
+    """Call a function in a worker, where the files are those that it was sent."""
     with copied(_inputs(name).copies):
         return function(*arguments)
 
@@ -189,7 +197,7 @@ def connected(address: str, described: Sweep, directory: Path, progress: Progres
             raise
         finally:
             if not lost:
-                with suppress(OSError):  # lost just now
+                with suppress(OSError, ValueError):  # lost just now; forgotten by another command for this folder
                     cluster.shutdown(cancel_futures=True)
                     client.unregister_worker_plugin(name)
             client.close()
@@ -204,10 +212,13 @@ def _client(address: str) -> Any:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # Workers compare versions.
             return Client(address, timeout=PATIENCE, set_as_default=False)
-    except ValueError as error:
-        raise ExecutorError(f"{address}: {error}; {remedy}") from None
     except (OSError, asyncio.TimeoutError):
         raise ExecutorError(f"{address}: no dask scheduler answers; {remedy}") from None
+    except TypeError as error:  # by a transport whose requirements are missing
+        needs = REQUIREMENTS.get(address.partition("://")[0], " ".join(str(error).split()))
+        raise ExecutorError(f"{address}: needs {needs}") from None
+    except Exception as error:
+        raise ExecutorError(f"{address}: {' '.join(str(error).split())}; {remedy}") from None
 
 
 async def _greet(address: str) -> None:

@@ -25,7 +25,6 @@ class Cost(NamedTuple):
     """What all runs take, about."""
 
     seconds: float  # on this machine, with every core
-    measured: bool  # whether that follows from earlier runs here, and not only from a calibration
     disk_bytes: int  # at most
     memory_bytes: int  # of one process
     looked_at: int  # how many runs this follows from
@@ -62,7 +61,6 @@ def estimate(sweep: Sweep) -> Cost:
     return Cost(
         # A process starts once, for many runs.
         seconds=max((one.start for one in times), default=0.0) + share * seconds,
-        measured=all(one.measured for one in times),
         disk_bytes=round(share * sum(need.disk_bytes for need in needs)),
         memory_bytes=PROCESS_BYTES + max((need.memory_bytes for need in needs), default=0),
         looked_at=looked_at,

@@ -13,6 +13,8 @@ from typing import Any
 from taichi_msm.errors import FilesError, ForeignError, SceneError, writing
 from taichi_msm.outputs.table import RECORD, RUNS, SWEEP
 from taichi_msm.progress import Pause
+from taichi_msm.results.entries import FILE, FOLDER, kind, require
+from taichi_msm.results.publication import MAX_RECORD
 from taichi_msm.results.whole import give_name, lock, staged
 from taichi_msm.sweeps.outcome import Outcome, outcome_of
 from taichi_msm.sweeps.result import FILES
@@ -24,19 +26,23 @@ from taichi_msm.system.versions import versions
 # Runs that ended so need not be taken again.
 ENDED = ("complete", "diverged")
 
+# Larger than the record of any sweep.
+MAX_BYTES = 1 << 32
+
 # How often a folder that another command has is tried again [s].
 PATIENCE = 0.1
 
 
 def values_in(directory: Path, sweep: Sweep) -> list[list[Any]]:
-    """Give the values of all runs: those that the folder has of this sweep, else new ones, which are kept there.
+    """Compute the values of all runs, which the folder keeps, after making sure that it holds no other sweep.
 
     Raises:
         SceneError: when the folder holds another sweep, or the same of versions that give other bits.
-        FilesError: when it cannot be read or written, or something is in the way.
+        FilesError: when it cannot be read or written, something is in the way, or it keeps other values.
     """
-    record = directory / SWEEP
-    description = sweep.description()
+    record = require(directory / SWEEP, FILE)
+    require(directory / RUNS, FOLDER)
+    description, values = sweep.description(), sweep.values()
     if not record.exists():
         for name in (RUNS, *FILES, RECORD):
             if (directory / name).exists():
@@ -46,30 +52,38 @@ def values_in(directory: Path, sweep: Sweep) -> list[list[Any]]:
             **description,
             "keys": sweep.keys,
             "versions": versions(),
-            "values": sweep.values(),
+            "values": values,
         }
         with writing(directory), staged(directory) as hidden:
             (hidden / SWEEP).write_text(json.dumps(content) + "\n", encoding="utf-8", errors="backslashreplace")
             give_name(hidden / SWEEP, record)  # unless another shard has just done so
     try:
-        kept = json.loads(record.read_bytes())
+        with record.open("rb") as file:
+            kept = json.loads(file.read(MAX_BYTES))
         earlier = {name: kept.get(name) for name in description}
-        values, began = kept["values"], what_decides_bits(kept["versions"], "cpu")
-        if [len(row) for row in values] != [len(sweep.keys)] * len(values):
-            raise ValueError("not the values of a sweep")
+        # As a text, in which no number equals another one, and NaN itself.
+        kept_values, began = json.dumps(kept["values"]), what_decides_bits(kept["versions"], "cpu")
     except OSError as error:
         raise FilesError(f"{record}: {(error.strerror or str(error)).lower()}") from None
-    except (ValueError, KeyError, TypeError, AttributeError):
+    except (ValueError, KeyError, TypeError, AttributeError, RecursionError):
         raise FilesError(f"{record}: damaged; choose another --out") from None
     if other := [name for name, value in json.loads(json.dumps(description)).items() if value != earlier[name]]:
-        what = {"digest": "the scene file", "pictures": "a picture"}.get(other[0], other[0])
-        raise SceneError([f"{directory}: holds the runs of another sweep: {what} differs; choose another --out"])
-    if len(values) != sweep.runs:
-        raise FilesError(f"{record}: damaged; choose another --out")
+        what = {"digest": "the scene file", "files": _changed(description["files"], earlier["files"])}
+        said = f"holds the runs of another sweep: {what.get(other[0], other[0])} differs"
+        raise SceneError([f"{directory}: {said}; choose another --out"])
     here = what_decides_bits(versions(), "cpu")
     if others := [f"{name} {version}" for name, version in began.items() if version != here.get(name)]:
         raise SceneError([f"{directory}: the sweep began with {', '.join(others)}; use these, or choose another --out"])
+    if kept_values != json.dumps(values):
+        said = "its values are not those of the sweep file, as it is damaged or of another SciPy"
+        raise FilesError(f"{record}: {said}; choose another --out")
     return values
+
+
+def _changed(files: dict[str, str], earlier: Any) -> str:
+    """Name a file whose digest is not what it was."""
+    known = earlier if isinstance(earlier, dict) else files
+    return next((path for path, digest in files.items() if known.get(path) != digest), "a file")
 
 
 @dataclass
@@ -92,20 +106,25 @@ def begin_sweep(sweep: Sweep, directory: Path, shard: tuple[int, int] = (1, 1)) 
     done, missing = [], []
     for run in range(part - 1, len(values), parts):
         task = Task(run, sweep.scene, sweep.overrides(values[run]), directory, home)
-        if outcome := ended(run, task.directory):
+        require(task.directory, FOLDER)
+        if outcome := ended(task, sweep):
             done.append(outcome)
         else:
             missing.append(task)
     return UnderWay(directory, sweep, values, done, missing, len(done) + len(missing))
 
 
-def ended(run: int, directory: Path) -> Outcome | None:
-    """Find the outcome of a run that has ended; None: it is missing, or was interrupted."""
+def ended(task: Task, sweep: Sweep) -> Outcome | None:
+    """Find the outcome of a run that has ended; None: it is missing, was interrupted, or is another task's."""
     # A record that no run has written is as none.
-    with suppress(OSError, ValueError, KeyError, TypeError, AttributeError):
-        record = json.loads((directory / RECORD).read_bytes())
-        if record["status"] in ENDED:
-            return outcome_of(run, record)
+    with suppress(OSError, ValueError, KeyError, TypeError, AttributeError, RecursionError):
+        if kind(task.directory / RECORD) == FILE:
+            with (task.directory / RECORD).open("rb") as file:
+                record = json.loads(file.read(MAX_RECORD))
+            is_own = tuple(record["overrides"]) == task.overrides
+            has_same_files = sweep.digests.issuperset(record["sha256"].values())
+            if record["status"] in ENDED and is_own and has_same_files:
+                return outcome_of(task.run, record)
     return None
 
 

@@ -21,7 +21,6 @@ MOST_NOTES = 5
 
 def cost_line(runs: int, cost: Cost, workers: Workers | None) -> str:
     """Say what a sweep takes; None: its workers are elsewhere."""
-    guess = "" if cost.measured else " (a guess, as no run has been timed here yet)"
     if workers is None:
         where = "if they were run here"
     else:
@@ -29,7 +28,7 @@ def cost_line(runs: int, cost: Cost, workers: Workers | None) -> str:
         where = f"in {processes} ({workers.cores} cores; memory for {workers.fitting})"
     disk = f"at most {cost.disk_bytes / 2**20:.1f} MiB on disk"
     refused = f"; of {cost.looked_at} that were checked, {cost.refused} will be refused, for example: {cost.example}"
-    return f"{_runs(runs)}: about {rough_time(cost.seconds)}{guess} {where}, {disk}{refused if cost.refused else ''}"
+    return f"{_runs(runs)}: about {rough_time(cost.seconds)} {where}, {disk}{refused if cost.refused else ''}"
 
 
 def summary_lines(

@@ -8,9 +8,8 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
-from taichi_msm.arguments import require_path
+from taichi_msm.arguments import MAX_WORKERS, require_path
 from taichi_msm.errors import ArgumentError, NotInstalledError, writing
-from taichi_msm.outputs.table import RUNS, numbered
 from taichi_msm.progress import Progress
 from taichi_msm.sweeps.cost import choose_workers, estimate
 from taichi_msm.sweeps.folder import ENDED, UnderWay, alone, begin_sweep, ended
@@ -41,7 +40,7 @@ def sweep(
 
     Args:
         scene: the scene file.
-        vary: keys of the scene by their dotted paths, and how each varies, as in a sweep file. Pictures are relative
+        vary: keys of the scene by their dotted paths, and how each varies, as in a sweep file. Files are relative
             to the scene file, and below its folder.
         directory: where runs/, table.csv and the other files go.
         samples: number of runs; None: every combination of the keys' grids.
@@ -72,8 +71,8 @@ def sweep(
     require_path(directory)
     if not isinstance(scene, (str, Path)):
         raise ArgumentError(f"scene: {scene!r}; take the path of a scene file")
-    if workers is not None and not (type(workers) is int and workers > 0):
-        raise ArgumentError(f"workers: {workers!r}; take a whole number, 1 or more, or None")
+    if workers is not None and not (type(workers) is int and 1 <= workers <= MAX_WORKERS):
+        raise ArgumentError(f"workers: {workers!r}; take a whole number, 1 to {MAX_WORKERS}, or None")
     settings = {"vary": vary, "seed": seed, "set": overrides or {}} | ({} if samples is None else {"samples": samples})
     described = make_sweep(scene, settings)
     # The caller may change the current directory meanwhile.
@@ -126,11 +125,12 @@ def go_on(under_way: UnderWay, executor: Executor, progress: Progress) -> Iterat
 
 def finish(under_way: UnderWay, executor: Executor, progress: Progress) -> tuple[list[str], list[str]]:
     """Write the table and the other files of a sweep; gives their names, and what the user should know."""
-    directory, total = under_way.directory, under_way.total
+    directory, total, sweep = under_way.directory, under_way.total, under_way.sweep
     with writing(directory), alone(directory, lambda: progress("runs", total, total)):
         # Another command may have taken a run that it kept from us.
+        tasks = {task.run: task for task in under_way.missing}
         rows = [
-            (None if row.status in ENDED else ended(row.run, directory / RUNS / numbered(row.run))) or row
+            (None if row.status in ENDED else ended(tasks[row.run], sweep)) or row
             for row in sorted(under_way.done, key=lambda row: row.run)
         ]
-        return write_reports(SweepResult(directory, under_way.sweep, under_way.values, rows), executor, progress)
+        return write_reports(SweepResult(directory, sweep, under_way.values, rows), executor, progress)

@@ -20,7 +20,18 @@ from taichi_msm.errors import ArgumentError, Key, Problem, SceneError
 from taichi_msm.faults import cut, flow, refused
 from taichi_msm.picture import SUFFIXES, PictureError, file_sha256
 from taichi_msm.scene import MAX_PATH, FilePath, Scene, Section, Whole, key
-from taichi_msm.scenefile.load import PICTURES, SCENE, Draft, File, Kind, is_below, parse_key, parse_override, read_file
+from taichi_msm.scenefile.load import (
+    PICTURES,
+    SCENE,
+    Draft,
+    File,
+    Kind,
+    is_below,
+    names_file,
+    parse_key,
+    parse_override,
+    read_file,
+)
 from taichi_msm.scenefile.validation import parse
 from taichi_msm.scenefile.yaml_reader import UnreadableError, read
 from taichi_msm.sweeps.distribution import Distribution
@@ -114,32 +125,37 @@ class Sweep:
         return tuple(f"{name}={cell(value)}" for name, value in pairs)
 
     @cached_property
-    def pictures(self) -> dict[str, str]:
-        """The SHA-256 of every picture that the runs may need, by its path; without those that cannot be read."""
+    def files(self) -> dict[str, str]:
+        """The SHA-256 of every file that the runs may need, by its path; without those that cannot be read."""
         names: list[str] = []
 
-        def noted(text: str) -> str:
+        def noted(_: Key, text: str) -> str:
             names.append(text)
             return text
 
         listed = [(name, one.values) for name, one in self.settings.vary.items() if one.kind in ("choice", "grid")]
         pairs = [(name, value) for name, values in listed for value in values]
-        _with_pictures((), self.scene.document.data, noted)
+        _with_files((), self.scene.document.data, noted)
         for name, value in [*self.settings.set.items(), *pairs]:
-            _with_pictures(_as_key(name), value, noted)
+            _with_files(_as_key(name), value, noted)
         digests = {}
         for path in dict.fromkeys(str(self.scene.folder / name) for name in names):
             with suppress(PictureError):  # The run that needs it says why.
                 digests[path] = file_sha256(path)
         return digests
 
+    @cached_property
+    def digests(self) -> frozenset[str]:
+        """The digests of these files."""
+        return frozenset(self.files.values())
+
     def description(self) -> dict[str, Any]:
         """Give all that its results follow from, for JSON; two sweeps that are described equally are one."""
         settings = self.settings.model_dump(mode="json", exclude={"scene", "vary"})
         vary = {name: {one.kind: one.values} for name, one in self.settings.vary.items()}
         scene = json.dumps(self.scene.document.data).encode()
-        pictures = {os.path.relpath(path, self.scene.folder): digest for path, digest in self.pictures.items()}
-        return {**settings, "vary": vary, "digest": hashlib.sha256(scene).hexdigest(), "pictures": pictures}
+        files = {os.path.relpath(path, self.scene.folder): digest for path, digest in self.files.items()}
+        return {**settings, "vary": vary, "digest": hashlib.sha256(scene).hexdigest(), "files": files}
 
 
 def load_sweep(path: str | Path) -> Sweep:
@@ -155,7 +171,7 @@ def load_sweep(path: str | Path) -> Sweep:
 
 
 def make_sweep(scene: str | Path, settings: Mapping[str, Any]) -> Sweep:
-    """Make a sweep without a file; its pictures are relative to the scene file. SceneError: with all its faults."""
+    """Build a sweep without a file; its paths are relative to the scene file. SceneError: with all its faults."""
     try:
         data = json.loads(json.dumps({**settings, "scene": Path(scene).name}))
     except (TypeError, ValueError) as error:
@@ -203,16 +219,17 @@ def cell(value: Any) -> str:
 
 
 def _relocate(data: dict[str, Any], folder: Path, home: Path) -> Iterator[Problem]:
-    """Make paths of pictures, given relative to a folder, relative to the scene's, its home; expand patterns."""
+    """Make paths of files, given relative to a folder, relative to the scene's, its home; expand patterns."""
     vary, fixed = _mappings(data)
     for name, ways in vary.items():
         for way in {"choice", "grid"} & set(ways if isinstance(ways, dict) else ()):
             path: Key = ("vary", name, way)
-            if isinstance(pattern := ways[way], str) and _as_key(name) in PICTURES:
+            if isinstance(pattern := ways[way], str) and names_file(_as_key(name)):
+                noun, suffixes = _kind_of_file(_as_key(name))
                 names = sorted(glob(pattern, root_dir=folder))  # noqa: PTH207  # Path.glob refuses absolute patterns
-                ways[way] = [text for text in names if text.lower().endswith(SUFFIXES) and (folder / text).is_file()]
+                ways[way] = [text for text in names if text.lower().endswith(suffixes) and (folder / text).is_file()]
                 if not ways[way]:
-                    said = f"{flow(pattern)} matches no picture; give a pattern relative to the sweep file"
+                    said = f"{flow(pattern)} matches no {noun}; give a pattern relative to the sweep file"
                     yield Problem(path, said)
             if isinstance(ways[way], list):
                 for index, value in enumerate(ways[way]):
@@ -224,10 +241,11 @@ def _relocate(data: dict[str, Any], folder: Path, home: Path) -> Iterator[Proble
 
 
 def _relocated(name: str, value: Any, folder: Path, home: Path) -> tuple[Any, list[str]]:
-    """Relocate the pictures in the value of a key; returns it, and what is wrong with them."""
+    """Relocate the files in the value of a key; returns it, and what is wrong with them."""
     faults = []
 
-    def relocated(text: str) -> str:
+    def relocated(key: Key, text: str) -> str:
+        noun, _ = _kind_of_file(key)
         path = folder / text
         try:
             is_file = path.is_file()
@@ -235,22 +253,27 @@ def _relocated(name: str, value: Any, folder: Path, home: Path) -> tuple[Any, li
             is_file = False
         if not (is_below(path, folder) or is_below(path, home)):
             faults.append(
-                f"{text} is neither below the sweep file's folder nor below the scene's; put the picture there"
+                f"{text} is neither below the sweep file's folder nor below the scene's; put the {noun} there"
             )
         elif not is_file:
-            faults.append(f"{cut(text)}: no such file; name a picture relative to the sweep file")
+            faults.append(f"{cut(text)}: no such file; name a {noun} relative to the sweep file")
         # A folder may be a link, from which .. leads elsewhere.
         return Path(os.path.relpath(path.parent.resolve() / path.name, home.resolve())).as_posix()
 
-    return _with_pictures(_as_key(name), value, relocated), faults
+    return _with_files(_as_key(name), value, relocated), faults
 
 
-def _with_pictures(path: Key, value: Any, change: Callable[[str], str]) -> Any:
-    """Change the paths of pictures in the value of a key."""
-    if path in PICTURES:
-        return change(value) if isinstance(value, str) and 0 < len(value) <= MAX_PATH else value
+def _kind_of_file(key: Key) -> tuple[str, tuple[str, ...]]:
+    """Return the noun for the file that a key names, and the ends that its name may have."""
+    return ("picture", SUFFIXES) if key in PICTURES else ("file", ("",))
+
+
+def _with_files(path: Key, value: Any, change: Callable[[Key, str], str]) -> Any:
+    """Change the paths of files in the value of a key."""
+    if names_file(path):
+        return change(path, value) if isinstance(value, str) and 0 < len(value) <= MAX_PATH else value
     if isinstance(value, dict):
-        return {name: _with_pictures((*path, name), one, change) for name, one in value.items()}
+        return {name: _with_files((*path, name), one, change) for name, one in value.items()}
     return value
 
 

@@ -14,7 +14,7 @@ from typing import TextIO
 from taichi_msm.errors import printable
 
 # Held while descriptors are redirected, which belong to all threads.
-_redirecting = threading.Lock()
+_redirecting = threading.RLock()
 
 
 def open_missing() -> None:
