@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import re
 from collections.abc import Callable
+from typing import Any
 
 import numpy as np
 import pytest
@@ -286,7 +287,7 @@ def released(across: float, down: float, active: str) -> Scene:
         *([t, across + x, down + y, height] for t, x, y, height in way),
         instrument={"radius": 0.006, "shaft": [0, 0, 1], "length": 0.15},
     )
-    tissue = {"young": 3e5, "thickness": 3.2e-3, "density": 1050, "foundation": 1e6, "pretension": 200}
+    tissue: dict[str, Any] = {"young": 3e5, "thickness": 3.2e-3, "density": 1050, "foundation": 1e6, "pretension": 200}
     sheet = {"points": [15, 9], "size": [0.045, 0.026]}
     tissue["foundation_active"] = active
     return scene(sheet=sheet, springs=None, damping=0, tissue=tissue, probes=[rod], time={"duration": 0.8})
