@@ -76,7 +76,7 @@ def _pierces(tool: Tool, position: NDArray[np.floating], time: float) -> bool:
         triangle = np.stack([place[i, j], third, place[i + 1, j + 1]], axis=1)
         x, y = triangle[..., 1], triangle[..., 2]
         shares = np.roll(x, -1, 1) * np.roll(y, -2, 1) - np.roll(x, -2, 1) * np.roll(y, -1, 1)
-        inside = (shares > 0).all(axis=1) | (shares < 0).all(axis=1)
+        inside = ((shares >= 0).all(axis=1) | (shares <= 0).all(axis=1)) & (shares.sum(axis=1) != 0)
         met = (shares * triangle[..., 0]).sum(axis=1)[inside] / shares.sum(axis=1)[inside]
         if ((met >= 0) & (met <= tool.length)).any():
             return True
