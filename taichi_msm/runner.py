@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import replace
 from functools import partial
@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 from taichi_msm.arguments import require_path
 from taichi_msm.errors import DamagedError, DeviceError, DivergedError, FilesError, SceneError, writing
 from taichi_msm.physics.lattice import rest_positions
+from taichi_msm.physics.path_dependence import PathDependence
 from taichi_msm.physics.pilots import AT_REST, Pilots, choose_pilots
 from taichi_msm.physics.plan import Plan
 from taichi_msm.physics.probe_force import ProbeRecord, probe_records
@@ -236,7 +237,7 @@ class _Run:
         plan, device, manifest = task.plan, task.device, task.manifest
         self._frames = plan.grid.frames + 1
         progress("compile", 0, self._frames)
-        cores = free_cores(plan)
+        self._cores = cores = free_cores(plan)
         # With one thread there is no core for an encoder beside the simulation.
         beside = device.threads > 1
         # In this order, so that the encoder starts up while kernels are compiled.
@@ -247,6 +248,11 @@ class _Run:
         self._resumed = self._writer.stored
         pilots = _pilots(task, resumed=self._resumed > 0)
         self._error: RunError | None = None
+        self._ways = PathDependence(plan) if plan.scene.time.at_rest else None
+        asked = manifest.asks_estimate
+        self._solves_again = self._ways is not None and (
+            asked is True or (asked is None and device.arch == "cpu" and self._ways.affords(pilots.cost))
+        )
         self._known = Known(manifest.estimate, pilots.reason, manifest.mesh)
         if pilots.some:
             try:
@@ -269,6 +275,9 @@ class _Run:
                 self._error.compile()
         if writer.saved:
             self._simulation.restore(writer.saved)
+        if self._ways and self._task.plan.scene.output:
+            for frame in range(writer.frames):
+                self._ways.follow(frame, writer.position(frame) - rest)
         if self._error:
             with self._watch.stage("pilot"):
                 for frame in range(1, writer.frames):
@@ -294,6 +303,8 @@ class _Run:
                 for camera, before in observed.items():
                     observed[camera] = simulation.observe(before.labels, camera, position, time)
             writer.add(position, observed, simulation.forces(), told)
+            if self._ways:
+                self._ways.follow(frame, position - rest)
             if self._error and frame > 0:
                 with stage("pilot"):
                     self._error.follow(position - rest, told)
@@ -302,6 +313,9 @@ class _Run:
                 kept = (writer.position(frame) - rest for frame in range(1, self._frames)) if scene.output else None
                 with stage("pilot"):
                     self._error.finish(kept, partial(self._progress, "pilot"))
+            if self._ways and self._solves_again:
+                with stage("pilot"):
+                    self._ways.finish(self._task.device, self._cores, partial(self._progress, "pilot", 0, 1))
         except KeyboardInterrupt:
             # All frames are done, and what the coarse pilot tells stands.
             writer.finish()
@@ -347,7 +361,7 @@ class _Run:
         seconds = {stage: watch.seconds.get(stage, 0.0) for stage in stages}
         record = {
             **ending,
-            **_facts(self._task, simulation.progress, simulation.felt, known),
+            **_facts(self._task, simulation.progress, simulation.felt, known, self._ways.notes() if self._ways else ()),
             "resumed": self._resumed,
             "timings": {**seconds, "encode": writer.encode_seconds, "total": watch.total()},
             "arch": device.arch,
@@ -380,7 +394,9 @@ def _pilots(task: _Task, *, resumed: bool) -> Pilots:
     return pilots
 
 
-def _facts(task: _Task, progress: RunProgress, felt: Felt, known: Known) -> dict[str, Any]:
+def _facts(
+    task: _Task, progress: RunProgress, felt: Felt, known: Known, path_dependence: Iterable[str]
+) -> dict[str, Any]:
     """Say what was run, and what is known of its last frame, for run.json."""
     manifest, plan = task.manifest, task.plan
     scene = plan.scene
@@ -406,7 +422,7 @@ def _facts(task: _Task, progress: RunProgress, felt: Felt, known: Known) -> dict
         "shortest_spring": progress.shortest_spring,
         "longest_spring": progress.longest_spring,
         "probes": probes,
-        "notes": [*run_notes(plan, probes, progress, *known), *drawing_notes(scene)],
+        "notes": [*run_notes(plan, probes, progress, *known), *path_dependence, *drawing_notes(scene)],
         "error_estimate": error_record(known),
         **({"error_estimate_reason": known.reason} if known.estimate is None else {}),
     }

@@ -8,17 +8,18 @@ from typing import Any
 import numpy as np
 import pytest
 
+from taichi_msm import Simulation
 from taichi_msm.errors import SceneError
 from taichi_msm.physics.kernel import SheetLayout
 from taichi_msm.physics.paths import fewest_steps, path_notes, tools_of
 from taichi_msm.physics.planning import try_plan
 from taichi_msm.physics.solver import Dynamics
-from taichi_msm.physics.state import State
+from taichi_msm.physics.state import RunProgress, State
 from taichi_msm.scene import Scene
 from taichi_msm.scenefile.validation import checked
 from taichi_msm.system.runtime import Device
 from tests import reference
-from tests.motion import dynamics_of, structure_of
+from tests.motion import dynamics_of, notes_of, structure_of
 from tests.scenes import plan_of, scene
 from tests.test_dynamics import as_on_a_gpu, assert_like_twin, with_lanes
 
@@ -244,3 +245,46 @@ def test_units_and_times_that_cannot_be_meant_are_noted() -> None:
     assert height == "probes.0.path: a height of 5 m beside a sheet of 0.4 m; heights are in metres"
     assert path == "probes.0.path ends at 300 s, after the end of the scene at 0.4 s"
     assert grip == "probes.0.grip begins at 2 s, not before the end of the scene at 0.4 s"
+
+
+def test_a_tip_that_is_deep_in_a_soft_foundation_is_noted() -> None:
+    def notes(**changes: float) -> list[str]:
+        given = {"young": 1e3, "thickness": 1e-3, "foundation": 3e5, "depth": 0.002, **changes}
+        depth = given.pop("depth")
+        rod = moved([0, 0.5, 0.5, 0], [0.2, 0.5, 0.5, -depth], instrument={"radius": 0.005})
+        made = touching(
+            [rod], sheet={"points": [41, 41], "size": [0.1, 0.1]}, tissue=given, time={"motion": "quasistatic"}
+        )
+        return [note for note in notes_of(made, RunProgress(), None) if "slides" in note]
+
+    # E t is 1 N/m, k R^2 7.5 N/m, R / 5 1 mm.
+    (note,) = notes()
+    assert note.startswith("probes.0: the sheet slides off the tip sideways")
+    for part in ("by 1 N/m", "7.5 N/m", "2 mm deep", "a fifth of its radius, 1 mm;", "less deep, or with a wider tip"):
+        assert part in note
+    assert not notes(depth=0.00099)
+    assert notes(young=7.4e3)
+    assert not notes(young=7.6e3)
+
+
+def test_a_rod_that_goes_through_the_sheet_is_noted(device: Device) -> None:
+    from_the_side = [moved([0, -0.5, 0.6, -0.08], [0.3, 1.5, 0.6, -0.08])]
+    made = touching(from_the_side, tissue={"young": 1e4, "thickness": 1e-3, "density": 1050}, time={"duration": 0.32})
+    # The border is at 0, a quarter of the way.
+    with Simulation(made, device.arch) as simulation:
+        simulation.advance(8)
+        progress = simulation.progress
+    assert (progress.pierced_by, progress.pierced_frame) == (1, 2)
+    (note,) = (note for note in notes_of(made, progress, None) if "went through" in note)
+    assert note.startswith("probes.0: the instrument went through the sheet, first seen at 0.08 s, frame 2")
+    # Exactly on the diagonal of a cell, without touching its corners.
+    between = moved(
+        [0, 0.525, 0.53125, 0.001], [0.2, 0.525, 0.53125, -0.03], instrument={"radius": 0.004, "shaft": [0, 0, 1]}
+    )
+    with Simulation(touching([between]), device.arch) as simulation:
+        simulation.advance(8)
+        assert simulation.progress.pierced_by == 1
+        assert simulation.progress.max_displacement == 0
+    with Simulation(touching([PRESSED, HELD]), device.arch) as simulation:
+        simulation.advance(10)
+        assert simulation.progress.pierced_by == 0

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import re
 from collections.abc import Callable
+from typing import Any
 
 import numpy as np
 import pytest
@@ -16,6 +17,7 @@ from taichi_msm.physics.forces import Gauge
 from taichi_msm.physics.state import RunProgress, Saved, State
 from taichi_msm.scene import Scene
 from taichi_msm.system.runtime import Device
+from tests.motion import notes_of
 from tests.scenes import SHEET, plan_of, scene, with_steps
 from tests.test_contact import moved
 
@@ -276,3 +278,30 @@ def test_how_far_a_point_may_be() -> None:
         flying = farthest_displacement(plan_of(scene(probes=probes, **sections)), 3.0)
         assert flying == pytest.approx(10 * 0.4 + 50 * 3.0**2 / 2)
     assert farthest_displacement(plan_of(scene(probes=probes, springs={"virtual": 1})), 3.0) == math.inf
+
+
+def released(across: float, down: float, active: str) -> Scene:
+    """A rod that crushes tissue without damping at this place, and is away from 0.3 s on."""
+    way = [[0, 0, 0, 0.0005], [0.12, 0, 0, -0.0053], [0.2, 0.04, 0.1, -0.0053], [0.3, 0, 0, 0.05]]
+    rod = moved(
+        *([t, across + x, down + y, height] for t, x, y, height in way),
+        instrument={"radius": 0.006, "shaft": [0, 0, 1], "length": 0.15},
+    )
+    tissue: dict[str, Any] = {"young": 3e5, "thickness": 3.2e-3, "density": 1050, "foundation": 1e6, "pretension": 200}
+    sheet = {"points": [15, 9], "size": [0.045, 0.026]}
+    tissue["foundation_active"] = active
+    return scene(sheet=sheet, springs=None, damping=0, tissue=tissue, probes=[rod], time={"duration": 0.8})
+
+
+@pytest.mark.parametrize("active", ["always", "loaded"])
+def test_energy_that_grows_without_a_load_is_noted(active: str, device: Device) -> None:
+    # Near the border, springs that are pressed together are stiffer than the step limit assumes.
+    for across, down, grows in ((0.76, 0.78, True), (0.5, 0.45, False)):
+        made = released(across, down, active)
+        with Simulation(made, device.arch) as simulation:
+            simulation.advance(20)
+            progress = simulation.progress
+        assert progress.energy_growth > (3 if grows else 0)
+        noted = [note for note in notes_of(made, progress, None) if note.startswith("the energy grew")]
+        assert len(noted) == grows
+        assert all(re.match(r"the energy grew \d+\.?\d* times after 0\.3 s", note) for note in noted)

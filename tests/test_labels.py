@@ -13,6 +13,7 @@ from taichi_msm.render import tracking
 from taichi_msm.render.camera import view
 from taichi_msm.render.labels import Labels
 from taichi_msm.render.rasterizer import Drawing, drawing_config
+from taichi_msm.render.renderer import Renderer, Shot
 from taichi_msm.render.surface import rods
 from taichi_msm.render.tracking import find, find_flow
 from taichi_msm.scene import Scene
@@ -154,6 +155,17 @@ def test_a_sheet_that_is_shifted_flows_by_its_shift(device: Device) -> None:
     gone[:, 78:] = True
     gone[:4] = True
     np.testing.assert_array_equal(found.occlusion, gone * 255)
+
+
+def test_coordinates_at_an_edge_are_on_the_sheet(device: Device) -> None:
+    made = drawable(camera="top")
+    down, across = np.meshgrid(*(np.linspace(0, 0.14, n) for n in made.sheet.points), indexing="ij")
+    # Two edges go through the centres of pixels, which are 5 mm wide; there f32 gives down to -3e-8.
+    position = np.stack([0.0025 + across - down, 0.1275 - across - down, 0 * across], axis=-1)
+    seen = look(made, position)
+    assert np.nanmin(seen.coordinates) == 0
+    flow = Renderer(made).flow(seen, Shot(position, view(made))).flow
+    np.testing.assert_allclose(flow[~np.isnan(seen.coordinates[..., 0])], 0, atol=1e-3)
 
 
 def test_points_behind_the_eye_are_nowhere(device: Device) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -12,6 +13,7 @@ import pytest
 
 from taichi_msm.errors import DeviceError, DivergedError, SceneError
 from taichi_msm.physics.lattice import rest_positions
+from taichi_msm.physics.path_dependence import PathDependence, second_solution
 from taichi_msm.physics.rest import ENOUGH, sheet_of
 from taichi_msm.physics.solver import layout_of
 from taichi_msm.results.finished_run import read_run
@@ -239,3 +241,63 @@ def test_a_pilot_that_never_rests_leaves_the_error_unknown(
     assert record["error_estimate"] is not None
     assert record["error_estimate"]["mesh_error"] is None
     assert "an unknown part of the largest displacement due to the number of points" in record["notes"][0]
+
+
+UP_AND_DOWN = [[0, 0], [4, 100], [8, 0]]
+
+
+def drawn_sideways(force: float = 12.0, **tissue: float) -> Scene:
+    """Tissue that is drawn along its plane by a wide tool, and let go, in eight frames."""
+    soft = {"young": 3e4, "thickness": 2e-3, "foundation": 1e4, "foundation_active": "always", **tissue}
+    tool = {"total": [force, 0, 0], "radius": 0.01, "falloff": 200, "load": UP_AND_DOWN}
+    return at_rest([tool], sheet={"points": [25, 25], "size": [0.1, 0.1]}, tissue=soft, time={"duration": 8})
+
+
+@pytest.mark.parametrize("estimate", [None, False])
+def test_an_equilibrium_that_depends_on_the_way_is_noted(estimate: bool | None, device: Device, tmp_path: Path) -> None:
+    """Without tension it wrinkles: two frames under the same loads, or one from rest, differ by a tenth and more."""
+
+    def notes(made: Scene, where: str) -> list[str]:
+        record = run(made, tmp_path / where, threads=device.threads, estimate_error=estimate)
+        return [note for note in record["notes"] if note.startswith("path-dependent")]
+
+    (note,) = notes(drawn_sideways(bending=1e-5), "wrinkled")
+    assert ("loaded at once" if estimate is None else "an earlier frame of equal loads") in note
+    share = re.search(r"(\d+) % of the largest displacement", note)
+    assert share is not None
+    assert int(share[1]) >= 10
+    assert "tissue.pretension, bending or a stiffer foundation" in note
+    assert not notes(drawn_sideways(2.0, pretension=20), "taut")
+    assert not notes(loaded(), "held")
+
+
+def test_a_frame_that_jumps_is_noted() -> None:
+    """The sheet moves with its load, and at one frame by a tenth of the largest displacement more."""
+    plan = plan_of(drawn_sideways())
+
+    def notes(jump: float) -> list[str]:
+        path = PathDependence(plan)
+        for frame in range(5):
+            moved = np.zeros((25, 25, 3))
+            moved[12, 12, 0] = 0.01 * frame / 4 + (jump if frame >= 3 else 0)
+            path.follow(frame, moved)
+        return list(path.notes())
+
+    assert not notes(0)
+    # 0.0025 a frame.
+    assert not notes(4.9 * 0.0025)
+    (note,) = notes(5.1 * 0.0025)
+    assert note.startswith("path-dependent at 3 s, frame 3: from the frame before the sheet jumps by 67 %")
+
+
+def test_a_second_solution_is_the_first_where_only_one_is_possible(device: Device) -> None:
+    made = loaded()
+    plan = plan_of(made)
+    with Simulation(made, threads=device.threads) as simulation:
+        simulation.advance(1)
+        found = simulation.positions() - rest_positions(made.sheet)
+    second = second_solution(plan, 1, device, None, lambda: None)
+    assert second is not None
+    np.testing.assert_allclose(second, found, rtol=0, atol=1e-4 * np.abs(found).max())
+    # The tool holds tissue from 1.5 s to 3.5 s.
+    assert second_solution(plan, 2, device, None, lambda: None) is None

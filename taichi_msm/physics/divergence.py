@@ -8,6 +8,8 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from taichi_msm.physics.contact_notes import piercing
+from taichi_msm.physics.energy_growth import EnergyGrowth
 from taichi_msm.physics.lattice import spacing
 from taichi_msm.physics.loads import Envelope
 from taichi_msm.physics.plan import Plan
@@ -75,11 +77,11 @@ class Watch:
         self._moved = _most_moved(plan)
         self._shares = np.array([norm(slot, plan.scene) for slot in plan.slots])
         self._swing = SWING / max(1e-9, 1 - (plan.grid.step / plan.stable_step) ** 2)
-        self._least = _underflow(plan)
+        self._least, self._growth = _underflow(plan), EnergyGrowth(plan)
 
     def steer(self, plan: Plan) -> None:
         """Expect other loads from now on; control points move if they did before."""
-        self._plan = plan
+        self._plan, self._growth = plan, EnergyGrowth(plan)
         self._loads = Envelope(plan)
         self._acceleration = max(self._acceleration, free_acceleration(plan))
         self._moved = max(self._moved, _most_moved(plan))
@@ -87,10 +89,15 @@ class Watch:
     def follow(self, reading: Reading) -> str:
         """Judge the next frame, as `judge` does, and record its progress if it is sound."""
         where, progress = farthest(reading.displacement), self.progress
-        wrong = self._fault(reading, where)
+        frame, wrong = reading.steps // self._grid.steps_per_frame, self._fault(reading, where)
         if not wrong:
+            least, growth = self._growth.follow(progress, reading, frame)
+            pierced_by, pierced_frame = progress.pierced_by, progress.pierced_frame
+            if not pierced_by:
+                pierced_by = piercing(self._plan, reading.displacement, frame)
+                pierced_frame = frame if pierced_by else 0
             self.progress = RunProgress(
-                frame=reading.steps // self._grid.steps_per_frame,
+                frame=frame,
                 max_displacement=max(progress.max_displacement, where.distance),
                 shortest_spring=min(progress.shortest_spring, reading.shortest_spring),
                 longest_spring=max(progress.longest_spring, reading.longest_spring),
@@ -100,6 +107,10 @@ class Watch:
                 peak=max(progress.peak, reading.energy),
                 residual=max(progress.residual, reading.residual),
                 evaluations=progress.evaluations + reading.evaluations,
+                least_energy=least,
+                energy_growth=growth,
+                pierced_by=pierced_by,
+                pierced_frame=pierced_frame,
             )
         return wrong
 

@@ -7,6 +7,8 @@ from collections.abc import Iterator, Sequence
 from dataclasses import replace
 
 from taichi_msm.physics import probe_force
+from taichi_msm.physics.contact_notes import contact_notes
+from taichi_msm.physics.energy_growth import growth_notes
 from taichi_msm.physics.error_control import Estimate
 from taichi_msm.physics.material import has_fixed_border
 from taichi_msm.physics.mesh_error import MeshEstimate
@@ -58,6 +60,8 @@ def run_notes(
             yield f"error {_size(mesh)} due to the number of points; due to the time step not estimated: {reason}"
     yield from probe_force.force_notes(scene, probes)
     yield from path_notes(scene, plan.tools)
+    yield from contact_notes(plan, progress)
+    yield from growth_notes(plan, progress)
     if mesh is not None and mesh.doubt:
         yield f"the error due to the number of points may be larger: {mesh.doubt}"
     if mesh is not None and WRONG < mesh.error < math.inf:

@@ -50,6 +50,12 @@ class RunProgress:
     # residual, evaluations: as in a `Reading`; the largest residual of any frame so far, and all evaluations
     residual: float = 0.0
     evaluations: int = 0
+    # least_energy, energy_growth: as `EnergyGrowth.follow` returns them
+    least_energy: float = 0.0
+    energy_growth: float = 0.0
+    # pierced_by, pierced_frame: probe, counted from 1, that `piercing` found first, and at which frame; 0: none so far
+    pierced_by: int = 0
+    pierced_frame: int = 0
 
 
 Numbers = tuple[float, float, float]

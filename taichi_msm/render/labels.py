@@ -85,6 +85,8 @@ def labels_of(numbers: NDArray[np.float32], size: tuple[int, int]) -> Labels:
         values = numbers.reshape(-1, width * height)[label.first : label.first + count]
         if len(values):
             arrays[name] = values.reshape((height, width, count)[: 2 + (count > 1)]).astype(label.dtype, copy=False)
+    # At the sheet's edge they may be outside by rounding.
+    arrays["coordinates"] = arrays["coordinates"].clip(0, 1)
     return Labels(**arrays)
 
 
