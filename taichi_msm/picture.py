@@ -210,7 +210,7 @@ def _require_file(path: str) -> None:
         raise _unreadable(path, error) from None
     if kind:
         raise PictureError(f"{path} is {kind}; name a picture")
-    if _place(path).stat().st_size > MAX_BYTES:
+    if location(path).stat().st_size > MAX_BYTES:
         raise PictureError(f"{path} is larger than {MAX_BYTES >> 30} GiB; scale it down")
 
 
