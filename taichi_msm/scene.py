@@ -685,7 +685,13 @@ class Camera(Section):
             update["distortion"] = {"model": "fisheye"}
         unused = {"calibration", "scale"} if "distortion" in update else {"calibration", "scale", "outside"}
         kept = {name: getattr(self, name) for name in self.model_fields_set - unused}
-        return self.model_validate(kept | update)
+        try:
+            return self.model_validate(kept | update)
+        except ValidationError:
+            said = f"{', '.join(f'{name} = {value:g}' for name, value in intrinsics.items())} for pictures of this size"
+            raise refused(
+                f"{self.calibration}: {said} are out of range; calibrate at a size near it", "scale"
+            ) from None
 
 
 def _given(info: ValidationInfo) -> set[str]:

@@ -130,6 +130,14 @@ def test_pictures_of_another_size_are_refused_or_scaled(small: Path) -> None:
     assert camera.intrinsics.model_dump() == {"fx": 123, "fy": 181.5, "cx": 39, "cy": 45.25}
 
 
+def test_numbers_that_scaling_makes_too_large_are_refused(small: Path) -> None:
+    Path("camera.yml").write_text("K: [1e6, 0, 1e6, 0, 1, 1, 0, 0, 1]\nD: [0, 0, 0, 0]\nimage_size: [1, 1]")
+    assert refused("camera.yml", "render.camera.scale=true") == (
+        "scale=true: render.camera.scale: camera.yml: fx = 4e+07, fy = 30, cx = 4e+07, cy = 44.5 for pictures of this "
+        "size are out of range; calibrate at a size near it"
+    )
+
+
 @pytest.mark.parametrize(
     ("text", "said"),
     [

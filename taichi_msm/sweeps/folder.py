@@ -26,8 +26,8 @@ from taichi_msm.system.versions import versions
 # Runs that ended so need not be taken again.
 ENDED = ("complete", "diverged")
 
-# Larger than the record of any sweep.
-MAX_BYTES = 1 << 32
+# A record is not read further than this, or twice the bytes of its values where these are more.
+MAX_BYTES = 1 << 28
 
 # How often a folder that another command has is tried again [s].
 PATIENCE = 0.1
@@ -57,11 +57,12 @@ def values_in(directory: Path, sweep: Sweep) -> list[list[Any]]:
         with writing(directory), staged(directory) as hidden:
             (hidden / SWEEP).write_text(json.dumps(content) + "\n", encoding="utf-8", errors="backslashreplace")
             give_name(hidden / SWEEP, record)  # unless another shard has just done so
+    # As a text, in which no number equals another one, and NaN itself.
+    own_values = json.dumps(values)
     try:
         with record.open("rb") as file:
-            kept = json.loads(file.read(MAX_BYTES))
+            kept = json.loads(file.read(max(MAX_BYTES, 2 * len(own_values))))
         earlier = {name: kept.get(name) for name in description}
-        # As a text, in which no number equals another one, and NaN itself.
         kept_values, began = json.dumps(kept["values"]), what_decides_bits(kept["versions"], "cpu")
     except OSError as error:
         raise FilesError(f"{record}: {(error.strerror or str(error)).lower()}") from None
@@ -74,7 +75,7 @@ def values_in(directory: Path, sweep: Sweep) -> list[list[Any]]:
     here = what_decides_bits(versions(), "cpu")
     if others := [f"{name} {version}" for name, version in began.items() if version != here.get(name)]:
         raise SceneError([f"{directory}: the sweep began with {', '.join(others)}; use these, or choose another --out"])
-    if kept_values != json.dumps(values):
+    if kept_values != own_values:
         said = "its values are not those of the sweep file, as it is damaged or of another SciPy"
         raise FilesError(f"{record}: {said}; choose another --out")
     return values
