@@ -23,11 +23,11 @@ def available_threads() -> int:
 def _quota(group: Path) -> float | None:
     """Read the cores that a control group may use, of version 2 or 1; None: no limit."""
     with contextlib.suppress(OSError, ValueError):
-        quota, period = (group / "cpu.max").read_text().split()
-        return int(quota) / int(period)
+        quota, period = map(int, (group / "cpu.max").read_text().split())
+        return quota / period
     with contextlib.suppress(OSError, ValueError):
-        quota = int((group / "cpu.cfs_quota_us").read_text())
-        return quota / int((group / "cpu.cfs_period_us").read_text()) if quota > 0 else None
+        quota, period = (int((group / f"cpu.cfs_{name}_us").read_text()) for name in ("quota", "period"))
+        return quota / period if quota > 0 else None
     return None
 
 
