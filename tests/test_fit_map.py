@@ -100,6 +100,7 @@ def test_the_map_comes_back_as_well_known_as_is_said(result: FitResult) -> None:
     assert result.map.factors.argmax() == TRUTH.argmax()
     assert np.median(result.map.errors) < 0.05
     assert result.chi_square == pytest.approx(result.degrees_of_freedom, rel=0.15)
+    assert not result.model_rejected
 
 
 def test_the_files_give_what_was_fitted(result: FitResult, folder: Path) -> None:

@@ -19,6 +19,7 @@ class Method(TypedDict, total=False):
     robust: bool
     profile: bool
     correlation: float | None
+    drift: float | None
     resolution: int | None
 
 
@@ -68,6 +69,7 @@ _TYPES: dict[str, tuple[Callable[[Any], bool], str]] = {
     "workers": (lambda it: _is_number(it, Integral) and it > 0, "a whole number, 1 or more, or None"),
     "sigma": (_is_number, "a number, or None"),
     "correlation": (_is_number, "a number of pixels, or None"),
+    "drift": (_is_number, "a number of seconds, or None"),
     "resolution": (lambda it: _is_number(it, Integral), "a whole number, or None"),
     **dict.fromkeys(("robust", "profile"), (lambda it: isinstance(it, bool), "True or False")),
 }

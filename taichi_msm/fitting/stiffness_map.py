@@ -14,6 +14,7 @@ from taichi_msm.fitting.fields import Fields, centres
 from taichi_msm.fitting.observations import Observations
 from taichi_msm.fitting.parameters import Bounds, rounded
 from taichi_msm.fitting.prediction import Predicted, runnable
+from taichi_msm.fitting.rejection import by_chi_square
 from taichi_msm.fitting.result import FitResult, FittedMap
 from taichi_msm.fitting.runs import points_error
 from taichi_msm.fitting.sight import Sight
@@ -136,11 +137,13 @@ def fit_map(given: Scene, seen: Observations, task: MapTask, image: str, progres
     drawn = {"map": StiffnessMap(image=image, range=found.range)}
     scene = given.model_copy(update={"tissue": given.tissue.model_copy(update=drawn)})
     mapped = checked(runnable(scene), {**plan.maps, "map": MapImage(found.grey, "")})
+    chi_square = float(np.sum((left / seen.sigma) ** 2))
     return FitResult(
         residual=float(np.sqrt(np.mean(left**2))),
         sigma=seen.sigma,
         unit=seen.unit,
-        chi_square=float(np.sum((left / seen.sigma) ** 2)),
+        chi_square=chi_square,
+        rejection=by_chi_square(chi_square, left.size, left.size),
         degrees_of_freedom=left.size,
         identifiable=not found.unknown.any(),
         mesh_error=points_error(mapped, tell),
