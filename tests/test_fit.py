@@ -325,6 +325,9 @@ def test_depths_and_forces_of_a_tool_tell_the_foundation(device: Device, tmp_pat
     found = fit(start, below, ["tissue.foundation"], forces=forces, directory=tmp_path / "fit")
     assert values(found) == pytest.approx([3e5], rel=1e-4)
     assert (tmp_path / "fit" / "fit.png").stat().st_size > 10_000
+    record = json.loads((tmp_path / "fit" / "fit.json").read_text())
+    assert record["sigma_force"] == 0.001
+    assert record["residual_force"] < 0.001
 
 
 def test_what_is_far_off_counts_less_in_a_robust_fit(tracks: dict[str, Array]) -> None:

@@ -290,3 +290,10 @@ def test_springs_and_contact_are_refused(device: Device) -> None:
     path = [[0, 0.5, 0.5, 0.001], [2, 0.5, 0.5, -0.003]]
     with pytest.raises(SceneError, match="a tool with a path has no gradient"):
         fit(scene(probes=[{"path": path, "instrument": rod}]), observed, ["tissue.map"], resolution=4)
+
+
+def test_a_map_that_takes_too_much_memory_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("taichi_msm.fitting.stiffness_map.available_memory", lambda: 1000)
+    seen = {"time": [1.0], "coordinates": PLACES, "position": np.zeros((len(PLACES), 1, 3)), "sigma": 1e-5}
+    with pytest.raises(SceneError, match="--resolution 4: 16 fields by 432 numbers that were seen take"):
+        fit(scene(), seen, ["tissue.map"], resolution=4)

@@ -22,7 +22,7 @@ from taichi_msm.fitting.estimation import Misfit, Search, Solution
 from taichi_msm.fitting.identifiability import MOST_ERROR, unseen
 from taichi_msm.fitting.observations import read_forces, read_observations, with_sigma
 from taichi_msm.fitting.parameters import Bounds, Parameter, as_data, make_parameters, with_values
-from taichi_msm.fitting.prediction import Job, runnable
+from taichi_msm.fitting.prediction import Job, Predicted, runnable
 from taichi_msm.fitting.profiles import Place, Profile, Profiler
 from taichi_msm.fitting.report import publication, write_report
 from taichi_msm.fitting.result import Estimate, FitResult, FittedMap
@@ -198,13 +198,26 @@ def _rejection(misfit: Misfit, solution: Solution, uncertain: Uncertainty, alike
 
 
 def _mesh(runs: Runs, misfit: Misfit, solution: Solution, uncertain: Uncertainty) -> tuple[float | None, Array | None]:
-    """Estimate the error of the points, and how far it moves every parameter, in units of x."""
+    """Estimate the error of the points, and how far it moves every parameter, in units of x; NaN: not known.
+
+    With three numbers of points the order shows; where it is less than expected, that counts. A change that is small by
+    chance counts as what the coarser ones let expect.
+    """
     error = runs.mesh_error(solution.x)
-    if error is None or (coarse := runs.coarse(solution.x)) is None:
+    if error is None or (half := runs.coarse(solution.x, 1)) is None:
         return None, None
-    order = WITH_CONTACT if any(probe.moved for probe in runs.job.scene.probes) else 2.0
-    rows = misfit.row(coarse) - misfit.row(solution.predicted)
-    return error, np.abs(uncertain.shift(misfit.divided(rows, uncertain.scales))) / (2**order - 1)
+    most = WITH_CONTACT if any(probe.moved for probe in runs.job.scene.probes) else 2.0
+
+    def moved_by(coarse: Predicted, fine: Predicted) -> Array:
+        rows = misfit.row(coarse) - misfit.row(fine)
+        return np.abs(uncertain.shift(misfit.divided(rows, uncertain.scales)))
+
+    shifts, order = moved_by(half, solution.predicted), np.full(len(solution.x), most)
+    if (quarter := runs.coarse(solution.x, 2)) is not None:
+        before = moved_by(quarter, half)
+        order = np.clip(np.log2(np.maximum(before, 1e-300) / np.maximum(shifts, 1e-300)), 1.0, most)
+        shifts = np.maximum(shifts, before / 2**most)
+    return error, np.where(uncertain.dropped, np.nan, shifts / (2**order - 1))
 
 
 def _estimate(
@@ -226,7 +239,7 @@ def _estimate(
         interval=(interval[0], interval[1]),
         start=one.start,
         identifiable=one.share(x, deviation) <= MOST_ERROR,
-        mesh_error=None if shifts is None else one.error(x, float(shifts[n])),
+        mesh_error=None if shifts is None or math.isnan(shifts[n]) else one.error(x, float(shifts[n])),
     )
 
 

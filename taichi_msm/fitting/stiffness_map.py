@@ -29,6 +29,7 @@ from taichi_msm.progress import Progress
 from taichi_msm.scene import Scene, StiffnessMap
 from taichi_msm.scenefile.validation import checked
 from taichi_msm.system import runtime
+from taichi_msm.system.resources import available_memory
 
 Array = NDArray[np.float64]
 
@@ -165,6 +166,11 @@ def _unusable(seen: Observations, scene: Scene, task: MapTask) -> Iterator[str]:
     if (known := int(seen.known.sum())) <= (needed := task.resolution**2):
         said = f"{known} numbers were seen, too few for {needed} fields; observe more points, or take fewer fields"
         yield f"{seen.name}: {said}: --resolution {max(2, math.isqrt(max(known - 1, 0)))}"
+        return
+    # What each field does to each number that was seen, twice while it is multiplied.
+    if (size := 16 * known * needed) > (free := available_memory()):
+        said = f"{needed} fields by {known} numbers that were seen take {size / 2**30:.3g} GiB of memory"
+        yield f"--resolution {task.resolution}: {said}, and {free / 2**30:.3g} GiB is free; take fewer fields or points"
         return
     yield from faults(seen, scene, task.resolution**2)
 

@@ -90,6 +90,11 @@ class Uncertainty:
         """Give the standard deviation of a combination of x."""
         return float(np.linalg.norm(exponents @ self.root))
 
+    @property
+    def dropped(self) -> NDArray[np.bool_]:
+        """Which of x have a part in a direction that is not seen, so that `shift` does not tell how far they move."""
+        return np.linalg.norm(self.directions[:, self.along > NOT_SEEN], axis=1) > LEAST_PART * 50
+
     def shift(self, rows: Array) -> Array:
         """Give how far x moves, as far as that is seen, if what is predicted is off by so much, in units of r."""
         seen = self.directions[:, self.along <= NOT_SEEN]
@@ -133,7 +138,7 @@ def _with_neighbours(misfit: Misfit, rows: Array, alike: Alike) -> tuple[Array, 
     """Compute U^T K U, and tr(K)^2 / tr(K^2), so many independent numbers as K leaves; forces are independent."""
     values, seen = misfit.count[0], misfit.seen
     # Tracks are where they were seen on the mean; those that never were have no errors.
-    ever = seen.there.any(axis=1)
+    ever: NDArray[np.bool_] = np.any(seen.there, axis=1)
     space, time = _likeness(seen, ever, alike)
     whole = np.zeros((*seen.values.shape, rows.shape[1]))
     whole[seen.known] = rows[:values]
