@@ -297,3 +297,9 @@ def test_a_map_that_takes_too_much_memory_is_refused(monkeypatch: pytest.MonkeyP
     seen = {"time": [1.0], "coordinates": PLACES, "position": np.zeros((len(PLACES), 1, 3)), "sigma": 1e-5}
     with pytest.raises(SceneError, match="--resolution 4: 16 fields by 432 numbers that were seen take"):
         fit(scene(), seen, ["tissue.map"], resolution=4)
+
+
+def test_bounds_that_no_tissue_reaches_are_refused() -> None:
+    seen = {"time": [1.0], "coordinates": PLACES, "position": np.zeros((len(PLACES), 1, 3)), "sigma": 1e-5}
+    with pytest.raises(SceneError, match=r"--bounds tissue.map=0.1,1e\+300: take factors of young from 1e-06"):
+        fit(scene(), seen, ["tissue.map"], resolution=4, bounds={"tissue.map": (0.1, 1e300)})

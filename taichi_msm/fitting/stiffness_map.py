@@ -38,6 +38,9 @@ KEY = "tissue.map"
 # The factors of a map without bounds.
 LOW, HIGH = 0.1, 10.0
 
+# Bounds are no wider, up or down.
+WIDEST = 1e6
+
 # A factor stays so far above the one with which a spring would have no length without its pretension.
 TAUT = 1.05
 
@@ -87,6 +90,9 @@ def map_task(scene: Scene, free: Sequence[str], bounds: Mapping[str, Bounds], re
     low, high = (LOW if low == -math.inf else low), (HIGH if high == math.inf else high)
     if not 0 < low < high:
         raise SceneError([f"--bounds {KEY}={low:g},{high:g}: take factors of young above 0, the smaller one first"])
+    if low < 1 / WIDEST or high > WIDEST:
+        said = f"take factors of young from {1 / WIDEST:g} to {WIDEST:g}"
+        raise SceneError([f"--bounds {KEY}={low:g},{high:g}: {said}"])
     return MapTask(resolution, (low, high))
 
 
