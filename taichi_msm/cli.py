@@ -570,6 +570,7 @@ def sweep(
 @click.option(
     "--correlation", type=float, metavar="PX", help="How far apart in the picture errors of tracks are alike [px]."
 )
+@click.option("--drift", type=float, metavar="SECONDS", help="How long errors of one track are alike [s].")
 @click.option("--profile", is_flag=True, help="Find intervals by going to their ends; takes more runs.")
 @click.option("--resolution", type=int, metavar="R", help="Fields along a side of a map that is fitted.")
 @click.option("--out", metavar="DIR", help="Directory for the fit.  [default: output/<name of the scene file>-fit]")
@@ -586,6 +587,7 @@ def fit(
     sigma: float | None,
     robust: bool,
     correlation: float | None,
+    drift: float | None,
     profile: bool,
     resolution: int | None,
     out: str | None,
@@ -624,6 +626,7 @@ def fit(
                 robust=robust,
                 profile=profile,
                 correlation=correlation,
+                drift=drift,
                 resolution=resolution,
             )
     except KeyboardInterrupt:

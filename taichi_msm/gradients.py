@@ -73,6 +73,8 @@ def gradient(scene: Scene | Mapping[str, Any], loss: Loss, threads: int | None =
         >>> bool(found.numbers["tissue.young"] < 0 < found.numbers["probes.0.load"][1])
         True
     """
+    if not callable(loss):
+        raise ArgumentError(f"loss: {loss!r}; take a function of the positions of every frame")
     plan = checked(scene)
     require_differentiable(plan)
     device = runtime.start("cpu", threads)

@@ -15,9 +15,10 @@ from scipy.stats import t as student
 
 from taichi_msm import ArgumentError, SceneError, Simulation, fit, load_scene, run
 from taichi_msm.fitting.arguments import Method
-from taichi_msm.fitting.observations import read_observations
+from taichi_msm.fitting.observations import Observations, read_observations
 from taichi_msm.fitting.parameters import make_parameters
 from taichi_msm.fitting.prediction import Job, Predictor, runnable
+from taichi_msm.fitting.rejection import by_signs
 from taichi_msm.fitting.result import FitResult
 from taichi_msm.fitting.sight import seen_by_camera
 from taichi_msm.fitting.suspicions import MOVES, faults, moved
@@ -324,6 +325,9 @@ def test_depths_and_forces_of_a_tool_tell_the_foundation(device: Device, tmp_pat
     found = fit(start, below, ["tissue.foundation"], forces=forces, directory=tmp_path / "fit")
     assert values(found) == pytest.approx([3e5], rel=1e-4)
     assert (tmp_path / "fit" / "fit.png").stat().st_size > 10_000
+    record = json.loads((tmp_path / "fit" / "fit.json").read_text())
+    assert record["sigma_force"] == 0.001
+    assert record["residual_force"] < 0.001
 
 
 def test_what_is_far_off_counts_less_in_a_robust_fit(tracks: dict[str, Array]) -> None:
@@ -702,3 +706,45 @@ def test_arguments_of_a_wrong_type_are_answered_in_a_line(
 def test_methods_are_those_that_are_described() -> None:
     assert fit.__doc__ is not None
     assert all(f"{name}" in fit.__doc__ for name in Method.__annotations__)
+
+
+def test_tracks_that_drift_widen_the_intervals(tracks: dict[str, Array]) -> None:
+    seen = noisy(tracks, 0.05)
+    seen["pixel"] += np.cumsum(np.random.default_rng(3).normal(0, 0.1, tracks["pixel"].shape), axis=1)
+    free = ["tissue.young", "tissue.foundation"]
+    plain = fit(changed(), seen, free, workers=1)
+    drifting = fit(changed(), seen, free, drift=1.0, workers=1)
+    assert any("--drift SECONDS" in line for line in plain.summary())
+    assert plain.model_rejected
+    assert not drifting.model_rejected
+    assert not any("--drift" in line for line in drifting.summary())
+    wider = drifting.parameters[free[1]].standard_error / plain.parameters[free[1]].standard_error
+    assert 1.2 < wider < 11**0.5
+
+
+def test_a_scene_that_cannot_move_as_was_seen_is_rejected_first_of_all(tracks: dict[str, Array]) -> None:
+    """With another damping, and none that is free."""
+    seen = noisy(tracks, 0.05, sigma=0.05)
+    wrong = fit(changed(tissue__damping=600), seen, ["tissue.foundation"], workers=1)
+    assert wrong.as_json()["model_rejected"] is True
+    first = wrong.summary()[0]
+    assert first.startswith("the model is rejected: ")
+    assert first.endswith("; the intervals do not cover this")
+    right = fit(changed(), seen, ["tissue.foundation"], workers=1)
+    assert right.as_json()["model_rejected"] is False
+    assert "rejected" not in right.summary()[0]
+
+
+def test_noise_is_not_taken_for_a_wrong_model() -> None:
+    """Also where neighbouring points are alike, some jump, and some were not seen."""
+    rng, wolves = np.random.default_rng(4), 0
+    for n in range(400):
+        left = rng.normal(0, 1, (30, 8 + n % 25, 2)) + (n % 2) * rng.normal(0, 2, (1, 8 + n % 25, 2))
+        left[rng.random(left.shape) < 0.05] *= 10
+        left[rng.random(left.shape[:2]) < 0.1] = np.nan
+        times = np.arange(left.shape[1])
+        seen = Observations("", "pixel", times, np.zeros((30, 2)), left, None)
+        wolves += by_signs(seen, left, 10.0) is not None
+    assert wolves <= 3
+    wrong = np.sin(times / 6)[:, None] + rng.normal(0, 1, left.shape)
+    assert by_signs(Observations("", "pixel", times, np.zeros((30, 2)), wrong, None), wrong, 10.0) is not None

@@ -100,6 +100,7 @@ def test_the_map_comes_back_as_well_known_as_is_said(result: FitResult) -> None:
     assert result.map.factors.argmax() == TRUTH.argmax()
     assert np.median(result.map.errors) < 0.05
     assert result.chi_square == pytest.approx(result.degrees_of_freedom, rel=0.15)
+    assert not result.model_rejected
 
 
 def test_the_files_give_what_was_fitted(result: FitResult, folder: Path) -> None:
@@ -289,3 +290,16 @@ def test_springs_and_contact_are_refused(device: Device) -> None:
     path = [[0, 0.5, 0.5, 0.001], [2, 0.5, 0.5, -0.003]]
     with pytest.raises(SceneError, match="a tool with a path has no gradient"):
         fit(scene(probes=[{"path": path, "instrument": rod}]), observed, ["tissue.map"], resolution=4)
+
+
+def test_a_map_that_takes_too_much_memory_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("taichi_msm.fitting.stiffness_map.available_memory", lambda: 1000)
+    seen = {"time": [1.0], "coordinates": PLACES, "position": np.zeros((len(PLACES), 1, 3)), "sigma": 1e-5}
+    with pytest.raises(SceneError, match="--resolution 4: 16 fields by 432 numbers that were seen take"):
+        fit(scene(), seen, ["tissue.map"], resolution=4)
+
+
+def test_bounds_that_no_tissue_reaches_are_refused() -> None:
+    seen = {"time": [1.0], "coordinates": PLACES, "position": np.zeros((len(PLACES), 1, 3)), "sigma": 1e-5}
+    with pytest.raises(SceneError, match=r"--bounds tissue.map=0.1,1e\+300: take factors of young from 1e-06"):
+        fit(scene(), seen, ["tissue.map"], resolution=4, bounds={"tissue.map": (0.1, 1e300)})

@@ -410,6 +410,7 @@ def test_contact_is_refused(device: Device) -> None:
 @pytest.mark.parametrize(
     ("returned", "message"),
     [
+        (3, r"loss: 3; take a function of the positions of every frame"),
         (lambda position: 1.0, r"loss: returned float; return a pair, its value and its derivative by the positions"),
         (lambda position: (np.nan, position), r"loss: its value is nan; return a finite number"),
         (lambda position: (position, position), r"loss: its value is an array of shape \(3, 6, 11, 3\); return a"),

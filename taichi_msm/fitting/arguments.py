@@ -20,6 +20,7 @@ class Method(TypedDict, total=False):
     robust: bool
     profile: bool
     correlation: float | None
+    drift: float | None
     resolution: int | None
 
 
@@ -72,6 +73,7 @@ _TYPES: dict[str, tuple[Callable[[Any], bool], str]] = {
     ),
     "sigma": (_is_number, "a number, or None"),
     "correlation": (_is_number, "a number of pixels, or None"),
+    "drift": (_is_number, "a number of seconds, or None"),
     "resolution": (lambda it: _is_number(it, Integral), "a whole number, or None"),
     **dict.fromkeys(("robust", "profile"), (lambda it: isinstance(it, bool), "True or False")),
 }

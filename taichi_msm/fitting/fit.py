@@ -16,20 +16,20 @@ from numpy.typing import NDArray
 from typing_extensions import Unpack
 
 from taichi_msm.errors import SceneError, writing
-from taichi_msm.fitting import notes
+from taichi_msm.fitting import notes, rejection
 from taichi_msm.fitting.arguments import Method, require_types
 from taichi_msm.fitting.estimation import Misfit, Search, Solution
 from taichi_msm.fitting.identifiability import MOST_ERROR, unseen
 from taichi_msm.fitting.observations import read_forces, read_observations, with_sigma
 from taichi_msm.fitting.parameters import Bounds, Parameter, as_data, make_parameters, with_values
-from taichi_msm.fitting.prediction import Job, runnable
+from taichi_msm.fitting.prediction import Job, Predicted, runnable
 from taichi_msm.fitting.profiles import Place, Profile, Profiler
 from taichi_msm.fitting.report import publication, write_report
 from taichi_msm.fitting.result import Estimate, FitResult, FittedMap
 from taichi_msm.fitting.runs import Runs
 from taichi_msm.fitting.stiffness_map import KEY, fit_map, map_task
 from taichi_msm.fitting.suspicions import faults, faults_beside, moved
-from taichi_msm.fitting.uncertainty import Uncertainty, uncertainty
+from taichi_msm.fitting.uncertainty import Alike, Uncertainty, uncertainty
 from taichi_msm.physics.mesh_error import WITH_CONTACT
 from taichi_msm.progress import Progress
 from taichi_msm.scene import Scene
@@ -73,7 +73,7 @@ def fit(
             fit, and nothing is written.
         **method: sigma, in place of the file's; robust: whether numbers that are far off count less; profile: whether
             the intervals are found by going there; correlation: how far apart in the picture errors of tracks are alike
-            [px]; resolution: R of a map.
+            [px]; drift: how long errors of one track are alike [s]; resolution: R of a map.
 
     Returns:
         What was found; also where the data do not tell a parameter: then `identifiable` is False.
@@ -102,7 +102,7 @@ def fit(
     if twice := [key for n, key in enumerate(free) if key in free[:n]]:
         raise SceneError([f"--free {twice[0]}: given twice; leave one of them out"])
     task = map_task(given, free, bounds or {}, method.get("resolution"))
-    other = {"forces": forces, **{name: method.get(name) for name in ("robust", "profile", "correlation")}}
+    other = {"forces": forces, **{name: method.get(name) for name in ("robust", "profile", "correlation", "drift")}}
     if task is not None and (given_too := [name for name, value in other.items() if value]):
         raise SceneError([f"--free {KEY}: --{given_too[0]} is of fits of numbers; leave it out"])
     parameters = () if task is not None else make_parameters(given, free, bounds or {})
@@ -113,6 +113,8 @@ def fit(
             raise SceneError([f"--correlation {correlation:g}: take a number of pixels above 0"])
         if seen.kind != "pixel":
             raise SceneError([f"{seen.name}: --correlation is in pixels, and these are positions; leave it out"])
+    if (drift := method.get("drift")) is not None and not 0 < drift < math.inf:
+        raise SceneError([f"--drift {drift:g}: take a number of seconds above 0"])
     if task is None and (wrong := list(faults(seen, given, len(parameters)))):
         raise SceneError(wrong)
     with ExitStack() as opened:
@@ -135,7 +137,7 @@ def fit(
 def _fit(runs: Runs, given: Scene, method: Method) -> FitResult:
     """Search, and say how well the best values are known."""
     parameters, seen = runs.job.parameters, runs.job.observations
-    correlation, start = method.get("correlation"), np.zeros(len(parameters))
+    alike, start = Alike(method.get("correlation"), method.get("drift")), np.zeros(len(parameters))
     runs.expected = 8 * len(start) + 4
     first = runs.first(start)
     same_camera = not any(one.key.startswith("render.") for one in parameters)
@@ -145,7 +147,7 @@ def _fit(runs: Runs, given: Scene, method: Method) -> FitResult:
     misfit = Misfit(seen, motion, robust=method.get("robust", False))
     search = Search(runs, misfit)
     solution = search.best(start)
-    uncertain = uncertainty(misfit, solution, search.derivatives(solution), correlation)
+    uncertain = uncertainty(misfit, solution, search.derivatives(solution), alike)
     profiles = Profiler(parameters, misfit, solution, uncertain).profiles(runs) if method.get("profile") else None
     mesh, shifts = _mesh(runs, misfit, solution, uncertain)
     places = enumerate(solution.x.tolist())
@@ -159,6 +161,8 @@ def _fit(runs: Runs, given: Scene, method: Method) -> FitResult:
         residual_force=float(np.sqrt(np.mean(forces**2))) if len(forces) else None,
         sigma=uncertain.scales.values,
         unit=seen.unit,
+        sigma_force=None if seen.forces is None else seen.forces.sigma,
+        rejection=_rejection(misfit, solution, uncertain, alike),
         chi_square=float(uncertain.left @ uncertain.left) if seen.sigma is not None else None,
         degrees_of_freedom=uncertain.freedom,
         identifiable=all(one.identifiable for one in estimates),
@@ -169,7 +173,7 @@ def _fit(runs: Runs, given: Scene, method: Method) -> FitResult:
             *notes.of_the_search(solution, parameters, fits=search.fits(solution)),
             *notes.of_the_points(parameters, solution.x, uncertain, shifts),
             *notes.of_ties(parameters, uncertain, blind),
-            *notes.of_what_is_left(seen, solution, uncertain, motion, independent=correlation is None),
+            *notes.of_what_is_left(seen, solution, uncertain, motion, alike),
         ],
         scene=Scene(**with_values(as_data(given), parameters, [one.value for one in estimates])),
         observations=seen,
@@ -179,14 +183,41 @@ def _fit(runs: Runs, given: Scene, method: Method) -> FitResult:
     )
 
 
+def _rejection(misfit: Misfit, solution: Solution, uncertain: Uncertainty, alike: Alike) -> str | None:
+    """Return in words why the scene cannot move as was seen; None: it may."""
+    seen, said, forces = misfit.seen, None, uncertain.left[misfit.count[0] :]
+    # What is far off in a robust fit makes chi-square large in any case.
+    if seen.sigma is not None and not misfit.robust:
+        total = float(uncertain.left @ uncertain.left)
+        said = rejection.by_chi_square(total, uncertain.freedom, uncertain.independent)
+    elif alike.drift is None:
+        said = rejection.by_signs(seen, solution.predicted.values - seen.values, misfit.motion)
+    if said is None and len(forces) and not misfit.robust:
+        said = rejection.by_chi_square(float(forces @ forces), len(forces), len(forces), "chi-square of the forces")
+    return said
+
+
 def _mesh(runs: Runs, misfit: Misfit, solution: Solution, uncertain: Uncertainty) -> tuple[float | None, Array | None]:
-    """Estimate the error of the points, and how far it moves every parameter, in units of x."""
+    """Estimate the error of the points, and how far it moves every parameter, in units of x; NaN: not known.
+
+    With three numbers of points the order shows; where it is less than expected, that counts. A change that is small by
+    chance counts as what the coarser ones let expect.
+    """
     error = runs.mesh_error(solution.x)
-    if error is None or (coarse := runs.coarse(solution.x)) is None:
+    if error is None or (half := runs.coarse(solution.x, 1)) is None:
         return None, None
-    order = WITH_CONTACT if any(probe.moved for probe in runs.job.scene.probes) else 2.0
-    rows = misfit.row(coarse) - misfit.row(solution.predicted)
-    return error, np.abs(uncertain.shift(misfit.divided(rows, uncertain.scales))) / (2**order - 1)
+    most = WITH_CONTACT if any(probe.moved for probe in runs.job.scene.probes) else 2.0
+
+    def moved_by(coarse: Predicted, fine: Predicted) -> Array:
+        rows = misfit.row(coarse) - misfit.row(fine)
+        return np.abs(uncertain.shift(misfit.divided(rows, uncertain.scales)))
+
+    shifts, order = moved_by(half, solution.predicted), np.full(len(solution.x), most)
+    if (quarter := runs.coarse(solution.x, 2)) is not None:
+        before = moved_by(quarter, half)
+        order = np.clip(np.log2(np.maximum(before, 1e-300) / np.maximum(shifts, 1e-300)), 1.0, most)
+        shifts = np.maximum(shifts, before / 2**most)
+    return error, np.where(uncertain.dropped, np.nan, shifts / (2**order - 1))
 
 
 def _estimate(
@@ -208,7 +239,7 @@ def _estimate(
         interval=(interval[0], interval[1]),
         start=one.start,
         identifiable=one.share(x, deviation) <= MOST_ERROR,
-        mesh_error=None if shifts is None else one.error(x, float(shifts[n])),
+        mesh_error=None if shifts is None or math.isnan(shifts[n]) else one.error(x, float(shifts[n])),
     )
 
 

@@ -12,7 +12,7 @@ from taichi_msm.fitting.estimation import Solution
 from taichi_msm.fitting.identifiability import Unseen
 from taichi_msm.fitting.observations import Observations
 from taichi_msm.fitting.parameters import Parameter, rounded
-from taichi_msm.fitting.uncertainty import Uncertainty
+from taichi_msm.fitting.uncertainty import Alike, Uncertainty
 
 Array = NDArray[np.float64]
 
@@ -69,7 +69,7 @@ def of_ties(parameters: Sequence[Parameter], uncertain: Uncertainty, blind: Sequ
 
 
 def of_what_is_left(
-    seen: Observations, solution: Solution, uncertain: Uncertainty, motion: float, *, independent: bool
+    seen: Observations, solution: Solution, uncertain: Uncertainty, motion: float, alike: Alike
 ) -> Iterator[str]:
     """Note errors that are larger than sigma, or that are not independent though they are taken to be."""
     if uncertain.factor > 1.5:
@@ -81,13 +81,13 @@ def of_what_is_left(
             yield "next to nothing is left, and the intervals are those of so small errors; give their size by --sigma"
         return
     beside, after = _alike(left, seen.coordinates)
-    if beside > ALIKE and independent:
+    if beside > ALIKE and alike.correlation is None:
         remedy = "; give --correlation PX" if seen.kind == "pixel" else ""
         said = f"what is left of neighbouring points is alike (correlation {beside:.2f})"
         yield f"{said}, so that the intervals are too narrow{remedy}"
-    elif after > ALIKE:
+    elif after > ALIKE and alike.drift is None:
         said = f"what is left of a point is alike from one time to the next (correlation {after:.2f})"
-        yield f"{said}, so that the intervals are too narrow"
+        yield f"{said}, so that the intervals are too narrow; give --drift SECONDS"
 
 
 def _alike(left: Array, coordinates: Array) -> tuple[float, float]:

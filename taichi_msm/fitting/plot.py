@@ -35,7 +35,13 @@ def plot(result: FitResult, file: BinaryIO) -> None:
 
 def _figure(result: FitResult) -> Figure:
     forces = result.observations.forces is not None
-    count = 3 + forces + len(result.parameters) + 3 * (result.map is not None)
+    points, times = result.observations.there.any(axis=1).sum(), result.observations.there.any(axis=0).sum()
+    # One time has no motion, and one point no place where more is left than elsewhere.
+    drawn = [
+        draw for draw, some in ((_plot_motion, times > 1), (_plot_match, times > 1), (_plot_left, points > 1)) if some
+    ]
+    drawn += [_plot_forces] if forces else []
+    count = len(drawn) + len(result.parameters) + 3 * (result.map is not None)
     rows = math.ceil(count / COLUMNS)
     engine = ConstrainedLayoutEngine(w_pad=0.1, h_pad=0.1)
     figure = Figure(figsize=(WIDE, HEIGHT * rows + 0.5), dpi=DPI, layout=engine)
@@ -45,12 +51,9 @@ def _figure(result: FitResult) -> Figure:
     if result.map is not None:
         plot_map(panels[:COLUMNS], result.map, result.scene.sheet)
         panels, count = panels[COLUMNS:], count - COLUMNS
-    _plot_motion(panels[0], result)
-    _plot_match(panels[1], result)
-    _plot_left(panels[2], result)
-    if forces:
-        _plot_forces(panels[3], result)
-    for axes, key in zip(panels[3 + forces :], result.parameters, strict=False):
+    for axes, draw in zip(panels, drawn, strict=False):
+        draw(axes, result)
+    for axes, key in zip(panels[len(drawn) :], result.parameters, strict=False):
         _plot_parameter(axes, result, key)
     for axes in panels[count:]:
         axes.set_axis_off()

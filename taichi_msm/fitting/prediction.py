@@ -75,7 +75,7 @@ class Predictor:
         x: Array,
         steps: int | None = None,
         *,
-        coarse: bool = False,
+        coarse: int = 0,
         whole: bool = False,
         pause: Pause = lambda: None,
     ) -> Predicted:
@@ -85,7 +85,7 @@ class Predictor:
             x: of every parameter.
             steps: of a frame, as of a run that this one is compared with, if it needs no more; None: so many that
                 runs with neighbouring values can have them too.
-            coarse: take half the cells a side; a scene for which `mesh_error.coarser` gives None is run as it is.
+            coarse: how many times to halve the cells a side; a SceneError where `mesh_error.coarser` gives None.
             whole: go on to the last frame, even if nothing was seen there.
             pause: called some times a second; what it raises stops it.
 
@@ -94,8 +94,10 @@ class Predictor:
             DivergedError: when the run diverges.
         """
         plan = self.plan(x)
-        if coarse:
-            plan = coarser(plan) or plan
+        for _ in range(coarse):
+            if (half := coarser(plan)) is None:
+                raise SceneError(["sheet.points: too few to take half of them"])
+            plan = half
         if plan.scene.time.step == "auto" and not plan.scene.time.at_rest:
             plan = plan.with_grid(steps_per_frame=max(steps or _with_margin(plan), plan.grid.steps_per_frame))
         if self._simulation is None:

@@ -28,7 +28,7 @@ class Estimate(NamedTuple):
         interval: both ends of the 95 % interval; None: there is none within the bounds.
         start: where the search began.
         identifiable: whether the standard error is at most the value, or of a place or a time its range.
-        mesh_error: how far, about, the number of points moves the value; None: not known.
+        mesh_error: how far, about, the number of points moves the value, rather too large; None: not known.
     """
 
     value: float
@@ -107,9 +107,11 @@ class FitResult:
         correlation: of the parameters, in their order.
         residual: the root mean square of predicted minus seen, of each coordinate [m] or [px].
         residual_force: the same of the forces [N]; None: none were seen.
+        sigma_force: the standard deviation of the forces, as given [N]; None: none were seen.
         sigma: the standard deviation of the coordinates, as given, else as found.
         unit: of residual and sigma, m or px.
         chi_square: the sum of (predicted - seen)^2 / sigma^2, where sigma is given.
+        rejection: why the scene cannot move as was seen, whatever its numbers are; None: it may.
         degrees_of_freedom: how many numbers were seen, less the parameters, but not less the fields of a map.
         identifiable: whether all parameters are.
         unseen: the combinations of parameters that the data cannot tell.
@@ -130,6 +132,8 @@ class FitResult:
     correlation: list[list[float]] = field(default_factory=list)
     residual: float
     residual_force: float | None = None
+    sigma_force: float | None = None
+    rejection: str | None = None
     sigma: float
     unit: str
     chi_square: float | None
@@ -147,9 +151,15 @@ class FitResult:
     curves: dict[str, list[Place]] = field(repr=False, default_factory=dict)
     map: FittedMap | None = None
 
+    @property
+    def model_rejected(self) -> bool:
+        """Whether the scene cannot move as was seen, whatever its numbers are."""
+        return self.rejection is not None
+
     def as_json(self) -> dict[str, Any]:
         """Give it as plain data, as in fit.json."""
-        plain = "correlation residual residual_force sigma unit chi_square degrees_of_freedom identifiable mesh_error"
+        plain = "model_rejected correlation residual residual_force sigma sigma_force unit chi_square "
+        plain += "degrees_of_freedom identifiable mesh_error"
         return {
             "observed": self.observations.name,
             "parameters": {key: one._asdict() for key, one in self.parameters.items()},
@@ -161,7 +171,13 @@ class FitResult:
     def summary(self) -> list[str]:
         """Say in lines what was found."""
         seen = self.observations
-        lines = [f"{key}: {_in_words(one)}" for key, one in self.parameters.items()]
+        known = "intervals" if self.map is None else "errors of the fields"
+        lines = (
+            []
+            if self.rejection is None
+            else [f"the model is rejected: {self.rejection}; the {known} do not cover this"]
+        )
+        lines += [f"{key}: {_in_words(one)}" for key, one in self.parameters.items()]
         lines += [one.text for one in self.unseen]
         lines += [] if self.map is None else [self.map.summary()]
         points, times = seen.there.shape

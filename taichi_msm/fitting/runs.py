@@ -70,10 +70,10 @@ class Runs:
         self._seconds, self.count = time.perf_counter() - begun, self.count + 1
         return predicted
 
-    def coarse(self, x: Array) -> Predicted | None:
-        """Predict with half the cells a side; None where that gives no run."""
+    def coarse(self, x: Array, halvings: int) -> Predicted | None:
+        """Predict with half the cells a side, or half of those; None where that gives no run."""
         self.count += 1
-        return self._predictor.attempt(x, coarse=True, pause=self._tell)
+        return self._predictor.attempt(x, coarse=halvings, pause=self._tell)
 
     def mesh_error(self, x: Array) -> float | None:
         """Estimate the error that the number of points makes, as `points_error`."""

@@ -14,6 +14,7 @@ from taichi_msm.fitting.fields import Fields, centres
 from taichi_msm.fitting.observations import Observations
 from taichi_msm.fitting.parameters import Bounds, rounded
 from taichi_msm.fitting.prediction import Predicted, runnable
+from taichi_msm.fitting.rejection import by_chi_square
 from taichi_msm.fitting.result import FitResult, FittedMap
 from taichi_msm.fitting.runs import points_error
 from taichi_msm.fitting.sight import Sight
@@ -28,6 +29,7 @@ from taichi_msm.progress import Progress
 from taichi_msm.scene import Scene, StiffnessMap
 from taichi_msm.scenefile.validation import checked
 from taichi_msm.system import runtime
+from taichi_msm.system.resources import available_memory
 
 Array = NDArray[np.float64]
 
@@ -35,6 +37,9 @@ KEY = "tissue.map"
 
 # The factors of a map without bounds.
 LOW, HIGH = 0.1, 10.0
+
+# Bounds are no wider, up or down.
+WIDEST = 1e6
 
 # A factor stays so far above the one with which a spring would have no length without its pretension.
 TAUT = 1.05
@@ -85,6 +90,9 @@ def map_task(scene: Scene, free: Sequence[str], bounds: Mapping[str, Bounds], re
     low, high = (LOW if low == -math.inf else low), (HIGH if high == math.inf else high)
     if not 0 < low < high:
         raise SceneError([f"--bounds {KEY}={low:g},{high:g}: take factors of young above 0, the smaller one first"])
+    if low < 1 / WIDEST or high > WIDEST:
+        said = f"take factors of young from {1 / WIDEST:g} to {WIDEST:g}"
+        raise SceneError([f"--bounds {KEY}={low:g},{high:g}: {said}"])
     return MapTask(resolution, (low, high))
 
 
@@ -136,11 +144,13 @@ def fit_map(given: Scene, seen: Observations, task: MapTask, image: str, progres
     drawn = {"map": StiffnessMap(image=image, range=found.range)}
     scene = given.model_copy(update={"tissue": given.tissue.model_copy(update=drawn)})
     mapped = checked(runnable(scene), {**plan.maps, "map": MapImage(found.grey, "")})
+    chi_square = float(np.sum((left / seen.sigma) ** 2))
     return FitResult(
         residual=float(np.sqrt(np.mean(left**2))),
         sigma=seen.sigma,
         unit=seen.unit,
-        chi_square=float(np.sum((left / seen.sigma) ** 2)),
+        chi_square=chi_square,
+        rejection=by_chi_square(chi_square, left.size, left.size),
         degrees_of_freedom=left.size,
         identifiable=not found.unknown.any(),
         mesh_error=points_error(mapped, tell),
@@ -162,6 +172,11 @@ def _unusable(seen: Observations, scene: Scene, task: MapTask) -> Iterator[str]:
     if (known := int(seen.known.sum())) <= (needed := task.resolution**2):
         said = f"{known} numbers were seen, too few for {needed} fields; observe more points, or take fewer fields"
         yield f"{seen.name}: {said}: --resolution {max(2, math.isqrt(max(known - 1, 0)))}"
+        return
+    # What each field does to each number that was seen, twice while it is multiplied.
+    if (size := 16 * known * needed) > (free := available_memory()):
+        said = f"{needed} fields by {known} numbers that were seen take {size / 2**30:.3g} GiB of memory"
+        yield f"--resolution {task.resolution}: {said}, and {free / 2**30:.3g} GiB is free; take fewer fields or points"
         return
     yield from faults(seen, scene, task.resolution**2)
 

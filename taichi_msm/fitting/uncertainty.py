@@ -6,7 +6,8 @@ With J the derivatives of r = (predicted - seen) / sigma by x, the covariance of
 
 where W = 1 and K = 1, and f is the mean of r^2 per degree of freedom, but at least 1. In a robust fit W is the second
 derivative of half of rho, and f the mean of the squares of its first over that of W. If errors of neighbouring tracks
-are alike, K = exp(-distance / correlation) for two tracks in one frame. With the singular values W^(1/2) J = U S V^T,
+are alike, K = exp(-distance / correlation) for two tracks in one frame; if tracks drift, K = exp(-apart / drift) for
+one track at two times; if both, their product. With the singular values W^(1/2) J = U S V^T,
 
     C = f V S^-1 (U^T K U) S^-1 V^T
 
@@ -16,11 +17,13 @@ which holds however little some direction is seen: nothing is squared.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from taichi_msm.fitting.estimation import Misfit, Scales, Solution
+from taichi_msm.fitting.observations import Observations
 
 Array = NDArray[np.float64]
 
@@ -35,6 +38,13 @@ NOT_SEEN = 0.5
 CONFIDENCE = 0.95
 
 
+class Alike(NamedTuple):
+    """How far apart errors of tracks are alike; None: they are independent."""
+
+    correlation: float | None  # of two tracks [px]
+    drift: float | None  # of two times [s]
+
+
 @dataclass(frozen=True, eq=False)
 class Uncertainty:
     """What the derivatives tell of the parameters' errors, in units of x.
@@ -46,6 +56,7 @@ class Uncertainty:
     scales: Scales  # standard deviations of what was seen, found or given
     factor: float  # f
     freedom: int  # degrees of freedom
+    independent: float  # so many independent numbers would tell as much of chi-square as these
     left: Array  # r
     weighted: Array  # W^(1/2) J, shape (numbers, n)
     directions: Array  # shape (n, n)
@@ -79,20 +90,25 @@ class Uncertainty:
         """Give the standard deviation of a combination of x."""
         return float(np.linalg.norm(exponents @ self.root))
 
+    @property
+    def dropped(self) -> NDArray[np.bool_]:
+        """Which of x have a part in a direction that is not seen, so that `shift` does not tell how far they move."""
+        return np.linalg.norm(self.directions[:, self.along > NOT_SEEN], axis=1) > LEAST_PART * 50
+
     def shift(self, rows: Array) -> Array:
         """Give how far x moves, as far as that is seen, if what is predicted is off by so much, in units of r."""
         seen = self.directions[:, self.along <= NOT_SEEN]
         return seen @ np.linalg.lstsq(self.weighted @ seen, rows, rcond=None)[0]
 
 
-def uncertainty(misfit: Misfit, solution: Solution, derivatives: Array, correlation: float | None) -> Uncertainty:
+def uncertainty(misfit: Misfit, solution: Solution, derivatives: Array, alike: Alike) -> Uncertainty:
     """Work out the uncertainty of a solution.
 
     Args:
         misfit: that was minimised.
         solution: the best values.
         derivatives: of what is predicted by x, shape (numbers, parameters).
-        correlation: how far apart errors of tracks are alike [px]; None: they are independent.
+        alike: how far apart errors of tracks are alike.
     """
     parameters = len(solution.x)
     freedom = max(1, sum(misfit.count) - parameters)
@@ -108,27 +124,41 @@ def uncertainty(misfit: Misfit, solution: Solution, derivatives: Array, correlat
     held = np.where(blind, 1 / AT_LARGE, singular.S)
     parts = np.where(blind & (np.abs(singular.Vh.T) < LEAST_PART), 0.0, singular.Vh.T)
     plain = root = np.sqrt(factor) * parts / held
-    if correlation is not None:
-        values, vectors = np.linalg.eigh(_with_neighbours(misfit, singular.U, correlation))
+    independent = float(freedom)
+    if alike != (None, None):
+        around, independent = _with_neighbours(misfit, singular.U, alike)
+        independent = min(independent, freedom)
+        values, vectors = np.linalg.eigh(around)
         root = plain @ (vectors * np.sqrt(np.maximum(values, 0.0)))
     wider = np.linalg.norm(root, axis=1) / np.linalg.norm(plain, axis=1)
-    return Uncertainty(scales, factor, freedom, left, weighted, singular.Vh.T, root, wider)
+    return Uncertainty(scales, factor, freedom, independent, left, weighted, singular.Vh.T, root, wider)
 
 
-def _with_neighbours(misfit: Misfit, rows: Array, correlation: float) -> Array:
-    """Give U^T K U, frame by frame and coordinate by coordinate; forces are independent."""
-    from scipy.spatial.distance import cdist
-
+def _with_neighbours(misfit: Misfit, rows: Array, alike: Alike) -> tuple[Array, float]:
+    """Compute U^T K U, and tr(K)^2 / tr(K^2), so many independent numbers as K leaves; forces are independent."""
     values, seen = misfit.count[0], misfit.seen
     # Tracks are where they were seen on the mean; those that never were have no errors.
-    ever = seen.there.any(axis=1)
-    pixels = np.nanmean(seen.values[ever], axis=1)
-    alike = np.exp(-cdist(pixels, pixels) / correlation)
+    ever: NDArray[np.bool_] = np.any(seen.there, axis=1)
+    space, time = _likeness(seen, ever, alike)
     whole = np.zeros((*seen.values.shape, rows.shape[1]))
     whole[seen.known] = rows[:values]
-    whole, total = whole[ever], rows[values:].T @ rows[values:]
-    for frame in range(whole.shape[1]):
-        for coordinate in range(whole.shape[2]):
-            one = whole[:, frame, coordinate]
-            total = total + one.T @ alike @ one
-    return total
+    whole = whole[ever]
+    beside = np.einsum("st,ntcp->nscp", time, np.tensordot(space, whole, 1))
+    every = len(rows) - values
+    there = seen.there[ever].astype(float)
+    square = every + seen.values.shape[2] * float(np.sum(space**2 * (there @ time**2 @ there.T)))
+    total = np.tensordot(whole, beside, ((0, 1, 2), (0, 1, 2))) + rows[values:].T @ rows[values:]
+    return total, len(rows) ** 2 / square
+
+
+def _likeness(seen: Observations, ever: NDArray[np.bool_], alike: Alike) -> tuple[Array, Array]:
+    """Correlate the errors of tracks, shape (tracks, tracks), and those of times, shape (T, T)."""
+    from scipy.spatial.distance import cdist
+
+    space, time = np.eye(int(ever.sum())), np.eye(len(seen.time))
+    if alike.correlation is not None:
+        pixels = np.nanmean(seen.values[ever], axis=1)
+        space = np.exp(-cdist(pixels, pixels) / alike.correlation)
+    if alike.drift is not None:
+        time = np.exp(-np.abs(seen.time[:, None] - seen.time) / alike.drift)
+    return space, time
