@@ -95,6 +95,13 @@ def test_the_colours_are_named_so_that_no_player_guesses(tmp_path: Path) -> None
         assert np.abs(one.astype(int) - other).max() <= OF_FIELDS
 
 
+def test_the_index_comes_before_the_pictures(tmp_path: Path) -> None:
+    """So that a browser shows a film while it loads."""
+    write(tmp_path / "a.mp4", [smooth(32, 32, frame) for frame in range(12)], 25)
+    data = (tmp_path / "a.mp4").read_bytes()
+    assert 0 < data.index(b"moov") < data.index(b"mdat")
+
+
 def test_a_full_disk_is_the_error_of_python() -> None:
     class Full(io.BytesIO):
         def write(self, data: Any) -> int:

@@ -141,7 +141,11 @@ PLANTED = {
         link(".partial/checkpoint/positions", "positions"),
         "checkpoint/positions: a symbolic link",
     ),
-    "the draft leads elsewhere": (link(".partial/checkpoint/draft", "draft"), "checkpoint/draft: a symbolic link"),
+    "the draft leads elsewhere": (
+        link(f".partial/checkpoint/.partial-{16 * 'a'}/draft", "draft"),
+        f"checkpoint/.partial-{16 * 'a'}/draft: a symbolic link",
+    ),
+    "a draft is the user's": (file(".partial/checkpoint/draft"), "checkpoint/draft: a file"),
     "the state is a folder": (folder(".partial/checkpoint/state.npz"), "checkpoint/state.npz: a folder"),
     "the frames lead elsewhere": (link("frames"), "frames: a symbolic link"),
     "the frames are a file": (file("frames"), "frames: a file"),

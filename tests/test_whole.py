@@ -87,6 +87,13 @@ def test_a_file_is_replaced_as_a_whole_or_not_at_all(tmp_path: Path) -> None:
     assert [(entry.name, entry.read_bytes()) for entry in tmp_path.iterdir()] == [("a", b"second")]
 
 
+def test_a_draft_of_the_user_stays(tmp_path: Path) -> None:
+    (tmp_path / "draft").write_text("mine")
+    with replacing(tmp_path / "a") as file:
+        file.write(b"new")
+    assert {path.name: path.read_text() for path in tmp_path.iterdir()} == {"a": "new", "draft": "mine"}
+
+
 def test_a_file_takes_the_first_free_name(tmp_path: Path) -> None:
     for name in ("a-1.png", "a-3.png"):
         (tmp_path / name).write_text("mine")

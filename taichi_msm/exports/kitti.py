@@ -29,7 +29,9 @@ from taichi_msm.outputs.flo import read_flo
 from taichi_msm.outputs.table import OUTPUTS, numbered
 from taichi_msm.progress import Count
 from taichi_msm.results.finished_run import FinishedRun, reading
+from taichi_msm.results.publication import MAX_RECORD
 from taichi_msm.results.whole import add
+from taichi_msm.system.files import read_regular
 
 SCALE, ZERO, LARGEST = 64.0, 32768.0, 65535.0
 
@@ -129,5 +131,5 @@ def _copy(run: FinishedRun, number: int, path: Path) -> None:
     run.picture("png", number)
     source = run.result("png", number)
     with reading(source):
-        data = source.read_bytes()
+        data = read_regular(source, MAX_RECORD)
     add(path, data)

@@ -8,9 +8,11 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from taichi_msm.errors import FilesError
+from taichi_msm.errors import ArgumentError
+from taichi_msm.exports.formats import ANY, FORMATS
 from taichi_msm.outputs.table import CAMERA
 from taichi_msm.results.finished_run import FinishedRun, damaged, reading
+from taichi_msm.system.files import read_regular
 
 Array = NDArray[np.float64]
 
@@ -30,22 +32,33 @@ class Pinhole(NamedTuple):
 
 
 def read_pinhole(run: FinishedRun, name: str) -> Pinhole:
-    """Read the camera of a run for a format; a FilesError if there is none, or one that the format cannot describe."""
+    """Read the camera of a run for a format.
+
+    Args:
+        run: the run, as the camera has seen it.
+        name: the format.
+
+    Returns:
+        The camera.
+
+    Raises:
+        FilesError: when there is none.
+        ArgumentError: when the format cannot describe it.
+    """
     path = run.directory / run.camera / CAMERA
+    another = "choose another camera by --camera, or " if FORMATS[name].cameras == ANY else ""
     with reading(path):
-        if path.is_symlink() or not path.is_file():
-            raise FilesError(f"{path}: no such file; {run.remedy('tracks')}")
-        with path.open("rb") as file:
-            described = json.loads(file.read(MAX_BYTES))
-        if "intrinsics" not in described:
-            said = f"{name} needs a pinhole, and {path} has none"
-            raise FilesError(
-                f"{said}; choose another camera by --camera, or run the scene with one that has perspective"
-            )
+        described = json.loads(read_regular(run.own(path, "tracks"), MAX_BYTES))
         # A fisheye is one with any coefficients.
-        if described.get("model") == "fisheye" or np.any(described.get("distortion", ())):
-            said = f"{path}: the camera has a distortion, which {name} cannot describe"
-            raise FilesError(f"{said}; choose another camera by --camera, or run the scene without it")
+        is_distorted = described.get("model") == "fisheye" or bool(np.any(described.get("distortion", ())))
+        is_pinhole = "intrinsics" in described
+    if not is_pinhole:
+        said = f"{name} needs a pinhole, and {path} has none"
+        raise ArgumentError(f"{said}; {another}run the scene with one that has perspective")
+    if is_distorted:
+        said = f"{path}: the camera has a distortion, which {name} cannot describe"
+        raise ArgumentError(f"{said}; {another}run the scene without it")
+    with reading(path):
         matrix = np.array(described["intrinsics"], float)
         poses = np.array(described.get("poses", [described["pose"]] * run.frames), float)[: run.frames]
         if matrix.shape != (3, 3) or poses.shape != (run.frames, 3, 4) or not np.isfinite(poses).all():

@@ -13,6 +13,8 @@ from taichi_msm.outputs.table import NUMBERED, RECORD, RUNS, SWEEP
 from taichi_msm.progress import Count
 from taichi_msm.results.entries import files
 from taichi_msm.results.finished_run import FinishedRun, read_run, reading
+from taichi_msm.results.publication import MAX_RECORD
+from taichi_msm.system.files import read_regular
 
 
 class Source(NamedTuple):
@@ -60,7 +62,7 @@ def read_runs(directories: Sequence[str | Path]) -> tuple[list[FinishedRun], int
         with reading(record):
             names = files(directory, (rf"{RUNS}/{NUMBERED}/{RECORD}",), strict=False)
             folders = sorted(((directory / name).parent for name in names), key=lambda folder: int(folder.name))
-            count = len(json.loads(record.read_bytes())["values"])
+            count = len(json.loads(read_regular(record, MAX_RECORD))["values"])
         complete = [run for run in map(read_run, folders) if run.status == "complete"]
         left_out += count - len(complete)
         runs += complete

@@ -11,6 +11,7 @@ import csv
 import io
 from collections.abc import Iterator, Sequence
 from contextlib import ExitStack
+from functools import partial
 from pathlib import Path
 from typing import TextIO
 
@@ -27,6 +28,10 @@ TRACKS_HEADER = ("time", "point", "across", "down", "x", "y", "occluded", "posit
 
 # As many digits as distinguish any two numbers of single precision.
 EXACT = "%.9g"
+
+
+# The longest line of forces.csv that is read [characters]; a run writes no longer one.
+LONGEST = 4096
 
 
 def write(sources: Sequence[Source], folder: Path) -> Iterator[list[str]]:
@@ -53,7 +58,7 @@ def _write_forces(run: FinishedRun, number: str, file: TextIO) -> None:
     """Copy the rows of a run, whose every value is a number."""
     path = run.result("forces")
     with reading(path), path.open(encoding="ascii", newline="") as source:
-        rows = csv.reader(source)
+        rows = csv.reader(iter(partial(source.readline, LONGEST), ""))
         if tuple(next(rows)) != FORCES_HEADER:
             raise damaged(path)
         for row in rows:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from fractions import Fraction
 from importlib.util import find_spec
+from pathlib import Path
 from typing import Any, BinaryIO
 
 import numpy as np
@@ -15,6 +16,9 @@ NOT_INSTALLED = "mp4 needs PyAV, which is not installed; pip install av"
 # twice as fast as the default for no more bytes, and looks 10 frames ahead, not 40, which all wait in memory. With one
 # thread the bytes are the same for any number of cores.
 OPTIONS = {"crf": "18", "preset": "veryfast", "threads": "1"}
+
+# The index comes before the pictures, so that a browser shows a film while it loads.
+CONTAINER = {"movflags": "faststart"}
 
 # The colours of HDTV, named in the file, because players choose by the size of the picture where nothing is named.
 BT709, LIMITED = 1, 1
@@ -32,7 +36,7 @@ class Mp4Writer:
     """A film; frame f lasts from f / rate to (f + 1) / rate.
 
     An odd last row or column is repeated, as H.264 takes colours of 2 x 2 pixels together. The size is width and height
-    [px]; the file must be seekable, and `close` closes it.
+    [px], the file must have a name and be seekable, and `close` closes it.
     """
 
     def __init__(self, file: BinaryIO, size: tuple[int, int], rate: float) -> None:
@@ -40,13 +44,17 @@ class Mp4Writer:
 
         self._file, self._frame = file, av.VideoFrame
         self._odd = [(0, side % 2) for side in reversed(size)]
-        self._container = av.open(file, "w", format="mp4")
+        # To move the pictures behind the index, they are read again, by another file than is written to.
+        self._container = av.open(file, "w", format="mp4", options=CONTAINER, io_open=self._reopen)
         self._stream: Any = self._container.add_stream("libx264", _ratio(rate), options=OPTIONS)
         self._stream.width, self._stream.height = (side + side % 2 for side in size)
         self._stream.pix_fmt = "yuv420p"
         code = self._stream.codec_context
         code.colorspace = code.color_primaries = code.color_trc = BT709
         code.color_range = LIMITED
+
+    def _reopen(self, *_: object) -> BinaryIO:
+        return Path(self._file.name).open("rb")
 
     def add(self, picture: NDArray[np.uint8]) -> None:
         """Add the next frame, shape (height, width, 3)."""

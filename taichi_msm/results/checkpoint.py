@@ -26,14 +26,17 @@ from taichi_msm.physics.terms.contact import contact_fields
 from taichi_msm.results.entries import FILE, FOLDER, clear, require
 from taichi_msm.results.publication import STAGING
 from taichi_msm.results.records import Records, damaged, digest
-from taichi_msm.results.whole import DRAFT, replacing
+from taichi_msm.results.whole import DRAFT, HIDDEN, LOCK, replacing
 from taichi_msm.scene import Scene
 from taichi_msm.timegrid import TimeGrid
 
 # A folder is a checkpoint if it has a run's manifest. Beside it are the positions of the frames, the forces if they are
 # asked for, and the last state.
 CHECKPOINT, MANIFEST, POSITIONS, FORCES, STATE = "checkpoint", "manifest.json", "positions", "forces", "state.npz"
-PATTERNS = tuple(re.escape(name) for name in (MANIFEST, POSITIONS, FORCES, STATE, DRAFT))
+PATTERNS = (
+    *(re.escape(name) for name in (MANIFEST, POSITIONS, FORCES, STATE)),
+    *(f"{HIDDEN}/{name}" for name in (LOCK, DRAFT)),
+)
 
 # The share of the time that saving states may take.
 SHARE = 0.02

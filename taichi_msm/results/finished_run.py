@@ -22,8 +22,10 @@ from taichi_msm.physics.lattice import rest_positions
 from taichi_msm.physics.planning import try_plan
 from taichi_msm.picture import PictureError, file_sha256, read_rgb
 from taichi_msm.render.camera import camera_problems
+from taichi_msm.results.entries import FILE, FOLDER, kind
 from taichi_msm.results.publication import MAX_RECORD
 from taichi_msm.scene import Scene
+from taichi_msm.system.files import read_regular
 
 # The largest number of f32.
 MOST = float(np.finfo(np.float32).max)
@@ -101,7 +103,7 @@ class FinishedRun:
         # A run removes this file before it moves any other.
         data = b""
         with suppress(OSError):
-            data = (self.directory / RECORD).read_bytes()
+            data = read_regular(self.directory / RECORD, MAX_RECORD)
         if data != self._record:
             raise FilesError(f"{self.directory}: another run replaced these results while they were read; try again")
 
@@ -148,11 +150,32 @@ class FinishedRun:
         path = folder / OUTPUTS[key].path(frame)
         if not self.has(key):
             raise FilesError(f"{result}: not among the results of {folder}; {self.remedy(key)}")
-        if not path.is_file():
-            raise FilesError(f"{path}: no such file; {self.remedy(key)}")
-        # The results may come from anybody, and what is read here may be given to others.
-        if (folder / result).is_symlink() or path.is_symlink():
-            raise FilesError(f"{path}: a symbolic link, which no run writes; {self.remedy(key)}")
+        return self.own(path, key)
+
+    def own(self, path: Path, key: str) -> Path:
+        """Make sure that a file was written by the run.
+
+        The results may come from anybody, and what is read may be given to others: no link leads out of the folder.
+
+        Args:
+            path: the file, below the run's folder.
+            key: the entry of `output` that writes it.
+
+        Returns:
+            The path.
+
+        Raises:
+            FilesError: when it is not there, is no file, or it or a folder on the way to it is a link.
+        """
+        below = path.relative_to(self.directory)
+        for inner in [*list(below.parents)[-2::-1], below]:
+            place = self.directory / inner
+            with reading(place):
+                found = kind(place)
+            if found not in (None, FILE if place == path else FOLDER):
+                raise FilesError(f"{place}: {found}, which no run writes; {self.remedy(key)}")
+            if found is None:
+                raise FilesError(f"{place}: no such file; {self.remedy(key)}")
         return path
 
 
@@ -168,8 +191,9 @@ def read_run(directory: str | Path) -> FinishedRun:
     with reading(path):
         if not path.is_file():
             raise FilesError(f"{path.parent}: no results of a run; name the folder that `run --out` wrote")
-        with path.open("rb") as file:
-            data = file.read(MAX_RECORD)
+        if kind(path) != FILE:
+            raise FilesError(f"{path}: {kind(path)}, which no run writes; name the folder that `run --out` wrote")
+        data = read_regular(path, MAX_RECORD)
         record = json.loads(data)
         scene, frames = _as_run(record), record["frames"]
         sha256, overrides = _DIGESTS.validate_python(record["sha256"]), _OVERRIDES.validate_python(record["overrides"])

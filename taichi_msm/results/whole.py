@@ -23,7 +23,7 @@ else:
 HIDDEN, LOCK, DRAFT = r"\.partial-[0-9a-f]{16}", "lock", "draft"
 
 # The files that are written in hidden folders.
-STAGED = (LOCK, "picture", "session", "copy", r"animation\.gif", r"study\.(?:png|md|json)", r"sweep\.json")
+STAGED = (LOCK, DRAFT, "picture", "session", "copy", r"animation\.gif", r"study\.(?:png|md|json)", r"sweep\.json")
 
 
 @contextmanager
@@ -72,16 +72,11 @@ def _clear_abandoned(folder: Path) -> None:
 
 @contextmanager
 def replacing(path: Path) -> Iterator[BinaryIO]:
-    """Open a draft beside a file, which it replaces at the end of the block; if the block raises, the file stays."""
-    draft = path.with_name(DRAFT)
-    draft.unlink(missing_ok=True)
-    try:
-        with create(draft) as file:
+    """Open a hidden draft of a file, which it replaces at the end of the block; if that raises, the file stays."""
+    with staged(path.parent) as hidden:
+        with create(hidden / DRAFT) as file:
             yield file
-        draft.replace(path)
-    except BaseException:
-        draft.unlink(missing_ok=True)
-        raise
+        (hidden / DRAFT).replace(path)
 
 
 def place(draft: Path, folder: Path, stem: str, suffix: str) -> Path:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import ast
 import os
-import tempfile
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cache, cached_property
@@ -13,6 +12,7 @@ from pathlib import Path
 from typing import Any
 
 from taichi_msm.errors import DeviceError, NotInstalledError, did_you_mean
+from taichi_msm.system.files import private_folder
 
 # The environment variable that chooses.
 CHOICE = "TAICHI_MSM_COMPILER"
@@ -70,7 +70,7 @@ class Compiler:
             # Without HOME, it aborts the process.
             os.environ.pop("HOME", None)
             folder = os.path.expanduser("~")  # noqa: PTH111  # Path.home raises where there is none
-            os.environ["HOME"] = folder if folder != "~" else tempfile.gettempdir()
+            os.environ["HOME"] = folder if folder != "~" else private_folder()
         os.environ.setdefault(f"ENABLE_{self.name.upper()}_HEADER_PRINT", "0")
         os.environ.setdefault(f"{self.prefix}_SKIP_VERSION_CHECK", "ON")
         # In a notebook, it reports on import that it is in one. This level is for the import only; `init` sets its own.

@@ -22,6 +22,7 @@ from numpy.typing import NDArray
 from taichi_msm.errors import ArgumentError, DeviceError, MsmError, did_you_mean
 from taichi_msm.system import resources
 from taichi_msm.system.compiler import Parts, chosen
+from taichi_msm.system.files import private_folder
 from taichi_msm.system.streams import silenced
 
 ti = chosen().load()
@@ -224,7 +225,7 @@ def _cache() -> dict[str, Any]:
     except OSError:
         # When a process ends, Taichi crashes if it cannot write to the folder, even if the cache is off.
         os.environ.pop(chosen().folder_variable, None)
-        return {"offline_cache": False, "offline_cache_file_path": tempfile.gettempdir()}
+        return {"offline_cache": False, "offline_cache_file_path": private_folder()}
     # The lock is held for milliseconds. A killed process leaves it behind, which blocks the cache for all others.
     lock = folder / chosen().lock
     with contextlib.suppress(OSError):
