@@ -85,6 +85,12 @@ class Shard(click.ParamType):  # type: ignore[type-arg]  # as above
 
 scene_argument = click.argument("scene", metavar="SCENE")
 image_option = click.option("--image", metavar="FILE", help="The picture on the sheet, instead of the scene's.")
+quality_option = click.option(
+    "--quality",
+    type=click.IntRange(1, 100),
+    metavar="N",
+    help="Quality of the film, with output: mp4 [%]; 65 by default.",
+)
 set_option = click.option(
     "--set",
     "overrides",
@@ -136,6 +142,7 @@ def program() -> None:
     default=None,
     help="Always or never estimate the error.  [default: if that takes at most two fifths of the run]",
 )
+@quality_option
 @click.option("--resume", metavar="DIR", help="Continue the unfinished run in DIR, instead of running SCENE.")
 @click.option("--again", metavar="DIR", help="Repeat the run that run.json in DIR tells of, instead of running SCENE.")
 @click.option("--quiet", is_flag=True, help="Print no progress and no summary.")
@@ -150,12 +157,14 @@ def run(
     arch: str,
     threads: int | None,
     estimate_error: bool | None,
+    quality: int | None,
     resume: str | None,
     again: str | None,
     quiet: bool,
     as_json: bool,
 ) -> int:
     """Simulate SCENE, draw its frames and write them."""
+    overrides += () if quality is None else (f"render.quality={quality}",)
     typed = [*overrides, *([f"image={image}"] if image is not None else [])]
     if resume is not None:
         require_alone(context, "--resume continues", RESUMABLE)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import errno
 import io
+import json
 from fractions import Fraction
 from pathlib import Path
 from types import SimpleNamespace
@@ -20,6 +21,7 @@ from taichi_msm.outputs.mp4 import Mp4Writer
 from taichi_msm.results.pictures import Job, PictureWriter
 from taichi_msm.scenefile.load import load_scene
 from taichi_msm.system.runtime import Device
+from tests.conftest import Program
 from tests.outputs import files
 from tests.test_resume import interrupted
 
@@ -36,9 +38,9 @@ def smooth(width: int, height: int, frame: int) -> NDArray[np.uint8]:
     return (40 + 170 * colours).astype(np.uint8)
 
 
-def write(path: Path, pictures: list[NDArray[np.uint8]], rate: float) -> None:
+def write(path: Path, pictures: list[NDArray[np.uint8]], rate: float, quality: int = 65) -> None:
     height, width, _ = pictures[0].shape
-    writer = Mp4Writer(path.open("x+b"), (width, height), rate)
+    writer = Mp4Writer(path.open("x+b"), (width, height), rate, quality)
     for picture in pictures:
         writer.add(picture)
     writer.close()
@@ -102,13 +104,23 @@ def test_the_index_comes_before_the_pictures(tmp_path: Path) -> None:
     assert 0 < data.index(b"moov") < data.index(b"mdat")
 
 
+def test_quality_is_bought_with_bytes(small: Path, program: Program) -> None:
+    sizes = []
+    for quality in ("1", "65", "100"):
+        done = program("run", "small.yaml", "--set", "output=[mp4]", "--quality", quality, "--quiet", "--no-estimate")
+        assert (done.returncode, done.stderr) == (0, "")
+        sizes.append(Path("output/small/animation.mp4").stat().st_size)
+        assert json.loads(Path("output/small/run.json").read_text())["overrides"][-1] == f"render.quality={quality}"
+    assert sizes[0] < sizes[1] < sizes[2]
+
+
 def test_a_full_disk_is_the_error_of_python() -> None:
     class Full(io.BytesIO):
         def write(self, data: Any) -> int:
             raise OSError(errno.ENOSPC, "no space")
 
     rng = np.random.default_rng(0)
-    writer = Mp4Writer(Full(), (256, 256), 25)
+    writer = Mp4Writer(Full(), (256, 256), 25, 65)
     with pytest.raises(OSError, match="no space") as caught:  # noqa: PT012
         for _ in range(40):
             writer.add(rng.integers(0, 256, (256, 256, 3), dtype=np.uint8))

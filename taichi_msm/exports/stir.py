@@ -145,10 +145,11 @@ def _discs(pixels: Pixels, size: tuple[int, int], radius: int) -> NDArray[np.uin
 
 def _write_frames(run: FinishedRun, folder: Path, progress: Count) -> None:
     """Write the film of a camera, and its first and last frame."""
+    render = run.scene.render
     end = round(1000 * run.time[-1])
     (folder / "frames").mkdir()
     with create(folder / "frames" / f"0ms-{end}ms-visible.mp4") as file:
-        film = mp4.Mp4Writer(file, run.scene.render.size, run.scene.time.frames_per_second)
+        film = mp4.Mp4Writer(file, render.size, run.scene.time.frames_per_second, render.quality)
         for frame in range(run.frames):
             progress(frame, run.frames)
             film.add(run.picture("png", frame))

@@ -12,10 +12,12 @@ from numpy.typing import NDArray
 
 NOT_INSTALLED = "mp4 needs PyAV, which is not installed; pip install av"
 
-# Of grasp.yaml, 512 x 512 pixels, this quality takes 2.5 kB a frame at 40 dB, where a GIF takes 35 kB. This preset is
-# twice as fast as the default for no more bytes, and looks 10 frames ahead, not 40, which all wait in memory. With one
-# thread the bytes are the same for any number of cores.
-OPTIONS = {"crf": "18", "preset": "veryfast", "threads": "1"}
+# This preset is twice as fast as the default for no more bytes, and looks 10 frames ahead, not 40, which all wait in
+# memory. With one thread the bytes are the same for any number of cores.
+OPTIONS = {"preset": "veryfast", "threads": "1"}
+
+# The rate factor of H.264 at a quality of 0 %; at 100 % it is 1, as 0 would need a profile that browsers do not play.
+LARGEST_RATE_FACTOR = 51
 
 # The index comes before the pictures, so that a browser shows a film while it loads.
 CONTAINER = {"movflags": "faststart"}
@@ -35,18 +37,24 @@ def is_installed() -> bool:
 class Mp4Writer:
     """A film; frame f lasts from f / rate to (f + 1) / rate.
 
-    An odd last row or column is repeated, as H.264 takes colours of 2 x 2 pixels together. The size is width and height
-    [px], the file must have a name and be seekable, and `close` closes it.
+    An odd last row or column is repeated, as H.264 takes colours of 2 x 2 pixels together.
+
+    Args:
+        file: where it is written; it has a name and is seekable, and `close` closes it.
+        size: width and height [px].
+        rate: frames per second.
+        quality: 1 to 100 [%].
     """
 
-    def __init__(self, file: BinaryIO, size: tuple[int, int], rate: float) -> None:
+    def __init__(self, file: BinaryIO, size: tuple[int, int], rate: float, quality: int) -> None:
         import av
 
         self._file, self._frame = file, av.VideoFrame
         self._odd = [(0, side % 2) for side in reversed(size)]
         # To move the pictures behind the index, they are read again, by another file than is written to.
         self._container = av.open(file, "w", format="mp4", options=CONTAINER, io_open=self._reopen)
-        self._stream: Any = self._container.add_stream("libx264", _ratio(rate), options=OPTIONS)
+        factor = max(1, round(LARGEST_RATE_FACTOR * (1 - quality / 100)))
+        self._stream: Any = self._container.add_stream("libx264", _ratio(rate), options={"crf": str(factor), **OPTIONS})
         self._stream.width, self._stream.height = (side + side % 2 for side in size)
         self._stream.pix_fmt = "yuv420p"
         code = self._stream.codec_context

@@ -39,6 +39,7 @@ class Job(NamedTuple):
     gif: bool
     background: tuple[int, int, int]  # a colour that the GIF keeps exactly
     mp4: bool = False
+    quality: int = 65  # of the film [%]
 
     def stills(self, number: int) -> list[Path]:
         """Name the PNGs of a frame."""
@@ -142,7 +143,7 @@ class PictureWriter:
             films.append(GifWriter(file, job.size, job.rate, Palette(shades(picture), job.background)))
         if job.mp4:
             file = self._files.enter_context(create(folder / OUTPUTS["mp4"].path()))
-            films.append(Mp4Writer(file, job.size, job.rate))
+            films.append(Mp4Writer(file, job.size, job.rate, job.quality))
         return films
 
     def _close(self) -> None:

@@ -212,6 +212,7 @@ class ResultWriter:
                     gif="gif" in scene.output,
                     background=scene.render.background,
                     mp4="mp4" in scene.output,
+                    quality=scene.render.quality,
                 )
                 locks = self._publication.lock_descriptors
                 self._encoder = Encoder(job, locks) if self._beside else PictureWriter(job)
