@@ -12,7 +12,7 @@ from taichi_msm.physics import probe_force
 from taichi_msm.physics.error_control import Estimate
 from taichi_msm.physics.material import has_fixed_border
 from taichi_msm.physics.mesh_error import MeshEstimate
-from taichi_msm.physics.paths import path_notes
+from taichi_msm.physics.paths import MOST_FINER, path_notes
 from taichi_msm.physics.pilots import AT_REST
 from taichi_msm.physics.plan import Plan
 from taichi_msm.physics.probe_force import ProbeRecord
@@ -32,9 +32,6 @@ LONGEST = 2.0
 
 # If an error is above this share of the largest displacement, a remedy is named.
 WRONG = 0.01
-
-# Advice is at most this many times as many points.
-MOST_FINER = 4
 
 
 def run_notes(
