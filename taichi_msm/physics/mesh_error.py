@@ -266,6 +266,8 @@ def choose_points(
             return tried, estimate
         # The error falls with the square of the length of the cells, or more slowly.
         needed = times * math.sqrt(estimate.error / (CLOSE * tolerance))
+        if estimate.doubt in (NARROW, APART) and needed == math.inf:
+            needed = LARGEST_CUT * times  # With more points it is known.
         if needed > most:
             break
         times *= min(LARGEST_CUT, max(LEAST_CUT, needed / times))
