@@ -18,15 +18,18 @@ from numpy.typing import NDArray
 from taichi_msm.arguments import require_path
 from taichi_msm.errors import DamagedError, DeviceError, DivergedError, FilesError, SceneError, writing
 from taichi_msm.physics.lattice import rest_positions
+from taichi_msm.physics.mesh_error import with_points
 from taichi_msm.physics.path_dependence import PathDependence
 from taichi_msm.physics.pilots import AT_REST, Pilots, choose_pilots
 from taichi_msm.physics.plan import Plan
+from taichi_msm.physics.planning import variant
 from taichi_msm.physics.probe_force import ProbeRecord, probe_records
 from taichi_msm.physics.run_error import Known, RunError
 from taichi_msm.physics.run_notes import run_notes
 from taichi_msm.physics.state import Felt, RunProgress
 from taichi_msm.physics.workload import ENCODING
 from taichi_msm.progress import Progress
+from taichi_msm.render.camera import view_at
 from taichi_msm.render.drawing_notes import drawing_notes
 from taichi_msm.render.labels import Observed
 from taichi_msm.render.texture import load_texture
@@ -34,13 +37,16 @@ from taichi_msm.results.manifest import Manifest, digests, read_manifest
 from taichi_msm.results.record import RunRecord
 from taichi_msm.results.writer import ResultWriter
 from taichi_msm.scene import Scene
-from taichi_msm.scenefile import budget
+from taichi_msm.scenefile import budget, duration
 from taichi_msm.scenefile.resolve import resolve
 from taichi_msm.scenefile.validation import checked
 from taichi_msm.simulation import Simulation
 from taichi_msm.system import resources, runtime
 from taichi_msm.system.runtime import Device
 from taichi_msm.system.versions import versions
+
+# Points are advised only for a run that takes no longer than this [s].
+LONGEST_ADVISED = 3600.0
 
 
 class Stopwatch:
@@ -307,7 +313,9 @@ class _Run:
                 self._ways.follow(frame, position - rest)
             if self._error and frame > 0:
                 with stage("pilot"):
-                    self._error.follow(position - rest, told)
+                    of_tools = [simulation.forces()[tool.probe].force for tool in self._task.plan.tools]
+                    forces = np.array(of_tools).reshape(-1, 3) if frame >= self._resumed else None
+                    self._error.follow(position - rest, told, forces)
         try:
             if self._error:
                 kept = (writer.position(frame) - rest for frame in range(1, self._frames)) if scene.output else None
@@ -422,7 +430,11 @@ def _facts(
         "shortest_spring": progress.shortest_spring,
         "longest_spring": progress.longest_spring,
         "probes": probes,
-        "notes": [*run_notes(plan, probes, progress, *known), *path_dependence, *drawing_notes(scene)],
+        "notes": [
+            *run_notes(plan, probes, progress, *known, partial(_affords, plan), _scale(scene)),
+            *path_dependence,
+            *drawing_notes(scene),
+        ],
         "error_estimate": error_record(known),
         **({"error_estimate_reason": known.reason} if known.estimate is None else {}),
     }
@@ -460,6 +472,22 @@ def _asked(given: Scene, scene: Scene) -> dict[str, Any]:
     return {key: asked for key, asked, chosen in pairs if asked != chosen}
 
 
+def _affords(plan: Plan, points: tuple[int, int]) -> bool:
+    """Tell whether a run with this number of points takes at most an hour, as `check` estimates it."""
+    return duration.estimate(variant(plan, with_points(plan.scene, points))).seconds <= LONGEST_ADVISED
+
+
+def _scale(scene: Scene) -> float | None:
+    """Compute the pixels per metre at the middle of the sheet; None: no picture is drawn, or it is out of sight."""
+    if not scene.renders:
+        return None
+    middle, right, up = view_at(scene, 0.0, next(iter(scene.render.all_cameras))).pixels(
+        np.array([[0.0, 0, 0], [1e-4, 0, 0], [0, 1e-4, 0]])
+    )
+    scale = float(max(np.linalg.norm(right - middle), np.linalg.norm(up - middle))) / 1e-4
+    return scale if math.isfinite(scale) else None
+
+
 def error_record(known: Known) -> dict[str, Any] | None:
     """Write what is known of the error for run.json, where null stands for what is not known, or not there."""
     estimate, mesh, keys = known.estimate, known.mesh, ("error", "rounding", "in_f64", "order", "at_least")
@@ -473,4 +501,6 @@ def error_record(known: Known) -> dict[str, Any] | None:
         fields |= {"rounding": None, "in_f64": None}
     if mesh is not None:
         fields |= {"mesh_error": mesh.error, "mesh_doubt": mesh.doubt}
+    if known.force is not None:
+        fields |= {"force_error": known.force.error, "force_doubt": known.force.doubt}
     return {key: None if value == math.inf else value for key, value in fields.items()}

@@ -258,16 +258,22 @@ def test_the_error_of_a_load_shorter_than_a_step_is_known(pulse: list[float], de
 def test_a_scene_that_is_all_right_has_no_notes() -> None:
     assert not notes_of(scene(), RunProgress(1, 1.0, 0.51), None)
     assert notes_of(scene(), RunProgress(1, 0.0, 0.49), Estimate(40, 1e-3, 1e-4, 1e-3, 2))[0] == (
-        "error 0.001 of the largest displacement: 0.001 due to the time step, 0.0001 to rounding"
+        "error: time step 0.1 %, rounding 0.01 % of 0 mm (0 mm); mesh error unknown: another number of points is "
+        "another sheet"
     )
     assert len(notes_of(scene(), RunProgress(1, 0.0, 0.49), None)) == 2
 
 
-@pytest.mark.parametrize(("error", "advice"), [(0.04, "; try sheet.points: [24, 30]"), (2000.0, "")])
+HELPS = "what helps more than points: tissue.bending, tissue.pretension or a wider tip"
+
+
+@pytest.mark.parametrize(("error", "advice"), [(0.015, "try sheet.points: [15, 19]"), (0.04, HELPS), (2000.0, HELPS)])
 def test_points_are_advised_where_they_can_help(error: float, advice: str) -> None:
     made = scene()
-    (note,) = notes_of(made, MOVED, None, mesh=MeshEstimate(error))
-    assert note == f"so few points make the run up to {100 * error:g} % wrong{advice}"
+    note = notes_of(made, MOVED, None, mesh=MeshEstimate(error))[-1]
+    assert note == f"so few points make the run up to {100 * error:g} % wrong; {advice}"
+    slow = notes_of(made, MOVED, None, mesh=MeshEstimate(error), affords=lambda points: False)[-1]
+    assert slow.endswith(HELPS)
 
 
 def test_positions_written_in_f32_have_the_digits_of_the_sheet(device: Device) -> None:

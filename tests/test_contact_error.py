@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterator
 from functools import partial
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -21,6 +22,8 @@ from taichi_msm.physics.plan import Plan
 from taichi_msm.physics.planning import variant
 from taichi_msm.physics.run_error import Known, RunError
 from taichi_msm.physics.solver import Dynamics
+from taichi_msm.runner import run
+from taichi_msm.scene import Scene
 from taichi_msm.system.runtime import Device
 from tests.motion import frames_on, notes_of, true_error
 from tests.scenes import plan_of, random_contact
@@ -128,11 +131,11 @@ def test_how_wrong_it_is_is_said_as_a_bound() -> None:
         return notes_of(made, MOVED, Estimate(10, 0.04, 0.0, 0.04, 1, at_least=at_least, at_most=True))
 
     first, step = said(at_least=False)
-    assert first == ("error at most about 0.04 of the largest displacement: at most about 0.04 due to the time step")
+    assert first.startswith("error: time step at most about 4 % of ")
     # Of order 1, it takes eight times as many steps.
     finer = 0.04 / (8 * plan_of(made).grid.steps_per_frame)
     assert step == f"the run is up to 4 % wrong; try time.step: {finer:.9g}"
-    assert said(at_least=True)[0].startswith("error roughly 0.04 of the largest displacement: roughly 0.04")
+    assert said(at_least=True)[0].startswith("error: time step roughly 4 % of ")
 
 
 def segments(rng: np.random.Generator) -> Iterator[tuple[NDArray[np.float64], NDArray[np.float64]]]:
@@ -190,4 +193,40 @@ def test_the_pilot_of_the_points_is_compared_with_the_run(device: Device, monkey
     known.follow(of_the_run, lambda: None)
     assert given[0] is of_the_run
     steps = [sheet.plan.grid.steps_per_frame for sheet in known._mesh._sheets]
-    assert steps == [math.ceil(plan.grid.steps_per_frame / 2)] * 2
+    assert steps == [math.ceil(plan.grid.steps_per_frame / 2)]
+
+
+@pytest.mark.parametrize(
+    ("radius", "place", "known"),
+    [(0.0005, 0.4583, False), (0.006, 0.4583, True)],
+    ids=["meets no point", "meets points"],
+)
+def test_a_rod_that_meets_no_point_has_no_known_error(
+    radius: float, place: float, known: bool, device: Device, tmp_path: Path
+) -> None:
+    made = {
+        "sheet": {"points": [13, 13], "size": [0.06, 0.06], "fixed": "border"},
+        "tissue": {
+            "young": 2e4,
+            "thickness": 2e-3,
+            "density": 1000,
+            "foundation": 2e5,
+            "foundation_active": "always",
+            "damping": 400,
+            "pretension": 10,
+        },
+        "probes": [
+            {
+                "path": [[0, place, place, 0.002], [0.4, place, place, -0.002]],
+                "instrument": {"radius": radius, "shaft": [0, 0, 1], "length": 0.1},
+            }
+        ],
+        "time": {"duration": 0.4, "frames_per_second": 10},
+        "output": ["forces"],
+    }
+    record = run(Scene.model_validate(made), tmp_path / "out", threads=device.threads, estimate_error=True)
+    estimate = record["error_estimate"]
+    assert estimate is not None
+    assert (estimate["mesh_error"] is not None, estimate["mesh_doubt"] == "") == (known, known)
+    assert (estimate["force_error"] is not None, estimate["force_doubt"] == "") == (known, known)
+    assert any("force error" in note for note in record["notes"])

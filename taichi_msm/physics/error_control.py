@@ -182,6 +182,11 @@ class Pilot:
                 self._in_f64 = max(self._in_f64, longest(same - exact))
                 self._rounding = max(self._rounding, longest(displacement - same))
 
+    def force_error(self, forces: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Estimate the error of the mean forces since the frame before [N], shape (tools, 3), by order 1."""
+        ratio = self._steps / self._plan.grid.steps_per_frame
+        return np.asarray(self._margin * abs(ratio / (ratio - 1)) * np.abs(forces - self._other.tool_forces()))
+
     @property
     def estimate(self) -> Estimate:
         """What the frames so far show."""

@@ -23,6 +23,9 @@ from taichi_msm.timegrid import TimeGrid
 # before a note is made.
 LARGEST_STRIDE = WIDEST_CELL = 0.5
 
+# Advice is at most this many times as many points.
+MOST_FINER = 4
+
 # At how many moments it is looked whether two tools are in one place.
 MOMENTS = 1024
 
@@ -172,9 +175,11 @@ def path_notes(scene: Scene, tools: Sequence[Tool]) -> Iterator[str]:
         if apart > WIDEST_CELL * tool.radius:
             (height, width), most = scene.sheet.size, WIDEST_CELL * tool.radius
             points = [int(np.ceil(side / most)) + 1 for side in (height, width)]
+            few = math.prod(points) <= MOST_FINER * math.prod(scene.sheet.points)
+            remedy = f"try sheet.points: {points}" if few else "take a wider tip"
             yield (
                 f"probes.{tool.probe}: the points are {apart:.3g} m apart, more than half the radius of the "
-                f"instrument, {tool.radius:.3g} m, which touches few of them; try sheet.points: {points}"
+                f"instrument, {tool.radius:.3g} m, which touches few of them; {remedy}"
             )
 
     if (where := overlap(tools, scene.time.duration)) is not None:

@@ -23,8 +23,8 @@ COARSEST = 0.6
 FINEST = 64
 
 # Steps of the pilots for the points, for each step of what they are compared with, in steps of the whole sheet: half
-# and a quarter of the cells a side, and of the steps; with contact both have half the steps.
-POINTS, POINTS_IN_CONTACT = 1 / 4 / 2 + 1 / 16 / 4, 1 / 4 / 2 + 1 / 16 / 2
+# and a quarter of the cells a side, and of the steps; with contact 1 / sqrt(2) of the cells a side and half the steps.
+POINTS, POINTS_IN_CONTACT = 1 / 4 / 2 + 1 / 16 / 4, 1 / 2 / 2
 
 
 # Why there is no error of the step where the sheet is at rest.

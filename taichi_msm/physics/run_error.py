@@ -8,15 +8,31 @@ from dataclasses import replace
 from functools import partial
 from typing import Any, NamedTuple
 
+import numpy as np
 from numpy.typing import NDArray
 
-from taichi_msm.physics.error_control import Estimate, Pilot, reconcile
-from taichi_msm.physics.mesh_error import MeshEstimate, MeshPilot, coarser
+from taichi_msm.physics.error_control import Estimate, Pilot, longest, reconcile
+from taichi_msm.physics.mesh_error import (
+    APART,
+    IN_CONTACT,
+    LARGEST_DIFFERENCE,
+    UNTOUCHED,
+    MeshEstimate,
+    MeshPilot,
+    companion,
+)
 from taichi_msm.physics.pilots import ENOUGH, Pilots
 from taichi_msm.physics.plan import Plan
 from taichi_msm.physics.solver import Dynamics
 from taichi_msm.progress import Count, Pause
 from taichi_msm.system.runtime import Device
+
+
+class ForceEstimate(NamedTuple):
+    """What is known about the error of the forces of tools on a path."""
+
+    error: float | None  # of any tool at any frame, as a fraction of the greatest force; None: not known
+    doubt: str = ""  # why it is not known
 
 
 class Known(NamedTuple):
@@ -25,6 +41,7 @@ class Known(NamedTuple):
     estimate: Estimate | None = None  # the error due to the step and to rounding; None: not estimated
     reason: str = ""  # why it was not estimated
     mesh: MeshEstimate | None = None  # the error due to the number of points; None: not estimated
+    force: ForceEstimate | None = None  # the error of the forces of tools on a path; None: there are none
 
 
 class RunError:
@@ -43,11 +60,13 @@ class RunError:
         self._coarse = known.estimate is None and 0 < pilots.beside < plan.grid.steps_per_frame
         tells_time = known.estimate is None and not pilots.reason
         self._time = Pilot(plan, pilots.beside, device, cores) if tells_time else None
-        coarse = coarser(plan) if pilots.points and known.mesh is None else None
+        coarse = companion(plan) if pilots.points and known.mesh is None else None
         # Otherwise it is compared with the run itself.
         self._mesh_beside_coarse = self._coarse and not plan.tools
         beside = plan.with_grid(steps_per_frame=pilots.beside) if self._mesh_beside_coarse else plan
         self._mesh = None if coarse is None else MeshPilot(beside, coarse, device, cores)
+        self._force_error, self._greatest = 0.0, np.zeros(len(plan.tools))
+        self._all_forces = True
 
     def compile(self) -> None:
         """Compile now what the first frame would compile."""
@@ -55,13 +74,27 @@ class RunError:
             if pilot is not None:
                 pilot.compile()
 
-    def follow(self, displacement: NDArray[Any], pause: Pause) -> None:
-        """Step to the next frame, and compare, as a `Pilot` does."""
+    def follow(self, displacement: NDArray[Any], pause: Pause, forces: NDArray[np.float64] | None = None) -> None:
+        """Step to the next frame, and compare, as a `Pilot` does.
+
+        Args:
+            displacement: of the run at that frame [m], shape (rows, cols, 3).
+            pause: as of a `Pilot`.
+            forces: of the tools on a path, the means since the frame before [N], shape (tools, 3); None: not kept.
+        """
         if self._time is not None:
             self._time.follow(displacement, pause)
         if self._mesh is not None:
             beside = self._time.displacement if self._time and self._mesh_beside_coarse else displacement
             self._mesh.follow(beside, pause)
+        if forces is None:
+            self._all_forces = False
+        elif self._plan.tools and self._mesh is not None:
+            apart = IN_CONTACT * np.abs(forces - self._mesh.tool_forces())
+            if self._time is not None:
+                apart = apart + self._time.force_error(forces)
+            self._force_error = max(self._force_error, longest(apart))
+            self._greatest = np.maximum(self._greatest, np.linalg.norm(forces, axis=1))
 
     def finish(self, displacements: Iterator[NDArray[Any]] | None, progress: Count) -> None:
         """After the last frame, take a finer pilot where the coarse one shows an error that matters.
@@ -95,4 +128,17 @@ class RunError:
             known = known._replace(estimate=estimate)
         if self._mesh is not None:
             known = known._replace(mesh=self._mesh.estimate)
-        return known
+            if self._plan.tools and self._all_forces and not self._greatest.all():
+                known = known._replace(mesh=MeshEstimate(math.inf, UNTOUCHED))
+        return known._replace(force=self._force(known.mesh)) if self._plan.tools else known
+
+    def _force(self, mesh: MeshEstimate | None) -> ForceEstimate:
+        """Estimate the error of the forces."""
+        if self._mesh is None or mesh is None:
+            return ForceEstimate(None, "there is no run with fewer points")
+        if not self._all_forces:
+            return ForceEstimate(None, "the forces of the frames before the run was continued are not kept")
+        if mesh.error == math.inf:
+            return ForceEstimate(None, mesh.doubt)
+        relative = self._force_error / float(self._greatest.max())
+        return ForceEstimate(relative) if relative < LARGEST_DIFFERENCE else ForceEstimate(None, APART)

@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
+
+import numpy as np
 
 from taichi_msm.physics import probe_force
 from taichi_msm.physics.contact_notes import contact_notes
@@ -12,12 +14,13 @@ from taichi_msm.physics.energy_growth import growth_notes
 from taichi_msm.physics.error_control import Estimate
 from taichi_msm.physics.material import has_fixed_border
 from taichi_msm.physics.mesh_error import MeshEstimate
-from taichi_msm.physics.paths import path_notes
+from taichi_msm.physics.paths import MOST_FINER, path_notes
 from taichi_msm.physics.pilots import AT_REST
 from taichi_msm.physics.plan import Plan
 from taichi_msm.physics.probe_force import ProbeRecord
+from taichi_msm.physics.run_error import ForceEstimate
 from taichi_msm.physics.state import RunProgress
-from taichi_msm.scene import MAX_POINTS, Foundation
+from taichi_msm.scene import MAX_POINTS, Foundation, Scene
 
 # The stability limit holds while no spring is compressed below this share of its rest length (see
 # `SpringTerm.bound`).
@@ -40,36 +43,54 @@ def run_notes(
     estimate: Estimate | None,
     reason: str = "",
     mesh: MeshEstimate | None = None,
+    force: ForceEstimate | None = None,
+    affords: Callable[[tuple[int, int]], bool] = lambda points: True,
+    scale: float | None = None,
 ) -> Iterator[str]:
-    """Say what is remarkable about a run up to its last frame, each in a line; the last three are what is `Known`."""
+    """Say what is remarkable about a run up to its last frame, each in a line.
+
+    Args:
+        plan: of the run.
+        probes: what is known of the force of each.
+        progress: of the run.
+        estimate: as in `Known`, like the next three.
+        reason: why there is none.
+        mesh: the error due to the number of points.
+        force: the error of the forces.
+        affords: whether a run with this number of points takes at most an hour.
+        scale: pixels per metre at the middle of the sheet; None: no picture is drawn.
+    """
     scene, grid = plan.scene, plan.grid
+    if estimate is not None or mesh is not None:
+        yield error(estimate, mesh, progress.max_displacement, scale) + (
+            "; mesh error unknown: another number of points is another sheet" if scene.tissue is None else ""
+        )
     if estimate is not None:
-        yield error(estimate, mesh)
         if WRONG < estimate.error < math.inf:
             wrong = float(f"{100 * estimate.error:.2g}")
             at_most = (estimate.at_most and not estimate.at_least) or not estimate.parted
             bound = "up to" if at_most else "about"
             yield f"the run is {bound} {wrong:g} % wrong; {_remedy(plan, estimate)}"
     elif reason == AT_REST:
-        points = f", {_size(mesh)} of the largest displacement due to the number of points" if mesh is not None else ""
-        yield f"error: none due to a time step, as the sheet is at rest{points}"
+        yield "error: none due to a time step, as the sheet is at rest"
     elif reason:
-        if mesh is None:
-            yield f"error not estimated: {reason}"
+        yield f"error {'of the time step ' if mesh is not None else ''}not estimated: {reason}"
+    if force is not None:
+        if force.error is None:
+            yield f"force error not known: {force.doubt}"
         else:
-            yield f"error {_size(mesh)} due to the number of points; due to the time step not estimated: {reason}"
+            yield f"force error at most about {_percent(force.error, 2)} % of the greatest force"
     yield from probe_force.force_notes(scene, probes)
     yield from path_notes(scene, plan.tools)
     yield from contact_notes(plan, progress)
     yield from growth_notes(plan, progress)
-    if mesh is not None and mesh.doubt:
+    if mesh is not None and mesh.doubt and mesh.error < math.inf:
         yield f"the error due to the number of points may be larger: {mesh.doubt}"
     if mesh is not None and WRONG < mesh.error < math.inf:
-        wrong, cut = float(f"{100 * mesh.error:.2g}"), math.sqrt(mesh.error / (WRONG / 2))
-        finer = [min(MAX_POINTS, math.ceil((count - 1) * cut) + 1) for count in scene.sheet.points]
-        remedy = f"; try sheet.points: {finer}" if max(finer) < MAX_POINTS else ""
-        bound = ("roughly" if mesh.at_most else "at least") if mesh.doubt else "up to"
-        yield f"so few points make the run {bound} {wrong:g} % wrong{remedy}"
+        wrong, bound = float(f"{100 * mesh.error:.2g}"), "up to"
+        if mesh.doubt:
+            bound = "roughly" if mesh.at_most else "at least"
+        yield f"so few points make the run {bound} {wrong:g} % wrong; {_finer(scene, mesh, affords)}"
     if progress.max_displacement == 0 and progress.frame > 0:
         yield "nothing moved: does a probe press where and when it should?"
     below = scene.tissue.foundation if scene.tissue is not None else None
@@ -97,27 +118,49 @@ def run_notes(
         )
 
 
-def error(estimate: Estimate, mesh: MeshEstimate | None = None) -> str:
-    """Say how wrong a run is."""
-    if estimate.error == math.inf:
+def error(
+    estimate: Estimate | None, mesh: MeshEstimate | None = None, largest: float = 0.0, scale: float | None = None
+) -> str:
+    """Say how wrong a run is, in parts of its largest displacement [m]; scale: in pixels per metre, if any."""
+    if estimate is not None and estimate.error == math.inf:
         return "error not known: a pilot run diverged, or steps do not resolve the damping"
-    bound = _bound(estimate.at_most or not estimate.parted, estimate.at_least)
-    parts = [f"{bound}{estimate.in_f64:.1g} due to the time step"]
-    if not estimate.parted:
-        parts = [f"{bound}{estimate.error:.1g} due to the time step and rounding"]
-    elif estimate.rounding:
-        parts.append(f"{estimate.rounding:.1g} to rounding")
-    if mesh is None:
-        return f"error {bound}{estimate.error:.1g} of the largest displacement: {', '.join(parts)}"
-    return (
-        f"error, as a fraction of the largest displacement: {', '.join(parts)}, {_size(mesh)} to the number of points"
-    )
+    parts, known = [], [mesh.error] if mesh is not None and mesh.error < math.inf else []
+    if estimate is not None:
+        bound = _bound(estimate.at_most or not estimate.parted, estimate.at_least)
+        named = "time step" if estimate.parted else "time step and rounding"
+        parts.append(f"{named} {bound}{_percent(estimate.in_f64 if estimate.parted else estimate.error, 1)} %")
+        if estimate.parted and estimate.rounding:
+            parts.append(f"rounding {_percent(estimate.rounding, 1)} %")
+        known.append(estimate.error)
+    if mesh is not None and mesh.error < math.inf:
+        parts.append(f"mesh {_bound(mesh.at_most, bool(mesh.doubt))}{_percent(mesh.error, 2)} %")
+    of = ""
+    if known:
+        away = max(known) * largest
+        pixels = f", {_digits(away * scale)} px" if scale is not None else ""
+        of = f" of {_digits(1000 * largest, 2)} mm ({_digits(1000 * away)} mm{pixels})"
+    unknown = f"; mesh error not known: {mesh.doubt}" if mesh is not None and mesh.error == math.inf else ""
+    return f"error: {', '.join(parts)}{of}{unknown}" if parts else f"error{unknown}".replace("error; ", "")
 
 
-def _size(mesh: MeshEstimate) -> str:
-    """Say how large the error is that the number of points makes."""
-    bound = _bound(mesh.at_most, bool(mesh.doubt))
-    return f"{bound}{mesh.error:.2g}" if mesh.error < math.inf else "an unknown part"
+def _percent(share: float, digits: int) -> str:
+    return _digits(100 * share, digits)
+
+
+def _digits(number: float, digits: int = 1) -> str:
+    """Write a number with this many digits, and without an exponent unless it is tiny."""
+    rounded = float(f"{number:.{digits}g}")
+    return np.format_float_positional(rounded, trim="-") if 1e-6 <= rounded < 1e6 or not rounded else f"{rounded:g}"
+
+
+def _finer(scene: Scene, mesh: MeshEstimate, affords: Callable[[tuple[int, int]], bool]) -> str:
+    """Say what would reduce the error that the number of points makes: no more than four times as many."""
+    cut = math.sqrt(mesh.error / (WRONG / 2))
+    rows, cols = (math.ceil((count - 1) * cut) + 1 for count in scene.sheet.points)
+    few = rows * cols <= MOST_FINER * math.prod(scene.sheet.points) and max(rows, cols) < MAX_POINTS
+    if few and affords((rows, cols)):
+        return f"try sheet.points: {[rows, cols]}"
+    return "what helps more than points: tissue.bending, tissue.pretension or a wider tip"
 
 
 def _bound(at_most: bool, at_least: bool) -> str:

@@ -18,7 +18,9 @@ class ErrorRecord(TypedDict):
     order: int | None  # of the method; None at rest
     at_least: bool  # whether `error` may be larger
     mesh_error: NotRequired[float | None]  # the error that the number of points makes; only with tissue
-    mesh_doubt: NotRequired[str]  # why `mesh_error` may be larger; empty: it is about that
+    mesh_doubt: NotRequired[str]  # why `mesh_error` may be larger or is not known; empty: it is about that
+    force_error: NotRequired[float | None]  # of tools on a path, as a fraction of the greatest force
+    force_doubt: NotRequired[str]  # why `force_error` is not known
 
 
 class RunRecord(TypedDict, total=False):

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from taichi_msm.physics.divergence import farthest_displacement
 from taichi_msm.physics.error_control import longest
-from taichi_msm.physics.mesh_error import FEWEST, CubicSampling, MeshPilot, coarser, with_points
+from taichi_msm.physics.mesh_error import FEWEST, CubicSampling, MeshPilot, companion, with_points
 from taichi_msm.physics.plan import Plan
 from taichi_msm.physics.planning import try_plan, variant, with_time
 from taichi_msm.physics.solver import Dynamics
@@ -99,7 +99,7 @@ class PointStudy:
         """Run a sheet with its own step beside the pilot that `run` would have; returns the time of stepping [s]."""
         dynamics = opened.enter_context(closing(Dynamics(plan, self._device)))
         sheet = _Sheet(plan, dynamics, Points(*plan.scene.sheet.points, plan.grid.steps_per_frame))
-        coarse = coarser(plan)
+        coarse = companion(plan)
         assert coarse is not None
         self._sheets.append(sheet)
         self._study.points.append(sheet.measured)
