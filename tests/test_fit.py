@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
@@ -15,6 +16,7 @@ from scipy.stats import t as student
 
 from taichi_msm import ArgumentError, SceneError, Simulation, fit, load_scene, run
 from taichi_msm.fitting.arguments import Method
+from taichi_msm.fitting.force_table import read_forces
 from taichi_msm.fitting.observations import read_observations
 from taichi_msm.fitting.parameters import make_parameters
 from taichi_msm.fitting.prediction import Job, Predictor, runnable
@@ -585,6 +587,56 @@ def test_a_table_without_forces_is_refused(tracks: dict[str, Array], tmp_path: P
     with pytest.raises(SceneError, match=f"forces.csv: {message}") as caught:
         fit(changed(), tracks, ["tissue.young"], forces=(tmp_path / "forces.csv", 0.1))
     assert len(caught.value.lines) == 1
+
+
+@pytest.mark.parametrize(
+    "data",
+    [
+        ("\ufeff" + FORCES + "0.1,0,,nan,-0.5\n").encode(),
+        (FORCES + "0.1,0,,,-0.5\n").encode("utf-16"),
+        (FORCES + "0.1,0,,,\u22120.5\n").encode(),
+        b'# a rig\n"time","probe","force_x","force_y","force_z"\ns,-,N,N,N\n# it begins\n"0.1","0","","","-0.5"\n',
+        b"time [s];probe;force_x [N];force_y [N];force_z [N]\n0,1;0;;;-0,5\n",
+        b"# time,probe,force_x,force_y,force_z\n0.1,0,,,-0.5\n",
+    ],
+    ids=["mark", "utf-16", "minus", "quotes, units, comments", "decimal commas", "commented header"],
+)
+def test_tables_of_other_programs_are_understood(tmp_path: Path, data: bytes) -> None:
+    (tmp_path / "forces.csv").write_bytes(data)
+    read = read_forces(tmp_path / "forces.csv", 0.1, 1)
+    assert (read.time.tolist(), read.probe.tolist()) == ([0.1], [0])
+    np.testing.assert_array_equal(read.force, [[np.nan, np.nan, -0.5]])
+
+
+@pytest.mark.parametrize(
+    ("row", "message"),
+    [
+        ("0.1,0,0,0,-0.5 N", r":3: force_z: '-0.5 N'; take a number, or leave the cell empty"),
+        ("0.1,0,n/a,0,0", ":3: force_x: 'n/a'; take"),
+        ("0.1,0,0,inf,0", ":3: force_y: 'inf'; take"),
+        ("0.1,0,0,1e308,0", ":3: force_y: '1e308'; take"),
+        ("0,1,0,0,0,0,0,-0,5", ":3: 9 cells, and 5 columns; with decimal commas, separate cells by ;"),
+    ],
+)
+def test_a_cell_that_is_no_number_is_refused(tmp_path: Path, row: str, message: str) -> None:
+    (tmp_path / "forces.csv").write_text(f"{FORCES}0,0,0,0,0\n{row}\n")
+    with pytest.raises(SceneError, match=message):
+        read_forces(tmp_path / "forces.csv", 0.1, 1)
+
+
+def test_a_unit_of_forces_other_than_newtons_is_refused(tmp_path: Path) -> None:
+    (tmp_path / "forces.csv").write_text(f"{FORCES}s,-,mN,mN,mN\n0,0,0,0,1\n")
+    with pytest.raises(SceneError, match=":2: force_x: unit 'mN'; give seconds and newtons"):
+        read_forces(tmp_path / "forces.csv", 0.1, 1)
+
+
+def test_forces_of_a_pipe_or_a_huge_file_are_refused(tmp_path: Path) -> None:
+    os.mkfifo(tmp_path / "pipe")
+    with (tmp_path / "huge").open("wb") as file:
+        file.truncate(20 * 10**9)
+    for name, message in (("pipe", "not a regular file"), ("huge", "20000 MB, more than")):
+        with pytest.raises(SceneError, match=f"{name}: {message}"):
+            read_forces(tmp_path / name, 0.1, 1)
 
 
 @pytest.mark.parametrize("robust", [False, True])

@@ -7,7 +7,6 @@ trajectory.npz and a tracks.npz of a run are taken as they are.
 
 from __future__ import annotations
 
-import math
 import zipfile
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
@@ -168,33 +167,3 @@ def _in_one_form(arrays: dict[str, NDArray[Any]], rate: float) -> dict[str, NDAr
         coordinates = np.stack([across.ravel(), down.ravel()], axis=1)
         return {**arrays, "coordinates": coordinates, "position": thinned.swapaxes(0, 1)}
     return arrays
-
-
-def read_forces(path: str | Path, sigma: float, probes: int) -> Forces:
-    """Read a forces.csv; SceneError: it is none, or tells of a probe that the scene lacks.
-
-    sigma: standard deviation of the error of each component [N].
-    """
-    name = str(path)
-    if not 0 < sigma < math.inf:
-        raise SceneError([f"--forces {name},{sigma:g}: take a number above 0, the standard deviation in newtons"])
-    columns = ("time", "probe", "force_x", "force_y", "force_z")
-    expected = f"name a forces.csv, with the columns {', '.join(columns)}"
-    try:
-        if not (text := Path(name).read_text("utf-8")).strip():
-            raise SceneError([f"{name}: is empty; {expected}"])
-        table: Any = np.genfromtxt(text.splitlines(), delimiter=",", names=True, ndmin=1)
-    except OSError as error:
-        reason = "no such file" if isinstance(error, FileNotFoundError) else str(error.strerror).lower()
-        raise SceneError([f"{name}: {reason}; {expected}"]) from None
-    except ValueError:
-        raise SceneError([f"{name}: no table of numbers; {expected}"]) from None
-    if missing := [column for column in columns if column not in (table.dtype.names or ())]:
-        raise SceneError([f"{name}: {missing[0]}: missing; {expected}"])
-    time, probe, force = table["time"], table["probe"], np.stack([table[column] for column in columns[2:]], axis=1)
-    if not (np.isfinite(force).any() and np.isfinite(time).all()):
-        what = "no row" if not len(time) else "no force" if np.isfinite(time).all() else "a row without a time"
-        raise SceneError([f"{name}: {what}; {expected}, and numbers in them"])
-    if wrong := [one for one in probe.tolist() if one not in range(probes)]:
-        raise SceneError([f"{name}: probe: {wrong[0]:g}; the scene has {probes}, numbered from 0"])
-    return Forces(name, time, probe.astype(np.intp), force, sigma)
