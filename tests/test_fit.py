@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import zipfile
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
@@ -637,6 +638,72 @@ def test_forces_of_a_pipe_or_a_huge_file_are_refused(tmp_path: Path) -> None:
     for name, message in (("pipe", "not a regular file"), ("huge", "20000 MB, more than")):
         with pytest.raises(SceneError, match=f"{name}: {message}"):
             read_forces(tmp_path / name, 0.1, 1)
+
+
+def test_arrays_that_are_not_needed_are_left_unread(tracks: dict[str, Array], tmp_path: Path) -> None:
+    save(tmp_path / "seen.npz", {**tracks, "meta": np.array({"rig": 1}, object)})
+    assert read_observations(tmp_path / "seen.npz", 25).values.shape == tracks["pixel"].shape
+    save(tmp_path / "seen.npz", {**tracks, "time": np.array([{}], object)})
+    with pytest.raises(SceneError, match=r"seen\.npz: time: an array of Python objects; write it again"):
+        read_observations(tmp_path / "seen.npz", 25)
+
+
+def _member(tmp_path: Path, data: bytes, method: int) -> bytearray:
+    with zipfile.ZipFile(tmp_path / "seen.npz", "w", method) as archive:
+        archive.writestr("time.npy", data)
+    return bytearray((tmp_path / "seen.npz").read_bytes())
+
+
+HEADER = b"\x93NUMPY\x01\x00"
+
+
+@pytest.mark.parametrize(
+    ("data", "method", "changes"),
+    [
+        (HEADER + bytes(200), zipfile.ZIP_DEFLATED, {38: 0xFF}),
+        (HEADER + bytes(200), zipfile.ZIP_LZMA, {48: 0xFF}),
+        (HEADER + bytes(200), zipfile.ZIP_STORED, {6: 1, -22 - 54 + 8: 1}),
+        (HEADER + b"\x04\x00((\n(", zipfile.ZIP_STORED, {}),
+        (b"raw", zipfile.ZIP_STORED, {}),
+        (HEADER + b"\x40\x1f" + b"-" * 8000, zipfile.ZIP_STORED, {}),
+    ],
+    ids=["deflate", "lzma", "encrypted", "tokens", "raw", "deep"],
+)
+def test_an_array_that_cannot_be_read_is_named(
+    tmp_path: Path, data: bytes, method: int, changes: dict[int, int]
+) -> None:
+    damaged = _member(tmp_path, data, method)
+    for at, byte in changes.items():
+        damaged[at] = byte
+    (tmp_path / "seen.npz").write_bytes(damaged)
+    with pytest.raises(SceneError, match=r"seen\.npz: time: cannot be read: ") as caught:
+        read_observations(tmp_path / "seen.npz", 25)
+    assert "\n" not in str(caught.value)
+
+
+def test_what_is_visible_is_seen(tracks: dict[str, Array]) -> None:
+    visible = np.random.default_rng(0).random(tracks["pixel"].shape[:2]) < 0.5
+    np.testing.assert_array_equal(read_observations({**tracks, "visible": visible}, 25).there, visible)
+    with pytest.raises(SceneError, match="observed: visible: float64 of shape"):
+        read_observations({**tracks, "visible": 0.9 * visible}, 25)
+    with pytest.raises(SceneError, match="observed: 'validity': not understood; take NaN"):
+        read_observations({**tracks, "validity": visible}, 25)
+
+
+def test_conventions_of_other_programs_are_asked_about(tracks: dict[str, Array]) -> None:
+    def answer(**more: Any) -> str:
+        return "\n".join(faults(read_observations({**tracks, **more}, 25), changed(), 2))
+
+    assert answer() == ""
+    for mark in (0, -1):
+        pixel = tracks["pixel"].copy()
+        pixel[3, 4:] = mark
+        assert f"pixel: {mark} in all numbers of 7 points and times; are they lost points? take NaN" in answer(
+            pixel=pixel
+        )
+    fractions = tracks["pixel"] / changed().render.size
+    assert "are they fractions of the frame? multiply them by its width and height" in answer(pixel=fractions)
+    assert "are they frame numbers? divide time by the frames per second, 25" in answer(time=np.arange(11))
 
 
 @pytest.mark.parametrize("robust", [False, True])
