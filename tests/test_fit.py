@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import json
+import os
+import zipfile
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
@@ -15,6 +17,7 @@ from scipy.stats import t as student
 
 from taichi_msm import ArgumentError, SceneError, Simulation, fit, load_scene, run
 from taichi_msm.fitting.arguments import Method
+from taichi_msm.fitting.force_table import read_forces
 from taichi_msm.fitting.observations import Observations, read_observations
 from taichi_msm.fitting.parameters import make_parameters
 from taichi_msm.fitting.prediction import Job, Predictor, runnable
@@ -591,6 +594,122 @@ def test_a_table_without_forces_is_refused(tracks: dict[str, Array], tmp_path: P
     assert len(caught.value.lines) == 1
 
 
+@pytest.mark.parametrize(
+    "data",
+    [
+        ("\ufeff" + FORCES + "0.1,0,,nan,-0.5\n").encode(),
+        (FORCES + "0.1,0,,,-0.5\n").encode("utf-16"),
+        (FORCES + "0.1,0,,,\u22120.5\n").encode(),
+        b'# a rig\n"time","probe","force_x","force_y","force_z"\ns,-,N,N,N\n# it begins\n"0.1","0","","","-0.5"\n',
+        b"time [s];probe;force_x [N];force_y [N];force_z [N]\n0,1;0;;;-0,5\n",
+        b"# time,probe,force_x,force_y,force_z\n0.1,0,,,-0.5\n",
+    ],
+    ids=["mark", "utf-16", "minus", "quotes, units, comments", "decimal commas", "commented header"],
+)
+def test_tables_of_other_programs_are_understood(tmp_path: Path, data: bytes) -> None:
+    (tmp_path / "forces.csv").write_bytes(data)
+    read = read_forces(tmp_path / "forces.csv", 0.1, 1)
+    assert (read.time.tolist(), read.probe.tolist()) == ([0.1], [0])
+    np.testing.assert_array_equal(read.force, [[np.nan, np.nan, -0.5]])
+
+
+@pytest.mark.parametrize(
+    ("row", "message"),
+    [
+        ("0.1,0,0,0,-0.5 N", r":3: force_z: '-0.5 N'; take a number, or leave the cell empty"),
+        ("0.1,0,n/a,0,0", ":3: force_x: 'n/a'; take"),
+        ("0.1,0,0,inf,0", ":3: force_y: 'inf'; take"),
+        ("0.1,0,0,1e308,0", ":3: force_y: '1e308'; take"),
+        ("0,1,0,0,0,0,0,-0,5", ":3: 9 cells, and 5 columns; with decimal commas, separate cells by ;"),
+    ],
+)
+def test_a_cell_that_is_no_number_is_refused(tmp_path: Path, row: str, message: str) -> None:
+    (tmp_path / "forces.csv").write_text(f"{FORCES}0,0,0,0,0\n{row}\n")
+    with pytest.raises(SceneError, match=message):
+        read_forces(tmp_path / "forces.csv", 0.1, 1)
+
+
+def test_a_unit_of_forces_other_than_newtons_is_refused(tmp_path: Path) -> None:
+    (tmp_path / "forces.csv").write_text(f"{FORCES}s,-,mN,mN,mN\n0,0,0,0,1\n")
+    with pytest.raises(SceneError, match=":2: force_x: unit 'mN'; give seconds and newtons"):
+        read_forces(tmp_path / "forces.csv", 0.1, 1)
+
+
+def test_forces_of_a_pipe_or_a_huge_file_are_refused(tmp_path: Path) -> None:
+    os.mkfifo(tmp_path / "pipe")
+    with (tmp_path / "huge").open("wb") as file:
+        file.truncate(20 * 10**9)
+    for name, message in (("pipe", "not a regular file"), ("huge", "20000 MB, more than")):
+        with pytest.raises(SceneError, match=f"{name}: {message}"):
+            read_forces(tmp_path / name, 0.1, 1)
+
+
+def test_arrays_that_are_not_needed_are_left_unread(tracks: dict[str, Array], tmp_path: Path) -> None:
+    save(tmp_path / "seen.npz", {**tracks, "meta": np.array({"rig": 1}, object)})
+    assert read_observations(tmp_path / "seen.npz", 25).values.shape == tracks["pixel"].shape
+    save(tmp_path / "seen.npz", {**tracks, "time": np.array([{}], object)})
+    with pytest.raises(SceneError, match=r"seen\.npz: time: an array of Python objects; write it again"):
+        read_observations(tmp_path / "seen.npz", 25)
+
+
+def _member(tmp_path: Path, data: bytes, method: int) -> bytearray:
+    with zipfile.ZipFile(tmp_path / "seen.npz", "w", method) as archive:
+        archive.writestr("time.npy", data)
+    return bytearray((tmp_path / "seen.npz").read_bytes())
+
+
+HEADER = b"\x93NUMPY\x01\x00"
+
+
+@pytest.mark.parametrize(
+    ("data", "method", "changes"),
+    [
+        (HEADER + bytes(200), zipfile.ZIP_DEFLATED, {38: 0xFF}),
+        (HEADER + bytes(200), zipfile.ZIP_LZMA, {48: 0xFF}),
+        (HEADER + bytes(200), zipfile.ZIP_STORED, {6: 1, -22 - 54 + 8: 1}),
+        (HEADER + b"\x04\x00((\n(", zipfile.ZIP_STORED, {}),
+        (b"raw", zipfile.ZIP_STORED, {}),
+        (HEADER + b"\x40\x1f" + b"-" * 8000, zipfile.ZIP_STORED, {}),
+    ],
+    ids=["deflate", "lzma", "encrypted", "tokens", "raw", "deep"],
+)
+def test_an_array_that_cannot_be_read_is_named(
+    tmp_path: Path, data: bytes, method: int, changes: dict[int, int]
+) -> None:
+    damaged = _member(tmp_path, data, method)
+    for at, byte in changes.items():
+        damaged[at] = byte
+    (tmp_path / "seen.npz").write_bytes(damaged)
+    with pytest.raises(SceneError, match=r"seen\.npz: time: cannot be read: ") as caught:
+        read_observations(tmp_path / "seen.npz", 25)
+    assert "\n" not in str(caught.value)
+
+
+def test_what_is_visible_is_seen(tracks: dict[str, Array]) -> None:
+    visible = np.random.default_rng(0).random(tracks["pixel"].shape[:2]) < 0.5
+    np.testing.assert_array_equal(read_observations({**tracks, "visible": visible}, 25).there, visible)
+    with pytest.raises(SceneError, match="observed: visible: float64 of shape"):
+        read_observations({**tracks, "visible": 0.9 * visible}, 25)
+    with pytest.raises(SceneError, match="observed: 'validity': not understood; take NaN"):
+        read_observations({**tracks, "validity": visible}, 25)
+
+
+def test_conventions_of_other_programs_are_asked_about(tracks: dict[str, Array]) -> None:
+    def answer(**more: Any) -> str:
+        return "\n".join(faults(read_observations({**tracks, **more}, 25), changed(), 2))
+
+    assert answer() == ""
+    for mark in (0, -1):
+        pixel = tracks["pixel"].copy()
+        pixel[3, 4:] = mark
+        assert f"pixel: {mark} in all numbers of 7 points and times; are they lost points? take NaN" in answer(
+            pixel=pixel
+        )
+    fractions = tracks["pixel"] / changed().render.size
+    assert "are they fractions of the frame? multiply them by its width and height" in answer(pixel=fractions)
+    assert "are they frame numbers? divide time by the frames per second, 25" in answer(time=np.arange(11))
+
+
 @pytest.mark.parametrize("robust", [False, True])
 @pytest.mark.filterwarnings("error:::taichi_msm")
 def test_an_exact_fit_has_errors_next_to_0(device: Device, robust: bool) -> None:
@@ -742,7 +861,7 @@ def test_noise_is_not_taken_for_a_wrong_model() -> None:
         left = rng.normal(0, 1, (30, 8 + n % 25, 2)) + (n % 2) * rng.normal(0, 2, (1, 8 + n % 25, 2))
         left[rng.random(left.shape) < 0.05] *= 10
         left[rng.random(left.shape[:2]) < 0.1] = np.nan
-        times = np.arange(left.shape[1])
+        times = np.arange(left.shape[1], dtype=float)
         seen = Observations("", "pixel", times, np.zeros((30, 2)), left, None)
         wolves += by_signs(seen, left, 10.0) is not None
     assert wolves <= 3

@@ -19,8 +19,9 @@ from taichi_msm.errors import SceneError, writing
 from taichi_msm.fitting import notes, rejection
 from taichi_msm.fitting.arguments import Method, require_types
 from taichi_msm.fitting.estimation import Misfit, Search, Solution
+from taichi_msm.fitting.force_table import read_forces
 from taichi_msm.fitting.identifiability import MOST_ERROR, unseen
-from taichi_msm.fitting.observations import read_forces, read_observations, with_sigma
+from taichi_msm.fitting.observations import read_observations, with_sigma
 from taichi_msm.fitting.parameters import Bounds, Parameter, as_data, make_parameters, with_values
 from taichi_msm.fitting.prediction import Job, Predicted, runnable
 from taichi_msm.fitting.profiles import Place, Profile, Profiler

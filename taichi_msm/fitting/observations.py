@@ -7,8 +7,6 @@ trajectory.npz and a tracks.npz of a run are taken as they are.
 
 from __future__ import annotations
 
-import math
-import zipfile
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -20,13 +18,12 @@ from numpy.typing import NDArray
 from taichi_msm.arguments import as_array
 from taichi_msm.errors import SceneError
 from taichi_msm.faults import LARGEST, SMALLEST
+from taichi_msm.fitting.archive import NEEDS, read_archive, require_understood
 
 Array = NDArray[np.float64]
 
 # A trajectory is thinned out to so many points a side.
 MOST_A_SIDE = 64
-
-NEEDS = "time (T,), coordinates (N, 2) and position (N, T, 3) or pixel (N, T, 2)"
 
 
 @dataclass(frozen=True, eq=False)
@@ -79,8 +76,9 @@ def read_observations(observed: str | Path | Mapping[str, Any], rate: float) -> 
         filled = {
             key: np.ma.filled(1.0 * value, np.nan) if np.ma.isMA(value) else value for key, value in observed.items()
         }
+        require_understood("observed", [str(key) for key in filled])
         return _checked("observed", {str(key): as_array(value, str(key)) for key, value in filled.items()}, rate)
-    return _checked(str(observed), _arrays(str(observed)), rate)
+    return _checked(str(observed), read_archive(str(observed)), rate)
 
 
 def with_sigma(seen: Observations, sigma: Any) -> Observations:
@@ -96,32 +94,13 @@ def with_sigma(seen: Observations, sigma: Any) -> Observations:
     return replace(seen, sigma=value)
 
 
-def _arrays(name: str) -> dict[str, NDArray[Any]]:
-    """Read the arrays of a file."""
-    path, remedy = Path(name), f"name an .npz with {NEEDS}, or a run's trajectory.npz or tracks.npz"
-    reason = "not an .npz"
-    try:
-        if not path.is_file():
-            raise SceneError([f"{name}: {'a folder' if path.is_dir() else 'no such file'}; {remedy}"])
-        archive = np.load(path, allow_pickle=False)
-        if not isinstance(archive, np.ndarray):
-            with archive:
-                return {key: archive[key] for key in archive.files}
-        reason = "a single array, as np.save writes"
-    except OSError as error:
-        reason = (error.strerror or "cannot be read").lower()
-    except (ValueError, EOFError, zipfile.BadZipFile):
-        pass
-    raise SceneError([f"{name}: {reason}; {remedy}"])
-
-
 def _checked(name: str, arrays: dict[str, NDArray[Any]], rate: float) -> Observations:
     """Make observations of arrays; SceneError: they are none."""
-    arrays = _in_one_form(arrays, rate)
+    found, arrays = ", ".join(arrays) or "nothing", _thinned(_hidden(name, arrays, rate))
     kinds = [kind for kind in ("position", "pixel") if kind in arrays]
     missing = [key for key in ("time", "coordinates") if key not in arrays]
     if missing := missing + ([] if kinds else ["position or pixel"]):
-        raise SceneError([f"{name}: {missing[0]}: missing; expected {NEEDS}"])
+        raise SceneError([f"{name}: {missing[0]}: missing; expected {NEEDS}, and it has {found}"])
     if len(kinds) == 2:
         raise SceneError([f"{name}: has both position and pixel; leave one of them out"])
     kind: Literal["position", "pixel"] = "position" if kinds[0] == "position" else "pixel"
@@ -153,48 +132,36 @@ def _checked(name: str, arrays: dict[str, NDArray[Any]], rate: float) -> Observa
     return with_sigma(Observations(name, kind, time, coordinates, values, None), arrays.get("sigma"))
 
 
-def _in_one_form(arrays: dict[str, NDArray[Any]], rate: float) -> dict[str, NDArray[Any]]:
-    """Turn the arrays of a trajectory.npz or a tracks.npz into those of our own files."""
-    if {"points", "occluded", "coordinates"} <= arrays.keys():
-        pixel = np.where(arrays["occluded"][..., None], np.nan, arrays["points"])
-        return {"time": np.arange(pixel.shape[1]) / rate, "coordinates": arrays["coordinates"], "pixel": pixel}
-    position = arrays.get("position")
-    if position is not None and position.ndim == 4 and "coordinates" not in arrays:
-        rows, cols = (
-            np.unique(np.linspace(0, n - 1, min(n, MOST_A_SIDE)).round().astype(int)) for n in position.shape[1:3]
-        )
-        down, across = np.meshgrid(rows / (position.shape[1] - 1), cols / (position.shape[2] - 1), indexing="ij")
-        thinned = position[:, rows[:, None], cols].reshape(len(position), -1, position.shape[3])
-        coordinates = np.stack([across.ravel(), down.ravel()], axis=1)
-        return {**arrays, "coordinates": coordinates, "position": thinned.swapaxes(0, 1)}
+def _hidden(name: str, arrays: dict[str, NDArray[Any]], rate: float) -> dict[str, NDArray[Any]]:
+    """Put NaN where `visible` or `occluded` says that a point was not seen; `points` of a tracks.npz become pixels."""
+    arrays = dict(arrays)
+    flags = {key: arrays.pop(key) for key in ("visible", "occluded") if key in arrays}
+    key = next((key for key in ("points", "pixel", "position") if key in arrays), "points")
+    for flag, array in flags.items():
+        shape = arrays[key].shape[:2] if key in arrays else ()
+        if array.shape != shape or array.dtype.kind not in "biu" or not np.isin(array, (0, 1)).all():
+            said = f"{array.dtype} of shape {array.shape}; take true or false for every point and time (N, T)"
+            raise SceneError([f"{name}: {flag}: {said}, as {key} has them"])
+        if arrays[key].dtype.kind in "fiu" and arrays[key].ndim == 3:
+            arrays[key] = np.where((array != (flag == "visible"))[..., None], np.nan, arrays[key])
+    if flags and key == "points":
+        arrays = {one: array for one, array in arrays.items() if one in ("time", "coordinates", "points")}
+        arrays["pixel"] = arrays.pop("points")
+        arrays.setdefault("time", np.arange(arrays["pixel"].shape[1]) / rate)
     return arrays
 
 
-def read_forces(path: str | Path, sigma: float, probes: int) -> Forces:
-    """Read a forces.csv; SceneError: it is none, or tells of a probe that the scene lacks.
-
-    sigma: standard deviation of the error of each component [N].
-    """
-    name = str(path)
-    if not 0 < sigma < math.inf:
-        raise SceneError([f"--forces {name},{sigma:g}: take a number above 0, the standard deviation in newtons"])
-    columns = ("time", "probe", "force_x", "force_y", "force_z")
-    expected = f"name a forces.csv, with the columns {', '.join(columns)}"
-    try:
-        if not (text := Path(name).read_text("utf-8")).strip():
-            raise SceneError([f"{name}: is empty; {expected}"])
-        table: Any = np.genfromtxt(text.splitlines(), delimiter=",", names=True, ndmin=1)
-    except OSError as error:
-        reason = "no such file" if isinstance(error, FileNotFoundError) else str(error.strerror).lower()
-        raise SceneError([f"{name}: {reason}; {expected}"]) from None
-    except ValueError:
-        raise SceneError([f"{name}: no table of numbers; {expected}"]) from None
-    if missing := [column for column in columns if column not in (table.dtype.names or ())]:
-        raise SceneError([f"{name}: {missing[0]}: missing; {expected}"])
-    time, probe, force = table["time"], table["probe"], np.stack([table[column] for column in columns[2:]], axis=1)
-    if not (np.isfinite(force).any() and np.isfinite(time).all()):
-        what = "no row" if not len(time) else "no force" if np.isfinite(time).all() else "a row without a time"
-        raise SceneError([f"{name}: {what}; {expected}, and numbers in them"])
-    if wrong := [one for one in probe.tolist() if one not in range(probes)]:
-        raise SceneError([f"{name}: probe: {wrong[0]:g}; the scene has {probes}, numbered from 0"])
-    return Forces(name, time, probe.astype(np.intp), force, sigma)
+def _thinned(arrays: dict[str, NDArray[Any]]) -> dict[str, NDArray[Any]]:
+    """Turn the arrays of a trajectory.npz into those of our own files."""
+    position = arrays.get("position")
+    if position is not None and position.ndim == 4 and min(position.shape[:3]) > 0 and "coordinates" not in arrays:
+        rows, cols = (
+            np.unique(np.linspace(0, n - 1, min(n, MOST_A_SIDE)).round().astype(int)) for n in position.shape[1:3]
+        )
+        down, across = np.meshgrid(
+            rows / max(position.shape[1] - 1, 1), cols / max(position.shape[2] - 1, 1), indexing="ij"
+        )
+        thinned = position[:, rows[:, None], cols].reshape(len(position), len(rows) * len(cols), position.shape[3])
+        coordinates = np.stack([across.ravel(), down.ravel()], axis=1)
+        return {**arrays, "coordinates": coordinates, "position": thinned.swapaxes(0, 1)}
+    return arrays

@@ -28,6 +28,9 @@ ROUNDING = 1e-9
 # Frames miss the motion if the points move less at the observed times than this share of their motion.
 MISSED = 0.1
 
+# Pixels are fractions of the frame if none is greater.
+FRACTION = 1.5
+
 # Pixels are of another camera, and positions of another place, if the points are farther from where they are at rest
 # than this [px], or this share of the sheet, and than so many times the motion.
 ASTRAY, ASIDE, TIMES = 3.0, 0.02, 3.0
@@ -45,6 +48,7 @@ def faults(seen: Observations, scene: Scene, parameters: int) -> Iterator[str]:
     if seen.forces is not None:
         yield from _times(seen.forces.time, seen.forces.name, scene)
     yield from _units(seen, scene)
+    yield from _lost(seen, scene)
     if seen.forces is None and _is_still(seen, scene):
         said = f"by more than its error, sigma {seen.sigma:g} {seen.unit}" if seen.sigma else "at all"
         yield f"{name}: no point moves {said}; observe while a tool acts, at points near it"
@@ -108,7 +112,13 @@ def _times(time: Array, name: str, scene: Scene) -> Iterator[str]:
     low, high = float(time.min()), float(time.max())
     if high > duration + slack:
         thousand = duration / 30 < high / 1000 <= duration * (1 + WHOLE)
-        remedy = "are they in ms? divide time by 1000" if thousand else "cut them off, or --set time.duration=..."
+        rate = scene.time.frames_per_second
+        numbers = bool((time == np.round(time)).all()) and high / rate <= duration + 1 / rate + slack
+        remedy = "cut them off, or --set time.duration=..."
+        if numbers:
+            remedy = f"are they frame numbers? divide time by the frames per second, {rate:g} in the scene"
+        elif thousand:
+            remedy = "are they in ms? divide time by 1000"
         yield f"{name}: time: up to {high:g} s, and the scene ends at {duration:g} s; {remedy}"
     elif low < -slack:
         yield f"{name}: time: from {low:g} s, and the scene begins at 0 s; let the scene's clock count"
@@ -129,6 +139,23 @@ def _units(seen: Observations, scene: Scene) -> Iterator[str]:
         said = f"the points are {spread:.3g} m from their middle, and {expected:.3g} m at rest; give metres"
         unit = {3: ": are they in mm? divide them by 1000", 2: ": are they in cm? divide them by 100"}
         yield f"{seen.name}: position: {said}{unit.get(round(math.log10(spread / expected)), '')}"
+
+
+def _lost(seen: Observations, scene: Scene) -> Iterator[str]:
+    """Find numbers that stand for points that were lost, and fractions of the frame in place of pixels."""
+    rest = seen_at_rest(scene, seen)
+    least = ASTRAY if seen.kind == "pixel" else ASIDE * max(scene.sheet.size)
+    for mark in (0, -1):
+        far = ~(np.linalg.norm(rest - mark, axis=-1) < least)
+        if number := int(((seen.values == mark).all(axis=2) & far).sum()):
+            said = f"{mark} in all numbers of {number} points and times; are they lost points? take NaN for them"
+            yield f"{seen.name}: {seen.kind}: {said}"
+            return
+    if seen.kind == "pixel" and np.nanmax(np.abs(seen.values)) <= FRACTION < ASTRAY < np.nan_to_num(np.abs(rest)).max():
+        width, height = scene.render.size
+        said = "are they fractions of the frame? multiply them by its width and height"
+        most = np.nanmax(np.abs(seen.values))
+        yield f"{seen.name}: pixel: up to {most:.3g}; {said}, {width} and {height} in the scene"
 
 
 def _elsewhere(seen: Observations, scene: Scene, first: Predicted) -> Iterator[str]:

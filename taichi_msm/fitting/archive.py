@@ -1,0 +1,73 @@
+"""Read the arrays of an .npz that observations may have; members of other names are left unread."""
+
+from __future__ import annotations
+
+import zipfile
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from taichi_msm.errors import SceneError
+from taichi_msm.picture import irregular
+from taichi_msm.system.resources import available_memory
+
+NEEDS = "time (T,), coordinates (N, 2) and position (N, T, 3) or pixel (N, T, 2)"
+MEMBERS = ("time", "coordinates", "position", "pixel", "sigma", "points", "occluded", "visible")
+
+# Arrays with such words in their names bear on what was seen.
+BEARING = ("visib", "occlu", "mask", "valid", "missing", "lost", "weight", "confid", "sigma", "std", "unit", "scale")
+
+
+def read_archive(name: str) -> dict[str, NDArray[Any]]:
+    """Return the arrays of a file by their names; SceneError: it is no .npz, or one of them cannot be used."""
+    path, remedy = Path(name), f"name an .npz with {NEEDS}, or a run's trajectory.npz or tracks.npz"
+    reason = "not an .npz"
+    try:
+        if kind := irregular(path):
+            raise SceneError([f"{name}: {'a folder' if path.is_dir() else kind}; {remedy}"])
+        with path.open("rb") as file:
+            begin = file.read(6)
+        if begin.startswith(b"PK"):
+            with zipfile.ZipFile(path) as archive:
+                return _members(name, archive)
+        if begin == b"\x93NUMPY":
+            reason = "a single array, as np.save writes"
+    except FileNotFoundError:
+        reason = "no such file"
+    except OSError as error:
+        reason = (error.strerror or "cannot be read").lower()
+    except (ValueError, NotImplementedError, zipfile.BadZipFile):
+        pass
+    raise SceneError([f"{name}: {reason}; {remedy}"])
+
+
+def require_understood(name: str, keys: list[str]) -> None:
+    """Check that no array that bears on what was seen is left out; SceneError: lists those that are."""
+    unknown = [key for key in keys if key not in MEMBERS and any(word in key.lower() for word in BEARING)]
+    if unknown:
+        said = "not understood; take NaN for what was not seen, or visible or occluded (N, T), and sigma for errors"
+        raise SceneError([f"{name}: {', '.join(map(ascii, unknown))}: {said}"])
+
+
+def _members(name: str, archive: zipfile.ZipFile) -> dict[str, NDArray[Any]]:
+    """Read the arrays that observations may have."""
+    infos = {info.filename.removesuffix(".npy"): info for info in archive.infolist()}
+    require_understood(name, list(infos))
+    wanted = {key: info for key, info in infos.items() if key in MEMBERS}
+    if (size := sum(info.file_size for info in wanted.values())) > (most := available_memory() // 4):
+        said = f"{size / 1e9:.1f} GB of arrays, and there is memory for {most / 1e9:.1f} GB; leave points or times out"
+        raise SceneError([f"{name}: {said}"])
+    arrays = {}
+    for key, info in wanted.items():
+        try:
+            with archive.open(info) as member:
+                arrays[key] = np.lib.format.read_array(member, allow_pickle=False)
+        except Exception as error:  # zipfile, its decompressors and NumPy raise any kind for bytes that are none
+            why = str(error).partition("\n")[0] or type(error).__name__
+            why = "an array of Python objects" if why.startswith("Object arrays") else f"cannot be read: {why}"
+            raise SceneError([f"{name}: {key}: {why}; write it again by np.savez, as numbers"]) from None
+    if not arrays and infos:
+        raise SceneError([f"{name}: has only {', '.join(map(ascii, list(infos)[:20]))}; expected {NEEDS}"])
+    return arrays

@@ -1,0 +1,142 @@
+"""Read a forces.csv: the forces of tools on the sheet that were measured.
+
+An empty cell and NaN alone mean "not measured"; every other cell that is no number is an error.
+"""
+
+from __future__ import annotations
+
+import csv
+import math
+import re
+from pathlib import Path
+
+import numpy as np
+
+from taichi_msm.errors import SceneError
+from taichi_msm.faults import LARGEST
+from taichi_msm.fitting.observations import Forces
+from taichi_msm.picture import irregular
+
+COLUMNS = {"time": "s", "probe": "", "force_x": "N", "force_y": "N", "force_z": "N"}
+EXPECTED = f"name a forces.csv, with the columns {', '.join(COLUMNS)}"
+
+# More bytes are no table of forces.
+MOST_BYTES = 2**26
+
+# A byte order mark, and the encoding that it stands for.
+MARKS = {b"\xff\xfe": "utf-16", b"\xfe\xff": "utf-16"}
+
+NUMBER = re.compile(r"[+-]?(\d+\.?\d*|\.\d+)([eE][+-]?\d+)?", re.ASCII)
+
+
+def read_forces(path: str | Path, sigma: float, probes: int) -> Forces:
+    """Read a forces.csv.
+
+    Args:
+        path: of the file.
+        sigma: standard deviation of the error of each component [N].
+        probes: how many the scene has.
+
+    Returns:
+        The forces of every row [N], NaN where not measured.
+
+    Raises:
+        SceneError: when it is no such table, or names a probe that the scene lacks.
+    """
+    name = str(path)
+    if not 0 < sigma < math.inf:
+        raise SceneError([f"--forces {name},{sigma:g}: take a number above 0, the standard deviation in newtons"])
+    if not (text := _text(name)).strip():
+        raise SceneError([f"{name}: is empty; {EXPECTED}"])
+    table = np.array(_rows(name, text), np.float64).reshape(-1, len(COLUMNS))
+    time, probe, force = table[:, 0], table[:, 1], table[:, 2:]
+    if not (np.isfinite(force).any() and np.isfinite(time).all()):
+        what = "no row" if not len(time) else "no force" if np.isfinite(time).all() else "a row without a time"
+        raise SceneError([f"{name}: {what}; {EXPECTED}, and numbers in them"])
+    if wrong := [one for one in probe.tolist() if one not in range(probes)]:
+        raise SceneError([f"{name}: probe: {wrong[0]:g}; the scene has {probes}, numbered from 0"])
+    return Forces(name, time, probe.astype(np.intp), force, sigma)
+
+
+def _text(name: str) -> str:
+    """Return the text of a regular file of bounded size."""
+    try:
+        if not (reason := irregular(Path(name))):
+            if (size := Path(name).stat().st_size) <= MOST_BYTES:
+                data = Path(name).read_bytes()
+                return data.decode(MARKS.get(data[:2], "utf-8-sig"))
+            reason = f"{size / 1e6:.0f} MB, more than the {MOST_BYTES / 1e6:.0f} MB of a table"
+    except UnicodeDecodeError as error:
+        reason = f"byte {error.start + 1} is not of UTF-8 text; save it as UTF-8"
+    except OSError as error:
+        reason = "no such file" if isinstance(error, FileNotFoundError) else str(error.strerror).lower()
+    except ValueError as error:
+        reason = str(error)
+    raise SceneError([f"{name}: {reason}; {EXPECTED}"])
+
+
+def _rows(name: str, text: str) -> list[list[float]]:
+    """Return the numbers of each row in the order of the columns."""
+    lines = text.splitlines()
+    start = next((line for line in lines if set(COLUMNS) <= set(re.findall(r"\w+", line))), lines[0])
+    delimiter = next((mark for mark in ";\t" if mark in start), ",")
+    reader = csv.reader(lines, delimiter=delimiter, skipinitialspace=True)
+    header: list[str] = []
+    rows: list[list[float]] = []
+    try:
+        for cells in reader:
+            where = f"{name}:{reader.line_num}"
+            is_header = not header and lines[reader.line_num - 1] == start
+            if not cells or (cells[0].startswith("#") and not is_header):
+                continue
+            if not header:
+                header = _header(where, [cell.lstrip("#").strip() for cell in cells])
+            elif len(cells) < len(header) or any(cells[len(header) :]):
+                remedy = "with decimal commas, separate cells by ;" if delimiter == "," else "give a cell a column"
+                raise SceneError([f"{where}: {len(cells)} cells, and {len(header)} columns; {remedy}"])
+            else:
+                named = {key: cells[header.index(key)].strip() for key in COLUMNS}
+                if rows or not _is_units(where, named):
+                    rows.append([_number(where, key, cell, delimiter) for key, cell in named.items()])
+    except csv.Error as error:
+        raise SceneError([f"{name}:{reader.line_num}: {error}; {EXPECTED}"]) from None
+    return rows
+
+
+def _header(where: str, cells: list[str]) -> list[str]:
+    """Return the names of the columns without their units; SceneError: one is missing or has another unit."""
+    split = [re.fullmatch(r"(.*?)\s*[\[(](.*)[\])]", cell) for cell in cells]
+    names = [cell if found is None else found[1] for cell, found in zip(cells, split, strict=True)]
+    if missing := [key for key in COLUMNS if key not in names]:
+        raise SceneError([f"{where.rpartition(':')[0]}: {missing[0]}: missing; {EXPECTED}"])
+    for key, found in zip(names, split, strict=True):
+        if found is not None:
+            _check_unit(where, key, found[2].strip())
+    return names
+
+
+def _is_units(where: str, named: dict[str, str]) -> bool:
+    """Check whether a row has units in place of numbers; SceneError: units other than those of the columns."""
+    if not (named["time"].isalpha() and named["time"].lower() != "nan"):
+        return False
+    for key, unit in named.items():
+        _check_unit(where, key, unit)
+    return True
+
+
+def _check_unit(where: str, key: str, unit: str) -> None:
+    if key in COLUMNS and unit not in (COLUMNS[key], "", "-", "1"):
+        raise SceneError([f"{where}: {key}: unit {unit!r}; give seconds and newtons"])
+
+
+def _number(where: str, key: str, cell: str, delimiter: str) -> float:
+    """Return the number of a cell, NaN of an empty one."""
+    if cell.lower() in ("", "nan"):
+        return math.nan
+    plain = cell.replace("\N{MINUS SIGN}", "-")
+    if delimiter != ",":
+        plain = plain.replace(",", ".", 1)
+    if not (NUMBER.fullmatch(plain) and abs(value := float(plain)) <= LARGEST):
+        said = "take a number, or leave the cell empty where nothing was measured"
+        raise SceneError([f"{where}: {key}: {cell[:40]!r}; {said}"])
+    return value
