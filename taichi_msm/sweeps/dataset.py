@@ -13,8 +13,10 @@ from pathlib import Path
 from typing import Any
 
 from taichi_msm.outputs.table import RECORD
+from taichi_msm.results.publication import MAX_RECORD
 from taichi_msm.results.whole import replacing
 from taichi_msm.sweeps.result import DATASET, SweepResult
+from taichi_msm.system.files import read_regular
 from taichi_msm.system.versions import versions
 
 # Where the keys of a scene are that decide what a run writes.
@@ -57,7 +59,7 @@ def split(runs: int, seed: int) -> list[str]:
 
 def _facts(directory: Path) -> dict[str, Any]:
     """Give what a loader needs to know of a run: its outputs, the frames, their size [px] and how many a second."""
-    record = json.loads((directory / RECORD).read_bytes())
+    record = json.loads(read_regular(directory / RECORD, MAX_RECORD))
     scene = record["scene"]
     return {
         "outputs": record["outputs"],
