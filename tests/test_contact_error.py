@@ -59,7 +59,7 @@ def test_the_error_of_the_step_is_hardly_above_what_is_told(
     seed: int, image: str, device: Device, record_property: Callable[[str, object], None]
 ) -> None:
     plan = plan_of(random_contact(seed, image))
-    assert choose_pilots(plan).cost <= 0.75
+    assert choose_pilots(plan).cost <= 0.75 + 1 / plan.grid.steps_per_frame  # Of an odd number the half is rounded.
     estimate = told(plan, device).estimate
     assert estimate is not None
     assert estimate.at_most

@@ -111,7 +111,11 @@ def coarser(plan: Plan, share: float = 0.5) -> Plan | None:
     possible = [halved for halved in halves if cell_ratio(halved.sheet) <= LONGEST_CELL]
     if not possible:
         return None
-    coarse = min(possible, key=lambda halved: halved.sheet.points)
+
+    def off(halved: Scene) -> float:
+        return sum(abs(count - 1 - cell) for count, cell in zip(halved.sheet.points, cells, strict=True))
+
+    coarse = min(possible, key=lambda halved: (off(halved), halved.sheet.points))
     probes = tuple(_pressing_alike(probe, scene.sheet, coarse.sheet) for probe in scene.probes)
     return variant(plan, coarse.model_copy(update={"probes": probes}))
 
