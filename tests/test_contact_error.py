@@ -49,7 +49,7 @@ def told(plan: Plan, device: Device) -> Known:
     for _ in range(plan.grid.frames):
         own.advance(plan.grid.steps_per_frame)
         kept.append(own.displacement())
-        known.follow(kept[-1], lambda: None)
+        known.follow(kept[-1], lambda: None, own.tool_forces())
     known.finish(iter(kept), lambda done, total: None)
     return known.known
 
@@ -87,6 +87,40 @@ def test_the_error_of_the_points_is_hardly_above_what_is_told(
     error = longest(own - reference) / longest(reference)
     record_property("told", f"{mesh.error:.3g}, {mesh.error / error:.2f} of the truth, {mesh.doubt=}")
     assert error <= (2 if mesh.doubt else 1.5) * mesh.error
+
+
+def test_the_errors_of_a_drag_are_about_what_is_told(
+    device: Device, record_property: Callable[[str, object], None]
+) -> None:
+    """Told over true is between 0.67 and 4, of displacements and forces, as shares of the greatest."""
+    wall = {"young": 4.5e4, "thickness": 2e-3, "density": 1050, "foundation": 1.3e5, "damping": 200, "pretension": 40}
+    path = [[0, 0.54, 0.35, 0.001], [0.15, 0.54, 0.35, -0.01], [0.48, 0.48, 0.37, -0.01], [0.54, 0.48, 0.37, 0.012]]
+    rod = {"radius": 0.008, "shaft": [0.2, 0.7, 1.2], "length": 0.15}
+    made = {
+        "sheet": {"points": [31, 31], "size": [0.1, 0.1], "fixed": "border"},
+        "tissue": {**wall, "foundation_active": "always"},
+        "probes": [{"path": path, "friction": 0.3, "instrument": rod}],
+        "time": {"duration": 0.56, "frames_per_second": 25, "precision": "f64"},
+        "output": [],
+    }
+    plan = plan_of(Scene.model_validate(made))
+    known = told(plan, device)
+    assert known.mesh is not None
+    assert known.force is not None
+    assert known.force.error is not None
+    finer = variant(plan, with_points(plan.scene, (61, 61))).with_grid(steps_per_frame=2 * plan.grid.steps_per_frame)
+    own, reference = Dynamics(plan, device), Dynamics(finer, device)
+    apart = most = forces_apart = greatest = 0.0
+    for _ in range(plan.grid.frames):
+        for one in (own, reference):
+            one.advance(one.plan.grid.steps_per_frame)
+        exact, force = reference.displacement()[::2, ::2], reference.tool_forces()
+        apart, most = max(apart, longest(own.displacement() - exact)), max(most, longest(exact))
+        forces_apart = max(forces_apart, longest(own.tool_forces() - force))
+        greatest = max(greatest, longest(force))
+    shares = known.mesh.error / (apart / most), known.force.error / (forces_apart / greatest)
+    record_property("told", f"{shares[0]:.2f} and {shares[1]:.2f} of the truth")
+    assert all(0.67 <= share <= 4 for share in shares)
 
 
 @pytest.mark.parametrize("tolerance", [0.03, pytest.param(0.003, marks=pytest.mark.slow)])

@@ -29,7 +29,7 @@ from taichi_msm.system.runtime import Device
 # The error of a tool's force, in root mean squares of its difference to the run with fewer points over the frames with
 # contact; and at least, as a share of the greatest force, in mesh errors of the displacement: where a grip holds points
 # of about the same force by chance, the first says little (docs/decisions/0027).
-IN_FORCES, IN_MESH_ERRORS = 1.4, 0.6
+IN_FORCES, IN_MESH_ERRORS = 1.15, 0.5
 
 
 class ForceEstimate(NamedTuple):
