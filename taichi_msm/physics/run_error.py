@@ -15,6 +15,7 @@ from taichi_msm.physics.error_control import Estimate, Pilot, reconcile
 from taichi_msm.physics.mesh_error import (
     APART,
     LARGEST_DIFFERENCE,
+    STEPPED,
     UNTOUCHED,
     MeshEstimate,
     MeshPilot,
@@ -27,8 +28,9 @@ from taichi_msm.progress import Count, Pause
 from taichi_msm.system.runtime import Device
 
 # The error of a tool's force, in root mean squares of its difference to the run with fewer points over the frames with
-# contact; and at least, as a share of the greatest force, in mesh errors of the displacement: where a grip holds points
-# of about the same force by chance, the first says little (docs/decisions/0027).
+# contact; and the least, as a share of the greatest force, in errors of the displacement by points: where a grip holds
+# points of about the same force by chance, the first says little. The most is the error of the displacement
+# (docs/decisions/0027).
 IN_FORCES, IN_MESH_ERRORS = 1.15, 0.5
 
 
@@ -136,10 +138,13 @@ class RunError:
             known = known._replace(mesh=self._mesh.estimate)
             if self._plan.tools and self._all_forces and not self._greatest.all():
                 known = known._replace(mesh=MeshEstimate(math.inf, UNTOUCHED))
-        return known._replace(force=self._force(known.mesh)) if self._plan.tools else known
+            elif self._plan.tools and known.estimate is not None and known.estimate.error > LARGEST_DIFFERENCE:
+                known = known._replace(mesh=MeshEstimate(math.inf, STEPPED))
+        return known._replace(force=self._force(known)) if self._plan.tools else known
 
-    def _force(self, mesh: MeshEstimate | None) -> ForceEstimate:
+    def _force(self, known: Known) -> ForceEstimate:
         """Estimate the error of the forces."""
+        mesh = known.mesh
         if self._mesh is None or mesh is None:
             return ForceEstimate(None, "there is no run with fewer points")
         if not self._all_forces:
@@ -149,4 +154,5 @@ class RunError:
         relative = float(np.sqrt(self._squares / np.maximum(self._touched, 1)).max() / self._greatest.max())
         if relative > IN_FORCES * LARGEST_DIFFERENCE:
             return ForceEstimate(None, APART)
-        return ForceEstimate(max(relative, IN_MESH_ERRORS * mesh.error))
+        most = max(mesh.error, known.estimate.error if known.estimate is not None else 0.0)
+        return ForceEstimate(min(max(relative, IN_MESH_ERRORS * mesh.error), most))
