@@ -272,8 +272,11 @@ def test_points_are_advised_where_they_can_help(error: float, advice: str) -> No
     made = scene()
     note = notes_of(made, MOVED, None, mesh=MeshEstimate(error))[-1]
     assert note == f"so few points make the run up to {100 * error:g} % wrong; {advice}"
-    slow = notes_of(made, MOVED, None, mesh=MeshEstimate(error), affords=lambda points: False)[-1]
+    slow = notes_of(made, MOVED, None, mesh=MeshEstimate(error), affords=lambda plan: False)[-1]
     assert slow.endswith(HELPS)
+    steps = Estimate(40, error, 0.0, error, 2)
+    assert "; try time.step: " in notes_of(made, MOVED, steps)[1]
+    assert notes_of(made, MOVED, steps, affords=lambda plan: False)[1].endswith("fewer sheet.points make them faster")
 
 
 def test_positions_written_in_f32_have_the_digits_of_the_sheet(device: Device) -> None:
