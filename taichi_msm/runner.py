@@ -18,11 +18,9 @@ from numpy.typing import NDArray
 from taichi_msm.arguments import require_path
 from taichi_msm.errors import DamagedError, DeviceError, DivergedError, FilesError, SceneError, writing
 from taichi_msm.physics.lattice import rest_positions
-from taichi_msm.physics.mesh_error import with_points
 from taichi_msm.physics.path_dependence import PathDependence
 from taichi_msm.physics.pilots import AT_REST, Pilots, choose_pilots
 from taichi_msm.physics.plan import Plan
-from taichi_msm.physics.planning import variant
 from taichi_msm.physics.probe_force import ProbeRecord, probe_records
 from taichi_msm.physics.run_error import Known, RunError
 from taichi_msm.physics.run_notes import run_notes
@@ -431,7 +429,7 @@ def _facts(
         "longest_spring": progress.longest_spring,
         "probes": probes,
         "notes": [
-            *run_notes(plan, probes, progress, *known, partial(_affords, plan), _scale(scene)),
+            *run_notes(plan, probes, progress, *known, _affords, _scale(scene)),
             *path_dependence,
             *drawing_notes(scene),
         ],
@@ -472,9 +470,9 @@ def _asked(given: Scene, scene: Scene) -> dict[str, Any]:
     return {key: asked for key, asked, chosen in pairs if asked != chosen}
 
 
-def _affords(plan: Plan, points: tuple[int, int]) -> bool:
-    """Tell whether a run with this number of points takes at most an hour, as `check` estimates it."""
-    return duration.estimate(variant(plan, with_points(plan.scene, points))).seconds <= LONGEST_ADVISED
+def _affords(plan: Plan) -> bool:
+    """Tell whether a run takes at most an hour, as `check` estimates it."""
+    return duration.estimate(plan).seconds <= LONGEST_ADVISED
 
 
 def _scale(scene: Scene) -> float | None:

@@ -272,8 +272,11 @@ def test_points_are_advised_where_they_can_help(error: float, advice: str) -> No
     made = scene()
     note = notes_of(made, MOVED, None, mesh=MeshEstimate(error))[-1]
     assert note == f"so few points make the run up to {100 * error:g} % wrong; {advice}"
-    slow = notes_of(made, MOVED, None, mesh=MeshEstimate(error), affords=lambda points: False)[-1]
+    slow = notes_of(made, MOVED, None, mesh=MeshEstimate(error), affords=lambda plan: False)[-1]
     assert slow.endswith(HELPS)
+    steps = Estimate(40, error, 0.0, error, 2)
+    assert "; try time.step: " in notes_of(made, MOVED, steps)[1]
+    assert notes_of(made, MOVED, steps, affords=lambda plan: False)[1].endswith("fewer sheet.points make them faster")
 
 
 def test_positions_written_in_f32_have_the_digits_of_the_sheet(device: Device) -> None:
@@ -311,9 +314,10 @@ def test_the_error_in_f64_is_that_of_the_step(device: Device) -> None:
     assert single.in_f64 == pytest.approx(double.error, rel=1e-9)
     assert double.in_f64 == double.error
     (said,) = notes_of(made, MOVED, single)
-    assert f"{double.error:.1g} due to the time step, {single.rounding:.1g} to rounding" in said
+    assert said.startswith("error: time step 0.000001 %, rounding 0.002 % of ")
+    assert (f"{double.error:.1g}", f"{single.rounding:.1g}") == ("1e-08", "2e-05")
     (said,) = notes_of(made, MOVED, double)
-    assert said.endswith(f": {single.in_f64:.1g} due to the time step")
+    assert said.startswith("error: time step 0.000001 % of ")
 
 
 @pytest.mark.parametrize("ends", [(0.0044889, 0.0121111), pytest.param((0.0067778, 0.0164444), marks=pytest.mark.slow)])

@@ -308,7 +308,7 @@ def test_the_fit_shown_is_what_it_finds(
 
 def test_the_error_in_the_readme_is_that_of_the_run(device: Device, tmp_path: Path) -> None:
     (line,) = read(README).split("<!-- error: checked by tests/test_docs.py -->\n```text\n")[1].splitlines()[:1]
-    press = load_scene(ROOT / "scenes" / "press.yaml", {"output": []})
+    press = load_scene(ROOT / "scenes" / "press.yaml", {"output": ["png"]})
     record = run(press, tmp_path / "press", threads=device.threads, estimate_error=True)
     assert line in record["notes"]
     rows, cols = record["points"]

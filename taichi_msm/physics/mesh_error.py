@@ -19,7 +19,7 @@ error.
 
 Where tools are moved, they touch more points one by one, and in a coarse run few or none, which then says nothing. So
 there is one run with 1 / sqrt(2) of the cells a side and half the steps. It is compared with the run itself, as a
-coarse pilot may press quite otherwise, and IN_CONTACT of the difference is told (docs/decisions/0027).
+coarse pilot may press quite otherwise, and IN_CONTACT of the difference, up to a limit, is told (docs/decisions/0027).
 
 With `springs`, a sheet with other points is another sheet, so its error is not defined.
 """
@@ -54,11 +54,13 @@ LOWEST_ORDER, HIGHEST_ORDER = 1.0, 3.0
 # The order where tools are moved.
 WITH_CONTACT = 1.5
 
-# Where tools are moved: the cells a side of the one run with fewer points, as a share of the run's; the largest
-# difference, as a share of the largest displacement, and the smallest radius, in cells of the run, that say anything.
-# Of 40 scenes, against twice as many cells a side, the error is 0.3 to 1.7 times the difference.
+# Where tools are moved: the cells a side of the one run with fewer points, as a share of the run's; what is told for a
+# difference of one, and the most that is told; the largest difference, as a share of the largest displacement, and the
+# smallest radius, in cells of the run, that say anything. The error is 0.3 to 1.7 times the difference; where the two
+# runs differ by more than half of the displacement, it is 0.15 to 0.9 whatever they differ by.
 CLOSER = 1 / math.sqrt(2)
 IN_CONTACT = 1.2
+MOST_IN_CONTACT = 0.6
 LARGEST_DIFFERENCE = 1.0
 NARROWEST = 0.8
 
@@ -86,6 +88,7 @@ FEWEST = 7
 # Why the error is not known, or may be larger.
 UNTOUCHED = "a tool on a path meets no point"
 NARROW = "the radius of a tool on a path is below 0.8 of a cell, so that it touches hardly a point"
+STEPPED = "the error of the time step is larger than the largest displacement"
 APART = "runs whose points are not as close do not approach the run"
 WRINKLES = "tissue without bending is pressed together, and with more points wrinkles more"
 
@@ -111,7 +114,11 @@ def coarser(plan: Plan, share: float = 0.5) -> Plan | None:
     possible = [halved for halved in halves if cell_ratio(halved.sheet) <= LONGEST_CELL]
     if not possible:
         return None
-    coarse = min(possible, key=lambda halved: halved.sheet.points)
+
+    def off(halved: Scene) -> float:
+        return sum(abs(count - 1 - cell) for count, cell in zip(halved.sheet.points, cells, strict=True))
+
+    coarse = min(possible, key=lambda halved: (off(halved), halved.sheet.points))
     probes = tuple(_pressing_alike(probe, scene.sheet, coarse.sheet) for probe in scene.probes)
     return variant(plan, coarse.model_copy(update={"probes": probes}))
 
@@ -229,7 +236,8 @@ class MeshPilot:
             return MeshEstimate(math.inf, NARROW)
         if difference > LARGEST_DIFFERENCE:
             return MeshEstimate(math.inf, APART)
-        return MeshEstimate(IN_CONTACT * difference + self._missing, WRINKLES if self._wrinkles else "", at_most=True)
+        told = min(IN_CONTACT * difference, MOST_IN_CONTACT) + self._missing
+        return MeshEstimate(told, WRINKLES if self._wrinkles else "", at_most=True)
 
 
 def with_points(scene: Scene, points: tuple[int, int]) -> Scene:

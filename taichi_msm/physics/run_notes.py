@@ -13,14 +13,15 @@ from taichi_msm.physics.contact_notes import contact_notes
 from taichi_msm.physics.energy_growth import growth_notes
 from taichi_msm.physics.error_control import Estimate
 from taichi_msm.physics.material import has_fixed_border
-from taichi_msm.physics.mesh_error import MeshEstimate
+from taichi_msm.physics.mesh_error import MeshEstimate, with_points
 from taichi_msm.physics.paths import MOST_FINER, path_notes
 from taichi_msm.physics.pilots import AT_REST
 from taichi_msm.physics.plan import Plan
+from taichi_msm.physics.planning import variant
 from taichi_msm.physics.probe_force import ProbeRecord
 from taichi_msm.physics.run_error import ForceEstimate
 from taichi_msm.physics.state import RunProgress
-from taichi_msm.scene import MAX_POINTS, Foundation, Scene
+from taichi_msm.scene import MAX_POINTS, Foundation
 
 # The stability limit holds while no spring is compressed below this share of its rest length (see
 # `SpringTerm.bound`).
@@ -44,7 +45,7 @@ def run_notes(
     reason: str = "",
     mesh: MeshEstimate | None = None,
     force: ForceEstimate | None = None,
-    affords: Callable[[tuple[int, int]], bool] = lambda points: True,
+    affords: Callable[[Plan], bool] = lambda plan: True,
     scale: float | None = None,
 ) -> Iterator[str]:
     """Say what is remarkable about a run up to its last frame, each in a line.
@@ -57,7 +58,7 @@ def run_notes(
         reason: why there is none.
         mesh: the error due to the number of points.
         force: the error of the forces.
-        affords: whether a run with this number of points takes at most an hour.
+        affords: whether a run takes at most an hour.
         scale: pixels per metre at the middle of the sheet; None: no picture is drawn.
     """
     scene, grid = plan.scene, plan.grid
@@ -70,7 +71,7 @@ def run_notes(
             wrong = float(f"{100 * estimate.error:.2g}")
             at_most = (estimate.at_most and not estimate.at_least) or not estimate.parted
             bound = "up to" if at_most else "about"
-            yield f"the run is {bound} {wrong:g} % wrong; {_remedy(plan, estimate)}"
+            yield f"the run is {bound} {wrong:g} % wrong; {_remedy(plan, estimate, affords)}"
     elif reason == AT_REST:
         yield "error: none due to a time step, as the sheet is at rest"
     elif reason:
@@ -90,7 +91,7 @@ def run_notes(
         wrong, bound = float(f"{100 * mesh.error:.2g}"), "up to"
         if mesh.doubt:
             bound = "roughly" if mesh.at_most else "at least"
-        yield f"so few points make the run {bound} {wrong:g} % wrong; {_finer(scene, mesh, affords)}"
+        yield f"so few points make the run {bound} {wrong:g} % wrong; {_finer(plan, mesh, affords)}"
     if progress.max_displacement == 0 and progress.frame > 0:
         yield "nothing moved: does a probe press where and when it should?"
     below = scene.tissue.foundation if scene.tissue is not None else None
@@ -153,12 +154,12 @@ def _digits(number: float, digits: int = 1) -> str:
     return np.format_float_positional(rounded, trim="-") if 1e-6 <= rounded < 1e6 or not rounded else f"{rounded:g}"
 
 
-def _finer(scene: Scene, mesh: MeshEstimate, affords: Callable[[tuple[int, int]], bool]) -> str:
+def _finer(plan: Plan, mesh: MeshEstimate, affords: Callable[[Plan], bool]) -> str:
     """Say what would reduce the error that the number of points makes: no more than four times as many."""
-    cut = math.sqrt(mesh.error / (WRONG / 2))
+    scene, cut = plan.scene, math.sqrt(mesh.error / (WRONG / 2))
     rows, cols = (math.ceil((count - 1) * cut) + 1 for count in scene.sheet.points)
     few = rows * cols <= MOST_FINER * math.prod(scene.sheet.points) and max(rows, cols) < MAX_POINTS
-    if few and affords((rows, cols)):
+    if few and affords(variant(plan, with_points(scene, (rows, cols)))):
         return f"try sheet.points: {[rows, cols]}"
     return "what helps more than points: tissue.bending, tissue.pretension or a wider tip"
 
@@ -168,7 +169,7 @@ def _bound(at_most: bool, at_least: bool) -> str:
     return ("roughly " if at_least else "at most about ") if at_most else "at least " if at_least else ""
 
 
-def _remedy(plan: Plan, estimate: Estimate) -> str:
+def _remedy(plan: Plan, estimate: Estimate, affords: Callable[[Plan], bool]) -> str:
     """Say what would reduce the error."""
     if not estimate.parted:
         return "pass --estimate-error to learn whether the step or rounding makes it"
@@ -182,5 +183,7 @@ def _remedy(plan: Plan, estimate: Estimate) -> str:
     if estimate.in_f64 > WRONG / 2:
         needed = plan.grid.steps_per_frame * (estimate.in_f64 / (WRONG / 2)) ** (1 / estimate.order)
         finer = replace(plan.grid, steps_per_frame=math.ceil(needed))
+        if not affords(replace(plan, grid=finer)):
+            return "steps as short as that needs take more than an hour: fewer sheet.points make them faster"
         said.insert(0, f"time.step: {finer.step:.9g}")
     return f"try {', or '.join(said)}"
