@@ -29,7 +29,7 @@ samples: 6
 vary: {damping: {uniform: [0.005, 0.02]}}
 set: {sheet.points: [5, 5], time.duration: 0.1, output: [trajectory], render.camera: {calibration: k.yml, poses: t.txt}}
 """
-CALIBRATION = "K: [50, 0, 20, 0, 50, 15, 0, 0, 1]\nwidth: 40\nheight: 30\n"
+CALIBRATION = "K: [50, 0, 20, 0, 50, 15, 0, 0, 1]\nD: [0, 0, 0, 0]\nwidth: 40\nheight: 30\n"
 POSES = "0 0 0 0.4 1 0 0 0\n999 0 0 0.5 1 0 0 0\n"
 
 # Until something happens that must [s].

@@ -203,7 +203,7 @@ def test_another_sweep_in_the_folder_is_refused(many: Path, program: Program) ->
 
 
 def test_a_sweep_with_another_calibration_is_another_one(many: Path, program: Program) -> None:
-    text = "K: [50, 0, 20, 0, 50, 15, 0, 0, 1]\nwidth: 40\nheight: 30\n"
+    text = "K: [50, 0, 20, 0, 50, 15, 0, 0, 1]\nD: [0, 0, 0, 0]\nwidth: 40\nheight: 30\n"
     (many / "camera.yml").write_text(text)
     setting = "set: {render.camera: {eye: [0, 0, 1], calibration: camera.yml}, output: [], time.duration: 0.1}"
     (many / "many.yaml").write_text(f"scene: small.yaml\nvary: {{damping: {{grid: [0.01]}}}}\n{setting}\n")

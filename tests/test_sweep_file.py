@@ -141,7 +141,7 @@ def test_pictures_are_found_from_the_sweep_file_and_given_from_the_scene(folder:
     assert {Path(path).name for path in sweep.files} == {"a.png", "b.png", "speckle.png"}
 
 
-CALIBRATION = "K: [50, 0, 20, 0, 50, 15, 0, 0, 1]\nwidth: 40\nheight: 30\n"
+CALIBRATION = "K: [50, 0, 20, 0, 50, 15, 0, 0, 1]\nD: [0, 0, 0, 0]\nwidth: 40\nheight: 30\n"
 POSES = "0 0 0 0.4 1 0 0 0\n9 0 0 0.5 1 0 0 0\n"
 
 
