@@ -115,6 +115,13 @@ def test_beyond_the_fold_there_is_nothing() -> None:
     assert Lens(True, (-0.5, 0, 0, 0)).limit == pytest.approx(np.tan(np.sqrt(2 / 3)))
 
 
+@pytest.mark.parametrize("key", range(8))
+def test_denormal_coefficients_change_nothing(key: int) -> None:
+    """A polynomial that one of them leads would have zeros where numbers overflow."""
+    assert Lens(False, tuple(5e-324 * (each == key) for each in range(8))).limit == Lens(False, (0,) * 8).limit
+    assert Lens(True, tuple(5e-324 * (each == key % 4) for each in range(4))).limit == Lens(True, (0,) * 4).limit
+
+
 @pytest.mark.parametrize(
     "coefficients",
     [

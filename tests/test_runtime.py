@@ -215,7 +215,8 @@ print(*results, runtime.ti.lang.impl.current_cfg().debug, sorted(os.environ.item
 def test_environment_and_other_threads_change_nothing_at_the_start(tmp_path: Path, root: Path) -> None:
     """The compiler's variables for its arch, its threads and its types would come before our arguments."""
     script, prefix = tmp_path / "at_once.py", chosen().prefix
-    given = {f"{prefix}_ARCH": "opengl", f"{prefix}_DEBUG": "1", f"{prefix}_CPU_MAX_NUM_THREADS": "1"}
+    settings = {"ARCH": "opengl", "DEBUG": "1", "CPU_MAX_NUM_THREADS": "1", "LOG_LEVEL": "loud", "OFFLINE_CACHE": "no"}
+    given = {f"{prefix}_{name}": value for name, value in settings.items()}
     script.write_text(f"given = {given}\n{AT_ONCE}")
     environment = {**os.environ, **given, "PYTHONPATH": str(root)}
     done = subprocess.run([sys.executable, str(script)], capture_output=True, text=True, timeout=60, env=environment)

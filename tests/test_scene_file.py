@@ -469,6 +469,8 @@ def test_errors(load: Load, text: str, expected: list[str]) -> None:
         ("a:\n " + "[" * 21 + "]" * 21, "s.yaml:2:22: nested more than 20 deep; write it flatter"),
         ("- " * 1000, "s.yaml:1:43: nested more than 20 deep; write it flatter"),
         ("[" * 1000, "s.yaml:1:22: nested more than 20 deep; write it flatter"),
+        # libyaml's own limit, which it reaches before it gives the first event.
+        ("a: " + "[" * 20_000, "s.yaml:1:1003: nested more than 20 deep; write it flatter"),
         ("? " * 1000, "s.yaml:1:3: a key must be text; put it in quotes"),
         ("a: {{ b }}\n", "s.yaml:1:5: a key must be text; put it in quotes"),
         ("[" + "1," * 100_000 + "]", "s.yaml:1:200000: more than 100000 values; write fewer"),

@@ -26,6 +26,9 @@ Array = NDArray[np.float64]
 # No lens shows what is farther than this from its axis.
 WIDEST = math.tan(math.radians(88))
 
+# Coefficients up to this change nothing within it, and dividing by them may overflow.
+TINY = 1e-100
+
 # The inverse is exact to this, where the focal length is 1: well below 1e-6 px.
 EXACT = 1e-11
 MOST_ROUNDS = 50
@@ -141,7 +144,7 @@ def _limit(lens: Lens) -> float:
     growth = (above + 2 * q * above.deriv()) * below - 2 * q * above * below.deriv()
     radial = float(min([WIDEST, *np.sqrt([*_positive(growth), *_positive(below)])]))
     tangential = math.hypot(*lens.coefficients[2:4])
-    if tangential == 0:
+    if tangential <= TINY:
         return radial
     radii = radial * np.linspace(0, 1, RADII + 1)[:-1]
     folded = np.flatnonzero(_least_determinant(lens, radii, tangential) <= 0)
@@ -169,5 +172,5 @@ def _least_determinant(lens: Lens, r: Any, tangential: float) -> Any:
 def _positive(polynomial: Polynomial) -> list[float]:
     """List the positive zeros of a polynomial."""
     # Leading zeros would be zeros at infinity.
-    roots = polynomial.trim().roots()
+    roots = polynomial.trim(TINY).roots()
     return [float(root.real) for root in roots if root.real > 0 and abs(root.imag) <= 1e-9 * abs(root)]

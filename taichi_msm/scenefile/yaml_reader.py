@@ -18,6 +18,7 @@ from taichi_msm.faults import cut
 
 MAX_DEPTH = 20
 MAX_NODES = 100_000
+_TOO_DEEP = f"nested more than {MAX_DEPTH} deep; write it flatter"
 
 # The largest number of faults to collect; a broken file may have tens of thousands.
 MAX_FAULTS = 1000
@@ -98,6 +99,9 @@ def _syntax_error(text: str, error: yaml.MarkedYAMLError) -> UnreadableError:
         line = text[error.context_mark.index :].partition("\n")[0]
         return UnreadableError(_mark(error.context_mark), f'no ":" in "{cut(line.strip())}"; expected KEY: VALUE')
     mark = error.problem_mark or error.context_mark
+    if mark and "nesting depth" in f"{error.problem} {error.context}":
+        # libyaml may reach its own limit before it gives the first event.
+        return UnreadableError(_mark(mark), _TOO_DEEP)
     at = mark.index if mark else 0
     hint = "; indent with spaces, not tabs" if text[at : at + 1] == "\t" else ""
     if error.problem == "mapping values are not allowed in this context":
@@ -158,7 +162,7 @@ class _Reader:
         if self._nodes > MAX_NODES:
             raise UnreadableError(_mark(event.start_mark), f"more than {MAX_NODES} values; write fewer")
         if len(path) > MAX_DEPTH:
-            raise UnreadableError(_mark(event.start_mark), f"nested more than {MAX_DEPTH} deep; write it flatter")
+            raise UnreadableError(_mark(event.start_mark), _TOO_DEEP)
         if isinstance(event, yaml.AliasEvent):
             self._refuse(event, path, f"alias *{event.anchor} is not allowed; write the value out")
             return

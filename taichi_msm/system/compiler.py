@@ -73,16 +73,19 @@ class Compiler:
             os.environ["HOME"] = folder if folder != "~" else private_folder()
         os.environ.setdefault(f"ENABLE_{self.name.upper()}_HEADER_PRINT", "0")
         os.environ.setdefault(f"{self.prefix}_SKIP_VERSION_CHECK", "ON")
-        # In a notebook, it reports on import that it is in one. This level is for the import only; `init` sets its own.
+        # In a notebook, it reports on import that it is in one, and a level that it does not know ends the import. This
+        # level is for the import only; `init` sets its own.
         level = f"{self.prefix}_LOG_LEVEL"
-        silent = os.environ.setdefault(level, "error") == "error"
+        before = os.environ.get(level)
+        os.environ[level] = "error"
         try:
             return import_module(self.name)
         except ImportError as error:
             raise NotInstalledError(f"{self.title} cannot be imported: {error}; {self.remedy}") from error
         finally:
-            if silent:
-                del os.environ[level]
+            del os.environ[level]
+            if before is not None:
+                os.environ[level] = before
 
     @cached_property
     def shortcuts(self) -> Parts:

@@ -283,8 +283,9 @@ def _alone() -> Iterator[None]:
 
 
 def _overrides(setting: str, name: str) -> bool:
-    """Return whether a variable of the environment changes how Taichi starts, other than its cache and its GPU."""
-    return setting != name and not setting.startswith(("OFFLINE_CACHE", "VISIBLE_DEVICE", "LIB_DIR", "SKIP_"))
+    """Return whether a variable of the environment changes how Taichi starts, other than its folders and its GPU."""
+    kept = "OFFLINE_CACHE_FILE_PATH", "VISIBLE_DEVICE", "LIB_DIR", "SKIP_"
+    return setting != name and not setting.startswith(kept)
 
 
 def _initialise(device: Device) -> str:
