@@ -17,7 +17,7 @@ def main() -> int:
     """Run the command line of the process."""
     gc.set_threshold(BETWEEN_SEARCHES)
     # PYTHONWARNINGS=error is for a user's own code; a warning in a library ends no command, here or in a child process.
-    if any(option.startswith("error") for option in sys.warnoptions):
+    if any(option and "error".startswith(option.partition(":")[0]) for option in sys.warnoptions):
         warnings.simplefilter("ignore")
         os.environ.pop("PYTHONWARNINGS", None)
     # OpenBLAS starts a thread for every core, each of which spins for a while; what we multiply is too small for two.
