@@ -635,6 +635,12 @@ def test_a_unit_of_forces_other_than_newtons_is_refused(tmp_path: Path) -> None:
         read_forces(tmp_path / "forces.csv", 0.1, 1)
 
 
+def test_a_column_given_twice_is_refused(tmp_path: Path) -> None:
+    (tmp_path / "forces.csv").write_text(f"{FORCES.strip()},force_z [N]\n0,0,0,0,1,2\n")
+    with pytest.raises(SceneError, match=":1: force_z: 2 columns of this name; leave one"):
+        read_forces(tmp_path / "forces.csv", 0.1, 1)
+
+
 def test_forces_of_a_pipe_or_a_huge_file_are_refused(tmp_path: Path) -> None:
     os.mkfifo(tmp_path / "pipe")
     with (tmp_path / "huge").open("wb") as file:
@@ -683,6 +689,7 @@ def test_an_array_that_cannot_be_read_is_named(
     with pytest.raises(SceneError, match=r"seen\.npz: time: cannot be read: ") as caught:
         read_observations(tmp_path / "seen.npz", 25)
     assert "\n" not in str(caught.value)
+    assert "ZipInfo" not in str(caught.value)
 
 
 def test_what_is_visible_is_seen(tracks: dict[str, Array]) -> None:
