@@ -717,6 +717,42 @@ def test_conventions_of_other_programs_are_asked_about(tracks: dict[str, Array])
     assert "are they frame numbers? divide time by the frames per second, 25" in answer(time=np.arange(11))
 
 
+@pytest.mark.parametrize(("factor", "unit"), [(1, None), (-1, None), (1000, "mN"), (101.97, "gf")])
+def test_units_and_signs_of_forces_are_asked_about(
+    tracks: dict[str, Array], device: Device, tmp_path: Path, factor: float, unit: str | None
+) -> None:
+    rows = [FORCES.strip()]
+    with Simulation(changed(), threads=device.threads) as simulation:
+        for _ in range(5):
+            simulation.advance()
+            rows.append(f"{simulation.time},0,,,{factor * simulation.forces()[0].force[2]}")
+    (tmp_path / "forces.csv").write_text("\n".join(rows))
+    # The force of the tool is given, so that no parameter scales it.
+    given = changed(tissue__young=2e5), noisy(tracks, 0.1, sigma=0.1), ["tissue.young"]
+    forces = tmp_path / "forces.csv", 0.01 * abs(factor)
+    if factor == 1:
+        assert not any("times those of the scene" in note for note in fit(*given, forces=forces, workers=1).notes)
+        return
+    said = "is it the force on the tool" if factor < 0 else f"are they in {unit}\\? divide them by {factor:g}"
+    with pytest.raises(SceneError, match=said):
+        fit(*given, forces=forces, workers=1)
+
+
+def test_offsets_of_half_a_pixel_and_turned_axes_are_asked_about(tracks: dict[str, Array], motion: Array) -> None:
+    def answer(**arrays: Any) -> str:
+        with pytest.raises(SceneError) as caught:
+            fit(changed(), arrays, ["tissue.young"], workers=1)
+        return str(caught.value)
+
+    seen = noisy(tracks, 0.1)
+    for offset, said in ((-0.5, "at 0? add 0.5"), (0.5, "at 1? subtract 0.5"), (np.array([0.5, 0]), "at 1?")):
+        assert f"is the centre of their first pixel {said}" in answer(**{**seen, "pixel": seen["pixel"] + offset})
+    assert "take 512 - y, counted from above" in answer(**{**seen, "pixel": [0, 512] + seen["pixel"] * [1, -1]})
+    turned = {"time": seen["time"], "position": motion * [1, -1, 1]}
+    assert "position: y of the points at rest has the other sign in the scene; take -y" in answer(**turned)
+    assert "position: z changes against the scene's" in answer(**{**turned, "position": motion * [1, 1, -1]})
+
+
 @pytest.mark.parametrize("robust", [False, True])
 @pytest.mark.filterwarnings("error:::taichi_msm")
 def test_an_exact_fit_has_errors_next_to_0(device: Device, robust: bool) -> None:
