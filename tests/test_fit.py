@@ -635,6 +635,12 @@ def test_a_unit_of_forces_other_than_newtons_is_refused(tmp_path: Path) -> None:
         read_forces(tmp_path / "forces.csv", 0.1, 1)
 
 
+def test_a_column_given_twice_is_refused(tmp_path: Path) -> None:
+    (tmp_path / "forces.csv").write_text(f"{FORCES.strip()},force_z [N]\n0,0,0,0,1,2\n")
+    with pytest.raises(SceneError, match=":1: force_z: 2 columns of this name; leave one"):
+        read_forces(tmp_path / "forces.csv", 0.1, 1)
+
+
 def test_forces_of_a_pipe_or_a_huge_file_are_refused(tmp_path: Path) -> None:
     os.mkfifo(tmp_path / "pipe")
     with (tmp_path / "huge").open("wb") as file:
@@ -683,6 +689,7 @@ def test_an_array_that_cannot_be_read_is_named(
     with pytest.raises(SceneError, match=r"seen\.npz: time: cannot be read: ") as caught:
         read_observations(tmp_path / "seen.npz", 25)
     assert "\n" not in str(caught.value)
+    assert "ZipInfo" not in str(caught.value)
 
 
 def test_what_is_visible_is_seen(tracks: dict[str, Array]) -> None:
@@ -708,6 +715,42 @@ def test_conventions_of_other_programs_are_asked_about(tracks: dict[str, Array])
     fractions = tracks["pixel"] / changed().render.size
     assert "are they fractions of the frame? multiply them by its width and height" in answer(pixel=fractions)
     assert "are they frame numbers? divide time by the frames per second, 25" in answer(time=np.arange(11))
+
+
+@pytest.mark.parametrize(("factor", "unit"), [(1, None), (-1, None), (1000, "mN"), (101.97, "gf")])
+def test_units_and_signs_of_forces_are_asked_about(
+    tracks: dict[str, Array], device: Device, tmp_path: Path, factor: float, unit: str | None
+) -> None:
+    rows = [FORCES.strip()]
+    with Simulation(changed(), threads=device.threads) as simulation:
+        for _ in range(5):
+            simulation.advance()
+            rows.append(f"{simulation.time},0,,,{factor * simulation.forces()[0].force[2]}")
+    (tmp_path / "forces.csv").write_text("\n".join(rows))
+    # The force of the tool is given, so that no parameter scales it.
+    given = changed(tissue__young=2e5), noisy(tracks, 0.1, sigma=0.1), ["tissue.young"]
+    forces = tmp_path / "forces.csv", 0.01 * abs(factor)
+    if factor == 1:
+        assert not any("times those of the scene" in note for note in fit(*given, forces=forces, workers=1).notes)
+        return
+    said = "is it the force on the tool" if factor < 0 else f"are they in {unit}\\? divide them by {factor:g}"
+    with pytest.raises(SceneError, match=said):
+        fit(*given, forces=forces, workers=1)
+
+
+def test_offsets_of_half_a_pixel_and_turned_axes_are_asked_about(tracks: dict[str, Array], motion: Array) -> None:
+    def answer(**arrays: Any) -> str:
+        with pytest.raises(SceneError) as caught:
+            fit(changed(), arrays, ["tissue.young"], workers=1)
+        return str(caught.value)
+
+    seen = noisy(tracks, 0.1)
+    for offset, said in ((-0.5, "at 0? add 0.5"), (0.5, "at 1? subtract 0.5"), (np.array([0.5, 0]), "at 1?")):
+        assert f"is the centre of their first pixel {said}" in answer(**{**seen, "pixel": seen["pixel"] + offset})
+    assert "take 512 - y, counted from above" in answer(**{**seen, "pixel": [0, 512] + seen["pixel"] * [1, -1]})
+    turned = {"time": seen["time"], "position": motion * [1, -1, 1]}
+    assert "position: y of the points at rest has the other sign in the scene; take -y" in answer(**turned)
+    assert "position: z changes against the scene's" in answer(**{**turned, "position": motion * [1, 1, -1]})
 
 
 @pytest.mark.parametrize("robust", [False, True])

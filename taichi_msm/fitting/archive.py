@@ -66,6 +66,7 @@ def _members(name: str, archive: zipfile.ZipFile) -> dict[str, NDArray[Any]]:
                 arrays[key] = np.lib.format.read_array(member, allow_pickle=False)
         except Exception as error:  # zipfile, its decompressors and NumPy raise any kind for bytes that are none
             why = str(error).partition("\n")[0] or type(error).__name__
+            why = "encrypted" if info.flag_bits & 1 else why
             why = "an array of Python objects" if why.startswith("Object arrays") else f"cannot be read: {why}"
             raise SceneError([f"{name}: {key}: {why}; write it again by np.savez, as numbers"]) from None
     if not arrays and infos:

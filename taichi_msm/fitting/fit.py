@@ -18,6 +18,7 @@ from typing_extensions import Unpack
 from taichi_msm.errors import SceneError, writing
 from taichi_msm.fitting import notes, rejection
 from taichi_msm.fitting.arguments import Method, require_types
+from taichi_msm.fitting.conventions import force_unit
 from taichi_msm.fitting.estimation import Misfit, Search, Solution
 from taichi_msm.fitting.force_table import read_forces
 from taichi_msm.fitting.identifiability import MOST_ERROR, unseen
@@ -29,7 +30,7 @@ from taichi_msm.fitting.report import publication, write_report
 from taichi_msm.fitting.result import Estimate, FitResult, FittedMap
 from taichi_msm.fitting.runs import Runs
 from taichi_msm.fitting.stiffness_map import KEY, fit_map, map_task
-from taichi_msm.fitting.suspicions import faults, faults_beside, moved
+from taichi_msm.fitting.suspicions import faults, faults_beside, faults_of_best, moved
 from taichi_msm.fitting.uncertainty import Alike, Uncertainty, uncertainty
 from taichi_msm.physics.mesh_error import WITH_CONTACT
 from taichi_msm.progress import Progress
@@ -142,12 +143,15 @@ def _fit(runs: Runs, given: Scene, method: Method) -> FitResult:
     runs.expected = 8 * len(start) + 4
     first = runs.first(start)
     same_camera = not any(one.key.startswith("render.") for one in parameters)
-    if wrong := list(faults_beside(seen, given, first, same_camera=same_camera)):
+    same_signs = all(one.is_log for one in parameters)
+    if wrong := list(faults_beside(seen, given, first, same_camera=same_camera, same_signs=same_signs)):
         raise SceneError(wrong)
     motion = moved(seen, given) or 1.0
     misfit = Misfit(seen, motion, robust=method.get("robust", False))
     search = Search(runs, misfit)
     solution = search.best(start)
+    if wrong := list(faults_of_best(seen, given, first, solution.predicted)):
+        raise SceneError(wrong)
     uncertain = uncertainty(misfit, solution, search.derivatives(solution), alike)
     profiles = Profiler(parameters, misfit, solution, uncertain).profiles(runs) if method.get("profile") else None
     mesh, shifts = _mesh(runs, misfit, solution, uncertain)
@@ -171,6 +175,7 @@ def _fit(runs: Runs, given: Scene, method: Method) -> FitResult:
         mesh_error=mesh,
         runs=runs.count,
         notes=[
+            *force_unit(seen, first),
             *notes.of_the_search(solution, parameters, fits=search.fits(solution)),
             *notes.of_the_points(parameters, solution.x, uncertain, shifts),
             *notes.of_ties(parameters, uncertain, blind),

@@ -104,11 +104,13 @@ def _rows(name: str, text: str) -> list[list[float]]:
 
 
 def _header(where: str, cells: list[str]) -> list[str]:
-    """Return the names of the columns without their units; SceneError: one is missing or has another unit."""
+    """Return the names of the columns without their units; SceneError: one is missing, repeated or of another unit."""
     split = [re.fullmatch(r"(.*?)\s*[\[(](.*)[\])]", cell) for cell in cells]
     names = [cell if found is None else found[1] for cell, found in zip(cells, split, strict=True)]
     if missing := [key for key in COLUMNS if key not in names]:
         raise SceneError([f"{where.rpartition(':')[0]}: {missing[0]}: missing; {EXPECTED}"])
+    if twice := [key for key in COLUMNS if names.count(key) > 1]:
+        raise SceneError([f"{where}: {twice[0]}: {names.count(twice[0])} columns of this name; leave one"])
     for key, found in zip(names, split, strict=True):
         if found is not None:
             _check_unit(where, key, found[2].strip())

@@ -8,6 +8,7 @@ from collections.abc import Iterator
 import numpy as np
 from numpy.typing import NDArray
 
+from taichi_msm.fitting.conventions import force_unit, half_pixel, mirrored, opposed
 from taichi_msm.fitting.observations import Observations
 from taichi_msm.fitting.prediction import Predicted
 from taichi_msm.fitting.sight import places_at_rest, seen_at_rest
@@ -54,10 +55,20 @@ def faults(seen: Observations, scene: Scene, parameters: int) -> Iterator[str]:
         yield f"{name}: no point moves {said}; observe while a tool acts, at points near it"
 
 
-def faults_beside(seen: Observations, scene: Scene, first: Predicted, *, same_camera: bool = True) -> Iterator[str]:
-    """Say what is wrong beside a run of the scene to its end: times that miss its motion, another camera.
+def faults_beside(
+    seen: Observations, scene: Scene, first: Predicted, *, same_camera: bool = True, same_signs: bool = True
+) -> Iterator[str]:
+    """Check observations against a run of the scene to its end.
 
-    same_camera: whether the scene has the camera that saw, and not one that is to be found.
+    Args:
+        seen: the observations.
+        scene: with the values where the search begins.
+        first: its prediction.
+        same_camera: whether the scene has the camera that saw, and not one that is to be found.
+        same_signs: whether the parameters keep the signs of forces and motion.
+
+    Yields:
+        A line of each fault: times that miss the motion, another camera, conventions of other programs.
     """
     rate, whole = scene.time.frames_per_second, float(first.motion.max())
     if whole <= ROUNDING * max(scene.sheet.size):
@@ -72,13 +83,32 @@ def faults_beside(seen: Observations, scene: Scene, first: Predicted, *, same_ca
             f"{1000 * whole:.3g} mm, and at these times by {1000 * observed:.3g} mm; observe between "
             f"{moving[0]:g} and {moving[-1]:g} s too"
         )
+        return
     if lost := int((seen.known & ~np.isfinite(first.values)).any(axis=(1, 2)).sum()):
         said = "are behind the eye of the scene's camera, or beyond its lens, where the search begins"
         remedy = "give the scene the camera that saw them, or NaN in their place"
         yield f"{seen.name}: {seen.kind}: {lost} of the points that were seen {said}; {remedy}"
         return
-    if same_camera:
-        yield from _elsewhere(seen, scene, first)
+    wrong = [*_other_places(seen, scene, first)] if same_camera else []
+    yield from wrong
+    if same_signs and not wrong:
+        yield from opposed(seen, scene, first)
+
+
+def faults_of_best(seen: Observations, scene: Scene, first: Predicted, best: Predicted) -> Iterator[str]:
+    """Check signs and units of forces, which are wrong where the search begins and where it ended."""
+    yield from opposed(seen, scene, first, best)
+    yield from force_unit(seen, first, best)
+
+
+def _other_places(seen: Observations, scene: Scene, first: Predicted) -> Iterator[str]:
+    """Compare places at rest: mirrored ones, others, and those half a pixel off."""
+    if wrong := [*mirrored(seen, scene)]:
+        yield from wrong
+        return
+    yield from _elsewhere(seen, scene, first)
+    if seen.kind == "pixel":
+        yield from half_pixel(seen, scene, first)
 
 
 def moved(seen: Observations, scene: Scene) -> float:
