@@ -275,7 +275,7 @@ def test_points_are_advised_where_they_can_help(error: float, advice: str) -> No
     slow = notes_of(made, MOVED, None, mesh=MeshEstimate(error), affords=lambda plan: False)[-1]
     assert slow.endswith(HELPS)
     steps = Estimate(40, error, 0.0, error, 2)
-    assert "; try time.step: " in notes_of(made, MOVED, steps)[1]
+    assert "for a smaller error of the time step, try time.step: " in notes_of(made, MOVED, steps)[1]
     assert notes_of(made, MOVED, steps, affords=lambda plan: False)[1].endswith("fewer sheet.points make them faster")
 
 
