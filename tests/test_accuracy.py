@@ -264,18 +264,18 @@ def test_a_scene_that_is_all_right_has_no_notes() -> None:
     assert len(notes_of(scene(), RunProgress(1, 0.0, 0.49), None)) == 2
 
 
-HELPS = "what helps more than points: tissue.bending, tissue.pretension or a wider tip"
+HELPS = "more than points, tissue.bending, tissue.pretension or a wider tip help"
 
 
 @pytest.mark.parametrize(("error", "advice"), [(0.015, "try sheet.points: [15, 19]"), (0.04, HELPS), (2000.0, HELPS)])
 def test_points_are_advised_where_they_can_help(error: float, advice: str) -> None:
     made = scene()
     note = notes_of(made, MOVED, None, mesh=MeshEstimate(error))[-1]
-    assert note == f"so few points make the run up to {100 * error:g} % wrong; {advice}"
+    assert note == f"for a smaller error of the mesh, {advice}"
     slow = notes_of(made, MOVED, None, mesh=MeshEstimate(error), affords=lambda plan: False)[-1]
     assert slow.endswith(HELPS)
     steps = Estimate(40, error, 0.0, error, 2)
-    assert "; try time.step: " in notes_of(made, MOVED, steps)[1]
+    assert "for a smaller error of the time step, try time.step: " in notes_of(made, MOVED, steps)[1]
     assert notes_of(made, MOVED, steps, affords=lambda plan: False)[1].endswith("fewer sheet.points make them faster")
 
 

@@ -104,13 +104,13 @@ def test_a_run_that_is_wrong_says_what_helps() -> None:
     assert len(said(0.009, 0.0, 0.009)) == 1
     (_, step) = said(0.04, 0.0, 0.04)
     # 24 steps a frame make a quarter of the error, and a third as many again half of that.
-    found = float(step.removeprefix("the run is about 4 % wrong; try time.step: "))
+    found = float(step.removeprefix("for a smaller error of the time step, try time.step: "))
     tried = plan_of(with_time(scene(), step=found)).grid
     assert tried.steps_per_frame == math.ceil(plan_of(scene()).grid.steps_per_frame * 8**0.5)
     (first, rounding) = said(0.03, 0.03, 1e-4)
     assert first.startswith("error: time step 0.01 %, rounding 3 % of ")
     assert rounding == (
-        "the run is about 3 % wrong; try time.precision: f64, or more springs.virtual, where the sheet buckles"
+        "for a smaller error of rounding, try time.precision: f64, or more springs.virtual, where the sheet buckles"
     )
 
 

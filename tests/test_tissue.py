@@ -480,7 +480,7 @@ def test_a_run_says_what_its_tool_and_its_points_do(load: Any, device: Device, t
     assert probe["largest_pressure"] == pytest.approx(
         2 / (math.pi * (0.01**2 + 2 * (0.01 / 100 + 1 / 100**2))), rel=1e-6
     )
-    assert any(note.startswith("so few points make the run up to") for note in record["notes"])
+    assert any(note.startswith("for a smaller error of the mesh, ") for note in record["notes"])
     assert re.search(r", mesh [\d.]+ % of [\d.]+ mm \([\d.]+ mm(, [\d.]+ px)?\)$", record["notes"][0])
     assert (
         f"probes.0: {probe['total_force']:.3g} N in all, 0.4 N of it under the flat end, at most 1.27 kPa"

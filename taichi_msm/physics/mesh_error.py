@@ -19,7 +19,9 @@ error.
 
 Where tools are moved, they touch more points one by one, and in a coarse run few or none, which then says nothing. So
 there is one run with 1 / sqrt(2) of the cells a side and half the steps. It is compared with the run itself, as a
-coarse pilot may press quite otherwise, and IN_CONTACT of the difference, up to a limit, is told (docs/decisions/0027).
+coarse pilot may press quite otherwise, and IN_CONTACT of the difference is the estimate. A difference above FAR says
+little, as the tool may have left one of the two sheets earlier; then a second run follows, with NEARER of the cells a
+side (docs/decisions/0027).
 
 With `springs`, a sheet with other points is another sheet, so its error is not defined.
 """
@@ -54,13 +56,15 @@ LOWEST_ORDER, HIGHEST_ORDER = 1.0, 3.0
 # The order where tools are moved.
 WITH_CONTACT = 1.5
 
-# Where tools are moved: the cells a side of the one run with fewer points, as a share of the run's; what is told for a
-# difference of one, and the most that is told; the largest difference, as a share of the largest displacement, and the
-# smallest radius, in cells of the run, that say anything. The error is 0.3 to 1.7 times the difference; where the two
-# runs differ by more than half of the displacement, it is 0.15 to 0.9 whatever they differ by.
+# Where tools are moved: the cells a side of the run with fewer points, as a share of the run's; the estimate for a
+# difference of one; the difference, as a share of the largest displacement, above which a second run with NEARER of the
+# cells follows, and the estimate in geometric means of both differences; the largest difference of the last run, and
+# the smallest radius, in cells of the run, that say anything.
 CLOSER = 1 / math.sqrt(2)
 IN_CONTACT = 1.2
-MOST_IN_CONTACT = 0.6
+FAR = 0.4
+NEARER = 0.85
+OF_BOTH = 0.7
 LARGEST_DIFFERENCE = 1.0
 NARROWEST = 0.8
 
@@ -109,6 +113,11 @@ def coarser(plan: Plan, share: float = 0.5) -> Plan | None:
         return None
     # Shares are rounded up or down, so that cells do not get too long.
     cells = [share * (count - 1) for count in scene.sheet.points]
+    if share == NEARER:
+        # Of the same parity, so that a tool over the middle meets a point there in both, or in none.
+        cells = [
+            count - 1 - 2 * round((count - 1 - few) / 2) for count, few in zip(scene.sheet.points, cells, strict=True)
+        ]
     ways = product(*({math.ceil(count) + 1, math.floor(count) + 1} for count in cells))
     halves = [with_points(scene, (rows, cols)) for rows, cols in ways]
     possible = [halved for halved in halves if cell_ratio(halved.sheet) <= LONGEST_CELL]
@@ -179,6 +188,7 @@ class MeshPilot:
         apart = max(spacing(plan.scene.sheet))
         self._narrow = any(tool.radius < NARROWEST * apart for tool in plan.tools)
         self._largest, self._shortest = 0.0, 1.0
+        self._nearer: MeshPilot | None = None
 
     def compile(self) -> None:
         """Compile now what the first frame would compile."""
@@ -202,6 +212,24 @@ class MeshPilot:
     def tool_forces(self) -> NDArray[np.float64]:
         """Return the forces of the tools in the first run with fewer points, as `Dynamics.tool_forces` does."""
         return self._sheets[0].tool_forces()
+
+    def nearer(self, plan: Plan, device: Device, cores: int | None = None) -> MeshPilot | None:
+        """Build the second run that is to follow, from the first frame on; None: the first says enough.
+
+        Args:
+            plan: as for the first, like the others.
+            device: to run it on.
+            cores: to run it with.
+        """
+        if self._contact and not self._narrow and self._relative > FAR:
+            coarse = coarser(plan, NEARER)
+            self._nearer = None if coarse is None else MeshPilot(plan, coarse, device, cores)
+        return self._nearer
+
+    @property
+    def _relative(self) -> float:
+        """The largest difference of the first run, as a share of the largest displacement so far."""
+        return self._differences[0] / self._largest if self._largest > 0 else 0.0
 
     @property
     def estimate(self) -> MeshEstimate:
@@ -234,10 +262,12 @@ class MeshPilot:
         """Estimate the error by the difference of the one run with fewer points, relative to the displacement."""
         if self._narrow:
             return MeshEstimate(math.inf, NARROW)
-        if difference > LARGEST_DIFFERENCE:
-            return MeshEstimate(math.inf, APART)
-        told = min(IN_CONTACT * difference, MOST_IN_CONTACT) + self._missing
-        return MeshEstimate(told, WRINKLES if self._wrinkles else "", at_most=True)
+        share = IN_CONTACT * difference
+        if difference > FAR:
+            if self._nearer is None or not self._nearer._relative <= LARGEST_DIFFERENCE:
+                return MeshEstimate(math.inf, APART)
+            share = OF_BOTH * math.sqrt(difference * self._nearer._relative)
+        return MeshEstimate(share + self._missing, WRINKLES if self._wrinkles else "", at_most=True)
 
 
 def with_points(scene: Scene, points: tuple[int, int]) -> Scene:
@@ -293,12 +323,16 @@ def estimate_points(plan: Plan, device: Device, progress: Count) -> MeshEstimate
     """Run a scene for which there is a `companion`, and its pilot, in f64; give the error that the pilot shows."""
     exact, coarse, grid = plan.with_grid(precision="f64"), companion(plan), plan.grid
     assert coarse is not None
-    own, pilot = sheet_of(exact, device), MeshPilot(exact, coarse, device)
-    for frame in range(grid.frames):
-        pause = partial(progress, frame, grid.frames)
-        pause()
-        own.advance(grid.steps_per_frame, pause)
-        pilot.follow(own.displacement(), pause)
+    pilot = MeshPilot(exact, coarse, device)
+    each: MeshPilot | None = pilot
+    while each is not None:
+        own = sheet_of(exact, device)
+        for frame in range(grid.frames):
+            pause = partial(progress, frame, grid.frames)
+            pause()
+            own.advance(grid.steps_per_frame, pause)
+            each.follow(own.displacement(), pause)
+        each = pilot.nearer(exact, device) if each is pilot else None
     return pilot.estimate
 
 

@@ -22,6 +22,7 @@ from taichi_msm.timegrid import TimeGrid
 # A tool may move by this share of its radius in a step, and be this much larger than the distance between points
 # before a note is made.
 LARGEST_STRIDE = WIDEST_CELL = 0.5
+TOO_FEW = "which touches few of them"
 
 # Advice is at most this many times as many points.
 MOST_FINER = 4
@@ -179,7 +180,7 @@ def path_notes(scene: Scene, tools: Sequence[Tool]) -> Iterator[str]:
             remedy = f"try sheet.points: {points}" if few else "take a wider tip"
             yield (
                 f"probes.{tool.probe}: the points are {apart:.3g} m apart, more than half the radius of the "
-                f"instrument, {tool.radius:.3g} m, which touches few of them; {remedy}"
+                f"instrument, {tool.radius:.3g} m, {TOO_FEW}; {remedy}"
             )
 
     if (where := overlap(tools, scene.time.duration)) is not None:

@@ -105,17 +105,23 @@ class RunError:
             self._greatest = np.maximum(self._greatest, np.linalg.norm(forces, axis=1))
 
     def finish(self, displacements: Iterator[NDArray[Any]] | None, progress: Count) -> None:
-        """After the last frame, take a finer pilot where the coarse one shows an error that matters.
+        """After the last frame, take pilots again where the first ones show an error that matters.
 
         displacements: of the run at all frames but the first [m]; None: not kept, and the run is repeated.
         """
-        if self._time is None or not self._pilots.after or self._time.estimate.error < ENOUGH:
+        early = self._time
+        takes_finer = early is not None and self._pilots.after and early.estimate.error >= ENOUGH
+        fine = Pilot(self._plan, self._pilots.after, self._device, self._cores) if takes_finer else None
+        nearer = self._mesh.nearer(self._plan, self._device, self._cores) if self._mesh is not None else None
+        pilots = [pilot for pilot in (fine, nearer) if pilot is not None]
+        if not pilots:
             return
         frames = self._plan.grid.frames
-        fine = Pilot(self._plan, self._pilots.after, self._device, self._cores)
         for frame, displacement in enumerate(displacements or self._repeated(), 1):
-            fine.follow(displacement, partial(progress, frame, frames))
-        self._known = self._known._replace(estimate=reconcile(self._time.estimate, fine.estimate))
+            for pilot in pilots:
+                pilot.follow(displacement, partial(progress, frame, frames))
+        if early is not None and fine is not None:
+            self._known = self._known._replace(estimate=reconcile(early.estimate, fine.estimate))
 
     def _repeated(self) -> Iterator[NDArray[Any]]:
         """Run the scene again; give the displacements of its frames."""

@@ -14,7 +14,7 @@ from taichi_msm.physics.energy_growth import growth_notes
 from taichi_msm.physics.error_control import Estimate
 from taichi_msm.physics.material import has_fixed_border
 from taichi_msm.physics.mesh_error import MeshEstimate, with_points
-from taichi_msm.physics.paths import MOST_FINER, path_notes
+from taichi_msm.physics.paths import MOST_FINER, TOO_FEW, path_notes
 from taichi_msm.physics.pilots import AT_REST
 from taichi_msm.physics.plan import Plan
 from taichi_msm.physics.planning import variant
@@ -68,10 +68,8 @@ def run_notes(
         )
     if estimate is not None:
         if WRONG < estimate.error < math.inf:
-            wrong = float(f"{100 * estimate.error:.2g}")
-            at_most = (estimate.at_most and not estimate.at_least) or not estimate.parted
-            bound = "up to" if at_most else "about"
-            yield f"the run is {bound} {wrong:g} % wrong; {_remedy(plan, estimate, affords)}"
+            of = "the time step" if not estimate.parted or estimate.in_f64 > WRONG / 2 else "rounding"
+            yield f"for a smaller error of {of}, {_remedy(plan, estimate, affords)}"
     elif reason == AT_REST:
         yield "error: none due to a time step, as the sheet is at rest"
     elif reason:
@@ -82,16 +80,15 @@ def run_notes(
         else:
             yield f"force error at most about {_percent(force.error, 2)} % of the greatest force"
     yield from probe_force.force_notes(scene, probes)
-    yield from path_notes(scene, plan.tools)
+    paths = list(path_notes(scene, plan.tools))
+    yield from paths
     yield from contact_notes(plan, progress)
     yield from growth_notes(plan, progress)
     if mesh is not None and mesh.doubt and mesh.error < math.inf:
         yield f"the error due to the number of points may be larger: {mesh.doubt}"
-    if mesh is not None and WRONG < mesh.error < math.inf:
-        wrong, bound = float(f"{100 * mesh.error:.2g}"), "up to"
-        if mesh.doubt:
-            bound = "roughly" if mesh.at_most else "at least"
-        yield f"so few points make the run {bound} {wrong:g} % wrong; {_finer(plan, mesh, affords)}"
+    # Where points are too far apart for a tool, it is said already what would help.
+    if mesh is not None and WRONG < mesh.error < math.inf and not any(TOO_FEW in note for note in paths):
+        yield f"for a smaller error of the mesh, {_finer(plan, mesh, affords)}"
     if progress.max_displacement == 0 and progress.frame > 0:
         yield "nothing moved: does a probe press where and when it should?"
     below = scene.tissue.foundation if scene.tissue is not None else None
@@ -161,7 +158,7 @@ def _finer(plan: Plan, mesh: MeshEstimate, affords: Callable[[Plan], bool]) -> s
     few = rows * cols <= MOST_FINER * math.prod(scene.sheet.points) and max(rows, cols) < MAX_POINTS
     if few and affords(variant(plan, with_points(scene, (rows, cols)))):
         return f"try sheet.points: {[rows, cols]}"
-    return "what helps more than points: tissue.bending, tissue.pretension or a wider tip"
+    return "more than points, tissue.bending, tissue.pretension or a wider tip help"
 
 
 def _bound(at_most: bool, at_least: bool) -> str:
