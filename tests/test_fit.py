@@ -21,10 +21,11 @@ from taichi_msm.fitting.force_table import read_forces
 from taichi_msm.fitting.observations import Observations, read_observations
 from taichi_msm.fitting.parameters import make_parameters
 from taichi_msm.fitting.prediction import Job, Predictor, runnable
-from taichi_msm.fitting.rejection import by_signs
+from taichi_msm.fitting.rejection import by_pattern
 from taichi_msm.fitting.result import FitResult
 from taichi_msm.fitting.sight import seen_by_camera
 from taichi_msm.fitting.suspicions import MOVES, faults, moved
+from taichi_msm.fitting.uncertainty import Alike
 from taichi_msm.physics.deformed import on_surface, surface_weights, touched
 from taichi_msm.scene import Scene
 from taichi_msm.system import resources
@@ -854,16 +855,43 @@ def test_a_scene_that_cannot_move_as_was_seen_is_rejected_first_of_all(tracks: d
     assert "rejected" not in right.summary()[0]
 
 
-def test_noise_is_not_taken_for_a_wrong_model() -> None:
-    """Also where neighbouring points are alike, some jump, and some were not seen."""
+@pytest.mark.parametrize("few", [False, True])
+def test_a_wrong_scene_is_rejected_by_what_is_left_alone(tracks: dict[str, Array], few: bool) -> None:
+    """By a wrong damping, also where two times tell nothing of time."""
+    seen = noisy(tracks, 0.02)
+    if few:
+        seen |= {"time": seen["time"][5:7], "pixel": seen["pixel"][:, 5:7]}
+    wrong = fit(changed(tissue__damping=600), seen, ["tissue.foundation"], workers=1)
+    assert wrong.summary()[0].startswith("the model is rejected: what is left of neighbouring points is alike")
+    assert not fit(changed(), seen, ["tissue.foundation"], workers=1).model_rejected
+
+
+def test_what_is_far_off_counts_in_full_for_the_rejection_of_a_robust_fit(tracks: dict[str, Array]) -> None:
+    seen = noisy(tracks, 0.1, sigma=0.1)
+    assert not fit(changed(), seen, ["tissue.foundation"], robust=True, workers=1).model_rejected
+    seen["pixel"][[7, 20]] += np.linspace(0, 40, 11)[:, None]
+    found = fit(changed(), seen, ["tissue.foundation"], robust=True, workers=1)
+    assert found.summary()[0].startswith("the model is rejected: chi-square of the plain residuals ")
+
+
+NOISE = [Alike(None, None), Alike(5.0, None), Alike(None, 1.0)]
+
+
+@pytest.mark.parametrize("alike", NOISE, ids=["independent", "alike in space", "alike in time"])
+def test_noise_is_not_taken_for_a_wrong_model(alike: Alike) -> None:
+    """Also where some jump, and some were not seen."""
     rng, wolves = np.random.default_rng(4), 0
-    for n in range(400):
-        left = rng.normal(0, 1, (30, 8 + n % 25, 2)) + (n % 2) * rng.normal(0, 2, (1, 8 + n % 25, 2))
+    times = np.arange(9.0)
+    for _ in range(400):
+        left = rng.normal(0, 1, (36, 9, 2))
+        left += 0 if alike.correlation is None else rng.normal(0, 2, (1, 9, 2))
+        left = left if alike.drift is None else np.cumsum(left, axis=1)
         left[rng.random(left.shape) < 0.05] *= 10
         left[rng.random(left.shape[:2]) < 0.1] = np.nan
-        times = np.arange(left.shape[1], dtype=float)
-        seen = Observations("", "pixel", times, np.zeros((30, 2)), left, None)
-        wolves += by_signs(seen, left, 10.0) is not None
+        wolves += by_pattern(Observations("", "pixel", times, PLACES, left, None), left, 10.0, alike) is not None
+    # Of 400, 0.4 are expected; more than 3 have a probability of 1e-3.
     assert wolves <= 3
-    wrong = np.sin(times / 6)[:, None] + rng.normal(0, 1, left.shape)
-    assert by_signs(Observations("", "pixel", times, np.zeros((30, 2)), wrong, None), wrong, 10.0) is not None
+    times = np.arange(40.0)
+    wrong = np.sin(times / 6)[:, None] + rng.normal(0, 1, (36, 40, 2))
+    seen = Observations("", "pixel", times, PLACES, wrong, None)
+    assert by_pattern(seen, wrong, 10.0, alike) is not None
