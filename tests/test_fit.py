@@ -20,9 +20,10 @@ from taichi_msm.fitting.arguments import Method
 from taichi_msm.fitting.force_table import read_forces
 from taichi_msm.fitting.observations import Observations, read_observations
 from taichi_msm.fitting.parameters import make_parameters
-from taichi_msm.fitting.prediction import Job, Predictor, runnable
+from taichi_msm.fitting.prediction import Job, Predicted, Predictor, runnable
 from taichi_msm.fitting.rejection import by_pattern
 from taichi_msm.fitting.result import FitResult
+from taichi_msm.fitting.runs import Runs
 from taichi_msm.fitting.sight import seen_by_camera
 from taichi_msm.fitting.suspicions import MOVES, faults, moved
 from taichi_msm.fitting.uncertainty import Alike
@@ -198,6 +199,7 @@ def test_what_pictures_cannot_tell_is_named_and_a_force_tells_it(tracks: dict[st
     found = fit(start, tmp_path / "truth" / "tracks.npz", free, sigma=0.1, workers=1)
     assert not found.identifiable
     assert not any(one.identifiable for one in found.parameters.values())
+    assert all(one.mesh_error is None for one in found.parameters.values())
     (unseen,) = found.unseen
     assert unseen.parameters == free
     assert len(unseen.known) == 3
@@ -398,6 +400,25 @@ def test_the_points_move_what_is_found_about_as_far_as_is_said(device: Device) -
     # The finer scene has a sixteenth of the error left; half of so few points are too few to tell it closely.
     assert abs(one.value - 3e5) / 4 < one.mesh_error < 4 * abs(one.value - 3e5)
     assert any("the number of points moves tissue.foundation" in note for note in found.notes)
+
+
+def test_a_third_mesh_tells_the_order_of_the_mesh_error(
+    tracks: dict[str, Array], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def told(order: int) -> float:
+        def coarse(runs: Runs, x: Array, halvings: int) -> Predicted:
+            fine = runs.one(x)
+            assert fine is not None
+            off = 1e-3 * (2 ** (order * halvings) - 1)
+            return fine._replace(values=fine.values + off * (fine.values - tracks["pixel"][:, :1]))
+
+        monkeypatch.setattr(Runs, "coarse", coarse)
+        error = fit(changed(), tracks, ["tissue.foundation"], workers=1).parameters["tissue.foundation"].mesh_error
+        assert error is not None
+        return error
+
+    # From half the cells to so many the change is 1 or 3 errors.
+    assert told(1) == pytest.approx(told(2), rel=0.01)
 
 
 def test_side_by_side_and_one_after_another_give_the_same_bits(tracks: dict[str, Array]) -> None:
