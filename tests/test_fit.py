@@ -20,11 +20,13 @@ from taichi_msm.fitting.arguments import Method
 from taichi_msm.fitting.force_table import read_forces
 from taichi_msm.fitting.observations import Observations, read_observations
 from taichi_msm.fitting.parameters import make_parameters
-from taichi_msm.fitting.prediction import Job, Predictor, runnable
-from taichi_msm.fitting.rejection import by_signs
+from taichi_msm.fitting.prediction import Job, Predicted, Predictor, runnable
+from taichi_msm.fitting.rejection import by_pattern
 from taichi_msm.fitting.result import FitResult
+from taichi_msm.fitting.runs import Runs
 from taichi_msm.fitting.sight import seen_by_camera
 from taichi_msm.fitting.suspicions import MOVES, faults, moved
+from taichi_msm.fitting.uncertainty import Alike
 from taichi_msm.physics.deformed import on_surface, surface_weights, touched
 from taichi_msm.scene import Scene
 from taichi_msm.system import resources
@@ -197,6 +199,7 @@ def test_what_pictures_cannot_tell_is_named_and_a_force_tells_it(tracks: dict[st
     found = fit(start, tmp_path / "truth" / "tracks.npz", free, sigma=0.1, workers=1)
     assert not found.identifiable
     assert not any(one.identifiable for one in found.parameters.values())
+    assert all(one.mesh_error is None for one in found.parameters.values())
     (unseen,) = found.unseen
     assert unseen.parameters == free
     assert len(unseen.known) == 3
@@ -397,6 +400,25 @@ def test_the_points_move_what_is_found_about_as_far_as_is_said(device: Device) -
     # The finer scene has a sixteenth of the error left; half of so few points are too few to tell it closely.
     assert abs(one.value - 3e5) / 4 < one.mesh_error < 4 * abs(one.value - 3e5)
     assert any("the number of points moves tissue.foundation" in note for note in found.notes)
+
+
+def test_a_third_mesh_tells_the_order_of_the_mesh_error(
+    tracks: dict[str, Array], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def told(order: int) -> float:
+        def coarse(runs: Runs, x: Array, halvings: int) -> Predicted:
+            fine = runs.one(x)
+            assert fine is not None
+            off = 1e-3 * (2 ** (order * halvings) - 1)
+            return fine._replace(values=fine.values + off * (fine.values - tracks["pixel"][:, :1]))
+
+        monkeypatch.setattr(Runs, "coarse", coarse)
+        error = fit(changed(), tracks, ["tissue.foundation"], workers=1).parameters["tissue.foundation"].mesh_error
+        assert error is not None
+        return error
+
+    # From half the cells to so many the change is 1 or 3 errors.
+    assert told(1) == pytest.approx(told(2), rel=0.01)
 
 
 def test_side_by_side_and_one_after_another_give_the_same_bits(tracks: dict[str, Array]) -> None:
@@ -897,16 +919,43 @@ def test_a_scene_that_cannot_move_as_was_seen_is_rejected_first_of_all(tracks: d
     assert "rejected" not in right.summary()[0]
 
 
-def test_noise_is_not_taken_for_a_wrong_model() -> None:
-    """Also where neighbouring points are alike, some jump, and some were not seen."""
+@pytest.mark.parametrize("few", [False, True])
+def test_a_wrong_scene_is_rejected_by_what_is_left_alone(tracks: dict[str, Array], few: bool) -> None:
+    """By a wrong damping, also where two times tell nothing of time."""
+    seen = noisy(tracks, 0.02)
+    if few:
+        seen |= {"time": seen["time"][5:7], "pixel": seen["pixel"][:, 5:7]}
+    wrong = fit(changed(tissue__damping=600), seen, ["tissue.foundation"], workers=1)
+    assert wrong.summary()[0].startswith("the model is rejected: what is left of neighbouring points is alike")
+    assert not fit(changed(), seen, ["tissue.foundation"], workers=1).model_rejected
+
+
+def test_what_is_far_off_counts_in_full_for_the_rejection_of_a_robust_fit(tracks: dict[str, Array]) -> None:
+    seen = noisy(tracks, 0.1, sigma=0.1)
+    assert not fit(changed(), seen, ["tissue.foundation"], robust=True, workers=1).model_rejected
+    seen["pixel"][[7, 20]] += np.linspace(0, 40, 11)[:, None]
+    found = fit(changed(), seen, ["tissue.foundation"], robust=True, workers=1)
+    assert found.summary()[0].startswith("the model is rejected: chi-square of the plain residuals ")
+
+
+NOISE = [Alike(None, None), Alike(5.0, None), Alike(None, 1.0)]
+
+
+@pytest.mark.parametrize("alike", NOISE, ids=["independent", "alike in space", "alike in time"])
+def test_noise_is_not_taken_for_a_wrong_model(alike: Alike) -> None:
+    """Also where some jump, and some were not seen."""
     rng, wolves = np.random.default_rng(4), 0
-    for n in range(400):
-        left = rng.normal(0, 1, (30, 8 + n % 25, 2)) + (n % 2) * rng.normal(0, 2, (1, 8 + n % 25, 2))
+    times = np.arange(9.0)
+    for _ in range(400):
+        left = rng.normal(0, 1, (36, 9, 2))
+        left += 0 if alike.correlation is None else rng.normal(0, 2, (1, 9, 2))
+        left = left if alike.drift is None else np.cumsum(left, axis=1)
         left[rng.random(left.shape) < 0.05] *= 10
         left[rng.random(left.shape[:2]) < 0.1] = np.nan
-        times = np.arange(left.shape[1], dtype=float)
-        seen = Observations("", "pixel", times, np.zeros((30, 2)), left, None)
-        wolves += by_signs(seen, left, 10.0) is not None
+        wolves += by_pattern(Observations("", "pixel", times, PLACES, left, None), left, 10.0, alike) is not None
+    # Of 400, 0.4 are expected; more than 3 have a probability of 1e-3.
     assert wolves <= 3
-    wrong = np.sin(times / 6)[:, None] + rng.normal(0, 1, left.shape)
-    assert by_signs(Observations("", "pixel", times, np.zeros((30, 2)), wrong, None), wrong, 10.0) is not None
+    times = np.arange(40.0)
+    wrong = np.sin(times / 6)[:, None] + rng.normal(0, 1, (36, 40, 2))
+    seen = Observations("", "pixel", times, PLACES, wrong, None)
+    assert by_pattern(seen, wrong, 10.0, alike) is not None

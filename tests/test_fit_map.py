@@ -103,6 +103,17 @@ def test_the_map_comes_back_as_well_known_as_is_said(result: FitResult) -> None:
     assert not result.model_rejected
 
 
+def test_a_map_in_a_wrong_scene_is_rejected(device: Device) -> None:
+    """With forces 10 % too large, which no stiffness of the springs explains where the tissue rests on a foundation."""
+    observed = seen_in(scene(), device, np.ones((4, 4)), np.array([1.0, 2.0]), 3e-6)
+    louder = [one | {"total": [1.1 * each for each in one["total"]]} for one in scene().model_dump()["probes"]]
+    found = fit(scene(probes=louder), observed, ["tissue.map"], resolution=4)
+    assert found.model_rejected
+    assert found.summary()[0].startswith("the model is rejected: chi-square ")
+    assert found.summary()[0].endswith("; the errors of the fields do not cover this")
+    assert not fit(scene(), observed, ["tissue.map"], resolution=4).model_rejected
+
+
 def test_the_files_give_what_was_fitted(result: FitResult, folder: Path) -> None:
     assert result.map is not None
     written = load_scene(folder / "scene.yaml")

@@ -191,15 +191,17 @@ def _fit(runs: Runs, given: Scene, method: Method) -> FitResult:
 
 def _rejection(misfit: Misfit, solution: Solution, uncertain: Uncertainty, alike: Alike) -> str | None:
     """Return in words why the scene cannot move as was seen; None: it may."""
-    seen, said, forces = misfit.seen, None, uncertain.left[misfit.count[0] :]
-    # What is far off in a robust fit makes chi-square large in any case.
-    if seen.sigma is not None and not misfit.robust:
+    seen, forces = misfit.seen, uncertain.left[misfit.count[0] :]
+    # In a robust fit what is far off counts in full here, which is said.
+    plain = " of the plain residuals" if misfit.robust else ""
+    if seen.sigma is not None:
         total = float(uncertain.left @ uncertain.left)
-        said = rejection.by_chi_square(total, uncertain.freedom, uncertain.independent)
-    elif alike.drift is None:
-        said = rejection.by_signs(seen, solution.predicted.values - seen.values, misfit.motion)
-    if said is None and len(forces) and not misfit.robust:
-        said = rejection.by_chi_square(float(forces @ forces), len(forces), len(forces), "chi-square of the forces")
+        said = rejection.by_chi_square(total, uncertain.freedom, uncertain.independent, f"chi-square{plain}")
+    else:
+        said = rejection.by_pattern(seen, solution.predicted.values - seen.values, misfit.motion, alike)
+    if said is None and len(forces):
+        what = f"chi-square{plain} of the forces"
+        said = rejection.by_chi_square(float(forces @ forces), len(forces), len(forces), what)
     return said
 
 
