@@ -11,7 +11,7 @@ from __future__ import annotations
 import json
 import math
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from itertools import zip_longest
 from typing import Any, NamedTuple
 
@@ -33,15 +33,20 @@ COEFFICIENTS = re.compile(
 )
 WIDTH, HEIGHT = (re.compile(rf"(image|img|picture|frame|camera|cam)?{side}") for side in ("(width|w)", "(height|h)"))
 SIZE = re.compile(r"(image|img|picture|frame|camera|cam)?(size|resolution|res|dims?)")
-LENS = re.compile(r"model|(camera|cam|lens|distortion|dist|projection)(model|type)(name|type)?")
+LENS = re.compile(
+    r"(camera|cam|lens|distortion|dist|projection|calibration|calib)?(model|type)(name|type)?|lens|projection"
+)
+LENS_ALONE = re.compile(r"lens|type|projection")
 FISHEYE = re.compile(r"(is|use)?fisheye(model)?")
 XI = re.compile(r"xi")
+ROI = re.compile(r"roi")
 
 # Other keys that would change what a camera sees, unless they are empty or 0.
 BEARING = re.compile(
     r"(?!right(cameramat|distortioncoeffs)$).*(distort(?!ed)|distorsion|coef|radial|tangential|prism|fisheye|omni|mirror|polynom|skew).*|kc|[kps][1-6]|"
     r"(?!new|opt|right).*(cameramat|intrinsic).*|(image|img|picture|frame|camera|cam)?(shape|dimensions?)|"
-    r"(image|img|picture|frame|camera|cam)(size|resolution|width|height).*|alpha|beta|lambda|(lens|dist).*model.*"
+    r"(image|img|picture|frame|camera|cam)(size|resolution|width|height).*|alpha|beta|lambda|(lens|dist).*model.*|"
+    r"binning|scale(factor)?|undistort(ed)?|rectified|roi|crop(ped)?"
 )
 
 # Names of models of lenses, spelled like keys: whether the lens is OpenCV's fisheye; None: they do not tell.
@@ -50,6 +55,7 @@ MODELS = {
     **dict.fromkeys(("plumbbob", "rationalpolynomial", "rational", "radtan", "radialtangential", "opencv"), False),
     **dict.fromkeys(("equidistant", "equi", "fisheye", "opencvfisheye", "kannalabrandt", "kannalabrandt4"), True),
 }
+FLAGS = {**dict.fromkeys(("1", "true", "yes", "on"), True), **dict.fromkeys(("0", "false", "no", "off"), False)}
 UNBENT = ("none", "nodistortion", "undistorted")
 
 # OpenCV's numbers of coefficients: only the first of them are known here, the others must be 0.
@@ -62,15 +68,19 @@ LARGEST, SHORTEST = 1e6, 1e-3
 SAME = 1e-6
 
 # Matrices are nested two deep, in mappings three; deeper ones take any time to read.
-MAX_DEPTH = 20
+MAX_DEPTH, MAX_VALUES = 20, 200_000
 
 # Endings of the keys of two cameras, and how many names of keys an error shows.
-PAIRS, SHOWN_NAMES = (("1", "2"), ("l", "r")), 12
+PAIRS, SHOWN_NAMES = re.compile(r"left(.*)|(.*)(1|l|left)"), 12
 
 # Quaternions whose length is farther from 1 are no rotations.
 UNIT = 1e-3
 
 _REMEDY = "write camera_matrix: [fx, 0, cx, 0, fy, cy, 0, 0, 1], distortion_coefficients: [k1, k2, p1, p2]"
+
+
+class RepeatedError(Exception):
+    """A key that is given twice."""
 
 
 class CameraFileError(Exception):
@@ -116,6 +126,8 @@ def _is_fisheye(keys: _Keys, values: Sequence[float] | None) -> bool:
     said: dict[bool, str] = {}
     for name, value in keys.named(LENS).items():
         model = _folded(value)
+        if LENS_ALONE.fullmatch(_folded(name)) and model not in MODELS:
+            continue  # Of the device.
         if model in UNBENT and not any(values or ()):
             keys.has_no_distortion = True
         elif model not in MODELS:
@@ -123,8 +135,10 @@ def _is_fisheye(keys: _Keys, values: Sequence[float] | None) -> bool:
             raise CameraFileError(f"{keys.path}: {name}: {cut(str(value))} is not known; expected one of: {known}")
         elif (fisheye := MODELS[model]) is not None:
             said[fisheye] = name
-    for name in keys.named(FISHEYE):
-        said[any(keys.numbers(FISHEYE) or ())] = name
+    for name, value in keys.named(FISHEYE).items():
+        if (flag := _folded(value)) not in FLAGS:
+            raise CameraFileError(f"{keys.path}: {name}: {cut(str(value))} is neither true nor false")
+        said[FLAGS[flag]] = name
     if len(said) > 1:
         raise CameraFileError(f"{keys.path}: {said[True]} is a fisheye's, {said[False]} is not; keep the right one")
     if any(keys.numbers(XI) or ()):
@@ -149,7 +163,7 @@ def _size(keys: _Keys) -> tuple[int, int] | None:
         raise CameraFileError(f"{keys.path}: {said}")
     # ROS lets pictures be smaller than those that its camera matrix is of.
     data = {_folded(name): value for name, value in keys.data.items()}
-    region = data["roi"] if isinstance(data.get("roi"), dict) else {}
+    region = keys.read_mapping(ROI)
     cut_out = any(region.get(name) for name in ("x_offset", "y_offset"))
     cut_out |= region.get("width") not in (None, 0, *(size or ())[:1])
     if cut_out or any(data.get(name) not in (None, 0, 1) for name in ("binningx", "binningy")):
@@ -189,6 +203,13 @@ class _Keys:
                 raise CameraFileError(f"{self.path}: {first} and {other} are not the same; keep the right one")
         return numbers
 
+    def read_mapping(self, spelling: re.Pattern[str]) -> Mapping[str, Any]:
+        """Find the mapping whose key has a spelling; empty: there is none, and anything else is not understood."""
+        found = {name: each for name, each in self.data.items() if spelling.fullmatch(_folded(name))}
+        mappings = {name: each for name, each in found.items() if isinstance(each, dict)}
+        self._understood |= mappings.keys()
+        return next(iter(mappings.values()), {})
+
     def require_all_understood(self) -> None:
         """Make sure that no other key changes what the camera sees."""
         names = [name for name in self.data.keys() - self._understood if BEARING.fullmatch(_folded(name))]
@@ -214,7 +235,9 @@ def _foreign(data: Mapping[str, Any]) -> str:
     inner = [{_folded(name) for name in value} for value in data.values() if isinstance(value, dict)]
     if any("intrinsics" in keys and {"cameramodel", "distortioncoeffs"} & keys for keys in inner):
         return f"a camchain of Kalibr, which is not read; found {_listed(data)}"
-    if any(name[:-1] + second in folded for name in folded for first, second in PAIRS if name.endswith(first)):
+    others = {f"right{stem}" for name in folded if (found := PAIRS.fullmatch(name)) and (stem := found[1])}
+    others |= {f"{found[2]}{end}" for name in folded if (found := PAIRS.fullmatch(name)) for end in ("2", "r", "right")}
+    if any(name in others and len(_flat(value)) == 9 for name, value in folded.items()):
         return f"of a stereo pair, as OpenCV's stereoCalibrate and SCARED, which is not read; found {_listed(data)}"
     return f"has no camera matrix that is known; found {_listed(data)}"
 
@@ -227,10 +250,17 @@ def read_poses(path: str) -> tuple[tuple[float, ...], ...]:
     rows: list[tuple[float, ...]] = []
     columns = None
     for n, line in enumerate(_read(path).splitlines(), 1):
-        text, _, comment = line.strip().partition("#")
+        text, _, comment = line.strip().replace('"', "").partition("#")
+        if ";" in text:
+            text = text.replace(",", ".").replace(";", ",")  # As spreadsheets write where decimals have commas.
         words = text.replace(",", " ").split()
-        if not rows and (header := _header(text or comment, is_comment=not words)):
+        if (header := _header(text or comment, is_comment=not words)) and not rows:
             columns = _columns(f"{path}:{n}", header)
+        elif header and _columns(f"{path}:{n}", header) != (columns or TUM):
+            raise CameraFileError(f"{path}:{n}: other columns than before; write a file of one order")
+        elif not words and not header and (found := OTHER_ORDER.search(comment)):
+            said = f"a comment has {cut(found[0])}, which is not understood"
+            raise CameraFileError(f"{path}:{n}: {said}; name the columns in the first line: # {', '.join(ROLES)}")
         elif words:
             row = _row(f"{path}:{n}", words, columns, separated="," in text)
             if fault := pose_fault(row, rows[-1] if rows else None):
@@ -263,7 +293,18 @@ ROLES = {
     **{f"q{axis}": rf"{_TURN}[^a-z]*{axis}" for axis in "xyzw"},
 }
 UNIT_OF = re.compile(r"\s*[\[(]([^\])]*)[\])]|[^a-z](m?u?n?s|nsecs?)$")
-SECONDS = {"": 1.0, "s": 1.0, "sec": 1.0, "seconds": 1.0, "ms": 1e3, "us": 1e6, "ns": 1e9, "nsec": 1e9, "nsecs": 1e9}
+SECONDS = {
+    **dict.fromkeys(("", "s", "sec", "seconds"), 1.0),
+    **dict.fromkeys(("ms", "milliseconds"), 1e3),
+    **dict.fromkeys(("us", "\u00b5s", "\u03bcs", "microseconds"), 1e6),
+    **dict.fromkeys(("ns", "nsec", "nsecs", "nanoseconds"), 1e9),
+}
+
+# Comments on another order of a quaternion, or on the inverse of a pose.
+OTHER_ORDER = re.compile(
+    r"\bw[\s,]*x[\s,]*y[\s,]*z\b|scalar[\s-]*first|\bq_?0\b|world[\s-]*(to|2)[\s-]*cam\w*|\bw2c\b|\bT_?cw\b",
+    re.IGNORECASE,
+)
 
 
 def _header(text: str, *, is_comment: bool) -> list[str]:
@@ -300,7 +341,7 @@ def _row(place: str, words: Sequence[str], columns: _Columns | None, *, separate
     """Read a pose from the words of a line."""
     expected = columns or TUM
     try:
-        numbers = [float(word) for word in words]
+        numbers = [math.nan if "_" in word else float(word) for word in words]
     except ValueError:
         numbers = []
     if len(numbers) != expected.width or not all(abs(number) <= MOST for number in numbers):
@@ -308,6 +349,8 @@ def _row(place: str, words: Sequence[str], columns: _Columns | None, *, separate
         if expected.width != len(TUM.places):
             said = f"{expected.width} numbers up to {MOST:g}, one a column of the header"
         shape = SHAPES.get(len(words), "") if columns is None else ""
+        if columns is None and separated and len(words) != EUROC_WIDTH:
+            shape = "; numbers with decimal commas need ; between them"
         raise CameraFileError(f"{place}: not a pose{shape}; expected {said}")
     if separated and columns is None:
         said = "commas without a header, and w comes first in EuRoC's rows, last in TUM's"
@@ -316,11 +359,13 @@ def _row(place: str, words: Sequence[str], columns: _Columns | None, *, separate
     return (row[0] / expected.second, *row[1:])
 
 
+EUROC_WIDTH = 17
+
 # Rows of other formats by how many words they have.
 SHAPES = {
     10: ", but ten words, as in COLMAP's images.txt, which is not read",
     12: ", but twelve numbers, as KITTI's, which are not read",
-    17: ", but 17 numbers, as EuRoC's; keep their header",
+    EUROC_WIDTH: ", but 17 numbers, as EuRoC's; keep their header",
 }
 
 
@@ -354,12 +399,15 @@ def _parse(path: str, text: str) -> Mapping[str, Any]:
     """Parse YAML, XML or JSON into a mapping."""
     try:
         data = _xml(text) if text.lstrip().startswith("<") else _yaml(text)
+    except RepeatedError as error:
+        raise CameraFileError(f"{path}: {cut(str(error))} is given twice; keep the right one") from None
     except (
         ArithmeticError,
         AttributeError,
         LookupError,
         RecursionError,
         SyntaxError,
+        TypeError,
         ValueError,
         yaml.YAMLError,
     ) as error:
@@ -373,7 +421,8 @@ def _parse(path: str, text: str) -> Mapping[str, Any]:
                 said = f"{cut(str(error.problem)).partition(' for the ')[2]}: not plain YAML; write numbers and lists"
             raise CameraFileError(f"{path}{where}: {said}") from None
     if not isinstance(data, dict):
-        said = "has no keys; expected camera_matrix and distortion_coefficients"
+        what = "a list" if isinstance(data, list) else "no keys"
+        said = f"has {what}; expected camera_matrix and distortion_coefficients as keys"
         if _INI.match(text):
             said = f"an ini file, which is not read; {_REMEDY}, in YAML"
         elif _COLMAP.search(text):
@@ -389,19 +438,34 @@ _DIRECTIVE = re.compile(_COMMENTS + r"%YAML[^\n]*")
 _COLMAP = re.compile(r"^\d+ [A-Z_]+ \d+ \d+ [-+.\de]+ ", re.MULTILINE)
 
 
-class _Loader(yaml.SafeLoader):
-    """Reads OpenCV's matrices as mappings."""
+# The C parser is twenty times faster than PyYAML's own.
+_Fast: Any = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
+
+
+class _Loader(_Fast):  # type: ignore[misc]
+    """Reads OpenCV's matrices as mappings, and refuses keys given twice."""
 
 
 def _mapping(loader: _Loader, node: yaml.MappingNode) -> dict[Any, Any]:
-    return loader.construct_mapping(node, deep=True)
+    return _distinct([loader.construct_object(each, deep=True) for each in pair] for pair in node.value)
+
+
+def _distinct(pairs: Iterable[Sequence[Any]]) -> dict[Any, Any]:
+    """Make a mapping; RepeatedError: a key is given twice."""
+    found: dict[Any, Any] = {}
+    for name, value in pairs:
+        if name in found:
+            raise RepeatedError(name)
+        found[name] = value
+    return found
 
 
 def _sequence(loader: _Loader, node: yaml.SequenceNode) -> list[Any]:
     return loader.construct_sequence(node, deep=True)
 
 
-_Loader.add_constructor("tag:yaml.org,2002:opencv-matrix", _mapping)
+for _kind in ("opencv-matrix", "map"):
+    _Loader.add_constructor(f"tag:yaml.org,2002:{_kind}", _mapping)
 # Python's yaml writes tuples so.
 _Loader.add_constructor("tag:yaml.org,2002:python/tuple", _sequence)
 
@@ -409,13 +473,13 @@ _Loader.add_constructor("tag:yaml.org,2002:python/tuple", _sequence)
 def _yaml(text: str) -> Any:
     """Read YAML or JSON, also with OpenCV's first line, which is not YAML."""
     if text.lstrip().startswith("{"):
-        return json.loads(text)
+        return json.loads(text, object_pairs_hook=_distinct)
     text = _DIRECTIVE.sub(r"\1", text, count=1)
-    # Aliases of aliases take any time, as what is nested deeply, and no calibration has either.
+    # Aliases of aliases take any time, what is nested deeply or has many values a long one; no calibration has these.
     depth = 0
-    for event in yaml.parse(text):
+    for count, event in enumerate(yaml.parse(text, _Fast)):
         depth += isinstance(event, yaml.CollectionStartEvent) - isinstance(event, yaml.CollectionEndEvent)
-        if isinstance(event, yaml.AliasEvent) or depth > MAX_DEPTH:
+        if isinstance(event, yaml.AliasEvent) or depth > MAX_DEPTH or count > MAX_VALUES:
             raise ValueError
     # What ROS prints of a topic is a document for each message, and all are alike.
     return next(yaml.load_all(text, _Loader), None)
@@ -428,23 +492,24 @@ def _xml(text: str) -> dict[str, Any]:
     # Without declarations there are no entities, which could be expanded to any size.
     if "<!" in text.replace("<!--", ""):
         raise ValueError
-    found: dict[str, Any] = {}
+    pairs = []
     for element in ElementTree.fromstring(text):
         data = element.find("data")
         words = (element.text or "") if data is None else (data.text or "")
-        found[element.tag] = words.strip() if data is None else {"data": words.split()}
-    return found
+        pairs.append((element.tag, words.strip() if data is None else {"data": words.split()}))
+    return _distinct(pairs)
 
 
 def _numbers(path: str, name: str, value: Any) -> list[float]:
     """Read numbers, or the data of a matrix."""
     try:
-        numbers = [float(one) for one in _flat(value)]
+        numbers = [math.nan if isinstance(one, bool) else float(one) for one in _flat(value)]
     except (TypeError, ValueError, OverflowError):
         numbers = [math.nan]
     # Written so that NaN is found too.
     if not all(abs(number) <= LARGEST for number in numbers):
-        raise CameraFileError(f"{path}: {name}: not numbers up to {LARGEST:g}; write them as OpenCV does")
+        said = f"{cut(str(value))} is not a list of numbers up to {LARGEST:g}; write it as OpenCV does"
+        raise CameraFileError(f"{path}: {name}: {said}")
     return numbers
 
 

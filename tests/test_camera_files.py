@@ -10,12 +10,14 @@ import numpy as np
 import pytest
 
 from taichi_msm import load_scene
+from taichi_msm.camera_files import read_calibration
 from taichi_msm.errors import SceneError
 from taichi_msm.render.camera import view
 from taichi_msm.scene import Camera
 
 MATRIX = np.array([[61.5, 0, 19.25], [0, 60.5, 14.75], [0, 0, 1]])
 COEFFICIENTS = [-0.3, 0.1, 0.001, -0.002, 0.03]
+NO_LIST = "is not a list of numbers up to 1e+06; write it as OpenCV does"
 READ = "render.camera={eye: [0, 0, 0.4], calibration: FILE}"
 
 
@@ -142,7 +144,7 @@ def test_numbers_that_scaling_makes_too_large_are_refused(small: Path) -> None:
     ("text", "said"),
     [
         ("a: b: c", "camera.yml:1: neither YAML, XML nor JSON; name a calibration"),
-        ("- 1", "camera.yml: has no keys; expected camera_matrix and distortion_coefficients"),
+        ("- 1", "camera.yml: has a list; expected camera_matrix and distortion_coefficients as keys"),
         ("a: &a [1]\nb: *a", "camera.yml: neither YAML, XML nor JSON; name a calibration"),
         ('<!DOCTYPE a [<!ENTITY b "c">]><a/>', "camera.yml: neither YAML, XML nor JSON; name a calibration"),
         ("K: 3", "camera.yml: its camera matrix is not [fx, 0, cx, 0, fy, cy, 0, 0, 1]; write it like that"),
@@ -150,15 +152,21 @@ def test_numbers_that_scaling_makes_too_large_are_refused(small: Path) -> None:
             "K: [1, 0, 1, 0, 1, 1, 0, 0, 1]\nwidth: 0\nheight: 0",
             "camera.yml: of pictures of 0 x 0 pixels; write the size of those that were calibrated with",
         ),
-        ("K: [1, 0, 1e9, 0, 1, 1, 0, 0, 1]", "camera.yml: K: not numbers up to 1e+06; write them as OpenCV does"),
+        (
+            "K: [1, 0, 1e9, 0, 1, 1, 0, 0, 1]",
+            f"camera.yml: K: [1, 0, '1e9', 0, 1, 1, 0, 0, 1] {NO_LIST}",
+        ),
         (
             "f: 3",
             "camera.yml: has no camera matrix that is known; found f; write camera_matrix: [fx, 0, cx, 0, fy, cy, 0, "
             "0, 1], distortion_coefficients: [k1, k2, p1, p2]",
         ),
-        ("", "camera.yml: has no keys; expected camera_matrix and distortion_coefficients"),
+        ("", "camera.yml: has no keys; expected camera_matrix and distortion_coefficients as keys"),
         ('width: !!int ""', "camera.yml: neither YAML, XML nor JSON; name a calibration"),
-        (f"K: [1{400 * '0'}]", "camera.yml: K: not numbers up to 1e+06; write them as OpenCV does"),
+        (
+            f"K: [1{400 * '0'}]",
+            f"camera.yml: K: [1{58 * '0'}... is not a list of numbers up to 1e+06; write it as OpenCV does",
+        ),
         (
             "K: [1, 0, 1, 2, 1, 1, 0, 0, 1]",
             "camera.yml: its camera matrix is not [fx, 0, cx, 0, fy, cy, 0, 0, 1]; write it like that",
@@ -167,7 +175,7 @@ def test_numbers_that_scaling_makes_too_large_are_refused(small: Path) -> None:
             "K: [1, 0, 1, 0, 1, 1, 0, 0, 1]\nwidth: 40",
             "camera.yml: has only one of image_width and image_height; write both",
         ),
-        ("K: [x]", "camera.yml: K: not numbers up to 1e+06; write them as OpenCV does"),
+        ("K: [x]", "camera.yml: K: ['x'] is not a list of numbers up to 1e+06; write it as OpenCV does"),
         (
             "K: [1, 0, 1, 0, 1, 1, 0, 0, 1]\nD: [1, 2, 3]",
             "camera.yml: 3 distortion coefficients that are not known; expected k1, k2, p1, p2, k3, k4, k5, k6, and 0 "
@@ -301,7 +309,7 @@ REST = "write camera_matrix: [fx, 0, cx, 0, fy, cy, 0, 0, 1], distortion_coeffic
             "its focal length is 1e-300; write it in pixels, 0.001 or more",
         ),
         (
-            "M1: 3\nD1: 3\nM2: 3\nD2: 3",
+            "M1: [1, 0, 0, 0, 1, 0, 0, 0, 1]\nD1: 3\nM2: [1, 0, 0, 0, 1, 0, 0, 0, 1]\nD2: 3",
             "of a stereo pair, as OpenCV's stereoCalibrate and SCARED, which is not read; found M1, D1, M2, D2; "
             f"{REST}",
         ),
@@ -315,7 +323,7 @@ REST = "write camera_matrix: [fx, 0, cx, 0, fy, cy, 0, 0, 1], distortion_coeffic
             f"a cameras.txt of COLMAP, which is not read; {REST}, in YAML",
         ),
         ("K: " + 400 * "[" + 400 * "]", None),
-        ('{"K": ' + 600 * "[" + "1" + 600 * "]" + "}", "K: not numbers up to 1e+06; write them as OpenCV does"),
+        ('{"K": ' + 600 * "[" + "1" + 600 * "]" + "}", f"K: {60 * '['}... {NO_LIST}"),
         ("K: !!python/object:numpy.ndarray {}", None),
     ],
 )  # fmt: skip
@@ -398,6 +406,73 @@ def test_a_header_decides_on_the_columns(text: str, small: Path) -> None:
     Path("poses.txt").write_text(text)
     expected = load_scene("small.yaml", ["render.camera={poses: tum.txt}"])
     assert load_scene("small.yaml", ["render.camera={poses: poses.txt}"]) == expected
+
+
+@pytest.mark.parametrize("separator", [";", ","])
+def test_tables_of_spreadsheets_are_read(separator: str, small: Path) -> None:
+    decimal = "," if separator == ";" else "."
+    rows = TUM.partition("\n")[2].replace(".", decimal).replace(" ", separator)
+    Path("tum.txt").write_text(TUM)
+    Path("poses.txt").write_text(
+        separator.join(f'"{name}"' for name in ("t", "x", "y", "z", "qx", "qy", "qz", "qw")) + "\n" + rows
+    )
+    expected = load_scene("small.yaml", ["render.camera={poses: tum.txt}"])
+    assert load_scene("small.yaml", ["render.camera={poses: poses.txt}"]) == expected
+
+
+@pytest.mark.parametrize(
+    "comment",
+    [
+        *("t, position, quaternion (w, x, y, z)", "time, pos xyz, quat wxyz", "t x y z q0 q1 q2 q3"),
+        *("quaternion, scalar first", "world to camera", "T_cw"),
+    ],
+)
+def test_a_comment_on_another_order_is_refused(comment: str, small: Path) -> None:
+    Path("poses.txt").write_text(TUM.replace("# timestamp tx ty tz qx qy qz qw", f"# {comment}"))
+    with pytest.raises(SceneError, match=r"poses\.txt:1: a comment has .*, which is not understood; name the columns"):
+        load_scene("small.yaml", ["render.camera={poses: poses.txt}"])
+
+
+def test_columns_stay_as_they_are(small: Path) -> None:
+    Path("poses.txt").write_text(f"{TUM}# t tx ty tz qw qx qy qz\n")
+    with pytest.raises(SceneError, match=r"poses\.txt:5: other columns than before"):
+        load_scene("small.yaml", ["render.camera={poses: poses.txt}"])
+
+
+@pytest.mark.parametrize("key", ["lens", "type", "projection", "calibration_model", "model_name", "fisheye"])
+def test_any_key_may_name_the_lens(key: str, small: Path) -> None:
+    Path("camera.yml").write_text(f"{K}D: [0.1, 0, 0, 0]\n{key}: {'true' if key == 'fisheye' else 'fisheye'}\n")
+    assert read_calibration("camera.yml").fisheye
+
+
+def test_the_name_of_a_device_is_no_lens(small: Path) -> None:
+    Path("camera.yml").write_text(f"{K}D: [0.1, 0, 0, 0]\nlens: 25 mm\ntype: endoscope\n")
+    assert not read_calibration("camera.yml").fisheye
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "dist: [0, 0, 0, 0]\ndist: [1, 0, 0, 0]\n" + K,
+        '{"dist": [0, 0, 0, 0], "dist": [1, 0, 0, 0], "K": [1, 0, 0, 0, 1, 0, 0, 0, 1]}',
+        "<a><K><data>1 0 0 0 1 0 0 0 1</data></K><dist>0</dist><dist>1</dist></a>",
+    ],
+)
+def test_a_key_given_twice_is_refused(text: str, small: Path) -> None:
+    Path("camera.yml").write_text(text)
+    assert refused("camera.yml") == "calibration: camera.yml: dist is given twice; keep the right one"
+
+
+@pytest.mark.parametrize("line", ["roi: [10, 10, 40, 40]", "binning: 2", "scale: 0.5", "undistorted: true", "crop: 1"])
+def test_pictures_that_were_changed_are_refused(line: str, small: Path) -> None:
+    Path("camera.yml").write_text(f"{K}D: [0.1, 0, 0, 0]\n{line}\n")
+    assert f"{line.partition(':')[0]}: not understood, and may change what the camera sees" in refused("camera.yml")
+
+
+@pytest.mark.parametrize("line", [f"x: [{'1,' * 300_000}]", "? [1, 2]\n: 3"])
+def test_many_values_and_keys_that_are_no_text_are_refused(line: str, small: Path) -> None:
+    Path("camera.yml").write_text(f"{K}D: [0.1, 0, 0, 0]\n{line}\n")
+    assert "neither YAML, XML nor JSON" in refused("camera.yml")
 
 
 @pytest.mark.parametrize(
