@@ -606,7 +606,9 @@ def test_a_file_that_is_none_is_refused(small: Path, program: Program, text: byt
         ("", "is empty; name a forces.csv"),
         (FORCES, "no row; name a forces.csv"),
         (FORCES + "0.1,0,,,\n", "no force; name a forces.csv"),
-        (FORCES + ",,,,\n", "a row without a time; name a forces.csv"),
+        (FORCES + ",,,,\n", "no row; name a forces.csv"),
+        (FORCES + ",0,0,0,1\n", "a row without a time; name a forces.csv"),
+        (FORCES.replace(",", " "), "time: missing; found time probe force_x f; name a forces.csv"),
     ],
 )
 def test_a_table_without_forces_is_refused(tracks: dict[str, Array], tmp_path: Path, text: str, message: str) -> None:
@@ -625,8 +627,9 @@ def test_a_table_without_forces_is_refused(tracks: dict[str, Array], tmp_path: P
         b'# a rig\n"time","probe","force_x","force_y","force_z"\ns,-,N,N,N\n# it begins\n"0.1","0","","","-0.5"\n',
         b"time [s];probe;force_x [N];force_y [N];force_z [N]\n0,1;0;;;-0,5\n",
         b"# time,probe,force_x,force_y,force_z\n0.1,0,,,-0.5\n",
+        b"sep=;\nA rig; of a lab\nTime;Probe;Force_X;Force_Y;Force_Z\n[s];[-];[N];[N];[N]\n0,1;0;;;-0,5\n% end\n;;;;\n",
     ],
-    ids=["mark", "utf-16", "minus", "quotes, units, comments", "decimal commas", "commented header"],
+    ids=["mark", "utf-16", "minus", "quotes, units, comments", "decimal commas", "commented header", "titles"],
 )
 def test_tables_of_other_programs_are_understood(tmp_path: Path, data: bytes) -> None:
     (tmp_path / "forces.csv").write_bytes(data)
@@ -642,12 +645,28 @@ def test_tables_of_other_programs_are_understood(tmp_path: Path, data: bytes) ->
         ("0.1,0,n/a,0,0", ":3: force_x: 'n/a'; take"),
         ("0.1,0,0,inf,0", ":3: force_y: 'inf'; take"),
         ("0.1,0,0,1e308,0", ":3: force_y: '1e308'; take"),
+        ('"0,1",0,0,0,0', ":3: time: '0,1'; take a number, or with decimal commas, separate cells by ;"),
+        ("0,0,0,0,1", ":3: a second row of 0 s and probe 0; leave one"),
         ("0,1,0,0,0,0,0,-0,5", ":3: 9 cells, and 5 columns; with decimal commas, separate cells by ;"),
     ],
 )
 def test_a_cell_that_is_no_number_is_refused(tmp_path: Path, row: str, message: str) -> None:
     (tmp_path / "forces.csv").write_text(f"{FORCES}0,0,0,0,0\n{row}\n")
     with pytest.raises(SceneError, match=message):
+        read_forces(tmp_path / "forces.csv", 0.1, 1)
+
+
+def test_one_file_has_one_decimal_mark(tmp_path: Path) -> None:
+    """A German -1.234 is a thousand times as much."""
+    (tmp_path / "forces.csv").write_text(FORCES.replace(",", ";") + "0,2;0;0;0;-1.234\n")
+    with pytest.raises(SceneError, match=r":2: force_z: '-1\.234'; both \. and , are decimal marks"):
+        read_forces(tmp_path / "forces.csv", 0.1, 1)
+
+
+@pytest.mark.parametrize("data", [b"PK\x03\x04", FORCES.encode("utf-16-le")], ids=["workbook", "no mark"])
+def test_a_file_that_is_no_text_is_named(tmp_path: Path, data: bytes) -> None:
+    (tmp_path / "forces.csv").write_bytes(data)
+    with pytest.raises(SceneError, match="a workbook, or UTF-16 without a byte order mark; save it as CSV in UTF-8"):
         read_forces(tmp_path / "forces.csv", 0.1, 1)
 
 
@@ -719,8 +738,9 @@ def test_what_is_visible_is_seen(tracks: dict[str, Array]) -> None:
     np.testing.assert_array_equal(read_observations({**tracks, "visible": visible}, 25).there, visible)
     with pytest.raises(SceneError, match="observed: visible: float64 of shape"):
         read_observations({**tracks, "visible": 0.9 * visible}, 25)
-    with pytest.raises(SceneError, match="observed: 'validity': not understood; take NaN"):
-        read_observations({**tracks, "validity": visible}, 25)
+    for name in ("validity", "status"):
+        with pytest.raises(SceneError, match=f"observed: '{name}': not understood; take NaN"):
+            read_observations({**tracks, name: visible}, 25)
 
 
 def test_conventions_of_other_programs_are_asked_about(tracks: dict[str, Array]) -> None:
@@ -728,7 +748,7 @@ def test_conventions_of_other_programs_are_asked_about(tracks: dict[str, Array])
         return "\n".join(faults(read_observations({**tracks, **more}, 25), changed(), 2))
 
     assert answer() == ""
-    for mark in (0, -1):
+    for mark in (0, -1, -9999):
         pixel = tracks["pixel"].copy()
         pixel[3, 4:] = mark
         assert f"pixel: {mark} in all numbers of 7 points and times; are they lost points? take NaN" in answer(

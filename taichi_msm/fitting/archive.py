@@ -17,7 +17,22 @@ NEEDS = "time (T,), coordinates (N, 2) and position (N, T, 3) or pixel (N, T, 2)
 MEMBERS = ("time", "coordinates", "position", "pixel", "sigma", "points", "occluded", "visible")
 
 # Arrays with such words in their names bear on what was seen.
-BEARING = ("visib", "occlu", "mask", "valid", "missing", "lost", "weight", "confid", "sigma", "std", "unit", "scale")
+BEARING = (
+    "visib",
+    "occlu",
+    "mask",
+    "valid",
+    "missing",
+    "lost",
+    "status",
+    "score",
+    "weight",
+    "confid",
+    "sigma",
+    "std",
+    "unit",
+    "scale",
+)
 
 
 def read_archive(name: str) -> dict[str, NDArray[Any]]:

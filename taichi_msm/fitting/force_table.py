@@ -48,7 +48,7 @@ def read_forces(path: str | Path, sigma: float, probes: int) -> Forces:
         raise SceneError([f"--forces {name},{sigma:g}: take a number above 0, the standard deviation in newtons"])
     if not (text := _text(name)).strip():
         raise SceneError([f"{name}: is empty; {EXPECTED}"])
-    table = np.array(_rows(name, text), np.float64).reshape(-1, len(COLUMNS))
+    table = np.array(_Reader(name, text).rows(), np.float64).reshape(-1, len(COLUMNS))
     time, probe, force = table[:, 0], table[:, 1], table[:, 2:]
     if not (np.isfinite(force).any() and np.isfinite(time).all()):
         what = "no row" if not len(time) else "no force" if np.isfinite(time).all() else "a row without a time"
@@ -64,6 +64,10 @@ def _text(name: str) -> str:
         if not (reason := irregular(Path(name))):
             if (size := Path(name).stat().st_size) <= MOST_BYTES:
                 data = Path(name).read_bytes()
+                if data.startswith(b"PK") or (b"\0" in data and data[:2] not in MARKS):
+                    raise SceneError(
+                        [f"{name}: a workbook, or UTF-16 without a byte order mark; save it as CSV in UTF-8"]
+                    )
                 return data.decode(MARKS.get(data[:2], "utf-8-sig"))
             reason = f"{size / 1e6:.0f} MB, more than the {MOST_BYTES / 1e6:.0f} MB of a table"
     except UnicodeDecodeError as error:
@@ -75,40 +79,72 @@ def _text(name: str) -> str:
     raise SceneError([f"{name}: {reason}; {EXPECTED}"])
 
 
-def _rows(name: str, text: str) -> list[list[float]]:
-    """Return the numbers of each row in the order of the columns."""
-    lines = text.splitlines()
-    start = next((line for line in lines if set(COLUMNS) <= set(re.findall(r"\w+", line))), lines[0])
-    delimiter = next((mark for mark in ";\t" if mark in start), ",")
-    reader = csv.reader(lines, delimiter=delimiter, skipinitialspace=True)
-    header: list[str] = []
-    rows: list[list[float]] = []
-    try:
-        for cells in reader:
-            where = f"{name}:{reader.line_num}"
-            is_header = not header and lines[reader.line_num - 1] == start
-            if not cells or (cells[0].startswith("#") and not is_header):
-                continue
-            if not header:
-                header = _header(where, [cell.lstrip("#").strip() for cell in cells])
-            elif len(cells) < len(header) or any(cells[len(header) :]):
-                remedy = "with decimal commas, separate cells by ;" if delimiter == "," else "give a cell a column"
-                raise SceneError([f"{where}: {len(cells)} cells, and {len(header)} columns; {remedy}"])
-            else:
-                named = {key: cells[header.index(key)].strip() for key in COLUMNS}
-                if rows or not _is_units(where, named):
-                    rows.append([_number(where, key, cell, delimiter) for key, cell in named.items()])
-    except csv.Error as error:
-        raise SceneError([f"{name}:{reader.line_num}: {error}; {EXPECTED}"]) from None
-    return rows
+class _Reader:
+    """Reads the rows of a table, whose separator and decimal mark are those of its program."""
+
+    def __init__(self, name: str, text: str) -> None:
+        self._name, lines = name, text.splitlines()
+        # Other lines may stand before the header.
+        known = (n for n, line in enumerate(lines) if set(COLUMNS) <= set(re.findall(r"\w+", line.lower())))
+        self._first = next(known, 0)
+        self._lines = lines[self._first :]
+        self._delimiter = next((mark for mark in ";\t" if mark in self._lines[0]), ",")
+        self._decimal = ""  # the mark that was found
+        self._seen: set[tuple[str, str]] = set()
+
+    def rows(self) -> list[list[float]]:
+        """Return the numbers of each row in the order of the columns."""
+        reader = csv.reader(self._lines, delimiter=self._delimiter, skipinitialspace=True)
+        rows: list[list[float]] = []
+        try:
+            header = _header(f"{self._name}:{self._first + 1}", [cell.lstrip("#% ").strip() for cell in next(reader)])
+            for cells in reader:
+                if any(map(str.strip, cells)) and not cells[0].startswith(("#", "%")):
+                    rows += self._row(f"{self._name}:{self._first + reader.line_num}", header, cells, first=not rows)
+        except csv.Error as error:
+            raise SceneError([f"{self._name}:{self._first + reader.line_num}: {error}; {EXPECTED}"]) from None
+        return rows
+
+    def _row(self, where: str, header: list[str], cells: list[str], *, first: bool) -> list[list[float]]:
+        """Return the numbers of a row, in a list; it is empty for a row of units."""
+        if len(cells) < len(header) or any(cells[len(header) :]):
+            remedy = "with decimal commas, separate cells by ;" if self._delimiter == "," else "give a cell a column"
+            raise SceneError([f"{where}: {len(cells)} cells, and {len(header)} columns; {remedy}"])
+        named = {key: cells[header.index(key)].strip() for key in COLUMNS}
+        if first and _is_units(where, named):
+            return []
+        if (moment := (named["time"], named["probe"])) in self._seen:
+            raise SceneError([f"{where}: a second row of {moment[0]} s and probe {moment[1]}; leave one"])
+        self._seen.add(moment)
+        return [[self._number(where, key, cell) for key, cell in named.items()]]
+
+    def _number(self, where: str, key: str, cell: str) -> float:
+        """Return the number of a cell, NaN of an empty one."""
+        if cell.lower() in ("", "nan"):
+            return math.nan
+        plain, said = cell.replace("\N{MINUS SIGN}", "-"), "leave the cell empty where nothing was measured"
+        for mark in {*plain} & {*",."} if self._delimiter != "," else ():
+            if self._decimal not in ("", mark):
+                raise SceneError(
+                    [f"{where}: {key}: {cell[:40]!r}; both . and , are decimal marks in this file; take one"]
+                )
+            self._decimal = mark
+            plain = plain.replace(",", ".", 1)
+        if "," in plain:
+            said = "with decimal commas, separate cells by ;"
+        if not (NUMBER.fullmatch(plain) and abs(value := float(plain)) <= LARGEST):
+            raise SceneError([f"{where}: {key}: {cell[:40]!r}; take a number, or {said}"])
+        return value
 
 
 def _header(where: str, cells: list[str]) -> list[str]:
     """Return the names of the columns without their units; SceneError: one is missing, repeated or of another unit."""
     split = [re.fullmatch(r"(.*?)\s*[\[(](.*)[\])]", cell) for cell in cells]
     names = [cell if found is None else found[1] for cell, found in zip(cells, split, strict=True)]
+    names = [name.lower() for name in names]
     if missing := [key for key in COLUMNS if key not in names]:
-        raise SceneError([f"{where.rpartition(':')[0]}: {missing[0]}: missing; {EXPECTED}"])
+        listed = ", ".join(name[:20] for name in names[:12])
+        raise SceneError([f"{where.rpartition(':')[0]}: {missing[0]}: missing; found {listed}; {EXPECTED}"])
     if twice := [key for key in COLUMNS if names.count(key) > 1]:
         raise SceneError([f"{where}: {twice[0]}: {names.count(twice[0])} columns of this name; leave one"])
     for key, found in zip(names, split, strict=True):
@@ -119,9 +155,10 @@ def _header(where: str, cells: list[str]) -> list[str]:
 
 def _is_units(where: str, named: dict[str, str]) -> bool:
     """Check whether a row has units in place of numbers; SceneError: units other than those of the columns."""
-    if not (named["time"].isalpha() and named["time"].lower() != "nan"):
+    units = {key: cell.strip("[]() ") for key, cell in named.items()}
+    if not (units["time"].isalpha() and units["time"].lower() != "nan"):
         return False
-    for key, unit in named.items():
+    for key, unit in units.items():
         _check_unit(where, key, unit)
     return True
 
@@ -129,16 +166,3 @@ def _is_units(where: str, named: dict[str, str]) -> bool:
 def _check_unit(where: str, key: str, unit: str) -> None:
     if key in COLUMNS and unit not in (COLUMNS[key], "", "-", "1"):
         raise SceneError([f"{where}: {key}: unit {unit!r}; give seconds and newtons"])
-
-
-def _number(where: str, key: str, cell: str, delimiter: str) -> float:
-    """Return the number of a cell, NaN of an empty one."""
-    if cell.lower() in ("", "nan"):
-        return math.nan
-    plain = cell.replace("\N{MINUS SIGN}", "-")
-    if delimiter != ",":
-        plain = plain.replace(",", ".", 1)
-    if not (NUMBER.fullmatch(plain) and abs(value := float(plain)) <= LARGEST):
-        said = "take a number, or leave the cell empty where nothing was measured"
-        raise SceneError([f"{where}: {key}: {cell[:40]!r}; {said}"])
-    return value

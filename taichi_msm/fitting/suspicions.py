@@ -175,10 +175,11 @@ def _lost(seen: Observations, scene: Scene) -> Iterator[str]:
     """Find numbers that stand for points that were lost, and fractions of the frame in place of pixels."""
     rest = seen_at_rest(scene, seen)
     least = ASTRAY if seen.kind == "pixel" else ASIDE * max(scene.sheet.size)
-    for mark in (0, -1):
-        far = ~(np.linalg.norm(rest - mark, axis=-1) < least)
-        if number := int(((seen.values == mark).all(axis=2) & far).sum()):
-            said = f"{mark} in all numbers of {number} points and times; are they lost points? take NaN for them"
+    alike = (seen.values == seen.values[..., :1]).all(axis=2)
+    alike &= ~(np.linalg.norm(rest - seen.values[..., :1], axis=-1) < least)
+    for mark, number in zip(*np.unique(seen.values[alike][:, 0], return_counts=True), strict=True):
+        if mark in (0, -1) or number > 1:
+            said = f"{mark:g} in all numbers of {number} points and times; are they lost points? take NaN for them"
             yield f"{seen.name}: {seen.kind}: {said}"
             return
     if seen.kind == "pixel" and np.nanmax(np.abs(seen.values)) <= FRACTION < ASTRAY < np.nan_to_num(np.abs(rest)).max():
