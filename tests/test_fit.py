@@ -842,7 +842,8 @@ def test_points_that_the_camera_does_not_see_have_no_part_in_a_correlation(motio
 
 def test_points_behind_the_eye_are_refused_where_they_were_seen(motion: Array, device: Device) -> None:
     scene, seen = near_the_sheet(motion, device)
-    seen["pixel"][np.isnan(seen["pixel"])] = 100
+    unseen = np.isnan(seen["pixel"])
+    seen["pixel"][unseen] = np.arange(unseen.sum())
     with pytest.raises(SceneError, match="pixel: 12 of the points that were seen are behind the eye") as caught:
         fit(scene, seen, ["tissue.young"], workers=1)
     assert len(caught.value.lines) == 1

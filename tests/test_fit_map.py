@@ -3,8 +3,11 @@
 from __future__ import annotations
 
 import json
+import signal
+import subprocess
 from collections.abc import Iterator
 from pathlib import Path
+from time import sleep
 from typing import Any
 
 import numpy as np
@@ -27,6 +30,7 @@ from taichi_msm.scenefile.validation import checked
 from taichi_msm.system import resources
 from taichi_msm.system.runtime import Device
 from tests.conftest import Program
+from tests.telling import Telling
 
 Array = NDArray[np.float64]
 
@@ -211,7 +215,7 @@ def test_the_mesh_error_is_that_of_the_map_that_was_found(result: FitResult, fol
 
 def test_points_behind_the_eye_are_refused(device: Device) -> None:
     low = scene(render={"camera": {"eye": [0, -0.02, 0.01], "target": [0, 0.05, 0]}})
-    pixel = np.full((len(PLACES), 1, 2), 100.0)
+    pixel = np.arange(2.0 * len(PLACES)).reshape(-1, 1, 2)
     seen = {"time": [1.0], "coordinates": PLACES, "pixel": pixel, "sigma": 1.0}
     with pytest.raises(SceneError, match="of the points that were seen are behind the eye of the scene's camera"):
         fit(low, seen, ["tissue.map"], resolution=2)
@@ -314,3 +318,22 @@ def test_bounds_that_no_tissue_reaches_are_refused() -> None:
     seen = {"time": [1.0], "coordinates": PLACES, "position": np.zeros((len(PLACES), 1, 3)), "sigma": 1e-5}
     with pytest.raises(SceneError, match=r"--bounds tissue.map=0.1,1e\+300: take factors of young from 1e-06"):
         fit(scene(), seen, ["tissue.map"], resolution=4, bounds={"tissue.map": (0.1, 1e300)})
+
+
+def test_ctrl_c_stops_a_map_in_the_middle_of_a_run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Of which one takes minutes."""
+    monkeypatch.chdir(tmp_path)
+    data = scene().model_dump(mode="json", exclude_none=True)
+    tissue = data["tissue"] | {"density": 1050, "damping": 50}
+    sheet, time = data["sheet"] | {"points": [65, 65]}, {"duration": 400, "frames_per_second": 1}
+    Path("scene.yaml").write_text(json.dumps(data | {"tissue": tissue, "sheet": sheet, "time": time}))
+    rest = np.pad((PLACES - 0.5) * [0.1, -0.1], ((0, 0), (0, 1)))
+    seen = np.random.default_rng(0).normal(rest, 1e-5, (2, len(PLACES), 3)).swapaxes(0, 1)
+    np.savez("seen.npz", time=[1.0, 2.0], coordinates=PLACES, position=seen)
+    command = ["fit", "scene.yaml", "seen.npz", "--free", "tissue.map", "--resolution", "4", "--sigma", "1e-6"]
+    with Telling(*command, stderr=subprocess.PIPE) as process:
+        process.until("fit")
+        sleep(2)
+        process.send_signal(signal.SIGINT)
+        _, error = process.communicate(timeout=20)
+    assert (process.returncode, error.splitlines()[-1]) == (130, "interrupted; nothing was written")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copy
+import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from operator import attrgetter
@@ -427,6 +428,62 @@ def test_a_loss_that_returns_something_else(
 ) -> None:
     with pytest.raises(ArgumentError, match=message):
         gradient(described("tissue", image), returned, threads=device.threads)
+
+
+@pytest.mark.parametrize("kind", ["motion", "rest"])
+def test_a_gradient_for_which_there_is_no_memory(
+    kind: str, image: str, device: Device, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    scene = Scene.model_validate(REST if kind == "rest" else described("tissue", image))
+    monkeypatch.setattr("taichi_msm.physics.adjoint.available_memory", lambda: 1000)
+    with pytest.raises(SceneError, match=r"GiB of memory, and .* is free; take fewer points"):
+        Adjoint(plan_of(scene), device)
+
+
+@pytest.mark.parametrize("kind", ["motion", "rest"])
+def test_what_a_pause_raises_stops_there(kind: str, image: str, device: Device) -> None:
+    adjoint = Adjoint(plan_of(Scene.model_validate(REST if kind == "rest" else described("tissue", image))), device)
+    slope = loss(adjoint.run())[1]
+    before = adjoint.backward(slope).maps["tissue.map"]
+
+    def stop() -> None:
+        raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        adjoint.run(pause=stop)
+    slope = loss(adjoint.run())[1]
+    with pytest.raises(KeyboardInterrupt):
+        adjoint.backward(slope, stop)
+    assert (adjoint.backward(slope).maps["tissue.map"] == before).all()
+
+
+def test_a_pause_follows_every_launch(image: str, device: Device, monkeypatch: pytest.MonkeyPatch) -> None:
+    adjoint, launch = Adjoint(plan_of(Scene.model_validate(described("tissue", image))), device), MotionAdjoint._launch
+    slope = loss(adjoint.run())[1]
+    launches: list[int] = []
+    pauses: list[int] = []
+
+    def counted(*arguments: Any) -> None:
+        launches.append(1)
+        launch(*arguments)
+
+    monkeypatch.setattr(MotionAdjoint, "_launch", counted)
+    adjoint.backward(slope, lambda: pauses.append(1))
+    assert len(pauses) == len(launches) > 2
+
+
+def test_a_solution_that_takes_long_is_left_behind(device: Device, monkeypatch: pytest.MonkeyPatch) -> None:
+    adjoint, pauses = Adjoint(plan_of(Scene.model_validate(REST)), device), []
+    slope = loss(adjoint.run())[1]
+    monkeypatch.setattr(adjoint_rest, "_solved", lambda *_: time.sleep(20))
+
+    def stop() -> None:
+        pauses.append(1)
+        if len(pauses) == 3:
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        adjoint.backward(slope, stop)
 
 
 def test_factors_that_cannot_be(image: str, device: Device) -> None:

@@ -125,12 +125,13 @@ def fit_map(given: Scene, seen: Observations, task: MapTask, image: str, progres
 
     search: Search | None = None
     tell()
-    points = _first(adjoint, sight, fields, start, seen, given)
+    position = adjoint.run(fields.factors(start), tell)
+    points = _first(position, sight, seen, given)
     by_points = 0.0
     if (half := coarser(plan)) is not None:
         few = Fields(task.resolution, _cells(half)).factors(start)
         other = Sight(half.scene, seen, half.grid.frames + 1)
-        moved = other.points(Adjoint(half, device).run(few))
+        moved = other.points(Adjoint(half, device).run(few, tell))
         apart = (other.seen(moved) - sight.seen(points))[seen.known] / RICHARDSON
         by_points = float(np.sqrt(np.nanmean(apart**2)))
     sigma = math.hypot(seen.sigma, by_points)
@@ -181,9 +182,8 @@ def _unusable(seen: Observations, scene: Scene, task: MapTask) -> Iterator[str]:
     yield from faults(seen, scene, task.resolution**2)
 
 
-def _first(adjoint: Adjoint, sight: Sight, fields: Fields, start: Array, seen: Observations, given: Scene) -> Array:
+def _first(position: Array, sight: Sight, seen: Observations, given: Scene) -> Array:
     """Give where the points are at the start [m], shape (N, T, 3); SceneError: what was seen is beside that."""
-    position = adjoint.run(fields.factors(start))
     at_frames = np.array([sight.on_sheet(frame) for frame in position])
     points = sight.at_times(at_frames)
     first = Predicted(sight.seen(points), np.empty((0, 3)), 0, sight.motion(at_frames))

@@ -116,7 +116,7 @@ class Search:
         sigma: the standard deviation of its errors, with those of the model [m] or [px].
         fields: of the map.
         limits: of the logs of the factors.
-        tell: called before every run; what it raises stops the search.
+        tell: called some times a second; what it raises stops the search.
 
     Attributes:
         runs: how many there were.
@@ -141,7 +141,7 @@ class Search:
         """Give where the points are with a map [m], shape (N, T, 3), and what is seen of them."""
         self._tell()
         self.runs += 1
-        points = self._sight.points(self._adjoint.run(self._fields.factors(x)))
+        points = self._sight.points(self._adjoint.run(self._fields.factors(x), self._tell))
         predicted = self._sight.seen(points)
         if not np.isfinite(predicted[self._seen.known]).all():
             said = "a point that was seen gets behind the eye of the camera with some maps"
@@ -152,7 +152,7 @@ class Search:
         """Give chi-square and its derivative by x."""
         points, predicted = self.predict(x)
         left = np.where(self._seen.known, predicted - self._seen.values, 0.0) / self._sigma
-        slope = self._adjoint.backward(self._sight.backward(points, 2 * left / self._sigma))
+        slope = self._adjoint.backward(self._sight.backward(points, 2 * left / self._sigma), self._tell)
         return float((left**2).sum()), self._fields.backward(x, slope.maps["tissue.map"])
 
     def best(self, start: Array) -> Solution:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 
 import numpy as np
@@ -9,15 +10,23 @@ from numpy.typing import NDArray
 
 from taichi_msm.arguments import are_numbers, as_array
 from taichi_msm.errors import ArgumentError, MsmError, SceneError
-from taichi_msm.physics.adjoint_motion import MotionAdjoint
+from taichi_msm.physics.adjoint_motion import MotionAdjoint, motion_bytes
 from taichi_msm.physics.adjoint_rest import RestAdjoint
 from taichi_msm.physics.lattice import rest_positions
 from taichi_msm.physics.plan import Plan
 from taichi_msm.physics.planning import stable_step
 from taichi_msm.physics.slopes import Derivatives, derivatives
+from taichi_msm.progress import Pause
+from taichi_msm.system.resources import available_memory
 from taichi_msm.system.runtime import Device
 
 Array = NDArray[np.float64]
+
+# Arrays of the positions of every frame at one time: displacements, positions, the loss's derivative, and their copies.
+FRAME_COPIES = 4
+
+# Bytes per point of a sparse solution at rest: 10,400 were measured with 81 x 81 points, 13,600 with 161 x 161.
+SOLUTION_BYTES = 14_000
 
 
 def require_differentiable(plan: Plan) -> None:
@@ -34,6 +43,19 @@ def mapped(plan: Plan) -> Plan:
     return replace(plan.with_grid(precision="f64"), material=replace(material, factors=factors))
 
 
+def _require_memory(plan: Plan) -> None:
+    """Raise SceneError unless the adjoint and the positions of every frame, of which there are some copies, fit."""
+    frames, points = plan.grid.frames + 1, math.prod(plan.scene.sheet.points)
+    needed = FRAME_COPIES * 3 * 8 * frames * points
+    needed += SOLUTION_BYTES * points if plan.scene.time.at_rest else motion_bytes(plan)
+    if needed > (free := available_memory()):
+        raise SceneError([
+            f"a gradient by {points} points in {frames} frames and {plan.grid.steps} steps takes about "
+            f"{needed / 2**30:.3g} GiB of memory, and {free / 2**30:.3g} GiB is free; take fewer points, or a shorter "
+            "time.duration"
+        ])  # fmt: skip
+
+
 class Adjoint:
     """A compiled sheet that is run and differentiated any number of times, in f64; a map of its stiffness may change.
 
@@ -43,12 +65,13 @@ class Adjoint:
         cores: number of cores that it may use; None: all.
 
     Raises:
-        SceneError: when a probe has a path.
+        SceneError: when a probe has a path, or the memory does not suffice.
     """
 
     def __init__(self, plan: Plan, device: Device, cores: int | None = None) -> None:
         require_differentiable(plan)
         self._plan = mapped(plan)
+        _require_memory(self._plan)
         self._sheet: MotionAdjoint | RestAdjoint
         if plan.scene.time.at_rest:
             self._sheet = RestAdjoint(self._plan, device)
@@ -56,11 +79,12 @@ class Adjoint:
             self._sheet = MotionAdjoint(self._plan, device, cores=cores)
         self._ran = False
 
-    def run(self, factors: Array | None = None) -> Array:
+    def run(self, factors: Array | None = None, pause: Pause = lambda: None) -> Array:
         """Run the scene.
 
         Args:
             factors: of the stiffness of every cell, shape (rows - 1, cols - 1), in the place of those of the scene.
+            pause: called some times a second; what it raises stops here, and nothing has run.
 
         Returns:
             Positions of every frame [m], shape (F + 1, rows, cols, 3).
@@ -72,15 +96,16 @@ class Adjoint:
         self._ran = False
         plan = self._plan if factors is None else self._with_factors(factors)
         self._sheet.restart(plan)
-        displacements = self._sheet.run()
+        displacements = self._sheet.run(pause)
         self._ran = True
         return rest_positions(plan.scene.sheet) + displacements
 
-    def backward(self, slope: Array) -> Derivatives:
+    def backward(self, slope: Array, pause: Pause = lambda: None) -> Derivatives:
         """Differentiate a loss at the last `run`.
 
         Args:
             slope: derivative of the loss by the positions of every frame, shape (F + 1, rows, cols, 3).
+            pause: called some times a second; what it raises stops here.
 
         Raises:
             ArgumentError: when it is not an array of finite numbers of that shape.
@@ -95,7 +120,7 @@ class Adjoint:
                 f"the loss's derivative: {slope.dtype} of shape {slope.shape}; take finite numbers of shape {shape}, "
                 "that of the positions"
             )
-        return derivatives(plan, *self._sheet.backward(np.asarray(slope, float)))
+        return derivatives(plan, *self._sheet.backward(np.asarray(slope, float), pause))
 
     def _with_factors(self, factors: Array) -> Plan:
         """Change the map of the stiffness."""

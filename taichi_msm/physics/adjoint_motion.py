@@ -45,6 +45,7 @@ from taichi_msm.physics.terms.damping import coefficients
 from taichi_msm.physics.terms.foundation import point_shares
 from taichi_msm.physics.terms.probes import ProbeTerm
 from taichi_msm.physics.terms.term import GAIN
+from taichi_msm.progress import Pause
 from taichi_msm.system.runtime import Memory, our_compilation, write
 
 # A segment may take so much, as each costs some launches.
@@ -58,6 +59,18 @@ LONG_PATIENCE = 8 * PATIENCE
 POINT_STEPS_PER_LAUNCH = 10_000_000
 
 Array = NDArray[np.float64]
+
+
+def segment_steps(steps: int, shape_bytes: int) -> int:
+    """Return the number of steps of a segment; all beginnings, two shapes each, then take about as much memory."""
+    return min(steps, max(math.ceil(math.sqrt(2 * steps)), SEGMENT_BYTES // shape_bytes))
+
+
+def motion_bytes(plan: Plan) -> int:
+    """Estimate the memory of the adjoint of a sheet in motion, without that of the frames [bytes]."""
+    steps, shape_bytes = plan.grid.steps, 3 * 8 * math.prod(plan.scene.sheet.points)
+    segment = segment_steps(steps, shape_bytes)
+    return shape_bytes * (segment + 2 * -(-steps // segment) + ADJOINT_PARTS + SUM_PARTS)
 
 
 class _Arrays(NamedTuple):
@@ -94,9 +107,7 @@ class MotionAdjoint(Dynamics):
         plan = self.plan
         layout, memory = self.structure, Memory()
         row_bytes = layout.width * layout.code.lanes * 8
-        # A segment and all beginnings, which are two shapes each, then take about the same memory.
-        least, shape_bytes = math.ceil(math.sqrt(2 * plan.grid.steps)), 3 * layout.rows * row_bytes
-        self._segment = min(plan.grid.steps, max(least, SEGMENT_BYTES // shape_bytes))
+        self._segment = segment_steps(plan.grid.steps, 3 * layout.rows * row_bytes)
         # No two workers write to one page of what they carry.
         self._carried_rows = 1 - (-PAGE // row_bytes)
         self._extra = (MOMENTS + self._carried_rows) * layout.workers
@@ -117,8 +128,8 @@ class MotionAdjoint(Dynamics):
             rows((SUM_PARTS + 2 * len(self._slopes)) * layout.rows + sums),
         )  # fmt: skip
 
-    def run(self) -> Array:
-        """Take all steps anew; returns the displacements of every frame [m], shape (F + 1, rows, cols, 3).
+    def run(self, pause: Pause = lambda: None) -> Array:
+        """Take all steps anew, with pauses; returns the displacements of every frame [m], shape (F + 1, rows, cols, 3).
 
         Raises:
             DivergedError: when the sheet diverges.
@@ -127,7 +138,7 @@ class MotionAdjoint(Dynamics):
         watch, frames = Watch(plan), np.zeros((grid.frames + 1, *plan.scene.sheet.points, 3))
         marks = {*range(0, grid.steps + 1, grid.steps_per_frame), *range(0, grid.steps, self._segment)}
         for n in sorted(marks):
-            self.advance(n - self.steps_done)
+            self.advance(n - self.steps_done, pause)
             if n % self._segment == 0 and n < grid.steps:
                 self._keep(n // self._segment)
             if n and n % grid.steps_per_frame == 0:
@@ -139,7 +150,7 @@ class MotionAdjoint(Dynamics):
                 frames[n // grid.steps_per_frame] = reading.displacement
         return frames
 
-    def backward(self, by_frame: Array) -> tuple[Slopes, LoadSlopes]:
+    def backward(self, by_frame: Array, pause: Pause = lambda: None) -> tuple[Slopes, LoadSlopes]:
         """Sweep the adjoint of the last `run`; by_frame: derivative of the loss by what that returned."""
         grid, layout, arrays = self.plan.grid, self.structure, self._arrays
         _, gain, _ = coefficients(self.plan)
@@ -155,21 +166,22 @@ class MotionAdjoint(Dynamics):
         loads, self._buffer, totals = LoadSlopes(self.plan), BUFFERS, np.zeros(2)
         block = max(1, STEPS_PER_TABLE // self._segment) * self._segment
         for first in reversed(range(0, grid.steps, block)):
-            totals += self._sweep_block(first, min(first + block, grid.steps), by_frame, loads)
+            totals += self._sweep_block(first, min(first + block, grid.steps), by_frame, loads, pause)
         return self._collect(gain, totals), loads
 
-    def _sweep_block(self, first: int, end: int, by_frame: Array, loads: LoadSlopes) -> Array:
+    def _sweep_block(self, first: int, end: int, by_frame: Array, loads: LoadSlopes, pause: Pause) -> Array:
         """Sweep back over some segments; returns the work of the loads on the adjoint after step 0, and in step 0."""
         table, h = self._table(first, end - first), self.plan.grid.step
         by_slot = np.zeros((end - first, len(self.plan.slots), PUSHED))
         at = end
         for begin in reversed(range(first, end, self._segment)):
-            self._record(begin, table[begin - first : at - first])
+            self._record(begin, table[begin - first : at - first], pause)
             while at > begin:
                 to = self._last_frame(begin, at)
                 rows = slice(to - first, at - first)
                 by_slot[rows] = self._sweep(begin, at, by_frame, table[rows])
                 at = to
+                pause()
         if first == 0:
             # The first step has another gain.
             by_slot[0] *= table[0, GAIN] / coefficients(self.plan)[1]
@@ -195,7 +207,7 @@ class MotionAdjoint(Dynamics):
         with our_compilation():
             copying(self.structure.code)(self._entries, source, target, *of, *to)
 
-    def _record(self, first: int, table: Array) -> None:
+    def _record(self, first: int, table: Array, pause: Pause) -> None:
         """Take the steps of a segment, from its first one on, and keep every shape; table: of its loads."""
         layout, arrays, count = self.structure, self._arrays, len(table) - 1
         begins = first // self._segment * self._entries
@@ -206,6 +218,7 @@ class MotionAdjoint(Dynamics):
             steps = min(most, count - done)
             sizes = self._sizes(steps, done, self._segment * layout.rows)
             self._launch(0, sizes, table[done : done + steps], *arrays.shapes, *arrays.moving, *self._sheet_arrays)
+            pause()
 
     def _last_frame(self, first: int, end: int) -> int:
         """Tell how far back a launch goes from step `end` of a segment: to the last frame before it at most."""

@@ -6,7 +6,10 @@ stiffness of the sheet in this shape, and the loss by p . f with K p = the deriv
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from concurrent.futures import Future, wait
+from functools import partial
+from threading import Thread
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -20,6 +23,7 @@ from taichi_msm.physics.plan import Plan
 from taichi_msm.physics.rest import Rest
 from taichi_msm.physics.slopes import LoadSlopes, Slopes
 from taichi_msm.physics.terms.foundation import point_shares
+from taichi_msm.progress import Pause
 from taichi_msm.system.runtime import Device
 
 if TYPE_CHECKING:
@@ -29,6 +33,9 @@ Array = NDArray[np.float64]
 
 # A solution with a larger error, of the size of the right side, is none.
 SOLVED = 1e-6
+
+# Seconds between pauses while a solution is found.
+PATIENCE = 0.1
 
 
 class RestAdjoint:
@@ -44,7 +51,7 @@ class RestAdjoint:
         self.plan = plan
         self._sheet.restart(plan)
 
-    def run(self) -> Array:
+    def run(self, pause: Pause) -> Array:
         """Find all shapes anew; returns the displacements of every frame [m], shape (F + 1, rows, cols, 3).
 
         Raises:
@@ -53,12 +60,12 @@ class RestAdjoint:
         self._sheet.restart(self.plan)
         frames = []
         for n in range(self.plan.grid.frames + 1):
-            self._sheet.advance(int(n > 0))
+            self._sheet.advance(int(n > 0), pause)
             frames.append(self._sheet.displacement())
         self._displacements = np.array(frames)
         return self._displacements.copy()
 
-    def backward(self, by_frame: Array) -> tuple[Slopes, LoadSlopes]:
+    def backward(self, by_frame: Array, pause: Pause) -> tuple[Slopes, LoadSlopes]:
         """Differentiate at the last `run`; by_frame: derivative of the loss by what that returned.
 
         Raises:
@@ -72,12 +79,13 @@ class RestAdjoint:
         )  # fmt: skip
         loads = LoadSlopes(plan)
         for n, slope in enumerate(by_frame):
+            pause()
             u: Array = self._displacements[n]
             if not slope[~plan.fixed].any():
                 continue
             at_frame = frame_loads(plan, n)
             held = plan.material.virtual * at_frame.active[0] * point_shares(plan)
-            p = _solved(plan, _stiffness(plan, families, held, curvature, u), slope)
+            p = _waited(partial(_solved, plan, _stiffness(plan, families, held, curvature, u), slope), pause)
             if p is None and u.any():
                 raise MsmError(
                     f"frame {n} has no gradient: the sheet has no stiffness against some motion; give it a foundation, "
@@ -147,6 +155,22 @@ def _laplacian(plan: Plan) -> Any:
 
     (across, inner_cols), (down, inner_rows) = second(cols, dx), second(rows, dy)
     return (sparse.kron(inner_rows, across) + sparse.kron(down, inner_cols)).tocsr()
+
+
+def _waited(work: Callable[[], Array | None], pause: Pause) -> Array | None:
+    """Return what some work in SciPy returns, with pauses meanwhile; what one raises leaves the work behind."""
+    future: Future[Array | None] = Future()
+
+    def finish() -> None:
+        try:
+            future.set_result(work())
+        except BaseException as error:
+            future.set_exception(error)
+
+    Thread(target=finish, daemon=True).start()
+    while wait([future], PATIENCE).not_done:
+        pause()
+    return future.result()
 
 
 def _solved(plan: Plan, stiffness: csc_matrix, slope: Array) -> Array | None:
