@@ -15,12 +15,12 @@ import numpy as np
 from benchmarks.process import FailedError, call
 from benchmarks.race import Progress
 from benchmarks.stepping.problem import Problem
-from taichi_msm.physics.adjoint import Adjoint
-from taichi_msm.physics.plan import Plan
-from taichi_msm.physics.planning import make_plan, with_time
-from taichi_msm.physics.solver import Dynamics
+from taichi_msm.gradients.gradient import Adjoint
+from taichi_msm.model.plan import Plan
+from taichi_msm.solver.dynamics import Dynamics
+from taichi_msm.solver.planning import make_plan, with_time
 from taichi_msm.system import runtime
-from taichi_msm.system.resources import available_threads
+from taichi_msm.system.process import available_threads
 
 # Points along a side, and steps; Taichi keeps every one of them, and its derivative.
 SIZES = {61: 1000, 331: 100}

@@ -15,10 +15,10 @@ from pathlib import Path
 
 from benchmarks.process import ROOT
 from taichi_msm import load_scene
-from taichi_msm.viewer.captures import Captures
-from taichi_msm.viewer.events import Drag, Press, Release
-from taichi_msm.viewer.session import Session
-from taichi_msm.viewer.window import Window
+from taichi_msm.view.events import Drag, Press, Release
+from taichi_msm.view.recording import Captures
+from taichi_msm.view.session import Session
+from taichi_msm.view.window import Window
 
 SIZES = (512, 1024)
 POINTS = (31, 101)

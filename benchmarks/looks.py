@@ -16,16 +16,17 @@ from benchmarks.drawing.problem import Problem
 from benchmarks.process import call
 from benchmarks.race import Progress
 from benchmarks.whole_run import SCENE, command
-from taichi_msm.outputs import table
+from taichi_msm.model.surface import rods
 from taichi_msm.render.camera import view
 from taichi_msm.render.rasterizer import Drawing, drawing_config
-from taichi_msm.render.surface import rods
 from taichi_msm.render.tracking import find_flow
-from taichi_msm.scene import Camera, Scene
+from taichi_msm.scene import outputs
+from taichi_msm.scene.camera import Camera
+from taichi_msm.scene.scene import Scene
 from taichi_msm.system import runtime
-from taichi_msm.system.resources import available_threads
+from taichi_msm.system.process import available_threads
 
-ALL_LABELS = tuple(name for name, output in table.OUTPUTS.items() if output.source in ("labels", "flow", "tracks"))
+ALL_LABELS = tuple(name for name, output in outputs.OUTPUTS.items() if output.source in ("labels", "flow", "tracks"))
 
 PIXELS = (512, 1024)
 REFINE = 10

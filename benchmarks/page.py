@@ -14,12 +14,12 @@ from benchmarks.parts import NARROW, PIXELS, READY, REFINE
 from benchmarks.process import ROOT
 from benchmarks.stepping.measure import TOLERANCE
 from taichi_msm import load_scene
-from taichi_msm.physics.planning import make_plan
-from taichi_msm.study import measure
+from taichi_msm.solver.planning import make_plan
+from taichi_msm.study import study
+from taichi_msm.study.format import duration, markdown, number, timing
 from taichi_msm.study.result import Timing
-from taichi_msm.study.table import duration, markdown, number, timing
 from taichi_msm.system.compiler import COMPILERS, chosen
-from taichi_msm.system.resources import available_threads
+from taichi_msm.system.process import available_threads
 from taichi_msm.system.runtime import Device, vector_bits
 
 TEMPLATE = ROOT / "docs" / "performance.template"
@@ -34,7 +34,7 @@ Entry = dict[str, Any]
 
 def machine() -> Results:
     """Describe where the benchmarks run."""
-    found = measure.machine(Device("cpu", available_threads()))
+    found = study.machine(Device("cpu", available_threads()))
     versions = {chosen().title: chosen().version, "NumPy": found["versions"]["numpy"]}
     for package in PACKAGES:
         try:

@@ -10,7 +10,7 @@ from benchmarks import bounds, compilers, gradients, instructions, looks, terms,
 from benchmarks.drawing import FLAT, LIT
 from benchmarks.race import Progress, race
 from benchmarks.stepping import FASTEST, PEERS
-from taichi_msm.system.resources import available_threads
+from taichi_msm.system.process import available_threads
 from taichi_msm.system.runtime import vector_bits
 
 STEPPING, DRAWING = "benchmarks.stepping.measure", "benchmarks.drawing.measure"

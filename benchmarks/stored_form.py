@@ -14,11 +14,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from taichi_msm import load_scene
-from taichi_msm.physics.lattice import rest_positions
-from taichi_msm.physics.loads import Schedule, decay, schedule
-from taichi_msm.physics.plan import Plan
-from taichi_msm.physics.planning import make_plan
-from taichi_msm.scene import Scene
+from taichi_msm.model.loads import Schedule, decay, schedule
+from taichi_msm.model.plan import Plan
+from taichi_msm.model.sheet import rest_positions
+from taichi_msm.scene.scene import Scene
+from taichi_msm.solver.planning import make_plan
 from tests.reference.neighbours import springs
 
 SCENE = Path(__file__).parent.parent / "scenes" / "figure-3.yaml"

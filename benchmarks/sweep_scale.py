@@ -22,10 +22,10 @@ import psutil
 from distributed import Client
 
 from benchmarks.process import OUTPUT
-from taichi_msm.sweeps.folder import begin_sweep
+from taichi_msm.sweeps.runs import begin_sweep
+from taichi_msm.sweeps.spec import Sweep, load_sweep
 from taichi_msm.sweeps.sweep import finish, go_on, opened
-from taichi_msm.sweeps.sweepfile import Sweep, load_sweep
-from taichi_msm.system.resources import available_threads
+from taichi_msm.system.process import available_threads
 
 FOLDER = OUTPUT / "sweep_scale"
 

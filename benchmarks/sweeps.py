@@ -20,7 +20,7 @@ import yaml
 
 from benchmarks.process import ROOT
 from benchmarks.whole_run import command
-from taichi_msm.system import resources
+from taichi_msm.system import process
 from taichi_msm.system.runtime import vector_bits
 
 ROUNDS = 5
@@ -88,7 +88,7 @@ def data_set(folder: Path, cache: str, number: int, films: int) -> Made:
 
 def main() -> None:
     """Measure, and write the page."""
-    cores = resources.available_threads()
+    cores = process.available_threads()
     with tempfile.TemporaryDirectory() as directory:
         folder, cache = Path(directory), f"{directory}/cache"
         sweeps, singles = short_runs(folder, cache)
@@ -98,7 +98,7 @@ def main() -> None:
     made = Made(*(statistics.median(column) for column in zip(*films, strict=True)))
     all_cores = cores * made.seconds
     text = (
-        f"On {cores} cores of an {resources.processor()} with vectors of {vector_bits()} bits, medians of {ROUNDS} and "
+        f"On {cores} cores of an {process.processor()} with vectors of {vector_bits()} bits, medians of {ROUNDS} and "
         f"{FILM_ROUNDS} rounds, kernels compiled before:\n\n"
         f"- {RUNS} runs of `press.yaml` with 31 × 31 points and without pictures take "
         f"{statistics.median(sweeps):.1f} s; {SINGLE} of them as single commands, one after another, take "

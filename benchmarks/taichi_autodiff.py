@@ -9,7 +9,7 @@ import taichi as ti
 from numpy.typing import NDArray
 
 from benchmarks.stepping.problem import CELL, FORCE, Problem
-from taichi_msm.physics.loads import decay
+from taichi_msm.model.loads import decay
 
 
 class Differentiated:

@@ -13,11 +13,11 @@ from PIL import Image
 
 from benchmarks.process import call
 from benchmarks.race import Progress
-from taichi_msm.physics.planning import make_plan
-from taichi_msm.physics.solver import Dynamics
-from taichi_msm.scene import Scene
+from taichi_msm.scene.scene import Scene
+from taichi_msm.solver.dynamics import Dynamics
+from taichi_msm.solver.planning import make_plan
 from taichi_msm.system import runtime
-from taichi_msm.system.resources import available_threads
+from taichi_msm.system.process import available_threads
 
 POINTS = (61, 331, 1024)
 PRECISIONS = ("f32", "f64")

@@ -19,10 +19,9 @@ from pathlib import Path
 from typing import Any
 
 from benchmarks import stored_form
-from taichi_msm.study.pictures import FINEST
+from taichi_msm.study.format import markdown
+from taichi_msm.study.measurements import FINEST, MARGIN
 from taichi_msm.study.result import REFINED_ENOUGH
-from taichi_msm.study.stepping import MARGIN
-from taichi_msm.study.table import markdown
 from taichi_msm.system.compiler import named
 
 ROOT = Path(__file__).parent.parent

@@ -19,13 +19,13 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from taichi_msm import Simulation, load_scene, run
-from taichi_msm.cli import main as main_of_program
-from taichi_msm.scene import Camera
-from taichi_msm.scenefile.load import plan_file
-from taichi_msm.sweeps.sweepfile import load_sweep
-from taichi_msm.viewer.captures import Captures
-from taichi_msm.viewer.script import film, load_script, timed
-from taichi_msm.viewer.session import Session
+from taichi_msm.cli.main import main as main_of_program
+from taichi_msm.load.scene_file import plan_file
+from taichi_msm.scene.camera import Camera
+from taichi_msm.sweeps.spec import load_sweep
+from taichi_msm.view.recording import Captures
+from taichi_msm.view.script import film, load_script, timed
+from taichi_msm.view.session import Session
 
 Floats = NDArray[np.float64]
 

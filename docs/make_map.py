@@ -18,10 +18,10 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from taichi_msm import FitResult, Scene, fit, load_scene, run
-from taichi_msm.fitting.fields import centres
-from taichi_msm.physics.material import map_factors, read_map
+from taichi_msm.fitting.tikhonov import centres
+from taichi_msm.model.sheet import map_factors, read_map
 from taichi_msm.plot_style import DPI, STYLE
-from taichi_msm.scene import StiffnessMap
+from taichi_msm.scene.sheet import StiffnessMap
 
 Floats = NDArray[np.float64]
 

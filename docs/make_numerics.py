@@ -22,18 +22,18 @@ from scipy.sparse.linalg import eigsh, spsolve
 from scipy.special import k0, k1
 
 from taichi_msm import Scene, load_scene
-from taichi_msm.physics.error_control import estimate_error, longest
-from taichi_msm.physics.lattice import fixed_points, rest_positions, spacing
-from taichi_msm.physics.loads import decay, loads_at
-from taichi_msm.physics.plan import Plan
-from taichi_msm.physics.planning import make_plan
-from taichi_msm.physics.rest import Rest
-from taichi_msm.physics.solver import Dynamics
-from taichi_msm.physics.state import State
+from taichi_msm.accuracy.time_step import estimate_error, longest
+from taichi_msm.model.loads import decay, loads_at
+from taichi_msm.model.plan import Plan
+from taichi_msm.model.sheet import fixed_points, rest_positions, spacing
+from taichi_msm.model.time_grid import Precision
 from taichi_msm.plot_style import BLUE, DPI, GREY, STYLE, VERMILION, WIDE
-from taichi_msm.study.table import markdown
+from taichi_msm.solver.dynamics import Dynamics
+from taichi_msm.solver.planning import make_plan
+from taichi_msm.solver.rest import Rest
+from taichi_msm.solver.state import State
+from taichi_msm.study.format import markdown
 from taichi_msm.system import runtime
-from taichi_msm.timegrid import Precision
 
 ROOT = Path(__file__).parent.parent
 PAGE, TEMPLATE = ROOT / "docs" / "numerics.md", ROOT / "docs" / "numerics.template"

@@ -13,12 +13,11 @@ from pathlib import Path
 from typing import Any
 
 import taichi_msm
-from taichi_msm.outputs.table import OUTPUTS
-from taichi_msm.scene import Section
-from taichi_msm.scenefile.load import schema
-from taichi_msm.sweeps.distribution import Distribution
-from taichi_msm.sweeps.sweepfile import SweepSettings
-from taichi_msm.viewer.events import KEYS, POINTER
+from taichi_msm.load.scene_file import schema
+from taichi_msm.scene.outputs import OUTPUTS
+from taichi_msm.scene.section import Section
+from taichi_msm.sweeps.spec import Distribution, SweepSettings
+from taichi_msm.view.events import KEYS, POINTER
 
 DOCS = Path(__file__).parent
 MARKS = "<!-- {}: made by docs/make_tables.py -->\n", "<!-- end of {} -->\n"

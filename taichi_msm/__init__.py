@@ -7,6 +7,8 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any
 
+from taichi_msm.version import __version__ as __version__
+
 if TYPE_CHECKING:
     from taichi_msm.errors import (
         ArgumentError,
@@ -17,53 +19,49 @@ if TYPE_CHECKING:
         NotInstalledError,
         SceneError,
     )
-    from taichi_msm.exports.convert import export
+    from taichi_msm.exports.export import export
     from taichi_msm.fitting.fit import fit
     from taichi_msm.fitting.result import FitResult, FittedMap
-    from taichi_msm.gradients import Gradient, gradient
-    from taichi_msm.physics.state import TipForce
-    from taichi_msm.playback import Playback
+    from taichi_msm.gradients.gradient import Gradient, gradient
+    from taichi_msm.load.scene_file import load_scene
+    from taichi_msm.model.surface import Surface
     from taichi_msm.render.labels import Flow, Labels, Sight
-    from taichi_msm.render.surface import Surface
-    from taichi_msm.runner import resume, run
-    from taichi_msm.scene import (
-        Camera,
-        Distortion,
-        Foundation,
-        Instrument,
-        Intrinsics,
-        Light,
-        Pose,
-        Probe,
-        Render,
-        Scene,
-        Sheet,
-        Springs,
-        StiffnessMap,
-        Time,
-        Tissue,
-    )
-    from taichi_msm.scenefile.load import load_scene
-    from taichi_msm.simulation import Simulation
-    from taichi_msm.sweeps.outcome import Outcome
+    from taichi_msm.runs.playback import Playback
+    from taichi_msm.runs.run import resume, run
+    from taichi_msm.runs.simulation import Simulation
+    from taichi_msm.scene.camera import Camera, Distortion, Intrinsics, Pose
+    from taichi_msm.scene.render import Light, Render
+    from taichi_msm.scene.scene import Scene, Time
+    from taichi_msm.scene.sheet import Foundation, Sheet, Springs, StiffnessMap, Tissue
+    from taichi_msm.scene.tools import Instrument, Probe
+    from taichi_msm.solver.state import TipForce
+    from taichi_msm.sweeps.runs import Outcome
     from taichi_msm.sweeps.sweep import sweep
 
-__version__ = "0.1.0"
 
-# The modules of all names but errors and the sections of a scene.
+# The module of each name.
 _HOMES = {
-    **dict.fromkeys(("Flow", "Labels", "Sight"), "render.labels"),
-    **dict.fromkeys(("resume", "run"), "runner"),
-    **dict.fromkeys(("Gradient", "gradient"), "gradients"),
-    "Playback": "playback",
-    "TipForce": "physics.state",
-    "Simulation": "simulation",
-    **dict.fromkeys(("FitResult", "FittedMap"), "fitting.result"),
-    "Surface": "render.surface",
-    "Outcome": "sweeps.outcome",
-    "export": "exports.convert",
+    **dict.fromkeys(
+        ("ArgumentError", "DeviceError", "DivergedError", "FilesError", "MsmError", "NotInstalledError", "SceneError"),
+        "errors",
+    ),
+    "export": "exports.export",
     "fit": "fitting.fit",
-    "load_scene": "scenefile.load",
+    **dict.fromkeys(("FitResult", "FittedMap"), "fitting.result"),
+    **dict.fromkeys(("Gradient", "gradient"), "gradients.gradient"),
+    "TipForce": "solver.state",
+    "Playback": "runs.playback",
+    **dict.fromkeys(("Flow", "Labels", "Sight"), "render.labels"),
+    "Surface": "model.surface",
+    **dict.fromkeys(("resume", "run"), "runs.run"),
+    **dict.fromkeys(("Camera", "Distortion", "Intrinsics", "Pose"), "scene.camera"),
+    **dict.fromkeys(("Light", "Render"), "scene.render"),
+    **dict.fromkeys(("Scene", "Time"), "scene.scene"),
+    **dict.fromkeys(("Foundation", "Sheet", "Springs", "StiffnessMap", "Tissue"), "scene.sheet"),
+    **dict.fromkeys(("Instrument", "Probe"), "scene.tools"),
+    "load_scene": "load.scene_file",
+    "Simulation": "runs.simulation",
+    "Outcome": "sweeps.runs",
     "sweep": "sweeps.sweep",
 }
 
@@ -116,5 +114,4 @@ def __getattr__(name: str) -> Any:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
     from importlib import import_module
 
-    home = _HOMES.get(name, "errors" if name.endswith("Error") else "scene")
-    return getattr(import_module(f"{__name__}.{home}"), name)
+    return getattr(import_module(f"{__name__}.{_HOMES[name]}"), name)

@@ -6,7 +6,7 @@ import os
 import sys
 import warnings
 
-from taichi_msm.system import signals, streams
+from taichi_msm.system import process
 
 # New objects after which Python searches for unreachable cycles. Its own 700, or 2000, are few where imports make half
 # a million objects that stay: the searches took a twentieth of a short run.
@@ -23,12 +23,12 @@ def main() -> int:
     # OpenBLAS starts a thread for every core, each of which spins for a while; what we multiply is too small for two.
     # NumPy loads it later, here and in the encoder's process.
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
-    streams.open_missing()
-    signals.leave_at_once()
+    process.open_missing()
+    process.leave_at_once()
     if isinstance(sys.stdout, io.TextIOWrapper):
         # A file name need not be text; errors, on stderr, are printed this way already.
         sys.stdout.reconfigure(errors="backslashreplace")
-    from taichi_msm.cli import main
+    from taichi_msm.cli.main import main
 
     try:
         return main()

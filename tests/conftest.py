@@ -10,12 +10,12 @@ from pathlib import Path
 import pytest
 from PIL import Image
 
-from taichi_msm.cli import main
-from taichi_msm.runner import run
-from taichi_msm.scenefile.load import load_scene
+from taichi_msm.cli.main import main
+from taichi_msm.load.scene_file import load_scene
+from taichi_msm.runs.run import run
 from taichi_msm.system import runtime
 from taichi_msm.system.compiler import chosen
-from taichi_msm.system.signals import SIGNALS
+from taichi_msm.system.process import SIGNALS
 from tests.scenes import SMALL, speckle
 
 # These files take longest.

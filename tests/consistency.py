@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from taichi_msm import Simulation
-from taichi_msm.scene import Scene
+from taichi_msm.scene.scene import Scene
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]

@@ -7,14 +7,14 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from taichi_msm.physics.error_control import Estimate, longest
-from taichi_msm.physics.kernel import SheetLayout
-from taichi_msm.physics.plan import Plan
-from taichi_msm.physics.probe_force import probe_records
-from taichi_msm.physics.run_notes import run_notes
-from taichi_msm.physics.solver import Dynamics, layout_of
-from taichi_msm.physics.state import RunProgress
-from taichi_msm.scene import Scene
+from taichi_msm.accuracy.report import run_notes
+from taichi_msm.accuracy.time_step import Estimate, longest
+from taichi_msm.model.plan import Plan
+from taichi_msm.model.tool_force import probe_records
+from taichi_msm.scene.scene import Scene
+from taichi_msm.solver.arrays import SheetLayout
+from taichi_msm.solver.dynamics import Dynamics, layout_of
+from taichi_msm.solver.state import RunProgress
 from taichi_msm.system.runtime import Device
 from tests.scenes import plan_of
 

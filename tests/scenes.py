@@ -7,10 +7,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from taichi_msm.physics.plan import Plan
-from taichi_msm.physics.planning import try_plan, with_time
-from taichi_msm.scene import Scene
-from taichi_msm.timegrid import TimeGrid
+from taichi_msm.model.plan import Plan
+from taichi_msm.model.time_grid import TimeGrid
+from taichi_msm.scene.scene import Scene
+from taichi_msm.solver.planning import try_plan, with_time
 
 SHEET = {"points": [9, 11], "size": [0.3, 0.4], "mass": 1e-3}
 SPRINGS = {"structural": 20, "shear": 10, "virtual": 0.5}

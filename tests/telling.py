@@ -12,7 +12,7 @@ from typing import Any
 PROGRAM = """
 import os, runpy, sys
 from contextlib import suppress
-from taichi_msm.system import signals
+from taichi_msm.system import process
 
 pipe = int(sys.argv.pop(1))
 os.set_blocking(pipe, False)
@@ -21,21 +21,23 @@ def tell(stage, done):
     with suppress(OSError):
         os.write(pipe, f"{stage} {done}\\n".encode())
 
-def leave_at_once(original=signals.leave_at_once):
+def leave_at_once(original=process.leave_at_once):
     original()
     tell("heard", 0)
-    from taichi_msm import cli  # as the program does next
+    from taichi_msm.cli import export, fit, run, session, study, sweep  # as the program does next
 
-    def interruptible(*arguments, original=cli.interruptible):
+    def interruptible(*arguments, original=session.interruptible):
         progress = original(*arguments)
         def telling(stage, done, total):
             tell(stage, done)
             progress(stage, done, total)
         return telling
 
-    cli.interruptible = interruptible
+    for module in (export, fit, run, session, study, sweep):
+        if hasattr(module, "interruptible"):
+            module.interruptible = interruptible
 
-signals.leave_at_once = leave_at_once
+process.leave_at_once = leave_at_once
 runpy.run_module("taichi_msm", run_name="__main__")
 """
 

@@ -11,16 +11,16 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from taichi_msm.accuracy import time_step
+from taichi_msm.accuracy.companions import coarse_steps, fine_steps
+from taichi_msm.accuracy.mesh import MeshEstimate
+from taichi_msm.accuracy.time_step import Estimate, Trials, choose_step, estimate_error, longest, order
 from taichi_msm.errors import SceneError
-from taichi_msm.physics import error_control
-from taichi_msm.physics.error_control import Estimate, Trials, choose_step, estimate_error, longest, order
-from taichi_msm.physics.mesh_error import MeshEstimate
-from taichi_msm.physics.pilots import coarse_steps, fine_steps
-from taichi_msm.physics.plan import Plan
-from taichi_msm.physics.planning import with_time
-from taichi_msm.physics.state import RunProgress
-from taichi_msm.scene import Scene
-from taichi_msm.simulation import Simulation
+from taichi_msm.model.plan import Plan
+from taichi_msm.runs.simulation import Simulation
+from taichi_msm.scene.scene import Scene
+from taichi_msm.solver.planning import with_time
+from taichi_msm.solver.state import RunProgress
 from taichi_msm.system.runtime import Device
 from tests.motion import frames, notes_of, true_error
 from tests.scenes import PRESS, SHEET, SPRINGS, plan_of, scene, with_steps
@@ -116,7 +116,7 @@ class Falling:
 def test_an_error_that_is_a_power_of_the_step_is_told_exactly(
     difference: str, p: int, monkeypatch: pytest.MonkeyPatch, device: Device
 ) -> None:
-    monkeypatch.setattr(error_control, "Dynamics", partial(Falling, p))
+    monkeypatch.setattr(time_step, "Dynamics", partial(Falling, p))
     made = scene(probes=[SOFT_PRESS], time={"step": 0.005, "damping_difference": difference})
     # In numbers near 1 the error, 2.5e-5 or more, is rounded by 1e-11 of itself.
     assert estimated(made, device).error == pytest.approx(0.005**p, rel=1e-9)

@@ -12,14 +12,14 @@ import pytest
 from PIL import Image
 
 from taichi_msm.errors import FilesError, SceneError
-from taichi_msm.physics.plan import Plan
-from taichi_msm.physics.planning import stable_steps
-from taichi_msm.playback import Playback
-from taichi_msm.results.finished_run import PUT_BACK, read_run
-from taichi_msm.results.manifest import digests
-from taichi_msm.results.record import RunRecord
-from taichi_msm.runner import resume, run
-from taichi_msm.scenefile.load import load_plan, load_scene
+from taichi_msm.load.scene_file import load_plan, load_scene
+from taichi_msm.model.plan import Plan
+from taichi_msm.runs.finished import PUT_BACK, read_run
+from taichi_msm.runs.manifest import digests
+from taichi_msm.runs.playback import Playback
+from taichi_msm.runs.run import resume, run
+from taichi_msm.runs.writer import RunRecord
+from taichi_msm.solver.planning import stable_steps
 from taichi_msm.system.runtime import Device
 from tests.conftest import Program
 from tests.outputs import files, results
@@ -194,7 +194,7 @@ def test_a_picture_that_changes_while_a_run_starts_is_noticed(
         Image.fromarray(speckle(30, 40, 1)).save(small / "speckle.png")
         return found
 
-    monkeypatch.setattr("taichi_msm.runner.digests", late)
+    monkeypatch.setattr("taichi_msm.runs.run.digests", late)
     with pytest.raises(SceneError, match=r"^image: speckle.png is not the file that was run"):
         run(load_scene("small.yaml"), "out", threads=device.threads)
 

@@ -11,13 +11,13 @@ import pytest
 from PIL import Image
 
 from taichi_msm.errors import SceneError
-from taichi_msm.outputs.table import OUTPUTS
-from taichi_msm.runner import run
-from taichi_msm.scene import Scene
-from taichi_msm.scenefile import budget
-from taichi_msm.scenefile.budget import FORCE_ROW_BYTES, Budget, require_disk, size_problems
-from taichi_msm.system import resources
-from taichi_msm.system.resources import available_memory, available_threads
+from taichi_msm.load import cost
+from taichi_msm.load.cost import FORCE_ROW_BYTES, Budget, require_disk, size_problems
+from taichi_msm.runs.run import run
+from taichi_msm.scene.outputs import OUTPUTS
+from taichi_msm.scene.scene import Scene
+from taichi_msm.system import process
+from taichi_msm.system.process import available_memory, available_threads
 from taichi_msm.system.runtime import Device
 from tests.scenes import plan_of, speckle
 
@@ -43,7 +43,7 @@ def scene(**keys: Any) -> Scene:
 
 
 def estimate(scene: Scene) -> Budget:
-    return budget.estimate(plan_of(scene))
+    return cost.estimate_memory(plan_of(scene))
 
 
 def faults(scene: Scene) -> list[str]:
@@ -177,15 +177,15 @@ def test_what_takes_most_of_the_memory_is_named(
 ) -> None:
     output = ["gif"] if "render" in keys else []
     monkeypatch.setattr(os, "cpu_count", lambda: 2)
-    monkeypatch.setattr(budget, "available_memory", lambda: 2**29)
+    monkeypatch.setattr(cost, "available_memory", lambda: 2**29)
     assert faults(scene(**{"output": output, **keys})) == [fault]
 
 
 def test_memory_that_just_fits(monkeypatch: pytest.MonkeyPatch) -> None:
     need = estimate(scene()).memory_bytes
-    monkeypatch.setattr(budget, "available_memory", lambda: need)
+    monkeypatch.setattr(cost, "available_memory", lambda: need)
     assert faults(scene()) == []
-    monkeypatch.setattr(budget, "available_memory", lambda: need - 1)
+    monkeypatch.setattr(cost, "available_memory", lambda: need - 1)
     assert len(faults(scene())) == 1
 
 
@@ -209,7 +209,7 @@ def test_available_memory() -> None:
 
 def test_free_memory(tmp_path: Path) -> None:
     (tmp_path / "meminfo").write_text("MemTotal:  900 kB\nMemFree:  1 kB\nMemAvailable:  300 kB\n")
-    assert resources._free_memory(tmp_path / "meminfo") == 300 * 1024
+    assert process._free_memory(tmp_path / "meminfo") == 300 * 1024
 
 
 @pytest.fixture
@@ -217,9 +217,9 @@ def groups(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """The folder of all control groups, of which this process is in outer/inner."""
     root, membership = tmp_path / "cgroup", tmp_path / "membership"
     membership.write_text("4:memory:/v1\n3:cpu,cpuacct:/v1\n2:cpuset:/\n0::/outer/inner\n")
-    monkeypatch.setattr(resources, "CONTROL_GROUPS", root)
-    monkeypatch.setattr(resources, "MEMBERSHIP", membership)
-    monkeypatch.setattr(resources, "_free_memory", lambda _: 2000)
+    monkeypatch.setattr(process, "CONTROL_GROUPS", root)
+    monkeypatch.setattr(process, "MEMBERSHIP", membership)
+    monkeypatch.setattr(process, "_free_memory", lambda _: 2000)
     return root
 
 
@@ -266,7 +266,7 @@ def test_systems_without_proc(monkeypatch: pytest.MonkeyPatch) -> None:
     def missing(_: Path) -> int:
         raise FileNotFoundError
 
-    monkeypatch.setattr(resources, "_free_memory", missing)
+    monkeypatch.setattr(process, "_free_memory", missing)
     assert 2**20 < available_memory() < sys.maxsize
     monkeypatch.delattr(os, "sysconf")
     assert available_memory() == sys.maxsize

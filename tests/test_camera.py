@@ -8,8 +8,10 @@ from numpy.typing import NDArray
 
 from taichi_msm.errors import SceneError
 from taichi_msm.render.camera import camera_problems, view
-from taichi_msm.scene import MAX_SUPERSAMPLE, Camera, Scene
-from taichi_msm.simulation import Simulation
+from taichi_msm.runs.simulation import Simulation
+from taichi_msm.scene.camera import Camera
+from taichi_msm.scene.scene import Scene
+from taichi_msm.scene.section import MAX_SUPERSAMPLE
 from taichi_msm.system.runtime import Device
 from tests.scenes import scene
 

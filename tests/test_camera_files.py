@@ -10,10 +10,10 @@ import numpy as np
 import pytest
 
 from taichi_msm import load_scene
-from taichi_msm.camera_files import read_calibration
 from taichi_msm.errors import SceneError
 from taichi_msm.render.camera import view
-from taichi_msm.scene import Camera
+from taichi_msm.scene.calibration import read_calibration
+from taichi_msm.scene.camera import Camera
 
 MATRIX = np.array([[61.5, 0, 19.25], [0, 60.5, 14.75], [0, 0, 1]])
 COEFFICIENTS = [-0.3, 0.1, 0.001, -0.002, 0.03]

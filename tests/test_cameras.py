@@ -13,18 +13,18 @@ from PIL import Image
 
 from taichi_msm import ArgumentError, Playback, Simulation, resume, run
 from taichi_msm.errors import ForeignError, SceneError
+from taichi_msm.load import cost
+from taichi_msm.load.scene_file import load_plan, load_scene
+from taichi_msm.model.surface import rods
 from taichi_msm.render import rasterizer
 from taichi_msm.render.camera import View, view, view_at
-from taichi_msm.render.places import sample_places
+from taichi_msm.render.lens_table import sample_places
 from taichi_msm.render.rasterizer import Drawing
-from taichi_msm.render.surface import rods
-from taichi_msm.results.finished_run import read_run
-from taichi_msm.scene import Scene
-from taichi_msm.scenefile import budget
-from taichi_msm.scenefile.load import load_plan, load_scene
+from taichi_msm.runs.finished import read_run
+from taichi_msm.scene.scene import Scene
 from taichi_msm.system.runtime import Device
-from taichi_msm.viewer.captures import Captures
-from taichi_msm.viewer.session import Session
+from taichi_msm.view.recording import Captures
+from taichi_msm.view.session import Session
 from tests.conftest import Program
 from tests.outputs import files, results
 from tests.reference import drawing as twin
@@ -213,9 +213,9 @@ def test_two_lenses_find_their_places_once_each(small: Path, device: Device, mon
 
 
 def test_the_budget_counts_every_camera(small: Path) -> None:
-    def need(cameras: Cameras) -> budget.Budget:
+    def need(cameras: Cameras) -> cost.Budget:
         of_three = [f"render.cameras={json.dumps(cameras)}", "output=[png, tracks, trajectory]"]
-        return budget.estimate(load_plan("small.yaml", of_three))
+        return cost.estimate_memory(load_plan("small.yaml", of_three))
 
     one, three = need({"a": LEFT}), need(dict.fromkeys("abc", LEFT))
     assert three.picture_bytes == 3 * one.picture_bytes

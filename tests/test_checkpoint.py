@@ -13,10 +13,10 @@ import numpy as np
 import pytest
 
 from taichi_msm.errors import DamagedError
-from taichi_msm.physics.state import Felt, PeakForce, RunProgress, Saved, State, TipForce
-from taichi_msm.results.checkpoint import FORCES, MANIFEST, POSITIONS, STATE, Checkpoint, seal, unseal
-from taichi_msm.results.manifest import Manifest, read_manifest
-from taichi_msm.scene import Scene
+from taichi_msm.runs.checkpoint import FORCES, MANIFEST, POSITIONS, STATE, Checkpoint, seal, unseal
+from taichi_msm.runs.manifest import Manifest, read_manifest
+from taichi_msm.scene.scene import Scene
+from taichi_msm.solver.state import Felt, PeakForce, RunProgress, Saved, State, TipForce
 from tests.scenes import scene, scene_and_grid
 
 FRAMES = 3

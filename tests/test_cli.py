@@ -17,9 +17,9 @@ import pytest
 import yaml
 from PIL import Image
 
-from taichi_msm import console
-from taichi_msm.cli import main
-from taichi_msm.scenefile.load import load_scene
+from taichi_msm.cli import console
+from taichi_msm.cli.main import main
+from taichi_msm.load.scene_file import load_scene
 from taichi_msm.system.compiler import chosen
 from tests import reference
 from tests.conftest import Program
@@ -179,7 +179,7 @@ def test_a_study_that_could_not_be_written_is_not_begun(
     def begun(*_: object, **__: object) -> None:
         raise AssertionError
 
-    monkeypatch.setattr("taichi_msm.study.measure.study", begun)
+    monkeypatch.setattr("taichi_msm.study.study.study", begun)
     (small / "file").touch()
     for out in ("file", "file/below"):
         done = program("study", "small.yaml", "--out", out)
@@ -644,7 +644,7 @@ def test_a_bug_is_one_line(small: Path, capsys: pytest.CaptureFixture[str], monk
         raise ZeroDivisionError("by zero\nin two lines")
 
     monkeypatch.delenv("TAICHI_MSM_TRACEBACK", raising=False)
-    monkeypatch.setattr("taichi_msm.scenefile.load.load_plan", broken)
+    monkeypatch.setattr("taichi_msm.load.scene_file.load_plan", broken)
     code, _, err = call(capsys, "check", "small.yaml")
     assert code == 1
     assert err == (

@@ -17,8 +17,8 @@ import pytest
 
 from taichi_msm import sweep
 from taichi_msm.errors import MsmError
-from taichi_msm.sweeps.folder import values_in
-from taichi_msm.sweeps.sweepfile import load_sweep
+from taichi_msm.sweeps.runs import values_in
+from taichi_msm.sweeps.spec import load_sweep
 from tests.conftest import Program
 
 pytest.importorskip("distributed", reason="needs dask.distributed: pip install distributed")

@@ -14,7 +14,7 @@ from pathlib import Path
 import pytest
 
 from taichi_msm import load_scene, run
-from taichi_msm.cli import main
+from taichi_msm.cli.main import main
 from taichi_msm.errors import DeviceError, NotInstalledError
 from taichi_msm.system import runtime
 from taichi_msm.system.compiler import COMPILERS, Compiler, chosen, named, what_decides_bits

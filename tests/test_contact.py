@@ -10,13 +10,13 @@ import pytest
 
 from taichi_msm import Simulation
 from taichi_msm.errors import SceneError
-from taichi_msm.physics.kernel import SheetLayout
-from taichi_msm.physics.paths import fewest_steps, path_notes, tools_of
-from taichi_msm.physics.planning import try_plan
-from taichi_msm.physics.solver import Dynamics
-from taichi_msm.physics.state import RunProgress, State
-from taichi_msm.scene import Scene
-from taichi_msm.scenefile.validation import checked
+from taichi_msm.load.check import checked
+from taichi_msm.model.tools import fewest_steps, path_notes, tools_of
+from taichi_msm.scene.scene import Scene
+from taichi_msm.solver.arrays import SheetLayout
+from taichi_msm.solver.dynamics import Dynamics
+from taichi_msm.solver.planning import try_plan
+from taichi_msm.solver.state import RunProgress, State
 from taichi_msm.system.runtime import Device
 from tests import reference
 from tests.motion import dynamics_of, notes_of, structure_of

@@ -13,17 +13,17 @@ import pytest
 from numpy.typing import NDArray
 from PIL import Image
 
-from taichi_msm.physics import error_control
-from taichi_msm.physics.error_control import Estimate, choose_step, estimate_error, longest, order, reconcile
-from taichi_msm.physics.mesh_error import MeshEstimate, companion, estimate_points, with_points
-from taichi_msm.physics.paths import overlap, path_notes
-from taichi_msm.physics.pilots import choose_pilots
-from taichi_msm.physics.plan import Plan
-from taichi_msm.physics.planning import variant
-from taichi_msm.physics.run_error import Known, RunError
-from taichi_msm.physics.solver import Dynamics
-from taichi_msm.runner import run
-from taichi_msm.scene import Scene
+from taichi_msm.accuracy import time_step
+from taichi_msm.accuracy.companions import choose_pilots
+from taichi_msm.accuracy.mesh import MeshEstimate, companion, estimate_points, with_points
+from taichi_msm.accuracy.report import Known, RunError
+from taichi_msm.accuracy.time_step import Estimate, choose_step, estimate_error, longest, order, reconcile
+from taichi_msm.model.plan import Plan
+from taichi_msm.model.tools import overlap, path_notes
+from taichi_msm.runs.run import run
+from taichi_msm.scene.scene import Scene
+from taichi_msm.solver.dynamics import Dynamics
+from taichi_msm.solver.planning import variant
 from taichi_msm.system.runtime import Device
 from tests.motion import frames_on, notes_of, true_error
 from tests.scenes import plan_of, random_contact
@@ -137,7 +137,7 @@ def test_contact_is_of_order_1() -> None:
 
 
 def test_without_a_coarse_pilot_half_as_much_again_is_told(monkeypatch: pytest.MonkeyPatch, device: Device) -> None:
-    monkeypatch.setattr(error_control, "Dynamics", partial(Falling, 1))
+    monkeypatch.setattr(time_step, "Dynamics", partial(Falling, 1))
     plan = plan_of(touching([PRESSED], time={"step": 0.005}))
     assert estimate_error(plan, device).error == pytest.approx(1.25 * 1.5 * 0.005 / (1 + 0.005 / 2), rel=1e-9)
 

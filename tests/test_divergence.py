@@ -11,11 +11,11 @@ import numpy as np
 import pytest
 
 from taichi_msm import DivergedError, Simulation
-from taichi_msm.physics.diagnosis import Diagnosis
-from taichi_msm.physics.divergence import farthest_displacement
-from taichi_msm.physics.forces import Gauge
-from taichi_msm.physics.state import RunProgress, Saved, State
-from taichi_msm.scene import Scene
+from taichi_msm.accuracy.diagnosis import Diagnosis
+from taichi_msm.accuracy.divergence import farthest_displacement
+from taichi_msm.scene.scene import Scene
+from taichi_msm.solver.dynamics import Gauge
+from taichi_msm.solver.state import RunProgress, Saved, State
 from taichi_msm.system.runtime import Device
 from tests.motion import notes_of
 from tests.scenes import SHEET, plan_of, scene, with_steps

@@ -21,15 +21,18 @@ import yaml
 from PIL import Image
 
 import taichi_msm
-from taichi_msm import cli, scene
+from taichi_msm.cli import options as cli_options
+from taichi_msm.cli import session
 from taichi_msm.exports.formats import FORMATS
-from taichi_msm.outputs.table import OUTPUTS
-from taichi_msm.results.record import ErrorRecord, RunRecord
-from taichi_msm.runner import run
-from taichi_msm.scenefile.load import load_scene, schema
-from taichi_msm.system import resources
+from taichi_msm.load.scene_file import load_scene, schema
+from taichi_msm.runs.run import run
+from taichi_msm.runs.writer import ErrorRecord, RunRecord
+from taichi_msm.scene import camera, render, scene, sheet, tools
+from taichi_msm.scene.outputs import OUTPUTS
+from taichi_msm.scene.section import Section
+from taichi_msm.system import process
 from taichi_msm.system.runtime import Device
-from taichi_msm.viewer.script import load_script
+from taichi_msm.view.script import load_script
 from tests.conftest import Program
 from tests.scenes import speckle
 
@@ -99,7 +102,7 @@ def examples_folder(device: Device, tmp_path_factory: pytest.TempPathFactory) ->
     Image.fromarray(speckle(90, 120)).save(folder / "photo.jpg")
     with pytest.MonkeyPatch.context() as patch:
         patch.chdir(folder)
-        patch.setattr(resources, "available_threads", lambda: device.threads)
+        patch.setattr(process, "available_threads", lambda: device.threads)
         yield folder
 
 
@@ -176,9 +179,9 @@ def test_the_table_of_keys_has_their_limits() -> None:
 
 
 def test_all_parts_of_a_scene_are_exported() -> None:
-    sections = {
-        name for name, value in vars(scene).items() if isinstance(value, type) and issubclass(value, scene.Section)
-    }
+    modules = (camera, render, scene, sheet, tools)
+    found = {name: value for module in modules for name, value in vars(module).items()}
+    sections = {name for name, value in found.items() if isinstance(value, type) and issubclass(value, Section)}
     assert sections - {"Section"} <= set(taichi_msm.__all__)
 
 
@@ -193,7 +196,7 @@ def test_every_key_of_the_record_has_its_row() -> None:
 
 
 def test_every_exit_code_has_its_row() -> None:
-    codes = {cli.DONE, cli.BUG, cli.WRONG_INPUT, cli.DIVERGED, cli.FILES, 130, 143}
+    codes = {session.DONE, session.BUG, session.WRONG_INPUT, session.DIVERGED, session.FILES, 130, 143}
     assert [int(code) for cell in table(DOCS / "command-line.md", "exit codes") for code in cell.split(", ")] == sorted(
         codes
     )
@@ -207,7 +210,7 @@ def test_every_option_of_the_command_line_is_shown() -> None:
     shown: dict[str, set[str]] = {}
     for usage in re.split(r"\n(?=taichi-msm)", blocks(DOCS / "command-line.md", "text")[0]):
         shown.setdefault(usage.split()[1], set()).update(re.findall(r"--[a-z-]+", usage))
-    for name, command in cli.program.commands.items():
+    for name, command in cli_options.program.commands.items():
         options = {
             option for param in command.params for option in (*param.opts, *param.secondary_opts) if option[0] == "-"
         }
@@ -217,7 +220,7 @@ def test_every_option_of_the_command_line_is_shown() -> None:
 @pytest.mark.parametrize("page", [*WITH_COMMANDS, DOCS / "command-line.md"], ids=lambda page: page.stem)
 def test_every_command_is_understood(page: Path) -> None:
     for name, *arguments in commands(page):
-        cli.program.commands[name].make_context(name, arguments)
+        cli_options.program.commands[name].make_context(name, arguments)
 
 
 def test_the_commands_work(small_scenes: Path, program: Program) -> None:
@@ -342,7 +345,7 @@ def test_the_citation_is_of_this_version() -> None:
 
 def test_the_notebook_runs(device: Device, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
     monkeypatch.chdir(ROOT)
-    monkeypatch.setattr(resources, "available_threads", lambda: device.threads)
+    monkeypatch.setattr(process, "available_threads", lambda: device.threads)
     notebook = json.loads(read(DOCS / "notebooks" / "closed-loop.ipynb"))
     cells = ["".join(cell["source"]) for cell in notebook["cells"] if cell["cell_type"] == "code"]
     names: dict[str, Any] = {}

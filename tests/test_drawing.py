@@ -9,14 +9,14 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from taichi_msm.physics.lattice import rest_positions
-from taichi_msm.render import bins, rasterizer_gpu, tracking
+from taichi_msm.model.sheet import rest_positions
+from taichi_msm.model.surface import rods
+from taichi_msm.render import bins, gpu, tracking
 from taichi_msm.render.camera import view
+from taichi_msm.render.cpu import Bands
 from taichi_msm.render.labels import track_grid
 from taichi_msm.render.rasterizer import Drawing, drawing_config
-from taichi_msm.render.rasterizer_cpu import Bands
-from taichi_msm.render.surface import rods
-from taichi_msm.scene import Scene
+from taichi_msm.scene.scene import Scene
 from taichi_msm.system import launches
 from taichi_msm.system.runtime import Device
 from tests import reference
@@ -119,7 +119,7 @@ def test_what_passes_behind_the_camera_is_looked_for_only_where_it_may_be_seen(
         lists.append(found.lengths.mean())
         return found
 
-    monkeypatch.setattr(rasterizer_gpu, "binned", counted)
+    monkeypatch.setattr(gpu, "binned", counted)
     monkeypatch.setattr(tracking, "binned", counted)
     for eye in ([0, 0, 0.1], [0, -0.9, 0.1]):
         camera = {"eye": eye, "target": [eye[0], eye[1] + 0.1, 0], "fov": 60, "distortion": distortion}
@@ -157,7 +157,7 @@ def test_the_shape_of_a_tile_does_not_change_the_bits(lanes: int, device: Device
         assert_alike_in_other_tiles(made, texture, dented(made), lanes)
 
 
-@pytest.mark.parametrize("parts", [rasterizer_gpu.MOST_PARTS, 100])
+@pytest.mark.parametrize("parts", [gpu.MOST_PARTS, 100])
 def test_launches_do_not_change_the_bits(parts: int, device: Device, monkeypatch: pytest.MonkeyPatch) -> None:
     """On a GPU, many strips, many launches for the lists of a strip, several triangles taken together, shuffled lists.
 
@@ -182,13 +182,13 @@ def test_launches_do_not_change_the_bits(parts: int, device: Device, monkeypatch
         return found._replace(entries=of.give(entries))
 
     monkeypatch.setattr(launches.Launches, "launch", counted)
-    monkeypatch.setattr(rasterizer_gpu, "binned", shuffled)
+    monkeypatch.setattr(gpu, "binned", shuffled)
     pictures = [Drawing(made, texture, config).draw(position, rods=placed)]
     few = len(begun)
     monkeypatch.setattr(launches, "MOST_ROUNDS", launches.SPARE + 250)
     monkeypatch.setattr(launches, "THREADS", 700)
-    monkeypatch.setattr(rasterizer_gpu, "THREADS", 700)
-    monkeypatch.setattr(rasterizer_gpu, "MOST_PARTS", parts)
+    monkeypatch.setattr(gpu, "THREADS", 700)
+    monkeypatch.setattr(gpu, "MOST_PARTS", parts)
     pictures += [Drawing(made, texture, config).draw(position, rods=placed) for _ in range(3)]
     assert len(begun) > 30 * few
     expected = Drawing(made, texture).draw(position, rods=placed)
@@ -202,7 +202,7 @@ def test_the_bound_of_a_thread_is_asserted(device: Device, monkeypatch: pytest.M
     made = made.model_copy(update={"probes": made.probes * 8})
     position = np.random.default_rng(4).normal(0, 0.2, (4, 4, 3))
     drawing = Drawing(made, speckle(8, 8), drawing_config(made)._replace(lanes=1))
-    monkeypatch.setattr(rasterizer_gpu, "MOST_PARTS", 1)
+    monkeypatch.setattr(gpu, "MOST_PARTS", 1)
     drawing.draw(position, rods=rods(made, position, 0))
     monkeypatch.setattr(launches, "MOST_ROUNDS", launches.SPARE + 3 * 2 * 65**2)
     with pytest.raises(AssertionError):

@@ -10,10 +10,10 @@ from typing import Any
 import pytest
 from PIL import Image
 
-from taichi_msm.physics.lattice import spacing
-from taichi_msm.render.drawing_notes import drawing_notes
-from taichi_msm.scene import Scene
-from taichi_msm.scenefile.load import load_scene
+from taichi_msm.load.scene_file import load_scene
+from taichi_msm.model.sheet import spacing
+from taichi_msm.render.notes import drawing_notes
+from taichi_msm.scene.scene import Scene
 from tests.conftest import Program
 from tests.scenes import PRESS, SHEET, scene
 

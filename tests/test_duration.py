@@ -7,29 +7,29 @@ from pathlib import Path
 
 import pytest
 
-from taichi_msm.physics.pilots import choose_pilots
-from taichi_msm.physics.workload import START, work
-from taichi_msm.scenefile import duration
-from taichi_msm.scenefile.duration import CALIBRATION, UNIT
-from taichi_msm.system import resources
+from taichi_msm.accuracy.companions import choose_pilots
+from taichi_msm.load import cost
+from taichi_msm.load.cost import CALIBRATION, UNIT
+from taichi_msm.solver.planning import START, work
+from taichi_msm.system import process
 from tests.conftest import Program
 from tests.scenes import plan_of
 from tests.scenes import scene as small_scene
 
 
 def test_the_calibration_is_soon_done() -> None:
-    duration._calibrate.cache_clear()
-    assert 0 < duration._calibrate() < 1
+    cost._calibrate.cache_clear()
+    assert 0 < cost._calibrate() < 1
 
 
 @pytest.mark.parametrize("cores", [1, 64])
 def test_the_estimate_is_the_work_at_the_speed_of_the_machine(cores: int, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(duration, "_calibrate", lambda: 2 * CALIBRATION)
-    monkeypatch.setattr(resources, "available_threads", lambda: cores)
+    monkeypatch.setattr(cost, "_calibrate", lambda: 2 * CALIBRATION)
+    monkeypatch.setattr(process, "available_threads", lambda: cores)
     plan = plan_of(small_scene(image="none.png", output=["gif"]))
     parts = work(plan, choose_pilots(plan).cost)
     assert min(parts) > 0
-    assert duration.estimate(plan) == pytest.approx((2 * UNIT * sum(parts), 2 * UNIT * START))
+    assert cost.estimate_duration(plan) == pytest.approx((2 * UNIT * sum(parts), 2 * UNIT * START))
 
 
 def test_check_says_how_long_a_run_takes(small: Path, program: Program) -> None:

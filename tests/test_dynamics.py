@@ -14,19 +14,20 @@ import pytest
 from numpy.typing import NDArray
 
 from taichi_msm.errors import MsmError
-from taichi_msm.physics import kernel_cpu, kernel_gpu
-from taichi_msm.physics.kernel import SheetLayout
-from taichi_msm.physics.lattice import rest_positions
-from taichi_msm.physics.solver import POINTS_PER_WORKER
-from taichi_msm.physics.terms.damping import DampingTerm
-from taichi_msm.physics.terms.foundation import FoundationTerm
-from taichi_msm.physics.terms.probes import ProbeTerm
-from taichi_msm.physics.terms.springs import SpringTerm
-from taichi_msm.scene import MAX_POINTS, Scene
-from taichi_msm.system import resources
+from taichi_msm.model.sheet import rest_positions
+from taichi_msm.scene.scene import Scene
+from taichi_msm.scene.section import MAX_POINTS
+from taichi_msm.solver import kernel_cpu, kernel_gpu
+from taichi_msm.solver.arrays import SheetLayout
+from taichi_msm.solver.dynamics import POINTS_PER_WORKER
+from taichi_msm.system import process
 from taichi_msm.system.launches import MOST_ROUNDS, THREADS
-from taichi_msm.system.resources import available_threads
+from taichi_msm.system.process import available_threads
 from taichi_msm.system.runtime import Device, lanes
+from taichi_msm.terms.damping import DampingTerm
+from taichi_msm.terms.foundation import FoundationTerm
+from taichi_msm.terms.loads import ProbeTerm
+from taichi_msm.terms.springs import SpringTerm
 from tests import reference
 from tests.motion import dynamics_of, structure_of
 from tests.scenes import PRESS, SHEET, SPRINGS, plan_of, random_scene, scene, with_steps
@@ -113,8 +114,8 @@ def test_small_sheets_and_fixed_sides(points: list[int], fixed: Any, device: Dev
 def short_launches(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
     """Few steps a launch on a GPU, as each of them is compiled."""
     kernel_gpu._kernels.cache_clear()
-    for module in ("kernel_gpu", "solver"):
-        monkeypatch.setattr(f"taichi_msm.physics.{module}.STEPS_PER_LAUNCH", 3)
+    for module in ("kernel_gpu", "dynamics"):
+        monkeypatch.setattr(f"taichi_msm.solver.{module}.STEPS_PER_LAUNCH", 3)
     yield
     kernel_gpu._kernels.cache_clear()
 
@@ -191,7 +192,7 @@ def test_a_launch_ends_soon(device: Device, monkeypatch: pytest.MonkeyPatch) -> 
     dynamics.advance(100)
     whole = dynamics.displacement()
     dynamics.restart(plan_of(made))
-    monkeypatch.setattr("taichi_msm.physics.solver.POINT_STEPS_PER_LAUNCH", 12 * math.prod(made.sheet.points))
+    monkeypatch.setattr("taichi_msm.solver.dynamics.POINT_STEPS_PER_LAUNCH", 12 * math.prod(made.sheet.points))
 
     def stop() -> None:
         if dynamics.steps_done == 36:
@@ -517,11 +518,11 @@ def test_rests_grow_while_workers_give_up_and_are_forgotten_when_they_do_not(
     monkeypatch.setattr("time.perf_counter", lambda: now)
     monkeypatch.setattr("time.process_time", lambda: next(had))
     # As long as nobody wants our cores, a worker that gives up is an accident, and rests stay the shortest.
-    monkeypatch.setattr(resources, "waited_for_cores", lambda: 0.0)
+    monkeypatch.setattr(process, "waited_for_cores", lambda: 0.0)
     scatter.advance(10_000, np.empty(0))
     assert taken[1] > 1000
     taken = [0, 0]
-    monkeypatch.setattr(resources, "waited_for_cores", wait_as_long_as_we_run)
+    monkeypatch.setattr(process, "waited_for_cores", wait_as_long_as_we_run)
     scatter.advance(10_000, np.empty(0))
     assert sum(taken) == 10_000
     assert taken[1] < 100
@@ -529,7 +530,7 @@ def test_rests_grow_while_workers_give_up_and_are_forgotten_when_they_do_not(
     taken = [0, 0]
     with monkeypatch.context() as patch:
         patch.setattr("time.process_time", lambda: now)
-        patch.setattr(resources, "waited_for_cores", lambda: 0.001 * taken[1])
+        patch.setattr(process, "waited_for_cores", lambda: 0.001 * taken[1])
         scatter.advance(10_000, np.empty(0))
     assert taken[1] < 200
     # Undisturbed for minutes, and then disturbed once: the rest is the shortest again.

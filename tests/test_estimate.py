@@ -11,15 +11,15 @@ import numpy as np
 import pytest
 
 from taichi_msm import load_scene, resume, run
-from taichi_msm.physics import pilots, workload
-from taichi_msm.physics.pilots import ENOUGH, Pilots, choose_pilots
-from taichi_msm.physics.planning import on, with_time
-from taichi_msm.physics.solver import Dynamics
-from taichi_msm.physics.state import RunProgress
-from taichi_msm.physics.workload import affords_pilots
-from taichi_msm.progress import Pause
-from taichi_msm.results.record import RunRecord
-from taichi_msm.scene import Scene
+from taichi_msm.accuracy import companions
+from taichi_msm.accuracy.companions import ENOUGH, Pilots, choose_pilots
+from taichi_msm.errors import Pause
+from taichi_msm.runs.writer import RunRecord
+from taichi_msm.scene.scene import Scene
+from taichi_msm.solver import planning
+from taichi_msm.solver.dynamics import Dynamics
+from taichi_msm.solver.planning import affords_pilots, on, with_time
+from taichi_msm.solver.state import RunProgress
 from taichi_msm.system.runtime import Device
 from tests.motion import notes_of, true_error
 from tests.scenes import PRESS, plan_of, scene
@@ -68,7 +68,7 @@ def test_an_estimate_can_be_left_out_or_asked_for(small: Path, device: Device, m
     record = run(made, "out", threads=device.threads, estimate_error=False)
     assert (record["error_estimate"], record["error_estimate_reason"]) == (None, "not asked for")
     assert "pilot" not in record["timings"]
-    monkeypatch.setattr(pilots, "affords_pilots", lambda plan, steps: False)
+    monkeypatch.setattr(companions, "affords_pilots", lambda plan, steps: False)
     record = run(made, "out", threads=device.threads)
     assert record["error_estimate"] is None
     assert record["error_estimate_reason"].startswith("it would take more than two fifths of the run")
@@ -96,7 +96,7 @@ def test_a_resumed_run_has_the_same_estimate(small: Path, device: Device) -> Non
 
 
 def test_a_run_that_is_wrong_says_what_helps() -> None:
-    from taichi_msm.physics.error_control import Estimate
+    from taichi_msm.accuracy.time_step import Estimate
 
     def said(error: float, rounding: float, in_f64: float) -> list[str]:
         return notes_of(scene(), MOVED, Estimate(10, error, rounding, in_f64, 2))
@@ -133,7 +133,7 @@ def test_a_small_run_is_in_f64_and_a_large_one_in_f32() -> None:
     assert precision(drawn) == "f64"
     # The work is counted, and not timed.
     steps = 30 * plan_of(made(edge, 30)).grid.steps_per_frame * edge**2
-    assert workload.DOUBLE * steps > workload.SMALL * workload.START >= workload.DOUBLE * steps * (1 - 3 / edge)
+    assert planning.DOUBLE * steps > planning.SMALL * planning.START >= planning.DOUBLE * steps * (1 - 3 / edge)
 
 
 def test_pilots_are_taken_while_they_are_two_fifths_of_the_run() -> None:
@@ -189,7 +189,7 @@ def test_a_finer_pilot_follows_an_error_that_matters(
     error = true_error(plan_of(made), device, fine=32)
     # Twice the next power of h, as in tests/test_accuracy.py.
     assert told(record) == pytest.approx(error, rel=1 / 12)
-    monkeypatch.setattr(pilots, "affords_pilots", lambda plan, steps: steps < 1)
+    monkeypatch.setattr(companions, "affords_pilots", lambda plan, steps: steps < 1)
     record = run(made, "out", threads=device.threads)
     found = record["error_estimate"]
     assert found is not None
@@ -229,7 +229,7 @@ def test_beside_f32_a_coarse_pilot_of_order_1_tells_a_bound(small: Path, device:
 def test_beside_f32_a_coarse_pilot_tells_a_bound(
     small: Path, device: Device, monkeypatch: pytest.MonkeyPatch, taken: list[int]
 ) -> None:
-    monkeypatch.setattr(pilots, "affords_pilots", lambda plan, steps: steps < 1)
+    monkeypatch.setattr(companions, "affords_pilots", lambda plan, steps: steps < 1)
     made = load_scene("small.yaml", [*WRONG, "time.precision=f32"])
     record = run(made, "out", threads=device.threads)
     assert record["steps"] is not None

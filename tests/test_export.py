@@ -15,14 +15,14 @@ import pytest
 from numpy.typing import NDArray
 from PIL import Image
 
-from taichi_msm import console
+from taichi_msm.cli import console
 from taichi_msm.errors import FilesError, ForeignError
 from taichi_msm.exports import obj
-from taichi_msm.exports.convert import export
+from taichi_msm.exports.export import export
 from taichi_msm.exports.formats import FORMATS
-from taichi_msm.results import entries
-from taichi_msm.results.finished_run import PUT_BACK, read_run
-from taichi_msm.runner import run
+from taichi_msm.runs import directory
+from taichi_msm.runs.finished import PUT_BACK, read_run
+from taichi_msm.runs.run import run
 from taichi_msm.system.runtime import Device
 from tests.conftest import Program
 from tests.outputs import files
@@ -65,7 +65,7 @@ def test_json_is_all_there_is_on_stdout(results: Path, program: Program) -> None
 def test_another_process_gives_the_same_bytes(results: Path) -> None:
     """And does not start Taichi."""
     exported(results, results / "here")
-    code = "import sys; from taichi_msm.cli import main; main(sys.argv[1:]); sys.exit('taichi' in sys.modules)"
+    code = "import sys; from taichi_msm.cli.main import main; main(sys.argv[1:]); sys.exit('taichi' in sys.modules)"
     arguments = ["export", str(results), "--format", "obj", "--out", str(results / "there"), "--quiet"]
     subprocess.run([sys.executable, "-c", code, *arguments], check=True)
     assert files(results / "there") == files(results / "here")
@@ -172,7 +172,7 @@ def test_two_exports_do_not_write_into_one_folder(results: Path) -> None:
 KILLED = """
 import os, signal, sys
 from pathlib import Path
-from taichi_msm.exports.convert import export
+from taichi_msm.exports.export import export
 
 def progress(done, total):
     if done == 3:
@@ -229,13 +229,13 @@ def test_many_files_are_compared_in_time_proportional_to_their_number(
         (out / name).write_text("of an earlier export")
     (out / "export.json").write_text(json.dumps({"files": names}))
     calls: list[str] = []
-    kind = entries.kind
+    kind = directory.kind
 
     def counted(path: Path) -> str | None:
         calls.append(path.name)
         return kind(path)
 
-    monkeypatch.setattr(entries, "kind", counted)
+    monkeypatch.setattr(directory, "kind", counted)
     assert len(exported(results, out)) == 8
     # A name is looked up some times, and never beside each of the others.
     assert count < len(calls) < 10 * count < count**2
@@ -433,7 +433,7 @@ def test_an_interrupted_export_changes_nothing(name: str, results: Path) -> None
 def test_the_command_says_that_it_was_interrupted(
     results: Path, program: Program, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("taichi_msm.system.signals.Interruption.grant", raise_interrupt)
+    monkeypatch.setattr("taichi_msm.system.process.Interruption.grant", raise_interrupt)
     done = program("export", str(results), "--format", "obj", "--json")
     assert (done.returncode, done.stderr) == (130, "interrupted; nothing was written\n")
     assert json.loads(done.stdout)["status"] == "interrupted"

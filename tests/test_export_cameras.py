@@ -12,8 +12,8 @@ import numpy as np
 import pytest
 
 from taichi_msm import ArgumentError, FilesError, export
-from taichi_msm.exports.pinhole import read_pinhole
-from taichi_msm.results.finished_run import read_run
+from taichi_msm.exports.inputs import read_pinhole
+from taichi_msm.runs.finished import read_run
 from tests.conftest import Program
 from tests.outputs import files
 

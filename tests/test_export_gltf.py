@@ -16,9 +16,9 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from taichi_msm.exports import gltf
-from taichi_msm.exports.convert import export
+from taichi_msm.exports.export import export
 from taichi_msm.exports.gltf import key_frames
-from taichi_msm.exports.mesh import unit_normals
+from taichi_msm.exports.inputs import unit_normals
 from tests.scenes import speckle
 
 Array = NDArray[Any]

@@ -16,10 +16,10 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from taichi_msm.errors import FilesError
-from taichi_msm.exports.convert import export
+from taichi_msm.exports.export import export
 from taichi_msm.exports.kitti import encode, png16
-from taichi_msm.outputs.flo import read_flo
-from taichi_msm.results.finished_run import reading
+from taichi_msm.runs.arrays import read_flo
+from taichi_msm.runs.finished import reading
 from tests.outputs import files
 
 WIDTH, HEIGHT, PAIRS = 40, 30, 4

@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from taichi_msm.exports.convert import export
-from taichi_msm.exports.mesh import unit_normals
+from taichi_msm.exports.export import export
+from taichi_msm.exports.inputs import unit_normals
 from tests.scenes import speckle
 
 

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 import taichi_msm
 from taichi_msm import ArgumentError, FilesError
 from taichi_msm.exports import tapvid
-from taichi_msm.exports.convert import export
+from taichi_msm.exports.export import export
 from tests.conftest import Program
 from tests.outputs import files
 from tests.test_finished_run import change, rewrite

@@ -31,7 +31,7 @@ from PIL import Image
 from scipy import ndimage
 
 from taichi_msm import FilesError, NotInstalledError, export
-from taichi_msm.outputs import mp4
+from taichi_msm.scene import outputs
 from tests.conftest import Program
 from tests.test_export_cameras import alone, describe
 
@@ -198,7 +198,7 @@ def test_two_cameras_are_needed_with_their_tracks_and_without_distortion(stereo:
 
 
 def test_without_pyav_there_is_one_line(stereo: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(mp4, "is_installed", lambda: False)
+    monkeypatch.setattr(outputs, "is_pyav_installed", lambda: False)
     with pytest.raises(NotInstalledError) as caught:
         export(stereo, "stir")
     assert str(caught.value) == "--format stir needs PyAV, which is not installed; pip install av"

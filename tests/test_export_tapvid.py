@@ -13,7 +13,7 @@ from PIL import Image
 
 from taichi_msm.errors import FilesError
 from taichi_msm.exports import tapvid
-from taichi_msm.exports.convert import export
+from taichi_msm.exports.export import export
 
 WIDTH, HEIGHT, FRAMES, TRACKS = 40, 30, 5, 6
 

@@ -11,11 +11,10 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from taichi_msm.exports.convert import export
+from taichi_msm.exports.export import export
 from taichi_msm.exports.vtk import speed
-from taichi_msm.physics.lattice import rest_positions
-from taichi_msm.physics.material import area_shares
-from taichi_msm.results.finished_run import read_run
+from taichi_msm.model.sheet import area_shares, rest_positions
+from taichi_msm.runs.finished import read_run
 from tests import reference
 from tests.conftest import Program
 

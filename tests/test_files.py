@@ -22,12 +22,12 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from taichi_msm.errors import FilesError
-from taichi_msm.outputs import gif
 from taichi_msm.render.labels import Observed
-from taichi_msm.results.encoder import Encoder, encode
-from taichi_msm.results.pictures import Job
-from taichi_msm.results.writer import ResultWriter
-from taichi_msm.scene import Scene
+from taichi_msm.runs import media
+from taichi_msm.runs.encoder import Encoder, encode
+from taichi_msm.runs.media import Job
+from taichi_msm.runs.writer import ResultWriter
+from taichi_msm.scene.scene import Scene
 from tests.outputs import files
 from tests.scenes import scene, scene_and_grid, speckle
 
@@ -40,7 +40,7 @@ import itertools
 import sys
 from pathlib import Path
 from taichi_msm.render.labels import Observed
-from taichi_msm.results.writer import ResultWriter
+from taichi_msm.runs.writer import ResultWriter
 from tests.scenes import scene_and_grid
 from tests.test_files import picture, position, small_scene
 
@@ -206,7 +206,7 @@ def finish_after_another(writer: ResultWriter) -> None:
 
 
 @pytest.mark.parametrize(
-    ("owner", "part"), [(Image.Image, "save"), (gif.Palette, "indices"), (gif.GifWriter, "_write_last")]
+    ("owner", "part"), [(Image.Image, "save"), (media.Palette, "indices"), (media.GifWriter, "_write_last")]
 )
 def test_an_interruption_while_a_picture_is_encoded_here_leaves_whole_frames(
     owner: type, part: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
@@ -216,7 +216,7 @@ def test_an_interruption_while_a_picture_is_encoded_here_leaves_whole_frames(
 
     def interrupted(*arguments: Any, **keywords: Any) -> Any:
         interrupt_main()
-        time.sleep(0.3)  # until the main thread has heard of it
+        time.sleep(1)  # until the main thread has heard of it
         return original(*arguments, **keywords)
 
     with ResultWriter(tmp_path / "interrupted", *scene_and_grid(small_scene()), beside=False) as writer:
@@ -334,14 +334,14 @@ def full_disk(*_: object, **__: object) -> None:
     raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
 
 
-@pytest.mark.parametrize("target", ["records.create", "checkpoint.replacing", "writer.add"])
+@pytest.mark.parametrize("target", ["checkpoint.create", "checkpoint.replacing", "writer.add"])
 def test_a_full_disk_is_one_line_and_changes_nothing(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, target: str
 ) -> None:
     """When the positions are written, the manifest or the record."""
     write(tmp_path, 3, small_scene())
     before = files(tmp_path)
-    monkeypatch.setattr(f"taichi_msm.results.{target}", full_disk)
+    monkeypatch.setattr(f"taichi_msm.runs.{target}", full_disk)
     with pytest.raises(FilesError) as told:
         write(tmp_path, 2, small_scene())
     assert str(told.value) == (

@@ -16,7 +16,7 @@ import pytest
 from PIL import Image
 
 from taichi_msm.errors import ArgumentError, FilesError
-from taichi_msm.results.finished_run import read_run
+from taichi_msm.runs.finished import read_run
 from tests.scenes import speckle
 
 RUN_AGAIN = "damaged, or not of this run; run the scene again"
@@ -220,7 +220,7 @@ def test_the_record_of_another_run_does_not_fit(ran: Path, results: Path) -> Non
 
 def test_reading_a_run_does_not_start_the_compiler(ran: Path) -> None:
     code = (
-        "import sys; from taichi_msm.results.finished_run import read_run; read_run(sys.argv[1]).positions(); "
+        "import sys; from taichi_msm.runs.finished import read_run; read_run(sys.argv[1]).positions(); "
         "sys.exit(bool({'taichi', 'quadrants'} & set(sys.modules)))"
     )
     subprocess.run([sys.executable, "-c", code, str(ran)], check=True)

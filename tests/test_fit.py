@@ -16,20 +16,17 @@ from numpy.typing import NDArray
 from scipy.stats import t as student
 
 from taichi_msm import ArgumentError, SceneError, Simulation, fit, load_scene, run
-from taichi_msm.fitting.arguments import Method
+from taichi_msm.fitting.checks import MOVES, faults, moved
 from taichi_msm.fitting.force_table import read_forces
-from taichi_msm.fitting.observations import Observations, read_observations
-from taichi_msm.fitting.parameters import make_parameters
-from taichi_msm.fitting.prediction import Job, Predicted, Predictor, runnable
+from taichi_msm.fitting.least_squares import Alike
+from taichi_msm.fitting.observations import Observations, read_observations, seen_by_camera
+from taichi_msm.fitting.parameters import Method, make_parameters
+from taichi_msm.fitting.predict import Job, Predicted, Predictor, Runs, runnable
 from taichi_msm.fitting.rejection import by_pattern
 from taichi_msm.fitting.result import FitResult
-from taichi_msm.fitting.runs import Runs
-from taichi_msm.fitting.sight import seen_by_camera
-from taichi_msm.fitting.suspicions import MOVES, faults, moved
-from taichi_msm.fitting.uncertainty import Alike
-from taichi_msm.physics.deformed import on_surface, surface_weights, touched
-from taichi_msm.scene import Scene
-from taichi_msm.system import resources
+from taichi_msm.model.surface import on_surface, surface_weights, touched
+from taichi_msm.scene.scene import Scene
+from taichi_msm.system import process
 from taichi_msm.system.runtime import Device
 from tests.conftest import Program
 
@@ -64,7 +61,7 @@ PLACES = np.stack([axis.ravel() for axis in np.meshgrid(GRID, GRID)], axis=1)
 def one_device(device: Device) -> Iterator[None]:
     """A fit takes every core, and a process has one device."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(resources, "available_threads", lambda: device.threads)
+        patch.setattr(process, "available_threads", lambda: device.threads)
         patch.setattr("taichi_msm.system.runtime.resources.available_threads", lambda: device.threads)
         yield
 

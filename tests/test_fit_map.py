@@ -16,18 +16,15 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from taichi_msm import FitResult, SceneError, fit, load_scene
-from taichi_msm.fitting.fields import Fields
-from taichi_msm.fitting.observations import Observations, read_observations
-from taichi_msm.fitting.prediction import runnable
-from taichi_msm.fitting.sight import Sight
-from taichi_msm.fitting.tikhonov import Search
-from taichi_msm.physics.adjoint import Adjoint
-from taichi_msm.physics.lattice import rest_positions
-from taichi_msm.physics.material import read_map
-from taichi_msm.physics.mesh_error import estimate_points
-from taichi_msm.scene import Scene
-from taichi_msm.scenefile.validation import checked
-from taichi_msm.system import resources
+from taichi_msm.accuracy.mesh import estimate_points
+from taichi_msm.fitting.observations import Observations, Sight, read_observations
+from taichi_msm.fitting.predict import runnable
+from taichi_msm.fitting.tikhonov import Fields, Search
+from taichi_msm.gradients.gradient import Adjoint
+from taichi_msm.load.check import checked
+from taichi_msm.model.sheet import read_map, rest_positions
+from taichi_msm.scene.scene import Scene
+from taichi_msm.system import process as process_module
 from taichi_msm.system.runtime import Device
 from tests.conftest import Program
 from tests.telling import Telling
@@ -75,7 +72,7 @@ def one_device(device: Device) -> Iterator[None]:
     """A fit takes every core, and a process has one device."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr("taichi_msm.system.runtime.resources.available_threads", lambda: device.threads)
-        patch.setattr(resources, "available_threads", lambda: device.threads)
+        patch.setattr(process_module, "available_threads", lambda: device.threads)
         yield
 
 

@@ -12,8 +12,8 @@ from scipy.optimize import brentq
 from scipy.special import k0, k1
 
 from taichi_msm import Simulation
-from taichi_msm.physics.loads import loads_at
-from taichi_msm.scene import Scene
+from taichi_msm.model.loads import loads_at
+from taichi_msm.scene.scene import Scene
 from taichi_msm.system.runtime import Device
 from tests import reference
 from tests.reference.sheet import sheet as assembled

@@ -16,12 +16,12 @@ import pytest
 from numpy.typing import NDArray
 
 from taichi_msm import DivergedError, Simulation, run
-from taichi_msm.console import summary
-from taichi_msm.physics.deformed import touched
-from taichi_msm.physics.lattice import rest_positions
-from taichi_msm.physics.probe_force import control_point, probe_records
-from taichi_msm.scene import Scene
-from taichi_msm.system.resources import available_threads
+from taichi_msm.cli.console import summary
+from taichi_msm.model.sheet import rest_positions
+from taichi_msm.model.surface import touched
+from taichi_msm.model.tool_force import control_point, probe_records
+from taichi_msm.scene.scene import Scene
+from taichi_msm.system.process import available_threads
 from taichi_msm.system.runtime import Device
 from tests import reference
 from tests.scenes import plan_of, scene

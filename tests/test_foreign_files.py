@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 
 from taichi_msm.errors import FilesError
-from taichi_msm.results.finished_run import read_run
+from taichi_msm.runs.finished import read_run
 from taichi_msm.system.files import private_folder, read_regular
 
 

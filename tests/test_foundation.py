@@ -11,23 +11,22 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from taichi_msm.accuracy.mesh import coarser
 from taichi_msm.errors import SceneError
-from taichi_msm.physics.divergence import farthest
-from taichi_msm.physics.kernel import SheetLayout
-from taichi_msm.physics.lattice import rest_positions
-from taichi_msm.physics.loads import schedule
-from taichi_msm.physics.mesh_error import coarser
-from taichi_msm.physics.planning import variant
-from taichi_msm.physics.state import RunProgress
-from taichi_msm.physics.terms.foundation import FoundationTerm
-from taichi_msm.runner import run
-from taichi_msm.scene import Foundation, Scene
-from taichi_msm.scenefile.load import load_plan, load_scene
-from taichi_msm.simulation import Simulation
-from taichi_msm.study.peer import acceleration
-from taichi_msm.study.terms import variants
-from taichi_msm.sweeps.sweepfile import load_sweep
+from taichi_msm.load.scene_file import load_plan, load_scene
+from taichi_msm.model.loads import schedule
+from taichi_msm.model.sheet import rest_positions
+from taichi_msm.runs.run import run
+from taichi_msm.runs.simulation import Simulation
+from taichi_msm.scene.scene import Scene
+from taichi_msm.scene.sheet import Foundation
+from taichi_msm.solver.arrays import SheetLayout
+from taichi_msm.solver.planning import variant
+from taichi_msm.solver.state import RunProgress, farthest
+from taichi_msm.study.measurements import acceleration, variants
+from taichi_msm.sweeps.spec import load_sweep
 from taichi_msm.system.runtime import Device
+from taichi_msm.terms.foundation import FoundationTerm
 from tests import reference
 from tests.conftest import Program
 from tests.motion import frames, notes_of, structure_of

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from PIL import Image
 from scipy.spatial import cKDTree
 
-from taichi_msm.outputs.gif import LONGEST, SHORTEST, TRANSPARENT, GifWriter, Palette
+from taichi_msm.runs.media import MAX_GIF_DELAY, SHORTEST, TRANSPARENT, GifWriter, Palette
 from tests.scenes import speckle
 
 Picture = NDArray[np.uint8]
@@ -136,7 +136,7 @@ def test_a_delay_that_does_not_fit_is_shared_by_repetitions(tmp_path: Path, pale
     write(tmp_path / "a.gif", [grey(0), grey(1)], 0.001, palette)
     found = blocks((tmp_path / "a.gif").read_bytes())
     assert sum(found.delays) == 200_000
-    assert max(found.delays) <= LONGEST
+    assert max(found.delays) <= MAX_GIF_DELAY
     shown, _ = read(tmp_path / "a.gif")
     np.testing.assert_array_equal(shown[0], grey(0))
     np.testing.assert_array_equal(shown[-1], grey(1))

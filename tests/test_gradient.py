@@ -17,14 +17,14 @@ from pydantic import BaseModel
 
 from taichi_msm import Scene, Simulation, gradient
 from taichi_msm.errors import ArgumentError, MsmError, SceneError
-from taichi_msm.physics import adjoint_motion, adjoint_rest
-from taichi_msm.physics.adjoint import Adjoint, mapped
-from taichi_msm.physics.adjoint_motion import MotionAdjoint
-from taichi_msm.physics.lattice import rest_positions
-from taichi_msm.physics.loads import schedule
-from taichi_msm.physics.plan import Plan
-from taichi_msm.physics.slopes import Derivatives
-from taichi_msm.physics.solver import layout_of
+from taichi_msm.gradients import motion, rest
+from taichi_msm.gradients.chain_rule import Derivatives
+from taichi_msm.gradients.gradient import Adjoint, mapped
+from taichi_msm.gradients.motion import MotionAdjoint
+from taichi_msm.model.loads import schedule
+from taichi_msm.model.plan import Plan
+from taichi_msm.model.sheet import rest_positions
+from taichi_msm.solver.dynamics import layout_of
 from taichi_msm.system.runtime import Device
 from tests.reference import adjoint as twin
 from tests.reference.sheet import sheet
@@ -44,7 +44,7 @@ TISSUE = {"young": 900, "thickness": 0.015, "density": 1000, "damping": 3.0}
 @pytest.fixture(autouse=True)
 def _short_segments(monkeypatch: pytest.MonkeyPatch) -> None:
     """Of small sheets, one segment would hold all steps."""
-    monkeypatch.setattr(adjoint_motion, "SEGMENT_BYTES", 0)
+    monkeypatch.setattr(motion, "SEGMENT_BYTES", 0)
 
 
 @pytest.fixture(scope="module")
@@ -308,10 +308,10 @@ def test_the_bits_depend_neither_on_workers_nor_on_segments(
     alone = bits(1)
     assert bits(2) == bits(3) == alone
     with monkeypatch.context() as patched:
-        patched.setattr(adjoint_motion, "SEGMENT_BYTES", 2**20)
+        patched.setattr(motion, "SEGMENT_BYTES", 2**20)
         assert bits(2) == alone
     # Workers that give up at once.
-    monkeypatch.setattr(adjoint_motion, "LONG_PATIENCE", 0)
+    monkeypatch.setattr(motion, "LONG_PATIENCE", 0)
     assert bits(3) == alone
 
 
@@ -396,7 +396,7 @@ def test_a_shape_without_stiffness_is_named(device: Device, monkeypatch: pytest.
     adjoint = Adjoint(plan_of(Scene.model_validate(REST)), device)
     slope = 1 + 0 * adjoint.run()
     # As if no solution were one.
-    monkeypatch.setattr(adjoint_rest, "SOLVED", -1)
+    monkeypatch.setattr(rest, "SOLVED", -1)
     with pytest.raises(MsmError, match=r"frame 1 has no gradient: .*give it a foundation, pretension or bending"):
         adjoint.backward(slope)
 
@@ -435,7 +435,7 @@ def test_a_gradient_for_which_there_is_no_memory(
     kind: str, image: str, device: Device, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     scene = Scene.model_validate(REST if kind == "rest" else described("tissue", image))
-    monkeypatch.setattr("taichi_msm.physics.adjoint.available_memory", lambda: 1000)
+    monkeypatch.setattr("taichi_msm.gradients.gradient.available_memory", lambda: 1000)
     with pytest.raises(SceneError, match=r"GiB of memory, and .* is free; take fewer points"):
         Adjoint(plan_of(scene), device)
 
@@ -475,7 +475,7 @@ def test_a_pause_follows_every_launch(image: str, device: Device, monkeypatch: p
 def test_a_solution_that_takes_long_is_left_behind(device: Device, monkeypatch: pytest.MonkeyPatch) -> None:
     adjoint, pauses = Adjoint(plan_of(Scene.model_validate(REST)), device), []
     slope = loss(adjoint.run())[1]
-    monkeypatch.setattr(adjoint_rest, "_solved", lambda *_: time.sleep(20))
+    monkeypatch.setattr(rest, "_solved", lambda *_: time.sleep(20))
 
     def stop() -> None:
         pauses.append(1)

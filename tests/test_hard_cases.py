@@ -1,6 +1,6 @@
 """The hard cases for numerical stability, scenes in tests/hard: each stays right with a known error, or says otherwise.
 
-Errors are of displacements, and fractions of the largest one of the run, as in `taichi_msm.physics.error_control`.
+Errors are of displacements, and fractions of the largest one of the run, as in `taichi_msm.accuracy.time_step`.
 """
 
 from __future__ import annotations
@@ -13,13 +13,13 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from taichi_msm.physics import lattice
-from taichi_msm.physics.divergence import MOST_SHEET_SIZES
-from taichi_msm.physics.error_control import estimate_error
-from taichi_msm.physics.probe_force import probe_force
-from taichi_msm.scene import Scene
-from taichi_msm.scenefile.load import load_scene
-from taichi_msm.simulation import Simulation
+from taichi_msm.accuracy.divergence import MOST_SHEET_SIZES
+from taichi_msm.accuracy.time_step import estimate_error
+from taichi_msm.load.scene_file import load_scene
+from taichi_msm.model import sheet
+from taichi_msm.model.tool_force import probe_force
+from taichi_msm.runs.simulation import Simulation
+from taichi_msm.scene.scene import Scene
 from taichi_msm.system.runtime import Device
 from tests import reference
 from tests.motion import dynamics_of, frames
@@ -121,7 +121,7 @@ def test_the_kernel_is_like_the_twin(name: str, device: Device) -> None:
     # A force is good to a rounding of a rest length, and roundings of every step add up over the steps after it; over
     # and over in one direction they would make steps^2, at random steps^1.5.
     assert longest(twin) > 0
-    assert difference <= F64 * steps**1.5 * max(longest(twin), *lattice.spacing(scene.sheet))
+    assert difference <= F64 * steps**1.5 * max(longest(twin), *sheet.spacing(scene.sheet))
 
 
 @pytest.mark.parametrize(
@@ -173,7 +173,7 @@ def test_adrift_moves_its_centre_of_mass_as_one_body(device: Device) -> None:
     # the release, where half the force acts for one step: only rounding is left, all to one side at worst.
     scene = hard("adrift")
     (probe,) = scene.probes
-    x, y = lattice.axes(scene.sheet)
+    x, y = sheet.axes(scene.sheet)
     share = np.exp(-probe.falloff * np.hypot(x + scene.sheet.size[1] / 2, y) - probe.offset)
     a = probe_force(probe, scene.sheet).force[0] * share.mean() / plan_of(scene).material.mass
     t = np.arange(1, scene.time.frames + 1) / scene.time.frames_per_second
@@ -211,10 +211,10 @@ def shadow_energy(scene: Scene, before: Array, after: Array) -> float:
     v, middle = (after - before) / h, (before + after) / 2
 
     def force(u: Array) -> Array:
-        return reference.elastic_force(scene, u) * ~lattice.fixed_points(scene.sheet)[..., None]
+        return reference.elastic_force(scene, u) * ~sheet.fixed_points(scene.sheet)[..., None]
 
     potential = 0.0
-    x = middle + lattice.rest_positions(scene.sheet)
+    x = middle + sheet.rest_positions(scene.sheet)
     for spring in springs(scene):
         if spring.down >= 0 and (spring.down, spring.right) != (0, -1):
             here, there = spring.ends(scene.sheet.points)

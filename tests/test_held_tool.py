@@ -5,9 +5,10 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from taichi_msm.physics.loads import Schedule, schedule
-from taichi_msm.scene import Probe, Scene
-from taichi_msm.viewer.held_tool import RISE, HeldTool
+from taichi_msm.model.loads import Schedule, schedule
+from taichi_msm.scene.scene import Scene
+from taichi_msm.scene.tools import Probe
+from taichi_msm.view.tools import RISE, HeldTool
 from tests.scenes import plan_of, scene
 
 RATE = 50.0

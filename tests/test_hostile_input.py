@@ -19,9 +19,9 @@ import pytest
 from PIL import Image
 
 from taichi_msm.errors import SceneError
+from taichi_msm.load.scene_file import load_scene
 from taichi_msm.render.texture import image_size, load_texture
-from taichi_msm.scene import Scene
-from taichi_msm.scenefile.load import load_scene
+from taichi_msm.scene.scene import Scene
 from taichi_msm.system.runtime import Device
 from tests.motion import dynamics_of
 from tests.mutation import damaged_picture, damaged_text

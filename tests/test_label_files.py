@@ -12,9 +12,9 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from taichi_msm import ArgumentError, FilesError, Playback, Simulation, resume, run
-from taichi_msm.render.surface import rods
-from taichi_msm.scene import Scene
-from taichi_msm.scenefile.load import load_scene
+from taichi_msm.load.scene_file import load_scene
+from taichi_msm.model.surface import rods
+from taichi_msm.scene.scene import Scene
 from taichi_msm.system.runtime import Device
 from tests.outputs import files, results
 from tests.reference import labels as twin

@@ -8,15 +8,15 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from taichi_msm.physics.lattice import rest_positions
+from taichi_msm.model.sheet import rest_positions
+from taichi_msm.model.surface import rods
 from taichi_msm.render import tracking
 from taichi_msm.render.camera import view
 from taichi_msm.render.labels import Labels
 from taichi_msm.render.rasterizer import Drawing, drawing_config
 from taichi_msm.render.renderer import Renderer, Shot
-from taichi_msm.render.surface import rods
 from taichi_msm.render.tracking import find, find_flow
-from taichi_msm.scene import Scene
+from taichi_msm.scene.scene import Scene
 from taichi_msm.system import launches
 from taichi_msm.system.runtime import Device
 from tests.reference import labels as twin

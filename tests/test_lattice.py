@@ -5,7 +5,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from taichi_msm.physics.lattice import fixed_points, rest_positions
+from taichi_msm.model.sheet import fixed_points, rest_positions
 from tests.reference.neighbours import springs
 from tests.scenes import SHEET, scene
 

@@ -10,16 +10,15 @@ import pytest
 from numpy.typing import NDArray
 
 from taichi_msm.errors import SceneError
-from taichi_msm.physics.lattice import rest_positions
+from taichi_msm.model.sheet import rest_positions
+from taichi_msm.model.surface import rods
 from taichi_msm.render import tracking
-from taichi_msm.render.camera import calibration, view
+from taichi_msm.render.camera import Lens, calibration, view
 from taichi_msm.render.labels import track_grid
-from taichi_msm.render.lens import Lens
 from taichi_msm.render.picking import pick
 from taichi_msm.render.rasterizer import Drawing, drawing_config
-from taichi_msm.render.surface import rods
 from taichi_msm.render.tracking import find, find_flow
-from taichi_msm.scene import Scene
+from taichi_msm.scene.scene import Scene
 from taichi_msm.system.runtime import Device
 from tests import reference
 from tests.reference import labels as twin

@@ -30,10 +30,10 @@ from taichi_msm import (
     resume,
     run,
 )
-from taichi_msm.physics.lattice import rest_positions
-from taichi_msm.physics.planning import with_time
+from taichi_msm.model.sheet import rest_positions
 from taichi_msm.render.camera import view
-from taichi_msm.system.resources import processor
+from taichi_msm.solver.planning import with_time
+from taichi_msm.system.process import processor
 from taichi_msm.system.runtime import Device
 from tests import reference
 from tests.scenes import PRESS, SHEET, plan_of, scene, speckle

@@ -7,9 +7,9 @@ import numpy as np
 import pytest
 from scipy.integrate import quad
 
-from taichi_msm.physics.loads import Envelope, key_times, loads_at, schedule
-from taichi_msm.physics.plan import probe_slots
-from taichi_msm.scene import Scene
+from taichi_msm.model.loads import Envelope, key_times, loads_at, schedule
+from taichi_msm.model.plan import probe_slots
+from taichi_msm.scene.scene import Scene
 from tests.scenes import PRESS, SPRINGS, plan_of, scene
 
 # 25 frames a second in 4 steps of 0.01 s.

@@ -7,14 +7,13 @@ from typing import Any
 import numpy as np
 import pytest
 
-from taichi_msm.physics.loads import schedule
-from taichi_msm.physics.paths import path_problems
-from taichi_msm.physics.plan import Plan
-from taichi_msm.physics.steering import steered
-from taichi_msm.physics.terms.contact import ContactTerm
-from taichi_msm.scene import Probe
-from taichi_msm.viewer.held_tool import RISE
-from taichi_msm.viewer.moved_tool import DEEPEST, FRICTION, HOVER, MovedTool
+from taichi_msm.model.loads import schedule
+from taichi_msm.model.plan import Plan
+from taichi_msm.model.tools import path_problems
+from taichi_msm.scene.tools import Probe
+from taichi_msm.solver.planning import steered
+from taichi_msm.terms.contact import ContactTerm
+from taichi_msm.view.tools import DEEPEST, FRICTION, HOVER, RISE, MovedTool
 from tests.scenes import plan_of, scene
 
 RATE = 30.0

@@ -12,12 +12,12 @@ from PIL import Image
 
 from taichi_msm import Playback, resume, run
 from taichi_msm.errors import SceneError
+from taichi_msm.load.scene_file import load_scene
 from taichi_msm.render.camera import calibration, view
-from taichi_msm.scene import Scene
-from taichi_msm.scenefile.load import load_scene
+from taichi_msm.scene.scene import Scene
 from taichi_msm.system.runtime import Device
-from taichi_msm.viewer.captures import Captures
-from taichi_msm.viewer.session import Session
+from taichi_msm.view.recording import Captures
+from taichi_msm.view.session import Session
 from tests.outputs import results
 from tests.reference import labels as twin
 from tests.scenes import scene

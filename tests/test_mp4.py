@@ -16,10 +16,9 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from taichi_msm import SceneError, run
-from taichi_msm.outputs import mp4
-from taichi_msm.outputs.mp4 import Mp4Writer
-from taichi_msm.results.pictures import Job, PictureWriter
-from taichi_msm.scenefile.load import load_scene
+from taichi_msm.load.scene_file import load_scene
+from taichi_msm.runs.media import Job, Mp4Writer, PictureWriter
+from taichi_msm.scene import outputs
 from taichi_msm.system.runtime import Device
 from tests.conftest import Program
 from tests.outputs import files
@@ -163,7 +162,7 @@ def test_a_film_can_be_given_up(tmp_path: Path) -> None:
 
 
 def test_without_pyav_the_scene_is_refused(small: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(mp4, "is_installed", lambda: False)
+    monkeypatch.setattr(outputs, "is_pyav_installed", lambda: False)
     with pytest.raises(SceneError) as caught:
         load_scene("small.yaml", ["output=[png, mp4]"])
     assert str(caught.value).endswith("output: mp4 needs PyAV, which is not installed; pip install av")

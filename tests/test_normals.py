@@ -10,12 +10,12 @@ import pytest
 from numpy.typing import NDArray
 
 from taichi_msm import Playback, Simulation, run
-from taichi_msm.physics.lattice import rest_positions
+from taichi_msm.model.sheet import rest_positions
+from taichi_msm.model.surface import Rod, rods
 from taichi_msm.render.camera import view
 from taichi_msm.render.labels import Labels
 from taichi_msm.render.rasterizer import Drawing, drawing_config
-from taichi_msm.render.surface import Rod, rods
-from taichi_msm.scene import Scene
+from taichi_msm.scene.scene import Scene
 from taichi_msm.system.runtime import Device
 from tests.reference import labels as twin
 from tests.scenes import speckle

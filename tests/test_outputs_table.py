@@ -7,9 +7,9 @@ from pathlib import Path
 
 import pytest
 
-from taichi_msm.outputs.table import OUTPUTS, PATTERNS, file_names, results
 from taichi_msm.render.labels import Flow, Labels, Observed, Stereo
-from taichi_msm.results.labels import _WRITERS
+from taichi_msm.runs.writer import _WRITERS
+from taichi_msm.scene.outputs import OUTPUTS, PATTERNS, file_names, results
 
 FIELDS = {"labels": Labels._fields, "flow": Flow._fields, "stereo": Stereo._fields}
 

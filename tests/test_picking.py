@@ -8,12 +8,11 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from taichi_msm.physics.lattice import rest_positions
-from taichi_msm.render.camera import pinhole, turned, view
-from taichi_msm.render.camera_path import placed
+from taichi_msm.model.sheet import rest_positions
+from taichi_msm.render.camera import pinhole, placed, turned, view
 from taichi_msm.render.picking import on_rest_plane, pick
 from taichi_msm.render.rasterizer import Drawing
-from taichi_msm.scene import Scene
+from taichi_msm.scene.scene import Scene
 from taichi_msm.system.runtime import Device
 from tests import reference
 from tests.scenes import scene

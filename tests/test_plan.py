@@ -9,13 +9,14 @@ from types import ModuleType
 from typing import Any
 
 import pytest
+import taichi_msm.runs.run
 
 import taichi_msm
-import taichi_msm.runner
-from taichi_msm import load_scene
-from taichi_msm.cli import main
-from taichi_msm.physics import lattice, material, plan, planning, terms
-from taichi_msm.physics.planning import make_plan, variant
+from taichi_msm import load_scene, terms
+from taichi_msm.cli.main import main
+from taichi_msm.model import plan, sheet
+from taichi_msm.solver import planning
+from taichi_msm.solver.planning import make_plan, variant
 
 # Gives a scene a map.
 MAP = "tissue.map={image: textures/tumour.png, range: [1, 13]}"
@@ -24,9 +25,9 @@ DERIVED = [
     (terms, "material_of"),
     (terms, "highest_frequency"),
     (plan, "probe_slots"),
-    (lattice, "fixed_points"),
-    (material, "read_map"),
-    (material, "map_factors"),
+    (sheet, "fixed_points"),
+    (sheet, "read_map"),
+    (sheet, "map_factors"),
     (planning, "stable_step"),
     (planning, "steps_per_frame"),
 ]

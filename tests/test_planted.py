@@ -14,10 +14,10 @@ import pytest
 
 from taichi_msm.errors import FilesError
 from taichi_msm.render.labels import Observed
-from taichi_msm.results.checkpoint import MANIFEST, is_unfinished
-from taichi_msm.results.manifest import read_manifest
-from taichi_msm.results.writer import ResultWriter
-from taichi_msm.scene import Scene
+from taichi_msm.runs.checkpoint import MANIFEST, is_unfinished
+from taichi_msm.runs.manifest import read_manifest
+from taichi_msm.runs.writer import ResultWriter
+from taichi_msm.scene.scene import Scene
 from tests.scenes import scene, scene_and_grid, speckle
 
 pytestmark = pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="needs links and pipes")
@@ -215,7 +215,7 @@ def test_a_checkpoint_whose_file_has_another_name(name: str, treasure: Path) -> 
 
 def test_the_default_folder_is_not_reached_by_a_link(treasure: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Who names a folder may name a link; what came with a scene may not choose for them."""
-    from taichi_msm.cli import result_directory
+    from taichi_msm.cli.session import result_directory
 
     monkeypatch.chdir(treasure.parent)
     Path("output").mkdir()

@@ -13,10 +13,9 @@ from typing import BinaryIO
 import pytest
 
 from taichi_msm.errors import FilesError, ForeignError
-from taichi_msm.outputs.table import PATTERNS
-from taichi_msm.results.publication import Publication
-from taichi_msm.results.whole import lock
-from taichi_msm.results.writer import RUN
+from taichi_msm.runs.directory import Publication, lock
+from taichi_msm.runs.writer import RUN
+from taichi_msm.scene.outputs import PATTERNS
 
 OLD = ["frames/0000.png", "frames/0001.png", "frames/0002.png", "flow/0000.flo", "animation.gif", "run.json"]
 NEW = ["frames/0000.png", "frames/0001.png", "trajectory.npz", "run.json"]
@@ -252,7 +251,7 @@ def test_a_directory_that_is_removed_when_it_was_opened_is_no_endless_loop(
         shutil.rmtree(tmp_path / "out", ignore_errors=True)
         return lock(path)
 
-    monkeypatch.setattr("taichi_msm.results.publication.lock", remove)
+    monkeypatch.setattr("taichi_msm.runs.directory.lock", remove)
     with pytest.raises(FileNotFoundError), Publication(tmp_path / "out", RUN):
         pass
 

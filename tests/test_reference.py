@@ -10,10 +10,10 @@ from numpy.typing import NDArray
 from PIL import Image
 from scipy.integrate import solve_ivp
 
-from taichi_msm.physics.elasticity import energy_density
-from taichi_msm.physics.lattice import fixed_points, rest_positions
-from taichi_msm.physics.loads import loads_at
-from taichi_msm.scene import Scene
+from taichi_msm.model.loads import loads_at
+from taichi_msm.model.sheet import fixed_points, rest_positions
+from taichi_msm.scene.scene import Scene
+from taichi_msm.terms.elasticity import energy_density
 from tests import reference
 from tests.scenes import plan_of, random_scene, random_tissue, scene, speckle
 

@@ -11,15 +11,15 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from taichi_msm.errors import DivergedError
-from taichi_msm.physics.kernel import SheetLayout
-from taichi_msm.physics.lattice import rest_positions
-from taichi_msm.physics.loads import frame_loads
-from taichi_msm.physics.paths import path_notes
-from taichi_msm.physics.plan import Plan
-from taichi_msm.physics.rest import ENOUGH, Rest
-from taichi_msm.physics.solver import Dynamics, layout_of
-from taichi_msm.scene import Scene
-from taichi_msm.simulation import Simulation
+from taichi_msm.model.loads import frame_loads
+from taichi_msm.model.plan import Plan
+from taichi_msm.model.sheet import rest_positions
+from taichi_msm.model.tools import path_notes
+from taichi_msm.runs.simulation import Simulation
+from taichi_msm.scene.scene import Scene
+from taichi_msm.solver.arrays import SheetLayout
+from taichi_msm.solver.dynamics import Dynamics, layout_of
+from taichi_msm.solver.rest import ENOUGH, Rest
 from taichi_msm.system.runtime import Device
 from tests import reference
 from tests.scenes import plan_of, scene, speckle

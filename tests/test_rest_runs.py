@@ -11,18 +11,18 @@ from typing import Any
 import numpy as np
 import pytest
 
+from taichi_msm.accuracy.path_dependence import PathDependence, second_solution
 from taichi_msm.errors import DeviceError, DivergedError, SceneError
-from taichi_msm.physics.lattice import rest_positions
-from taichi_msm.physics.path_dependence import PathDependence, second_solution
-from taichi_msm.physics.rest import ENOUGH, sheet_of
-from taichi_msm.physics.solver import layout_of
-from taichi_msm.results.finished_run import read_run
-from taichi_msm.runner import resume, run
-from taichi_msm.scene import Scene
-from taichi_msm.scenefile.load import load_scene
-from taichi_msm.scenefile.validation import checked
-from taichi_msm.simulation import Simulation
-from taichi_msm.study.measure import study
+from taichi_msm.load.check import checked
+from taichi_msm.load.scene_file import load_scene
+from taichi_msm.model.sheet import rest_positions
+from taichi_msm.runs.finished import read_run
+from taichi_msm.runs.run import resume, run
+from taichi_msm.runs.simulation import Simulation
+from taichi_msm.scene.scene import Scene
+from taichi_msm.solver.dynamics import layout_of
+from taichi_msm.solver.rest import ENOUGH, sheet_of
+from taichi_msm.study.study import study
 from taichi_msm.system.runtime import Device
 from tests.conftest import Program
 from tests.scenes import plan_of
@@ -150,7 +150,7 @@ def test_an_interrupted_run_ends_with_the_same_bits(device: Device, tmp_path: Pa
 def test_what_never_rests_is_a_divergence(
     load: list[list[float]], frames: int, device: Device, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("taichi_msm.physics.rest.MOST_EVALUATIONS", 20)
+    monkeypatch.setattr("taichi_msm.solver.rest.MOST_EVALUATIONS", 20)
     made = at_rest([{**PUSH, "load": load}], output=["trajectory"], **NEVER)
     record = run(made, tmp_path / "out", threads=device.threads)
     assert (record["status"], record["frames"]) == ("diverged", frames)
@@ -237,7 +237,7 @@ def test_a_pilot_that_never_rests_leaves_the_error_unknown(
         monkeypatch.setattr(pilot, "advance", diverges)
         return pilot
 
-    monkeypatch.setattr("taichi_msm.physics.mesh_error.sheet_of", failing)
+    monkeypatch.setattr("taichi_msm.accuracy.mesh.sheet_of", failing)
     record = run(made, tmp_path / "out", threads=device.threads)
     assert record["error_estimate"] is not None
     assert record["error_estimate"]["mesh_error"] is None

@@ -19,16 +19,16 @@ import pytest
 from numpy.typing import NDArray
 from PIL import Image
 
-from taichi_msm import FilesError, resume, run, runner
-from taichi_msm.physics import solver, workload
-from taichi_msm.physics.state import TipForce
-from taichi_msm.results.checkpoint import MANIFEST, POSITIONS, STATE, Checkpoint
-from taichi_msm.results.record import RunRecord
-from taichi_msm.scene import Scene
-from taichi_msm.scenefile.load import load_scene
-from taichi_msm.system.compiler import COMPILERS, chosen
+from taichi_msm import FilesError, resume, run
+from taichi_msm.load.scene_file import load_scene
+from taichi_msm.runs import run as run_module
+from taichi_msm.runs.checkpoint import MANIFEST, POSITIONS, STATE, Checkpoint
+from taichi_msm.runs.writer import RunRecord
+from taichi_msm.scene.scene import Scene
+from taichi_msm.solver import dynamics, planning
+from taichi_msm.solver.state import TipForce
+from taichi_msm.system.compiler import COMPILERS, chosen, versions
 from taichi_msm.system.runtime import Device
-from taichi_msm.system.versions import versions
 from tests.outputs import files, results
 from tests.scenes import speckle
 
@@ -101,7 +101,7 @@ def test_a_run_that_is_interrupted_goes_on_to_the_same_bits(
     output: str, probes: tuple[str, ...], small: Path, device: Device, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Again and again, at a frame's end and within one, and while earlier frames are drawn anew."""
-    monkeypatch.setattr(solver, "MAX_STEPS_PER_LAUNCH", 300)
+    monkeypatch.setattr(dynamics, "MAX_STEPS_PER_LAUNCH", 300)
     made = dragged("time.duration=0.12", f"output=[{output}]", *probes)
     whole = run(made, "whole", threads=device.threads, estimate_error=False)
     record = run(made, "parts", threads=device.threads, estimate_error=False, progress=Stop(5))
@@ -211,7 +211,7 @@ def test_a_run_that_kept_no_positions_goes_on_where_no_pilot_needs_them(
     asked: bool | None, small: Path, device: Device, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Else it begins anew, so that what is known of its error does not depend on the interruption."""
-    monkeypatch.setattr(workload, "MOST_FOR_PILOTS", 0.0)
+    monkeypatch.setattr(planning, "MOST_FOR_PILOTS", 0.0)
     made = dragged("time.duration=0.2", "output=[]")
     whole = run(made, "whole", threads=device.threads, estimate_error=asked)
     assert (whole["error_estimate"] is None) == (not asked)
@@ -274,7 +274,7 @@ def test_a_run_begins_anew_unless_its_compiler_has_the_same_bits(
     for there, goes_on in (({other.name: other.tested}, True), ({chosen().name: "0.0.1"}, False)):
         interrupted(made, "parts", device)
         with monkeypatch.context() as patch:
-            patch.setattr(runner, "versions", lambda there=there: {**rest, **there})
+            patch.setattr(run_module, "versions", lambda there=there: {**rest, **there})
             record = run(made, "parts", threads=device.threads)
         assert (record["resumed"] > 0) == goes_on
         assert record["versions"] == {**(mine if goes_on else rest), **there}
@@ -287,7 +287,7 @@ def test_another_picture_or_version_is_not_gone_on_with(
     before = files(small / "parts")
     others = {**versions(), chosen().name: "1.7.99"}
     with monkeypatch.context() as patch:
-        patch.setattr(runner, "versions", lambda: others)
+        patch.setattr(run_module, "versions", lambda: others)
         with pytest.raises(
             FilesError,
             match=rf"^the run began with {chosen().name} {chosen().version}; use these versions, or run",

@@ -11,9 +11,10 @@ from typing import Any
 
 import pytest
 
-from taichi_msm.physics.lattice import rest_positions
+from taichi_msm.model.sheet import rest_positions
 from taichi_msm.render.rasterizer import Drawing
-from taichi_msm.system import resources, runtime
+from taichi_msm.system import process as process_module
+from taichi_msm.system import runtime
 from taichi_msm.system.compiler import chosen
 from tests.motion import dynamics_of
 from tests.scenes import SHEET, scene, speckle
@@ -56,7 +57,7 @@ def test_threads_that_take_all_cores_have_one_each(
 @pytest.mark.skipif(not Path("/proc/self/task").is_dir(), reason="the system does not tell the cores of threads")
 def test_the_threads_that_are_pinned_are_those_that_work(tmp_path: Path) -> None:
     cores = sorted(os.sched_getaffinity(0))
-    if resources.available_threads() != len(cores):
+    if process_module.available_threads() != len(cores):
         pytest.skip("a quota keeps this process from using all of its cores")
     # Taichi reads the source of a kernel from its file.
     script = tmp_path / "work.py"
@@ -94,7 +95,7 @@ def test_a_process_may_have_many_sheets_and_gets_their_memory_back(device: runti
 # Two of these at once on one core, from a line on stdin on: each waits while the other works.
 BESIDE = """
 import os, time
-from taichi_msm.system.resources import waited_for_cores
+from taichi_msm.system.process import waited_for_cores
 
 os.sched_setaffinity(0, {min(os.sched_getaffinity(0))})
 print("ready", flush=True)
@@ -106,7 +107,7 @@ print(waited_for_cores() - before)
 """
 
 
-@pytest.mark.skipif(resources.waited_for_cores() is None, reason="the system does not tell")
+@pytest.mark.skipif(process_module.waited_for_cores() is None, reason="the system does not tell")
 def test_waiting_for_a_core_is_noticed(root: Path) -> None:
     environment = {**os.environ, "PYTHONPATH": str(root)}
     both = [
@@ -127,12 +128,12 @@ def test_waiting_for_a_core_is_noticed(root: Path) -> None:
 
 
 def test_where_the_system_does_not_tell_of_waiting(tmp_path: Path) -> None:
-    assert resources.waited_for_cores(tmp_path / "missing") is None
+    assert process_module.waited_for_cores(tmp_path / "missing") is None
     (tmp_path / "1").mkdir()
     (tmp_path / "1" / "schedstat").write_text("5 2000000000 7\n")
-    assert resources.waited_for_cores(tmp_path) == 2.0
+    assert process_module.waited_for_cores(tmp_path) == 2.0
     (tmp_path / "2").mkdir()
-    assert resources.waited_for_cores(tmp_path) is None
+    assert process_module.waited_for_cores(tmp_path) is None
 
 
 # One simulation in another thread and another process.
@@ -229,7 +230,7 @@ def test_environment_and_other_threads_change_nothing_at_the_start(tmp_path: Pat
 
 # Starts after a stop; an object that was made before a stop is dropped after it.
 AGAIN = """
-from taichi_msm.physics.lattice import rest_positions
+from taichi_msm.model.sheet import rest_positions
 from taichi_msm.render.rasterizer import Drawing
 from taichi_msm.system import runtime
 from tests.scenes import scene, speckle

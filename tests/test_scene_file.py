@@ -16,9 +16,10 @@ import yaml
 from PIL import Image
 
 from taichi_msm.errors import SceneError
-from taichi_msm.scene import MAX_PROBES, Scene
-from taichi_msm.scenefile import yaml_reader
-from taichi_msm.scenefile.load import MAX_LINES, load_scene, parse_override, schema
+from taichi_msm.load import yaml_reader
+from taichi_msm.load.scene_file import MAX_LINES, load_scene, parse_override, schema
+from taichi_msm.scene.scene import Scene
+from taichi_msm.scene.section import MAX_PROBES
 
 GOOD = """\
 sheet:
@@ -848,7 +849,7 @@ def test_a_scene_sees_no_picture_outside_its_folder(name: str, tmp_path: Path, m
     name = name.format(absolute=tmp_path / "secret.png")
     Path("s.yaml").write_text(GOOD + f"image: {name}\nregion: [0, 0, 9, 9]\n")
     opened: list[str] = []
-    monkeypatch.setattr("taichi_msm.picture._require_file", opened.append)
+    monkeypatch.setattr("taichi_msm.images._require_file", opened.append)
     with pytest.raises(SceneError) as caught:
         load_scene("s.yaml")
     said = "is not below the scene's folder; put the picture there, or name it with --image"

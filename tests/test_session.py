@@ -16,16 +16,16 @@ from PIL import Image
 
 from taichi_msm import load_scene, run
 from taichi_msm.errors import FilesError, SceneError
-from taichi_msm.physics.lattice import rest_positions
-from taichi_msm.physics.loads import schedule
+from taichi_msm.model.loads import schedule
+from taichi_msm.model.sheet import rest_positions
 from taichi_msm.system.runtime import Device
-from taichi_msm.viewer import captures, hud
-from taichi_msm.viewer import session as live_session
-from taichi_msm.viewer.captures import Captures
-from taichi_msm.viewer.events import KEYS, Drag, Event, Harder, Hover, Key, Percent, Press, Release, Turn
-from taichi_msm.viewer.moved_tool import MovedTool
-from taichi_msm.viewer.script import film
-from taichi_msm.viewer.session import Session, with_live_frames
+from taichi_msm.view import overlay, recording
+from taichi_msm.view import session as live_session
+from taichi_msm.view.events import KEYS, Drag, Event, Harder, Hover, Key, Percent, Press, Release, Turn
+from taichi_msm.view.recording import Captures
+from taichi_msm.view.script import film
+from taichi_msm.view.session import Session, with_live_frames
+from taichi_msm.view.tools import MovedTool
 from tests.outputs import duration
 from tests.scenes import plan_of
 
@@ -397,7 +397,7 @@ def test_a_film_shows_the_tissue_alone(begin: Begin) -> None:
 
 
 def test_a_session_too_long_for_a_file_says_so_before(begin: Begin, monkeypatch: pytest.MonkeyPatch) -> None:
-    for module in (live_session, captures):
+    for module in (live_session, recording):
         monkeypatch.setattr(module, "MAX_NODES", 1100)
     session = begin(TILTED)
     session.handle(Press(60, 50))
@@ -724,10 +724,10 @@ def test_a_tool_too_thin_for_the_points_says_so(begin: Begin) -> None:
 
 def bar_of(picture: np.ndarray) -> float:
     """How much of the bar under the two lines of figures is filled."""
-    lines = [row[:, 0] for row in picture[:80] if (row[:70] == hud.OUTLINE).all(axis=-1).any()]
+    lines = [row[:, 0] for row in picture[:80] if (row[:70] == overlay.OUTLINE).all(axis=-1).any()]
     row = lines[len(lines) // 2]
-    right = int(np.flatnonzero(row == hud.OUTLINE)[-1])
-    return float((row[: right + 1] == 255).sum() / (hud.BAR * 11))
+    right = int(np.flatnonzero(row == overlay.OUTLINE)[-1])
+    return float((row[: right + 1] == 255).sum() / (overlay.BAR * 11))
 
 
 def test_the_force_felt_is_shown_with_a_bar(begin: Begin) -> None:
@@ -743,7 +743,7 @@ def test_the_force_felt_is_shown_with_a_bar(begin: Begin) -> None:
         hardest = max(hardest, session.felt())
     said = session._figure_lines("")[0]
     assert said == f"press 45 mm deep  ·  {live_session.newtons(session.felt())}"
-    bar = hud.Bar(session.felt(), hardest, "N")
+    bar = overlay.Bar(session.felt(), hardest, "N")
     assert bar_of(session.picture()) == pytest.approx(session.felt() / bar.end, abs=0.02)
     session.handle(Key("r"))
     session.handle(Percent(40))
@@ -757,7 +757,7 @@ def test_the_force_felt_is_shown_with_a_bar(begin: Begin) -> None:
     ("largest", "end"), [(0.5, 0.5), (0.51, 1), (1, 1), (1.01, 2), (2.4, 5), (7, 10), (0.3, 0.5), (3e-4, 5e-4)]
 )
 def test_a_bar_ends_at_a_round_number(largest: float, end: float) -> None:
-    assert hud.Bar(0.1, largest, "N").end == pytest.approx(end)
+    assert overlay.Bar(0.1, largest, "N").end == pytest.approx(end)
 
 
 @pytest.mark.parametrize(("force", "said"), [(0.0, "0 N"), (0.514, "0.51 N"), (9.63, "9.6 N"), (123.4, "123 N")])

@@ -9,9 +9,8 @@ import pytest
 from PIL import Image
 
 from scenes.textures.make_mucosa import FOLDER, PICTURES, paint
-from taichi_msm.scenefile.load import plan_file
-from taichi_msm.sweeps.samples import values_of_runs
-from taichi_msm.sweeps.sweepfile import load_sweep
+from taichi_msm.load.scene_file import plan_file
+from taichi_msm.sweeps.spec import load_sweep, values_of_runs
 
 
 def test_no_run_of_the_data_set_is_refused(root: Path) -> None:

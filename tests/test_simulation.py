@@ -8,9 +8,10 @@ import numpy as np
 import pytest
 
 import taichi_msm
-from taichi_msm import DivergedError, Simulation, runner
+from taichi_msm import DivergedError, Simulation
 from taichi_msm.render.labels import Observed
-from taichi_msm.system import resources
+from taichi_msm.runs import run
+from taichi_msm.system import process
 from taichi_msm.system.compiler import chosen
 from taichi_msm.system.runtime import Device
 from tests import reference
@@ -45,7 +46,7 @@ def test_kernels_are_compiled_once_in_a_process(device: Device, monkeypatch: pyt
         made = scene(render={"size": [40, 30], "refine": refine}, image="any.png", output=["png"])
         with Simulation(made, threads=device.threads, texture=speckle(30, 40)) as simulation:
             if refine == 3:
-                monkeypatch.setattr("taichi_msm.simulation._compiled", set())
+                monkeypatch.setattr("taichi_msm.runs.simulation._compiled", set())
             simulation.compile()
         assert len(observed) == drawn
 
@@ -92,14 +93,14 @@ def test_one_device_a_process(device: Device) -> None:
 
 
 def test_the_encoder_has_a_core_of_its_own_while_it_works(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(resources, "available_threads", lambda: 4)
+    monkeypatch.setattr(process, "available_threads", lambda: 4)
     made = scene(render={"size": [512, 512]}, time={"step": 0.001})
-    assert runner.free_cores(plan_of(made)) == 4, "nothing to encode"
+    assert run.free_cores(plan_of(made)) == 4, "nothing to encode"
     made = made.model_copy(update={"image": "a.png", "output": ("gif",)})
-    assert runner.free_cores(plan_of(made)) == 3
+    assert run.free_cores(plan_of(made)) == 3
     # 40 steps of 10^6 points a frame take longer than its 512 x 512 pixels.
     large = made.sheet.model_copy(update={"points": (1000, 1000)})
     large_scene = made.model_copy(update={"sheet": large})
-    assert runner.free_cores(plan_of(large_scene)) == 4
-    monkeypatch.setattr(resources, "available_threads", lambda: 1)
-    assert runner.free_cores(plan_of(made)) == 1
+    assert run.free_cores(plan_of(large_scene)) == 4
+    monkeypatch.setattr(process, "available_threads", lambda: 1)
+    assert run.free_cores(plan_of(made)) == 1

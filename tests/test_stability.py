@@ -6,9 +6,9 @@ from typing import Any
 import numpy as np
 import pytest
 
-from taichi_msm.physics.lattice import rest_positions
-from taichi_msm.physics.planning import try_plan
-from taichi_msm.physics.terms import highest_frequency
+from taichi_msm.model.sheet import rest_positions
+from taichi_msm.solver.planning import try_plan
+from taichi_msm.terms import highest_frequency
 from tests import reference
 from tests.scenes import SHEET, plan_of, scene
 

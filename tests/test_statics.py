@@ -8,10 +8,10 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import root
 
-from taichi_msm.physics.lattice import fixed_points
-from taichi_msm.physics.loads import loads_at
-from taichi_msm.physics.state import State
-from taichi_msm.scene import Scene
+from taichi_msm.model.loads import loads_at
+from taichi_msm.model.sheet import fixed_points
+from taichi_msm.scene.scene import Scene
+from taichi_msm.solver.state import State
 from taichi_msm.system.runtime import Device
 from tests import reference
 from tests.motion import dynamics_of

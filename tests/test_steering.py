@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from taichi_msm import ArgumentError, Probe, SceneError, Simulation
-from taichi_msm.scene import Scene
+from taichi_msm.scene.scene import Scene
 from taichi_msm.system.runtime import Device
 from tests.scenes import plan_of
 from tests.test_contact import HELD, PRESSED, ROD, RUBBED, moved, touching

@@ -13,27 +13,37 @@ import pytest
 from PIL import Image
 from pydantic import BaseModel
 
-from taichi_msm.physics.error_control import longest
-from taichi_msm.physics.lattice import rest_positions
-from taichi_msm.physics.mesh_error import with_points
-from taichi_msm.physics.plan import Plan
-from taichi_msm.physics.planning import with_time
-from taichi_msm.physics.solver import Dynamics
-from taichi_msm.physics.terms.damping import DampingTerm
-from taichi_msm.physics.terms.foundation import FoundationTerm
-from taichi_msm.physics.terms.probes import ProbeTerm
-from taichi_msm.physics.terms.springs import SpringTerm
-from taichi_msm.runner import run
-from taichi_msm.scene import Scene
-from taichi_msm.study import measure, pictures, terms
-from taichi_msm.study.peer import FailedError, TooSlowError, solve
-from taichi_msm.study.pictures import measure_pictures
-from taichi_msm.study.points import ROUNDS as POINTS_ROUNDS
-from taichi_msm.study.points import PointStudy, _reference, lattices
+from taichi_msm.accuracy.mesh import with_points
+from taichi_msm.accuracy.time_step import longest
+from taichi_msm.model.plan import Plan
+from taichi_msm.model.sheet import rest_positions
+from taichi_msm.runs.run import run
+from taichi_msm.scene.scene import Scene
+from taichi_msm.solver.dynamics import Dynamics
+from taichi_msm.solver.planning import with_time
+from taichi_msm.study import measurements
+from taichi_msm.study import study as study_module
+from taichi_msm.study.measurements import (
+    MARGIN,
+    POINT_ROUNDS,
+    FailedError,
+    PointStudy,
+    SteppingStudy,
+    TooSlowError,
+    _reference,
+    lattices,
+    measure_pictures,
+    measure_terms,
+    solve,
+    variants,
+)
+from taichi_msm.study.measurements import POINT_ROUNDS as POINTS_ROUNDS
 from taichi_msm.study.result import Drawn, Stepping, Study, Timing, observed_orders
-from taichi_msm.study.stepping import MARGIN, ROUNDS, SteppingStudy
-from taichi_msm.study.terms import measure_terms, variants
 from taichi_msm.system.runtime import Device
+from taichi_msm.terms.damping import DampingTerm
+from taichi_msm.terms.foundation import FoundationTerm
+from taichi_msm.terms.loads import ProbeTerm
+from taichi_msm.terms.springs import SpringTerm
 from tests import reference
 from tests.motion import frames_on, structure_of
 from tests.scenes import PRESS, SPRINGS, plan_of, scene, speckle
@@ -68,7 +78,7 @@ def test_stepping_starts_at_the_largest_stable_step_and_halves_it(stepping: Step
         assert 0.5 * limit < steps[0] <= limit
         np.testing.assert_allclose(np.divide(steps[:-1], steps[1:]), 2)
         assert len(steps) >= 3
-    assert all(point.seconds.runs == ROUNDS for point in points)
+    assert all(point.seconds.runs == POINT_ROUNDS for point in points)
     assert all(point.seconds.fastest <= point.seconds.median <= point.seconds.slowest for point in points)
 
 
@@ -167,7 +177,9 @@ def test_dop853_is_left_out_where_tools_touch(device: Device) -> None:
     made = touching([PRESSED])
     with closing(SteppingStudy(plan_of(made), device, 0.01, study_of(made), nothing)) as measured:
         measured.run()
-        measure._measure_peer(plan_of(made), measured, measure.QUICK, measured.study, lambda stage, done, total: None)
+        study_module._measure_peer(
+            plan_of(made), measured, study_module.QUICK, measured.study, lambda stage, done, total: None
+        )
     assert not measured.study.peers
     (note,) = measured.study.notes
     assert note.startswith("DOP853, SciPy's general integrator,")
@@ -224,10 +236,10 @@ def test_why_dop853_is_left_out_is_told(
     def solve(*_: Any) -> Any:
         raise raised
 
-    monkeypatch.setattr(measure, "solve", solve)
+    monkeypatch.setattr(study_module, "solve", solve)
     found = study_of(scene())
     found.reference = stepping.study.reference
-    measure._measure_peer(plan_of(scene()), stepping, measure.QUICK, found, lambda stage, done, total: None)
+    study_module._measure_peer(plan_of(scene()), stepping, study_module.QUICK, found, lambda stage, done, total: None)
     who = "DOP853, SciPy's general integrator, which the study compares its own steps with,"
     assert found.notes == [f"{who} {said}; no other figure depends on it"]
 
@@ -263,7 +275,7 @@ def test_all_terms_are_timed_on_the_grid_of_the_whole_scene(device: Device, monk
             grids.append(plan.grid)
             super().__init__(plan, device)
 
-    monkeypatch.setattr(terms, "Dynamics", Recorded)
+    monkeypatch.setattr(measurements, "Dynamics", Recorded)
     made = scene(time={"precision": "auto"})
     measure_terms(plan_of(made), device, 0.0001, study_of(made), nothing)
     assert len(grids) == len(list(variants(made)))
@@ -397,7 +409,7 @@ def test_an_interruption_leaves_the_points_that_were_timed(device: Device) -> No
             raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):
-        PointStudy(plan_of(tissue((13, 13))), device, measure.QUICK.longest_run, made, stop).run()
+        PointStudy(plan_of(tissue((13, 13))), device, study_module.QUICK.longest_run, made, stop).run()
     made.finish()
     assert [(one.name, one.seconds.runs) for one in made.points] == [("7 x 7", 1)]
     assert made.points[0].error is not None
@@ -405,9 +417,9 @@ def test_an_interruption_leaves_the_points_that_were_timed(device: Device) -> No
 
 @pytest.mark.slow
 def test_pictures_are_judged_by_a_finer_one(device: Device, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(pictures, "REFINES", (0, 3))
-    monkeypatch.setattr(pictures, "SUPERSAMPLES", (1, 4))
-    monkeypatch.setattr(pictures, "FINEST", {"refine": 4, "supersample": 5})
+    monkeypatch.setattr(measurements, "REFINES", (0, 3))
+    monkeypatch.setattr(measurements, "SUPERSAMPLES", (1, 4))
+    monkeypatch.setattr(measurements, "FINEST", {"refine": 4, "supersample": 5})
     made = scene(render={"size": [60, 45], "camera": "oblique", "refine": 3})
     position = rest_positions(made.sheet)
     position[4, 5, 2] += 0.05
@@ -419,7 +431,7 @@ def test_pictures_are_judged_by_a_finer_one(device: Device, monkeypatch: pytest.
     assert psnr[3, 4] > max(psnr[0, 4], psnr[3, 1]) > psnr[0, 1]
     assert points[3, 4].largest_error < points[0, 1].largest_error
     # By the twin.
-    fine = made.model_copy(update={"render": BaseModel.model_copy(made.render, update=pictures.FINEST)})
+    fine = made.model_copy(update={"render": BaseModel.model_copy(made.render, update=measurements.FINEST)})
     own = made.model_copy(update={"render": made.render.model_copy(update={"refine": 0})})
     apart = reference.draw(fine, position, speckle(20, 30)).astype(float) - reference.draw(
         own, position, speckle(20, 30)
@@ -429,13 +441,13 @@ def test_pictures_are_judged_by_a_finer_one(device: Device, monkeypatch: pytest.
 
 def test_psnr_is_of_values_to_255() -> None:
     black = np.zeros((4, 5, 3), np.uint8)
-    assert pictures.psnr(black + np.uint8(51), black) == pytest.approx(20 * np.log10(5), abs=1e-12)
-    assert pictures.psnr(black, black) is None
+    assert measurements.psnr(black + np.uint8(51), black) == pytest.approx(20 * np.log10(5), abs=1e-12)
+    assert measurements.psnr(black, black) is None
 
 
 def test_a_quick_study_of_pictures_varies_one_at_a_time() -> None:
     made = scene(render={"size": [6, 4], "refine": 2, "supersample": 3})
-    settings = list(pictures.settings(made, quick=True))
+    settings = list(measurements.settings(made, quick=True))
     assert settings == [(2, 1), (2, 2), *((refine, 3) for refine in (0, 1, 2, 5, 10, 20)), (2, 4)]
 
 

@@ -17,10 +17,9 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from taichi_msm.errors import FilesError
-from taichi_msm.study.page import summary
-from taichi_msm.study.report import WITHOUT_MATPLOTLIB, as_record, write_report
+from taichi_msm.study.format import duration, number, timing
+from taichi_msm.study.report import WITHOUT_MATPLOTLIB, as_record, summary, write_report
 from taichi_msm.study.result import Drawn, Peer, Points, Reference, Stepping, Study, TimedTerm, Timing
-from taichi_msm.study.table import duration, number, timing
 from tests.scenes import scene
 
 FILES = ["study.png", "study.md", "study.json"]

@@ -23,16 +23,13 @@ import pytest
 
 from taichi_msm import sweep
 from taichi_msm.errors import ArgumentError, MsmError, SceneError
-from taichi_msm.picture import file_sha256
-from taichi_msm.scenefile import duration
-from taichi_msm.sweeps import cost
-from taichi_msm.sweeps.folder import UnderWay, begin_sweep, values_in
-from taichi_msm.sweeps.outcome import Outcome
+from taichi_msm.images import file_sha256
+from taichi_msm.load import cost as cost_module
+from taichi_msm.sweeps import tables
 from taichi_msm.sweeps.pool import ORPHANED, DiedError, Pool
-from taichi_msm.sweeps.schedule import outcomes
+from taichi_msm.sweeps.runs import Outcome, Task, UnderWay, begin_sweep, outcomes, values_in
+from taichi_msm.sweeps.spec import load_sweep, make_sweep
 from taichi_msm.sweeps.sweep import finish, go_on
-from taichi_msm.sweeps.sweepfile import load_sweep, make_sweep
-from taichi_msm.sweeps.task import Task
 from tests.conftest import Program
 from tests.outputs import files, results
 from tests.scenes import SMALL
@@ -494,23 +491,23 @@ def test_an_executor_that_takes_no_more_runs_is_an_error() -> None:
 
 
 def test_there_is_a_process_for_each_core_as_far_as_memory_goes(monkeypatch: pytest.MonkeyPatch) -> None:
-    need = cost.Cost(1.0, 0, 1 << 30, 1, 0, "")
-    monkeypatch.setattr(cost, "available_threads", lambda: 8)
+    need = tables.Cost(1.0, 0, 1 << 30, 1, 0, "")
+    monkeypatch.setattr(tables, "available_threads", lambda: 8)
     for free, runs_, number in ((100 << 30, 1000, 8), (3 << 30, 1000, 3), (1 << 20, 1000, 1), (100 << 30, 5, 5)):
-        monkeypatch.setattr(cost, "available_memory", lambda free=free: free)
-        assert cost.choose_workers(need, runs_).number == number
-    assert cost.choose_workers(need, 1, asked=7).number == 7
+        monkeypatch.setattr(tables, "available_memory", lambda free=free: free)
+        assert tables.choose_workers(need, runs_).number == number
+    assert tables.choose_workers(need, 1, asked=7).number == 7
 
 
 def test_the_cost_is_that_of_all_runs(many: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(cost, "available_threads", lambda: 2)
-    monkeypatch.setattr(duration, "estimate", lambda plan: duration.Duration(5.0, 3.0))
+    monkeypatch.setattr(tables, "available_threads", lambda: 2)
+    monkeypatch.setattr(cost_module, "estimate_duration", lambda plan: cost_module.Duration(5.0, 3.0))
     for samples in (64, 6400):
         (many / "many.yaml").write_text(
             SWEEP.replace("[0.01, auto]", "[auto]").replace("samples: 4", f"samples: {samples}")
         )
-        estimate = cost.estimate(load_sweep("many.yaml"))
+        estimate = tables.estimate(load_sweep("many.yaml"))
         # A start, and of each run its work and what it takes besides, which two processes share: 3 frames.
-        each = 5 - 3 + (cost.RUN_SECONDS + 3 * cost.FRAME_SECONDS) / 2
+        each = 5 - 3 + (tables.RUN_SECONDS + 3 * tables.FRAME_SECONDS) / 2
         assert estimate.seconds == pytest.approx(3 + samples * each)
         assert (estimate.looked_at, estimate.refused) == (64, 0)

@@ -16,11 +16,10 @@ from scipy.special import ndtri
 from scipy.stats import qmc
 
 from taichi_msm.errors import SceneError
-from taichi_msm.scene import MAX_PATH, Scene
-from taichi_msm.scenefile.load import ANY, CAMERA_FILES, PICTURES, load_plan
-from taichi_msm.sweeps.distribution import Distribution
-from taichi_msm.sweeps.samples import values_of_runs, values_of_some
-from taichi_msm.sweeps.sweepfile import cell, load_sweep
+from taichi_msm.load.scene_file import ANY, CAMERA_FILES, PICTURES, load_plan
+from taichi_msm.scene.scene import Scene
+from taichi_msm.scene.section import MAX_PATH
+from taichi_msm.sweeps.spec import Distribution, cell, load_sweep, values_of_runs, values_of_some
 from tests.scenes import speckle
 
 
@@ -104,7 +103,7 @@ def test_grids_give_every_combination_the_last_key_fastest() -> None:
     ],
 )
 def test_a_cell_is_what_set_takes(value: Any) -> None:
-    from taichi_msm.scenefile.load import parse_override
+    from taichi_msm.load.scene_file import parse_override
 
     assert parse_override(f"key={cell(value)}").value == value
 

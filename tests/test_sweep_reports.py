@@ -20,18 +20,20 @@ from scipy.stats import qmc
 from taichi_msm import sweep
 from taichi_msm.errors import ForeignError
 from taichi_msm.plot_style import STYLE
-from taichi_msm.sweeps.captions import short_names, short_value
-from taichi_msm.sweeps.contact import WITHOUT_PICTURES, last_picture
-from taichi_msm.sweeps.dataset import split
-from taichi_msm.sweeps.folder import values_in
-from taichi_msm.sweeps.outcome import Outcome
-from taichi_msm.sweeps.parameters import parameters, results
+from taichi_msm.sweeps.plots import (
+    WITHOUT_PICTURES,
+    first_order,
+    last_picture,
+    parameters,
+    results,
+    sensitivity,
+    short_names,
+    short_value,
+)
 from taichi_msm.sweeps.pool import Pool
-from taichi_msm.sweeps.reports import WITHOUT_MATPLOTLIB, WITHOUT_SALIB, write_reports
-from taichi_msm.sweeps.result import CONTACT, FILES, SweepResult
-from taichi_msm.sweeps.samples import values_of_runs
-from taichi_msm.sweeps.sensitivity import first_order, sensitivity
-from taichi_msm.sweeps.sweepfile import make_sweep
+from taichi_msm.sweeps.runs import CONTACT, FILES, Outcome, SweepResult, values_in
+from taichi_msm.sweeps.spec import make_sweep, values_of_runs
+from taichi_msm.sweeps.tables import WITHOUT_MATPLOTLIB, WITHOUT_SALIB, split, write_reports
 
 VARY = {
     "damping": {"log_uniform": [1e-3, 1e-1]},
@@ -214,7 +216,7 @@ def test_without_pictures_there_is_a_note_and_no_earlier_picture(make: Make) -> 
 def test_without_libraries_there_are_notes(make: Make, monkeypatch: pytest.MonkeyPatch) -> None:
     for name in ("matplotlib", "SALib", "SALib.analyze", "pyarrow"):
         monkeypatch.setitem(sys.modules, name, None)
-    monkeypatch.delitem(sys.modules, "taichi_msm.sweeps.plot", raising=False)
+    monkeypatch.delitem(sys.modules, "taichi_msm.sweeps.plots", raising=False)
     names, notes = write(make(128))
     assert names == ["table.csv", "dataset.json"]
     assert notes == [WITHOUT_PICTURES, WITHOUT_SALIB, WITHOUT_MATPLOTLIB]
@@ -222,7 +224,7 @@ def test_without_libraries_there_are_notes(make: Make, monkeypatch: pytest.Monke
 
 def test_of_many_parameters_those_of_largest_sensitivity_are_plotted(make: Make) -> None:
     style = pytest.importorskip("matplotlib.style")
-    from taichi_msm.sweeps.plot import Content, _figure
+    from taichi_msm.sweeps.plots import Content, _figure
 
     keys = ["springs.shear", "springs.structural", "springs.virtual", "sheet.mass", "probes.0.falloff"]
     vary = {key: {"uniform": [1, 2]} for key in keys} | {"probes.0.force": {"uniform": [[0, 0, 1], [1, 1, 2]]}}

@@ -12,9 +12,9 @@ from numpy.typing import NDArray
 from PIL import Image, ImageCms
 
 from taichi_msm.errors import SceneError
-from taichi_msm.picture import read_grey
+from taichi_msm.images import read_grey
 from taichi_msm.render.texture import image_problems, image_size, load_texture
-from taichi_msm.scene import Scene
+from taichi_msm.scene.scene import Scene
 from tests.scenes import speckle
 
 BACKGROUND = (10, 20, 30)

@@ -10,11 +10,11 @@ import numpy as np
 import pytest
 
 from taichi_msm import Simulation
-from taichi_msm.physics.error_control import choose_step
-from taichi_msm.physics.loads import schedule
-from taichi_msm.physics.planning import on, with_chosen_grid
+from taichi_msm.accuracy.time_step import choose_step
+from taichi_msm.model.loads import schedule
+from taichi_msm.model.time_grid import TimeGrid
+from taichi_msm.solver.planning import on, with_chosen_grid
 from taichi_msm.system.runtime import Device
-from taichi_msm.timegrid import TimeGrid
 from tests.scenes import PRESS, plan_of, scene
 
 

@@ -12,25 +12,25 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from taichi_msm.console import summary
+from taichi_msm.accuracy.mesh import FEWEST, CubicSampling, MeshEstimate, MeshPilot, choose_points, coarser
+from taichi_msm.accuracy.time_step import longest
+from taichi_msm.cli.console import summary
 from taichi_msm.errors import ArgumentError, FilesError, SceneError
-from taichi_msm.physics import kernel_gpu, probe_force
-from taichi_msm.physics.error_control import longest
-from taichi_msm.physics.lattice import rest_positions
-from taichi_msm.physics.material import Maps
-from taichi_msm.physics.mesh_error import FEWEST, CubicSampling, MeshEstimate, MeshPilot, choose_points, coarser
-from taichi_msm.physics.plan import Plan
-from taichi_msm.physics.terms.bending import BendingTerm
-from taichi_msm.physics.terms.damping import DampingTerm
-from taichi_msm.physics.terms.foundation import FoundationTerm
-from taichi_msm.physics.terms.probes import ProbeTerm
-from taichi_msm.physics.terms.springs import SpringTerm, stiffness
-from taichi_msm.runner import resume, run
-from taichi_msm.scene import Scene
-from taichi_msm.scenefile.load import load_scene
-from taichi_msm.scenefile.validation import checked
-from taichi_msm.simulation import Simulation
+from taichi_msm.load.check import checked
+from taichi_msm.load.scene_file import load_scene
+from taichi_msm.model import tool_force
+from taichi_msm.model.plan import Plan
+from taichi_msm.model.sheet import Maps, rest_positions
+from taichi_msm.runs.run import resume, run
+from taichi_msm.runs.simulation import Simulation
+from taichi_msm.scene.scene import Scene
+from taichi_msm.solver import kernel_gpu
 from taichi_msm.system.runtime import Device
+from taichi_msm.terms.bending import BendingTerm
+from taichi_msm.terms.damping import DampingTerm
+from taichi_msm.terms.foundation import FoundationTerm
+from taichi_msm.terms.loads import ProbeTerm
+from taichi_msm.terms.springs import SpringTerm, stiffness
 from tests import reference
 from tests.motion import dynamics_of, frames, structure_of
 from tests.outputs import results
@@ -137,8 +137,8 @@ def test_bands_do_not_change_the_bits(seed: int, image: str, device: Device) -> 
 def test_the_form_of_a_gpu_gives_the_same_bits(
     seed: int, image: str, device: Device, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    for module in ("kernel_gpu", "solver"):
-        monkeypatch.setattr(f"taichi_msm.physics.{module}.STEPS_PER_LAUNCH", 2)
+    for module in ("kernel_gpu", "dynamics"):
+        monkeypatch.setattr(f"taichi_msm.solver.{module}.STEPS_PER_LAUNCH", 2)
     kernel_gpu._kernels.cache_clear()
     made = random_tissue(seed, image)
     layout = structure_of(made, device)
@@ -421,7 +421,7 @@ def test_a_tolerance_of_the_points_chooses_them(load: Any, device: Device, tmp_p
 
 
 def test_a_tolerance_that_no_points_meet_is_refused(load: Any, device: Device, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("taichi_msm.physics.mesh_error.MAX_POINTS", 40)
+    monkeypatch.setattr("taichi_msm.accuracy.mesh.MAX_POINTS", 40)
     with pytest.raises(SceneError, match=r"sheet.tolerance: 0.0001 is out of reach: with \d+ x \d+ points the error"):
         choose_points(plan_of(load("sheet.tolerance=0.0001")), device, checked)
 
@@ -552,7 +552,7 @@ def test_points_for_which_a_given_step_is_too_long_are_refused(load: Any, device
 )
 def test_a_tool_that_does_not_act_as_a_whole_is_told_of(setting: str, told: str, load: Any) -> None:
     def notes(made: Scene) -> list[str]:
-        return list(probe_force.force_notes(made, probe_force.probe_records(made)))
+        return list(tool_force.force_notes(made, tool_force.probe_records(made)))
 
     assert not notes(load())
     (said,) = notes(load(setting))

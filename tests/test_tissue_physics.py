@@ -21,14 +21,15 @@ from skfem import Basis, BilinearForm, ElementQuad2, ElementVector, LinearForm, 
 from skfem.helpers import dot
 from skfem.models.elasticity import linear_elasticity, plane_stress
 
-from taichi_msm.physics.elasticity import energy_density
-from taichi_msm.physics.lattice import fixed_points, rest_positions, spacing
-from taichi_msm.physics.loads import loads_at
-from taichi_msm.physics.probe_force import spread
-from taichi_msm.physics.state import State
-from taichi_msm.physics.terms import highest_frequency
-from taichi_msm.scene import Probe, Scene
+from taichi_msm.model.loads import loads_at
+from taichi_msm.model.sheet import fixed_points, rest_positions, spacing
+from taichi_msm.model.tool_force import spread
+from taichi_msm.scene.scene import Scene
+from taichi_msm.scene.tools import Probe
+from taichi_msm.solver.state import State
 from taichi_msm.system.runtime import Device
+from taichi_msm.terms import highest_frequency
+from taichi_msm.terms.elasticity import energy_density
 from tests import reference
 from tests.motion import dynamics_of
 from tests.reference.sheet import sheet as assembled

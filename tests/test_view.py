@@ -20,12 +20,12 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from taichi_msm import load_scene
-from taichi_msm.cli import main
+from taichi_msm.cli.main import main
 from taichi_msm.errors import SceneError
-from taichi_msm.scene import Scene
-from taichi_msm.viewer.events import Drag, Harder, Hover, Key, Percent, Press, Release, Turn
-from taichi_msm.viewer.script import load_script, timed
-from taichi_msm.viewer.window import LONGEST, QUIT, Hand, Pacing, opening, placed
+from taichi_msm.scene.scene import Scene
+from taichi_msm.view.events import Drag, Harder, Hover, Key, Percent, Press, Release, Turn
+from taichi_msm.view.script import load_script, timed
+from taichi_msm.view.window import LONGEST, QUIT, Hand, Pacing, opening, placed
 from tests.conftest import Program
 from tests.outputs import duration
 from tests.telling import Telling
@@ -591,7 +591,7 @@ def test_signals_close_the_window(small: Path, screen: Screen, number: int, code
 SHOWING = """\
 import sys
 import numpy as np
-from taichi_msm.viewer.window import Window
+from taichi_msm.view.window import Window
 picture = np.load("picture.npy")
 with Window("a", (320, 240)) as window:
     for _ in sys.stdin:

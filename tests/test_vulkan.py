@@ -15,15 +15,15 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from taichi_msm import run
-from taichi_msm.outputs.flo import read_flo
-from taichi_msm.physics.lattice import rest_positions
+from taichi_msm.load.scene_file import load_scene
+from taichi_msm.model.sheet import rest_positions
+from taichi_msm.model.surface import rods
 from taichi_msm.render.camera import view
 from taichi_msm.render.labels import track_grid
 from taichi_msm.render.rasterizer import Drawing, drawing_config
-from taichi_msm.render.surface import rods
 from taichi_msm.render.tracking import find, find_flow
-from taichi_msm.scene import Scene
-from taichi_msm.scenefile.load import load_scene
+from taichi_msm.runs.arrays import read_flo
+from taichi_msm.scene.scene import Scene
 from taichi_msm.system.runtime import Device
 from tests.outputs import results
 from tests.scenes import speckle
@@ -45,7 +45,7 @@ SETTINGS = [
 # A run, one that is interrupted and resumed, and one that diverges, in one process.
 RUNS = """
 import json, sys
-from taichi_msm.physics import diagnosis
+from taichi_msm.accuracy import diagnosis
 from taichi_msm import load_scene, resume, run
 from tests.test_resume import Stop
 
@@ -162,7 +162,7 @@ print(-again() + again())
 # A run with threads that have no bound.
 CUT_SHORT = """
 import sys
-from taichi_msm.cli import main
+from taichi_msm.cli.main import main
 from taichi_msm.system import launches
 launches.MOST_ROUNDS = 1 << 30
 sys.exit(main(sys.argv[1:]))

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from taichi_msm.results.whole import LOCK, lock, place, replacing, staged
+from taichi_msm.runs.directory import LOCK, lock, place, replacing, staged
 
 
 @pytest.mark.skipif(sys.platform == "win32", reason="no lock")

@@ -14,9 +14,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from benchmarks.process import CACHE, ROOT
-from taichi_msm.physics.lattice import rest_positions
+from taichi_msm.model.sheet import rest_positions
 from taichi_msm.render.texture import load_texture
-from taichi_msm.scene import Scene
+from taichi_msm.scene.scene import Scene
 from tests import reference
 
 POINTS, SIDE = 31, 0.33

@@ -10,7 +10,7 @@ import numpy as np
 from benchmarks.native import library
 from benchmarks.stepping.planes import Planes
 from benchmarks.stepping.problem import FORCE, Problem
-from taichi_msm.physics.lattice import spacing
+from taichi_msm.model.sheet import spacing
 
 FLOATS = np.ctypeslib.ndpointer(np.float32, flags="C_CONTIGUOUS")
 

@@ -6,7 +6,7 @@ from dataclasses import replace
 
 from benchmarks.process import vector_bits
 from benchmarks.stepping.problem import Problem, Stepper
-from taichi_msm.physics.solver import Dynamics, layout_of
+from taichi_msm.solver.dynamics import Dynamics, layout_of
 from taichi_msm.system import runtime
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from benchmarks.stepping.problem import Problem, Stepper
-from taichi_msm.physics.solver import Dynamics
+from taichi_msm.solver.dynamics import Dynamics
 from taichi_msm.system import runtime
 
 

@@ -13,7 +13,7 @@ import numpy as np
 
 from benchmarks.stepping.planes import Planes
 from benchmarks.stepping.problem import FORCE, Problem
-from taichi_msm.physics.lattice import spacing
+from taichi_msm.model.sheet import spacing
 
 
 @numba.njit(fastmath=True, inline="always", cache=True)

@@ -20,12 +20,12 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from taichi_msm.physics.loads import decay
-from taichi_msm.physics.material import Material
-from taichi_msm.physics.plan import Plan
-from taichi_msm.physics.planning import make_plan
-from taichi_msm.scene import Scene
-from taichi_msm.timegrid import TimeGrid
+from taichi_msm.model.loads import decay
+from taichi_msm.model.plan import Plan
+from taichi_msm.model.sheet import Material
+from taichi_msm.model.time_grid import TimeGrid
+from taichi_msm.scene.scene import Scene
+from taichi_msm.solver.planning import make_plan
 from tests import reference
 from tests.reference.neighbours import Spring, springs
 

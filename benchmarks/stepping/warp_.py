@@ -6,7 +6,7 @@ import numpy as np
 import warp as wp
 
 from benchmarks.stepping.problem import Array, Problem, Stepper
-from taichi_msm.physics.lattice import spacing
+from taichi_msm.model.sheet import spacing
 
 
 @wp.struct

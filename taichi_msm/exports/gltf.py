@@ -25,13 +25,13 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from taichi_msm import __version__
-from taichi_msm.exports.mesh import REFINE, picture_png, unit_normals
-from taichi_msm.exports.sources import in_folders
-from taichi_msm.progress import Count
-from taichi_msm.render.surface import surface
-from taichi_msm.results.finished_run import FinishedRun
-from taichi_msm.results.whole import create
+from taichi_msm.errors import Count
+from taichi_msm.exports.formats import in_folders
+from taichi_msm.exports.inputs import REFINE, picture_png, unit_normals
+from taichi_msm.model.surface import surface
+from taichi_msm.runs.directory import create
+from taichi_msm.runs.finished import FinishedRun
+from taichi_msm.version import __version__
 
 FILE = "surface.glb"
 

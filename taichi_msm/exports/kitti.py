@@ -23,14 +23,12 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from taichi_msm.errors import FilesError
-from taichi_msm.exports.sources import Source
-from taichi_msm.outputs.flo import read_flo
-from taichi_msm.outputs.table import OUTPUTS, numbered
-from taichi_msm.progress import Count
-from taichi_msm.results.finished_run import FinishedRun, reading
-from taichi_msm.results.publication import MAX_RECORD
-from taichi_msm.results.whole import add
+from taichi_msm.errors import Count, FilesError
+from taichi_msm.exports.formats import Source
+from taichi_msm.runs.arrays import read_flo
+from taichi_msm.runs.directory import MAX_RECORD, add
+from taichi_msm.runs.finished import FinishedRun, reading
+from taichi_msm.scene.outputs import OUTPUTS, numbered
 from taichi_msm.system.files import read_regular
 
 SCALE, ZERO, LARGEST = 64.0, 32768.0, 65535.0

@@ -15,12 +15,12 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from taichi_msm.exports.mesh import PICTURE, REFINE, picture_png, unit_normals
-from taichi_msm.exports.sources import in_folders
-from taichi_msm.progress import Count
-from taichi_msm.render.surface import surface
-from taichi_msm.results.finished_run import FinishedRun
-from taichi_msm.results.whole import add, create
+from taichi_msm.errors import Count
+from taichi_msm.exports.formats import in_folders
+from taichi_msm.exports.inputs import PICTURE, REFINE, picture_png, unit_normals
+from taichi_msm.model.surface import surface
+from taichi_msm.runs.directory import add, create
+from taichi_msm.runs.finished import FinishedRun
 
 MATERIAL = "surface.mtl"
 

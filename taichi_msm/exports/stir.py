@@ -33,15 +33,14 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
 
-from taichi_msm.errors import FilesError, NotInstalledError
-from taichi_msm.exports.pinhole import FIRST_CENTRE, Pinhole, read_pinhole
-from taichi_msm.exports.sources import Source
-from taichi_msm.exports.tracks import read_tracks
-from taichi_msm.outputs import mp4
-from taichi_msm.outputs.table import numbered
-from taichi_msm.progress import Count
-from taichi_msm.results.finished_run import FinishedRun
-from taichi_msm.results.whole import add, create
+from taichi_msm.errors import Count, FilesError, NotInstalledError
+from taichi_msm.exports.formats import Source
+from taichi_msm.exports.inputs import FIRST_CENTRE, Pinhole, read_pinhole, read_tracks
+from taichi_msm.runs import media
+from taichi_msm.runs.directory import add, create
+from taichi_msm.runs.finished import FinishedRun
+from taichi_msm.scene import outputs
+from taichi_msm.scene.outputs import numbered
 
 NAME, SIDES = "stir", ("left", "right")
 
@@ -64,8 +63,8 @@ def write(sources: Sequence[Source], folder: Path) -> Iterator[list[str]]:
         FilesError: what `read_pinhole` does, and when the cameras are not beside each other.
         NotInstalledError: when PyAV is not installed.
     """
-    if not mp4.is_installed():
-        raise NotInstalledError(f"--format {mp4.NOT_INSTALLED.replace('mp4', NAME, 1)}")
+    if not outputs.is_pyav_installed():
+        raise NotInstalledError(f"--format {outputs.PYAV_NOT_INSTALLED.replace('mp4', NAME, 1)}")
     for run, name, progress in sources:
         yield _write_run(run, folder / (name or numbered(0)), progress)
 
@@ -149,7 +148,7 @@ def _write_frames(run: FinishedRun, folder: Path, progress: Count) -> None:
     end = round(1000 * run.time[-1])
     (folder / "frames").mkdir()
     with create(folder / "frames" / f"0ms-{end}ms-visible.mp4") as file:
-        film = mp4.Mp4Writer(file, render.size, run.scene.time.frames_per_second, render.quality)
+        film = media.Mp4Writer(file, render.size, run.scene.time.frames_per_second, render.quality)
         for frame in range(run.frames):
             progress(frame, run.frames)
             film.add(run.picture("png", frame))

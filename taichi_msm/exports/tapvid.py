@@ -24,13 +24,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from taichi_msm.errors import FilesError
-from taichi_msm.exports.sources import Source
-from taichi_msm.exports.tracks import read_tracks
-from taichi_msm.progress import Count
-from taichi_msm.results.finished_run import FinishedRun
-from taichi_msm.results.whole import create
-from taichi_msm.system.resources import available_memory
+from taichi_msm.errors import Count, FilesError
+from taichi_msm.exports.formats import Source
+from taichi_msm.exports.inputs import read_tracks
+from taichi_msm.runs.directory import create
+from taichi_msm.runs.finished import FinishedRun
+from taichi_msm.system.process import available_memory
 
 # The pickle protocol that every Python from 3.4 on reads.
 PROTOCOL = 4

@@ -26,14 +26,13 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
 
-from taichi_msm.exports.pinhole import read_pinhole
-from taichi_msm.exports.sources import Source
-from taichi_msm.exports.tracks import read_places, read_tracks
-from taichi_msm.outputs.npz import write_arrays
-from taichi_msm.outputs.table import numbered
-from taichi_msm.progress import Count
-from taichi_msm.results.finished_run import FinishedRun
-from taichi_msm.results.whole import create
+from taichi_msm.errors import Count
+from taichi_msm.exports.formats import Source
+from taichi_msm.exports.inputs import read_pinhole, read_places, read_tracks
+from taichi_msm.runs.arrays import write_arrays
+from taichi_msm.runs.directory import create
+from taichi_msm.runs.finished import FinishedRun
+from taichi_msm.scene.outputs import numbered
 
 NAME = "tapvid3d"
 

@@ -21,16 +21,15 @@ from xml.etree import ElementTree
 import numpy as np
 from numpy.typing import NDArray
 
-from taichi_msm.errors import NotInstalledError
-from taichi_msm.exports.mesh import PICTURE, REFINE, picture_png
-from taichi_msm.exports.sources import in_folders
-from taichi_msm.physics.elasticity import energy_density
-from taichi_msm.physics.lattice import rest_positions
-from taichi_msm.physics.planning import make_plan
-from taichi_msm.progress import Count
-from taichi_msm.render.surface import surface
-from taichi_msm.results.finished_run import FinishedRun
-from taichi_msm.results.whole import add
+from taichi_msm.errors import Count, NotInstalledError
+from taichi_msm.exports.formats import in_folders
+from taichi_msm.exports.inputs import PICTURE, REFINE, picture_png
+from taichi_msm.model.sheet import rest_positions
+from taichi_msm.model.surface import surface
+from taichi_msm.runs.directory import add
+from taichi_msm.runs.finished import FinishedRun
+from taichi_msm.solver.planning import make_plan
+from taichi_msm.terms.elasticity import energy_density
 
 COLLECTION = "surface.pvd"
 

@@ -10,8 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from taichi_msm.errors import SceneError
-from taichi_msm.picture import irregular
-from taichi_msm.system.resources import available_memory
+from taichi_msm.images import irregular
+from taichi_msm.system.process import available_memory
 
 NEEDS = "time (T,), coordinates (N, 2) and position (N, T, 3) or pixel (N, T, 2)"
 MEMBERS = ("time", "coordinates", "position", "pixel", "sigma", "points", "occluded", "visible")

@@ -7,10 +7,9 @@ from collections.abc import Iterator
 import numpy as np
 from numpy.typing import NDArray
 
-from taichi_msm.fitting.observations import Observations
-from taichi_msm.fitting.prediction import Predicted
-from taichi_msm.fitting.sight import seen_at_rest
-from taichi_msm.scene import Scene
+from taichi_msm.fitting.observations import Observations, seen_at_rest
+from taichi_msm.fitting.predict import Predicted
+from taichi_msm.scene.scene import Scene
 
 Array = NDArray[np.float64]
 

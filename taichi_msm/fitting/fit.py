@@ -15,28 +15,43 @@ import numpy as np
 from numpy.typing import NDArray
 from typing_extensions import Unpack
 
-from taichi_msm.errors import SceneError, writing
-from taichi_msm.fitting import notes, rejection
-from taichi_msm.fitting.arguments import Method, require_types
+from taichi_msm.accuracy.mesh import WITH_CONTACT
+from taichi_msm.errors import Progress, SceneError, writing
+from taichi_msm.fitting import rejection
+from taichi_msm.fitting import result as result_module
+from taichi_msm.fitting.checks import faults, faults_beside, faults_of_best, moved
 from taichi_msm.fitting.conventions import force_unit
-from taichi_msm.fitting.estimation import Misfit, Search, Solution
 from taichi_msm.fitting.force_table import read_forces
-from taichi_msm.fitting.identifiability import MOST_ERROR, unseen
+from taichi_msm.fitting.least_squares import (
+    MOST_ERROR,
+    Alike,
+    Misfit,
+    Place,
+    Profile,
+    Profiler,
+    Search,
+    Solution,
+    Uncertainty,
+    uncertainty,
+    unseen,
+)
 from taichi_msm.fitting.observations import read_observations, with_sigma
-from taichi_msm.fitting.parameters import Bounds, Parameter, as_data, make_parameters, with_values
-from taichi_msm.fitting.prediction import Job, Predicted, runnable
-from taichi_msm.fitting.profiles import Place, Profile, Profiler
+from taichi_msm.fitting.parameters import (
+    Bounds,
+    Method,
+    Parameter,
+    as_data,
+    make_parameters,
+    require_types,
+    with_values,
+)
+from taichi_msm.fitting.predict import Job, Predicted, Runs, runnable
 from taichi_msm.fitting.report import publication, write_report
 from taichi_msm.fitting.result import Estimate, FitResult, FittedMap
-from taichi_msm.fitting.runs import Runs
 from taichi_msm.fitting.stiffness_map import KEY, fit_map, map_task
-from taichi_msm.fitting.suspicions import faults, faults_beside, faults_of_best, moved
-from taichi_msm.fitting.uncertainty import Alike, Uncertainty, uncertainty
-from taichi_msm.physics.mesh_error import WITH_CONTACT
-from taichi_msm.progress import Progress
-from taichi_msm.scene import Scene
-from taichi_msm.scenefile.load import load_scene
-from taichi_msm.scenefile.validation import checked
+from taichi_msm.load.check import checked
+from taichi_msm.load.scene_file import load_scene
+from taichi_msm.scene.scene import Scene
 
 Array = NDArray[np.float64]
 
@@ -176,10 +191,10 @@ def _fit(runs: Runs, given: Scene, method: Method) -> FitResult:
         runs=runs.count,
         notes=[
             *force_unit(seen, first),
-            *notes.of_the_search(solution, parameters, fits=search.fits(solution)),
-            *notes.of_the_points(parameters, solution.x, uncertain, shifts),
-            *notes.of_ties(parameters, uncertain, blind),
-            *notes.of_what_is_left(seen, solution, uncertain, motion, alike),
+            *result_module.of_the_search(solution, parameters, fits=search.fits(solution)),
+            *result_module.of_the_points(parameters, solution.x, uncertain, shifts),
+            *result_module.of_ties(parameters, uncertain, blind),
+            *result_module.of_what_is_left(seen, solution, uncertain, motion, alike),
         ],
         scene=Scene(**with_values(as_data(given), parameters, [one.value for one in estimates])),
         observations=seen,

@@ -13,9 +13,9 @@ from pathlib import Path
 import numpy as np
 
 from taichi_msm.errors import SceneError
-from taichi_msm.faults import LARGEST
 from taichi_msm.fitting.observations import Forces
-from taichi_msm.picture import irregular
+from taichi_msm.images import irregular
+from taichi_msm.scene.section import LARGEST
 
 COLUMNS = {"time": "s", "probe": "", "force_x": "N", "force_y": "N", "force_z": "N"}
 EXPECTED = f"name a forces.csv, with the columns {', '.join(COLUMNS)}"

@@ -14,8 +14,8 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
+from taichi_msm.fitting.least_squares import Alike
 from taichi_msm.fitting.observations import Observations
-from taichi_msm.fitting.uncertainty import Alike
 
 Array = NDArray[np.float64]
 

@@ -9,27 +9,24 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from taichi_msm.errors import SceneError
-from taichi_msm.fitting.fields import Fields, centres
-from taichi_msm.fitting.observations import Observations
+from taichi_msm.accuracy.mesh import coarser
+from taichi_msm.errors import Progress, SceneError
+from taichi_msm.fitting.checks import faults, faults_beside
+from taichi_msm.fitting.observations import Observations, Sight
 from taichi_msm.fitting.parameters import Bounds, rounded
-from taichi_msm.fitting.prediction import Predicted, runnable
+from taichi_msm.fitting.predict import Predicted, points_error, runnable
 from taichi_msm.fitting.rejection import by_chi_square
 from taichi_msm.fitting.result import FitResult, FittedMap
-from taichi_msm.fitting.runs import points_error
-from taichi_msm.fitting.sight import Sight
-from taichi_msm.fitting.suspicions import faults, faults_beside
-from taichi_msm.fitting.tikhonov import Search, Solution
-from taichi_msm.physics.adjoint import Adjoint, require_differentiable
-from taichi_msm.physics.material import MapImage, map_factors
-from taichi_msm.physics.mesh_error import coarser
-from taichi_msm.physics.plan import Plan
-from taichi_msm.physics.planning import stable_step
-from taichi_msm.progress import Progress
-from taichi_msm.scene import Scene, StiffnessMap
-from taichi_msm.scenefile.validation import checked
+from taichi_msm.fitting.tikhonov import Fields, Search, Solution, centres
+from taichi_msm.gradients.gradient import Adjoint, require_differentiable
+from taichi_msm.load.check import checked
+from taichi_msm.model.plan import Plan
+from taichi_msm.model.sheet import MapImage, map_factors
+from taichi_msm.scene.scene import Scene
+from taichi_msm.scene.sheet import StiffnessMap
+from taichi_msm.solver.planning import stable_step
 from taichi_msm.system import runtime
-from taichi_msm.system.resources import available_memory
+from taichi_msm.system.process import available_memory
 
 Array = NDArray[np.float64]
 

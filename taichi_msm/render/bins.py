@@ -5,7 +5,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from taichi_msm.render.samples import Integers
+from taichi_msm.render.config import Integers
 from taichi_msm.system.launches import Launches, end_thread
 from taichi_msm.system.runtime import our_compilation, ti
 

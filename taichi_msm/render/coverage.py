@@ -3,16 +3,39 @@
 Vertices are not stored. For a sample inside the outline of a cell, the two equations of geometry.py give the small
 quad; the side of the quad's diagonal that the sample is on gives the triangle; and the two linear equations of the
 triangle give the place on it. A cell that is folded or reaches behind the camera is drawn triangle by triangle instead.
+
+The samples that show an instrument.
+
+A rod is all that lies within its radius of the line segment from the middle A of its tip to A + U length, its other
+end. The line of sight through a sample is P = O + D t, where t is the depth. On the side of the rod the component of
+P - A perpendicular to U has the radius as its length, which is a quadratic equation for t. Where its solution lies
+beyond an end of the segment, the line of sight is intersected with the sphere around that end instead.
+
+What is kept of the point of the sheet that a sample shows. A new output per pixel is a few lines of `store`.
 """
 
 from typing import Any, NamedTuple
 
-from taichi_msm.render import geometry
-from taichi_msm.render.attributes import cell_at, store
-from taichi_msm.render.bending import BENT_NUMBERS
-from taichi_msm.render.places import BEYOND
-from taichi_msm.render.samples import box_of, centres, clip, keep, places, places_of, tiles_of
+from taichi_msm.render import geometry, uniforms
+from taichi_msm.render import uniforms as uni
+from taichi_msm.render.config import (
+    INFINITY,
+    box_of,
+    centres,
+    clip,
+    keep,
+    keep_unit,
+    places,
+    places_of,
+    steps,
+    tiles_of,
+)
+from taichi_msm.render.geometry import POINT_NUMBERS, facet, line_of_sight, on_triangle, w_at
+from taichi_msm.render.lens_kernels import BENT_NUMBERS
+from taichi_msm.render.lens_table import BEYOND
 from taichi_msm.system.runtime import ti
+
+pass  # REMOVED
 
 
 class Part(NamedTuple):
@@ -166,3 +189,287 @@ def cover(i, j, drawn: ti.template(), sheet: ti.template(), band: ti.template())
             if tile == end_tile:
                 tile = first_tile
                 tile_line += 1
+
+
+@ti.func
+def dot(a_x, a_y, a_z, b_x, b_y, b_z):
+    """Give the scalar product of two vectors."""
+    return a_x * b_x + a_y * b_y + a_z * b_z
+
+
+@ti.func
+def meet(x, y, n, numbers: ti.template()):
+    """Find where lines of sight meet rod n first: the depth, INFINITY where they miss; the normal times the radius."""
+    rod = uni.RODS + n * uni.ROD_NUMBERS
+    tip, axis = rod + uni.TIP, rod + uni.AXIS
+    u_x, u_y, u_z = numbers[axis], numbers[axis + 1], numbers[axis + 2]
+    length, radius = numbers[rod + uni.LENGTH], numbers[rod + uni.RADIUS]
+    # The line of sight P = O + D t; here t is counted from the depth of the tip, and the tip is at 0.
+    start = numbers[tip + 2] * (-1.0)
+    across, up = line_of_sight(x, y, numbers)
+    d_x, d_y, d_z = across * numbers[uni.PINHOLE], up * numbers[uni.PINHOLE], -1.0
+    w = w_at(start, numbers)
+    o_x, o_y, o_z = across * w - numbers[tip], up * w - numbers[tip + 1], 0.0
+    # The side of the rod: a t^2 + 2 b t + c = 0.
+    d_d = dot(d_x, d_y, d_z, d_x, d_y, d_z)
+    d_u = dot(d_x, d_y, d_z, u_x, u_y, u_z)
+    o_u = dot(o_x, o_y, o_z, u_x, u_y, u_z)
+    o_d = dot(o_x, o_y, o_z, d_x, d_y, d_z)
+    o_o = dot(o_x, o_y, o_z, o_x, o_y, o_z)
+    a = ti.max(d_d - d_u * d_u, 1e-12)
+    b = o_d - o_u * d_u
+    c = o_o - o_u * o_u - radius * radius
+    inner = b * b - a * c
+    t_side = (ti.sqrt(ti.max(inner, 0.0)) + b) * (-1.0) / a
+    along = o_u + t_side * d_u
+    # The sphere around the end beyond which the solution lies.
+    end = ti.select(along < length * 0.5, 0.0, length)
+    b_end = o_d - end * d_u
+    c_end = o_o - 2.0 * end * o_u + end * end - radius * radius
+    inner_end = b_end * b_end - d_d * c_end
+    t_end = (ti.sqrt(ti.max(inner_end, 0.0)) + b_end) * (-1.0) / d_d
+    on_side = (along >= 0.0) & (along <= length)
+    t = ti.select(on_side, t_side, t_end)
+    met = (inner >= 0.0) & (on_side | (inner_end >= 0.0))
+    foot = ti.max(ti.min(o_u + t * d_u, length), 0.0)
+    return (
+        ti.select(met, start + t, INFINITY),
+        o_x + d_x * t - u_x * foot,
+        o_y + d_y * t - u_y * foot,
+        d_z * t - u_z * foot,
+    )
+
+
+@ti.func
+def cover_tile_with_rod(at, x, y, n, band: ti.template()):
+    """Cover a tile of samples with rod n."""
+    plane, samples = ti.static((band.config.plane, band.samples))
+    depth, n_x, n_y, n_z = meet(x, y, n, band.numbers)
+    visible = (w_at(depth, band.numbers) > band.near) & (depth < samples[at + plane.depth])
+    if ti.static(band.config.bends):
+        visible = visible & (x < BEYOND)
+    keep(at + plane.depth, visible, depth, samples)
+    keep(at + plane.instrument, visible, 255.0, samples)
+    if ti.static(band.config.metal):
+        keep(at + plane.normal_x, visible, n_x, samples)
+        keep(at + plane.normal_y, visible, n_y, samples)
+        keep(at + plane.normal_z, visible, n_z, samples)
+    if ti.static(band.config.normals):
+        # In OpenCV's axes.
+        keep_unit(at + plane.facet_x, visible, [n_x, n_y * (-1.0), n_z * (-1.0)], samples)
+
+
+@ti.func
+def cover_with_rods(count, band: ti.template()):
+    """Cover a band with its `count` instruments."""
+    config, numbers = ti.static((band.config, band.numbers))
+    for n in range(count):
+        rod = uni.RODS + n * uni.ROD_NUMBERS
+        left, right = numbers[rod + uni.LEFT], numbers[rod + uni.RIGHT]
+        top, bottom = numbers[rod + uni.TOP], numbers[rod + uni.BOTTOM]
+        low_x, high_x, low_y, high_y = left, right, top, bottom
+        if ti.static(config.bends):
+            # Which tiles show what is within these bounds is known of each tile alone.
+            low_x, high_x, low_y, high_y = band.left, band.right, band.top, band.bottom
+        if low_y < band.bottom and high_y > band.top:
+            first_column, end_column, first_row, end_row = clip(low_x, high_x, low_y, high_y, band)
+            first_tile, end_tile, first_line, end_line = tiles_of(first_column, end_column, first_row, end_row, band)
+            for line in range(first_line, end_line):
+                for tile in range(first_tile, end_tile):
+                    at = band.first + (line * band.across + tile) * config.planes
+                    tile_x, tile_y = tile * config.tile_width, band.top + line * config.tile_height
+                    reached = True
+                    if ti.static(config.bends):
+                        box = ti.static(box_of(at, tile_x, tile_y, band))
+                        reached = box[0] <= right and box[1] >= left and box[2] <= bottom and box[3] >= top
+                    if reached:
+                        x, y = places(tile_x, tile_y, places_of(at, band), band.samples, config)
+                        cover_tile_with_rod(at, x, y, n, band)
+
+
+# The numbers of the unit normal at a mass point; normals are stored after the other numbers of all mass points.
+NORMAL_NUMBERS = 3
+
+# A footprint of this size covers any texture [texels squared].
+LARGEST_FOOTPRINT = 1e12
+
+
+class DrawnSheet(NamedTuple):
+    """The mass points, and the size of what is between them."""
+
+    point: Any  # the numbers of every mass point, then the normals
+    rows: Any
+    cols: Any
+    parts: Any  # small quads along a side of a cell
+    texture_width: Any  # [texels]
+    texture_height: Any
+    bent: Any  # entry of `point` where what `store_bent` stored begins, if there is a lens
+
+
+class Cell(NamedTuple):
+    """A cell and its place on the sheet and on the texture."""
+
+    patch: Any
+    i: Any  # its row and column
+    j: Any
+    down: Any  # cells of the sheet
+    across: Any
+    texel_x: Any  # whole texels to its upper left mass point
+    texel_y: Any
+    rest_x: Any  # the fraction of a texel that remains
+    rest_y: Any
+    step_x: Any  # texels of the cell
+    step_y: Any
+    normal: Any  # entry of the normal at its upper left mass point
+
+
+@ti.func
+def cell_at(i, j, patch: ti.template(), sheet: ti.template()):
+    """Find the place of the cell to the right and below of mass point (i, j)."""
+    # In f64, so that it is exact to a fraction of a texel on any sheet.
+    texel_x = ti.cast(j, ti.f64) * sheet.texture_width / (sheet.cols - 1) - 0.5
+    texel_y = ti.cast(i, ti.f64) * sheet.texture_height / (sheet.rows - 1) - 0.5
+    whole_x, whole_y = ti.floor(texel_x), ti.floor(texel_y)
+    first_x, first_y = ti.cast(whole_x, ti.f32), ti.cast(whole_y, ti.f32)
+    rest_x, rest_y = ti.cast(texel_x - whole_x, ti.f32), ti.cast(texel_y - whole_y, ti.f32)
+    step_x = ti.cast(sheet.texture_width, ti.f32) / (sheet.cols - 1)
+    step_y = ti.cast(sheet.texture_height, ti.f32) / (sheet.rows - 1)
+    row, column = ti.cast(i, ti.f32), ti.cast(j, ti.f32)
+    down, across = ti.cast(sheet.rows - 1, ti.f32), ti.cast(sheet.cols - 1, ti.f32)
+    normal = sheet.rows * sheet.cols * POINT_NUMBERS + (i * sheet.cols + j) * NORMAL_NUMBERS
+    return ti.static(Cell(patch, row, column, down, across, first_x, first_y, rest_x, rest_y, step_x, step_y, normal))
+
+
+@ti.func
+def store_normal(
+    position: ti.template(), i, j, rows, cols, config: ti.template(), numbers: ti.template(), point: ti.template()
+):
+    """Store the normal of the sheet at mass point (i, j), if it is shaded; for tissue, in the camera's frame."""
+    if ti.static(config.headlit or config.tissue):
+        i0, i1 = ti.max(i - 1, 0), ti.min(i + 1, rows - 1)
+        j0, j1 = ti.max(j - 1, 0), ti.min(j + 1, cols - 1)
+        r = [position[i, j1, n] - position[i, j0, n] for n in ti.static(range(3))]
+        u = [position[i0, j, n] - position[i1, j, n] for n in ti.static(range(3))]
+        across = [r[1] * u[2] - r[2] * u[1], r[2] * u[0] - r[0] * u[2], r[0] * u[1] - r[1] * u[0]]
+        length = ti.sqrt(across[0] * across[0] + across[1] * across[1] + across[2] * across[2])
+        normal = [across[n] / ti.max(length, 1e-30) for n in ti.static(range(3))]
+        here = rows * cols * POINT_NUMBERS + (i * cols + j) * NORMAL_NUMBERS
+        for n in ti.static(range(3)):
+            axis = uni.AXES + 3 * n
+            point[here + n] = (
+                numbers[axis] * normal[0] + numbers[axis + 1] * normal[1] + numbers[axis + 2] * normal[2]
+                if ti.static(config.tissue)
+                else normal[n]
+            )
+
+
+@ti.func
+def normal_at(across, along, cell: ti.template(), sheet: ti.template()):
+    """Interpolate the normals of the mass points; the result, a list, is not normalised."""
+    below = cell.normal + sheet.cols * NORMAL_NUMBERS
+    a = [sheet.point[cell.normal + n] for n in ti.static(range(3))]
+    b = [sheet.point[cell.normal + NORMAL_NUMBERS + n] for n in ti.static(range(3))]
+    c = [sheet.point[below + n] for n in ti.static(range(3))]
+    d = [sheet.point[below + NORMAL_NUMBERS + n] for n in ti.static(range(3))]
+    return [
+        a[n] + (b[n] - a[n]) * across + (c[n] - a[n] + (d[n] - b[n] - (c[n] - a[n])) * across) * along
+        for n in ti.static(range(3))
+    ]
+
+
+@ti.func
+def absolute(values):
+    """Give absolute values; ti.abs of a vector crashes."""
+    return ti.max(values, values * (-1.0))
+
+
+@ti.func
+def headlight(normal: ti.template(), numbers: ti.template()):
+    """Share of the headlight that is reflected: the cosine between the normal and the direction to the light."""
+    length = ti.sqrt(normal[0] * normal[0] + normal[1] * normal[1] + normal[2] * normal[2])
+    toward = uni.HEADLIGHT
+    cosine = absolute(normal[0] * numbers[toward] + normal[1] * numbers[toward + 1] + normal[2] * numbers[toward + 2])
+    cosine = cosine / ti.max(length, 1e-30)
+    # Where a point is infinite or NaN, so is its normal.
+    return ti.max(ti.min(cosine, 1.0), 0.0)
+
+
+@ti.func
+def footprint(at, x, y, s, t, texels_x, texels_y, triangle: ti.template(), band: ti.template()):
+    """Square of the larger of a sample's width and height on the texture, in units of style.SHARP texels.
+
+    With x = X / w the derivatives of (x, y) with respect to (s, t) are (R_1, D_1; R_2, D_2) / w, where
+    R_1 = R_x - x R_w and so on; those of (s, t) with respect to (x, y) are the inverse. Also gives 1 where the front of
+    the triangle is seen, else -1.
+    """
+    p, r, d = ti.static((triangle.p, triangle.r, triangle.d))
+    r_1 = r[0] - x * r[2]
+    d_1 = d[0] - x * d[2]
+    r_2 = r[1] - y * r[2]
+    d_2 = d[1] - y * d[2]
+    # Written as in `on_triangle`, so that the compiler computes it once.
+    share = 1.0 / (r_1 * d_2 - r_2 * d_1)
+    scale = (p[2] + r[2] * s + d[2] * t) * share
+    if ti.static(band.config.place_steps):
+        step = steps(at, band)
+        d_2, d_1 = d_2 * step[0] - d_1 * step[1], d_1 * step[3] - d_2 * step[2]
+        r_2, r_1 = r_2 * step[0] - r_1 * step[1], r_1 * step[3] - r_2 * step[2]
+    across_1, across_2, down_1, down_2 = d_1 * texels_x, d_2 * texels_x, r_1 * texels_y, r_2 * texels_y
+    largest = ti.max(across_1 * across_1 + down_1 * down_1, across_2 * across_2 + down_2 * down_2)
+    square = largest * (scale * scale) * (1.0 / (uniforms.SHARP * uniforms.SHARP))
+    return ti.min(square, LARGEST_FOOTPRINT), ti.select(scale < 0.0, -1.0, 1.0)
+
+
+@ti.func
+def distance_to_line(place, right, below):
+    """Distance of samples from the nearest line of the mesh [samples], given their distance from its first [cells].
+
+    `right` and `below` are those distances of what their neighbours show of the same triangle.
+    """
+    to_right, to_below = right - place, below - place
+    slope = ti.sqrt(to_right * to_right + to_below * to_below)
+    return absolute(place - ti.round(place)) / ti.max(slope, 1e-12)
+
+
+@ti.func
+def store(
+    at, visible, x, y, s, t, column, line,
+    triangle: ti.template(), cell: ti.template(), sheet: ti.template(), band: ti.template(),
+):  # fmt: skip
+    """Keep what the visible samples of a tile show: (s, t) of a triangle of a cell's small quad (column, line)."""
+    config, samples = ti.static((band.config, band.samples))
+    plane = ti.static(config.plane)
+    part = 1.0 / sheet.parts
+    across = (column + s) * part
+    along = (line + t) * part
+    keep(at + plane.texel_x, visible, cell.rest_x + across * cell.step_x + cell.texel_x, samples)
+    keep(at + plane.texel_y, visible, cell.rest_y + along * cell.step_y + cell.texel_y, samples)
+    if ti.static(config.labels):
+        keep(at + plane.across, visible, (cell.j + across) / cell.across, samples)
+        keep(at + plane.down, visible, (cell.i + along) / cell.down, samples)
+    if ti.static(config.normals):
+        keep_unit(at + plane.facet_x, visible, facet(x, y, triangle, band.numbers), samples)
+    if ti.static(config.headlit):
+        normal = normal_at(across, along, cell, sheet)
+        keep(at + plane.light, visible, headlight(normal, band.numbers), samples)
+    if ti.static(config.tissue):
+        size, front = footprint(at, x, y, s, t, cell.step_x * part, cell.step_y * part, triangle, band)
+        # On the side that is seen of the triangle: at a fold, the interpolated normal may lean the other way.
+        normal = normal_at(across, along, cell, sheet)
+        keep(at + plane.normal_x, visible, normal[0] * front, samples)
+        keep(at + plane.normal_y, visible, normal[1] * front, samples)
+        keep(at + plane.normal_z, visible, normal[2] * front, samples)
+        keep(at + plane.footprint, visible, size, samples)
+    if ti.static(config.wireframe):
+        right_x, right_y, below_x, below_y = x + 1.0, y, x, y + 1.0
+        if ti.static(config.place_steps):
+            step = steps(at, band)
+            right_x, right_y, below_x, below_y = x + step[0], y + step[1], x + step[2], y + step[3]
+        s_right, t_right = on_triangle(right_x, right_y, triangle)
+        s_below, t_below = on_triangle(below_x, below_y, triangle)
+        distance = ti.min(
+            distance_to_line(across, (column + s_right) * part, (column + s_below) * part),
+            distance_to_line(along, (line + t_right) * part, (line + t_below) * part),
+        )
+        reach = uniforms.WIRE_WIDTH / 2 * config.supersample + 0.5
+        keep(at + plane.wire, visible, uniforms.WIRE_OPACITY * ti.max(ti.min(reach - distance, 1.0), 0.0), samples)

@@ -12,9 +12,9 @@ listed row by row: upper left and right, lower left and right.
 
 from typing import Any, NamedTuple
 
-from taichi_msm.render import bending
+from taichi_msm.render import lens_kernels
 from taichi_msm.render import uniforms as uni
-from taichi_msm.render.samples import INFINITY
+from taichi_msm.render.config import INFINITY
 from taichi_msm.system.runtime import ti
 
 # The numbers of a mass point: (X, Y, w, depth), its place in the picture [samples], at SEEN.
@@ -283,15 +283,18 @@ def may_reach(corner, at, cols, top, bottom, numbers: ti.template(), point: ti.t
 
     The numbers of its upper left mass point begin at `corner`, and what `store_bent` stored of it at `at`.
     """
-    below, under = corner + cols * POINT_NUMBERS, at + cols * bending.BENT_NUMBERS
-    bent_corners = ti.static((at, at + bending.BENT_NUMBERS, under, under + bending.BENT_NUMBERS))
+    below, under = corner + cols * POINT_NUMBERS, at + cols * lens_kernels.BENT_NUMBERS
+    bent_corners = ti.static((at, at + lens_kernels.BENT_NUMBERS, under, under + lens_kernels.BENT_NUMBERS))
     within = [point[here + 2] for here in bent_corners]
     seen = [point[here + 1] for here in bent_corners]
     corners = ti.static((corner, corner + POINT_NUMBERS, below, below + POINT_NUMBERS))
     x = [point[here + SEEN] for here in corners]
     y = [point[here + SEEN + 1] for here in corners]
     longest = ti.max(
-        bending.side(x, y, 0, 1), bending.side(x, y, 1, 3), bending.side(x, y, 3, 2), bending.side(x, y, 2, 0)
+        lens_kernels.side(x, y, 0, 1),
+        lens_kernels.side(x, y, 1, 3),
+        lens_kernels.side(x, y, 3, 2),
+        lens_kernels.side(x, y, 2, 0),
     )
     far = numbers[uni.BEND] * longest + 2.0
     lowest, highest = ti.max(seen[0], seen[1], seen[2], seen[3]), ti.min(seen[0], seen[1], seen[2], seen[3])
@@ -305,16 +308,19 @@ def cell_bounds(at, cols, outline: ti.template(), numbers: ti.template(), point:
 
     What `store_bent` stored of its upper left mass point is at `at`, in a sheet of so many columns.
     """
-    below = at + cols * bending.BENT_NUMBERS
-    corners = ti.static((at, at + bending.BENT_NUMBERS, below, below + bending.BENT_NUMBERS))
+    below = at + cols * lens_kernels.BENT_NUMBERS
+    corners = ti.static((at, at + lens_kernels.BENT_NUMBERS, below, below + lens_kernels.BENT_NUMBERS))
     x, y = ti.static((outline.x, outline.y))
     longest = ti.max(
-        bending.side(x, y, 0, 1), bending.side(x, y, 1, 3), bending.side(x, y, 3, 2), bending.side(x, y, 2, 0)
+        lens_kernels.side(x, y, 0, 1),
+        lens_kernels.side(x, y, 1, 3),
+        lens_kernels.side(x, y, 3, 2),
+        lens_kernels.side(x, y, 2, 0),
     )
     within = point[corners[0] + 2] + point[corners[1] + 2] + point[corners[2] + 2] + point[corners[3] + 2] > 3.5
     seen_x = [point[here] for here in corners]
     seen_y = [point[here + 1] for here in corners]
-    return bending.bent_bounds(x, y, seen_x, seen_y, within, longest, numbers)
+    return lens_kernels.bent_bounds(x, y, seen_x, seen_y, within, longest, numbers)
 
 
 @ti.func
@@ -366,9 +372,11 @@ def triangle_bounds(
             overstep += OVERSTEP_OF_PICTURE * around / extent
             x = [k[0] / k[2] for k in ti.static((p, q, r))]
             y = [k[1] / k[2] for k in ti.static((p, q, r))]
-            longest = ti.max(bending.side(x, y, 0, 1), bending.side(x, y, 1, 2), bending.side(x, y, 2, 0))
-            seen = [bending.bent(x[n], y[n], numbers, lens) for n in ti.static(range(3))]
-            low_x, high_x, low_y, high_y = bending.bent_bounds(
+            longest = ti.max(
+                lens_kernels.side(x, y, 0, 1), lens_kernels.side(x, y, 1, 2), lens_kernels.side(x, y, 2, 0)
+            )
+            seen = [lens_kernels.bent(x[n], y[n], numbers, lens) for n in ti.static(range(3))]
+            low_x, high_x, low_y, high_y = lens_kernels.bent_bounds(
                 x, y, [one[0] for one in seen], [one[1] for one in seen], seen[0][2] and seen[1][2] and seen[2][2],
                 longest, numbers,
             )  # fmt: skip

@@ -15,16 +15,16 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from taichi_msm.model.surface import Rod
 from taichi_msm.render import uniforms as uni
 from taichi_msm.render.camera import View, view, view_at
+from taichi_msm.render.config import DrawingConfig
+from taichi_msm.render.cpu import Bands
+from taichi_msm.render.gpu import Threads
 from taichi_msm.render.labels import Observed, labels_of
-from taichi_msm.render.places import sample_places
-from taichi_msm.render.rasterizer_cpu import Bands
-from taichi_msm.render.rasterizer_gpu import Threads
-from taichi_msm.render.samples import DrawingConfig
-from taichi_msm.render.surface import Rod
-from taichi_msm.render.texture_filter import pyramid
-from taichi_msm.scene import Scene
+from taichi_msm.render.lens_table import sample_places
+from taichi_msm.render.shading import pyramid
+from taichi_msm.scene.scene import Scene
 from taichi_msm.system.runtime import lanes
 
 

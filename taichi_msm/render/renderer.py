@@ -9,13 +9,14 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from taichi_msm.arguments import are_numbers, as_array
-from taichi_msm.errors import ArgumentError, did_you_mean
+from taichi_msm.errors import ArgumentError, are_numbers, as_array, did_you_mean
+from taichi_msm.model.surface import Rod
 from taichi_msm.render.camera import View, moves, view, view_at
 from taichi_msm.render.labels import Flow, Labels, Observed, Sight, Stereo, track_grid
-from taichi_msm.render.surface import Rod
 from taichi_msm.render.texture import load_texture
-from taichi_msm.scene import PRESETS, Camera, Render, Scene
+from taichi_msm.scene.camera import Camera
+from taichi_msm.scene.render import PRESETS, Render
+from taichi_msm.scene.scene import Scene
 
 if TYPE_CHECKING:
     from taichi_msm.render.rasterizer import Drawing

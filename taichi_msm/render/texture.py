@@ -5,10 +5,9 @@ from __future__ import annotations
 from collections.abc import Iterator
 from typing import TYPE_CHECKING, Any
 
-from taichi_msm.arguments import as_array
-from taichi_msm.errors import ArgumentError, Problem, SceneError
-from taichi_msm.picture import MAX_SIDE, PictureError, has_transparency, picture_size, read_rgb
-from taichi_msm.scene import Scene
+from taichi_msm.errors import ArgumentError, Problem, SceneError, as_array
+from taichi_msm.images import MAX_SIDE, PictureError, has_transparency, picture_size, read_rgb
+from taichi_msm.scene.scene import Scene
 
 if TYPE_CHECKING:
     import numpy as np

@@ -11,17 +11,17 @@ from functools import cache
 import numpy as np
 from numpy.typing import NDArray
 
-from taichi_msm.render import bending, geometry
+from taichi_msm.model.surface import Rod
+from taichi_msm.render import geometry, lens_kernels
 from taichi_msm.render import uniforms as uni
 from taichi_msm.render.bins import BOUNDS, binned, store_bounds
 from taichi_msm.render.camera import View
+from taichi_msm.render.config import INFINITY, Bytes, Doubles, Floats, Integers
+from taichi_msm.render.coverage import meet
 from taichi_msm.render.geometry import POINT_NUMBERS
-from taichi_msm.render.instrument_coverage import meet
 from taichi_msm.render.labels import NO_FLOW, Flow, Sight
-from taichi_msm.render.places import window
-from taichi_msm.render.samples import INFINITY, Bytes, Doubles, Floats, Integers
-from taichi_msm.render.surface import Rod
-from taichi_msm.scene import Scene
+from taichi_msm.render.lens_table import window
+from taichi_msm.scene.scene import Scene
 from taichi_msm.system.launches import Launches, end_thread
 from taichi_msm.system.runtime import lanes, our_compilation, ti
 
@@ -273,7 +273,7 @@ def _finding(lens: str) -> Callable[..., None]:
                     x, y = p[0] / p[2], p[1] / p[2]
                     place_x, place_y, within = x, y, True
                     if ti.static(lens != ""):
-                        x, y, within = bending.bent(place_x, place_y, numbers, lens)
+                        x, y, within = lens_kernels.bent(place_x, place_y, numbers, lens)
                     if within and x >= 0.0 and y >= 0.0 and x < width and y < height:
                         out_of_sight = False
                         depth = p[3] - numbers[uni.TOUCHING]

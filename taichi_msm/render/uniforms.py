@@ -1,4 +1,6 @@
-"""What kernel 2 is told of a picture, in two arrays, as every argument of a kernel costs time.
+"""The constants that decide the look of the picture.
+
+What kernel 2 is told of a picture, in two arrays, as every argument of a kernel costs time.
 
 One holds sizes and counters; the other the numbers of the view, its light and its instruments.
 """
@@ -11,11 +13,39 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from taichi_msm.render import style
+from taichi_msm.model.surface import Rod
 from taichi_msm.render.camera import View
-from taichi_msm.render.places import visible
-from taichi_msm.render.surface import Rod
-from taichi_msm.scene import Render, Scene
+from taichi_msm.render.lens_table import visible
+from taichi_msm.scene.render import Render
+from taichi_msm.scene.scene import Scene
+
+# The mass-point mesh: its colour, the width of a line [px], and how much of the surface it hides.
+WIRE_COLOUR = (235, 245, 255)
+WIRE_WIDTH = 1.0
+WIRE_OPACITY = 0.75
+
+# A sample of tissue that is at most this many texels wide shows the texture at full size: the filter has two texels.
+SHARP = 2.0
+
+# Where the light is, to the right of the eye and above it, as a fraction of the distance to what the camera looks at.
+LIGHT_RIGHT, LIGHT_UP = -0.3, 0.0
+
+# How far around the surface light wraps, and how narrow highlights are: (M V)^(2^SHARPNESS).
+WRAP = 0.3
+SHARPNESS = 3
+
+# Share of the light that an instrument takes from the tissue that it touches.
+SHADE = 0.7
+
+# Metal: its colour; the shares of ambient light, of diffuse light and of the reflected room; and the brightness of its
+# highlight, as a fraction of white.
+METAL = (176.0, 182.0, 190.0)
+METAL_AMBIENT, METAL_DIFFUSE, METAL_MIRROR, METAL_GLOSS = 0.2, 0.35, 0.6, 0.7
+
+# The least depth at which metal is lit, in units of the distance from the light to the middle of the picture.
+METAL_NEAREST = 0.2
+
+pass  # REMOVED
 
 Array = NDArray[np.float64]
 
@@ -85,9 +115,9 @@ def view_numbers(
     numbers[CENTRE_X:SPREAD_X], numbers[SPREAD_X:PINHOLE] = view.centre * factor, 1 / (view.scale * factor)
     numbers[PINHOLE], numbers[MIDDLE_X:LIGHT_X] = view.pinhole, view.size / 2 * factor
     lamp, light = view.lamp or view, render.light
-    place = np.array([style.LIGHT_RIGHT, style.LIGHT_UP, 0.0]) * lamp.distance
+    place = np.array([LIGHT_RIGHT, LIGHT_UP, 0.0]) * lamp.distance
     far = math.hypot(place[0], place[1], lamp.distance)
-    unit = (1 + style.WRAP) / (lamp.distance / far + style.WRAP)
+    unit = (1 + WRAP) / (lamp.distance / far + WRAP)
     if lamp is not view:
         place = view.axes @ (lamp.eye + place @ lamp.axes - view.eye)
     numbers[[LIGHT_X, LIGHT_Y, LIGHT_Z]], numbers[HEADLIGHT:RODS] = place, lamp.axes[2]

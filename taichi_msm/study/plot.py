@@ -35,8 +35,8 @@ from taichi_msm.plot_style import (
     VERMILION,
     WIDE,
 )
+from taichi_msm.study.format import mostly_rounding, number, unit, where
 from taichi_msm.study.result import Drawn, Peer, Points, Stepping, Study
-from taichi_msm.study.table import mostly_rounding, number, unit, where
 from taichi_msm.system.compiler import named
 
 # Colour shows the damping difference, dashes and markers the precision.

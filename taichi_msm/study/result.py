@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from taichi_msm.scene import MAX_POINTS
+from taichi_msm.scene.section import MAX_POINTS
 
 # A picture is refined enough if no other one of the same supersampling has a PSNR higher by more than this [dB].
 REFINED_ENOUGH = 0.1

@@ -24,15 +24,12 @@ from distributed.client import ClosedClientError
 from distributed.comm import connect
 from distributed.utils import LoopRunner, silence_logging_cmgr
 
-from taichi_msm.errors import ExecutorError, LostExecutorError, MsmError
-from taichi_msm.outputs.table import SWEEP
-from taichi_msm.picture import copied
-from taichi_msm.progress import Progress
-from taichi_msm.sweeps.outcome import Outcome
-from taichi_msm.sweeps.sweepfile import Sweep
-from taichi_msm.sweeps.task import Task, take
-from taichi_msm.system.compiler import what_decides_bits
-from taichi_msm.system.versions import versions
+from taichi_msm.errors import ExecutorError, LostExecutorError, MsmError, Progress
+from taichi_msm.images import copied
+from taichi_msm.scene.outputs import SWEEP
+from taichi_msm.sweeps.runs import Outcome, Task, take
+from taichi_msm.sweeps.spec import Sweep
+from taichi_msm.system.compiler import versions, what_decides_bits
 
 # How long a scheduler may take to answer [s].
 PATIENCE = 10

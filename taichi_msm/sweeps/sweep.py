@@ -8,17 +8,11 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
-from taichi_msm.arguments import MAX_WORKERS, require_path
-from taichi_msm.errors import ArgumentError, NotInstalledError, writing
-from taichi_msm.progress import Progress
-from taichi_msm.sweeps.cost import choose_workers, estimate
-from taichi_msm.sweeps.folder import ENDED, UnderWay, alone, begin_sweep, ended
-from taichi_msm.sweeps.outcome import Outcome
+from taichi_msm.errors import MAX_WORKERS, ArgumentError, NotInstalledError, Progress, require_path, writing
 from taichi_msm.sweeps.pool import Pool
-from taichi_msm.sweeps.reports import write_reports
-from taichi_msm.sweeps.result import SweepResult
-from taichi_msm.sweeps.schedule import outcomes
-from taichi_msm.sweeps.sweepfile import make_sweep
+from taichi_msm.sweeps.runs import ENDED, Outcome, SweepResult, UnderWay, alone, begin_sweep, ended, outcomes
+from taichi_msm.sweeps.spec import make_sweep
+from taichi_msm.sweeps.tables import choose_workers, estimate, write_reports
 
 
 def sweep(

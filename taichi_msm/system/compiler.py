@@ -1,9 +1,14 @@
-"""The compiler of our kernels: Taichi, or Quadrants, its maintained fork. No other module knows which of them it is."""
+"""The compiler of our kernels: Taichi, or Quadrants, its maintained fork. No other module knows which of them it is.
+
+The versions that results depend on.
+"""
 
 from __future__ import annotations
 
 import ast
 import os
+import platform
+import sys
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cache, cached_property
@@ -13,6 +18,7 @@ from typing import Any
 
 from taichi_msm.errors import DeviceError, NotInstalledError, did_you_mean
 from taichi_msm.system.files import private_folder
+from taichi_msm.version import __version__
 
 # The environment variable that chooses.
 CHOICE = "TAICHI_MSM_COMPILER"
@@ -179,4 +185,23 @@ def what_decides_bits(versions: Mapping[str, str], arch: str) -> dict[str, str]:
         name: version
         for name, version in versions.items()
         if arch != "cpu" or name not in COMPILERS or version != COMPILERS[name].tested
+    }
+
+
+pass  # REMOVED
+
+
+def versions() -> dict[str, str]:
+    """Name the versions that the results depend on."""
+    # Imported here, as they take a while.
+    import numpy as np
+    import PIL
+
+    return {
+        "taichi-msm": __version__,
+        "python": platform.python_version(),
+        chosen().name: chosen().version,
+        "numpy": np.__version__,
+        "pillow": PIL.__version__,
+        "platform": f"{sys.platform} {platform.machine()}",
     }

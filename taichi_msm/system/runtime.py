@@ -20,10 +20,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from taichi_msm.errors import ArgumentError, DeviceError, MsmError, did_you_mean
-from taichi_msm.system import resources
+from taichi_msm.system import process as process_module
 from taichi_msm.system.compiler import Parts, chosen
 from taichi_msm.system.files import private_folder
-from taichi_msm.system.streams import silenced
+from taichi_msm.system.process import silenced
 
 ti = chosen().load()
 
@@ -139,7 +139,7 @@ def start(arch: str = "cpu", threads: int | None = None) -> Device:
     if arch not in ARCHS:
         near = did_you_mean(str(arch), ARCHS)
         raise DeviceError(f"--arch {arch}: not supported; take one of: {', '.join(ARCHS)}{near}")
-    wanted = Device(arch, resources.available_threads() if threads is None else threads)
+    wanted = Device(arch, process_module.available_threads() if threads is None else threads)
     with _starting:
         return _start(wanted)
 
@@ -316,5 +316,5 @@ def _initialise(device: Device) -> str:
     # The threads of the pool are the last that Taichi starts.
     _pin([thread for thread in _threads() if thread not in before][-device.threads :])
     if on_cpu:
-        return resources.processor()
+        return process_module.processor()
     return next(filter(None, named.groups())) if named else ""

@@ -15,10 +15,10 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from taichi_msm.physics.lattice import rest_positions, spacing
-from taichi_msm.physics.loads import Schedule
-from taichi_msm.physics.plan import Plan
-from taichi_msm.scene import Scene
+from taichi_msm.model.loads import Schedule
+from taichi_msm.model.plan import Plan
+from taichi_msm.model.sheet import rest_positions, spacing
+from taichi_msm.scene.scene import Scene
 from tests.reference.sheet import Sheet, Springs
 
 # Of complex numbers where the derivative is by a complex step.

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from taichi_msm.physics.lattice import rest_positions
-from taichi_msm.physics.plan import Plan
+from taichi_msm.model.plan import Plan
+from taichi_msm.model.sheet import rest_positions
 from tests.reference.sheet import sheet
 
 Array = NDArray[np.float64]

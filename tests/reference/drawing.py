@@ -9,10 +9,10 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from taichi_msm.render import style
+from taichi_msm.model.surface import Rod
+from taichi_msm.render import uniforms
 from taichi_msm.render.camera import View, view
-from taichi_msm.render.surface import Rod
-from taichi_msm.scene import Scene
+from taichi_msm.scene.scene import Scene
 from tests.reference.lens import undistorted
 from tests.reference.shading import headlight, meet, metal, normals, normals_at, sample, tissue
 
@@ -85,8 +85,8 @@ def wire_share(scene: Scene, triangle: Array, at: Sampled) -> Array:
     )
     slope = np.hypot(mesh(*right) - here, mesh(*below) - here)
     distance = np.abs(here - np.round(here)) / np.maximum(slope, 1e-12)
-    half = style.WIRE_WIDTH / 2 * scene.render.supersample
-    return np.asarray(style.WIRE_OPACITY * np.clip(half + 0.5 - distance.min(axis=0), 0, 1))
+    half = uniforms.WIRE_WIDTH / 2 * scene.render.supersample
+    return np.asarray(uniforms.WIRE_OPACITY * np.clip(half + 0.5 - distance.min(axis=0), 0, 1))
 
 
 class Seen(NamedTuple):
@@ -194,7 +194,7 @@ def footprint(triangle: Array, at: Sampled, texels: tuple[int, int]) -> Array:
 
     right = place(*at(step, 0)) - place(*at(-step, 0))
     down = place(*at(0, step)) - place(*at(0, -step))
-    return np.asarray(np.maximum(np.hypot(*right), np.hypot(*down)) / (2 * step * style.SHARP))
+    return np.asarray(np.maximum(np.hypot(*right), np.hypot(*down)) / (2 * step * uniforms.SHARP))
 
 
 def draw(
@@ -224,7 +224,7 @@ def draw(
     if scene.render.shading == "headlight":
         lit *= headlight(normal, (camera.lamp or camera).axes[2])[..., None]
     wire = seen.wire[..., None]
-    lit = lit * (1 - wire) + np.array(style.WIRE_COLOUR) * wire
+    lit = lit * (1 - wire) + np.array(uniforms.WIRE_COLOUR) * wire
     colour = np.where(sheet[..., None], lit, np.array(scene.render.background, float))
     depth, outward = meet(rods, camera, scene.render.size, factor)
     nearer = depth < seen.depth

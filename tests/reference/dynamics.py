@@ -7,11 +7,11 @@ from collections.abc import Iterator
 import numpy as np
 from numpy.typing import NDArray
 
-from taichi_msm.physics.lattice import rest_positions, spacing
-from taichi_msm.physics.loads import Schedule, schedule
-from taichi_msm.physics.plan import Plan
-from taichi_msm.physics.planning import make_plan
-from taichi_msm.scene import Scene
+from taichi_msm.model.loads import Schedule, schedule
+from taichi_msm.model.plan import Plan
+from taichi_msm.model.sheet import rest_positions, spacing
+from taichi_msm.scene.scene import Scene
+from taichi_msm.solver.planning import make_plan
 from tests.reference.contact import Contact
 from tests.reference.sheet import Springs, sheet
 

@@ -7,9 +7,9 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
+from taichi_msm.model.surface import Rod
 from taichi_msm.render.camera import view
-from taichi_msm.render.surface import Rod
-from taichi_msm.scene import Scene
+from taichi_msm.scene.scene import Scene
 from tests.reference.drawing import look, refine, triangles, weights
 from tests.reference.lens import distort
 from tests.reference.shading import meet

@@ -5,8 +5,8 @@ from __future__ import annotations
 import math
 from typing import NamedTuple
 
-from taichi_msm.physics.lattice import spacing
-from taichi_msm.scene import Scene
+from taichi_msm.model.sheet import spacing
+from taichi_msm.scene.scene import Scene
 
 Window = tuple[slice, slice]
 

@@ -6,10 +6,10 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import minimize
 
-from taichi_msm.physics.lattice import rest_positions
-from taichi_msm.physics.loads import Schedule
-from taichi_msm.physics.plan import Plan
-from taichi_msm.scene import Scene
+from taichi_msm.model.loads import Schedule
+from taichi_msm.model.plan import Plan
+from taichi_msm.model.sheet import rest_positions
+from taichi_msm.scene.scene import Scene
 from tests.reference.dynamics import energy, force, surgical_force
 from tests.reference.sheet import sheet
 

@@ -7,10 +7,10 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from taichi_msm.render import style
+from taichi_msm.model.surface import Rod
+from taichi_msm.render import uniforms
 from taichi_msm.render.camera import View
-from taichi_msm.render.surface import Rod
-from taichi_msm.scene import Scene
+from taichi_msm.scene.scene import Scene
 from tests.reference.lens import undistorted
 
 Array = NDArray[np.float64]
@@ -182,7 +182,7 @@ def illuminate(camera: View, factor: int, depth: Array, normal: Array) -> tuple[
     lamp = camera.lamp or camera
     right, up, toward = lamp.axes
     point = points(camera, factor, depth)
-    light = lamp.eye + lamp.distance * (style.LIGHT_RIGHT * right + style.LIGHT_UP * up)
+    light = lamp.eye + lamp.distance * (uniforms.LIGHT_RIGHT * right + uniforms.LIGHT_UP * up)
     to_eye = unit(camera.eye - point) if camera.pinhole else np.broadcast_to(camera.axes[2], point.shape)
     middle = np.linalg.norm(light - (lamp.eye - lamp.distance * toward))
     nearness = np.minimum(middle / np.linalg.norm(light - point, axis=-1), 4)
@@ -192,7 +192,7 @@ def illuminate(camera: View, factor: int, depth: Array, normal: Array) -> tuple[
 def highlight(normal: Array, to_light: Array, to_eye: Array) -> Array:
     """Give the highlight of Phong's model, 0 to 1."""
     mirrored = 2 * (normal * to_light).sum(axis=-1, keepdims=True) * normal - to_light
-    return np.asarray(np.clip((mirrored * to_eye).sum(axis=-1), 0, 1) ** 2**style.SHARPNESS)
+    return np.asarray(np.clip((mirrored * to_eye).sum(axis=-1), 0, 1) ** 2**uniforms.SHARPNESS)
 
 
 def tissue(
@@ -227,16 +227,16 @@ def tissue(
     slope = np.concatenate([rises * upward * sizes * (1, -1), np.zeros_like(rises[..., :1])], axis=-1)
     leaning = normal - slope + (slope * normal).sum(axis=-1, keepdims=True) * normal
     facing, to_light, to_eye, nearness = illuminate(camera, factor, depth, leaning)
-    wrapped = np.maximum((facing * to_light).sum(axis=-1) + style.WRAP, 0) / (1 + style.WRAP) * nearness
-    aside = np.hypot(style.LIGHT_RIGHT, style.LIGHT_UP)
-    wrapped /= (1 / np.hypot(1, aside) + style.WRAP) / (1 + style.WRAP)
+    wrapped = np.maximum((facing * to_light).sum(axis=-1) + uniforms.WRAP, 0) / (1 + uniforms.WRAP) * nearness
+    aside = np.hypot(uniforms.LIGHT_RIGHT, uniforms.LIGHT_UP)
+    wrapped /= (1 / np.hypot(1, aside) + uniforms.WRAP) / (1 + uniforms.WRAP)
     share = light.ambient + (1 - light.ambient) * wrapped
     gloss = 255 * light.gloss * highlight(facing, to_light, to_eye) * nearness
     for rod in rods:
         away = points(camera, factor, depth) - rod.tip
         foot = np.clip(away @ rod.axis, 0, rod.length)[..., None] * rod.axis
         ratio = np.maximum(np.linalg.norm(away - foot, axis=-1) / rod.radius, 1)
-        share, gloss = (value * (1 - style.SHADE / ratio**2) for value in (share, gloss))
+        share, gloss = (value * (1 - uniforms.SHADE / ratio**2) for value in (share, gloss))
     y, x = (np.mgrid[: depth.shape[0], : depth.shape[1]] + 0.5) / factor
     middle = camera.size / 2
     off = np.hypot(x - middle[0], y - middle[1]) / np.hypot(*middle)
@@ -246,15 +246,15 @@ def tissue(
 
 def metal(camera: View, factor: int, depth: Array, normal: Array) -> Array:
     """Shade metal, which reflects a room that is bright above and dark below; colours, shape (height, width, 3)."""
-    far = (camera.lamp or camera).distance * np.hypot(1, np.hypot(style.LIGHT_RIGHT, style.LIGHT_UP))
-    below = np.maximum(np.where(np.isfinite(depth), depth, far), style.METAL_NEAREST * far)
+    far = (camera.lamp or camera).distance * np.hypot(1, np.hypot(uniforms.LIGHT_RIGHT, uniforms.LIGHT_UP))
+    below = np.maximum(np.where(np.isfinite(depth), depth, far), uniforms.METAL_NEAREST * far)
     facing, to_light, to_eye, _ = illuminate(camera, factor, below, normal)
     cosine = np.maximum((facing * to_light).sum(axis=-1), 0)
     mirrored = 2 * (facing * to_eye).sum(axis=-1, keepdims=True) * facing - to_eye
     bright = np.maximum(mirrored @ camera.axes[1], 0)
-    share = style.METAL_AMBIENT + style.METAL_DIFFUSE * cosine + style.METAL_MIRROR * bright**2
-    gloss = 255 * style.METAL_GLOSS * highlight(facing, to_light, to_eye)
-    return np.asarray(np.minimum(share[..., None] * np.array(style.METAL) + gloss[..., None], 255))
+    share = uniforms.METAL_AMBIENT + uniforms.METAL_DIFFUSE * cosine + uniforms.METAL_MIRROR * bright**2
+    gloss = 255 * uniforms.METAL_GLOSS * highlight(facing, to_light, to_eye)
+    return np.asarray(np.minimum(share[..., None] * np.array(uniforms.METAL) + gloss[..., None], 255))
 
 
 def meet(rods: Sequence[Rod], camera: View, size: tuple[int, int], factor: int) -> tuple[Array, Array]:

@@ -10,9 +10,9 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from taichi_msm.physics.lattice import spacing
-from taichi_msm.physics.material import MapImage, cell_factors, point_factors, read_map
-from taichi_msm.scene import Scene, StiffnessMap, Tissue
+from taichi_msm.model.sheet import MapImage, cell_factors, point_factors, read_map, spacing
+from taichi_msm.scene.scene import Scene
+from taichi_msm.scene.sheet import StiffnessMap, Tissue
 
 Array = NDArray[np.float64]
 Window = tuple[slice, slice]

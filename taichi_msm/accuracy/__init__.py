@@ -1,0 +1,1 @@
+"""Error estimates of a run, divergence, and warnings."""

@@ -1,0 +1,132 @@
+"""taichi_msm.cli.main.fit."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import click
+
+from taichi_msm.cli.options import json_option, program, scene_argument, set_option, workers_option
+from taichi_msm.cli.session import DIVERGED, DONE, interrupted, interruptible, print_json, report, result_directory
+from taichi_msm.errors import (
+    DivergedError,
+    printable,
+)
+from taichi_msm.system.process import Interruption
+
+if TYPE_CHECKING:
+    pass
+
+
+@program.command()
+@scene_argument
+@click.argument("observed", metavar="OBSERVED")
+@click.argument("more", metavar="", nargs=-1)
+@click.option("--free", metavar="KEY ...", multiple=True, help="Numbers of the scene that are fitted, by dotted path.")
+@click.option("--bounds", metavar="KEY=LOW,HIGH ...", multiple=True, help="Smallest and largest value of a number.")
+@set_option
+@click.option(
+    "--forces",
+    metavar="FILE,SIGMA",
+    help="Forces of the tools that were seen too, as in forces.csv, and the standard deviation of their errors [N].",
+)
+@click.option("--sigma", type=float, metavar="SIGMA", help="Standard deviation of what was seen [m] or [px].")
+@click.option("--robust", is_flag=True, help="Let numbers that are far off count less.")
+@click.option(
+    "--correlation", type=float, metavar="PX", help="How far apart in the picture errors of tracks are alike [px]."
+)
+@click.option("--drift", type=float, metavar="SECONDS", help="How long errors of one track are alike [s].")
+@click.option("--profile", is_flag=True, help="Find intervals by going to their ends; takes more runs.")
+@click.option("--resolution", type=int, metavar="R", help="Fields along a side of a map that is fitted.")
+@click.option("--out", metavar="DIR", help="Directory for the fit.  [default: output/<name of the scene file>-fit]")
+@workers_option(help="Processes that take runs side by side.  [default: as many as pay]")
+@json_option
+def fit(
+    scene: str,
+    observed: str,
+    more: tuple[str, ...],
+    free: tuple[str, ...],
+    bounds: tuple[str, ...],
+    overrides: tuple[str, ...],
+    forces: str | None,
+    sigma: float | None,
+    robust: bool,
+    correlation: float | None,
+    drift: float | None,
+    profile: bool,
+    resolution: int | None,
+    out: str | None,
+    workers: int | None,
+    as_json: bool,
+) -> int:
+    """Find numbers of SCENE from what was seen of the tissue, OBSERVED, and how well they are known."""
+    from taichi_msm.load.scene_file import load_scene
+
+    # Both options take several words.
+    free = (*free, *(word for word in more if "=" not in word))
+    limits: dict[str, tuple[float, float]] = {}
+    for key, ends in map(read_bounds, (*bounds, *(word for word in more if "=" in word))):
+        if key in limits:
+            raise click.BadParameter(f"{key}: given twice; leave one of them out", param_hint="--bounds")
+        limits[key] = ends
+    loaded = load_scene(scene, overrides)
+    directory = result_directory(out, f"{Path(scene).stem}-fit")
+
+    from taichi_msm.cli.console import Progress
+    from taichi_msm.fitting.fit import fit as find
+
+    interruption = Interruption()
+    try:
+        with Progress(quiet=as_json) as bar:
+            found = find(
+                loaded,
+                observed,
+                free,
+                bounds=limits,
+                forces=None if forces is None else read_forces_option(forces),
+                directory=directory,
+                workers=workers,
+                progress=interruptible(bar, interruption),
+                sigma=sigma,
+                robust=robust,
+                profile=profile,
+                correlation=correlation,
+                drift=drift,
+                resolution=resolution,
+            )
+    except KeyboardInterrupt:
+        return interrupted(interruption, as_json)
+    except DivergedError as error:
+        report("diverged", [f"{scene}: where the search begins: {error}"], as_json)
+        return DIVERGED
+    if as_json:
+        print_json({"directory": str(directory), **found.as_json()})
+    else:
+        click.echo("\n".join(map(printable, [f"{directory}: fit of {observed}", *found.summary()])))
+    return DONE
+
+
+def read_bounds(text: str) -> tuple[str, tuple[float, float]]:
+    """Read KEY=LOW,HIGH; an end that is left out is infinite."""
+    key, _, ends = text.partition("=")
+    low, comma, high = ends.partition(",")
+    try:
+        if not comma:
+            raise ValueError
+        return key.strip(), (float(low or "-inf"), float(high or "inf"))
+    except ValueError:
+        said = f"{text}: expected KEY=LOW,HIGH, such as tissue.young=5e3,1e5"
+        raise click.BadParameter(said, param_hint="--bounds") from None
+
+
+def read_forces_option(text: str) -> tuple[str, float]:
+    """Read FILE,SIGMA."""
+    name, _, sigma = text.rpartition(",")
+    try:
+        if not name:
+            raise ValueError
+        return name, float(sigma)
+    except ValueError:
+        said = f"{text}: expected FILE,SIGMA, such as forces.csv,0.01"
+        raise click.BadParameter(said, param_hint="--forces") from None

@@ -1,0 +1,96 @@
+"""taichi_msm.cli.main.options."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Sequence
+from functools import partial
+from typing import TYPE_CHECKING, Any
+
+import click
+
+from taichi_msm.errors import (
+    MAX_WORKERS,
+    did_you_mean,
+)
+from taichi_msm.version import __version__
+
+if TYPE_CHECKING:
+    pass
+
+
+class Choice(click.Choice):  # type: ignore[type-arg]  # before click 8.2 it takes none
+    """One of some words; the message about any other names the nearest."""
+
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> str:
+        """Give the word, or say which may have been meant."""
+        try:
+            return str(super().convert(value, param, ctx))
+        except click.BadParameter as error:
+            said = error.message.rstrip(".") + did_you_mean(str(value), [str(word) for word in self.choices])
+            raise click.BadParameter(said, ctx, param) from None
+
+
+class Shard(click.ParamType):  # type: ignore[type-arg]  # as above
+    """A part of some work, I/N: part I of N, from 1."""
+
+    name = "I/N"
+
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> tuple[int, int]:
+        """Read the two numbers."""
+        numbers = re.fullmatch("([0-9]{1,9})/([0-9]{1,9})", value)
+        if numbers is None or not 1 <= int(numbers[1]) <= int(numbers[2]):
+            self.fail(f"{value} is no part; take I/N with 1 <= I <= N, such as 3/8", param, ctx)
+        return int(numbers[1]), int(numbers[2])
+
+
+scene_argument = click.argument("scene", metavar="SCENE")
+image_option = click.option("--image", metavar="FILE", help="The picture on the sheet, instead of the scene's.")
+quality_option = click.option(
+    "--quality",
+    type=click.IntRange(1, 100),
+    metavar="N",
+    help="Quality of the film, with output: mp4 [%]; 65 by default.",
+)
+set_option = click.option(
+    "--set",
+    "overrides",
+    metavar="KEY=VALUE",
+    multiple=True,
+    help="Override a key of the scene by its dotted path, e.g. sheet.points=[61,61]; list items by index.",
+)
+arch_option = click.option(
+    "--arch", metavar="cpu|cuda|vulkan", default="cpu", show_default=True, help="Device to compute on."
+)
+threads_option = click.option(
+    "--threads", type=click.IntRange(1, MAX_WORKERS), metavar="N", help="CPU threads.  [default: every core]"
+)
+workers_option = partial(click.option, "--workers", type=click.IntRange(1, MAX_WORKERS), metavar="N")
+json_option = click.option("--json", "as_json", is_flag=True, help="Print one JSON object on stdout and nothing else.")
+
+
+def tell_version(context: click.Context, _option: click.Parameter, asked: bool) -> None:
+    """Print the versions of the program and of its compiler, and end, if that was asked for."""
+    if asked:
+        from taichi_msm.system.compiler import chosen
+
+        click.echo(f"taichi-msm {__version__}")
+        click.echo(f"{chosen().title} {chosen().version}")
+        context.exit()
+
+
+@click.group(context_settings={"help_option_names": ["-h", "--help"]})
+@click.option(
+    "--version", is_flag=True, is_eager=True, expose_value=False, callback=tell_version, help="Print the versions."
+)
+def program() -> None:
+    """Deform an image as tissue deforms."""
+
+
+def require_alone(context: click.Context, does: str, allowed: Sequence[str]) -> None:
+    """Make sure that no scene and no settings were given with an option that takes those of an earlier run."""
+    for option in context.command.params:
+        typed = context.get_parameter_source(str(option.name)) is click.core.ParameterSource.COMMANDLINE
+        if typed and option.name not in allowed:
+            name = option.opts[0] if isinstance(option, click.Option) else "SCENE"
+            raise click.UsageError(f"{does} a run with its own settings; leave out {name}")

@@ -1,0 +1,115 @@
+"""taichi_msm.cli.main.sweep."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import click
+
+from taichi_msm.cli.options import Shard, json_option, program, workers_option
+from taichi_msm.cli.session import DONE, FILES, interrupted, interruptible, print_json, report, result_directory
+from taichi_msm.errors import (
+    LostExecutorError,
+    printable,
+)
+from taichi_msm.system.process import Interruption, tell
+
+if TYPE_CHECKING:
+    from taichi_msm.sweeps.spec import Sweep
+    from taichi_msm.sweeps.tables import Cost
+# Sweeps of more runs, or of more seconds, must be meant.
+MANY_RUNS, LONG = 10_000, 86400
+
+
+@program.command()
+@click.argument("file", metavar="SWEEP")
+@click.option("--out", metavar="DIR", help="Directory for the runs.  [default: output/<name of the sweep file>]")
+@workers_option(help="Processes that take the runs.  [default: one for each core, as far as memory goes]")
+@click.option("--dask", metavar="ADDRESS", help="Let the workers of a dask scheduler take the runs.")
+@click.option("--shard", type=Shard(), metavar="I/N", help="Take only part I of N of the runs; write no table.")
+@click.option("--dry-run", is_flag=True, help="Print the values of all runs, and what they take; run nothing.")
+@click.option("--yes", is_flag=True, help=f"Take more than {MANY_RUNS} runs, or longer than a day.")
+@json_option
+def sweep(
+    file: str,
+    out: str | None,
+    workers: int | None,
+    dask: str | None,
+    shard: tuple[int, int] | None,
+    dry_run: bool,
+    yes: bool,
+    as_json: bool,
+) -> int:
+    """Run a scene many times with varied values, as SWEEP says, and write a table of the results."""
+    from taichi_msm.cli.console import Progress
+    from taichi_msm.sweeps.runs import begin_sweep
+    from taichi_msm.sweeps.spec import load_sweep
+    from taichi_msm.sweeps.sweep import finish, go_on, opened
+    from taichi_msm.sweeps.tables import choose_workers, cost_line, count, estimate, summary_lines
+
+    if workers is not None and dask is not None:
+        raise click.UsageError("--workers are processes here, and --dask has its own; leave out one of them")
+    described = load_sweep(file)
+    directory = result_directory(out, Path(file).stem)
+    cost = estimate(described)
+    chosen = choose_workers(cost, described.runs, workers)
+    if dry_run:
+        return print_plan(described, cost, shard or (1, 1), workers, as_json)
+    if not yes and (described.runs > MANY_RUNS or cost.seconds > LONG):
+        raise click.UsageError(f"{cost_line(described.runs, cost, chosen)}; add --yes if that is meant")
+    under_way = begin_sweep(described, directory, shard or (1, 1))
+    outcomes, missing, total = under_way.done, len(under_way.missing), under_way.total
+    chosen = choose_workers(cost, missing, workers)
+    if not as_json:
+        tell([f"{len(outcomes)} of {total} runs have ended before"] if outcomes else [])
+        here = chosen if dask is None else None
+        tell([cost_line(missing, cost.of(missing / described.runs), here)] if missing else [])
+    interruption = Interruption()
+    files: list[str] = []
+    notes: list[str] = []
+    try:
+        with Progress(quiet=as_json) as bar:
+            progress = interruptible(bar, interruption)
+            where = dask if missing else None  # Nothing else needs a cluster.
+            with opened(where, chosen.number, under_way, progress) as executor:
+                for _ in go_on(under_way, executor, progress):
+                    pass
+                if shard is None:
+                    files, notes = finish(under_way, executor, progress)
+    except KeyboardInterrupt:
+        return interrupted(interruption, as_json, f"interrupted; {so_far(len(outcomes), total)}")
+    except LostExecutorError as error:
+        report("error", [f"{error}; {so_far(len(outcomes), total)}"], as_json)
+        return FILES
+    if as_json:
+        counts = count(outcomes)
+        print_json({"directory": str(directory), "runs": len(outcomes), **counts, "outputs": files, "notes": notes})
+    else:
+        click.echo("\n".join(map(printable, summary_lines(directory, outcomes, shard, files, notes))))
+    return DONE
+
+
+def print_plan(described: Sweep, cost: Cost, shard: tuple[int, int], workers: int | None, as_json: bool) -> int:
+    """Print the values of the runs of a shard, and what they take."""
+    from taichi_msm.sweeps.spec import cell
+    from taichi_msm.sweeps.tables import choose_workers, cost_line, csv_line
+
+    (part, parts), values = shard, described.values()
+    runs = range(part - 1, len(values), parts)
+    cost = cost.of(len(runs) / len(values))
+    chosen = choose_workers(cost, len(runs), workers)
+    if as_json:
+        rows = {"keys": described.keys, "runs": list(runs), "values": [values[run] for run in runs]}
+        print_json({**rows, **cost._asdict(), "workers": chosen.number})
+        return DONE
+    click.echo(csv_line(["run", *described.keys]))
+    for run in runs:
+        click.echo(printable(csv_line([run, *map(cell, values[run])])))
+    click.echo(cost_line(len(runs), cost, chosen))
+    return DONE
+
+
+def so_far(done: int, total: int) -> str:
+    """Say how much of a sweep is done, and how to go on."""
+    return f"{done} of {total} runs have ended; the same command goes on"

@@ -1,0 +1,1 @@
+"""Gradients of a loss by the exact adjoint of the discrete steps."""

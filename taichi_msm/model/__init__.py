@@ -1,0 +1,1 @@
+"""The sheet in NumPy: mass points, loads, tools, plan."""

@@ -1,0 +1,232 @@
+"""The sheet at rest: where its points are, which of them are fixed.
+
+What a sheet is made of, whichever way a scene describes it, and what is wrong with a description.
+
+With `springs`, the scene has the numbers of the model. With `tissue`, they are derived from it cell by cell: a cell
+adds to the springs along its edges and diagonals and to the points at its corners. So points and springs at an edge,
+which belong to fewer cells, get less. Each term of the model derives its own numbers (see `terms`).
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from taichi_msm.errors import Problem
+from taichi_msm.images import file_sha256, read_grey
+from taichi_msm.scene.scene import Scene
+from taichi_msm.scene.section import MAX_POINTS
+from taichi_msm.scene.sheet import Sheet, StiffnessMap
+
+SIDES = ("top", "bottom", "left", "right")
+
+
+def spacing(sheet: Sheet) -> tuple[float, float]:
+    """Give the distance between neighbouring columns and between neighbouring rows [m]."""
+    (rows, cols), (height, width) = sheet.points, sheet.size
+    return width / (cols - 1), height / (rows - 1)
+
+
+def axes(sheet: Sheet) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Give x of the columns, shape (cols,), and y of the rows, shape (rows, 1), at rest [m].
+
+    x_j = (j / (cols - 1) - 1/2) width, y_i = (1/2 - i / (rows - 1)) height.
+    """
+    (rows, cols), (height, width) = sheet.points, sheet.size
+    return (np.arange(cols) / (cols - 1) - 0.5) * width, (0.5 - np.arange(rows)[:, None] / (rows - 1)) * height
+
+
+def rest_positions(sheet: Sheet) -> NDArray[np.float64]:
+    """Give the rest positions of the points, X_ij = (x_j, y_i, 0) [m], shape (rows, cols, 3)."""
+    position = np.zeros((*sheet.points, 3))
+    position[..., 0], position[..., 1] = axes(sheet)
+    return position
+
+
+def fixed_points(sheet: Sheet) -> NDArray[np.bool_]:
+    """Mark the points that never move, shape (rows, cols)."""
+    fixed = np.zeros(sheet.points, dtype=bool)
+    if sheet.fixed == "corners":
+        fixed[np.ix_((0, -1), (0, -1))] = True
+        return fixed
+    sides = {"border": SIDES, "none": ()}.get(sheet.fixed, sheet.fixed) if isinstance(sheet.fixed, str) else sheet.fixed
+    fixed[0] |= "top" in sides
+    fixed[-1] |= "bottom" in sides
+    fixed[:, 0] |= "left" in sides
+    fixed[:, -1] |= "right" in sides
+    return fixed
+
+
+pass  # REMOVED
+
+# Cells longer than this many times their width would need springs of negative stiffness.
+LONGEST_CELL = math.sqrt(3)
+
+Array = NDArray[np.float64]
+
+
+class MapImage(NamedTuple):
+    """The file of a map. It is read once, so that a whole run has one map even if the file changes meanwhile."""
+
+    grey: NDArray[Any]  # 0 to 255, of 16-bit pictures 0 to 65535; shape (height, width)
+    sha256: str  # of the file
+
+
+# The files of a scene's maps, by the keys that name them, such as map and foundation_map.
+Maps = Mapping[str, MapImage]
+
+
+@dataclass(frozen=True, eq=False)
+class Material:
+    """The numbers of a sheet; with maps, those for a factor of 1."""
+
+    mass: float  # of a point [kg]
+    drag: float  # C / m [1/s]
+    # across, down, shear: stiffness k of springs along a row, along a column and along diagonals [N/m]
+    across: float
+    down: float
+    shear: float
+    tension: float  # e; a spring pulls at rest with this share of its stiffness times its length
+    virtual: float  # stiffness K of the virtual springs [N/m]; 0 if they never act
+    always: bool  # whether the virtual springs always act; else only under a load
+    bending: float  # D dx dy [N m3]
+    by_area: bool  # whether points and springs at an edge get less than others, as in tissue
+    factors: Array | None  # of the stiffness of every cell, shape (rows - 1, cols - 1); None without a map
+    virtual_factors: Array | None  # of K at every point, shape (rows, cols); None without a map
+
+    @property
+    def tensions(self) -> tuple[float, float, float]:
+        """Tension per length, tau, of springs along rows, along columns and of diagonals [N/m]."""
+        return self.across * self.tension, self.down * self.tension, self.shear * self.tension
+
+
+def read_map(stiffness_map: StiffnessMap) -> MapImage:
+    """Read the file of a map; PictureError: it cannot be used."""
+    sha256 = file_sha256(stiffness_map.image)
+    return MapImage(read_grey(stiffness_map.image, sha256), sha256)
+
+
+def cell_factors(stiffness_map: StiffnessMap, image: MapImage, sheet: Sheet) -> Array:
+    """Give the factors at the centres of the cells, shape (rows - 1, cols - 1)."""
+    rows, cols = (count - 1 for count in sheet.points)
+    return map_factors(stiffness_map, image, (np.arange(rows) + 0.5) / rows, (np.arange(cols) + 0.5) / cols)
+
+
+def point_factors(stiffness_map: StiffnessMap, image: MapImage, sheet: Sheet) -> Array:
+    """Give the factors at the mass points, shape (rows, cols)."""
+    rows, cols = (np.arange(count) / (count - 1) for count in sheet.points)
+    return map_factors(stiffness_map, image, rows, cols)
+
+
+def map_factors(stiffness_map: StiffnessMap, image: MapImage, rows: Array, cols: Array) -> Array:
+    """Interpolate the factors bilinearly between texels, constant beyond them.
+
+    rows, cols: places of the rows from the top, of the columns from the left, as fractions of the sheet.
+    """
+    grey = image.grey.astype(float)
+    height, width = grey.shape
+    row = np.clip(rows * height - 0.5, 0, height - 1)
+    column = np.clip(cols * width - 0.5, 0, width - 1)
+    top, left = row.astype(int), column.astype(int)
+    bottom, right = np.minimum(top + 1, height - 1), np.minimum(left + 1, width - 1)
+    down, across = (row - top)[:, None], column - left
+    above = grey[np.ix_(top, left)] * (1 - across) + grey[np.ix_(top, right)] * across
+    below = grey[np.ix_(bottom, left)] * (1 - across) + grey[np.ix_(bottom, right)] * across
+    black, white = stiffness_map.range
+    return black + (white - black) / np.iinfo(image.grey.dtype).max * (above * (1 - down) + below * down)
+
+
+def largest_mean(factors: Array) -> float:
+    """Find the largest mean of the factors of the cells around a point."""
+    around, cells = np.pad(factors, 1), np.pad(np.ones_like(factors), 1)
+
+    def at_points(values: Array) -> Array:
+        return values[:-1, :-1] + values[:-1, 1:] + values[1:, :-1] + values[1:, 1:]
+
+    return float((at_points(around) / at_points(cells)).max())
+
+
+def area_shares(sheet: Sheet) -> Array:
+    """Tell which share of a cell's area belongs to each point: 1, at edges 1/2, at corners 1/4; shape (rows, cols)."""
+    rows, cols = np.ones(sheet.points[0]), np.ones(sheet.points[1])
+    rows[[0, -1]], cols[[0, -1]] = 0.5, 0.5
+    return np.outer(rows, cols)
+
+
+def cell_ratio(sheet: Sheet) -> float:
+    """Give the ratio of the longer to the shorter side of a cell."""
+    dx, dy = spacing(sheet)
+    return max(dx, dy) / min(dx, dy)
+
+
+def has_fixed_border(fixed: NDArray[np.bool_]) -> bool:
+    """Tell whether every point at an edge is fixed."""
+    return bool(fixed[[0, -1]].all() and fixed[:, [0, -1]].all())
+
+
+def kind_problems(scene: Scene) -> Iterator[Problem]:
+    """Find missing and superfluous keys of springs and of tissue."""
+    sheet = scene.sheet
+    if scene.tissue is None:
+        if scene.springs is None:
+            said = "missing; expected a mapping with young, thickness and density, or springs in its place"
+            yield Problem(("tissue",), said)
+        elif sheet.mass is None and not scene.time.at_rest:
+            yield Problem(("sheet", "mass"), "missing; with springs expected a number above 0, in kg")
+        if sheet.tolerance is not None:
+            said = f"{sheet.tolerance:g} needs tissue: with springs other points make another sheet; remove tolerance"
+            yield Problem(("sheet", "tolerance"), said)
+        return
+    if scene.tissue.density is None and not scene.time.at_rest:
+        yield Problem(("tissue", "density"), "missing; expected a number above 0, in kg/m3")
+    if scene.springs is not None:
+        yield Problem(("springs",), "tissue already gives the stiffness of the sheet; remove springs or tissue")
+    if sheet.mass is not None:
+        yield Problem(("sheet", "mass"), "tissue has the mass of density x thickness x area; remove mass")
+    if scene.damping:
+        yield Problem(("damping",), f"{scene.damping:g} N s/m is per point; with tissue set tissue.damping, in 1/s")
+    for index, probe in enumerate(scene.probes):
+        if probe.force is not None:
+            said = "is per point, so that more points would be pressed deeper; set total, of the whole tool, in newtons"
+            yield Problem(("probes", index, "force"), said)
+
+
+def tissue_problems(scene: Scene, fixed: NDArray[np.bool_], factors: Array | None) -> Iterator[Problem]:
+    """Find tissue that is impossible, where `kind_problems` finds nothing; factors None: not known, or no map."""
+    tissue, sheet = scene.tissue, scene.sheet
+    if tissue is None:
+        return
+    longest = cell_ratio(sheet)
+    if longest > LONGEST_CELL * (1 + 1e-9):
+        (dx, dy), (rows, cols), (height, width) = spacing(sheet), sheet.points, sheet.size
+        enough = (rows, math.ceil(width / dy / LONGEST_CELL) + 1), (math.ceil(height / dx / LONGEST_CELL) + 1, cols)
+        more = enough[0] if dx > dy else enough[1]
+        remedy = f"try {list(more)}" if max(more) <= MAX_POINTS else "take another sheet.size"
+        yield Problem(
+            ("sheet", "points"),
+            f"{list(sheet.points)} make cells {longest:.3g} times as long as wide, and tissue allows "
+            f"{LONGEST_CELL:.3g} times; {remedy}",
+        )
+    if tissue.foundation_map is not None and tissue.foundation_stiffness == 0:
+        said = "needs a foundation; set tissue.foundation, such as {young: 15e3, depth: 0.05}, or remove foundation_map"
+        yield Problem(("tissue", "foundation_map"), said)
+    if not has_fixed_border(fixed):
+        bending = "plate" if tissue.bending == "plate" else f"{tissue.bending:g} N m"
+        for name, value in (("pretension", f"{tissue.pretension:g} N/m"), ("bending", bending)):
+            if getattr(tissue, name) != 0:
+                said = f"{value} needs every side fixed; set sheet.fixed: border, or {name}: 0"
+                yield Problem(("tissue", name), said)
+    if tissue.pretension > 0:
+        softest = 1.0 if factors is None else float(factors.min())
+        most = 1.5 * tissue.young * tissue.thickness * softest
+        if tissue.pretension >= most:
+            yield Problem(
+                ("tissue", "pretension"),
+                f"{tissue.pretension:g} N/m is too much for young, {tissue.young:g} Pa, and thickness: without it the "
+                f"sheet would shrink to nothing; take less than {most:.3g} N/m, or a larger young",
+            )

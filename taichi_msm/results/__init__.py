@@ -1,1 +1,0 @@
-"""What a run writes: whole or not at all."""

@@ -1,0 +1,1 @@
+"""One run: stepping, drawing, writing, resuming."""

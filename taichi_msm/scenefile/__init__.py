@@ -1,1 +1,0 @@
-"""From a scene file to a checked scene."""

@@ -1,0 +1,1 @@
+"""Time stepping and equilibrium: arrays, kernels, drivers."""

@@ -1,0 +1,374 @@
+"""The interface to kernel 1, which computes the force on every point and its Verlet step, a frame in few launches.
+
+State of point P: its displacement u_n = x_n - X and the last difference d_n = u_n - u_{n-1}, which a Verlet step
+changes as `terms.damping` tells. This is the position form (eq. 6 to 9) rearranged so that nothing cancels: in f32 it
+keeps the digits of a small motion on a large sheet.
+
+The forces that the probes exert on the sheet at the frames of a run, and the greatest of them.
+
+Of a probe with a force it is that at the frame, (percent(t) / 100) force times the sum of its decay over the points
+that are not fixed. Of a tool that is moved it is the mean over the steps since the frame before (`Dynamics`).
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from taichi_msm.errors import ArgumentError, DeviceError, MsmError, Pause
+from taichi_msm.model.loads import FrameLoad, Schedule, decay, schedule
+from taichi_msm.model.plan import Plan
+from taichi_msm.model.sheet import area_shares, axes, rest_positions, spacing
+from taichi_msm.model.surface import touched
+from taichi_msm.model.tool_force import probe_force
+from taichi_msm.solver.arrays import BYTES, SheetLayout, Start, StepKernel
+from taichi_msm.solver.kernel_cpu import Scatter
+from taichi_msm.solver.kernel_gpu import STEPS_PER_LAUNCH, Gather
+from taichi_msm.solver.pushes import sum_pushes
+from taichi_msm.solver.state import Felt, PeakForce, Reading, State, TipForce
+from taichi_msm.system.process import available_threads
+from taichi_msm.system.runtime import Device, lanes
+from taichi_msm.terms import terms_of
+from taichi_msm.terms.base import ACROSS, AREA, COLUMN_ROWS, GAIN, HAS_LEFT, HAS_RIGHT, MOTION, MOVES, StepCode
+from taichi_msm.terms.contact import ContactTerm
+from taichi_msm.terms.damping import coefficients
+from taichi_msm.terms.loads import ProbeTerm, standing
+from taichi_msm.terms.springs import LEAST, MOST, SpringTerm
+
+# With fewer points per worker, one worker more costs more time in waiting than it saves in work.
+POINTS_PER_WORKER = 450
+
+# If a band takes more than CACHE bytes, its passes take DEPTH steps each.
+CACHE = 3 << 17
+DEPTH = 8
+
+# Numbers that a pass keeps per point: displacement, difference and the force carried to the next row, as vectors.
+NUMBERS_PER_POINT = 9
+
+# A launch takes no more steps than this, so that Ctrl-C is noticed soon: steps times points, about 0.1 s of one core;
+# and steps.
+POINT_STEPS_PER_LAUNCH = 40_000_000
+MAX_STEPS_PER_LAUNCH = 8192
+
+# Loads are tabulated for this many steps at a time; NumPy takes hardly less time for the steps of a few frames.
+STEPS_PER_TABLE = 4096
+
+
+def layout_of(plan: Plan, device: Device, cores: int | None = None) -> SheetLayout:
+    """Choose how a sheet is laid out and shared out among cores, None: all, and what is compiled for it.
+
+    Raises:
+        DeviceError: when the device cannot do what the scene needs.
+    """
+    (rows, cols), fixed, precision = plan.scene.sheet.points, plan.fixed, plan.grid.precision
+    fixed_rows = bool(fixed[0].all()), bool(fixed[-1].all())
+    if plan.scene.time.at_rest:
+        if device.arch != "cpu":
+            raise DeviceError(f"--arch {device.arch}: time.motion: quasistatic runs on a CPU only; take --arch cpu")
+        workers = 1
+    elif device.arch == "cpu":
+        # Workers wait by spinning, so more workers than cores would only hold each other up.
+        cores = min(device.threads, available_threads() if cores is None else cores)
+        workers = max(1, min(cores, rows * cols // POINTS_PER_WORKER, (rows - sum(fixed_rows)) // 2))
+    else:
+        workers = 0
+    code = StepCode(precision, lanes(precision), plan.open_edges and plan.material.by_area, terms_of(plan))
+    if device.arch == "vulkan" and precision == "f64" and any(slot.moves for slot in plan.slots):
+        raise DeviceError(
+            "--arch vulkan: has no exp in f64, which control points that move need; take time.precision: f32 without a "
+            "tolerance or an estimate of the error, or --arch cpu"
+        )
+    fits = workers == 0 or rows // workers * cols * NUMBERS_PER_POINT * BYTES[precision] <= CACHE
+    depth = 1 if fits or code.reach > 1 else DEPTH
+    return SheetLayout(rows, cols, workers, depth, fixed_rows, code)
+
+
+class Dynamics:
+    """The sheet in motion.
+
+    Args:
+        layout: in the place of the scene's own; for tests.
+        cores: number of cores that stepping may use; None: all.
+
+    Attributes:
+        plan: of what is stepped.
+        structure: the layout, and what the kernels are compiled for.
+        steps_done: number of steps taken.
+        launches: number of times that a series of steps was taken, each followed by a call of `pause`.
+        torn: whether an exception, such as KeyboardInterrupt, came while steps were taken, so that it is not known how
+            many were; then only `restart` helps.
+    """
+
+    def __init__(self, plan: Plan, device: Device, layout: SheetLayout | None = None, cores: int | None = None) -> None:
+        self._device, self._layout, self._cores = device, layout, cores
+        self.launches = 0
+        self._sheet: StepKernel | None = None
+        self.restart(plan)
+
+    def restart(self, plan: Plan, state: State | None = None) -> None:
+        """Begin again with the same scene or another; nothing is compiled if only numbers differ.
+
+        state: what `state` returned for the same points and steps, to continue from; None: at rest.
+        """
+        self.plan = plan
+        self.structure = self._layout or layout_of(plan, self._device, self._cores)
+        self._real = np.dtype(np.float32 if self.structure.code.precision == "f32" else np.float64)
+        self.steps_done, self.torn = 0 if state is None else state.steps, True
+        self._tabulate(STEPS_PER_TABLE)
+        self._place(state)
+        self.torn = False
+
+    def steer(self, plan: Plan) -> None:
+        """Continue with other probes, each of which moves, jumps or stands as its predecessor did, and the same steps.
+
+        Raises:
+            ArgumentError: when the new probes need another kernel.
+        """
+        probes, before = ProbeTerm.of(plan), self.structure.code.require(ProbeTerm)
+        tools, compiled = ContactTerm.of(plan), self.structure.code.get(ContactTerm)
+        if [tool.probe for tool in plan.tools] != [tool.probe for tool in self.plan.tools]:
+            raise ArgumentError("probes: which of them have a path cannot change; restart with the new scene")
+        if probes.moves != before.moves:
+            raise ArgumentError(
+                f"probes: which control points move or jump cannot change (before: {_in_words(before.moves)}; now: "
+                f"{_in_words(probes.moves)}); restart with the new scene"
+            )
+        if probes.by_area != before.by_area:
+            raise ArgumentError("probes: one has total instead of force, or the reverse; restart with the new scene")
+        if tools and compiled and not tools.is_compiled_in(compiled):
+            raise ArgumentError(
+                "probes: friction and grips cannot be added where there were none; restart with the new scene, such as "
+                "with a friction of 1e-9, or with a grip that ends before the start"
+            )
+        if standing(plan) != standing(self.plan):
+            self._moving.arrays.set_fields(self.structure.code.first_field(ProbeTerm), probes.fields(plan))
+        self.plan = plan
+        # A caller that steers will steer again in a frame, so no more loads than those of a frame are tabulated.
+        self._tabulate(plan.grid.steps_per_frame)
+
+    def advance(self, steps: int, pause: Pause = lambda: None) -> None:
+        """Take a number of steps, with a pause after every launch. Where it begins at a frame, forces are counted anew.
+
+        An exception from it stops the sheet there; another call continues.
+
+        Raises:
+            MsmError: when the sheet is torn; so do `state` and `read`.
+        """
+        points = self.structure.rows * self.structure.cols
+        most, depth = max(1, min(MAX_STEPS_PER_LAUNCH, POINT_STEPS_PER_LAUNCH // points)), self.structure.depth
+        # A launch takes whole passes. If not even one is within the limit, it takes up to four times the limit.
+        most = most // depth * depth or min(depth, 4 * most)
+        if self.structure.workers == 0:
+            most = STEPS_PER_LAUNCH
+        self._require_whole()
+        if steps and self.steps_done % self.plan.grid.steps_per_frame == 0:
+            sum_pushes(self.structure, self._moving.arrays, clear=True)
+        end = self.steps_done + steps
+        while self.steps_done < end:
+            count = min(most, end - self.steps_done)
+            self.torn = True
+            self._moving.advance(count, self._next_loads(count))
+            self.steps_done += count
+            self.torn = False
+            self.launches += 1
+            pause()
+
+    def compile(self) -> None:
+        """Compile the step and the read-out without moving anything."""
+        self._moving.compile(self._loads)
+        self.displacement()
+        self.tool_forces()
+
+    def displacement(self) -> NDArray[Any]:
+        """Read the displacements x - X [m], shape (rows, cols, 3), in the scene's precision."""
+        return self.read().displacement
+
+    def state(self) -> State:
+        """Read everything that the next steps depend on."""
+        self._require_whole()
+        u, d = self._copy(differences=False)[0], self._copy(differences=True)[0]
+        return State(self.steps_done, u, d, self._contact())
+
+    def read(self) -> Reading:
+        """Read the displacements and measure the sheet, in the scene's precision."""
+        self._require_whole()
+        displacement, measures = self._copy(differences=False)
+        code, plan = self.structure.code, self.plan
+        springs = measures[:, code.first_measure(SpringTerm) :]
+        # The measures are (L^2 - L0^2) / L0^2.
+        shortest, longest = (
+            math.sqrt(max(0.0, 1.0 + float(extreme))) for extreme in (springs[:, LEAST].min(), springs[:, MOST].max())
+        )
+        sums = measures.sum(axis=0, dtype=np.float64)
+        energy = self._of_motion(sums)
+        for term in code.terms:
+            first = code.first_measure(type(term))
+            energy += term.energy(sums[first : first + len(term.reductions)], plan)
+        return Reading(self.steps_done, displacement, shortest, longest, energy / 2)
+
+    def _of_motion(self, sums: NDArray[Any]) -> float:
+        """Give twice the energy of motion [J], from the measures summed up."""
+        return self.plan.material.mass * float(sums[MOTION]) / self.plan.grid.step**2
+
+    def _copy(self, *, differences: bool) -> tuple[NDArray[Any], NDArray[Any]]:
+        """Copy the displacements or the differences, and the measures of every row."""
+        rows, cols, code = self.structure.rows, self.structure.cols, self.structure.code
+        values, measures = np.empty((rows, cols, 3), self._real), np.empty((rows, code.first_measure(None)), self._real)
+        self._moving.read(differences, values, measures)
+        return values, measures
+
+    def tool_forces(self) -> NDArray[np.float64]:
+        """Give at a frame the mean force of each tool since the frame before [N], shape (tools, 3).
+
+        It is the sum of m push (1 + g h / 2) / h^2 over the points and the steps, or of m push / h^2 with backward
+        differences, by the number of steps; m is the mass of a point.
+        """
+        _, gain, _ = coefficients(self.plan)
+        sums = sum_pushes(self.structure, self._moving.arrays, clear=False)
+        return sums / (gain * self.plan.grid.steps_per_frame)
+
+    def _contact(self) -> NDArray[Any]:
+        """Read the fields of contact, shape (fields, rows, cols)."""
+        code = self.structure.code
+        contact = code.get(ContactTerm)
+        if contact is None:
+            return np.empty((0, self.structure.rows, self.structure.cols), self._real)
+        return self._moving.arrays.get_fields(code.first_field(ContactTerm), contact.field_count)
+
+    def _require_whole(self) -> None:
+        if self.torn:
+            raise MsmError("interrupted while steps were taken; restore what was saved before, or restart the scene")
+
+    def close(self) -> None:
+        """Free the memory."""
+        self._sheet = None
+
+    @property
+    def _moving(self) -> StepKernel:
+        assert self._sheet is not None, "it is closed"
+        return self._sheet
+
+    def _next_loads(self, count: int) -> NDArray[Any]:
+        """Give the table of the loads of the next steps, shape (count, columns)."""
+        done = self.steps_done - self._first_tabled
+        if done + count > len(self._loads):
+            done = 0
+            self._tabulate(max(count, STEPS_PER_TABLE))
+        return self._loads[done : done + count]
+
+    def _tabulate(self, count: int) -> None:
+        """Tabulate the loads of the next steps."""
+        self._first_tabled, self._loads = self.steps_done, self._table(self.steps_done, count)
+
+    def _table(self, first: int, count: int) -> NDArray[Any]:
+        """Tabulate the loads of steps first, ..., first + count - 1, shape (count, columns)."""
+        _, gain, first_gain = coefficients(self.plan)
+        table = self._columns(schedule(self.plan, first, count), first)
+        table[:, GAIN] = gain
+        if first == 0:
+            table[0, GAIN] = first_gain
+        return table
+
+    def _columns(self, loads: Schedule, first: int) -> NDArray[Any]:
+        """Tabulate the loads from step `first` on, shape (their number, columns), without a gain."""
+        code = self.structure.code
+        table = np.zeros((len(loads.active), code.first_column(None)))
+        for term in code.terms:
+            first_column = code.first_column(type(term))
+            table[:, first_column : first_column + term.column_count] = term.columns(self.plan, loads, first)
+        # Loads too large for f32 become infinite; the next reading of the sheet shows it.
+        with np.errstate(over="ignore"):
+            return table.astype(self._real)
+
+    def _place(self, state: State | None) -> None:
+        """Fill the arrays of the sheet."""
+        layout, plan, sheet = self.structure, self.plan, self.plan.scene.sheet
+        moves, column, areas = ~plan.fixed, np.arange(layout.cols), area_shares(sheet)
+        # Rows are of three kinds: the first, any in between, the last.
+        kinds = [0, layout.rows // 2, -1]
+        shares = areas[kinds] if layout.code.by_area else np.ones((3, layout.cols))
+        by_column = np.empty((COLUMN_ROWS, layout.cols))
+        by_column[MOVES : MOVES + 3] = moves[kinds] / shares
+        # Springs along columns ask for the shares of a row in between even where there is none.
+        by_column[AREA : AREA + 3] = areas[0], 2 * areas[0], areas[-1]
+        by_column[ACROSS] = axes(sheet)[0]
+        by_column[HAS_LEFT] = column > 0
+        by_column[HAS_RIGHT] = column < layout.cols - 1
+        numbers = *spacing(sheet), sheet.size[0] / 2, *(n for term in layout.code.terms for n in term.numbers(plan))
+        fields = np.concatenate([term.fields(plan) for term in layout.code.terms])
+        if state is not None and len(state.contact):
+            first = layout.code.first_field(ContactTerm)
+            fields[first : first + len(state.contact)] = state.contact
+        stiffness = layout.code.require(SpringTerm).laid_out(plan)
+        self._sheet = None  # Frees its memory before another sheet takes some.
+        self._sheet = self._started(Start(np.array(numbers), by_column, fields, stiffness, state))
+
+    def _started(self, start: Start) -> StepKernel:
+        """Make the form of the kernel that the device takes."""
+        kind: type[StepKernel] = Scatter if self.structure.workers else Gather
+        return kind(self.structure, start)
+
+
+def _in_words(moves: tuple[bool, ...]) -> str:
+    return ", ".join("yes" if slot_moves else "no" for slot_moves in moves) or "none"
+
+
+Array = NDArray[np.float64]
+
+
+class Gauge:
+    """Tells the forces of a plan's probes at its frames."""
+
+    def __init__(self, plan: Plan) -> None:
+        self._plan = plan
+        sheet = plan.scene.sheet
+        self._loads = {n: FrameLoad(probe, sheet) for n, probe in enumerate(plan.scene.probes) if not probe.moved}
+        # The sums of decays that stay the same, by probe.
+        self._standing: dict[int, float] = {}
+
+    def at_rest(self) -> Felt:
+        """Give the forces at the first frame."""
+        plan, real = self._plan, np.float32 if self._plan.grid.precision == "f32" else np.float64
+        forces = self._forces(0, rest_positions(plan.scene.sheet).astype(real), np.zeros((len(plan.tools), 3)))
+        return Felt(forces, tuple(PeakForce(0.0, one.force) for one in forces))
+
+    def follow(self, before: Felt, frame: int, position: NDArray[Any], tools: Array) -> Felt:
+        """Give the forces at a frame, and the greatest up to it.
+
+        Args:
+            before: those at the frame before.
+            frame: its number.
+            position: of the points [m], shape (rows, cols, 3).
+            tools: the forces of the tools that are moved [N], shape (tools, 3).
+        """
+        forces, time = self._forces(frame, position, tools), frame / self._plan.grid.frames_per_second
+        peaks = zip(before.greatest, (PeakForce(time, one.force) for one in forces), strict=True)
+        return Felt(forces, tuple(max(pair, key=lambda peak: math.hypot(*peak.force)) for pair in peaks))
+
+    def _forces(self, frame: int, position: NDArray[Any], tools: Array) -> tuple[TipForce, ...]:
+        plan, moved = self._plan, iter(zip(self._plan.tools, tools.tolist(), strict=True))
+        rate, sheet, forces = plan.grid.frames_per_second, plan.scene.sheet, []
+        for index, probe in enumerate(plan.scene.probes):
+            if probe.moved:
+                tool, (x, y, z) = next(moved)
+                forces.append(TipForce(index, tool.lowest(frame / rate), (x, y, z)))
+                continue
+            percent, at = self._loads[index].at(frame, rate)
+            share = percent / 100 * self._decays(index, at) if percent else 0.0
+            x, y, z = probe_force(probe, sheet).force
+            tip, _ = touched(position, plan.scene.render.refine, sheet, at)
+            # Not -0.
+            forces.append(TipForce(index, tuple(tip.tolist()), (share * x + 0.0, share * y + 0.0, share * z + 0.0)))
+        return tuple(forces)
+
+    def _decays(self, index: int, at: Array) -> float:
+        """Add up the decay of a probe over the points that are not fixed."""
+        probe, sheet = self._plan.scene.probes[index], self._plan.scene.sheet
+        if self._loads[index].moves:
+            return float(decay(probe, sheet, at)[~self._plan.fixed].sum())
+        if index not in self._standing:
+            self._standing[index] = float(decay(probe, sheet)[~self._plan.fixed].sum())
+        return self._standing[index]

@@ -1,0 +1,148 @@
+"""A row in a pass on a CPU: the forces of its springs, each evaluated once for both ends, and then its step.
+
+Lane l of entry b of a row is column b - 1 of strip l, so the neighbours of an entry are the entries beside it, and
+every operation is one vector instruction. The first and the last entry of a row are a halo: the entries at the other
+end of the strips, shifted by one lane. The force of a spring between this row and the next one is added to this row at
+once and carried to the next; the force of a spring along the row is carried to the next entry. After that no other row
+depends on the old displacements of this row, so it is stepped in place.
+
+Tools that are moved then push the points out of their rods, in the rows that they reach.
+"""
+
+# No `from __future__ import annotations` here: Taichi reads the annotations of a kernel.
+
+from collections.abc import Callable
+
+from taichi_msm.system.runtime import ti
+from taichi_msm.terms.base import DX, DY, HAS_LEFT, HAS_RIGHT, Entry, StepCode
+from taichi_msm.terms.contact import ContactTerm, greatest_lane
+from taichi_msm.terms.springs import SpringTerm
+
+
+def row_passing(code: StepCode, move: Callable[..., None]) -> Callable[..., None]:
+    """Make the function that goes through a row and moves it.
+
+    move(sheet, entry, target, force, now) does so with an entry, given the force of its springs: see `point_step`.
+    """
+    vector, columns, springs = code.vector, code.first_column(None), code.require(SpringTerm)
+    structural, shear = springs.structural, springs.shear
+    leaves_out = springs.open_edges and not springs.mapped
+    along, to_other_row, of_row, of_column, of_diagonal = springs.between(code)
+
+    @ti.func
+    def pass_row(
+        sheet: ti.template(), carried: ti.template(), carried_row, line: ti.template(), here, next_row, exists, up,
+        loads: ti.template(), n, moving,
+    ):  # fmt: skip
+        """Go through row `line`, in row `here` of u, and move it if `moving`.
+
+        The other row, `next_row` of u, is `up` above this one [m]; exists: 0 if there is none, else 1. `carried_row` is
+        the row of the forces carried from row to row, and n that of the table of loads.
+        """
+        width, strip, i, kind = sheet.width, sheet.width - 2, line.i, line.kind
+        diagonal = ti.sqrt(sheet.numbers[DX] * sheet.numbers[DX] + sheet.numbers[DY] * sheet.numbers[DY])
+        # The lower one of the two rows.
+        lower = i + ti.select(up < 0, 1, 0)
+        # Where u has this row and the other one, and where the forces between them are carried; all from entry 0 on.
+        row, other, carry = here * width, next_row * width, carried_row * width
+        # Force of the left neighbour, and forces carried to the other row: for the entry before this one, this one and
+        # the next one.
+        left, last = [vector(0) for _ in ti.static(range(3))], [vector(0) for _ in ti.static(range(3))]
+        this, coming = [vector(0) for _ in ti.static(range(3))], [vector(0) for _ in ti.static(range(3))]
+        has_left, has_right = vector(1), vector(1)
+        if ti.static(leaves_out):
+            has_right = sheet.by_column[HAS_RIGHT * width + 0]
+        u = [sheet.u[c][row] for c in ti.static(range(3))]
+        if ti.static(structural):
+            first = along(sheet, row + 1, u, of_row(sheet, i, kind, 0), has_right)
+            for c in ti.static(range(3)):
+                left[c] = first[c]
+        if ti.static(shear):
+            first_right = to_other_row(
+                sheet, other + 1, 1, u, up, diagonal, of_diagonal(sheet, lower, 0), has_right * exists
+            )
+            for c in ti.static(range(3)):
+                coming[c] = first_right[c]
+        # Read once, because the compiler must assume that stores to the arrays change the table.
+        now = [loads[n, c] for c in ti.static(range(columns))]
+        for b in range(1, strip + 1):
+            # Sum of the forces on the neighbours in the other row.
+            force = [vector(0) for _ in ti.static(range(3))]
+            for c in ti.static(range(3)):
+                # Neighbours are read again for every entry: there are too few registers to keep them.
+                u[c] = sheet.u[c][row + b]
+                last[c] = this[c]
+                this[c] = coming[c]
+            if ti.static(leaves_out):
+                has_left, has_right = sheet.by_column[HAS_LEFT * width + b], sheet.by_column[HAS_RIGHT * width + b]
+            if ti.static(shear):
+                to_left = to_other_row(
+                    sheet, other + b - 1, -1, u, up, diagonal, of_diagonal(sheet, lower, b - 1), has_left * exists
+                )
+                for c in ti.static(range(3)):
+                    force[c] = to_left[c]
+                    last[c] += to_left[c]
+            if ti.static(structural):
+                straight = to_other_row(sheet, other + b, 0, u, up, ti.abs(up), of_column(sheet, lower, b), exists)
+                for c in ti.static(range(3)):
+                    force[c] += straight[c]
+                    this[c] += straight[c]
+            if ti.static(shear):
+                to_right = to_other_row(
+                    sheet, other + b + 1, 1, u, up, diagonal, of_diagonal(sheet, lower, b), has_right * exists
+                )
+                for c in ti.static(range(3)):
+                    force[c] += to_right[c]
+                    coming[c] = to_right[c]
+            for c in ti.static(range(3)):
+                force[c] = carried[c][carry + b] - force[c]
+            if ti.static(structural):
+                right = along(sheet, row + b + 1, u, of_row(sheet, i, kind, b), has_right)
+                for c in ti.static(range(3)):
+                    force[c] += left[c] - right[c]
+                    left[c] = right[c]
+            for c in ti.static(range(3)):
+                # What was stored there was read for the entry before.
+                carried[c][carry + b - 1] = last[c]
+            if moving:
+                entry = ti.static(Entry(line, b, u))
+                move(sheet, entry, here, force, now)
+        if ti.static(shear):
+            if ti.static(leaves_out):
+                has_left = sheet.by_column[HAS_LEFT * width + strip + 1]
+            for c in ti.static(range(3)):
+                u[c] = sheet.u[c][row + strip + 1]
+            end = to_other_row(
+                sheet, other + strip, -1, u, up, diagonal, of_diagonal(sheet, lower, strip), has_left * exists
+            )
+            for c in ti.static(range(3)):
+                this[c] += end[c]
+        for c in ti.static(range(3)):
+            carried[c][carry + strip] = this[c]
+
+    return pass_row
+
+
+def row_touching(code: StepCode, contact: ContactTerm) -> Callable[..., None]:
+    """Make the function that resolves the contact of a row with all tools, if one reaches it."""
+    columns, resolve, reaches = code.first_column(None), contact.resolving(code), contact.reaching(code)
+    greatest = greatest_lane(code)
+
+    @ti.func
+    def touch_row(sheet: ti.template(), i, kind, loads: ti.template(), n):
+        """Resolve the contact of row i after step n of the launch."""
+        now = [loads[n, c] for c in ti.static(range(columns))]
+        at = i * sheet.width
+        # Smallest and largest displacements along y and z.
+        least, most = [[sheet.u[c][at + 1] for c in ti.static((1, 2))] for _ in ti.static(range(2))]
+        for b in range(2, sheet.width - 1):
+            for n in ti.static(range(2)):
+                value = sheet.u[n + 1][at + b]
+                least[n], most[n] = ti.min(least[n], value), ti.max(most[n], value)
+        low = [0 - greatest(0.0 - least[n]) for n in ti.static(range(2))]
+        high = [greatest(most[n]) for n in ti.static(range(2))]
+        if reaches(sheet, i, low, high, now):
+            for b in range(1, sheet.width - 1):
+                resolve(sheet, i, kind, i, b, now)
+
+    return touch_row

@@ -1,0 +1,616 @@
+"""Work and precision of stepping: every precision and damping difference, from the largest stable step downwards.
+
+Work and precision of the number of points: tissue with a quarter, half and twice the cells a side.
+
+Work and precision of drawing: every refinement and supersampling, for the most deformed frame.
+
+The cost of each term of the model: the time of a step without it.
+
+The same equations solved by SciPy's DOP853, as a careful person would do without this program.
+"""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack, closing
+from dataclasses import replace
+from itertools import pairwise
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import BaseModel
+
+from taichi_msm.accuracy.divergence import farthest_displacement
+from taichi_msm.accuracy.mesh import FEWEST, CubicSampling, MeshPilot, companion, with_points
+from taichi_msm.accuracy.time_step import longest
+from taichi_msm.errors import Count
+from taichi_msm.load import cost
+from taichi_msm.model.loads import Schedule, key_times, loads_at
+from taichi_msm.model.plan import Plan
+from taichi_msm.model.sheet import area_shares, axes, spacing
+from taichi_msm.model.time_grid import Precision
+from taichi_msm.model.tool_force import probe_force
+from taichi_msm.model.tools import fewest_steps
+from taichi_msm.render.rasterizer import Drawing
+from taichi_msm.scene.scene import Scene
+from taichi_msm.scene.section import MAX_POINTS
+from taichi_msm.solver.dynamics import Dynamics
+from taichi_msm.solver.planning import stable_steps, try_plan, variant, with_time
+from taichi_msm.study.result import Drawn, Points, Reference, Stepping, Study, TimedTerm
+from taichi_msm.system import process
+from taichi_msm.system.runtime import Device
+from taichi_msm.terms.elasticity import elastic_force, spring_families
+
+PRECISIONS: tuple[Precision, ...] = ("f64", "f32")
+DIFFERENCES = ("central", "backward")
+
+# How many times every setting is timed; all settings take turns.
+ROUNDS = 5
+
+# An error counts as known if it is at least this many times that of the reference.
+MARGIN = 20
+
+# How many times the largest stable step is halved at least, whatever it costs.
+LEAST_HALVINGS = 2
+
+Frames = NDArray[Any]
+
+
+class SteppingStudy:
+    """Measures the stepping of a checked scene, in runs of up to about `longest_run` seconds.
+
+    `progress` may raise KeyboardInterrupt: the results in `study` stay.
+
+    Attributes:
+        frames: displacements of the reference at every frame but the first [m], shape (F, rows, cols, 3).
+    """
+
+    def __init__(self, plan: Plan, device: Device, longest_run: float, study: Study, progress: Count) -> None:
+        self.plan = plan
+        self._plans = {
+            difference: variant(plan, with_time(plan.scene, damping_difference=difference, step="auto"))
+            for difference in DIFFERENCES
+        }
+        self.frames: Frames | None = None
+        self._longest_run, self.study, self._progress = longest_run, study, progress
+        self._done, self._to_do = 0, 1
+        self._dynamics: dict[str, Dynamics] = {
+            one: Dynamics(plan.with_grid(precision=one), device) for one in PRECISIONS
+        }
+
+    def run(self) -> None:
+        """Compute the reference, then the errors, then measure the times."""
+        for dynamics in self._dynamics.values():
+            self._progress(0, self._to_do)
+            dynamics.compile()
+        series = {difference: list(self._series(difference)) for difference in DIFFERENCES}
+        finest = max(steps for counts in series.values() for steps in counts)
+        self._to_do = 3 + ROUNDS * len(PRECISIONS) * sum(len(counts) for counts in series.values())
+        self._make_reference(finest)
+        for difference, counts in series.items():
+            self._measure_errors(difference, counts)
+        self._to_do = self._done + (ROUNDS - 1) * len(self.study.stepping)
+        for _ in range(ROUNDS - 1):
+            for one in self.study.stepping:
+                self._run(one.precision, one.damping_difference, one.steps_per_frame, one.samples)
+
+    def relative(self, frames: Frames) -> float:
+        """Give the largest error of frames relative to the reference, as a fraction of the largest displacement."""
+        assert self.frames is not None
+        largest = self._reference.largest
+        return longest(frames - self.frames) / largest if largest > 0 else 0.0
+
+    def known(self, error: float) -> bool:
+        """Tell whether the reference is exact enough to know an error."""
+        return error >= MARGIN * self._reference.error
+
+    def close(self) -> None:
+        """Free the memory."""
+        for dynamics in self._dynamics.values():
+            dynamics.close()
+
+    @property
+    def _reference(self) -> Reference:
+        assert self.study.reference is not None
+        return self.study.reference
+
+    def _series(self, difference: str) -> Iterator[int]:
+        """Give the steps per frame of a series: of the largest valid step, doubled until a run would take too long."""
+        steps = fewest_steps(self.plan.tools, self.plan.grid, stable_steps(self._plans[difference]))
+        samples: list[float] = []
+        self._run("f64", difference, steps, samples)
+        yield steps
+        for halving in range(1, 64):
+            if halving > LEAST_HALVINGS and samples[0] * 2**halving > self._longest_run:
+                return
+            yield steps * 2**halving
+
+    def _make_reference(self, finest: int) -> None:
+        """Extrapolate central differences from steps well below the finest that is measured.
+
+        u* = u_{h/2} + (u_{h/2} - u_h) / 3. Its error is at most about its distance from the same with 2 h for h. With
+        contact, which is of order 1 about, nothing is extrapolated.
+        """
+        coarse, middle, fine = (self._run("f64", "central", finest * 2**halving, []) for halving in range(3))
+        before, self.frames = middle + (middle - coarse) / 3, fine + (fine - middle) / 3
+        if self.plan.tools:
+            before, self.frames = middle, fine
+        largest = longest(self.frames)
+        error = longest(self.frames - before) / largest if largest > 0 else 0.0
+        self.study.reference = Reference(4 * finest, error, largest)
+
+    def _measure_errors(self, difference: str, counts: list[int]) -> None:
+        """Run every step once: in f32 until rounding dominates, in f64 until the reference is not exact enough."""
+        going, farthest = set(PRECISIONS), farthest_displacement(self.plan, self.plan.scene.time.duration)
+        for steps in counts:
+            exact: Frames | None = None
+            for precision in (one for one in PRECISIONS if one in going):
+                point = Stepping(precision, difference, steps, replace(self.plan.grid, steps_per_frame=steps).step)
+                frames = self._run(precision, difference, steps, point.samples)
+                error, rounding = self.relative(frames), None
+                if precision == "f64":
+                    exact = frames
+                elif exact is not None and self._reference.largest > 0:
+                    rounding = longest(frames - exact) / self._reference.largest
+                self.study.stepping.append(point)
+                if error < math.inf and longest(frames) <= farthest:
+                    point.error, point.rounding, point.known = error, rounding, self.known(error)
+                    if not point.known or (rounding is not None and rounding > error / 2):
+                        going.discard(precision)
+
+    def _run(self, precision: str, difference: str, steps: int, samples: list[float]) -> Frames:
+        """Step through the scene, and append the time of stepping alone [s] to the samples."""
+        dynamics = self._dynamics[precision]
+        plan = self._plans[difference].with_grid(precision=precision, steps_per_frame=steps)
+        dynamics.restart(plan)
+        frames = np.empty((plan.grid.frames, *plan.scene.sheet.points, 3), precision.replace("f", "float"))
+        seconds = 0.0
+        for frame in frames:
+            self._progress(self._done, self._to_do)
+            start = time.perf_counter()
+            dynamics.advance(steps)
+            seconds += time.perf_counter() - start
+            frame[:] = dynamics.displacement()
+        samples.append(seconds)
+        self._done += 1
+        return frames
+
+
+# Cells a side, relative to those of the scene.
+COARSER = (1 / 4, 1 / 2)
+FINER = 2
+
+# How many times every sheet is timed; all sheets take turns.
+POINT_ROUNDS = 5
+
+# An error counts as known if it is at least this many times the bound of the reference's own error.
+POINT_MARGIN = 5
+
+Field = NDArray[Any]
+Lattice = tuple[int, int]
+
+
+class _Sheet(NamedTuple):
+    """A sheet with some number of points, and what is known about it so far."""
+
+    plan: Plan
+    dynamics: Dynamics
+    measured: Points
+
+
+class PointStudy:
+    """Measures the error and the speed of a sheet of tissue with more or fewer points, in f64.
+
+    Errors are measured with the same steps for all sheets, so that the errors of the step cancel. Times are measured
+    with the automatic step of each sheet, which is longer for fewer points.
+
+    The reference is a sheet with more points than all those listed, if there is time for it. Otherwise it is the finest
+    of those listed, whose own error is then known only as a bound.
+
+    A run takes up to about `longest_run` seconds; the reference, which is run only once, as long as all the runs
+    together by which another sheet is timed. The results in `study` come with the fewest points first; `progress` may
+    raise KeyboardInterrupt: they stay.
+    """
+
+    def __init__(self, plan: Plan, device: Device, longest_run: float, study: Study, progress: Count) -> None:
+        scene = with_time(plan.scene, step="auto", tolerance=None, precision="f64")
+        self._plan = variant(plan, with_points(scene, scene.sheet.points))
+        self._device, self._longest_run, self._study, self._progress = device, longest_run, study, progress
+        self._sheets: list[_Sheet] = []
+        self._done = 0
+
+    def run(self) -> None:
+        """Compute the estimates, then the errors, then measure the times; with springs nothing.
+
+        Other points would make another sheet of springs.
+        """
+        if self._plan.scene.tissue is None:
+            return
+        with ExitStack() as opened:
+            seconds = 0.0
+            for plan in lattices(self._plan):
+                seconds = self._try(plan, opened)
+            if not self._sheets:
+                said = f"points were not measured: with fewer than {FEWEST} a side they cannot be compared"
+                self._study.notes.append(said)
+                return
+            finer = self._finer(self._plan, seconds, self._longest_run)
+            if finer is None:
+                rows, cols = _scaled(self._plan, FINER)
+                self._study.notes.append(f"{rows} x {cols} points were not measured: time or memory")
+            else:
+                seconds = self._try(finer, opened)
+                finer = self._finer(finer, seconds, POINT_ROUNDS * self._longest_run)
+            if len(self._sheets) < 2:
+                return
+            self._measure_errors(finer)
+            for _ in range(POINT_ROUNDS):
+                for sheet in self._sheets:
+                    sheet.measured.samples.append(self._step_through(sheet))
+
+    def _try(self, plan: Plan, opened: ExitStack) -> float:
+        """Run a sheet with its own step beside the pilot that `run` would have; returns the time of stepping [s]."""
+        dynamics = opened.enter_context(closing(Dynamics(plan, self._device)))
+        sheet = _Sheet(plan, dynamics, Points(*plan.scene.sheet.points, plan.grid.steps_per_frame))
+        coarse = companion(plan)
+        assert coarse is not None
+        self._sheets.append(sheet)
+        self._study.points.append(sheet.measured)
+        self._tick()
+        dynamics.compile()
+        pilot = MeshPilot(plan, coarse, self._device)
+        pilot.compile()
+        first = self._step_through(sheet, pilot)
+        # The faster of two runs: what disturbs one may not disturb the other.
+        seconds = min(first, self._step_through(sheet, pilot.nearer(plan, self._device)))
+        estimate = pilot.estimate.error
+        sheet.measured.estimate = estimate if estimate < math.inf else None
+        return seconds
+
+    def _finer(self, plan: Plan, seconds: float, longest_run: float) -> Plan | None:
+        """Plan more points than a plan has, through which it took `seconds` to step.
+
+        Returns:
+            The plan; None if stepping through it would take longer than `longest_run` [s], or too much memory.
+        """
+        points = _scaled(plan, FINER)
+        if max(points) > MAX_POINTS:
+            return None
+        finer = variant(plan, with_points(plan.scene, points))
+        work = [math.prod(one.scene.sheet.points) * one.grid.steps_per_frame for one in (plan, finer)]
+        return None if seconds * work[1] / work[0] > longest_run or any(cost.size_problems(finer)) else finer
+
+    def _measure_errors(self, finer: Plan | None) -> None:
+        """Step through the scene with all sheets side by side, and with a finer one if any; compare every frame."""
+        finest = self._sheets[-1].plan if finer is None else finer
+        grid = finest.grid
+        with ExitStack() as opened:
+            sheets = [sheet.dynamics for sheet in self._sheets]
+            if finer is not None:
+                sheets.append(opened.enter_context(closing(Dynamics(finer, self._device))))
+                sheets[-1].compile()
+            for sheet in sheets:
+                sheet.restart(sheet.plan.with_grid(steps_per_frame=grid.steps_per_frame))
+            errors, own_error, largest = [0.0] * len(sheets), 0.0, 0.0
+            for _ in range(grid.frames):
+                for sheet in sheets:
+                    self._tick()
+                    sheet.advance(grid.steps_per_frame)
+                fields = [sheet.displacement() for sheet in sheets]
+                with np.errstate(all="ignore"):
+                    exact, bound = _reference(fields, extrapolate=not finest.tools)
+                    apart = [longest(_sampled(one, exact) - exact) for one in fields[:-1]]
+                    # Between the points of the finest sheet, its error is not known. But if its order is 1 or more, it
+                    # is at most its distance from a sheet that is twice as coarse.
+                    apart.append(longest(_sampled(fields[-2], fields[-1]) - fields[-1]))
+                errors = [max(pair) for pair in zip(errors, apart, strict=True)]
+                own_error, largest = max(own_error, bound), max(largest, longest(exact))
+            self._done += 1
+        farthest = farthest_displacement(finest, finest.scene.time.duration)
+        if not largest <= farthest:
+            return
+        for (plan, _, measured), error in zip(self._sheets, errors, strict=False):
+            if plan is not finest:
+                measured.known = error >= POINT_MARGIN * own_error
+                error += 0.0 if measured.known else own_error
+            share = error / largest if largest > 0 else 0.0
+            measured.error = share if share < math.inf else None
+
+    def _step_through(self, sheet: _Sheet, pilot: MeshPilot | None = None) -> float:
+        """Step through the scene with the sheet's own step; returns the time of stepping alone [s]."""
+        plan, dynamics, _ = sheet
+        dynamics.restart(plan)
+        seconds = 0.0
+        for _ in range(plan.grid.frames):
+            self._tick()
+            start = time.perf_counter()
+            dynamics.advance(plan.grid.steps_per_frame)
+            seconds += time.perf_counter() - start
+            displacement = dynamics.displacement()
+            if pilot is not None:
+                pilot.follow(displacement, self._tick)
+        self._done += 1
+        return seconds
+
+    def _tick(self) -> None:
+        # For each sheet the estimate, another run and the rounds; for all of them together the errors.
+        self._progress(self._done, 1 + (2 + POINT_ROUNDS) * len(self._sheets))
+
+
+def lattices(plan: Plan) -> Iterator[Plan]:
+    """Plan the numbers of points to compare, as far as the scene allows them; its own come last."""
+    for share in COARSER:
+        points = _scaled(plan, share)
+        coarse, _ = try_plan(with_points(plan.scene, points), plan.maps) if min(points) >= FEWEST else (None, [])
+        if coarse is not None:
+            yield coarse
+    if min(plan.scene.sheet.points) >= FEWEST:
+        yield plan
+
+
+def _scaled(plan: Plan, factor: float) -> Lattice:
+    """Give the rows and columns of points for `factor` times the cells a side."""
+    rows, cols = (round((count - 1) * factor) + 1 for count in plan.scene.sheet.points)
+    return rows, cols
+
+
+def _reference(fields: list[Field], *, extrapolate: bool) -> tuple[Field, float]:
+    """Extrapolate the two finest fields by Richardson, for an error of order 2 in the length of cells.
+
+    u* = u + (u - u_r) / (r^2 - 1), where u_r has cells r times as long. The correction is computed at the points of u_r
+    and interpolated at those of u. The error of u* is at most about its distance from the extrapolation of the next two
+    fields, or of u from u_r if there are only two.
+
+    Args:
+        fields: two or more of displacements [m], the fewest points first, each of shape (rows, cols, 3).
+        extrapolate: whether to; else, as with contact, which has a lower order, u* is the finest one.
+
+    Returns:
+        u* at the points of the finest field [m], and an approximate bound of its error [m].
+    """
+    if not extrapolate:
+        return fields[-1], longest(_sampled(fields[-1], fields[-2]) - fields[-2])
+    exact = fields[-1] + _sampled(_correction(fields[-1], fields[-2]), fields[-1])
+    if len(fields) > 2:
+        before = fields[-2] + _sampled(_correction(fields[-2], fields[-3]), fields[-2])
+    else:
+        before = _sampled(fields[-1], fields[-2])
+    return exact, longest(_sampled(exact, before) - before)
+
+
+def _correction(fine: Field, coarse: Field) -> Field:
+    """Compute the correction of Richardson's extrapolation at the points of the coarse field."""
+    ratio = min((of - 1) / (to - 1) for of, to in zip(fine.shape[:2], coarse.shape[:2], strict=True))
+    correction: Field = (_sampled(fine, coarse) - coarse) / (ratio**2 - 1)
+    return correction
+
+
+def _sampled(values: Field, like: Field) -> Field:
+    """Interpolate a field at the points of another one."""
+    (rows, cols), (to_rows, to_cols) = values.shape[:2], like.shape[:2]
+    return CubicSampling((rows, cols), (to_rows, to_cols)).at(values)
+
+
+REFINES = (0, 1, 2, 5, 10, 20)
+SUPERSAMPLES = (1, 2, 3, 4)
+
+# Settings of the reference picture, if there is memory for it; they must be finer than all that are compared with it.
+FINEST = {"refine": 40, "supersample": 8}
+
+PICTURE_ROUNDS = 5
+
+Picture = NDArray[np.uint8]
+
+
+def measure_pictures(
+    scene: Scene, position: NDArray[Any], texture: Picture, quick: bool, study: Study, progress: Count
+) -> None:
+    """Draw the reference picture, then every setting, taking turns; `quick` varies the settings one at a time.
+
+    The positions of the points [m] have the shape (rows, cols, 3), the picture on the sheet (height, width, 3).
+    """
+    position = np.ascontiguousarray(position, np.float32)
+    memory = process.available_memory() // 2
+    finest = _with_render(scene, **FINEST)
+    if cost.drawing_bytes(finest) > memory:
+        study.notes.append("drawing was not measured: there is no memory for a picture fine enough to compare with")
+        return
+    truth = Drawing(finest, texture).draw(position)
+    drawings, compared = [], list(settings(scene, quick))
+    for number, (refine, supersample) in enumerate(compared):
+        progress(number, len(compared) * PICTURE_ROUNDS)
+        changed = _with_render(scene, refine=refine, supersample=supersample)
+        memory -= cost.drawing_bytes(changed)
+        if memory < 0:
+            study.notes.append(f"drawing was not measured from refine {refine}, supersample {supersample} on: memory")
+            break
+        drawing = Drawing(changed, texture)
+        drawings.append(drawing)
+        picture = drawing.draw(position)
+        apart = int(np.abs(picture.astype(np.int16) - truth).max())
+        study.drawing.append(Drawn(refine, supersample, psnr(picture, truth), apart))
+    for round_ in range(PICTURE_ROUNDS):
+        for number, (drawing, drawn) in enumerate(zip(drawings, study.drawing, strict=True)):
+            progress(round_ * len(drawings) + number, len(drawings) * PICTURE_ROUNDS)
+            start = time.perf_counter()
+            drawing.draw(position)
+            drawn.samples.append(time.perf_counter() - start)
+
+
+def settings(scene: Scene, quick: bool) -> Iterator[tuple[int, int]]:
+    """List refinements and supersamplings to compare; `quick`: with one of them as in the scene."""
+    own = scene.render
+    for supersample in sorted({*SUPERSAMPLES, own.supersample}):
+        for refine in sorted({*REFINES, own.refine}):
+            if not quick or refine == own.refine or supersample == own.supersample:
+                yield refine, supersample
+
+
+def psnr(picture: Picture, truth: Picture) -> float | None:
+    """Give the peak signal-to-noise ratio [dB], 10 log10(255^2 / mean square error); None where they are the same."""
+    square = float(np.mean((picture.astype(np.float64) - truth) ** 2))
+    return 10 * math.log10(255**2 / square) if square > 0 else None
+
+
+def _with_render(scene: Scene, **changes: int) -> Scene:
+    # Not checked, because the settings of the reference picture exceed the limits of a scene.
+    return scene.model_copy(update={"render": BaseModel.model_copy(scene.render, update=changes)})
+
+
+TERM_ROUNDS = 9
+
+# The terms of a sheet that can be left out, and the values that leave them out.
+SPRING_TERMS: dict[str, float | None] = {"structural": 0.0, "shear": 0.0, "virtual": 0.0, "map": None}
+TISSUE_TERMS: dict[str, float | None] = {
+    **dict.fromkeys(("foundation", "damping", "pretension", "bending"), 0.0),
+    **dict.fromkeys(("map", "foundation_map")),
+}
+
+
+def measure_terms(plan: Plan, device: Device, sample: float, study: Study, progress: Count) -> None:
+    """Measure the time of a step with each term left out in turn, in samples of about so many seconds."""
+    # All variants have the steps of the whole scene: without a spring the automatic step would be another.
+    grid = {"steps_per_frame": plan.grid.steps_per_frame, "precision": plan.grid.precision}
+    plans = {without: variant(plan, scene).with_grid(**grid) for without, scene in variants(plan.scene)}
+    study.terms += map(TimedTerm, plans)
+    with ExitStack() as opened:
+        sheets: list[Dynamics] = []
+        for without in plans.values():
+            progress(0, len(plans))
+            sheets.append(opened.enter_context(closing(Dynamics(without, device))))
+            sheets[-1].compile()
+        frames = round(sample / (_step_seconds(sheets[0], 1) * plan.grid.steps_per_frame))
+        frames = max(1, min(plan.grid.frames, frames))
+        for round_ in range(TERM_ROUNDS):
+            for number, (term, sheet) in enumerate(zip(study.terms, sheets, strict=True)):
+                progress(round_ * len(sheets) + number, TERM_ROUNDS * len(sheets))
+                # From rest, so that all variants step through the same part of the scene.
+                sheet.restart(sheet.plan)
+                term.samples.append(_step_seconds(sheet, frames))
+
+
+def variants(scene: Scene) -> Iterator[tuple[str, Scene]]:
+    """Give the scene without each of its terms in turn, by the term's key; the first variant is the whole scene."""
+    yield "", scene
+    terms, sheet = (SPRING_TERMS, scene.springs) if scene.tissue is None else (TISSUE_TERMS, scene.tissue)
+    assert sheet is not None
+    for name, absent in terms.items():
+        if getattr(sheet, name) not in (0, None):
+            rest = sheet.model_copy(update={name: absent})
+            yield f"{scene.kind}.{name}", scene.model_copy(update={scene.kind: rest})
+    if scene.damping > 0:
+        yield "damping", scene.model_copy(update={"damping": 0.0})
+    for index in range(len(scene.probes)):
+        others = scene.probes[:index] + scene.probes[index + 1 :]
+        yield f"probes.{index}", scene.model_copy(update={"probes": others})
+
+
+def _step_seconds(dynamics: Dynamics, frames: int) -> float:
+    """Measure the time of one step [s]."""
+    steps = frames * dynamics.plan.grid.steps_per_frame
+    start = time.perf_counter()
+    dynamics.advance(steps)
+    return (time.perf_counter() - start) / steps
+
+
+# Loads are evaluated this far inside an interval between two keys, as a fraction of it: at its ends they may jump.
+INSIDE = 1e-9
+
+Array = NDArray[np.float64]
+
+
+class TooSlowError(Exception):
+    """The time limit is exceeded."""
+
+
+class FailedError(Exception):
+    """The solver finds no step that is small enough; the message says when."""
+
+
+def solve(plan: Plan, rtol: float, atol: float, deadline: float, tick: Callable[[], None]) -> tuple[Array, int]:
+    """Integrate from key to key of the loads, between which they are smooth.
+
+    The absolute tolerance is of displacements [m] and velocities [m/s]; `tick` is called now and then.
+
+    Returns:
+        Displacements at every frame but the first [m], shape (F, rows, cols, 3); and the number of evaluations.
+
+    Raises:
+        TooSlowError: when `time.perf_counter()` has come to the deadline.
+        FailedError: when SciPy fails.
+    """
+    from scipy.integrate import solve_ivp
+
+    scene = plan.scene
+    shape = (*scene.sheet.points, 3)
+    accelerate, moves = acceleration(plan), ~plan.fixed[..., None]
+    state = np.zeros(2 * int(np.prod(shape)))
+    evaluations = 0
+    displacements = []
+    for start, end, frames in _pieces(scene):
+        margin = INSIDE * (end - start)
+        first = loads_at(plan, np.array([start + margin, end - margin]))
+
+        def motion(t: float, y: Array, start: float = start, end: float = end, ends: Schedule = first) -> Array:
+            if time.perf_counter() > deadline:
+                raise TooSlowError
+            tick()
+            share = (t - start) / (end - start)
+            between = (each[:1] + share * (each[1:] - each[:1]) for each in ends[1:])
+            loads = Schedule(ends.slots, *between)
+            u, v = y.reshape(2, *shape)
+            return np.concatenate([v.ravel(), (accelerate(u, v, loads) * moves).ravel()])
+
+        times = np.union1d(frames, end)
+        solved = solve_ivp(motion, (start, end), state, "DOP853", t_eval=times, rtol=rtol, atol=atol)
+        if not solved.success:
+            raise FailedError(f"after {solved.t[-1] if solved.t.size else start:.3g} s")
+        state = solved.y[:, -1]
+        evaluations += solved.nfev
+        displacements += [column[: state.size // 2].reshape(shape) for column in solved.y.T[: len(frames)]]
+    return np.array(displacements), evaluations
+
+
+def acceleration(plan: Plan) -> Callable[[Array, Array, Schedule], Array]:
+    """Prepare the right side of eq. 1 over the mass: displacements [m] and velocities [m/s] to accelerations [m/s2].
+
+    The arrays have the shape (rows, cols, 3), and the schedule one step.
+    """
+    scene, sheet, every = plan.scene, plan.material, tuple(spring_families(plan))
+    (dx, dy), (x, y) = spacing(scene.sheet), axes(scene.sheet)
+    shares = area_shares(scene.sheet)
+    area = shares if sheet.by_area else np.ones_like(shares)
+    held = area if sheet.virtual_factors is None else area * sheet.virtual_factors
+    probes = [probe_force(probe, scene.sheet) for probe in scene.probes]
+
+    def laplacian(u: Array) -> Array:
+        inner = u[1:-1, 1:-1]
+        return (u[1:-1, 2:] - 2 * inner + u[1:-1, :-2]) / dx**2 + (u[2:, 1:-1] - 2 * inner + u[:-2, 1:-1]) / dy**2
+
+    def accelerate(u: Array, v: Array, loads: Schedule) -> Array:
+        force = elastic_force(every, u) - (loads.active[0] * sheet.virtual * held)[..., None] * u
+        for slot, strength, (at_x, at_y) in zip(loads.slots, loads.strength[0], loads.point[0], strict=True):
+            probe = probes[slot.probe]
+            decay = probe.decay(np.hypot(x - at_x, y - at_y)) * (shares if probe.by_area else 1)
+            force += decay[..., None] * strength
+        if sheet.bending:
+            # Points with four neighbours have a moment; those at the edges, which are fixed, need no force.
+            moment = np.zeros_like(u)
+            moment[1:-1, 1:-1] = sheet.bending * laplacian(u)
+            force[1:-1, 1:-1] -= laplacian(moment)
+        return np.asarray(force / (sheet.mass * area)[..., None] - sheet.drag * v)
+
+    return accelerate
+
+
+def _pieces(scene: Scene) -> Iterator[tuple[float, float, Array]]:
+    """Split the time at the keys: start, end, and the times t of frames with start < t <= end."""
+    frames = np.arange(1, scene.time.frames + 1) / scene.time.frames_per_second
+    bounds = [0.0, *key_times(scene), float(frames[-1])]
+    for start, end in pairwise(bounds):
+        # A key that differs from the time of a frame only by rounding is at that frame.
+        near = frames[(frames > start * (1 + INSIDE)) & (frames <= end * (1 + INSIDE))]
+        yield start, end, np.minimum(near, end)

@@ -1,0 +1,136 @@
+"""Bending: the resistance of a plate, which keeps the sheet smooth. Scene: `tissue.bending`.
+
+The energy is D / 2 times the integral of the Laplacian of u squared. With the moment M = D dx dy Laplacian(u), which is
+0 at edges, where the sheet may turn, the force on a point is -Laplacian(M).
+"""
+
+# No `from __future__ import annotations` here: Taichi reads the annotations of a kernel.
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Any, ClassVar
+
+from numpy.typing import NDArray
+from typing_extensions import Self
+
+from taichi_msm.model.plan import Plan
+from taichi_msm.model.sheet import Material, spacing
+from taichi_msm.scene.scene import Scene
+from taichi_msm.scene.sheet import Sheet
+from taichi_msm.terms.base import DX, DY, HAS_LEFT, HAS_RIGHT, StepCode, Term
+
+# Poisson's ratio of a lattice of springs between nearest and diagonal neighbours.
+POISSON = 1 / 3
+
+
+@dataclass(frozen=True)
+class BendingTerm(Term):
+    """Bending. Moments are stored a row ahead of the points that are stepped, in rows of u."""
+
+    # The moments of the neighbours, and what these depend on.
+    reach: ClassVar[int] = 2
+    numbers_count: ClassVar[int] = 1
+    # The sum of the squares of the Laplacian.
+    reductions: ClassVar[tuple[str, ...]] = ("sum",)
+
+    @staticmethod
+    def derive(scene: Scene) -> dict[str, Any]:
+        """Give D dx dy; `plate` is E t^3 / 12 (1 - nu^2)."""
+        tissue, (dx, dy) = scene.tissue, spacing(scene.sheet)
+        if tissue is None:
+            return {"bending": 0.0}
+        plate = tissue.young * tissue.thickness**3 / (12 * (1 - POISSON**2))
+        return {"bending": (plate if tissue.bending == "plate" else tissue.bending) * (dx * dy)}
+
+    @classmethod
+    def of(cls, plan: Plan) -> Self | None:
+        """Leave it out if it is 0."""
+        return cls() if plan.material.bending > 0 else None
+
+    @staticmethod
+    def bound(material: Material, sheet: Sheet) -> float:
+        """Bound the part of m w^2 by the square of the largest Laplacian, (4 / dx^2 + 4 / dy^2)^2 D dx dy [N/m]."""
+        dx, dy = spacing(sheet)
+        return material.bending * (4 / dx**2 + 4 / dy**2) ** 2
+
+    def numbers(self, plan: Plan) -> tuple[float, ...]:
+        """Give D dx dy [N m3]."""
+        return (plan.material.bending,)
+
+    def energy(self, sums: NDArray[Any], plan: Plan) -> float:
+        """Give twice the energy [J]."""
+        return plan.material.bending * float(sums[0])
+
+    def storing(self, code: StepCode) -> Callable[..., None]:
+        """Make the function that stores the moment of an entry."""
+        ti = code.ti
+        vector, number, laplacian = code.vector, code.first_number(BendingTerm), five_point(code)
+
+        @ti.func
+        def store_moment(sheet: ti.template(), i, before, row, after, b, target):
+            """Store the moment of entry b of row i, whose displacement is in `row`, in row `target` of u."""
+            dx, dy, stiffness = sheet.numbers[DX], sheet.numbers[DY], sheet.numbers[number]
+            across, down = stiffness / (dx * dx), stiffness / (dy * dy)
+            for c in ti.static(range(3)):
+                sheet.u[c][target * sheet.width + b] = vector(0)
+            if 0 < i < sheet.rows - 1:
+                inside = sheet.by_column[HAS_LEFT * sheet.width + b] * sheet.by_column[HAS_RIGHT * sheet.width + b]
+                for c in ti.static(range(3)):
+                    curved = laplacian(sheet.u[c], sheet.width, before, row, after, b, across, down)
+                    sheet.u[c][target * sheet.width + b] = inside * curved
+
+        return store_moment
+
+    def forces(self, code: StepCode) -> Sequence[Callable[..., Any]]:
+        """Make the function that adds the force on an entry."""
+        ti = code.ti
+        laplacian = five_point(code)
+
+        @ti.func
+        def add(force: ti.template(), sheet: ti.template(), entry: ti.template(), _now: ti.template()):
+            row = ti.static(entry.row)
+            across, down = 1 / (sheet.numbers[DX] * sheet.numbers[DX]), 1 / (sheet.numbers[DY] * sheet.numbers[DY])
+            for c in ti.static(range(3)):
+                bent = laplacian(sheet.u[c], sheet.width, row.before, row.at, row.after, entry.b, across, down)
+                force[c] = force[c] - bent
+
+        return (add,)
+
+    def tangents(self, code: StepCode) -> Sequence[Callable[..., Any]]:
+        """Make the function that adds the change of the force, which is linear in the displacements."""
+        return self.forces(code)
+
+    def measuring(self, code: StepCode) -> Sequence[Callable[..., None]]:
+        """Make the function that adds up the square of the Laplacian, which is 0 at edges."""
+        ti = code.ti
+        real, vector, first, laplacian = code.real, code.vector, code.first_measure(BendingTerm), five_point(code)
+
+        @ti.func
+        def measure(measures: ti.template(), sheet: ti.template(), p, _i, kind, b):
+            inside = sheet.by_column[HAS_LEFT * sheet.width + b] * sheet.by_column[HAS_RIGHT * sheet.width + b]
+            inside *= ti.cast(kind == 1, real)
+            # Only an inner row has both a row before it and one after it.
+            before, after = p - ti.cast(kind == 1, ti.i32), p + ti.cast(kind == 1, ti.i32)
+            across, down = 1 / (sheet.numbers[DX] * sheet.numbers[DX]), 1 / (sheet.numbers[DY] * sheet.numbers[DY])
+            bent = vector(0)
+            for c in ti.static(range(3)):
+                curved = inside * laplacian(sheet.u[c], sheet.width, before, p, after, b, across, down)
+                bent += curved * curved
+            measures[first] += bent
+
+        return (measure,)
+
+
+def five_point(code: StepCode) -> Callable[..., Any]:
+    """Make the function that gives the five-point Laplacian of an array."""
+    ti = code.ti
+
+    @ti.func
+    def laplacian(field: ti.template(), width, before, row, after, b, across, down):
+        """Laplacian at entry b of a row, between rows before and after; across: 1/dx^2, down: 1/dy^2."""
+        here = field[row * width + b]
+        beside = (field[row * width + b - 1] - here) + (field[row * width + b + 1] - here)
+        over = (field[before * width + b] - here) + (field[after * width + b] - here)
+        return across * beside + down * over
+
+    return laplacian

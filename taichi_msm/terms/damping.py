@@ -1,0 +1,66 @@
+"""Damping: a force against the velocity, C v on every point. Scene: `damping`, or `tissue.damping`.
+
+In a Verlet step, d_{n+1} = keep d_n + gain F_n and u_{n+1} = u_n + d_{n+1} (eq. 6 to 9), with g = C / m and the step h,
+
+    central:   keep = (1 - g h / 2) / (1 + g h / 2)    gain = h^2 / m / (1 + g h / 2)
+    backward:  keep = 1 - g h                          gain = h^2 / m
+    step 0:    d_0 = 0                                 gain = h^2 / m / 2
+"""
+
+# No `from __future__ import annotations` here: Taichi reads the annotations of a kernel.
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Any, ClassVar
+
+from typing_extensions import Self
+
+from taichi_msm.model.plan import Plan
+from taichi_msm.scene.scene import Scene
+from taichi_msm.terms.base import StepCode, Term
+
+
+def coefficients(plan: Plan) -> tuple[float, float, float]:
+    """Compute keep, gain and the gain of step 0 [m/N], for central or backward differences."""
+    material, h = plan.material, plan.grid.step
+    g, whole = material.drag, h * h / material.mass
+    if plan.scene.time.damping_difference == "central":
+        return (1 - g * h / 2) / (1 + g * h / 2), whole / (1 + g * h / 2), whole / 2
+    return 1 - g * h, whole, whole / 2
+
+
+@dataclass(frozen=True)
+class DampingTerm(Term):
+    """Damping of every point. It adds no energy, and its limit on the step is in `planning.stable_step`."""
+
+    numbers_count: ClassVar[int] = 1
+
+    @staticmethod
+    def derive(scene: Scene) -> dict[str, Any]:
+        """Give C / m [1/s]; at rest nothing moves."""
+        if scene.time.at_rest:
+            return {"drag": 0.0}
+        if scene.tissue is not None:
+            return {"drag": scene.tissue.damping}
+        assert scene.sheet.mass is not None
+        return {"drag": scene.damping / scene.sheet.mass}
+
+    @classmethod
+    def of(cls, plan: Plan) -> Self | None:
+        """Leave it out if it is 0."""
+        return cls() if plan.material.drag > 0 else None
+
+    def numbers(self, plan: Plan) -> tuple[float, ...]:
+        """Give the factor `keep`."""
+        return coefficients(plan)[:1]
+
+    def reducing(self, code: StepCode) -> Sequence[Callable[..., Any]]:
+        """Make the function that reduces the last difference."""
+        ti, keep = code.ti, code.first_number(DampingTerm)
+
+        @ti.func
+        def reduce(d: ti.template(), sheet: ti.template()):
+            for c in ti.static(range(3)):
+                d[c] *= sheet.numbers[keep]
+
+        return (reduce,)

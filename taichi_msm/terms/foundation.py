@@ -1,0 +1,113 @@
+"""The foundation, or virtual springs: each pulls a point back to its rest position.
+
+Scene: `springs.virtual` and `virtual_active`, or `tissue.foundation`, `foundation_active` and `foundation_map`. The
+force is -K u.
+"""
+
+# No `from __future__ import annotations` here: Taichi reads the annotations of a kernel.
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from typing_extensions import Self
+
+from taichi_msm.model.loads import Schedule
+from taichi_msm.model.plan import Plan
+from taichi_msm.model.sheet import Material, area_shares, spacing
+from taichi_msm.scene.scene import Scene
+from taichi_msm.scene.sheet import Sheet
+from taichi_msm.terms.base import AREA, StepCode, Term
+
+
+@dataclass(frozen=True)
+class FoundationTerm(Term):
+    """Virtual springs. Their energy is not measured: `divergence` bounds it."""
+
+    by_area: bool  # whether they are softer at an open edge, where less of the sheet's area belongs to a point
+    mapped: bool  # whether the share of K that each point has is read from a field
+
+    @staticmethod
+    def derive(scene: Scene) -> dict[str, Any]:
+        """Give K, of a tissue foundation dx dy, or 0 if it never acts; and whether it acts without a load."""
+        if scene.tissue is not None:
+            k = scene.tissue.foundation_stiffness * math.prod(spacing(scene.sheet))
+            active = scene.tissue.foundation_active
+        else:
+            assert scene.springs is not None
+            k, active = scene.springs.virtual, scene.springs.virtual_active
+        always = active == "always"
+        return {"virtual": k if always or scene.probes else 0.0, "always": always}
+
+    @classmethod
+    def of(cls, plan: Plan) -> Self | None:
+        """Leave them out if they never act."""
+        material = plan.material
+        mapped = material.virtual_factors is not None
+        return cls(plan.open_edges and material.by_area and not mapped, mapped) if material.virtual > 0 else None
+
+    @staticmethod
+    def bound(material: Material, sheet: Sheet) -> float:
+        """Give the part of m w^2, which is the largest K [N/m]."""
+        factors = material.virtual_factors
+        return material.virtual if factors is None else material.virtual * float(factors.max())
+
+    @classmethod
+    def bounds(cls, plan: Plan) -> NDArray[Any] | float:
+        """Give K of each point, as if none had less of the sheet's area."""
+        factors = plan.material.virtual_factors
+        return plan.material.virtual * (1.0 if factors is None else factors)
+
+    @property
+    def column_count(self) -> int:
+        """One column: K, times the share of it that acts."""
+        return 1
+
+    def columns(self, plan: Plan, loads: Schedule, first: int) -> NDArray[Any]:
+        """Give K at every step [N/m]."""
+        return plan.material.virtual * loads.active[:, None]
+
+    @property
+    def field_count(self) -> int:
+        """One field with a map."""
+        return int(self.mapped)
+
+    def fields(self, plan: Plan) -> NDArray[Any]:
+        """Give each point's share of K: its factor times its share of a cell's area."""
+        return point_shares(plan)[None] if self.mapped else super().fields(plan)
+
+    def forces(self, code: StepCode) -> Sequence[Callable[..., Any]]:
+        """Make the function that adds -K u."""
+        ti = code.ti
+        by_area, mapped, column = self.by_area, self.mapped, code.first_column(FoundationTerm)
+        field = code.first_field(FoundationTerm)
+
+        @ti.func
+        def add(force: ti.template(), sheet: ti.template(), entry: ti.template(), now: ti.template()):
+            if ti.static(mapped):
+                held = now[column] * sheet.fields[(field * sheet.rows + entry.row.i) * sheet.width + entry.b]
+                for c in ti.static(range(3)):
+                    force[c] = force[c] - held * entry.u[c]
+            elif ti.static(by_area):
+                held = now[column] * sheet.by_column[(AREA + entry.row.kind) * sheet.width + entry.b]
+                for c in ti.static(range(3)):
+                    force[c] = force[c] - held * entry.u[c]
+            else:
+                for c in ti.static(range(3)):
+                    force[c] = force[c] - now[column] * entry.u[c]
+
+        return (add,)
+
+    def tangents(self, code: StepCode) -> Sequence[Callable[..., Any]]:
+        """Make the function that adds the change of the force, which is linear in the displacements."""
+        return self.forces(code)
+
+
+def point_shares(plan: Plan) -> NDArray[Any]:
+    """Give each point's share of K: its factor times its share of a cell's area; shape (rows, cols)."""
+    material = plan.material
+    shares = area_shares(plan.scene.sheet) if material.by_area else np.ones(plan.fixed.shape)
+    return shares if material.virtual_factors is None else material.virtual_factors * shares

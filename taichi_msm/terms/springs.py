@@ -1,0 +1,376 @@
+"""Springs between neighbours: along rows, along columns and along both diagonals of a cell.
+
+Scene: `springs.structural`, `springs.shear` and `springs.map`, or `tissue.young`, `thickness`, `pretension` and `map`.
+
+The force of P on its neighbour Q is, with q = u_P - u_Q and the rest vector o from Q to P,
+
+    k (L - L0) (P - Q) / L = k (L^2 - L0^2) / (L^2 + L0 L) (o + q),    L^2 - L0^2 = q (q + 2 o)         (eq. 2)
+
+which keeps the digits of a small motion on a large sheet. The force of Q on P is the opposite, to the bit.
+
+Of a tissue each cell, dx by dy, adds to the springs along its edges and diagonals (f: the factor of the map there)
+
+    along x     f E t (9/8 dy/dx - 3/8 dx/dy) / 2        along y: the same with x and y exchanged
+    diagonals   f 3/16 E t (dx^2 + dy^2) / (dx dy)
+
+so that the lattice is an isotropic sheet in plane stress. Springs impose its Poisson's ratio of 1/3; docs/model.md has
+the derivation.
+
+Under a tension S each spring pulls at rest with tau L. Here tau = k1 e, where k1 is its stiffness for f = 1 and
+e = S / (3/2 E t). Its force, less that at rest, which cancels, is
+
+    (k - tau) (1 - L0 / L) (o + q) + tau q
+
+and its energy ((k - tau) (L - L0)^2 + tau q^2) / 2.
+"""
+
+# No `from __future__ import annotations` here: Taichi reads the annotations of a kernel.
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Any, ClassVar
+
+import numpy as np
+from numpy.typing import NDArray
+from typing_extensions import Self
+
+from taichi_msm.model.plan import Plan
+from taichi_msm.model.sheet import Material, largest_mean, spacing
+from taichi_msm.scene.scene import Scene
+from taichi_msm.scene.sheet import Sheet
+from taichi_msm.terms.base import AREA, DX, DY, HAS_LEFT, HAS_RIGHT, StepCode, Term
+
+# Families of springs.
+ALONG_ROW, ALONG_COLUMN, DIAGONAL = range(3)
+
+# Measures: the smallest and the largest (L^2 - L0^2) / L0^2; for every family the sum of (k - tau) (L / L0 - 1)^2;
+# and then, under tension, the sum of |q|^2 / L0^2.
+LEAST, MOST, STRETCHED, TENSE = 0, 1, 2, 5
+
+# Prevents a division by 0 at L = 0, where the force is then 0, as P - Q is. A literal in a kernel is always f32.
+TINY = 1e-36
+
+
+@dataclass(frozen=True)
+class SpringTerm(Term):
+    """Springs between neighbours."""
+
+    # structural, shear: whether there are springs along rows and columns, and along diagonals
+    structural: bool
+    shear: bool
+    open_edges: bool  # whether a point at an edge moves, so that springs beyond the edge must be left out
+    by_area: bool  # whether springs along such an edge are softer than others, because they belong to one cell
+    mapped: bool  # whether the stiffness of every spring is read from an array; it is 0 where there is no spring
+    tense: bool  # whether the sheet is under tension at rest
+
+    reach: ClassVar[int] = 1
+    # k - tau, and then tau, of each family.
+    numbers_count: ClassVar[int] = 6
+    reductions: ClassVar[tuple[str, ...]] = ("min", "max", "sum", "sum", "sum", "sum", "sum", "sum")
+
+    @staticmethod
+    def derive(scene: Scene) -> dict[str, Any]:
+        """Take over the springs, or make a sheet of a tissue: see the module."""
+        tissue, springs = scene.tissue, scene.springs
+        if tissue is None:
+            assert springs is not None
+            return {"across": springs.structural, "down": springs.structural, "shear": springs.shear, "tension": 0.0}
+        dx, dy = spacing(scene.sheet)
+        membrane = tissue.young * tissue.thickness
+        return {
+            "across": membrane * (9 / 8 * dy / dx - 3 / 8 * dx / dy),
+            "down": membrane * (9 / 8 * dx / dy - 3 / 8 * dy / dx),
+            "shear": 3 / 16 * membrane * (dx * dx + dy * dy) / (dx * dy),
+            "tension": tissue.pretension / (1.5 * membrane),
+        }
+
+    @classmethod
+    def of(cls, plan: Plan) -> Self:
+        """Leave out the families that have no stiffness."""
+        material, open_edges = plan.material, plan.open_edges
+        return cls(
+            structural=max(material.across, material.down) > 0,
+            shear=material.shear > 0,
+            open_edges=open_edges,
+            by_area=open_edges and material.by_area,
+            mapped=material.factors is not None,
+            tense=material.tension > 0,
+        )
+
+    @staticmethod
+    def bound(material: Material, sheet: Sheet) -> float:
+        """Bound the part of m w^2 of the springs, as long as none is shorter than half its length [N/m].
+
+        The energy is a sum over cells. The springs of a cell have at most the energy k / 2 |q|^2, so that no mode of a
+        cell with a quarter of the points' mass at its corners has more than
+
+            m w^2 = 4 max(across + down, across + 2 shear, down + 2 shear)
+
+        and hence no mode of the sheet. If factors differ, each cell takes the share of a point's mass that it has of
+        the point's stiffness; the maximum is then multiplied by the largest mean of the factors around a point.
+        """
+        largest = 1.0
+        if material.factors is not None:
+            largest = largest_mean(material.factors) if material.by_area else float(material.factors.max())
+        return _unmapped_bound(material) * largest
+
+    @classmethod
+    def bounds(cls, plan: Plan) -> NDArray[Any] | float:
+        """Bound it point by point: with a map, each cell gives its corners a quarter of its own bound.
+
+        Tissue has fewer cells at a point at an edge. Springs along an edge are whole: the largest factor.
+        """
+        material, factors = plan.material, plan.material.factors
+        if factors is None:
+            factors = np.ones([count - 1 for count in plan.scene.sheet.points])
+        around = np.pad(factors, 1)
+        cells = np.stack([around[:-1, :-1], around[:-1, 1:], around[1:, :-1], around[1:, 1:]])
+        shares = cells.mean(axis=0) if material.by_area else cells.max(axis=0)
+        return _unmapped_bound(material) * shares
+
+    def numbers(self, plan: Plan) -> tuple[float, ...]:
+        """Give k - tau and tau of every family [N/m]."""
+        material = plan.material
+        less = 1 - material.tension
+        return material.across * less, material.down * less, material.shear * less, *material.tensions
+
+    def energy(self, sums: NDArray[Any], plan: Plan) -> float:
+        """Give twice the energy [J]."""
+        dx, dy = spacing(plan.scene.sheet)
+        squares = np.array([dx**2, dy**2, dx**2 + dy**2])
+        return float((sums[STRETCHED:TENSE] + plan.material.tensions * sums[TENSE:]) @ squares)
+
+    def between(self, code: StepCode) -> tuple[Callable[..., Any], ...]:
+        """Make the functions for the forces of springs along a row and to another one, and for their stiffness."""
+        ti = code.ti
+        tense, mapped, by_area = self.tense, self.mapped, self.by_area and not self.mapped
+        leaves_out, real, first = self.open_edges and not self.mapped, code.real, code.first_number(SpringTerm)
+        first_tension = first + 3
+
+        @ti.func
+        def pull(weighted, square, length, to: ti.template(), tension, q: ti.template()):
+            """Force along the deformed spring, from k (L^2 - L0^2) and L^2, plus tension times the difference q."""
+            share = weighted / (square + length * ti.sqrt(square))
+            force = [share * to[c] for c in ti.static(range(3))]
+            if ti.static(tense):
+                for c in ti.static(range(3)):
+                    force[c] += tension * q[c]
+            return force
+
+        @ti.func
+        def along(sheet: ti.template(), right, here: ti.template(), k, exists):
+            """Force of a point displaced by `here` on its right neighbour, in entry `right` of u; exists: 0 if none."""
+            dx = sheet.numbers[DX]
+            x, y, z = here[0] - sheet.u[0][right], here[1] - sheet.u[1][right], here[2] - sheet.u[2][right]
+            to_x = x - dx
+            rest = y * y + z * z
+            weighted = k * (x * (to_x - dx) + rest)
+            if ti.static(leaves_out):
+                weighted *= exists
+            tension = sheet.numbers[first_tension + ALONG_ROW]
+            return pull(weighted, to_x * to_x + (rest + TINY), dx, [to_x, y, z], tension, [x, y, z])
+
+        @ti.func
+        def to_other_row(sheet: ti.template(), entry, right: ti.template(), here: ti.template(), up, length, k, exists):
+            """Force of a point displaced by `here` on that in `entry`, `right` columns on in the row above."""
+            x, y, z = here[0] - sheet.u[0][entry], here[1] - sheet.u[1][entry], here[2] - sheet.u[2][entry]
+            to_x = x
+            to_y = y - up
+            rest = z * z
+            longer = x * x + (y * (to_y - up) + rest)
+            if ti.static(right != 0):
+                to_x = x - right * sheet.numbers[DX]
+                longer = x * (to_x - right * sheet.numbers[DX]) + (y * (to_y - up) + rest)
+            weighted = k * longer
+            if ti.static(leaves_out):
+                weighted *= exists
+            tension = sheet.numbers[first_tension + ti.static(DIAGONAL if right else ALONG_COLUMN)]
+            square = to_x * to_x + to_y * to_y + (rest + TINY)
+            return pull(weighted, square, length, [to_x, to_y, z], tension, [x, y, z])
+
+        @ti.func
+        def of_row(sheet: ti.template(), i, kind, b):
+            """Stiffness of the spring to the right of entry b of row i; one along an edge belongs to one cell."""
+            if ti.static(mapped):
+                return sheet.stiffness[i * sheet.width + b]
+            elif ti.static(by_area):  # noqa: RET505  # Taichi would compile the rest as well.
+                return sheet.numbers[first + ALONG_ROW] * ti.select(kind == 1, ti.cast(1, real), ti.cast(0.5, real))
+            else:
+                return sheet.numbers[first + ALONG_ROW]
+
+        @ti.func
+        def of_column(sheet: ti.template(), lower, b):
+            """Stiffness of the spring between entry b of row `lower` and the row before."""
+            if ti.static(mapped):
+                return sheet.stiffness[(sheet.rows + lower) * sheet.width + b]
+            elif ti.static(by_area):  # noqa: RET505
+                return sheet.numbers[first + ALONG_COLUMN] * sheet.by_column[(AREA + 1) * sheet.width + b]
+            else:
+                return sheet.numbers[first + ALONG_COLUMN]
+
+        @ti.func
+        def of_diagonal(sheet: ti.template(), lower, b):
+            """Stiffness of the diagonals of the cell right of entry b, between row `lower` and the row before."""
+            if ti.static(mapped):
+                return sheet.stiffness[(2 * sheet.rows + 1 + lower) * sheet.width + b]
+            else:  # noqa: RET505
+                return sheet.numbers[first + DIAGONAL]
+
+        return along, to_other_row, of_row, of_column, of_diagonal
+
+    def tangent(self, code: StepCode) -> Callable[..., Any]:
+        """Make the function that differentiates the force of a point P on its neighbour Q.
+
+        As u_P - u_Q changes from q by p, the force of k - tau and tau changes by
+
+            (k - tau) (s p + (1 - s) ((o + q) . p) (o + q) / L^2) + tau p,    s = 1 - L0 / L
+
+        which is symmetric. The product of the force with p changes with k - tau by s (o + q) . p, with tau by q . p.
+        """
+        ti, tense = code.ti, self.tense
+
+        @ti.func
+        def differentiate(q: ti.template(), p: ti.template(), x0, y0, length, k, tension):
+            """Give the change of the force, x, y and z; and of its product with p by k - tau and by tau."""
+            to = [q[0] + x0, q[1] + y0, q[2]]
+            square = to[0] * to[0] + to[1] * to[1] + (to[2] * to[2] + TINY)
+            longer = q[0] * (to[0] + x0) + (q[1] * (to[1] + y0) + q[2] * q[2])
+            both = square + length * ti.sqrt(square)
+            # One division in the place of two.
+            inverse = 1 / (square * both)
+            share = longer * square * inverse
+            along = to[0] * p[0] + to[1] * p[1] + to[2] * p[2]
+            straight, turned = k * share, k * ((1 - share) * both * inverse * along)
+            if ti.static(tense):
+                straight += tension
+            change = [straight * p[c] + turned * to[c] for c in ti.static(range(3))]
+            apart = q[0] * p[0] + q[1] * p[1] + q[2] * p[2]
+            return [change[0], change[1], change[2], share * along, apart]
+
+        return differentiate
+
+    def pulling(self, code: StepCode) -> Callable[..., Any]:
+        """Make the function that gives the square of the largest force of the springs to the right and below."""
+        ti = code.ti
+        structural, shear, vector = self.structural, self.shear, code.vector
+        along, to_other_row, of_row, of_column, of_diagonal = self.between(code)
+
+        @ti.func
+        def stronger(largest, force: ti.template()):
+            """Give the larger of a square and that of a force."""
+            return ti.max(largest, force[0] * force[0] + force[1] * force[1] + force[2] * force[2])
+
+        @ti.func
+        def pull(sheet: ti.template(), entry: ti.template()):
+            row = ti.static(entry.row)
+            u = ti.static(entry.u)
+            b, largest = entry.b, vector(0)
+            # Beyond an edge there is no spring.
+            has_left, has_right = (
+                sheet.by_column[HAS_LEFT * sheet.width + b],
+                sheet.by_column[HAS_RIGHT * sheet.width + b],
+            )
+            dx, dy = sheet.numbers[DX], sheet.numbers[DY]
+            here, below, lower = row.i * sheet.width + b, (row.i + 1) * sheet.width + b, row.i + 1
+            if ti.static(structural):
+                k = vector(0) + of_row(sheet, row.i, row.kind, b)
+                largest = stronger(largest, along(sheet, here + 1, u, k * has_right, vector(1)))
+            if lower < sheet.rows:
+                if ti.static(structural):
+                    k = vector(0) + of_column(sheet, lower, b)
+                    largest = stronger(largest, to_other_row(sheet, below, 0, u, 0 - dy, dy, k, vector(1)))
+                if ti.static(shear):
+                    diagonal = ti.sqrt(dx * dx + dy * dy)
+                    for right, exists in ti.static(((-1, has_left), (1, has_right))):
+                        k = vector(0) + of_diagonal(sheet, lower, b + ti.static(min(right, 0)))
+                        force = to_other_row(sheet, below + right, right, u, 0 - dy, diagonal, k * exists, vector(1))
+                        largest = stronger(largest, force)
+            return largest
+
+        return pull
+
+    def measuring(self, code: StepCode) -> Sequence[Callable[..., None]]:
+        """Make the function that measures the springs to the right of an entry and to the row below it."""
+        ti = code.ti
+        tense, open_edges, vector, first = self.tense, self.open_edges, code.vector, code.first_measure(SpringTerm)
+        _, _, of_row, of_column, of_diagonal = self.between(code)
+        # Of every family that there is: rows and columns from one end to the other, for each of its springs.
+        structural = ((ALONG_ROW, 0, (1,)), (ALONG_COLUMN, 1, (0,))) if self.structural else ()
+        families = structural + (((DIAGONAL, 1, (-1, 1)),) if self.shear else ())
+
+        @ti.func
+        def longer(sheet: ti.template(), p, q, b, right: ti.template(), x0, y0):
+            """(L^2 - L0^2) / L0^2 and |q|^2 / L0^2 of the spring from entry b of row p to entry b + right of row q."""
+            here, there = p * sheet.width + b, q * sheet.width + b + right
+            x = sheet.u[0][there] - sheet.u[0][here]
+            y = sheet.u[1][there] - sheet.u[1][here]
+            z = sheet.u[2][there] - sheet.u[2][here]
+            square = x0 * x0 + y0 * y0
+            share = (x * (x + 2 * x0) + (y * (y + 2 * y0) + z * z)) / square
+            apart = (x * x + y * y + z * z) / square
+            # Beyond the edge there is no spring.
+            if ti.static(open_edges and right != 0):
+                side = ti.static(HAS_LEFT if right < 0 else HAS_RIGHT)
+                share = ti.select(sheet.by_column[side * sheet.width + b] > 0, share, vector(0))
+            return share, apart
+
+        @ti.func
+        def measure(measures: ti.template(), sheet: ti.template(), p, i, kind, b):
+            dx, dy = sheet.numbers[DX], sheet.numbers[DY]
+            for family, down, rights in ti.static(families):
+                if i + down < sheet.rows:
+                    stretched, tense_part = vector(0), vector(0)
+                    for right in ti.static(rights):
+                        k = vector(0)
+                        if ti.static(family == ALONG_ROW):
+                            k += of_row(sheet, i, kind, b)
+                        elif ti.static(family == ALONG_COLUMN):
+                            k += of_column(sheet, i + 1, b)
+                        else:
+                            k += of_diagonal(sheet, i + 1, b + ti.static(min(right, 0)))
+                        share, apart = longer(sheet, p, p + down, b, right, right * dx, -down * dy)
+                        measures[first + LEAST] = ti.min(measures[first + LEAST], share)
+                        measures[first + MOST] = ti.max(measures[first + MOST], share)
+                        # L / L0 - 1; rounding may put the share below -1.
+                        stretch = share / (1 + ti.sqrt(ti.max(share + 1, vector(0))))
+                        stretched += stretch * stretch * k
+                        tense_part += apart
+                    measures[first + STRETCHED + family] += stretched
+                    if ti.static(tense):
+                        measures[first + TENSE + family] += tense_part
+
+        return (measure,)
+
+    def laid_out(self, plan: Plan) -> NDArray[Any] | None:
+        """Give the array of stiffness: k - tau of every spring [N/m], shape (stiffness_rows, cols); None without a map.
+
+        Along rows come as many rows as the sheet has; along columns and diagonals one more, of which the first and the
+        last are zeros, as are the entries of springs beyond the last column.
+        """
+        material = plan.material
+        if material.factors is None:
+            return None
+        pads = ((0, 0), (0, 1)), ((1, 1), (0, 0)), ((1, 1), (0, 1))
+        families = zip(stiffness(material, material.factors), material.tensions, pads, strict=True)
+        return np.concatenate([np.pad(np.maximum(k - tension, 0), pad) for k, tension, pad in families])
+
+
+def _unmapped_bound(material: Material) -> float:
+    """Bound m w^2 where the factor of the map is 1: see `SpringTerm.bound` [N/m]."""
+    across, down, shear = material.across, material.down, material.shear
+    return 4 * max(across + down, across + 2 * shear, down + 2 * shear)
+
+
+def stiffness(material: Material, factors: NDArray[Any]) -> tuple[NDArray[Any], NDArray[Any], NDArray[Any]]:
+    """Assemble the stiffness k of every spring from the factors of its cells, shape (rows - 1, cols - 1) [N/m].
+
+    Along rows, shape (rows, cols - 1); along columns, shape (rows - 1, cols); along both diagonals of a cell.
+    """
+    above_and_below, beside = np.pad(factors, ((1, 1), (0, 0))), np.pad(factors, ((0, 0), (1, 1)))
+    across = material.across / 2 * (above_and_below[:-1] + above_and_below[1:])
+    down = material.down / 2 * (beside[:, :-1] + beside[:, 1:])
+    if not material.by_area:
+        # A spring at an edge is as stiff as any other: with the factor of its only cell, not with half of it.
+        across[[0, -1]] *= 2
+        down[:, [0, -1]] *= 2
+    return across, down, material.shear * factors
