@@ -9,9 +9,9 @@ from types import ModuleType
 from typing import Any
 
 import pytest
-import taichi_msm.runs.run
 
 import taichi_msm
+import taichi_msm.runs.run
 from taichi_msm import load_scene, terms
 from taichi_msm.cli.main import main
 from taichi_msm.model import plan, sheet

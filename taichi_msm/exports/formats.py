@@ -23,7 +23,7 @@ class Format(NamedTuple):
 
     means: str  # what it is for, in few words
     needs: tuple[str, ...]  # the entries of a scene's `output` that it is made from
-    files: tuple[str, ...]  # their names as regular expressions, for `entries.files`
+    files: tuple[str, ...]  # their names as regular expressions, for `directory.files`
     uses: tuple[str, ...] = ()  # further entries of `output`, of which it would have more
     pairs: bool = False  # whether it numbers pairs of frames, not runs
     cameras: tuple[str, ...] = ()  # what it shows: nothing that a camera sees, ANY camera, or those of these names

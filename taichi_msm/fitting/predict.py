@@ -93,7 +93,7 @@ class Predictor:
             x: of every parameter.
             steps: of a frame, as of a run that this one is compared with, if it needs no more; None: so many that
                 runs with neighbouring values can have them too.
-            coarse: how many times to halve the cells a side; a SceneError where `mesh_error.coarser` gives None.
+            coarse: how many times to halve the cells a side; a SceneError where `mesh.coarser` gives None.
             whole: go on to the last frame, even if nothing was seen there.
             pause: called some times a second; what it raises stops it.
 

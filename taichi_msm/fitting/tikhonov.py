@@ -198,7 +198,7 @@ class Search:
 
 
 class Fields:
-    """R x R fields of a map, and the cells of a sheet, which get what `material.map_factors` gives of such a picture.
+    """R x R fields of a map, and the cells of a sheet, which get what `sheet.map_factors` gives of such a picture.
 
     Args:
         resolution: R.

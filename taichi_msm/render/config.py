@@ -83,7 +83,7 @@ class DrawingConfig(NamedTuple):
 
     @property
     def place_planes(self) -> int:
-        """Vectors of the table of places per tile: x and y, what changes them (places.py), a box; 0 without a lens."""
+        """Vectors of the table of places per tile: x, y, their changes (lens_table.py), and a box; 0 without a lens."""
         return (6 if self.place_steps else 2) + (not self.unordered) if self.lens else 0
 
     @property

@@ -396,7 +396,7 @@ def headlight(normal: ti.template(), numbers: ti.template()):
 
 @ti.func
 def footprint(at, x, y, s, t, texels_x, texels_y, triangle: ti.template(), band: ti.template()):
-    """Square of the larger of a sample's width and height on the texture, in units of style.SHARP texels.
+    """Square of the larger of a sample's width and height on the texture, in units of uniforms.SHARP texels.
 
     With x = X / w the derivatives of (x, y) with respect to (s, t) are (R_1, D_1; R_2, D_2) / w, where
     R_1 = R_x - x R_w and so on; those of (s, t) with respect to (x, y) are the inverse. Also gives 1 where the front of

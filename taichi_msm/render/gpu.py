@@ -48,7 +48,7 @@ STORED = BENT + BENT_NUMBERS
 
 
 class Threads:
-    """The memory of one sheet's pictures on a GPU, and their kernels; arguments as for `rasterizer_cpu.Bands`."""
+    """The memory of one sheet's pictures on a GPU, and their kernels; arguments as for `cpu.Bands`."""
 
     def __init__(
         self, config: DrawingConfig, points: tuple[int, int], size: tuple[int, int], texels: NDArray[np.float32]
@@ -73,13 +73,13 @@ class Threads:
         self._labels = launches.array(np.float32, max(numbers * width * height, 1))
 
     def place(self, places: NDArray[np.float32]) -> None:
-        """Take the places of the samples of the pictures that follow, as `rasterizer_cpu.Bands.place` does."""
+        """Take the places of the samples of the pictures that follow, as `cpu.Bands.place` does."""
         write(self._samples, places.reshape(-1, 1))
 
     def draw(
         self, position: NDArray[np.float32], numbers: NDArray[np.float32], sizes: NDArray[np.int32]
     ) -> tuple[NDArray[np.uint8], NDArray[np.float32]]:
-        """Draw as `rasterizer_cpu.Bands.draw` does; raises a DeviceError when the device cut threads short."""
+        """Draw as `cpu.Bands.draw` does; raises a DeviceError when the device cut threads short."""
         launches, factor = Launches(bounded=True), self._config.supersample
         (width, height), rods = self._size, int(sizes[uni.ROD_COUNT])
         across, down = width * factor, height * factor

@@ -1,7 +1,7 @@
 """Lenses that bend lines, in kernels: where a place is seen, and the bounds of what a cell or a triangle covers.
 
-The formulas are those of lens.py, the bounds those of `places.Visible`. A place is what a camera without the lens sees
-there, in samples of its picture.
+The formulas are those of camera.py, the bounds those of `lens_table.Visible`. A place is what a camera without the lens
+sees there, in samples of its picture.
 """
 
 from taichi_msm.render import uniforms as uni

@@ -1,8 +1,8 @@
 """Kernel 2: bilinear refinement, projection, rasterisation of textured triangles, shading.
 
 It finds what each sample of the picture shows: the sheet (coverage.py) or an instrument in front of it
-(instrument_coverage.py). From that it writes the colours of pixels, their labels, or both (shading.py). Samples are
-shared among the workers of a CPU in bands (rasterizer_cpu.py), and are threads of a GPU (rasterizer_gpu.py). As in
+(coverage.py). From that it writes the colours of pixels, their labels, or both (shading.py). Samples are
+shared among the workers of a CPU in bands (cpu.py), and are threads of a GPU (gpu.py). As in
 kernel 1, vectors stay vectors down to the machine code (docs/decisions/0010), and casts, floor and abs of vectors are
 written to allow this.
 """

@@ -14,7 +14,7 @@ M = 2 (N L) N - L the direction into which light from L is reflected:
 d is the distance from P to the light, and d0 that from the point in the middle of the picture; there, a flat sheet that
 faces the camera keeps its colours. Light wraps around the surface, as scattering in tissue makes it do, so no side of a
 dent is black. An instrument shades tissue near it: at r times its radius from its axis it takes away the share
-style.SHADE / r^2 of the light.
+uniforms.SHADE / r^2 of the light.
 
 Normals are lists, and may have any length.
 

@@ -80,7 +80,7 @@ TOUCHING = 52
 TOUCHING_SHARE = 1e-9  # this distance as a fraction of the sheet's larger side
 
 # The lens: its coefficients; how far from the axis of view it is taken [m], at w = 1; where the axis is seen [samples],
-# and samples per metre at w = 1; the numbers of `places.Visible`, in samples.
+# and samples per metre at w = 1; the numbers of `lens_table.Visible`, in samples.
 LENS, LENS_RADIUS, PICTURE_X, PICTURE_Y, FOCAL_X, FOCAL_Y, VISIBLE, BEND, STRETCH = 53, *range(61, 67), 70, 71
 
 # The light's place toward the camera, in its frame [m]; the direction to the headlight, in the world.

@@ -49,7 +49,7 @@ Listed = Callable[[str], bool]
 
 
 class Contents(NamedTuple):
-    """What is published in a directory: the results of a run, or an export. Patterns are those of `entries.files`."""
+    """What is published in a directory: the results of a run, or an export. Patterns are those of `directory.files`."""
 
     name: str  # what writes it, in messages
     record: str  # the file that lists what was written

@@ -205,7 +205,7 @@ def steps_per_frame(time: Time, limit: float) -> int:
     """Count the steps of one frame.
 
     auto: the fewest whose step is at most half the stability limit. A given step is rounded to a fraction of a frame.
-    A tolerance may ask for more steps, which `error_control.choose_step` finds. At rest a frame counts as a step.
+    A tolerance may ask for more steps, which `time_step.choose_step` finds. At rest a frame counts as a step.
     """
     if time.at_rest:
         return 1

@@ -253,7 +253,7 @@ class Task(NamedTuple):
 def take(task: Task, progress: Progress = lambda stage, done, total: None) -> Outcome:
     """Run a scene with its overrides on one thread, as `run --set` does; whatever fails is in the outcome.
 
-    `progress` is called some times a second; it may raise a KeyboardInterrupt, as from `runner.run`.
+    `progress` is called some times a second; it may raise a KeyboardInterrupt, as from `runs.run.run`.
     """
     os.chdir(task.home)
     try:

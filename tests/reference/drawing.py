@@ -96,7 +96,7 @@ class Seen(NamedTuple):
         depth: along the direction of view [m]; infinite where nothing is.
         u, v: the material point, fractions of the sheet's width and height from its upper left; NaN where none is.
         wire: share of the mesh lines in the colour.
-        footprint: the larger of a sample's width and height on the texture, in units of style.SHARP texels.
+        footprint: the larger of a sample's width and height on the texture, in units of uniforms.SHARP texels.
         front: 1 where the front of the triangle is seen, else -1.
         facet: normal of the triangle's front in the world [m^2], shape (height, width, 3); NaN where none is.
     """
@@ -177,7 +177,7 @@ def triangles(surface: Array) -> Iterator[Array]:
 
 
 def footprint(triangle: Array, at: Sampled, texels: tuple[int, int]) -> Array:
-    """Give the larger of a sample's width and height on the texture, in units of style.SHARP texels.
+    """Give the larger of a sample's width and height on the texture, in units of uniforms.SHARP texels.
 
     It is found by finite differences over a thousandth of a sample.
 

@@ -100,7 +100,7 @@ def minified(texture: NDArray[np.uint8], u: Array, v: Array, footprint: Array) -
         texture: colours, shape (height, width, 3).
         u: 0 at the left edge to 1 at the right one, any shape.
         v: 0 at the top edge to 1 at the bottom one, the same shape.
-        footprint: the larger of a sample's width and height on the texture, in units of style.SHARP texels; the same
+        footprint: the larger of a sample's width and height on the texture, in units of uniforms.SHARP texels; the same
             shape.
 
     Returns:
@@ -204,7 +204,7 @@ def tissue(
     place: tuple[Array, Array, Array],
     rods: Sequence[Rod],
 ) -> Array:
-    """Shade wet tissue; see `render/lighting.py`.
+    """Shade wet tissue; see `render/shading.py`.
 
     Args:
         scene: the scene.
