@@ -11,7 +11,7 @@ random, by no more than these forces would move it. Where the balance is stable 
 motion. Where it is not, the forces do not vanish, and FIRE goes on to where the sheet buckles. Only a sheet with
 springs that are pressed together, or on a rod, can give way; there the search goes on to the share SURE, for up to four
 times the evaluations. So a weak instability may go unnoticed: 1 % above a critical load, but not 3 %
-(tests/test_rest.py).
+(tests/solver/test_rest.py).
 
 Where nothing holds the sheet or is in its way any more, it is flat: without tension it has no stiffness out of its
 plane, so that the forces would never tell the way back.

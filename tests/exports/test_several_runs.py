@@ -1,0 +1,231 @@
+"""One export of several runs, and of a sweep's folder, holds what exports of each run hold."""
+
+from __future__ import annotations
+
+import csv
+import json
+import pickle
+import shutil
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+import taichi_msm
+from taichi_msm import ArgumentError, FilesError
+from taichi_msm.exports import tapvid
+from taichi_msm.exports.export import export
+from tests.conftest import Program
+from tests.outputs import files
+from tests.runs.test_finished import change, rewrite
+
+FRAMES, WIDTH, HEIGHT = 5, 40, 30
+
+
+@pytest.fixture
+def pair(results: Path, monkeypatch: pytest.MonkeyPatch) -> list[str]:
+    """Two runs that differ in all that is exported; the second has two frames less. The current folder is theirs."""
+    monkeypatch.chdir(results.parent)
+    for seed, (name, frames) in enumerate([("a", FRAMES), ("b", FRAMES - 2)]):
+        run = Path(shutil.copytree(results, name))
+        rng = np.random.default_rng(seed)
+        change(run, frames=frames)
+        rewrite(run, edit=lambda position, seed=seed, frames=frames: with_motion(position[:frames], seed))
+        (run / "flow").mkdir()
+        for number in range(frames - 1):
+            flow = rng.normal(0, 9, (HEIGHT, WIDTH, 2)).astype("<f4")
+            head = np.float32(202021.25).tobytes() + np.array([WIDTH, HEIGHT], "<i4").tobytes()
+            (run / "flow" / f"{number:04}.flo").write_bytes(head + flow.tobytes())
+        points = rng.uniform(0, 30, (6, frames, 2)).astype(np.float32)
+        np.savez(run / "tracks.npz", points=points, occluded=np.zeros((6, frames), bool))
+    return ["a", "b"]
+
+
+def with_motion(position: NDArray[Any], seed: int) -> NDArray[Any]:
+    position[1:, ..., 2] -= 1e-3 * seed
+    return position
+
+
+def index(out: Path) -> list[list[str]]:
+    with (out / "index.csv").open(newline="", encoding="utf-8") as file:
+        return list(csv.reader(file))
+
+
+def contents(out: Path) -> dict[str, bytes]:
+    """The files of an export but those that are about all."""
+    return {name: data for name, data in files(out).items() if name not in ("index.csv", "export.json")}
+
+
+@pytest.mark.parametrize("name", ["vtk", "gltf", "obj"])
+def test_each_run_has_a_folder_of_its_own(name: str, pair: list[str], tmp_path: Path) -> None:
+    pytest.importorskip("vtkmodules" if name == "vtk" else "numpy")
+    export(pair, name, "all")
+    expected: dict[str, bytes] = {}
+    for number, run in enumerate(pair):
+        export(run, name)
+        assert index(Path(run, f"export-{name}")) == [["number", "run"], ["000000", run]]
+        alone = contents(Path(run, f"export-{name}"))
+        expected |= {f"{number:06}/{path}": data for path, data in alone.items()}
+    assert contents(Path("all")) == expected
+    assert index(Path("all")) == [["number", "run"], ["000000", "a"], ["000001", "b"]]
+    assert json.loads(Path("all", "export.json").read_text())["files"] == sorted([*expected, "index.csv"])
+
+
+def test_pairs_of_frames_are_numbered_through(pair: list[str]) -> None:
+    export(pair, "kitti", "all")
+    pairs = [*(("a", frame) for frame in range(FRAMES - 1)), *(("b", frame) for frame in range(FRAMES - 3))]
+    rows = [[f"{number:06}", run, str(frame)] for number, (run, frame) in enumerate(pairs)]
+    assert index(Path("all")) == [["number", "run", "frame"], *rows]
+    alone = {run: contents(export(run, "kitti").directory) for run in pair}
+    expected: dict[str, bytes] = {}
+    for number, (run, frame) in enumerate(pairs):
+        of_pair = {path: data for path, data in alone[run].items() if f"/{frame:06}_1" in path}
+        expected |= {path.replace(f"/{frame:06}", f"/{number:06}"): data for path, data in of_pair.items()}
+    assert contents(Path("all")) == expected
+
+
+def test_videos_are_named_by_their_numbers(pair: list[str]) -> None:
+    export(pair, "tapvid", "all")
+    videos = pickle.loads(Path("all", "tapvid.pkl").read_bytes())
+    assert list(videos) == ["000000", "000001"]
+    for run, video in zip(pair, videos.values(), strict=True):
+        export(run, "tapvid", Path(run, "alone"))
+        alone = pickle.loads(Path(run, "alone", "tapvid.pkl").read_bytes())[run]
+        assert alone.keys() == video.keys()
+        for key, values in alone.items():
+            np.testing.assert_array_equal(video[key], values)
+
+
+def test_all_videos_together_must_fit_into_memory(pair: list[str], monkeypatch: pytest.MonkeyPatch) -> None:
+    need = 2 * 3 * (FRAMES + FRAMES - 2) * WIDTH * HEIGHT
+    monkeypatch.setattr(tapvid, "available_memory", lambda: need - 1)
+    said = r"^the videos of 2 runs take 0\.0 GiB of memory, and 0\.0 are free; export fewer runs at a time"
+    with pytest.raises(FilesError, match=said):
+        export(pair, "tapvid", "all")
+    monkeypatch.setattr(tapvid, "available_memory", lambda: need)
+    export(pair, "tapvid", "all")
+
+
+def test_progress_counts_the_frames_of_all_runs(pair: list[str]) -> None:
+    calls: list[tuple[int, int]] = []
+    export(pair, "obj", "all", lambda done, total: calls.append((done, total)))
+    assert calls == [(done, 8) for done in (0, *range(8))]
+
+
+def test_an_export_of_several_runs_and_one_of_one_replace_each_other(pair: list[str]) -> None:
+    out = Path("all")
+    for runs in (pair, pair[:1], pair):
+        # What a process that was killed had begun.
+        for name in ("new/000001/0000.obj", "new/index.csv"):
+            (out / ".partial" / name).parent.mkdir(parents=True, exist_ok=True)
+            (out / ".partial" / name).write_text("half")
+        done = export(runs, "obj", out)
+        assert set(files(out)) == {*done.files, "export.json"}
+    assert sorted(path.name for path in out.iterdir()) == ["000000", "000001", "export.json", "index.csv"]
+
+
+def test_a_run_that_cannot_be_exported_leaves_the_earlier_export(pair: list[str]) -> None:
+    export(pair, "obj", "all")
+    before = files(Path("all"))
+    Path("b", "trajectory.npz").write_bytes(b"")
+    with pytest.raises(FilesError, match=r"^b/trajectory\.npz: damaged"):
+        export(pair, "obj", "all")
+    change(Path("b"), scene=json.loads(Path("a", "run.json").read_text())["scene"] | {"image": "gone.png"})
+    shutil.copy("a/trajectory.npz", "b")
+    change(Path("b"), frames=FRAMES)
+    with pytest.raises(FilesError, match=r"^b: image: .*gone\.png: no such file"):
+        export(pair, "obj", "all")
+    assert files(Path("all")) == before
+
+
+def test_a_run_that_is_replaced_while_it_is_read_is_noticed(pair: list[str]) -> None:
+    def replace(done: int, total: int) -> None:
+        if done == FRAMES:
+            change(Path("b"), frames=FRAMES - 1)
+
+    with pytest.raises(FilesError, match=r"^b: another run replaced these results while they were read; try again"):
+        export(pair, "obj", "all", replace)
+    assert not Path("all").exists()
+
+
+def test_notes_name_their_runs(pair: list[str]) -> None:
+    again = 'run the scene again with --set "output=[png,gif,trajectory,occlusion]"'
+    note = f"flow_noc is left out: occlusion is not among the results; {again}"
+    assert export("a", "kitti").notes == [note]
+    assert export(pair, "kitti", "all").notes == [f"a and 1 more: {note}"]
+    shutil.rmtree("b/frames")
+    image_2 = f"image_2 is left out: frames is not among the results; {again}"
+    assert export(pair, "kitti", "all").notes == [f"a and 1 more: {note}", f"b: {image_2}"]
+
+
+@pytest.fixture
+def sweep(pair: list[str]) -> Path:
+    """A sweep of five runs, of which two are complete, two have failed and one is missing."""
+    for number, (run, status) in enumerate([("a", "diverged"), ("a", "complete"), ("a", "interrupted")]):
+        change(Path(shutil.copytree(run, f"sweep/runs/{number:06}")), status=status)
+    shutil.copytree("b", "sweep/runs/1000000")
+    Path("sweep", "sweep.json").write_text('{"values": [[], [], [], [], []]}')
+    return Path("sweep")
+
+
+def test_complete_runs_of_a_sweep_are_exported(sweep: Path, program: Program) -> None:
+    done = program("export", "sweep", "--format", "kitti", "--json")
+    assert (done.returncode, done.stderr) == (0, "")
+    told = json.loads(done.stdout)
+    assert told["directory"] == "sweep/export-kitti"
+    assert told["notes"][0] == "left out, as not complete: 3 of 5 runs; table.csv of the sweep tells why"
+    rows = [("sweep/runs/000001", frame) for frame in range(4)] + [("sweep/runs/1000000", frame) for frame in range(2)]
+    expected = [[f"{number:06}", run, str(frame)] for number, (run, frame) in enumerate(rows)]
+    assert index(sweep / "export-kitti")[1:] == expected
+
+
+def test_sweeps_and_runs_go_together(sweep: Path, program: Program) -> None:
+    """A run that is named is taken, whatever its status, and links are not followed."""
+    (sweep / "runs" / "000003").symlink_to(Path("a").resolve())
+    done = program("export", "./sweep/runs/000002", "sweep", "b/", "--format", "gltf")
+    left_out = "left out, as not complete: 3 of 7 runs; table.csv of the sweep tells why"
+    assert (done.returncode, done.stdout, done.stderr) == (0, f"output/export-gltf: 5 files\n{left_out}\n", "")
+    runs = ["sweep/runs/000002", "sweep/runs/000001", "sweep/runs/1000000", "b"]
+    assert index(Path("output/export-gltf"))[1:] == [[f"{number:06}", run] for number, run in enumerate(runs)]
+    assert export(sweep / "runs" / "000000", "obj").notes == []
+
+
+def test_what_a_sweep_lacks_is_named_with_the_remedy(sweep: Path, program: Program) -> None:
+    shutil.rmtree(sweep / "runs" / "1000000" / "flow")
+    done = program("export", "sweep", "--format", "kitti")
+    remedy = "run the sweep into a new folder with `set: {output: [png,gif,trajectory,flow,occlusion]}` in its file"
+    assert (done.returncode, done.stderr) == (4, f"sweep/runs/1000000: kitti needs flow; {remedy}\n")
+    Path("sweep", "sweep.json").write_text("?")
+    done = program("export", "sweep", "--format", "kitti")
+    assert (done.returncode, done.stderr.count("\n")) == (4, 1)
+    assert done.stderr.startswith("sweep/sweep.json: damaged")
+    Path("sweep", "sweep.json").write_text('{"values": [[]]}')
+    for folder in ("000001", "1000000"):
+        shutil.rmtree(sweep / "runs" / folder)
+    done = program("export", "sweep", "--format", "obj")
+    assert (done.returncode, done.stderr) == (4, "sweep: no run is complete; table.csv there tells why\n")
+
+
+def test_wrong_arguments_are_told_of(results: Path) -> None:
+    known = "take one of kitti, tapvid, tapvid3d, stir, vtk, gltf, obj, csv"
+    wrong: list[tuple[tuple[Any, ...], str]] = [
+        ((results, "glft"), f"format: 'glft'; {known}; did you mean 'gltf'?"),
+        ((results, ["obj"]), f"format: ['obj']; {known}; did you mean 'obj'?"),
+        (([], "obj"), "runs: []; take the folder of a run or of a sweep, or several"),
+        ((3, "obj"), "directory: 3; take a path"),
+        (([results, None], "obj"), "directory: None; take a path"),
+        ((results, "obj", 3), "directory: 3; take a path"),
+    ]
+    for arguments, said in wrong:
+        with pytest.raises(ArgumentError) as caught:
+            taichi_msm.export(*arguments)
+        assert str(caught.value) == said
+
+
+def test_a_default_folder_that_is_a_link_is_refused(pair: list[str]) -> None:
+    Path("elsewhere").mkdir()
+    Path("output").symlink_to("elsewhere")
+    with pytest.raises(FilesError, match=r"^output: a symbolic link; name the folder it leads to with --out"):
+        export(pair, "obj")

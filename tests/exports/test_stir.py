@@ -1,0 +1,205 @@
+"""What STIR's own loader reads of our files.
+
+Its requirements, restated (athaddius/STIRLoader, STIRLoader/STIRLoader.py at 7e7f87c):
+
+- lines 39 to 53: the data folder holds a folder for each recording, in it left*, and there seq*;
+- lines 69 to 80: the folder of the right camera has the name of the left one with left replaced by right;
+- lines 154 to 160: frames/*.mp4 is one film on each side; lines 128 to 134: its name begins with whole milliseconds,
+  from and to, each before "ms-";
+- lines 180 to 188: calib.json has camera matrices, distortions, translation and rotation; lines 194 to 196: the
+  right distortion is 0;
+- lines 23 to 36, 197 and 475: places are (x, y, disparity, 1) times Q, whose last row is -1 over the first number of
+  the translation in millimetres: it must be negative for places before the camera;
+- lines 204 to 245: segmentation/icgstartseg.png, icgendseg.png, *_icgstart.png and *_icgend.png;
+- lines 260 to 281: a point is the centre of the box around what is connected and not 0, at whole numbers,
+  x + width // 2 and y + height // 2, counted from the first pixel;
+- lines 382 to 401: a point's other picture has it within 10 rows, with a disparity of 8 to 105 px;
+- lines 582 to 587 and 695 to 706: films have 1280 x 1024 pixels.
+"""
+
+from __future__ import annotations
+
+import json
+import sys
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+from PIL import Image
+from scipy import ndimage
+
+from taichi_msm import FilesError, NotInstalledError, export
+from taichi_msm.scene import outputs
+from tests.conftest import Program
+from tests.exports.test_cameras import alone, describe
+
+av: Any = pytest.importorskip("av")
+
+FRAMES, WIDTH, HEIGHT, BASELINE = 5, 320, 256, 0.008
+
+
+def sequences(data: Path) -> list[Path]:
+    return sorted(data.glob("*/left*/seq*"))
+
+
+def to_the_right(left: Path) -> Path:
+    return left.parents[1] / left.parent.name.replace("left", "right", 1) / left.name
+
+
+def film(sequence: Path) -> list[NDArray[np.uint8]]:
+    (path,) = sequence.glob("frames/*.mp4")
+    start, end, _ = path.name.split("ms-")
+    assert (int(start), int(end)) == (0, 400)
+    with av.open(str(path)) as container:
+        assert container.streams.video[0].codec_context.name == "h264"
+        return [frame.to_ndarray(format="rgb24") for frame in container.decode(video=0)]
+
+
+def centres(sequence: Path, part: str) -> NDArray[np.int64]:
+    """The marked points of a picture, row by row as found: x, y."""
+    mask = np.asarray(Image.open(sequence / f"segmentation/icg{part}seg.png"))
+    assert mask.shape == (HEIGHT, WIDTH)
+    assert set(np.unique(mask)) == {0, 255}
+    boxes = ndimage.find_objects(ndimage.label(mask, np.ones((3, 3)))[0])
+    return np.array([[each.start + (each.stop - each.start) // 2 for each in (box[1], box[0])] for box in boxes])
+
+
+def tracks(folder: Path) -> dict[str, Any]:
+    with np.load(folder / "tracks.npz") as archive:
+        return dict(archive)
+
+
+def test_the_loader_finds_films_and_calibration(stereo: Path) -> None:
+    done = export(stereo, "stir")
+    (left,) = sequences(done.directory)
+    assert left == done.directory / "000000/left/seq00"
+    for side in (left, to_the_right(left)):
+        shown = film(side)
+        assert (len(shown), shown[0].shape) == (FRAMES, (HEIGHT, WIDTH, 3))
+        for frame, part in ((0, "start"), (FRAMES - 1, "end")):
+            (picture,) = side.glob(f"*_icg{part}.png")
+            drawn = np.asarray(Image.open(stereo / side.parent.name / f"frames/{frame:04}.png"))
+            np.testing.assert_array_equal(np.asarray(Image.open(picture)), drawn)
+            # In light, as colours have half the resolution.
+            assert np.abs((shown[frame].astype(int) - drawn) @ (0.2126, 0.7152, 0.0722)).mean() < 3, "grey levels"
+    calibration = json.loads((left.parents[1] / "calib.json").read_text())
+    assert not np.any(calibration["rightdistortioncoeffs"])
+    np.testing.assert_array_equal(calibration["rotation"], np.eye(3))
+    np.testing.assert_allclose(calibration["translation"], [-BASELINE, 0, 0], rtol=1e-9)
+    described = json.loads((stereo / "left/camera.json").read_text())["intrinsics"]
+    for name in ("left", "right"):
+        # From our pixels to OpenCV's.
+        np.testing.assert_allclose(
+            np.subtract(described, calibration[f"{name}cameramat"]), [[0, 0, 0.5]] * 2 + [[0] * 3]
+        )
+
+
+def test_marked_points_are_the_tracked_ones(stereo: Path) -> None:
+    (left,) = sequences(export(stereo, "stir").directory)
+    count = set()
+    for side in (left, to_the_right(left)):
+        made = tracks(stereo / side.parent.name)
+        for frame, part in ((0, "start"), (-1, "end")):
+            found = centres(side, part)
+            count.add(len(found))
+            pixels = np.floor(made["points"][:, frame]).astype(int)
+            number = [np.flatnonzero((pixels == centre).all(axis=-1)) for centre in found]
+            assert all(len(each) == 1 for each in number)
+            assert not made["occluded"][np.concatenate(number), frame].any()
+    (marked,) = count
+    assert marked > 20
+
+
+def test_places_come_back_from_both_cameras(stereo: Path) -> None:
+    """As the loader computes them [mm], where the depth is off by as much as a pixel of disparity tells."""
+    (left,) = sequences(export(stereo, "stir").directory)
+    calibration = json.loads((left.parents[1] / "calib.json").read_text())
+    matrix, baseline = np.array(calibration["leftcameramat"]), calibration["translation"][0] * 1000
+    made = tracks(stereo / "left")
+    pose = np.array(json.loads((stereo / "left/camera.json").read_text())["pose"])
+    for frame, part in ((0, "start"), (-1, "end")):
+        other = centres(to_the_right(left), part)
+        for x, y in centres(left, part):
+            (n,) = np.flatnonzero((np.floor(made["points"][:, frame]) == (x, y)).all(axis=-1))
+            disparity = x - other[np.abs(other - (x, y)).sum(axis=-1).argmin(), 0]
+            w = -disparity / baseline
+            place = np.array([x - matrix[0, 2], y - matrix[1, 2], matrix[0, 0]]) / w
+            expected = 1000 * (pose @ np.append(made["position"][n, frame], 1))
+            assert abs(place[2] - expected[2]) < 1.01 * expected[2] ** 2 / (matrix[0, 0] * -baseline) / (
+                1 - 1 / disparity
+            )
+            assert np.abs(place[:2] / place[2] - expected[:2] / expected[2]).max() < 0.51 / matrix[0, 0]
+
+
+def test_what_the_loader_does_not_take_is_said(stereo: Path) -> None:
+    notes = export(stereo, "stir").notes
+    assert "STIR's loader reads films of 1280 x 1024 pixels only; these have 320 x 256" in notes
+    assert any("for disparities of 8 to 105 px; here they are" in note for note in notes)
+
+
+def test_points_that_a_camera_does_not_see_are_not_marked(stereo: Path) -> None:
+    (left,) = sequences(export(stereo, "stir").directory)
+    before = len(centres(left, "start"))
+    made = tracks(stereo / "right")
+    x, y = centres(left, "start")[0]
+    (n,) = np.flatnonzero((np.floor(tracks(stereo / "left")["points"][:, 0]) == (x, y)).all(axis=-1))
+    made["occluded"][n, -1], made["points"][n, -1] = True, np.nan
+    np.savez(stereo / "right" / "tracks.npz", **made)
+    done = export(stereo, "stir")
+    assert all(
+        len(centres(side, part)) == before - 1 for side in (left, to_the_right(left)) for part in ("start", "end")
+    )
+    assert done.notes[0].startswith(f"{before - 1} of 36 points are marked; the others are hidden from a camera")
+
+
+def test_discs_do_not_touch_each_other(stereo: Path) -> None:
+    """Two that did would be one point, in between."""
+    for side in ("left", "right"):
+        made = tracks(stereo / side)
+        made["points"][1] = made["points"][0] + (5, 0)
+        made["points"][2] = made["points"][0] + (6, 0)
+        np.savez(stereo / side / "tracks.npz", **made)
+    (left,) = sequences(export(stereo, "stir").directory)
+    first = np.floor(tracks(stereo / "left")["points"][:3, 0]).astype(int)
+    found = centres(left, "start").tolist()
+    assert [centre.tolist() in found for centre in first] == [True, False, True]
+
+
+def test_cameras_that_are_not_beside_each_other_are_refused(stereo: Path) -> None:
+    pose = np.array(json.loads((stereo / "right/camera.json").read_text())["pose"])
+    turned, lower, swapped = pose.copy(), pose.copy(), pose.copy()
+    turned[0], turned[1] = pose[1], -pose[0]
+    lower[1, 3] += 1e-4
+    swapped[0, 3] += 2 * BASELINE
+    said = r"/stereo: stir needs the camera right beside left, to the right of it and just like it; run the scene with"
+    for other in (turned, lower, swapped):
+        describe(stereo / "right", pose=other.tolist())
+        with pytest.raises(FilesError, match=said):
+            export(stereo, "stir")
+    describe(stereo / "right", pose=pose.tolist(), intrinsics=[[100, 0, 160], [0, 100, 128], [0, 0, 1]])
+    with pytest.raises(FilesError, match=said):
+        export(stereo, "stir")
+
+
+def test_two_cameras_are_needed_with_their_tracks_and_without_distortion(stereo: Path, program: Program) -> None:
+    single = alone(stereo, "left")
+    said = r"stir needs the cameras left and right; it has one camera, without a name; run the scene with `cameras`"
+    with pytest.raises(FilesError, match=said):
+        export(single, "stir")
+    describe(stereo / "right", distortion=[0.1] * 8)
+    done = program("export", str(stereo), "--format", "stir")
+    said = f"{stereo}/right/camera.json: the camera has a distortion, which stir cannot describe"
+    assert (done.returncode, done.stderr) == (2, f"{said}; run the scene without it\n")
+    (stereo / "right/tracks.npz").unlink()
+    with pytest.raises(FilesError, match=r"/stereo/right: stir needs tracks"):
+        export(stereo, "stir")
+
+
+def test_without_pyav_there_is_one_line(stereo: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(outputs, "is_pyav_installed", lambda: False)
+    with pytest.raises(NotInstalledError) as caught:
+        export(stereo, "stir")
+    assert str(caught.value) == "--format stir needs PyAV, which is not installed; pip install av"
+    assert "av" in sys.modules

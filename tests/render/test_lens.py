@@ -1,0 +1,315 @@
+"""Lenses that bend lines: against OpenCV, the twin that tries every triangle at every pixel, and picking."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from taichi_msm.errors import SceneError
+from taichi_msm.model.sheet import rest_positions
+from taichi_msm.model.surface import rods
+from taichi_msm.render import tracking
+from taichi_msm.render.camera import Lens, calibration, view
+from taichi_msm.render.labels import track_grid
+from taichi_msm.render.picking import pick
+from taichi_msm.render.rasterizer import Drawing, drawing_config
+from taichi_msm.render.tracking import find, find_flow
+from taichi_msm.scene.scene import Scene
+from taichi_msm.system.runtime import Device
+from tests import reference
+from tests.reference import labels as twin
+from tests.render.test_labels import crumpled, folded, look
+from tests.render.test_rasterizer import assert_alike_in_other_tiles, dented, difference, drawable, with_instruments
+from tests.scenes import speckle
+
+Array = NDArray[np.float64]
+
+# Made for a picture of 80 x 60 pixels. The endoscope's coefficients are those of a laparoscope, rounded; `fold` folds
+# back within the picture.
+INTRINSICS = {"fx": 60, "fy": 62, "cx": 37, "cy": 31}
+LENSES: dict[str, dict[str, Any]] = {
+    "endoscope": {"distortion": {"k1": -0.34, "k2": 0.12, "p1": 0.001, "p2": -0.002, "k3": -0.01}},
+    "fold": {"distortion": {"k1": -0.5}, "outside": "background"},
+    "rational": {"distortion": {"k1": 0.3, "k2": 0.1, "k4": 0.8, "k6": 0.02, "p1": -0.004}},
+    "fisheye": {"distortion": {"model": "fisheye", "k1": -0.05, "k2": 0.01}},
+    "pincushion": {"distortion": {"k1": 0.4}},
+}
+EVERY_LENS = pytest.mark.parametrize("lens", LENSES)
+
+# Kernels of pictures take long to compile.
+A_LENS_OF_EACH_MODEL = pytest.mark.parametrize(
+    "lens", [pytest.param(lens, marks=() if lens in ("fold", "fisheye") else pytest.mark.slow) for lens in LENSES]
+)
+
+
+def seen_through(lens: str, points: tuple[int, int] = (9, 11), **render: Any) -> Scene:
+    camera = {"eye": [0.05, -0.2, 0.3], "target": [0, 0, 0], "intrinsics": INTRINSICS, **LENSES[lens]}
+    return with_instruments(drawable(points, camera=camera, **render))
+
+
+def opencv(made: Scene, points: Array) -> Array:
+    """Project points with OpenCV, from what camera.json says; indices of pixels, shape (n, 2)."""
+    written = calibration(view(made))
+    matrix, turn = np.array(written["calibration"]), np.array(written["pose"])
+    project = cv2.fisheye.projectPoints if written["model"] == "fisheye" else cv2.projectPoints
+    distortion, axis = np.array(written["distortion"]), cv2.Rodrigues(turn[:, :3])[0]
+    return np.asarray(project(points.reshape(-1, 1, 3), axis, turn[:, 3], matrix, distortion)[0][:, 0])
+
+
+def on_surface(made: Scene, coordinates: Array, position: Array) -> Array:
+    """The points of the drawn surface at coordinates, shape (n, 3)."""
+    surface = reference.refine(position, made.render.refine)
+    rows, cols = surface.shape[:2]
+    across, down = coordinates[:, 0] * (cols - 1), coordinates[:, 1] * (rows - 1)
+    j, i = np.minimum(across.astype(int), cols - 2), np.minimum(down.astype(int), rows - 2)
+    s, t = (across - j)[:, None], (down - i)[:, None]
+    a, b, c, d = surface[i, j], surface[i, j + 1], surface[i + 1, j], surface[i + 1, j + 1]
+    return np.where(t > s, a + (c - a) * t + (d - c) * s, a + (b - a) * s + (d - b) * t)
+
+
+@pytest.mark.parametrize(
+    "lens",
+    [
+        Lens(False, (-0.5, 0.2, 1e-3, -2e-3, 0, 0, 0, 0)),
+        Lens(False, (-0.5, 0, 0, 0, 0, 0, 0, 0)),
+        Lens(False, (0.3, 0.1, 1e-3, 1e-3, 0.05, 0.4, 0.1, 0.01)),
+        Lens(True, (-0.05, 0.01, -0.003, 0.001)),
+        Lens(True, (-0.5, 0, 0, 0)),
+    ],
+    ids=str,
+)
+def test_places_are_those_of_opencv_and_back(lens: Lens) -> None:
+    rng = np.random.default_rng(1)
+    away, turn = min(lens.limit * 0.98, 2.5) * rng.uniform(0, 1, 5000), rng.uniform(0, 2 * np.pi, 5000)
+    place = np.stack([away * np.cos(turn), away * np.sin(turn)], axis=-1)
+    points, none = np.concatenate([place, np.ones((5000, 1))], axis=1)[:, None], np.zeros(3)
+    project = cv2.fisheye.projectPoints if lens.fisheye else cv2.projectPoints
+    expected = project(points, none, none, np.eye(3), np.array(lens.coefficients))[0][:, 0]
+    seen = lens.distort(place)
+    np.testing.assert_allclose(seen, expected, atol=1e-13)
+    # 1e-6 px where the focal length is 1000 px; nothing is nearer to the axis and seen there too.
+    np.testing.assert_allclose(lens.undistort(seen), place, atol=1e-9)
+    step = 1e-6 * np.eye(2)
+    slope = [(lens.distort(place + way) - lens.distort(place - way)) / 2e-6 for way in step]
+    np.testing.assert_allclose(lens.jacobian(place), np.stack(slope, axis=-1), atol=1e-7)
+
+
+def test_beyond_the_fold_there_is_nothing() -> None:
+    lens = Lens(False, (-0.5, 0, 0, 0, 0, 0, 0, 0))
+    # r - r^3 / 2 is largest, sqrt(8 / 27), at r = sqrt(2 / 3).
+    assert lens.limit == pytest.approx(np.sqrt(2 / 3))
+    rim = np.sqrt(8 / 27)
+    found = lens.undistort(np.array([[0.0, 0.0], [0.0, rim * 0.9999], [rim * 1.0001, 0.0]]))
+    np.testing.assert_array_equal(np.isnan(found[:, 0]), [False, False, True])
+    np.testing.assert_array_equal(found[0], [0, 0])
+    # Before a pole, here at r = sqrt(5), everything is seen.
+    lens = Lens(False, (-0.2, 0.02, 0, 0, 0, -0.2, 0, 0))
+    place = np.array([[0.0, 1e-3], [0.0, 1.0], [2.0, 0.0], [2.2, 0.0]])
+    np.testing.assert_allclose(lens.undistort(lens.distort(place)), place, atol=1e-9)
+    # t - t^3 / 2 is largest at t = sqrt(2 / 3).
+    assert Lens(True, (-0.5, 0, 0, 0)).limit == pytest.approx(np.tan(np.sqrt(2 / 3)))
+
+
+@pytest.mark.parametrize("key", range(8))
+def test_denormal_coefficients_change_nothing(key: int) -> None:
+    """A polynomial that one of them leads would have zeros where numbers overflow."""
+    assert Lens(False, tuple(5e-324 * (each == key) for each in range(8))).limit == Lens(False, (0,) * 8).limit
+    assert Lens(True, tuple(5e-324 * (each == key % 4) for each in range(4))).limit == Lens(True, (0,) * 4).limit
+
+
+@pytest.mark.parametrize(
+    "coefficients",
+    [
+        (0, 0, 0.05, 0, 0, 0, 0, 0),
+        (-0.5, 0, 0.02, 0.01, 0, 0, 0, 0),
+        (0.1, 0.2, 0.01, -0.3, 0.1, 0.5, 0, 0.1),
+        (0, 0, 2, 1e6, 0, 0, 0, 0),
+        (-0.2, 0.1, 0.2, 0, 0, 0.3, 0, -0.4),
+    ],
+)
+def test_tangential_distortion_folds_too(coefficients: tuple[float, ...]) -> None:
+    """Where the determinant of the derivatives gets 0, at some angle, and not before."""
+    lens = Lens(False, coefficients)
+    angle = np.linspace(0, 2 * np.pi, 721)
+    circle = np.stack([np.cos(angle), np.sin(angle)], axis=-1)
+    least = [np.linalg.det(lens.jacobian(share * lens.limit * circle)).min() for share in np.linspace(0.01, 1.01, 101)]
+    assert min(least[:-2]) > 0
+    assert least[-1] < 0
+    # Of y + 3 p1 y^2, the distorted place below the axis without all else, the derivative is 0 at y = -1 / (6 p1).
+    assert Lens(False, (0, 0, 0.05, 0, 0, 0, 0, 0)).limit == pytest.approx(1 / 0.3)
+
+
+@pytest.mark.parametrize(
+    ("lens", "render"),
+    [
+        pytest.param("endoscope", {}, marks=pytest.mark.slow),
+        pytest.param("endoscope", {"wireframe": True, "supersample": 2}, marks=pytest.mark.slow),
+        ("fold", {"shading": "tissue", "light": {"relief": -0.2, "vignette": 0.3}}),
+        ("fisheye", {"shading": "tissue", "wireframe": True}),
+        pytest.param("pincushion", {"supersample": 2}, marks=pytest.mark.slow),
+    ],
+)
+def test_pictures_are_like_the_twins(lens: str, render: dict[str, Any], device: Device) -> None:
+    made, texture = seen_through(lens, **render), speckle(13, 17)
+    for shape in (dented, folded):
+        position = shape(made)
+        placed = rods(made, position, 0)
+        drawn = Drawing(made, texture).draw(position, rods=placed)
+        apart = difference(drawn, reference.draw(made, position, texture, placed))
+        # As without a lens (test_drawing.py).
+        assert (apart > 1).mean() < 0.005
+        assert (apart == 1).mean() < 0.01
+        assert 0.2 < (drawn.max(axis=-1) > 0).mean() < 0.95
+
+
+@A_LENS_OF_EACH_MODEL
+def test_large_cells_are_bent(lens: str, device: Device) -> None:
+    """Sides of cells 90 pixels long bend by up to 8 px, more than a tile, outward and inward."""
+    intrinsics = {"fx": 150, "fy": 150, "cx": 99.5, "cy": 74.5}
+    camera = {"eye": [0, 0, 0.33], "intrinsics": intrinsics, **LENSES[lens]}
+    for refine in (0, 3):
+        made = drawable((2, 3), camera=camera, size=[200, 150], refine=refine)
+        position = rest_positions(made.sheet)
+        found, (coordinates, _, _) = look(made, position), twin.labels(made, position)
+        np.testing.assert_allclose(found.coordinates, coordinates, atol=1e-5)
+
+
+@pytest.mark.parametrize(
+    "lens", [pytest.param(lens, marks=() if lens == "fisheye" else pytest.mark.slow) for lens in LENSES]
+)
+@pytest.mark.parametrize("lanes", [pytest.param(1, marks=pytest.mark.slow), 4])
+def test_the_shape_of_a_tile_does_not_change_the_bits(lens: str, lanes: int, device: Device) -> None:
+    renders: list[dict[str, Any]] = [{"shading": "tissue", "size": [79, 57]}, {"wireframe": True, "supersample": 3}]
+    for render in renders:
+        made, texture = seen_through(lens, **render), speckle(30, 20)
+        assert_alike_in_other_tiles(made, texture, folded(made), lanes)
+
+
+@pytest.mark.parametrize(
+    ("lens", "shape"),
+    [
+        pytest.param(lens, shape, marks=() if shape is folded or lens in ("fold", "fisheye") else pytest.mark.slow)
+        for lens in LENSES
+        for shape in (dented, folded, crumpled)
+    ],
+)
+def test_labels_are_on_the_ray_of_each_pixel(lens: str, shape: Any, device: Device) -> None:
+    made = seen_through(lens)
+    position = shape(made)
+    placed = rods(made, position, 0)
+    found, (coordinates, depth, instrument) = look(made, position), twin.labels(made, position, placed)
+    alike = (np.isnan(found.coordinates[..., 0]) == np.isnan(coordinates[..., 0])) & (
+        np.abs(found.depth - depth) < 1e-4 * depth.max()
+    )
+    assert alike.mean() > 0.997
+    assert ((found.instrument == 255) == instrument)[alike].all()
+    sheet = alike & ~np.isnan(coordinates[..., 0])
+    assert sheet.mean() > 0.2
+    points = on_surface(made, found.coordinates[sheet].astype(float), position)
+    assert np.abs(opencv(made, points) - np.argwhere(sheet)[:, ::-1]).max() < 0.01
+    pose = np.array(calibration(view(made))["pose"])
+    np.testing.assert_allclose(found.depth[sheet], points @ pose[2, :3] + pose[2, 3], rtol=1e-5)
+    # Nothing moved: no flow, and nothing is hidden.
+    still = find_flow(made, found.coordinates, position, view(made), placed)
+    seen = ~np.isnan(found.coordinates[..., 0])
+    assert np.abs(still.flow[seen]).max() < 0.01
+    assert (still.occlusion > 0).sum() <= 3
+
+
+@EVERY_LENS
+@pytest.mark.parametrize("shape", [dented, folded, crumpled])
+@pytest.mark.parametrize("lanes", [None, 1])
+def test_points_are_found_and_hidden_as_the_twin_says(
+    lanes: int | None, shape: Any, lens: str, device: Device, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    made = seen_through(lens)
+    position = shape(made)
+    coordinates = np.random.default_rng(9).uniform(0, 1, (2000, 2)).astype(np.float32)
+    if lanes:
+        monkeypatch.setattr(tracking, "lanes", lambda precision: lanes)
+    found = find(made, coordinates, position, view(made))
+    pixels, hidden = twin.find(made, coordinates.astype(float), position)
+    np.testing.assert_allclose(found.pixels, pixels, atol=1e-4)
+    np.testing.assert_array_equal(found.hidden, hidden)
+
+
+def test_what_is_beyond_the_limit_is_outside_the_picture(device: Device) -> None:
+    camera = {"eye": [0, 0, 0.1], "intrinsics": INTRINSICS, **LENSES["fold"]}
+    made = drawable(camera=camera, background=[10, 20, 30])
+    position = rest_positions(made.sheet)
+    # 0.0816 m of the sheet are seen up to 0.816 from the axis, and with distortion sqrt(8 / 27).
+    labels = look(made, position)
+    y, x = np.mgrid[:60, :80]
+    away = np.hypot((x - 37) / 60, (y - 31) / 62)
+    rim = np.sqrt(8 / 27)
+    assert not np.isnan(labels.coordinates[away < rim - 0.01]).any()
+    assert np.isnan(labels.coordinates[away > rim]).all()
+    assert (labels.depth[away > rim] == 0).all()
+    drawn = Drawing(made, speckle(9, 9)).draw(position)
+    assert (drawn[away > rim] == [10, 20, 30]).all()
+    # Nor is there a second picture of what folds back.
+    moved = find_flow(made, labels.coordinates, position + np.array([0.05, 0, 0]), view(made))
+    gone: NDArray[np.bool_] = np.all(moved.flow > 1e9, axis=-1)
+    assert (moved.occlusion[gone & ~np.isnan(labels.coordinates[..., 0])] == 255).all()
+    assert gone[31, 68]
+    found = find(made, np.array([[0.5, 0.5], [0.99, 0.5]]), position, view(made))
+    np.testing.assert_array_equal(np.isnan(found.pixels[:, 0]), [False, True])
+    np.testing.assert_array_equal(found.hidden, [False, True])
+
+
+def test_what_tangential_distortion_folds_back_is_outside_the_picture(device: Device) -> None:
+    # From 3 mm above the sheet, much of it is farther from the axis than the fold.
+    camera = {"eye": [0, 0, 0.003], "target": [0, 0.03, 0.003], "up": [0, 0, -1], "intrinsics": INTRINSICS}
+    made = drawable((9, 9), camera={**camera, "distortion": {"p1": 0.05}})
+    places, (height, width) = track_grid(100), made.sheet.size
+    points = np.stack([(places[:, 0] - 0.5) * width, (0.5 - places[:, 1]) * height, np.zeros(len(places))], axis=-1)
+    away = (view(made)._replace(lens=None).pixels(points) - [37.5, 31.5]) / [60, 62]
+    found = find(made, places, rest_positions(made.sheet), view(made))
+    np.testing.assert_array_equal(np.isnan(found.pixels[:, 0]), ~(np.linalg.norm(away, axis=-1) < 1 / 0.3))
+    assert 0.1 < np.isnan(found.pixels).mean() < 0.9
+
+
+@EVERY_LENS
+def test_what_is_picked_is_what_is_labelled(lens: str, device: Device) -> None:
+    made = seen_through(lens).model_copy(update={"probes": ()})
+    position = folded(made)
+    labels = look(made, position).coordinates
+    for x, y in [(40, 30), (15, 20), (66, 44), (30, 50), (2, 2)]:
+        place, label = pick(position, made.render.refine, view(made), (x, y)), labels[y, x]
+        assert (place is None) == bool(np.isnan(label[0]))
+        if place is not None:
+            np.testing.assert_allclose(place, label, atol=1e-5)
+
+
+def test_a_lens_without_coefficients_has_the_bits_of_none(device: Device) -> None:
+    camera = {"eye": [0.05, -0.2, 0.3], "intrinsics": INTRINSICS}
+    plain, zero = drawable(camera=camera), drawable(camera={**camera, "distortion": {"k1": 0.0}})
+    position, texture = dented(plain), speckle(13, 17)
+    assert drawing_config(plain) == drawing_config(zero)
+    np.testing.assert_array_equal(Drawing(plain, texture).draw(position), Drawing(zero, texture).draw(position))
+
+
+@pytest.mark.parametrize(
+    ("camera", "said"),
+    [
+        (
+            {"distortion": {"k1": -0.5}},
+            "render.camera.distortion: folds back at 32 px from the principal point, and the picture reaches 53 px; "
+            "take coefficients that are good to there, or set outside: background",
+        ),
+        (
+            {"distortion": {"model": "fisheye", "k1": 3.0}, "intrinsics": {**INTRINSICS, "fx": 4, "fy": 4}},
+            "render.camera.distortion: reaches 88 degrees at 49 px from the principal point, and the picture reaches "
+            "53 px; take coefficients that are good to there, or set outside: background",
+        ),
+    ],
+)
+def test_a_lens_that_does_not_reach_the_corners_is_refused(camera: dict[str, Any], said: str) -> None:
+    made = drawable(camera={"eye": [0, 0, 0.3], "intrinsics": INTRINSICS, **camera})
+    with pytest.raises(SceneError) as caught:
+        view(made)
+    assert str(caught.value) == said

@@ -1,0 +1,445 @@
+from __future__ import annotations
+
+import errno
+import io
+import json
+import os
+import shutil
+import signal
+import subprocess
+import sys
+import time
+import zipfile
+from _thread import interrupt_main
+from collections.abc import Callable
+from pathlib import Path
+from threading import Event
+from typing import Any
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+from PIL import Image
+
+from taichi_msm.errors import FilesError
+from taichi_msm.render.labels import Observed
+from taichi_msm.runs import media
+from taichi_msm.runs.encoder import Encoder, encode
+from taichi_msm.runs.media import Job
+from taichi_msm.runs.writer import ResultWriter
+from taichi_msm.scene.scene import Scene
+from tests.outputs import files
+from tests.scenes import scene, scene_and_grid, speckle
+
+ROWS, COLS = 3, 4
+WIDTH, HEIGHT = 40, 24
+
+# A run of one frame after another that never ends; names its encoder on stdout when the tenth is handed over.
+ENDLESS = """
+import itertools
+import sys
+from pathlib import Path
+from taichi_msm.render.labels import Observed
+from taichi_msm.runs.writer import ResultWriter
+from tests.scenes import scene_and_grid
+from tests.runs.test_files import picture, position, small_scene
+
+with ResultWriter(Path(sys.argv[1]), *scene_and_grid(small_scene())) as writer:
+    for frame in itertools.count():
+        writer.add(position(frame), {"": Observed(picture(frame))})
+        if frame == 10:
+            print(writer._encoder._process.pid, flush=True)
+"""
+
+
+def small_scene(*output: str, precision: str = "f32", **render: Any) -> Scene:
+    return scene(
+        image="texture.png",
+        sheet={"points": [ROWS, COLS], "size": [0.3, 0.4], "mass": 1e-3},
+        time={"precision": precision},
+        render={"size": [WIDTH, HEIGHT], **render},
+        output=list(output or ("png", "gif", "trajectory")),
+    )
+
+
+def position(frame: int) -> NDArray[np.float64]:
+    return np.random.default_rng(frame).normal(size=(ROWS, COLS, 3))
+
+
+def picture(frame: int) -> NDArray[np.uint8]:
+    return speckle(HEIGHT, WIDTH, frame)
+
+
+def write(directory: Path, frames: int, scene: Scene, *, beside: bool = True) -> list[str]:
+    with ResultWriter(directory, *scene_and_grid(scene), beside=beside) as writer:
+        for frame in range(frames):
+            writer.add(position(frame), {"": Observed(picture(frame) if scene.draws else None)})
+        names: list[str] = writer.publish({})["outputs"]
+        assert writer.frames == frames
+    return names
+
+
+def test_all_results_of_a_run(tmp_path: Path) -> None:
+    names = write(tmp_path / "a" / "b", 11, small_scene())
+    assert names == ["frames", "animation.gif", "trajectory.npz", "run.json"]
+    found = files(tmp_path / "a" / "b")
+    frames = [f"frames/{frame:04}.png" for frame in range(11)]
+    assert sorted(found) == sorted([*frames, "animation.gif", "trajectory.npz", "run.json"])
+    for frame in range(11):
+        with Image.open(tmp_path / "a" / "b" / frames[frame]) as image:
+            np.testing.assert_array_equal(np.asarray(image), picture(frame))
+    with Image.open(tmp_path / "a" / "b" / "animation.gif") as image:
+        assert image.size == (WIDTH, HEIGHT)
+        assert getattr(image, "n_frames", 1) == 11
+    assert json.loads(found["run.json"]) == {"frames": 11, "outputs": names}
+
+
+@pytest.mark.parametrize("beside", [True, False])
+def test_equal_runs_write_equal_bytes(beside: bool, tmp_path: Path) -> None:
+    for name, other in (("first", True), ("second", beside)):
+        write(tmp_path / name, 7, small_scene(), beside=other)
+    assert files(tmp_path / "first") == files(tmp_path / "second")
+
+
+@pytest.mark.parametrize(
+    ("outputs", "names"),
+    [
+        (("png",), ["frames", "run.json"]),
+        (("gif",), ["animation.gif", "run.json"]),
+        (("trajectory",), ["trajectory.npz", "run.json"]),
+    ],
+)
+def test_only_the_outputs_asked_for_are_there(tmp_path: Path, outputs: tuple[str, ...], names: list[str]) -> None:
+    """Also those that an earlier run left go, but no file of the user's."""
+    write(tmp_path, 4, small_scene())
+    (tmp_path / "notes.txt").write_text("mine")
+    assert write(tmp_path, 3, small_scene(*outputs)) == names
+    assert sorted(path.name for path in tmp_path.iterdir()) == sorted([*names, "notes.txt"])
+    if "png" in outputs:
+        assert len(list((tmp_path / "frames").iterdir())) == 3
+
+
+def test_a_run_without_outputs_writes_its_record(tmp_path: Path) -> None:
+    assert write(tmp_path, 3, scene(output=[])) == ["run.json"]
+    assert [path.name for path in tmp_path.iterdir()] == ["run.json"]
+
+
+@pytest.mark.parametrize(("precision", "dtype"), [("f32", np.float32), ("f64", np.float64)])
+def test_the_trajectory_comes_back(tmp_path: Path, precision: str, dtype: type[np.floating[Any]]) -> None:
+    write(tmp_path, 6, small_scene("trajectory", precision=precision))
+    with np.load(tmp_path / "trajectory.npz") as trajectory:
+        assert trajectory["position"].dtype == dtype
+        assert trajectory["time"].dtype == np.float64
+        np.testing.assert_array_equal(trajectory["time"], np.arange(6) / 25)
+        np.testing.assert_array_equal(trajectory["position"], [position(f).astype(dtype) for f in range(6)])
+
+
+def test_a_trajectory_may_be_longer_than_4_gib(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """zipfile refuses to write past its limit unless it was told before the first byte."""
+    monkeypatch.setattr(zipfile, "ZIP64_LIMIT", 1000)
+    write(tmp_path, 20, small_scene("trajectory"))
+    with np.load(tmp_path / "trajectory.npz") as trajectory:
+        assert trajectory["position"].shape == (20, ROWS, COLS, 3)
+
+
+@pytest.mark.parametrize("light", [1.25, pytest.param(0.7, marks=pytest.mark.fuzz), 0.25])
+def test_the_animation_is_like_its_frames(tmp_path: Path, light: float) -> None:
+    """The palette, made from the first frame, foresees later ones in other light, and the background."""
+    first = np.empty((16, 16, 3), np.uint8)
+    first[:, ::2], first[:, 1::2] = (200, 100, 90), (180, 130, 100)
+    later = first.copy()
+    later[:8] = (first[:8] * light).astype(np.uint8)
+    background = (1, 99, 255)
+    first[:, 0] = later[:, 0] = background
+    with ResultWriter(tmp_path, *scene_and_grid(small_scene("gif", background=background, size=[16, 16]))) as writer:
+        writer.add(position(0), {"": Observed(first)})
+        writer.add(position(1), {"": Observed(later)})
+        writer.publish({})
+    with Image.open(tmp_path / "animation.gif") as image:
+        image.seek(1)
+        shown = np.asarray(image.convert("RGB")).astype(float)
+    assert (shown[:, 0] == background).all()
+    # Levels of light lie up to a quarter apart: half of that, of 200, and the lookup's 2 and the rounding's 1.
+    assert np.abs(shown - later).max() <= 28
+
+
+@pytest.mark.parametrize("beside", [True, False])
+def test_leaving_without_publishing_leaves_what_was_there(beside: bool, tmp_path: Path) -> None:
+    write(tmp_path / "out", 3, small_scene())
+    before = files(tmp_path / "out")
+    for directory in (tmp_path / "out", tmp_path / "fresh"):
+        with ResultWriter(directory, *scene_and_grid(small_scene()), beside=beside) as writer:
+            writer.add(position(9), {"": Observed(picture(9))})
+    assert files(tmp_path / "out") == before
+    assert not (tmp_path / "fresh").exists()
+
+
+@pytest.mark.parametrize(
+    ("rows", "frames"), [pytest.param(0, 1, marks=pytest.mark.fuzz), (HEIGHT // 2, 1), (HEIGHT, 2)]
+)
+def test_an_interrupted_hand_over_leaves_whole_frames(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, rows: int, frames: int
+) -> None:
+    """Ctrl-C may come when the positions of a frame, but not all rows of its picture, are handed over."""
+
+    def interrupted(encoder: Encoder, pictures: NDArray[np.uint8], pause: Callable[[], None]) -> None:
+        add(encoder, pictures[:, :rows])
+        raise KeyboardInterrupt
+
+    add = Encoder.add
+    with ResultWriter(tmp_path / "interrupted", *scene_and_grid(small_scene())) as writer:
+        writer.add(position(0), {"": Observed(picture(0))})
+        with monkeypatch.context() as patch:
+            patch.setattr(Encoder, "add", interrupted)
+            with pytest.raises(KeyboardInterrupt):
+                writer.add(position(1), {"": Observed(picture(1))})
+        writer.finish()
+        assert writer.frames == frames
+        writer.publish({})
+    write(tmp_path / "whole", frames, small_scene())
+    assert files(tmp_path / "interrupted") == files(tmp_path / "whole")
+
+
+def finish_after_another(writer: ResultWriter) -> None:
+    writer.add(position(1), {"": Observed(picture(1))})
+    writer.finish()
+
+
+@pytest.mark.parametrize(
+    ("owner", "part"), [(Image.Image, "save"), (media.Palette, "indices"), (media.GifWriter, "_write_last")]
+)
+def test_an_interruption_while_a_picture_is_encoded_here_leaves_whole_frames(
+    owner: type, part: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Ctrl-C may come in the middle of a still, of a frame of the film, and of its end."""
+    original = getattr(owner, part)
+
+    def interrupted(*arguments: Any, **keywords: Any) -> Any:
+        interrupt_main()
+        time.sleep(1)  # until the main thread has heard of it
+        return original(*arguments, **keywords)
+
+    with ResultWriter(tmp_path / "interrupted", *scene_and_grid(small_scene()), beside=False) as writer:
+        writer.add(position(0), {"": Observed(picture(0))})
+        with monkeypatch.context() as patch:
+            patch.setattr(owner, part, interrupted)
+            with pytest.raises(KeyboardInterrupt):
+                finish_after_another(writer)
+        writer.finish(hurry=True)
+        writer.publish({})
+        frames = writer.frames
+    write(tmp_path / "whole", frames, small_scene())
+    assert files(tmp_path / "interrupted") == files(tmp_path / "whole")
+
+
+@pytest.mark.parametrize("taken", [1, 4])
+def test_an_encoder_in_a_hurry_takes_no_more_pictures(taken: int, tmp_path: Path) -> None:
+    hurry, shown = Event(), [speckle(20, 30, frame) for frame in range(7)]
+
+    class Pictures(io.BytesIO):
+        """The pictures; while one of them is read, there comes a hurry."""
+
+        def read(self, size: int | None = -1) -> bytes:
+            data = super().read(size)
+            if self.tell() == taken * shown[0].nbytes:
+                hurry.set()
+            return data
+
+    job = Job((tmp_path,), (30, 20), 25.0, png=True, gif=True, background=(0, 0, 0))
+    frames = encode(job, Pictures(b"".join(one.tobytes() for one in shown)), hurry).frames
+    assert 1 <= frames <= taken
+    assert sorted(path.name for path in (tmp_path / "frames").glob("*")) == [f"000{n}.png" for n in range(frames)]
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="no such signal")
+def test_in_a_hurry_frames_are_given_up_and_those_left_are_whole(tmp_path: Path) -> None:
+    made = small_scene(size=[1500, 1000])
+    large = [speckle(1000, 1500, frame) for frame in range(7)]
+    with ResultWriter(tmp_path, *scene_and_grid(made)) as writer:
+        for frame, shown in enumerate(large):
+            writer.add(position(frame), {"": Observed(shown)})
+        writer.finish(hurry=True)
+        writer.publish({})
+        frames = writer.frames
+    # On a busy machine the encoder may be done before it is told to hurry; see the test below.
+    assert 0 < frames <= 7
+    assert sorted(path.name for path in (tmp_path / "frames").iterdir()) == [f"000{n}.png" for n in range(frames)]
+    for frame in range(frames):
+        with Image.open(tmp_path / "frames" / f"000{frame}.png") as image:
+            np.testing.assert_array_equal(np.asarray(image), large[frame])
+    with Image.open(tmp_path / "animation.gif") as image:
+        assert getattr(image, "n_frames", 1) == frames
+    with np.load(tmp_path / "trajectory.npz") as trajectory:
+        assert len(trajectory["position"]) == frames
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="no sessions")
+def test_ctrl_c_does_not_reach_the_encoder(tmp_path: Path) -> None:
+    with ResultWriter(tmp_path, *scene_and_grid(small_scene())) as writer:
+        assert isinstance(writer._encoder, Encoder)
+        assert os.getsid(writer._encoder._process.pid) != os.getsid(0)
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="no such signal")
+def test_who_waits_for_a_stopped_encoder_can_stop_waiting(tmp_path: Path) -> None:
+    """And then has it finish what it has."""
+
+    def stop() -> None:
+        raise KeyboardInterrupt
+
+    with ResultWriter(tmp_path, *scene_and_grid(small_scene())) as writer:
+        assert isinstance(writer._encoder, Encoder)
+        os.kill(writer._encoder._process.pid, signal.SIGSTOP)
+        for frame in range(3):
+            writer.add(position(frame), {"": Observed(picture(frame))})
+        with pytest.raises(KeyboardInterrupt):
+            writer.finish(stop)
+        writer.finish(hurry=True)
+        writer.publish({})
+        assert writer.frames <= 3
+
+
+@pytest.mark.parametrize("beside", [True, False])
+def test_the_time_spent_encoding_is_told(beside: bool, tmp_path: Path) -> None:
+    with ResultWriter(tmp_path, *scene_and_grid(small_scene()), beside=beside) as writer:
+        writer.add(position(0), {"": Observed(picture(0))})
+        writer.finish()
+        assert 0 < writer.encode_seconds < 60
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="kills with SIGKILL")
+def test_a_killed_run_leaves_the_results_and_the_next_one_goes_on(tmp_path: Path, root: Path) -> None:
+    write(tmp_path, 3, small_scene())
+    before = files(tmp_path)
+    command = [sys.executable, "-c", ENDLESS, str(tmp_path)]
+    with subprocess.Popen(command, cwd=root, stdout=subprocess.PIPE, stderr=subprocess.PIPE) as run:
+        assert run.stdout
+        encoder = int(run.stdout.readline())
+        with pytest.raises(FilesError, match="another run is writing there"):
+            write(tmp_path, 2, small_scene())
+        os.kill(encoder, signal.SIGSTOP)
+        run.kill()
+        run.wait()
+        with pytest.raises(FilesError, match="another run is writing there"):
+            write(tmp_path, 2, small_scene())
+        os.kill(encoder, signal.SIGCONT)
+        run.communicate()  # until the encoder has ended too
+    assert {name: data for name, data in files(tmp_path).items() if ".partial" not in name} == before
+    write(tmp_path, 2, small_scene())
+    assert len(list((tmp_path / "frames").iterdir())) == 2
+    assert not (tmp_path / ".partial").exists()
+
+
+def full_disk(*_: object, **__: object) -> None:
+    raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+
+@pytest.mark.parametrize("target", ["checkpoint.create", "checkpoint.replacing", "writer.add"])
+def test_a_full_disk_is_one_line_and_changes_nothing(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, target: str
+) -> None:
+    """When the positions are written, the manifest or the record."""
+    write(tmp_path, 3, small_scene())
+    before = files(tmp_path)
+    monkeypatch.setattr(f"taichi_msm.runs.{target}", full_disk)
+    with pytest.raises(FilesError) as told:
+        write(tmp_path, 2, small_scene())
+    assert str(told.value) == (
+        f"{tmp_path}: cannot write: No space left on device; free some space or choose another --out"
+    )
+    assert files(tmp_path) == before
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="needs a limit for the size of files")
+@pytest.mark.parametrize(
+    ("points", "limit"),
+    [
+        pytest.param(100, 4096, id="many positions fail at once"),
+        pytest.param(2, 40, id="few wait in a buffer until the end"),
+        pytest.param(100, 100 * 100 * 3 * 8 + 200, id="the positions fit but not their headers"),
+    ],
+)
+def test_positions_that_cannot_be_written(tmp_path: Path, points: int, limit: int) -> None:
+    import resource
+
+    sheet = {"points": [points, points], "size": [0.3, 0.4], "mass": 1e-3}
+    soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
+
+    def run() -> None:
+        with ResultWriter(tmp_path, *scene_and_grid(scene(sheet=sheet, output=["trajectory"]))) as writer:
+            resource.setrlimit(resource.RLIMIT_FSIZE, (limit, hard))
+            writer.add(np.zeros((points, points, 3)), {"": Observed()})
+            writer.publish({})
+
+    try:
+        with pytest.raises(FilesError, match="cannot write: File too large; choose another --out"):
+            run()
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
+    assert list(tmp_path.iterdir()) == []
+
+
+def refused(directory: Path, meanwhile: Callable[[ResultWriter], None] = lambda _: None, *, beside: bool = True) -> str:
+    """The error of a run of many frames in whose course something happens."""
+
+    def run() -> None:
+        with ResultWriter(directory, *scene_and_grid(small_scene()), beside=beside) as writer:
+            meanwhile(writer)
+            for frame in range(1000):
+                writer.add(position(frame), {"": Observed(picture(frame))})
+            writer.publish({})
+
+    with pytest.raises(FilesError) as told:
+        run()
+    return str(told.value)
+
+
+def test_a_file_in_the_place_of_the_directory(tmp_path: Path) -> None:
+    (tmp_path / "out").write_text("mine")
+    assert refused(tmp_path / "out") == (f"{tmp_path / 'out'}: cannot write: Not a directory; choose another --out")
+
+
+@pytest.mark.skipif(not hasattr(os, "geteuid") or os.geteuid() == 0, reason="root may write everywhere")
+def test_a_directory_that_cannot_be_written(tmp_path: Path) -> None:
+    tmp_path.chmod(0o500)
+    assert "Permission denied; choose another --out" in refused(tmp_path / "out")
+
+
+@pytest.mark.parametrize("beside", [True, False])
+def test_what_stops_the_encoder_is_told(beside: bool, tmp_path: Path) -> None:
+    def block(_: ResultWriter) -> None:
+        (tmp_path / ".partial" / "new" / "frames").write_text("in the way")
+
+    assert refused(tmp_path, block, beside=beside) == f"{tmp_path}: cannot write: File exists; choose another --out"
+    assert (tmp_path / ".partial" / "new" / "frames").read_text() == "in the way"
+
+
+def test_an_encoder_that_is_killed_is_told(tmp_path: Path) -> None:
+    def kill(writer: ResultWriter) -> None:
+        assert isinstance(writer._encoder, Encoder)
+        writer._encoder._process.kill()
+
+    assert "cannot write: the encoder ended with exit code" in refused(tmp_path, kill)
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="open files stay there")
+def test_a_directory_that_vanishes(tmp_path: Path) -> None:
+    def vanish(_: ResultWriter) -> None:
+        shutil.rmtree(tmp_path / "out")
+
+    assert "No such file or directory; choose another --out" in refused(tmp_path / "out", vanish)
+    assert not (tmp_path / "out").exists()
+
+
+def test_the_record_is_strict_json(tmp_path: Path) -> None:
+    with ResultWriter(tmp_path, *scene_and_grid(scene())) as writer:
+        with pytest.raises(ValueError, match="not JSON compliant"):
+            writer.publish({"step": float("nan")})
+        writer.publish({"image": "Schleimhaut-Ä.png", "odd": "\udcff.png"})
+    text = (tmp_path / "run.json").read_bytes().decode()
+    assert text == (
+        '{\n  "image": "Schleimhaut-Ä.png",\n  "odd": "\\udcff.png",\n  "frames": 0,\n'
+        '  "outputs": [\n    "run.json"\n  ]\n}\n'
+    )
+    assert json.loads(text)["odd"] == "\udcff.png"

@@ -1,0 +1,199 @@
+"""The forces of probes on the sheet: against the twin, and against what must hold of any force."""
+
+from __future__ import annotations
+
+import csv
+import json
+import math
+import re
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from taichi_msm import DivergedError, Simulation, run
+from taichi_msm.cli.console import summary
+from taichi_msm.model.sheet import rest_positions
+from taichi_msm.model.surface import touched
+from taichi_msm.model.tool_force import control_point, probe_records
+from taichi_msm.scene.scene import Scene
+from taichi_msm.system.process import available_threads
+from taichi_msm.system.runtime import Device
+from tests import reference
+from tests.scenes import plan_of, scene
+from tests.terms.test_contact import CASES, EDGES, PRESSED, touching
+
+Array = NDArray[np.float64]
+
+
+def expected_forces(made: Scene) -> Array:
+    """The twin's mean force of every probe at every frame but the first [N], shape (frames, probes, 3)."""
+    plan = plan_of(made)
+    per_frame, found = plan.grid.steps_per_frame, []
+    for n, (_, contact) in enumerate(reference.steps(plan)):
+        if n > 0:
+            found.append(contact.force.sum(axis=(1, 2)))
+    return np.array(found).reshape(-1, per_frame, len(made.probes), 3).mean(axis=1)
+
+
+@pytest.mark.parametrize(("precision", "error"), [("f32", 2e-3), ("f64", 1e-13)])
+@pytest.mark.parametrize("difference", ["central", "backward"])
+def test_the_force_of_a_tool_is_that_of_the_twin(precision: str, error: float, difference: str, device: Device) -> None:
+    """In f32, positions of 0.1 m are rounded by 4e-9 m, and pushes are 1e-5 m."""
+    made = touching(CASES["together"], time={"precision": precision, "damping_difference": difference})
+    forces, expected = [], expected_forces(made)
+    with Simulation(made, threads=device.threads) as simulation:
+        assert all(one.force == (0, 0, 0) for one in simulation.forces())
+        for frame, each in enumerate(expected):
+            simulation.advance()
+            forces.append([one.force for one in simulation.forces()])
+            lowest = [tool.lowest((frame + 1) / 25) for tool in plan_of(made).tools]
+            assert [one.tip for one in simulation.forces()] == lowest
+            assert np.abs(np.array(forces[-1]) - each).max() < error * np.abs(expected).max()
+        norms = np.linalg.norm(forces, axis=2)
+        for index, peak in enumerate(simulation.felt.greatest):
+            greatest = int(norms[:, index].argmax())
+            assert (peak.time, peak.force) == ((greatest + 1) / 25, forces[greatest][index])
+
+
+def test_points_at_an_open_edge_count_with_their_mass(device: Device) -> None:
+    made = touching(EDGES["comes from beside"])
+    made = made.model_copy(update={"sheet": made.sheet.model_copy(update={"fixed": "none"})})
+    expected = expected_forces(made)
+    with Simulation(made, threads=device.threads) as simulation:
+        for each in expected:
+            simulation.advance()
+            assert np.abs(simulation.forces()[0].force - each[0]).max() < 1e-12 * np.abs(expected).max()
+
+
+# Jumps up at a frame, down between two, and to another place at a third.
+JUMPING: dict[str, Any] = {
+    "at": [[0, 0.4, 0.5], [0.2, 0.6, 0.5], [0.2, 0.3, 0.5]],
+    "load": [[0, 0], [0.08, 50], [0.08, 100], [0.17, 100], [0.17, 0], [0.2, 0], [0.3, 80]],
+    "falloff": 40,
+    "force": [1, 0, -3],
+    "offset": 0,
+}
+
+
+def test_the_force_of_a_load_is_that_at_the_frame(device: Device) -> None:
+    made = scene(probes=[JUMPING])
+    rate = made.time.frames_per_second
+    percents = {0: 0, 1: 25, 2: 100, 3: 100, 4: 100, 5: 0, 6: 80 * 0.4, 7: 80 * 0.8, 8: 80}
+    rest, free = rest_positions(made.sheet), ~plan_of(made).fixed
+    with Simulation(made, threads=device.threads) as simulation:
+        for frame, percent in percents.items():
+            (felt,) = simulation.forces()
+            at = control_point(made.probes[0], made.sheet, frame / rate)
+            distance = np.hypot(*(rest[..., :2] - at).T).T
+            total = np.exp(-40 * distance)[free].sum() * percent / 100
+            np.testing.assert_allclose(felt.force, np.array([1, 0, -3]) * total, rtol=1e-13, atol=0)
+            assert felt.tip == tuple(touched(simulation.positions(), made.render.refine, made.sheet, at)[0])
+            assert felt.tip[2] < 0 or frame == 0
+            simulation.advance()
+
+
+def test_a_tool_far_from_what_is_fixed_has_the_force_that_is_told(device: Device) -> None:
+    probe = {"total": [1, 0, -2], "radius": 0.01, "falloff": 500, "load": [[0, 100]]}
+    made = touching([probe], sheet={"points": [17, 21], "size": [0.3, 0.4], "fixed": "none"})
+    (record,) = probe_records(made)
+    with Simulation(made, threads=device.threads) as simulation:
+        (felt,) = simulation.forces()
+    assert record is not None
+    assert np.linalg.norm(felt.force) == pytest.approx(record["total_force"], rel=1e-14)
+
+
+def test_forces_go_on_where_they_were_saved(device: Device) -> None:
+    made = touching([PRESSED, {"total": [0, 0, -1], "at": [0.2, 0.2], "load": [[0, 0], [0.2, 100], [0.4, 0]]}])
+    with Simulation(made, threads=device.threads) as simulation:
+        first = simulation.forces()
+        simulation.advance(6)
+        saved, felt = simulation.save(), simulation.forces()
+        simulation.advance(4)
+        end = simulation.felt
+        assert end.forces[0] != felt[0]
+        simulation.restore(saved)
+        assert simulation.forces() == felt
+        simulation.advance(4)
+        assert simulation.felt == end
+        simulation.restart()
+        assert simulation.forces() == first
+        simulation.advance(10)
+        assert simulation.felt == end
+        with pytest.raises(Exception, match=r"saved at step .* probes"):
+            simulation.restore(saved._replace(felt=saved.felt._replace(forces=())))
+
+
+def table_of(directory: Path) -> list[list[str]]:
+    with (directory / "forces.csv").open(newline="") as file:
+        return list(csv.reader(file))
+
+
+def test_a_run_writes_the_forces_of_all_frames(device: Device, tmp_path: Path) -> None:
+    """To the bit, and the greatest of every probe is in the record."""
+    load = {"total": [0.1, 0, -1], "load": [[0, 0], [0.2, 100], [0.4, 0]], "at": [0.2, 0.3]}
+    made = touching([load, *CASES["rubbed"]], output=["forces"])
+    expected = []
+    with Simulation(made, threads=device.threads) as simulation:
+        for frame in range(11):
+            expected += [[frame / 25, one.probe, *one.tip, *one.force] for one in simulation.forces()]
+            simulation.advance(int(frame < 10))
+    record = run(made, tmp_path / "out", threads=device.threads)
+    assert record["outputs"] == ["forces.csv", "run.json"]
+    header, *rows = table_of(tmp_path / "out")
+    assert header == ["time", "probe", "tip_x", "tip_y", "tip_z", "force_x", "force_y", "force_z"]
+    assert [list(map(float, row)) for row in rows] == expected
+    for probe, found in enumerate(record["probes"]):
+        (greatest, row) = max((math.hypot(*row[5:]), row) for row in expected if row[1] == probe)
+        assert found["greatest_force"] == greatest
+        assert [found["greatest_force_time"], *found["greatest_force_vector"]] == [row[0], *row[5:]]
+    said = summary(record, tmp_path)
+    assert re.search(r"^probes\.0: [\d.]+ N in all, at most [\d.]+ kPa$", said, re.MULTILINE)
+    assert re.search(r"^probes\.1: at most [\d.]+ N, at 0\.\d+ s$", said, re.MULTILINE)
+
+
+def test_without_probes_there_is_a_table_without_rows(device: Device, tmp_path: Path) -> None:
+    run(scene(probes=[], output=["forces"]), tmp_path, threads=device.threads)
+    assert len(table_of(tmp_path)) == 1
+
+
+def test_forces_have_the_same_bits_with_any_number_of_threads(tmp_path: Path, device: Device) -> None:
+    """Also a thread, in a process of its own."""
+    probes = json.dumps([{**PRESSED, "friction": 0.3}])
+    (tmp_path / "scene.yaml").write_text(
+        "sheet: {points: [41, 61], size: [0.3, 0.4]}\n"
+        "tissue: {young: 1.0e3, thickness: 0.01, density: 1000, foundation: 3.0e3, damping: 5}\n"
+        f"probes: {probes}\n"
+        "time: {duration: 0.2, precision: f32}\n"
+        "output: [forces]\n"
+    )
+    tables = []
+    for threads in (1, 2):
+        command = [sys.executable, "-m", "taichi_msm", "run", "scene.yaml", "--threads", str(threads), "--no-estimate"]
+        subprocess.run([*command, "--quiet", "--out", f"out-{threads}"], cwd=tmp_path, check=True)
+        tables.append((tmp_path / f"out-{threads}" / "forces.csv").read_bytes())
+    assert tables[0] == tables[1]
+    record = json.loads((tmp_path / "out-2" / "run.json").read_text())
+    assert record["workers"] == min(2, available_threads()) or device.threads == 1
+    assert record["probes"][0]["greatest_force"] > 0.1
+
+
+def test_what_was_felt_before_a_divergence_is_kept(device: Device) -> None:
+    """At the frame before the last good step, also when it is found out again from an earlier one."""
+    blow = {"total": [0, 0, 1e30], "load": [[0.21, 0], [0.21, 100]]}
+    with Simulation(touching([PRESSED, blow]), threads=device.threads) as simulation:
+        simulation.advance(3)
+        start = simulation.save()
+        simulation.advance(2)
+        felt = simulation.felt
+        with pytest.raises(DivergedError):
+            simulation.advance()
+        assert simulation.felt == felt
+        good = simulation.diagnose(start).good
+        assert good is not None
+        assert good.felt == felt
+        assert felt.forces[0].force[2] < -0.1

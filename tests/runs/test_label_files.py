@@ -1,0 +1,236 @@
+"""The labels of a run: their files as other programs read them, and what they say against the twin."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+from PIL import Image
+
+from taichi_msm import ArgumentError, FilesError, Playback, Simulation, resume, run
+from taichi_msm.load.scene_file import load_scene
+from taichi_msm.model.surface import rods
+from taichi_msm.scene.scene import Scene
+from taichi_msm.system.runtime import Device
+from tests.outputs import files, results
+from tests.reference import labels as twin
+from tests.reference.drawing import refine as refined
+from tests.runs.test_resume import interrupted, published
+
+ALL = "output=[png, coordinates, depth, normals, flow, occlusion, instrument, tracks, trajectory]"
+OBLIQUE = "render.camera=oblique"
+ROD = "probes.0.instrument={radius: 0.01, shaft: [1, -0.5, 0.6], length: 0.2}"
+
+
+def small_scene(*overrides: str) -> Scene:
+    return load_scene("small.yaml", ["render.tracks=5", *overrides])
+
+
+def read_flow(path: Path) -> NDArray[np.float32]:
+    """Read the Middlebury format, as its authors describe it."""
+    data = path.read_bytes()
+    assert data[:4] == b"PIEH"
+    width, height = np.frombuffer(data, "<i4", 2, 4)
+    return np.frombuffer(data, "<f4", offset=12).reshape(height, width, 2)
+
+
+def made(directory: str, device: Device, *overrides: str) -> tuple[Path, dict[str, NDArray[Any]]]:
+    """The results of a run with all labels, and its trajectory."""
+    record = run(small_scene(ALL, *overrides), directory, threads=device.threads)
+    assert record["status"] == "complete"
+    with np.load(f"{directory}/trajectory.npz") as archive:
+        return Path(directory), dict(archive)
+
+
+@pytest.mark.parametrize("camera", ["top", "oblique"])
+def test_labels_are_those_of_the_twin(camera: str, small: Path, device: Device) -> None:
+    done, trajectory = made("out", device, f"render.camera={camera}", ROD)
+    scene, position = small_scene(f"render.camera={camera}", ROD), trajectory["position"].astype(float)
+    for frame in range(5):
+        placed = rods(scene, position[frame], trajectory["time"][frame])
+        coordinates, depth, instrument = twin.labels(scene, position[frame], placed)
+        found = np.load(done / f"coordinates/{frame:04}.npy")
+        assert (found.dtype, found.shape) == (np.float32, (30, 40, 2))
+        np.testing.assert_allclose(found, coordinates, atol=1e-5)
+        with Image.open(done / f"depth/{frame:04}.tiff") as image:
+            assert image.mode == "F"
+            np.testing.assert_allclose(np.array(image), depth, rtol=1e-5)
+        with Image.open(done / f"instrument/{frame:04}.png") as image:
+            assert image.mode == "L"
+            np.testing.assert_array_equal(np.array(image), instrument * 255)
+        if frame < 4:
+            flow = read_flow(done / f"flow/{frame:04}.flo")
+            sheet = ~np.isnan(coordinates[..., 0])
+            pixels, _ = twin.find(scene, coordinates[sheet], position[frame + 1])
+            assert np.abs(flow[sheet] - (pixels - np.argwhere(sheet)[:, ::-1] - 0.5)).max() < 0.01
+            assert (flow[~sheet] == 1e10).all()
+            with Image.open(done / f"occlusion/{frame:04}.png") as image:
+                occlusion = np.array(image)
+            assert set(np.unique(occlusion)) <= {0, 255}
+            assert not occlusion[~sheet].any()
+    assert not (done / "flow/0004.flo").exists()
+    assert not (done / "occlusion/0004.png").exists()
+
+
+def test_tracks_are_those_of_the_twin(small: Path, device: Device) -> None:
+    done, trajectory = made("out", device, OBLIQUE)
+    with np.load(done / "tracks.npz") as archive:
+        tracks = dict(archive)
+    middle = (np.arange(5) + 0.5) / 5
+    np.testing.assert_allclose(tracks["coordinates"], [[x, y] for y in middle for x in middle], rtol=1e-6)
+    assert (tracks["points"].dtype, tracks["points"].shape) == (np.float32, (25, 5, 2))
+    assert (tracks["occluded"].dtype, tracks["occluded"].shape) == (np.bool_, (25, 5))
+    for frame, position in enumerate(trajectory["position"].astype(float)):
+        pixels, hidden = twin.find(small_scene(OBLIQUE), tracks["coordinates"].astype(float), position)
+        np.testing.assert_allclose(tracks["points"][:, frame], pixels, atol=1e-3)
+        np.testing.assert_array_equal(tracks["occluded"][:, frame], hidden)
+
+
+@pytest.mark.parametrize("refine", [0, 3])
+def test_tracks_are_on_the_drawn_surface(refine: int, small: Path, device: Device) -> None:
+    """Also within cells: 7 points across are not on the edges of 10 cells."""
+    done, trajectory = made("out", device, OBLIQUE, f"render.refine={refine}", "render.tracks=7")
+    with np.load(done / "tracks.npz") as archive:
+        tracks = dict(archive)
+    assert (tracks["position"].dtype, tracks["position"].shape) == (np.float32, (49, 5, 3))
+    projection = np.array(json.loads((done / "camera.json").read_text())["projection"])
+    for frame, position in enumerate(trajectory["position"].astype(float)):
+        expected = twin.between(refined(position, refine), tracks["coordinates"].astype(float))
+        # Rounded once to single precision, of at most half a metre.
+        np.testing.assert_allclose(tracks["position"][:, frame], expected, rtol=0, atol=2**-25)
+        seen = np.concatenate([tracks["position"][:, frame], np.ones((49, 1))], axis=-1) @ projection.T
+        np.testing.assert_allclose(seen[:, :2] / seen[:, 2:], tracks["points"][:, frame], atol=1e-4)
+
+
+@pytest.mark.parametrize("camera", ["top", "oblique", "{eye: [0.1, -0.3, 0.3], fov: 60, up: [0.2, 1, 0]}"])
+def test_the_camera_projects_material_points_to_their_pixels(camera: str, small: Path, device: Device) -> None:
+    done, trajectory = made("out", device, f"render.camera={camera}")
+    written = json.loads((done / "camera.json").read_text())
+    assert written["size"] == [40, 30]
+    projection = np.array(written["projection"])
+    # A corner of the sheet, which is a mass point, found by its coordinates.
+    with Simulation(small_scene(f"render.camera={camera}"), threads=device.threads) as simulation:
+        seen = simulation.locate(np.array([[0.0, 0.0], [1.0, 0.5]]), positions=trajectory["position"][0])
+    for pixel, (i, j) in zip(seen.pixels, ((0, 0), (4, 10)), strict=True):
+        point = np.append(trajectory["position"][0, i, j], 1)
+        x, y, w = projection @ point
+        np.testing.assert_allclose([x / w, y / w], pixel, atol=1e-4)
+        if camera == "top":
+            assert "pose" not in written
+        else:
+            across, down, depth = np.array(written["pose"]) @ point
+            assert depth > 0, "OpenCV looks along z"
+            seen_at = np.array(written["intrinsics"]) @ [across, down, depth]
+            np.testing.assert_allclose(seen_at[:2] / seen_at[2], pixel, atol=1e-4)
+
+
+def test_labels_do_not_depend_on_the_samples_of_the_picture(small: Path, device: Device) -> None:
+    once, _ = made("once", device, ROD, OBLIQUE)
+    twice, _ = made("twice", device, ROD, OBLIQUE, "render.supersample=2")
+    one, two = results(once), results(twice)
+    assert {name for name in one if one[name] != two[name]} == {f"frames/{n:04}.png" for n in range(5)}
+
+
+def test_labels_need_no_picture(small: Path, device: Device) -> None:
+    scene = small_scene("output=[flow, tracks]").model_copy(update={"image": None})
+    record = run(scene, "out", threads=device.threads)
+    assert record["outputs"] == ["flow", "tracks.npz", "camera.json", "run.json"]
+    assert sorted(results(Path("out"))) == ["camera.json", *(f"flow/{n:04}.flo" for n in range(4)), "tracks.npz"]
+
+
+def test_masks_alone_need_no_camera(small: Path, device: Device) -> None:
+    run(small_scene("output=[occlusion, instrument]"), "out", threads=device.threads)
+    assert not Path("out/camera.json").exists()
+
+
+def test_a_run_with_labels_that_is_interrupted_goes_on_to_the_same_bits(small: Path, device: Device) -> None:
+    overrides = (ALL, ROD, "time.frames_per_second=40")
+    run(small_scene(*overrides), "whole", threads=device.threads)
+    record = interrupted(small_scene(*overrides), "part", device)
+    frames = record["frames"]
+    part = published(Path("part"))
+    assert len([name for name in part if name.startswith("depth/")]) == frames
+    assert len([name for name in part if name.startswith("flow/")]) == frames - 1
+    with np.load("part/tracks.npz") as archive:
+        assert archive["points"].shape == (25, frames, 2)
+    assert resume("part", threads=device.threads)["status"] == "complete"
+    assert results(Path("part")) == results(Path("whole"))
+
+
+def test_labels_of_an_earlier_run_go_and_other_files_stay(small: Path, device: Device) -> None:
+    made("out", device)
+    Path("out/flow/notes.txt").write_text("mine")
+    run(small_scene("output=[depth]", "time.duration=0.2"), "out", threads=device.threads)
+    found = files(Path("out"))
+    assert found.pop("flow/notes.txt") == b"mine"
+    assert sorted(found) == ["camera.json", "depth/0000.tiff", "depth/0001.tiff", "depth/0002.tiff", "run.json"]
+
+
+def test_files_in_the_place_of_labels_are_not_overwritten(small: Path, device: Device) -> None:
+    Path("out/depth").mkdir(parents=True)
+    Path("out/depth/0001.tiff").write_text("mine")
+    with pytest.raises(FilesError, match=r"depth/0001.tiff"):
+        run(small_scene("output=[depth]"), "out", threads=device.threads)
+    assert Path("out/depth/0001.tiff").read_text() == "mine"
+
+
+def test_labels_and_flow_from_python(small: Path, device: Device) -> None:
+    done, trajectory = made("out", device, OBLIQUE, ROD)
+    with Simulation(small_scene(OBLIQUE, ROD), threads=device.threads) as simulation:
+        first = simulation.labels()
+        simulation.advance(3)
+        third = simulation.labels()
+        np.testing.assert_array_equal(third.coordinates, np.load(done / "coordinates/0003.npy"))
+        ahead = simulation.flow(first)
+        back = simulation.flow(third, positions=trajectory["position"][0], time=0.0)
+    # There and back again: of what both frames show, the flow back is where the flow ahead came from.
+    rows, columns = np.nonzero((ahead.flow[..., 0] < 1e9) & (ahead.occlusion == 0))
+    flow = ahead.flow[rows, columns]
+    there = np.stack([columns, rows], axis=-1) + flow
+    near = np.round(there).astype(int)
+    inside = ((near >= 1) & (near < [39, 29])).all(axis=-1) & (np.abs(there - near) < 0.05).all(axis=-1)
+    returned = back.flow[near[inside, 1], near[inside, 0]]
+    good = returned[:, 0] < 1e9
+    assert good.sum() > 5
+    # The flow changes by less than its own size from pixel to pixel, here over 0.05 px.
+    assert np.abs(flow[inside][good] + returned[good]).max() < 0.05 * np.abs(flow).max() + 0.01
+
+
+def test_a_run_is_played_back(small: Path, device: Device) -> None:
+    done, trajectory = made("out", device, OBLIQUE, ROD)
+    with Playback(done, threads=device.threads) as playback:
+        np.testing.assert_array_equal(playback.positions, trajectory["position"])
+        np.testing.assert_array_equal(playback.time, trajectory["time"])
+        with Image.open(done / "frames/0002.png") as image:
+            np.testing.assert_array_equal(playback.draw(2), np.array(image))
+        np.testing.assert_array_equal(playback.labels(3).coordinates, np.load(done / "coordinates/0003.npy"))
+        np.testing.assert_array_equal(playback.flow(1, 2).flow, read_flow(done / "flow/0001.flo"))
+        # Any two frames: what stays where it is flows nowhere.
+        still = playback.flow(4, 4).flow
+        assert np.abs(still[still[..., 0] < 1e9]).max() < 1e-3
+        for frame in (-1, 5, 1.0, True):
+            with pytest.raises(ArgumentError, match=r"frame: .*; take a whole number, 0 to 4"):
+                playback.draw(frame)  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize(
+    ("call", "said"),
+    [
+        (lambda one: one.flow("labels"), "before: take what `labels` gave"),
+        (lambda one: one.flow(one.labels()._replace(coordinates=np.zeros((3, 3, 2)))), "before: take what"),
+        (lambda one: one.flow(one.labels()._replace(coordinates="none")), "before: "),
+        (lambda one: one.flow(one.labels()._replace(coordinates=one.labels().coordinates * 7)), "before: take what"),
+        (lambda one: one.locate([[0.5, 1.5]]), "coordinates: float64 of shape"),
+        (lambda one: one.locate([0.5, 0.5]), "coordinates: float64 of shape"),
+        (lambda one: one.locate([[np.nan, 0.5]]), "coordinates: float64 of shape"),
+        (lambda one: one.labels(positions=np.zeros((3, 3))), "positions: float64 of shape"),
+        (lambda one: one.draw(time="now"), "time: 'now'; take a number"),
+    ],
+)
+def test_wrong_arguments(call: Any, said: str, small: Path, device: Device) -> None:
+    with Simulation(small_scene(), threads=device.threads) as simulation, pytest.raises(ArgumentError, match=said):
+        call(simulation)

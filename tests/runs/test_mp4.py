@@ -1,0 +1,169 @@
+"""Films are read back by PyAV as what was drawn."""
+
+from __future__ import annotations
+
+import errno
+import io
+import json
+from fractions import Fraction
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+from PIL import Image
+
+from taichi_msm import SceneError, run
+from taichi_msm.load.scene_file import load_scene
+from taichi_msm.runs.media import Job, Mp4Writer, PictureWriter
+from taichi_msm.scene import outputs
+from taichi_msm.system.runtime import Device
+from tests.conftest import Program
+from tests.outputs import files
+from tests.runs.test_resume import interrupted
+
+av: Any = pytest.importorskip("av")
+
+# How far colours are off, at most, of fields of one colour, by rounding to 219 levels and back; and of ramps, also by
+# half the resolution in colour, and by what the encoder takes off.
+OF_FIELDS, OF_RAMPS = 4, 16
+
+
+def smooth(width: int, height: int, frame: int) -> NDArray[np.uint8]:
+    across, down = np.meshgrid(np.linspace(0, 1, width), np.linspace(0, 1, height))
+    colours = np.stack([across, down, np.full_like(across, frame / 10)], axis=-1)
+    return (40 + 170 * colours).astype(np.uint8)
+
+
+def write(path: Path, pictures: list[NDArray[np.uint8]], rate: float, quality: int = 65) -> None:
+    height, width, _ = pictures[0].shape
+    writer = Mp4Writer(path.open("x+b"), (width, height), rate, quality)
+    for picture in pictures:
+        writer.add(picture)
+    writer.close()
+
+
+def read(path: Path) -> tuple[Any, list[NDArray[np.uint8]], list[float]]:
+    """The stream of a film, its pictures, and when each appears [s]."""
+    with av.open(str(path)) as container:
+        (stream,) = container.streams
+        frames = list(container.decode(stream))
+        assert (stream.codec_context.name, stream.codec_context.pix_fmt) == ("h264", "yuv420p")
+        assert stream.frames == len(frames)
+        pictures = [frame.to_ndarray(format="rgb24") for frame in frames]
+        # What it knows is gone with the container.
+        names = ("width", "height", "frames", "average_rate", "time_base", "duration")
+        known = SimpleNamespace(**{name: getattr(stream, name) for name in names})
+        codec = stream.codec_context
+        known.colours = codec.colorspace, codec.color_primaries, codec.color_trc, codec.color_range
+        return known, pictures, [float(frame.pts * frame.time_base) for frame in frames]
+
+
+@pytest.mark.parametrize("size", [(64, 48), (63, 48), (64, 47), (33, 31), (1, 1)])
+def test_an_odd_last_row_or_column_is_repeated(size: tuple[int, int], tmp_path: Path) -> None:
+    width, height = size
+    drawn = [smooth(width, height, frame) for frame in range(7)]
+    write(tmp_path / "a.mp4", drawn, 25)
+    stream, shown, _ = read(tmp_path / "a.mp4")
+    assert (stream.width, stream.height) == (width + width % 2, height + height % 2)
+    assert len(shown) == 7
+    for one, other in zip(shown, drawn, strict=True):
+        expected = other[np.minimum(np.arange(stream.height), height - 1)][
+            :, np.minimum(range(stream.width), width - 1)
+        ]
+        assert np.abs(one.astype(int) - expected).max() <= OF_RAMPS
+
+
+@pytest.mark.parametrize("rate", [25, 12.5, 30000 / 1001, 0.1, 1000, 1 / 3])
+def test_every_frame_has_its_time(rate: float, tmp_path: Path) -> None:
+    write(tmp_path / "a.mp4", [smooth(32, 32, frame) for frame in range(12)], rate)
+    stream, _, times = read(tmp_path / "a.mp4")
+    assert float(stream.average_rate) == pytest.approx(rate, rel=1e-9)
+    # A tick of the file.
+    np.testing.assert_allclose(times, np.arange(12) / rate, rtol=0, atol=float(stream.time_base))
+    assert float(stream.duration * stream.time_base) == pytest.approx(12 / rate, abs=float(stream.time_base))
+
+
+def test_the_colours_are_named_so_that_no_player_guesses(tmp_path: Path) -> None:
+    """Saturated colours, which would be off by up to 30 with the other standard's matrix."""
+    drawn = [np.full((32, 32, 3), colour, np.uint8) for colour in ((200, 30, 30), (30, 200, 30), (30, 30, 200))]
+    write(tmp_path / "a.mp4", drawn, 25)
+    stream, shown, _ = read(tmp_path / "a.mp4")
+    assert stream.colours == (1, 1, 1, 1)
+    for one, other in zip(shown, drawn, strict=True):
+        assert np.abs(one.astype(int) - other).max() <= OF_FIELDS
+
+
+def test_the_index_comes_before_the_pictures(tmp_path: Path) -> None:
+    """So that a browser shows a film while it loads."""
+    write(tmp_path / "a.mp4", [smooth(32, 32, frame) for frame in range(12)], 25)
+    data = (tmp_path / "a.mp4").read_bytes()
+    assert 0 < data.index(b"moov") < data.index(b"mdat")
+
+
+def test_quality_is_bought_with_bytes(small: Path, program: Program) -> None:
+    sizes = []
+    for quality in ("1", "65", "100"):
+        done = program("run", "small.yaml", "--set", "output=[mp4]", "--quality", quality, "--quiet", "--no-estimate")
+        assert (done.returncode, done.stderr) == (0, "")
+        sizes.append(Path("output/small/animation.mp4").stat().st_size)
+        assert json.loads(Path("output/small/run.json").read_text())["overrides"][-1] == f"render.quality={quality}"
+    assert sizes[0] < sizes[1] < sizes[2]
+
+
+def test_a_full_disk_is_the_error_of_python() -> None:
+    class Full(io.BytesIO):
+        def write(self, data: Any) -> int:
+            raise OSError(errno.ENOSPC, "no space")
+
+    rng = np.random.default_rng(0)
+    writer = Mp4Writer(Full(), (256, 256), 25, 65)
+    with pytest.raises(OSError, match="no space") as caught:  # noqa: PT012
+        for _ in range(40):
+            writer.add(rng.integers(0, 256, (256, 256, 3), dtype=np.uint8))
+        writer.close()
+    assert caught.value.errno == errno.ENOSPC
+
+
+def test_a_run_writes_a_film_of_its_frames(small: Path, device: Device) -> None:
+    scene = load_scene("small.yaml", ["output=[png, mp4]", "render.size=[41, 30]"])
+    done = run(scene, "out", threads=device.threads, estimate_error=False)
+    assert done["outputs"] == ["frames", "animation.mp4", "run.json"]
+    stream, shown, times = read(Path("out/animation.mp4"))
+    assert (stream.width, stream.height, stream.average_rate) == (42, 30, Fraction(10))
+    np.testing.assert_allclose(times, np.arange(5) / 10, rtol=0, atol=1e-4)
+    for frame, one in enumerate(shown):
+        drawn = np.asarray(Image.open(f"out/frames/{frame:04}.png")).astype(int)
+        # Half the resolution in colour, so it is compared in light: 3 grey levels of noise.
+        weights = (0.2126, 0.7152, 0.0722)
+        assert np.abs((one[:, :-1] - drawn) @ weights).mean() < 3
+
+
+def test_a_film_alone_is_enough_and_the_same_after_an_interruption(small: Path, device: Device) -> None:
+    overrides = ["output=[mp4, trajectory]", "time.frames_per_second=40"]
+    run(load_scene("small.yaml", overrides), "whole", threads=device.threads, estimate_error=False)
+    record = interrupted(load_scene("small.yaml", overrides), "part", device)
+    stream, _, _ = read(Path("part/animation.mp4"))
+    assert 0 < stream.frames == record["frames"] < 17
+    run(load_scene("small.yaml", overrides), "part", threads=device.threads, estimate_error=False)
+    whole, part = (files(Path(name)) for name in ("whole", "part"))
+    assert whole["animation.mp4"] == part["animation.mp4"]
+
+
+def test_a_film_can_be_given_up(tmp_path: Path) -> None:
+    job = Job((tmp_path,), (64, 48), 25.0, png=False, gif=True, background=(0, 0, 0), mp4=True)
+    writer = PictureWriter(job)
+    for frame in range(30):
+        writer.add(smooth(64, 48, frame)[None])
+    writer.abort()
+    assert {path.name for path in tmp_path.iterdir()} == {"animation.gif", "animation.mp4"}
+
+
+def test_without_pyav_the_scene_is_refused(small: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(outputs, "is_pyav_installed", lambda: False)
+    with pytest.raises(SceneError) as caught:
+        load_scene("small.yaml", ["output=[png, mp4]"])
+    assert str(caught.value).endswith("output: mp4 needs PyAV, which is not installed; pip install av")
+    load_scene("small.yaml", ["output=[png]"])

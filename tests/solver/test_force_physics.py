@@ -1,0 +1,213 @@
+"""The forces of tools against the physics that they stand for: Newton's third law, work, and tools of known force."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+from scipy.optimize import brentq
+from scipy.special import k0, k1
+
+from taichi_msm import Simulation
+from taichi_msm.model.loads import loads_at
+from taichi_msm.scene.scene import Scene
+from taichi_msm.system.runtime import Device
+from tests import reference
+from tests.reference.sheet import sheet as assembled
+from tests.scenes import plan_of
+from tests.terms.test_contact import HELD, PRESSED, RUBBED, moved, touching
+
+Array = NDArray[np.float64]
+
+FREE = {"points": [17, 21], "size": [0.3, 0.4], "fixed": "none"}
+UNDAMPED = {"young": 1e3, "thickness": 0.01, "density": 1000}
+LOAD = {"total": [0.3, 0, -1], "at": [0.3, 0.3], "load": [[0, 0], [0.4, 100]], "falloff": 40}
+
+
+def test_a_free_sheet_gains_the_momentum_that_its_tools_give(device: Device) -> None:
+    """Velocities are those half a step before the frames, and a load is linear between them."""
+    made = touching([PRESSED, HELD, LOAD], sheet=FREE, tissue=UNDAMPED, time={"step": 1 / 1000})
+    mass, gained = assembled(made).mass[..., None], []
+    with Simulation(made, threads=device.threads) as simulation:
+        simulation.advance()
+        for _ in range(9):
+            before = (mass * simulation.velocities()).sum(axis=(0, 1)), np.array(simulation.forces()[2].force)
+            simulation.advance()
+            *tools, load = (np.array(one.force) for one in simulation.forces())
+            given = sum(tools) / 25 + (before[1] + load) / 2 / 25 - (load - before[1]) / 2 / 1000
+            gained.append((mass * simulation.velocities()).sum(axis=(0, 1)) - before[0] - given)
+            assert np.abs(given).max() > 1e-3
+    assert np.abs(gained).max() < 1e-12
+
+
+@pytest.mark.parametrize(
+    "probe",
+    [
+        moved([0, 0.5, 0.5, 0.0], [0.2, 0.55, 0.5, -0.03]),
+        moved([0, 0.5, 0.5, 0.0], [0.2, 0.55, 0.5, -0.03], friction=0.3),
+        moved([0, 0.5, 0.5, 0.0], [0.2, 0.55, 0.5, 0.03], grip=[[0, 10]]),
+    ],
+    ids=["pressed", "rubbed", "pulled"],
+)
+def test_at_rest_a_tool_bears_what_springs_and_foundation_would_do_without_it(
+    probe: dict[str, Any], device: Device
+) -> None:
+    """The forces of the springs that are cut free, and so those on what holds the sheet."""
+    tissue = {**UNDAMPED, "foundation": 3e3, "foundation_active": "always", "damping": 30}
+    made = touching([probe], tissue=tissue, time={"duration": 3.0})
+    with Simulation(made, threads=device.threads) as simulation:
+        rest = simulation.positions()
+        simulation.advance(75)
+        (felt,), u = simulation.forces(), simulation.positions() - rest
+        assert np.abs(simulation.velocities()).max() < 1e-12
+    fixed, force = plan_of(made).fixed, reference.force(made, u, loads_at(plan_of(made), np.array([3.0])), 0)
+    touched = np.linalg.norm(force, axis=-1) > 1e-9
+    assert 5 < (touched & ~fixed).sum() < 60
+    size = np.linalg.norm(felt.force)
+    np.testing.assert_allclose(felt.force, -force[touched & ~fixed].sum(axis=0), rtol=0, atol=1e-9 * size)
+    springs, held = reference.elastic_force(made, u), assembled(made).virtual[..., None] * u
+    np.testing.assert_allclose(springs[fixed].sum(axis=0), -springs[~fixed].sum(axis=0), rtol=0, atol=1e-12 * size)
+    np.testing.assert_allclose(felt.force, springs[fixed].sum(axis=0) + held.sum(axis=(0, 1)), rtol=0, atol=1e-9 * size)
+
+
+def dipped(count: int = 81) -> list[list[float]]:
+    """A path that goes down smoothly."""
+    times = np.linspace(0, 0.4, count).tolist()
+    return [[t, 0.5, 0.5, 0.001 - 0.03 * math.sin(math.pi * t / 0.8) ** 2] for t in times]
+
+
+def balance(probe: dict[str, Any], device: Device, points: tuple[int, int] = (17, 21), rate: int = 1200) -> Array:
+    """Work of a tool, energy gained and energy lost to damping [J]; every step is a frame."""
+    tissue = {**UNDAMPED, "foundation": 3e3, "foundation_active": "always", "damping": 5}
+    time = {"frames_per_second": rate, "step": 1 / rate}
+    made = touching([probe], sheet={"points": points, "size": [0.3, 0.4]}, tissue=tissue, time=time)
+    parts, tips, forces, velocities = assembled(made), [], [], []
+    with Simulation(made, threads=device.threads) as simulation:
+        rest = simulation.positions()
+        for _ in range(plan_of(made).grid.frames):
+            tips.append(simulation.forces()[0].tip)
+            simulation.advance()
+            forces.append(simulation.forces()[0].force)
+            velocities.append(simulation.velocities())
+        u, last = simulation.positions() - rest, simulation.forces()[0].tip
+        gained = simulation.progress.energy + (parts.virtual[..., None] * u * u).sum() / 2
+    # A force at step n does work along the way from step n - 1 to n + 1, and so does the damping.
+    ways = np.array([*tips[1:], last]) - np.array(tips)
+    work = (np.array(forces)[1:] * (ways[1:] + ways[:-1])).sum() / 2
+    middle = (np.array(velocities)[1:] + np.array(velocities)[:-1]) / 2
+    return np.array([work, gained, 5 * (parts.mass[..., None] * middle**2).sum() / rate])
+
+
+def test_the_work_of_a_grip_is_the_energy_gained_and_lost(device: Device) -> None:
+    """But for the kinks of its path, each of which gives m (dv)^2 / 2 within a step, and half a step at both ends."""
+    missing = []
+    for rate in (300, 600, 1200):
+        work, gained, lost = balance(moved(*dipped(), grip=[[0, 1]]), device, rate=rate)
+        assert lost > 0.05 * work
+        missing.append(abs(work - gained - lost) / work)
+    assert missing[0] < 1e-3
+    assert missing[1] < 0.6 * missing[0]
+    assert missing[2] < 0.6 * missing[1]
+
+
+def test_the_work_of_a_press_is_the_energy_gained_and_lost_but_for_impacts(device: Device) -> None:
+    """Each point that comes to the tool takes on its speed, and loses the energy of the difference: less with more."""
+    missing = []
+    for points in ((9, 11), (17, 21), (65, 81)):
+        work, gained, lost = balance(moved(*dipped()), device, points)
+        missing.append((work - gained - lost) / work)
+    assert 0.05 > missing[0] > missing[1] > missing[2] > 0
+    assert missing[2] < 0.02
+
+
+def test_friction_takes_energy(device: Device) -> None:
+    work, gained, lost = balance(RUBBED, device)
+    assert work - gained - lost > 0.3 * work
+
+
+# Tension, foundation, and the length over which a dent fades, in a sheet that is wide for it.
+S, K = 25.0, 4e5
+FADES = math.sqrt(S / K)
+
+
+def membrane(points: int, probe: dict[str, Any], **tissue: Any) -> Scene:
+    """A sheet whose tension holds it, with all that a load does to it come to rest after 0.12 s."""
+    held = {"young": 3e4, "thickness": 3e-3, "density": 1050, "damping": 700, "pretension": S, "foundation": K}
+    return Scene(
+        sheet={"points": [points, points], "size": [0.1, 0.1]},
+        tissue={**held, "foundation_active": "always", **tissue},
+        probes=[probe],
+        time={"duration": 0.12, "precision": "f64"},
+        output=[],
+    )
+
+
+def lowered(radius: float, height: float, **changes: Any) -> dict[str, Any]:
+    """A rod that stands upright."""
+    rod = {"radius": radius, "shaft": [0, 0, 1], "length": 0.1}
+    return {"path": [[0, 0.5, 0.5, 0.0], [0.02, 0.5, 0.5, height]], "instrument": rod, **changes}
+
+
+def pressed(made: Scene, device: Device) -> tuple[Array, Array]:
+    """The tip and the force at the end."""
+    with Simulation(made, threads=device.threads) as simulation:
+        simulation.advance(3)
+        (felt,) = simulation.forces()
+        assert np.abs(simulation.velocities()).max() < 1e-9
+        return np.array(felt.tip), np.array(felt.force)
+
+
+def test_a_membrane_on_a_foundation_resists_a_round_tip(device: Device) -> None:
+    """As K0: with S w'' = K w outside of the radius c, and the sphere within, both smooth where they meet.
+
+    The depth is a twentieth of the length over which the dent fades, so slopes squared, which springs feel, are 0.003.
+    """
+    radius, depth = 0.04, 4e-4
+
+    def height(c: float) -> float:
+        return float(c / radius * FADES / k1(c / FADES) * k0(c / FADES) + c**2 / (2 * radius))
+
+    c = brentq(lambda c: height(c) - depth, 1e-6, 0.02)
+    under = K * (math.pi * c**2 * depth - math.pi * c**4 / (4 * radius))
+    expected = under + S * 2 * math.pi * c * c / radius
+    errors = []
+    for points in (61, 121):
+        tip, force = pressed(membrane(points, lowered(radius, -depth)), device)
+        assert tip[2] == -depth
+        assert np.abs(force[:2]).max() < 1e-12
+        errors.append(abs(force[2] / -expected - 1))
+    assert errors[0] < 0.04
+    assert errors[1] < 0.01
+
+
+def test_a_membrane_on_a_foundation_resists_a_flat_patch(device: Device) -> None:
+    """A grip holds the points of a disc: K pi a^2 w below it, and 2 pi a S w / l K1(a / l) / K0(a / l) at its rim.
+
+    The rim is a staircase, with an error of the first order, which two meshes tell.
+    """
+    a, height = 0.01, 4e-4
+    # A tip that touches the sheet holds what is within 1.5 radii of its middle.
+    tool = lowered(a / math.sqrt(1.5**2 - 1), height, grip=[[0, 10]])
+    x = a / FADES
+    expected = height * (K * math.pi * a**2 + 2 * math.pi * a * S / FADES * k1(x) / k0(x))
+    coarse, fine = (float(pressed(membrane(points, tool), device)[1][2]) for points in (61, 121))
+    assert fine == pytest.approx(expected, rel=0.06)
+    assert 2 * fine - coarse == pytest.approx(expected, rel=0.03)
+
+
+def test_a_foundation_alone_resists_by_the_area(device: Device) -> None:
+    """K a w exactly, of the points that are held; and by the pressure under the flat end of a load."""
+    alone = {"young": 1e-6, "pretension": 0}
+    a = 0.01015  # No point is so far from the middle.
+    tool = lowered(a / math.sqrt(1.5**2 - 1), 4e-4, grip=[[0, 10]])
+    _, force = pressed(membrane(101, tool, **alone), device)
+    area = 1e-6 * sum(math.hypot(i, j) < 1e3 * a for i in range(-11, 12) for j in range(-11, 12))
+    assert area == pytest.approx(math.pi * a**2, rel=0.01)
+    np.testing.assert_allclose(force, [0, 0, K * area * 4e-4], rtol=1e-9, atol=1e-12)
+    load = {"total": [0, 0, -0.1], "radius": a, "falloff": 1e7, "load": [[0, 0], [0.02, 100]]}
+    tip, force = pressed(membrane(101, load, **alone), device)
+    assert force[2] == pytest.approx(-0.1, rel=0.01)
+    assert tip[2] == pytest.approx(-0.1 / (math.pi * a**2) / K, rel=1e-3)

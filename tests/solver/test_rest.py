@@ -1,0 +1,313 @@
+"""The sheet at rest against SciPy's minimum of the twin's energy, and against what must hold of any equilibrium."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+from PIL import Image
+
+from taichi_msm.errors import DivergedError
+from taichi_msm.model.loads import frame_loads
+from taichi_msm.model.plan import Plan
+from taichi_msm.model.sheet import rest_positions
+from taichi_msm.model.tools import path_notes
+from taichi_msm.runs.simulation import Simulation
+from taichi_msm.scene.scene import Scene
+from taichi_msm.solver.arrays import SheetLayout
+from taichi_msm.solver.dynamics import Dynamics, layout_of
+from taichi_msm.solver.rest import ENOUGH, Rest
+from taichi_msm.system.runtime import Device
+from tests import reference
+from tests.scenes import plan_of, scene, speckle
+from tests.solver.test_dynamics import with_lanes
+from tests.terms.test_contact import moved
+
+Array = NDArray[np.float64]
+
+# The law: of the largest displacement.
+CLOSE = 2e-6
+
+SHEET = {"points": [9, 11], "size": [0.3, 0.4]}
+TISSUE = {"young": 1e3, "thickness": 0.01, "foundation": 3e3}
+PUSH = {"total": [0.3, 0.2, -1], "radius": 0.03, "falloff": 30, "at": [0.4, 0.6]}
+
+
+def at_rest(probes: list[dict[str, Any]], **sections: Any) -> Scene:
+    """A scene of one frame interval, in tissue."""
+    given = {"sheet": SHEET, "tissue": TISSUE, "springs": None, "damping": 0, "probes": probes, **sections}
+    time = {"motion": "quasistatic", "duration": 1, "frames_per_second": 1, "precision": "auto"}
+    return scene(**{**given, "time": {**time, **sections.get("time", {})}})
+
+
+def tissue(probe: dict[str, Any] = PUSH, sheet: dict[str, Any] | None = None, **keys: Any) -> Scene:
+    return at_rest([probe], sheet={**SHEET, **(sheet or {})}, tissue={**TISSUE, **keys})
+
+
+SPRINGY = {"structural": 20, "shear": 10, "virtual": 0.5}
+POINTED = {"force": [0.1, 0.2, -1], "falloff": 20, "offset": 0}
+
+
+def springy(sheet: dict[str, Any] | None = None, **keys: Any) -> Scene:
+    given = {**SPRINGY, **keys}
+    return at_rest([POINTED], sheet={**SHEET, **(sheet or {})}, tissue=None, springs=given)
+
+
+@pytest.fixture
+def grey(tmp_path: Path) -> str:
+    path = tmp_path / "grey.png"
+    Image.fromarray(speckle(6, 7)[..., 0]).save(path)
+    return str(path)
+
+
+def case(name: str, grey: str) -> Scene:
+    return {
+        "springs": lambda: springy(),
+        "springs, one side": lambda: springy({"fixed": ["left"]}, virtual=5),
+        "springs, map": lambda: springy(map={"image": grey, "range": [0.5, 4]}),
+        "tissue": lambda: tissue(foundation_active="always"),
+        "pulled": lambda: tissue({**PUSH, "total": [0, 0, 2]}),
+        "tension": lambda: tissue(pretension=2, foundation=0),
+        "plate": lambda: tissue(bending="plate"),
+        "plate, map": lambda: tissue(bending=1e-3, pretension=1, map={"image": grey, "range": [1, 6]}),
+        "corners": lambda: tissue(sheet={"fixed": "corners"}),
+        "nothing fixed": lambda: tissue({**PUSH, "total": [0.05, 0.02, -0.3]}, {"fixed": "none"}),
+        "one side, map": lambda: tissue(sheet={"fixed": ["top"]}, map={"image": grey, "range": [1, 6]}),
+        "moving": lambda: tissue({**PUSH, "at": [[0, 0.2, 0.2], [2, 0.8, 0.6]]}),
+    }[name]()
+
+
+CASES = (
+    "springs", "springs, one side", "springs, map", "tissue", "pulled", "tension", "plate", "plate, map", "corners",
+    "nothing fixed", "one side, map", "moving",
+)  # fmt: skip
+
+# These have every term, and most ways to fix a sheet.
+QUICK = ("springs, one side", "plate, map", "moving")
+
+
+def shape_of(plan: Plan, device: Device, frames: int = 1, layout: SheetLayout | None = None) -> Array:
+    """Displacements of the last of some frames [m]."""
+    rest = Rest(plan, device, layout)
+    rest.advance(frames)
+    assert rest.residual <= ENOUGH
+    u = rest.displacement()
+    rest.close()
+    return u
+
+
+def nearly_flat(plan: Plan) -> Array:
+    """Displacements that no symmetry keeps in the plane [m]."""
+    return 1e-9 * np.random.default_rng(0).standard_normal((*plan.fixed.shape, 3)) * ~plan.fixed[..., None]
+
+
+def assert_close(u: Array, twin: Array) -> None:
+    np.testing.assert_allclose(u, twin, rtol=0, atol=CLOSE * float(np.abs(twin).max()))
+
+
+@pytest.mark.parametrize(
+    "name", [pytest.param(name, marks=() if name in QUICK else pytest.mark.slow) for name in CASES]
+)
+def test_like_scipy(name: str, grey: str, device: Device) -> None:
+    plan = plan_of(case(name, grey))
+    u = shape_of(plan, device)
+    twin = reference.equilibrium(plan, frame_loads(plan, 1), nearly_flat(plan))
+    assert np.abs(twin).max() > 0.003
+    assert_close(u, twin)
+
+
+PRESSED = moved([0, 0.5, 0.5, 0.001], [1, 0.52, 0.45, -0.03])
+
+
+def test_a_tool_like_scipy_with_constraints(device: Device) -> None:
+    plan = plan_of(at_rest([PRESSED], tissue={**TISSUE, "pretension": 2}))
+    rest = Rest(plan, device)
+    rest.advance(1)
+    u, loads = rest.displacement(), frame_loads(plan, 1)
+    twin = reference.equilibrium_outside_tool(plan, loads, 1.0, 0.01)
+    assert (reference.clearance(plan, twin, 1.0) < 1e-9).sum() >= 3
+    assert_close(u, twin)
+    # In balance, the tool bears what all else exerts on the sheet.
+    others = reference.force(plan.scene, u, loads, 0)[~plan.fixed].sum(axis=0)
+    np.testing.assert_allclose(rest.tool_forces()[0], -others, rtol=0, atol=1e-6 * np.abs(others).max())
+
+
+def test_a_grip_holds_the_points_of_the_frame_before(device: Device) -> None:
+    tool = moved([0, 0.5, 0.4, 0.0], [1, 0.5, 0.4, -0.02], [2, 0.45, 0.6, 0.04], grip=[[1.5, 2.5]])
+    plan = plan_of(at_rest([tool], time={"duration": 3}))
+    rest = Rest(plan, device)
+    rest.advance(1)
+    before, tip = rest.displacement(), plan.tools[0]
+    rest.advance(1)
+    u, middle = rest.displacement(), tip.middle(np.array([1.0, 2.0]))
+    held = np.linalg.norm(reference.place(plan, before) - middle[0], axis=-1) <= 1.5 * tip.radius
+    assert held.sum() > 4
+    moved_by = np.where(held[..., None], before + middle[1] - middle[0], 0)
+    np.testing.assert_allclose(u[held], moved_by[held], rtol=0, atol=1e-15)
+    assert_close(
+        u, reference.equilibrium(plan, frame_loads(plan, 2), moved_by + nearly_flat(plan) * ~held[..., None], held)
+    )
+    others = reference.force(plan.scene, u, frame_loads(plan, 2), 0)[~plan.fixed].sum(axis=0)
+    np.testing.assert_allclose(rest.tool_forces()[0], -others, rtol=0, atol=1e-6 * np.abs(others).max())
+    # Let go, at the first frame after the end of the grip, it is flat: the tip is above it.
+    rest.advance(1)
+    assert not rest.displacement().any()
+    assert not rest.tool_forces().any()
+
+
+def test_one_frame_goes_the_way_of_many(device: Device) -> None:
+    """At its end the middle of the tip is below the flat sheet, which it would push aside."""
+    made = at_rest([moved([0, 0.5, 0.5, 0.001], [1, 0.5, 0.5, -0.06])])
+    u = shape_of(plan_of(made), device)
+    assert u[..., 2].min() < -0.059
+    assert_close(u, shape_of(plan_of(with_rate(made, 20)), device, 20))
+
+
+@pytest.mark.parametrize("frames", [1, 10])
+def test_a_rod_that_lies_does_not_fall_through_the_sheet(frames: int, device: Device) -> None:
+    """At its end the flat sheet would be above it."""
+    rod = {"radius": 0.005, "shaft": [1, 0, 0], "length": 0.03}
+    made = at_rest(
+        [moved([0, 0.5, 0.5, 0], [1, 0.5, 0.5, -0.015], instrument=rod)],
+        sheet={"points": [31, 31], "size": [0.1, 0.1]},
+        tissue={"young": 3e4, "thickness": 3e-3, "foundation": 3e5, "pretension": 25},
+    )
+    u = shape_of(plan_of(with_rate(made, frames)), device, frames)
+    assert u[..., 2].min() == pytest.approx(-0.015, rel=0.01)
+
+
+def with_rate(made: Scene, rate: float) -> Scene:
+    return made.model_copy(update={"time": made.time.model_copy(update={"frames_per_second": rate})})
+
+
+def test_a_stepped_sheet_comes_to_the_same_rest(device: Device) -> None:
+    made = tissue(pretension=2, density=1000, damping=20, foundation_active="always")
+    dynamic = made.model_copy(update={"time": made.time.model_copy(update={"motion": "dynamic", "duration": 4})})
+    stepped = Dynamics(plan_of(dynamic).with_grid(precision="f64"), device)
+    stepped.advance(stepped.plan.grid.steps)
+    assert_close(shape_of(plan_of(made), device), stepped.displacement())
+
+
+@pytest.mark.parametrize(
+    "made",
+    [
+        tissue({**PUSH, "at": [[0, 0.2, 0.2], [2, 0.8, 0.6]]}, {"points": [9, 14]}, bending="plate"),
+        at_rest([PRESSED], sheet={**SHEET, "fixed": ["left", "top"]}),
+    ],
+)
+def test_lanes_do_not_change_the_bits(made: Scene, device: Device) -> None:
+    plan = plan_of(made)
+    layout = layout_of(plan, device)
+    plain = shape_of(plan, device).tobytes()
+    for lanes in (1, 4):
+        assert shape_of(plan, device, layout=with_lanes(layout, lanes)).tobytes() == plain
+
+
+SQUEEZE = {"total": [1.5, 0, 0], "radius": 0.03, "falloff": 30, "at": [0.3, 0.5]}
+LIFT = {"total": [0, 0, 0.05], "radius": 0.03, "falloff": 30, "at": [0.6, 0.5], "load": [[0, 100], [2, 100], [2, 0]]}
+
+
+def test_a_flat_sheet_that_is_pressed_together_buckles(device: Device) -> None:
+    plan = plan_of(tissue(SQUEEZE, foundation=100))
+    u, loads = shape_of(plan, device), frame_loads(plan, 1)
+    flat = np.zeros_like(u)
+    in_plane = reference.equilibrium(plan, loads, flat)
+    assert not in_plane[..., 2].any(), "the forces balance in the plane, too"
+    assert np.abs(u[..., 2]).max() > 0.01
+    assert reference.potential(plan.scene, u, loads) < reference.potential(plan.scene, in_plane, loads)
+    assert softest(plan, in_plane, 1) < 0 < softest(plan, u, 1)
+
+
+# With a force of CRITICAL the softest mode of the flat sheet loses its stiffness; found by bisection with `softest`.
+CRITICAL = [({"foundation": 3e3}, 2.0314), ({"foundation": 100, "bending": "plate"}, 0.24046)]
+
+
+@pytest.mark.parametrize(("keys", "critical"), CRITICAL)
+def test_it_buckles_near_the_critical_load(keys: dict[str, Any], critical: float, device: Device) -> None:
+    for share, buckles in ((0.99, False), (1.03, True)):
+        squeeze = {**SQUEEZE, "total": [share * critical, 0, 0]}
+        plan = plan_of(tissue(squeeze, foundation_active="always", **keys))
+        u = shape_of(plan, device)
+        assert (np.abs(u[..., 2]).max() > 1e-3) == buckles
+        assert softest(plan, u, 1) > 0
+
+
+def softest(plan: Plan, u: Array, frame: int) -> float:
+    """The smallest eigenvalue of the stiffness of the points that move [N/m]."""
+    free, loads = ~plan.fixed, frame_loads(plan, frame)
+
+    def slope(x: Array) -> Array:
+        placed = u.copy()
+        placed[free] = x.reshape(-1, 3)
+        return -reference.force(plan.scene, placed, loads, 0)[free].ravel()
+
+    return float(np.linalg.eigvalsh(reference.stiffness(slope, u[free].ravel())).min())
+
+
+@pytest.mark.parametrize("side", [1, -1])
+def test_what_has_buckled_goes_on_as_it_began(side: int, device: Device) -> None:
+    lift = {**LIFT, "total": [0, 0, side * 0.05]}
+    plan = plan_of(
+        at_rest(
+            [{**SQUEEZE, "load": [[1, 0], [2, 100]]}, lift], tissue={**TISSUE, "foundation": 100}, time={"duration": 3}
+        )
+    )
+    u = shape_of(plan, device, 3)
+    largest = np.abs(u[..., 2]).max()
+    assert largest > 0.01
+    assert (side * u[..., 2]).max() == largest
+
+
+def test_loads_at_a_frame(device: Device) -> None:
+    jump = {**PUSH, "load": [[0, 50], [1, 100], [1, -20], [2, 0], [2.0000005, 70], [3, 0]]}
+    plan = plan_of(at_rest([jump], time={"duration": 4}))
+    percents = [frame_loads(plan, frame).strength[0, 0, 2] for frame in range(5)]
+    whole = frame_loads(plan_of(at_rest([PUSH])), 1).strength[0, 0, 2]
+    # A key within a millionth of a frame is at it; and what comes later counts.
+    np.testing.assert_allclose(percents, whole * np.array([0.5, -0.2, 0.7, 0, 0]), rtol=1e-12)
+    assert [frame_loads(plan, frame).active[0] for frame in range(5)] == [1, 1, 1, 0, 0]
+    path = plan_of(at_rest([moved([1, 0.5, 0.5, 0.001], [2, 0.5, 0.5, 0.1])], time={"duration": 3}))
+    assert [frame_loads(path, frame).active[0] for frame in range(4)] == [0, 1, 1, 0]
+
+
+def test_without_a_load_it_is_flat_and_a_held_load_costs_nothing(device: Device) -> None:
+    # Neither tension nor a foundation would bring it back.
+    made = tissue({**PUSH, "load": [[0, 0], [1, 100], [2, 100], [2.5, 0]]}, foundation=0)
+    rest, shapes, evaluations = Rest(plan_of(made), device), [], []
+    for frame in range(5):
+        rest.advance(min(frame, 1))
+        shapes.append(rest.displacement())
+        evaluations.append(rest.evaluations)
+    assert not shapes[0].any()
+    assert shapes[1].tobytes() == shapes[2].tobytes()
+    assert not shapes[3].any()
+    assert evaluations[2:] == [1, 1, 1]
+
+
+def test_mass_and_damping_and_the_step_do_not_matter(device: Device) -> None:
+    plain = shape_of(plan_of(springy()), device).tobytes()
+    heavy = springy({"mass": 3.0}).model_copy(update={"damping": 0.3})
+    assert shape_of(plan_of(heavy), device).tobytes() == plain
+    slow = heavy.model_copy(update={"time": heavy.time.model_copy(update={"step": 0.7})})
+    assert shape_of(plan_of(slow), device).tobytes() == plain
+
+
+NEVER = {"sheet": {**SHEET, "fixed": "none"}, "tissue": {**TISSUE, "foundation": 0}}
+
+
+def test_a_sheet_that_nothing_holds_never_rests(device: Device) -> None:
+    with Simulation(at_rest([{**PUSH, "load": [[0, 0], [1, 100]]}], **NEVER), threads=device.threads) as simulation:
+        with pytest.raises(DivergedError, match=r"diverged at 1 s, frame 1: no shape .* nothing holds the sheet; fix"):
+            simulation.advance()
+        assert simulation.frame == 0
+        assert (simulation.positions() == rest_positions(simulation.scene.sheet)).all()
+        assert "nothing holds" in simulation.diagnose().message
+
+
+def test_a_grip_between_two_frames_is_noted() -> None:
+    plan = plan_of(at_rest([moved([0, 0.5, 0.5, 0.001], grip=[[0.2, 0.8], [0.9, 1.5]])]))
+    (note,) = (note for note in path_notes(plan.scene, plan.tools) if "grip" in note)
+    assert note == "probes.0.grip from 0.2 to 0.8 s holds nothing: no frame is between them"

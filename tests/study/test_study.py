@@ -1,0 +1,530 @@
+"""What a study measures is what it says."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from contextlib import closing
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+from PIL import Image
+from pydantic import BaseModel
+
+from taichi_msm.accuracy.mesh import with_points
+from taichi_msm.accuracy.time_step import longest
+from taichi_msm.model.plan import Plan
+from taichi_msm.model.sheet import rest_positions
+from taichi_msm.runs.run import run
+from taichi_msm.scene.scene import Scene
+from taichi_msm.solver.dynamics import Dynamics
+from taichi_msm.solver.planning import with_time
+from taichi_msm.study import measurements
+from taichi_msm.study import study as study_module
+from taichi_msm.study.measurements import (
+    MARGIN,
+    POINT_ROUNDS,
+    FailedError,
+    PointStudy,
+    SteppingStudy,
+    TooSlowError,
+    _reference,
+    lattices,
+    measure_pictures,
+    measure_terms,
+    solve,
+    variants,
+)
+from taichi_msm.study.measurements import POINT_ROUNDS as POINTS_ROUNDS
+from taichi_msm.study.result import Drawn, Stepping, Study, Timing, observed_orders
+from taichi_msm.system.runtime import Device
+from taichi_msm.terms.damping import DampingTerm
+from taichi_msm.terms.foundation import FoundationTerm
+from taichi_msm.terms.loads import ProbeTerm
+from taichi_msm.terms.springs import SpringTerm
+from tests import reference
+from tests.motion import frames_on, structure_of
+from tests.scenes import PRESS, SPRINGS, plan_of, scene, speckle
+from tests.terms.test_contact import PRESSED, RUBBED, moved, touching
+
+SOFT_PRESS = {**PRESS, "force": [0, 300, -1000]}
+
+
+def study_of(made: Scene) -> Study:
+    return Study("press", made.model_dump(), "complete", 1e-3, {})
+
+
+def nothing(done: int, total: int) -> None:
+    assert 0 <= done <= total
+
+
+@pytest.fixture(scope="module")
+def stepping(device: Device) -> Any:
+    """A study of a small scene with a release on a step."""
+    made = scene(probes=[SOFT_PRESS], damping=0.02, time={"damping_difference": "backward"})
+    with closing(SteppingStudy(plan_of(made), device, 0.05, study_of(made), nothing)) as measured:
+        measured.run()
+        yield measured
+
+
+def test_stepping_starts_at_the_largest_stable_step_and_halves_it(stepping: SteppingStudy) -> None:
+    points = stepping.study.stepping
+    assert {point.method for point in points} == {"f32 central", "f32 backward", "f64 central", "f64 backward"}
+    for method in ("f32 central", "f64 backward"):
+        steps = [point.step for point in points if point.method == method]
+        limit = plan_of(with_time(stepping.plan.scene, damping_difference=method.split()[1])).stable_step
+        assert 0.5 * limit < steps[0] <= limit
+        np.testing.assert_allclose(np.divide(steps[:-1], steps[1:]), 2)
+        assert len(steps) >= 3
+    assert all(point.seconds.runs == POINT_ROUNDS for point in points)
+    assert all(point.seconds.fastest <= point.seconds.median <= point.seconds.slowest for point in points)
+
+
+def test_errors_of_stepping_are_those_of_the_twin(stepping: SteppingStudy) -> None:
+    point = next(point for point in stepping.study.stepping if point.method == "f64 backward")
+    made = with_time(stepping.plan.scene, step=point.step, precision="f64")
+    exact = reference.simulate(with_time(made, step=point.step / 64, damping_difference="central"))
+    wrong = reference.simulate(made) - exact
+    largest = np.linalg.norm(exact - exact[0], axis=-1).max()
+    # 64 times finer, of order 2 beside one of order 1, the twin is off by 1 % of the error or less.
+    assert point.error == pytest.approx(np.linalg.norm(wrong, axis=-1).max() / largest, rel=0.01)
+    assert stepping.study.reference is not None
+    assert stepping.study.reference.largest == pytest.approx(largest, rel=1e-5)
+
+
+def test_the_reference_is_as_exact_as_it_says(stepping: SteppingStudy) -> None:
+    assert stepping.frames is not None
+    assert stepping.study.reference is not None
+    made = with_time(stepping.plan.scene, damping_difference="central")
+    solved, _ = solve(plan_of(made), 1e-12, 1e-14, float("inf"), lambda: None)
+    error = np.linalg.norm(solved - stepping.frames, axis=-1).max() / stepping.study.reference.largest
+    # The integrator keeps 1e-12 a step, of some thousand steps.
+    assert error < stepping.study.reference.error + 1e-9
+    for point in stepping.study.stepping:
+        assert point.error is not None
+        assert point.known == (point.error >= MARGIN * stepping.study.reference.error)
+
+
+def test_observed_orders(stepping: SteppingStudy) -> None:
+    orders = observed_orders(stepping.study.stepping)
+    assert orders["f64 backward"] == pytest.approx(1, abs=0.15)
+    # From the limit of stability down the first halvings are not in the range of the asymptote yet.
+    assert orders["f64 central"] == pytest.approx(2, abs=0.3)
+
+
+def test_orders_are_fitted_above_the_rounding_floor() -> None:
+    def point(step: float, error: float, rounding: float) -> Stepping:
+        return Stepping("f32", "central", 1, step, error, rounding, True, samples=[1.0])
+
+    points = [point(0.1**n, 0.1 ** (2 * n) + 1e-6, 1e-6) for n in range(5)]
+    # The points of 1e-6 and 2e-6 are mostly rounding; the next is, by 1 %.
+    assert observed_orders(points) == {"f32 central": pytest.approx(2, abs=0.01)}
+    assert observed_orders(points[2:]) == {"f32 central": None}
+
+
+def test_a_series_halves_its_steps_though_they_miss_a_jump(device: Device) -> None:
+    # A release at 3.25 frames, which no ninth of a frame meets.
+    made = scene(probes=[{**SOFT_PRESS, "load": [[0, 100], [0.13, 100], [0.13, 0]]}], time={"duration": 0.2})
+    with closing(SteppingStudy(plan_of(made), device, 0.001, study_of(made), nothing)) as measured:
+        measured.run()
+        counts = [point.steps_per_frame for point in measured.study.stepping if point.method == "f64 central"]
+    assert counts == [9, 18, 36]
+
+
+@pytest.mark.slow
+def test_dop853_solves_moving_and_jumping_probes() -> None:
+    at = [[0, 0.2, 0.3], [0.2, 0.6, 0.5], [0.2, 0.4, 0.4], [0.3, 0.5, 0.7]]
+    probe = {"at": at, "force": [200, 100, -500], "load": [[0.05, 50], [0.3, 100], [0.3, 0]], "falloff": 20}
+    made = scene(probes=[probe], springs={**SPRINGS, "virtual": 5}, time={"step": 0.04 / 320})
+    solved, evaluations = solve(plan_of(made), 1e-8, 1e-12, float("inf"), lambda: None)
+    coarse, fine = (
+        (reference.simulate(with_time(made, step=0.04 / cut)) - rest_positions(made.sheet))[1:] for cut in (160, 320)
+    )
+    largest = np.abs(solved).max()
+    error = np.abs(solved - fine).max()
+    # The twin's own error, of order 2 as every jump is on a step: a third of what a halving changes.
+    assert error == pytest.approx(np.abs(fine - coarse).max() / 3, rel=0.1)
+    assert error < 1e-3 * largest
+    assert solved.shape == (10, 9, 11, 3)
+    assert evaluations > 100
+
+
+def test_a_timing_is_a_median_with_its_spread() -> None:
+    assert Timing.of([3.0, 1.0, 9.0, 2.0, 4.0]) == Timing(3.0, 1.0, 9.0, 5)
+
+
+def test_an_error_near_that_of_the_reference_is_not_known(stepping: SteppingStudy) -> None:
+    assert stepping.study.reference is not None
+    assert stepping.known(21 * stepping.study.reference.error)
+    assert not stepping.known(19 * stepping.study.reference.error)
+
+
+def test_dop853_gives_up_in_time() -> None:
+    with pytest.raises(TooSlowError):
+        solve(plan_of(scene()), 1e-3, 1e-6, 0.0, lambda: None)
+
+
+def test_dop853_fails_where_no_step_is_small_enough(monkeypatch: pytest.MonkeyPatch) -> None:
+    failed = SimpleNamespace(success=False, t=np.array([0.04, 0.08]))
+    monkeypatch.setattr("scipy.integrate.solve_ivp", lambda *_, **__: failed)
+    with pytest.raises(FailedError, match=r"^after 0.08 s$"):
+        solve(plan_of(scene()), 1e-4, 1e-6, float("inf"), lambda: None)
+
+
+def test_dop853_is_left_out_where_tools_touch(device: Device) -> None:
+    made = touching([PRESSED])
+    with closing(SteppingStudy(plan_of(made), device, 0.01, study_of(made), nothing)) as measured:
+        measured.run()
+        study_module._measure_peer(
+            plan_of(made), measured, study_module.QUICK, measured.study, lambda stage, done, total: None
+        )
+    assert not measured.study.peers
+    (note,) = measured.study.notes
+    assert note.startswith("DOP853, SciPy's general integrator,")
+    assert note.endswith("is left out, as it knows no contact; no other figure depends on it")
+    # The reference is the finest run itself, and what a run with half its steps differs from it is its error.
+    known = measured.study.reference
+    assert known is not None
+    fine, half = (
+        frames_on(plan_of(made).with_grid(steps_per_frame=count), device)
+        for count in (known.steps_per_frame, known.steps_per_frame // 2)
+    )
+    assert measured.frames is not None
+    assert measured.frames.tobytes() == fine.tobytes()
+    assert known.error == longest(fine - half) / longest(fine)
+
+
+def test_a_study_takes_no_steps_in_which_a_tool_moves_too_far(device: Device) -> None:
+    fast = moved([0, 0.5, 0.5, 0.1], [0.1, 0.9, 0.5, 0.1], instrument={"radius": 0.005})
+    made = touching([fast], time={"step": 0.001, "duration": 0.04})
+    assert plan_of(made).stable_step > 0.01
+    with closing(SteppingStudy(plan_of(made), device, 0.001, study_of(made), nothing)) as measured:
+        measured.run()
+    assert max(point.step for point in measured.study.stepping) <= 0.005 / 2 / 1.6
+
+
+def test_points_in_contact_are_not_extrapolated() -> None:
+    fields = [np.full((count, count, 3), value) for count, value in ((7, 4.0), (13, 2.0), (25, 1.0))]
+    exact, bound = _reference(fields, extrapolate=False)
+    assert exact is fields[-1]
+    assert bound == pytest.approx(3**0.5)
+
+
+def test_a_tool_that_is_moved_is_left_out_like_any_other() -> None:
+    made = touching([PRESSED, RUBBED])
+    without = dict(variants(made))
+    assert [len(plan_of(without[f"probes.{n}"]).tools) for n in (0, 1)] == [1, 1]
+
+
+@pytest.mark.parametrize(
+    ("raised", "said"),
+    [
+        (TooSlowError(), "takes more than 10 s at rtol 0.0001 and was stopped"),
+        (
+            FailedError("after 0.3 s"),
+            "finds no step small enough after 0.3 s, at rtol 0.0001: forces change too suddenly for it there, as where "
+            "a spring is pressed to a point or the sheet runs away",
+        ),
+    ],
+    ids=["slow", "failed"],
+)
+def test_why_dop853_is_left_out_is_told(
+    raised: Exception, said: str, stepping: SteppingStudy, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def solve(*_: Any) -> Any:
+        raise raised
+
+    monkeypatch.setattr(study_module, "solve", solve)
+    found = study_of(scene())
+    found.reference = stepping.study.reference
+    study_module._measure_peer(plan_of(scene()), stepping, study_module.QUICK, found, lambda stage, done, total: None)
+    who = "DOP853, SciPy's general integrator, which the study compares its own steps with,"
+    assert found.notes == [f"{who} {said}; no other figure depends on it"]
+
+
+def test_terms_are_left_out_of_the_kernel(device: Device) -> None:
+    made = scene(probes=[PRESS, PRESS])
+    shapes = {name: structure_of(variant, device).code for name, variant in variants(made)}
+    assert list(shapes) == [
+        "",
+        "springs.structural",
+        "springs.shear",
+        "springs.virtual",
+        "damping",
+        "probes.0",
+        "probes.1",
+    ]
+    springs = {name: code.require(SpringTerm) for name, code in shapes.items()}
+    assert (springs[""].structural, springs[""].shear) == (True, True)
+    assert not springs["springs.structural"].structural
+    assert not springs["springs.shear"].shear
+    assert not shapes["springs.virtual"].get(FoundationTerm)
+    assert not shapes["damping"].get(DampingTerm)
+    assert shapes["probes.1"].get(ProbeTerm) == ProbeTerm((False,), (False,))
+    assert list(dict(variants(scene(springs={}, damping=0, probes=[])))) == [""]
+
+
+def test_all_terms_are_timed_on_the_grid_of_the_whole_scene(device: Device, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Without a stiff spring `auto` would take longer steps, and maybe others in f64."""
+    grids = []
+
+    class Recorded(Dynamics):
+        def __init__(self, plan: Plan, device: Device) -> None:
+            grids.append(plan.grid)
+            super().__init__(plan, device)
+
+    monkeypatch.setattr(measurements, "Dynamics", Recorded)
+    made = scene(time={"precision": "auto"})
+    measure_terms(plan_of(made), device, 0.0001, study_of(made), nothing)
+    assert len(grids) == len(list(variants(made)))
+    assert set(grids) == {plan_of(made).grid} != {plan_of(variant).grid for _, variant in variants(made)}
+
+
+def test_terms_are_timed(device: Device) -> None:
+    made = scene(damping=0, springs={"shear": 10})
+    study = study_of(made)
+    measure_terms(plan_of(made), device, 0.001, study, nothing)
+    assert [term.without for term in study.terms] == ["", "springs.shear", "probes.0"]
+    assert all(1e-8 < term.seconds.median < 1e-2 and term.seconds.runs == 9 for term in study.terms)
+
+
+def tissue(points: tuple[int, int] = (33, 33), **time: Any) -> Scene:
+    """A tense sheet under a tool that covers it, whose displacement is smooth: (S / K)^(1/2) = 16 mm are many cells."""
+    return Scene(
+        sheet={"points": points, "size": [0.1, 0.1]},
+        tissue={
+            "young": 3e3,
+            "thickness": 2e-3,
+            "density": 1050,
+            "foundation": 2e4,
+            "damping": 40,
+            "pretension": 5,
+        },
+        probes=[{"total": [0, 0, -0.2], "radius": 0.2, "falloff": 100, "load": [[0, 0], [0.2, 100]]}],
+        time={"duration": 0.2, "frames_per_second": 25, "precision": "f64", **time},
+        output=[],
+    )
+
+
+def points_study(made: Scene, device: Device, longest_run: float) -> Study:
+    study = study_of(made)
+    PointStudy(plan_of(made), device, longest_run, study, nothing).run()
+    return study
+
+
+@pytest.fixture(scope="module")
+def points(device: Device) -> Study:
+    return points_study(tissue(), device, 2.0)
+
+
+def test_the_error_of_points_is_of_order_2(points: Study) -> None:
+    found = points.points
+    assert points.notes == []
+    assert [one.name for one in found] == ["9 x 9", "17 x 17", "33 x 33", "65 x 65"]
+    assert [one.known for one in found[:3]] == [True] * 3
+    errors = [one.error or 0.0 for one in found]
+    # Between 9 points a side the cubics are wrong besides, by terms of order 4.
+    assert np.log2(errors[1] / errors[2]) == pytest.approx(2, abs=0.2)
+    assert errors[0] / errors[1] > 4
+    assert all(one.seconds.runs == POINTS_ROUNDS for one in found)
+    # The largest stable step is as long as a cell.
+    assert found[3].steps_per_frame / found[2].steps_per_frame == pytest.approx(2, abs=0.05)
+
+
+def test_the_error_of_points_is_that_against_many_more(points: Study, device: Device) -> None:
+    many = tissue((65, 65))
+    steps = plan_of(many).grid.steps_per_frame
+
+    def displacements(count: int) -> Any:
+        return frames_on(plan_of(with_points(many, (count, count))).with_grid(steps_per_frame=steps), device)
+
+    exact = displacements(65)
+    largest = np.linalg.norm(exact, axis=-1).max()
+    for found in points.points[1:3]:
+        stride = 64 // (found.rows - 1)
+        apart = np.linalg.norm(displacements(found.rows) - exact[:, ::stride, ::stride], axis=-1).max() / largest
+        # 65 x 65 have 1/4 of the error of 33 x 33 themselves; and between the points it may be somewhat larger.
+        assert apart <= (found.error or 0.0) < 1.6 * apart
+
+
+def test_the_estimate_beside_it_is_that_of_a_run(points: Study, device: Device, tmp_path: Path) -> None:
+    found = points.points[1]
+    record = run(tissue((17, 17)), tmp_path / "out", threads=device.threads, estimate_error=True)
+    estimate = record["error_estimate"]
+    assert estimate is not None
+    # The run compares sheets with half as many steps, whose own errors differ by less than this with the points.
+    assert estimate["mesh_error"] == pytest.approx(found.estimate, rel=0.01)
+
+
+def test_without_time_for_more_points_the_error_of_the_finest_is_a_bound(points: Study, device: Device) -> None:
+    measured = points_study(tissue(), device, 1e-6)
+    found, better = measured.points, points.points
+    assert measured.notes == ["65 x 65 points were not measured: time or memory"]
+    assert [one.name for one in found] == ["9 x 9", "17 x 17", "33 x 33"]
+    assert found[0].known
+    assert not found[2].known
+    assert (found[2].error or 0.0) > (better[2].error or 1.0)
+
+
+def test_where_the_finest_is_the_reference_its_error_is_never_known(device: Device) -> None:
+    # At the border the displacement jumps, by far more than the extrapolation there may be wrong.
+    made = tissue((13, 13))
+    assert made.tissue is not None
+    slack = made.model_copy(update={"tissue": made.tissue.model_copy(update={"pretension": 0.0, "foundation": 2e6})})
+    assert [one.known for one in points_study(slack, device, 1e-6).points] == [True, False]
+
+
+def points_of(plans: Iterable[Plan]) -> list[tuple[int, int]]:
+    return [plan.scene.sheet.points for plan in plans]
+
+
+def test_points_are_quarters_and_halves_of_the_cells() -> None:
+    assert points_of(lattices(plan_of(tissue((31, 31))))) == [(9, 9), (16, 16), (31, 31)]
+    assert points_of(lattices(plan_of(tissue((41, 25))))) == [(11, 7), (21, 13), (41, 25)]
+    # Too few to be compared with half as many; and cells that would be too long.
+    assert points_of(lattices(plan_of(tissue((13, 15))))) == [(7, 8), (13, 15)]
+    assert points_of(lattices(plan_of(tissue((6, 6))))) == []
+    assert points_of(lattices(plan_of(tissue((46, 27))))) == [(23, 14), (46, 27)]
+
+
+def test_a_sheet_of_too_few_points_is_left_out(device: Device) -> None:
+    measured = points_study(tissue((6, 6)), device, 1.0)
+    assert measured.points == []
+    assert measured.notes == ["points were not measured: with fewer than 7 a side they cannot be compared"]
+
+
+def test_springs_have_no_part_of_points(device: Device) -> None:
+    made = points_study(scene(), device, 1.0)
+    assert (made.points, made.notes) == ([], [])
+
+
+def test_an_interruption_leaves_the_points_that_were_timed(device: Device) -> None:
+    made = study_of(tissue((13, 13)))
+
+    def stop(done: int, total: int) -> None:
+        # The estimates and the errors of three are done, and one was timed once.
+        if done == 2 * 3 + 1 + 1:
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        PointStudy(plan_of(tissue((13, 13))), device, study_module.QUICK.longest_run, made, stop).run()
+    made.finish()
+    assert [(one.name, one.seconds.runs) for one in made.points] == [("7 x 7", 1)]
+    assert made.points[0].error is not None
+
+
+@pytest.mark.slow
+def test_pictures_are_judged_by_a_finer_one(device: Device, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(measurements, "REFINES", (0, 3))
+    monkeypatch.setattr(measurements, "SUPERSAMPLES", (1, 4))
+    monkeypatch.setattr(measurements, "FINEST", {"refine": 4, "supersample": 5})
+    made = scene(render={"size": [60, 45], "camera": "oblique", "refine": 3})
+    position = rest_positions(made.sheet)
+    position[4, 5, 2] += 0.05
+    study = study_of(made)
+    measure_pictures(made, position, speckle(20, 30), False, study, nothing)
+    points = {(point.refine, point.supersample): point for point in study.drawing}
+    assert set(points) == {(0, 1), (3, 1), (0, 4), (3, 4)}
+    psnr = {setting: point.psnr or 0.0 for setting, point in points.items()}
+    assert psnr[3, 4] > max(psnr[0, 4], psnr[3, 1]) > psnr[0, 1]
+    assert points[3, 4].largest_error < points[0, 1].largest_error
+    # By the twin.
+    fine = made.model_copy(update={"render": BaseModel.model_copy(made.render, update=measurements.FINEST)})
+    own = made.model_copy(update={"render": made.render.model_copy(update={"refine": 0})})
+    apart = reference.draw(fine, position, speckle(20, 30)).astype(float) - reference.draw(
+        own, position, speckle(20, 30)
+    )
+    assert psnr[0, 1] == pytest.approx(10 * np.log10(255**2 / (apart**2).mean()), abs=0.1)
+
+
+def test_psnr_is_of_values_to_255() -> None:
+    black = np.zeros((4, 5, 3), np.uint8)
+    assert measurements.psnr(black + np.uint8(51), black) == pytest.approx(20 * np.log10(5), abs=1e-12)
+    assert measurements.psnr(black, black) is None
+
+
+def test_a_quick_study_of_pictures_varies_one_at_a_time() -> None:
+    made = scene(render={"size": [6, 4], "refine": 2, "supersample": 3})
+    settings = list(measurements.settings(made, quick=True))
+    assert settings == [(2, 1), (2, 2), *((refine, 3) for refine in (0, 1, 2, 5, 10, 20)), (2, 4)]
+
+
+def stepping_point(error: float | None, seconds: float, **changes: Any) -> Stepping:
+    values: dict[str, Any] = {"precision": "f32", "damping_difference": "central", "steps_per_frame": 40, "step": 0.001}
+    return Stepping(
+        **values | changes,
+        error=error,
+        rounding=0.0,
+        known=True,
+        samples=[seconds],
+    )
+
+
+def drawn(refine: int, psnr: float | None, seconds: float, supersample: int = 1) -> Drawn:
+    return Drawn(refine, supersample, psnr, 1, samples=[seconds])
+
+
+def test_the_recommendation_is_the_cheapest_within_the_tolerance() -> None:
+    made = study_of(scene())
+    assert made.recommendation() == []
+    made.stepping = [
+        stepping_point(2e-3, 1.0),
+        stepping_point(9e-4, 3.0, precision="f64"),
+        stepping_point(5e-4, 2.0, step=0.0005),
+        stepping_point(None, 0.5),
+    ]
+    made.settings["time"]["tolerance"] = 1e-4
+    made.drawing = [drawn(0, 40.0, 1.0), drawn(1, 49.95, 2.0), drawn(2, 50.0, 3.0), drawn(1, 60.0, 0.1, supersample=2)]
+    assert made.recommendation() == [
+        "time:",
+        "  tolerance: null",
+        "  step: 0.0005",
+        "  damping_difference: central",
+        "  precision: f32",
+        "render:",
+        "  refine: 1",
+        "  supersample: 1",
+    ]
+
+
+def test_the_step_recommended_is_one_that_a_scene_takes() -> None:
+    # Written with few digits, it must still divide a frame.
+    made = study_of(scene())
+    made.stepping = [stepping_point(1e-4, 1.0, step=1 / 25 / 77, steps_per_frame=77)]
+    text = made.recommendation()[1].split(": ")[1]
+    assert plan_of(with_time(scene(), step=float(text))).grid.steps_per_frame == 77
+    assert plan_of(scene(time={"step": float(text)})).grid.step == 1 / (25 * 77)
+
+
+def test_of_one_method_the_largest_step_is_recommended() -> None:
+    made = study_of(scene())
+    made.stepping = [stepping_point(5e-4, 1.1, step=0.001), stepping_point(1e-4, 1.0, step=0.0005)]
+    assert made.best_stepping is made.stepping[0]
+
+
+def test_an_interruption_leaves_what_is_done(device: Device) -> None:
+    calls = 0
+
+    def stop(done: int, total: int) -> None:
+        nonlocal calls
+        calls += 1
+        if calls > 90:
+            raise KeyboardInterrupt
+
+    with closing(SteppingStudy(plan_of(scene(probes=[SOFT_PRESS])), device, 0.01, study_of(scene()), stop)) as measured:
+        with pytest.raises(KeyboardInterrupt):
+            measured.run()
+        assert measured.study.reference is not None
+        assert measured.study.stepping
+
+
+def test_without_a_term_a_given_step_may_be_unstable(device: Device, tmp_path: Path) -> None:
+    """A map of soft places, left out, makes the sheet stiffer than the step allows; it is timed all the same."""
+    Image.new("L", (3, 3), 0).save(tmp_path / "map.png")
+    soft = {"structural": 20, "map": {"image": str(tmp_path / "map.png"), "range": [0.01, 1]}}
+    plan = plan_of(scene(springs=soft, time={"step": 0.04 / 4}))
+    study = Study("press", scene().model_dump(), "complete", 1e-3, {})
+    measure_terms(plan, device, 0.0001, study, nothing)
+    assert [term.without for term in study.terms][-1] == "probes.0"

@@ -1,0 +1,290 @@
+"""Tools that are moved: contact, friction and grips against their twin, and against what must hold of any contact."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+
+from taichi_msm import Simulation
+from taichi_msm.errors import SceneError
+from taichi_msm.load.check import checked
+from taichi_msm.model.tools import fewest_steps, path_notes, tools_of
+from taichi_msm.scene.scene import Scene
+from taichi_msm.solver.arrays import SheetLayout
+from taichi_msm.solver.dynamics import Dynamics
+from taichi_msm.solver.planning import try_plan
+from taichi_msm.solver.state import RunProgress, State
+from taichi_msm.system.runtime import Device
+from tests import reference
+from tests.motion import dynamics_of, notes_of, structure_of
+from tests.scenes import plan_of, scene
+from tests.solver.test_dynamics import as_on_a_gpu, assert_like_twin, with_lanes
+
+ROD = {"radius": 0.05, "shaft": [0.5, -0.6, 0.9], "length": 0.3}
+
+
+def moved(*keys: list[float], **changes: Any) -> dict[str, Any]:
+    return {"path": list(keys), "instrument": {**ROD, **changes.pop("instrument", {})}, **changes}
+
+
+def touching(probes: list[dict[str, Any]], **sections: Any) -> Scene:
+    tissue = {"young": 1e3, "thickness": 0.01, "density": 1000, "foundation": 3e3, "damping": 5}
+    given = {"sheet": {"points": [17, 21], "size": [0.3, 0.4]}, "tissue": tissue, "springs": None, "damping": 0}
+    return scene(**{**given, "probes": probes, **sections})
+
+
+PRESSED = moved([0, 0.5, 0.5, 0.001], [0.2, 0.52, 0.45, -0.03], [0.4, 0.6, 0.5, -0.02])
+RUBBED = moved([0, 0.3, 0.5, 0.0], [0.1, 0.3, 0.5, -0.03], [0.4, 0.7, 0.4, -0.03], friction=0.3)
+HELD = moved([0, 0.5, 0.4, 0.0], [0.1, 0.5, 0.4, -0.02], [0.4, 0.45, 0.6, 0.04], grip=[[0.1, 0.25], [0.3, 0.38]])
+BESIDE = moved([0, 0.6, 0.4, 0.0], [0.12, 0.55, 0.4, -0.02], [0.4, 0.9, 0.3, 0.03], grip=[[0.12, 0.4]], friction=0.5)
+
+CASES = {"pressed": [PRESSED], "rubbed": [RUBBED], "held": [HELD], "together": [HELD, RUBBED, BESIDE]}
+
+# Each has kernels of its own, so that all take long.
+QUICK = (("pressed", "f64"), ("rubbed", "f32"), ("together", "f64"))
+
+
+@pytest.mark.parametrize(
+    ("case", "precision"),
+    [
+        pytest.param(case, precision, marks=() if (case, precision) in QUICK else pytest.mark.slow)
+        for case in CASES
+        for precision in ("f32", "f64")
+    ],
+)
+def test_like_twin(case: str, precision: str, device: Device) -> None:
+    assert_like_twin(touching(CASES[case], time={"precision": precision}), device)
+
+
+@pytest.mark.parametrize("case", CASES)
+def test_the_case_is_what_its_name_says(case: str) -> None:
+    probes = range(len(CASES[case]))
+    pushed, held = set(), set()
+    for _, contact in reference.steps(plan_of(touching(CASES[case]))):
+        pushed |= {index for index in probes if contact.push[index].any()}
+        held |= set(contact.holder.ravel()) - {-1}
+    assert pushed == set(probes)
+    assert held == {index for index in probes if "grip" in CASES[case][index]}
+
+
+def states(made: Scene, device: Device, layout: SheetLayout) -> bytes:
+    """All that the next steps depend on, at the end, and the forces that the tools feel in each frame."""
+    dynamics, grid = dynamics_of(made, device, layout), plan_of(made).grid
+    forces = []
+    for _ in range(grid.frames):
+        dynamics.advance(grid.steps_per_frame)
+        forces.append(dynamics.tool_forces())
+    assert len({force.tobytes() for force in forces}) == grid.frames
+    state = dynamics.state()
+    dynamics.close()
+    return b"".join(array.tobytes() for array in (*state[1:], *forces))
+
+
+def test_lanes_workers_and_passes_do_not_change_the_bits(device: Device) -> None:
+    made = touching(CASES["together"], time={"precision": "f32"})
+    layout = structure_of(made, device)
+    plain = states(made, device, layout)
+    for lanes, workers, depth in ((4, 2, 3), (1, 1, 1)):
+        assert states(made, device, replace(with_lanes(layout, lanes), workers=workers, depth=depth)) == plain
+    assert states(made, device, as_on_a_gpu(layout)) == plain
+
+
+def test_steps_go_on_from_a_state(device: Device) -> None:
+    made = touching(CASES["together"])
+    plan, dynamics = plan_of(made), dynamics_of(made, device)
+    dynamics.advance(plan.grid.steps * 3 // 4 + 1)
+    saved = dynamics.state()
+    assert len(saved.contact) == 3 * 3 + 4
+    dynamics.restart(plan, State(*saved))
+    dynamics.advance(plan.grid.steps - saved.steps)
+    whole = dynamics_of(made, device)
+    whole.advance(plan.grid.steps)
+    assert [part.tobytes() for part in dynamics.state()[1:]] == [part.tobytes() for part in whole.state()[1:]]
+
+
+DOWN_AND_UP = ([0, 0.5, 0.5, 0.0], [0.1, 0.5, 0.5, -0.02], [0.4, 0.6, 0.5, 0.02])
+LOADED = {"total": [0, 0, 2], "radius": 0.05, "load": [[0, 0], [0.2, 100]]}
+FRAME = 1 / 25
+
+# What is at an edge of the rules.
+EDGES: dict[str, list[dict[str, Any]]] = {
+    "equal to a frame": [moved(*DOWN_AND_UP, grip=[[3 * FRAME + 0.9e-6 * FRAME, 7 * FRAME - 0.9e-6 * FRAME]])],
+    "after a frame": [moved(*DOWN_AND_UP, grip=[[3 * FRAME + 2e-6 * FRAME, 7 * FRAME + 2e-6 * FRAME]])],
+    "one grip after the other": [moved(*DOWN_AND_UP, grip=[[0.1, 0.2], [0.2, 0.3]])],
+    "shorter than a step": [moved(*DOWN_AND_UP, grip=[[0.1001, 0.1002], [0.15, 0.1501]])],
+    "from before the start to after the end": [
+        moved([-0.5, 0.5, 0.5, 0.05], [0.3, 0.5, 0.5, -0.02], [0.9, 0.5, 0.5, 0.0], grip=[[-1, 5]])
+    ],
+    "a single key": [moved([0.1, 0.5, 0.5, 0.0], grip=[[0.1, 0.3]]), LOADED],
+    "begins late and ends early": [moved([0.1, 0.5, 0.5, 0.0], [0.2, 0.5, 0.5, -0.03])],
+    "comes from beside": [moved([0, 1.5, 0.5, -0.03], [0.4, 0.8, 0.5, -0.03])],
+    "larger than the sheet": [
+        moved([0, 0.5, 0.5, 0.0], [0.2, 0.5, 0.5, -0.05], [0.4, 0.5, 0.5, -0.01], instrument={"radius": 0.5})
+    ],
+    "from below": [
+        moved([0, 0.5, 0.5, -0.1], [0.2, 0.5, 0.45, -0.07], instrument={"shaft": [0.2, 0.1, -1]}, friction=0.3)
+    ],
+    "lies": [moved([0, 0.3, 0.5, 0.0], [0.2, 0.3, 0.5, -0.03], instrument={"shaft": [1, 0, 0]}, friction=0.3)],
+}
+
+
+@pytest.mark.parametrize("fixed", ["border", pytest.param("none", marks=pytest.mark.slow)])
+@pytest.mark.parametrize("case", EDGES)
+def test_edges_like_twin(case: str, fixed: str, device: Device) -> None:
+    made = touching(EDGES[case])
+    small = made.sheet.model_copy(update={"points": (9, 11), "fixed": fixed})
+    assert_like_twin(made.model_copy(update={"sheet": small}), device)
+
+
+@pytest.mark.parametrize(("height", "pushed"), [(0.05, 0.05), (0.0, 0.0), (0.1, 0.0)], ids=["axis", "below", "above"])
+@pytest.mark.parametrize("precision", ["f32", "f64"])
+def test_the_middle_line_pushes_up_and_the_surface_does_not(
+    precision: str, height: float, pushed: float, device: Device
+) -> None:
+    """A point with d = 0 and with d = radius, to the bit, and with no force on it."""
+    probe = moved([0, 0.5, 0.5, 0.0], instrument={"shaft": [1, 0, 0]}, friction=0.3)
+    plan = plan_of(scene(springs={"virtual": 1.0}, damping=0, probes=[probe], time={"precision": precision}))
+    displacement = np.zeros((*plan.scene.sheet.points, 3), precision.replace("f", "float"))
+    displacement[4, 5, 2] = height
+    dynamics = Dynamics(plan, device)
+    dynamics.restart(plan, State(1, displacement, np.zeros_like(displacement)))
+    dynamics.advance(1)
+    assert dynamics.state().contact[:3, 4, 5] == pytest.approx([0, 0, pushed])
+    assert dynamics.displacement()[4, 5] == pytest.approx([0, 0, height + pushed])
+
+
+def test_a_sheet_of_four_points_like_twin(device: Device) -> None:
+    held = moved(
+        [0, 0.2, 0.2, 0.0], [0.2, 0.2, 0.2, -0.03], [0.4, 0.6, 0.5, -0.02],
+        friction=0.3, grip=[[0.2, 0.3]], instrument={"radius": 0.2},
+    )  # fmt: skip
+    made = touching([held])
+    small = made.sheet.model_copy(update={"points": (2, 2), "size": (0.3, 0.3), "fixed": "none"})
+    assert_like_twin(made.model_copy(update={"sheet": small}), device)
+
+
+PATH = PRESSED["path"]
+REFUSED: dict[str, tuple[dict[str, Any], str]] = {
+    "in the sheet": (
+        moved([0, 0.5, 0.5, -0.01]),
+        "path: the instrument is 0.01 m in the sheet at rest at 0 s; begin above it, at a greater height",
+    ),
+    "a jump": (
+        moved([0, 0.5, 0.5, 0.0], [0, 0.5, 0.5, 0.01]),
+        "path.1: is at 0 s, and the key before it at 0 s; sort the keys, each later than the last",
+    ),
+    "no rod": ({"path": PATH}, "instrument: missing; with path expected a mapping with radius, shaft and length"),
+    "a force": (
+        {**PRESSED, "total": [0, 0, -1]},
+        "total: goes with a force, and path gives the place; remove one of them",
+    ),
+    "no path": ({"total": [0, 0, -1], "friction": 0.1}, "friction: goes with path; a tool with a force has none"),
+    "a grip that ends before": (
+        {**PRESSED, "grip": [[0.2, 0.1]]},
+        "grip.0: ends at 0.1 s, and begins at 0.2 s; give [from, to] in this order",
+    ),
+    "two grips at once": (
+        {**PRESSED, "grip": [[0.1, 0.3], [0.2, 0.4]]},
+        "grip.1: begins at 0.2 s, before the grip before it ends; sort them, without overlap",
+    ),
+}
+
+
+@pytest.mark.parametrize("case", REFUSED)
+def test_what_a_tool_cannot_be_is_refused_with_the_remedy(case: str) -> None:
+    probe, said = REFUSED[case]
+    given: dict[str, Any] = {
+        "sheet": {"points": [9, 11], "size": [0.3, 0.4]},
+        "tissue": {"young": 1e3, "thickness": 0.01, "density": 1000},
+        "time": {"duration": 0.4},
+        "output": [],
+    }
+    with pytest.raises(SceneError) as refused:
+        checked({**given, "probes": [probe]})
+    assert list(refused.value.lines) == [f"probes.0.{said}"]
+
+
+def problems(*keys: list[float], **time: Any) -> list[str]:
+    return [str(problem) for problem in try_plan(touching([moved(*keys)], time=time))[1]]
+
+
+def test_how_far_a_tool_comes_in_a_step() -> None:
+    """Half of its radius, 0.05 m, at most: within one segment of its path, across a key, and from the start on."""
+    still, step = [0, 0.5, 0.5, 0.1], {"step": 0.01}
+    assert not problems(still, [0.4, 0.5, 0.5, 0.1], **step)
+    # Between columns 0.4 m apart in all: 0.16 m/s, 2.4 m/s, 2.6 m/s.
+    assert not problems(still, [0.1, 0.5 + 0.24 / 0.4, 0.5, 0.1], **step)
+    (far,) = problems(still, [0.2, 0.5, 0.5, 0.1], [0.3, 0.5 + 0.26 / 0.4, 0.5, 0.1], **step)
+    assert far == (
+        "probes.0.path.2: moves 0.026 m in a step of 0.01 s, over half the radius of its instrument; move at most 2.5 "
+        "m/s, or take a smaller step"
+    )
+    # 0.024 m within a microsecond, and twice that within a step.
+    assert not problems(still, [0.1, 0.5, 0.5, 0.1], [0.100001, 0.56, 0.5, 0.1], **step)
+    twice = [[0.1, 0.5, 0.5, 0.1], [0.100001, 0.56, 0.5, 0.1], [0.104, 0.56, 0.5, 0.1], [0.104001, 0.62, 0.5, 0.1]]
+    assert "moves 0.048 m in a step" in problems(still, *twice, **step)[0]
+    # After the end, where a simulation may still go, and before the start.
+    assert problems(still, [0.4, 0.5, 0.5, 0.1], [0.41, 0.9, 0.5, 0.1], **step)
+    assert not problems([-0.01, 0.1, 0.5, 0.1], still, **step)
+
+
+def test_the_fewest_steps_in_which_no_tool_moves_too_far() -> None:
+    plan = plan_of(touching([moved([0, 0.5, 0.5, 0.1], [0.1, 1.5, 0.5, 0.1])]))
+    assert fewest_steps(plan.tools, plan.grid, 1) == 7  # 0.16 m in a frame, in parts of 0.025 m
+    assert fewest_steps(plan.tools, plan.grid, 9) == 9
+    assert fewest_steps((), plan.grid, 1) == 1
+
+
+def test_units_and_times_that_cannot_be_meant_are_noted() -> None:
+    late = {**PRESSED, "path": [[0, 0.5, 0.5, 1], [300, 0.5, 0.5, -5]], "grip": [[2, 3]]}
+    made = touching([late])
+    height, path, grip, *_ = path_notes(made, tools_of(made.probes, made.sheet))
+    assert height == "probes.0.path: a height of 5 m beside a sheet of 0.4 m; heights are in metres"
+    assert path == "probes.0.path ends at 300 s, after the end of the scene at 0.4 s"
+    assert grip == "probes.0.grip begins at 2 s, not before the end of the scene at 0.4 s"
+
+
+def test_a_tip_that_is_deep_in_a_soft_foundation_is_noted() -> None:
+    def notes(**changes: float) -> list[str]:
+        given = {"young": 1e3, "thickness": 1e-3, "foundation": 3e5, "depth": 0.002, **changes}
+        depth = given.pop("depth")
+        rod = moved([0, 0.5, 0.5, 0], [0.2, 0.5, 0.5, -depth], instrument={"radius": 0.005})
+        made = touching(
+            [rod], sheet={"points": [41, 41], "size": [0.1, 0.1]}, tissue=given, time={"motion": "quasistatic"}
+        )
+        return [note for note in notes_of(made, RunProgress(), None) if "slides" in note]
+
+    # E t is 1 N/m, k R^2 7.5 N/m, R / 5 1 mm.
+    (note,) = notes()
+    assert note.startswith("probes.0: the sheet slides off the tip sideways")
+    for part in ("by 1 N/m", "7.5 N/m", "2 mm deep", "a fifth of its radius, 1 mm;", "less deep, or with a wider tip"):
+        assert part in note
+    assert not notes(depth=0.00099)
+    assert notes(young=7.4e3)
+    assert not notes(young=7.6e3)
+
+
+def test_a_rod_that_goes_through_the_sheet_is_noted(device: Device) -> None:
+    from_the_side = [moved([0, -0.5, 0.6, -0.08], [0.3, 1.5, 0.6, -0.08])]
+    made = touching(from_the_side, tissue={"young": 1e4, "thickness": 1e-3, "density": 1050}, time={"duration": 0.32})
+    # The border is at 0, a quarter of the way.
+    with Simulation(made, device.arch) as simulation:
+        simulation.advance(8)
+        progress = simulation.progress
+    assert (progress.pierced_by, progress.pierced_frame) == (1, 2)
+    (note,) = (note for note in notes_of(made, progress, None) if "went through" in note)
+    assert note.startswith("probes.0: the instrument went through the sheet, first seen at 0.08 s, frame 2")
+    # Exactly on the diagonal of a cell, without touching its corners.
+    between = moved(
+        [0, 0.525, 0.53125, 0.001], [0.2, 0.525, 0.53125, -0.03], instrument={"radius": 0.004, "shaft": [0, 0, 1]}
+    )
+    with Simulation(touching([between]), device.arch) as simulation:
+        simulation.advance(8)
+        assert simulation.progress.pierced_by == 1
+        assert simulation.progress.max_displacement == 0
+    with Simulation(touching([PRESSED, HELD]), device.arch) as simulation:
+        simulation.advance(10)
+        assert simulation.progress.pierced_by == 0
